@@ -9,6 +9,7 @@ use ratn_proto::v1::execute_response::Kind;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_worker::endpoint::{Endpoint, connect};
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::tls::ClientTls;
 use ratn_worker::trace::Traced;
 use std::time::Duration;
 use support::{Place, wait_for};
@@ -28,7 +29,7 @@ struct Holder {
 
 impl Holder {
     async fn open(manager: &Endpoint) -> anyhow::Result<Holder> {
-        let mut resources = ResourceServiceClient::new(connect(manager).await?);
+        let mut resources = ResourceServiceClient::new(connect(manager, &ClientTls::none()).await?);
         let (pings, outgoing) = mpsc::channel(1);
         pings
             .send(v1::KeepAliveRequest { session_id: "holder".into(), ttl_ms: TTL_MS, client: "holder".into() })
@@ -74,7 +75,8 @@ async fn give(lease: v1::Lease, action: &str, goal_id: String) -> anyhow::Result
     let endpoint: Endpoint = lease.resources.first().context("a resource")?.endpoint.parse()?;
     let goal = v1::Goal { goal_id, action: action.to_owned(), lease: Some(lease), ..Default::default() };
     let request = v1::ExecuteRequest { goal: Some(goal), known_only: false };
-    let mut heard = match ActionServiceClient::new(connect(&endpoint).await?).execute(request).await {
+    let mut heard = match ActionServiceClient::new(connect(&endpoint, &ClientTls::none()).await?).execute(request).await
+    {
         Ok(heard) => heard.into_inner(),
         Err(refused) => return Ok(Err(refused)),
     };

@@ -6,6 +6,7 @@ use anyhow::{Context, ensure};
 use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::tls::ClientTls;
 use std::io::Read;
 use std::net::TcpStream;
 use std::process::{Command, Output};
@@ -171,8 +172,8 @@ fn an_idle_connection_is_closed_and_its_client_goes_on_and_one_with_a_watch_stay
     let Endpoint::Tcp { port, .. } = found else { anyhow::bail!("{found} is not TCP") };
     tokio::runtime::Runtime::new()?.block_on(async {
         let ((through, mut closed), (watched_through, mut watched_closed)) = (relay(port).await?, relay(port).await?);
-        let client = ResourceClient::new(&Channels::new(), &through, "")?;
-        let watching = ResourceClient::new(&Channels::new(), &watched_through, "")?;
+        let client = ResourceClient::new(&Channels::new(&ClientTls::none()), &through, "")?;
+        let watching = ResourceClient::new(&Channels::new(&ClientTls::none()), &watched_through, "")?;
         let mut watch = watching.watch(&[]).await?;
         watch.next().await?;
         for _ in 0..2 {

@@ -14,6 +14,7 @@ use cluster::{Cluster, Proxy};
 use nix::sys::signal::Signal;
 use ratn_worker::client::wait_until_serving;
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::tls::ClientTls;
 use std::time::{Duration, Instant};
 use support::crashes::{AGAIN, PATIENCE, Random, number};
 use support::tool_clients::{CLIENTS, Crowd, told};
@@ -111,7 +112,7 @@ impl Pair {
             self.revive(0)?;
             self.revive(1)?;
             for (number, manager) in self.managers.iter().enumerate() {
-                if wait_until_serving(&manager.itself, Duration::from_millis(300)).await.is_ok() {
+                if wait_until_serving(&manager.itself, &ClientTls::none(), Duration::from_millis(300)).await.is_ok() {
                     return Ok(number);
                 }
             }
@@ -206,7 +207,8 @@ impl Pair {
         let (begin, other) = (Instant::now(), 1 - than);
         loop {
             self.revive(other)?;
-            match wait_until_serving(&self.managers[other].itself, Duration::from_millis(300)).await {
+            match wait_until_serving(&self.managers[other].itself, &ClientTls::none(), Duration::from_millis(300)).await
+            {
                 Err(error) if begin.elapsed() >= PATIENCE => return Err(error).with_context(|| self.said()),
                 Err(_) => {}
                 Ok(()) => return Ok(()),

@@ -11,6 +11,7 @@ use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
+use ratn_worker::tls::ClientTls;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -38,7 +39,8 @@ struct Holder {
 
 impl Holder {
     async fn acquire(directory: &Path, name: &str) -> anyhow::Result<Holder> {
-        let (channels, manager) = (Channels::new(), RuntimeDirectory::at(directory).find("resource-manager")?);
+        let (channels, manager) =
+            (Channels::new(&ClientTls::none()), RuntimeDirectory::at(directory).find("resource-manager")?);
         let session = Session::open(&channels, &manager, name, TTL);
         session.alive(PATIENCE).await?;
         let resources = ResourceClient::new(&channels, &manager, session.id())?;

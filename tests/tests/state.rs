@@ -9,6 +9,7 @@ use ratn_model::id::Revision;
 use ratn_model::value::Value;
 use ratn_worker::client::{Channels, WorldClient};
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::tls::ClientTls;
 use std::path::{Path, PathBuf};
 use support::{Place, Started, texts, wait_for};
 
@@ -83,7 +84,7 @@ fn a_backup_of_a_running_world_pool_has_its_facts() -> anyhow::Result<()> {
     let cell = Cell { place: Place::new()? };
     let asking = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let endpoint: Endpoint = format!("unix:{}", cell.path("run/world-pool.sock")).parse()?;
-    let world = || WorldClient::new(&Channels::new(), &endpoint);
+    let world = || WorldClient::new(&Channels::new(&ClientTls::none()), &endpoint);
     let set = |value| {
         let fact = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
         vec![Change::Set { fact, value: Value::Int(value) }]

@@ -10,6 +10,7 @@ use ratn_worker::client::{AcquireOptions, ActionClient, CallError, Channels, Res
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
+use ratn_worker::tls::ClientTls;
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -34,7 +35,8 @@ struct Holder {
 
 impl Holder {
     async fn acquire(directory: &Path, name: &str) -> anyhow::Result<Holder> {
-        let (channels, manager) = (Channels::new(), RuntimeDirectory::at(directory).find("resource-manager")?);
+        let (channels, manager) =
+            (Channels::new(&ClientTls::none()), RuntimeDirectory::at(directory).find("resource-manager")?);
         let session = Session::open(&channels, &manager, name, TTL);
         session.alive(PATIENCE).await?;
         let resources = ResourceClient::new(&channels, &manager, session.id())?;

@@ -18,6 +18,7 @@ use ratn_storage::{Log, Options, Store};
 use ratn_worker::client::{AcquireOptions, Channels, Commit, ResourceClient, WorldClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::Session;
+use ratn_worker::tls::ClientTls;
 use serde_json::{Value as Json, json};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -238,7 +239,7 @@ async fn what_is_here_is_written_down_for_later_versions() -> anyhow::Result<()>
     std::fs::create_dir_all(&target)?;
     let mut system = System::new()?;
     system.start()?;
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     make_a_snapshot(&system, &channels).await?;
     let (_client, answers) = ask(&system, &channels).await?;
     let mut expected = system.tell()?;
@@ -324,7 +325,7 @@ async fn what_earlier_versions_left_is_there_and_their_requests_asked_again_get_
         for (what, now) in system.tell()? {
             ensure!(same(&expected[what], &now), "{place}: {what}\nthen {}\nnow  {now}", expected[what]);
         }
-        let channels = Channels::new();
+        let channels = Channels::new(&ClientTls::none());
         let (client, answers) = ask(&system, &channels).await.with_context(|| place.to_string())?;
         ensure!(same(&expected["answers"], &answers), "{place}: then {}, now {answers}", expected["answers"]);
         let state = *client.session.state().borrow();

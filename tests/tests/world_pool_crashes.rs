@@ -12,6 +12,7 @@ use ratn_model::id::Revision;
 use ratn_model::value::Value;
 use ratn_worker::client::{CallError, Channels, WorldClient};
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::tls::ClientTls;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -72,7 +73,7 @@ fn changes(client: usize, round: i64) -> Vec<Change> {
 
 /// Commits, one after the other, until it is told to end.
 async fn client(number: usize, endpoint: Endpoint, shared: Shared, end: CancellationToken) -> anyhow::Result<()> {
-    let world = WorldClient::new(&Channels::new(), &endpoint)?;
+    let world = WorldClient::new(&Channels::new(&ClientTls::none()), &endpoint)?;
     let mut before: Option<(i64, Revision)> = None;
     for round in 1.. {
         if end.is_cancelled() {
@@ -102,7 +103,7 @@ async fn client(number: usize, endpoint: Endpoint, shared: Shared, end: Cancella
 
 /// What the pool says now holds all that the clients were told, and nothing by halves or twice.
 async fn verify(shared: &Shared, endpoint: &Endpoint) -> anyhow::Result<()> {
-    let world = WorldClient::new(&Channels::new(), endpoint)?;
+    let world = WorldClient::new(&Channels::new(&ClientTls::none()), endpoint)?;
     let (acknowledged, newest) = told(shared, |told| (told.acknowledged.clone(), told.newest));
     let ((revision, facts), _) = answered(|| world.root()).await?;
     let asked = told(shared, |told| told.asked.clone());

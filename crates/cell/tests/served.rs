@@ -19,6 +19,7 @@ use ratn_worker::endpoint::{Endpoint, connect};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::safety::{SafetyClient, SafetyState};
 use ratn_worker::session::Session;
+use ratn_worker::tls::ClientTls;
 use ratn_worker::worker::WorkerOptions;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -60,7 +61,7 @@ async fn system(speed: f64, boxes: usize) -> System {
         ..WorkerOptions::default()
     };
     tokio::spawn(ratn_workers::detector::worker(options, None).shutdown(end.clone()).run());
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &manager, "test", TTL);
     session.alive(DEADLINE).await.unwrap();
     let resources = ResourceClient::new(&channels, &manager, session.id()).unwrap();
@@ -328,7 +329,7 @@ async fn a_cell_that_ends_in_mid_motion_stops_it_and_then_takes_its_modules_back
 
 /// Where the arm is.
 async fn arm(cell: &Endpoint) -> v1::Joints {
-    let mut client = CellServiceClient::new(connect(cell).await.unwrap());
+    let mut client = CellServiceClient::new(connect(cell, &ClientTls::none()).await.unwrap());
     client.get_ground_truth(v1::GetGroundTruthRequest {}).await.unwrap().into_inner().arm.unwrap()
 }
 
@@ -371,7 +372,7 @@ async fn an_arm_stands_still_each_time_that_the_line_to_the_manager_hangs() {
     tokio::spawn(ratn_cell::run(config, directory.clone(), end.clone()));
     let cell = directory.wait_for(ratn_cell::ROLE, DEADLINE).await.unwrap();
 
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &manager, "test", TTL);
     session.alive(DEADLINE).await.unwrap();
     let resources = ResourceClient::new(&channels, &manager, session.id()).unwrap();
@@ -482,7 +483,7 @@ async fn cell_alone(runtime: &Path, state_dir: Option<PathBuf>) -> (SafetyClient
     let (directory, end) = (RuntimeDirectory::create(runtime).unwrap(), CancellationToken::new());
     tokio::spawn(ratn_cell::run(CellConfig { state_dir, ..CellConfig::default() }, directory.clone(), end.clone()));
     let cell = directory.wait_for(ratn_cell::ROLE, DEADLINE).await.unwrap();
-    (SafetyClient::new(&Channels::new(), &cell).unwrap(), end)
+    (SafetyClient::new(&Channels::new(&ClientTls::none()), &cell).unwrap(), end)
 }
 
 #[tokio::test(flavor = "multi_thread")]

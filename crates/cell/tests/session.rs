@@ -11,6 +11,7 @@ use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
+use ratn_worker::tls::ClientTls;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -58,7 +59,7 @@ impl Manager {
 
     /// The session that offers the arm, once it is another one than this.
     async fn offers_the_arm(&self, other_than: &str) -> String {
-        let resources = ResourceClient::new(&Channels::new(), &self.endpoint, "").unwrap();
+        let resources = ResourceClient::new(&Channels::new(&ClientTls::none()), &self.endpoint, "").unwrap();
         let offered = async {
             loop {
                 match resources.get("arm@sim").await {
@@ -89,7 +90,7 @@ async fn a_cell_whose_session_id_is_anothers_offers_its_arm_in_a_session_of_anot
     // The manager comes back with a state in which the session is that of somebody who proves nothing.
     let other = RuntimeDirectory::create(elsewhere.path()).unwrap();
     let manager = Manager::start(&other, Endpoint::loopback()).await;
-    let taken = Session::open_as(&Channels::new(), &manager.endpoint, first.clone(), "another", HOUR);
+    let taken = Session::open_as(&Channels::new(&ClientTls::none()), &manager.endpoint, first.clone(), "another", HOUR);
     taken.alive(DEADLINE).await.unwrap();
     taken.abandon().await;
     manager.end().await;

@@ -10,6 +10,7 @@ use ratn_worker::endpoint::Endpoint;
 use ratn_worker::provider::Provider;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
+use ratn_worker::tls::ClientTls;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
@@ -59,6 +60,8 @@ pub(crate) struct LastingSession {
 pub(crate) struct Manager {
     pub(crate) configured: Option<Endpoint>,
     pub(crate) directory: RuntimeDirectory,
+    /// What it is shown, and by what it is trusted.
+    pub(crate) tls: ClientTls,
 }
 
 /// A provider's link.
@@ -115,7 +118,7 @@ impl LastingSession {
 impl Link {
     /// Keeps the link up until `shutdown`. Then it closes the session, and with the session every resource is gone.
     pub(crate) async fn keep(mut self, shutdown: CancellationToken) {
-        let channels = Channels::new();
+        let channels = Channels::new(&self.manager.tls);
         let mut demand = self.demand.take();
         // What is wanted from the beginning on, an earlier process may have offered.
         let mut before = self.wanted.borrow().clone();

@@ -75,16 +75,18 @@ impl Check for ServiceConfig {
 }
 
 impl ServiceConfig {
-    /// What this process shows to others and whom it trusts, where the environment did not say: its own certificate and the
-    /// authority of its clients, one authority being for a whole system.
+    /// What a daemon shows to others and whom it trusts as their client: what the environment says (`from_environment`), else its own
+    /// certificate and the authority of its clients, one authority being for a whole system.
     ///
     /// # Errors
     /// [`TlsError`] of a file that cannot be read.
-    pub fn trust(&self) -> Result<(), TlsError> {
-        if let Some(files) = &self.tls {
-            tls::install(ClientTls::read(&files.client_ca, Some((&files.cert, &files.key)))?);
+    pub fn client_tls(&self, from_environment: &ClientTls) -> Result<ClientTls, TlsError> {
+        match &self.tls {
+            Some(files) if from_environment.is_none() => {
+                ClientTls::read(&files.client_ca, Some((&files.cert, &files.key)))
+            }
+            _ => Ok(from_environment.clone()),
         }
-        Ok(())
     }
 
     /// What processes that a daemon starts have in their environment, so that they let in whom the daemon does and show what it shows:

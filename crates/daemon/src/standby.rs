@@ -21,6 +21,7 @@ use ratn_worker::gate::{Gate, Identity};
 use ratn_worker::panic::{exit_on_panic, exit_on_panic_blocking};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Bound, Phase, ServeError, Services, Serving, bind_as};
+use ratn_worker::tls::ClientTls;
 use ratn_worker::trace::Traced;
 use ratn_worker::vitals::Vitals;
 use std::path::{Path, PathBuf};
@@ -253,7 +254,9 @@ pub(crate) fn etcd(config: &StorageConfig, role: &str, address: &str, mark: Opti
 fn connect(address: &str, tls: &ClientTlsConfig) -> Result<Channel, String> {
     let endpoint: Endpoint = address.parse().map_err(|error| format!("{error}"))?;
     let (Endpoint::Tcp { .. } | Endpoint::Tls { .. }) = endpoint else {
-        return connect_lazily(&endpoint).map(Traced::into_channel).map_err(|error| error.to_string());
+        return connect_lazily(&endpoint, &ClientTls::none())
+            .map(Traced::into_channel)
+            .map_err(|error| error.to_string());
     };
     let mut configured =
         tonic::transport::Endpoint::from_shared(address.to_owned()).map_err(|error| error.to_string())?;

@@ -10,6 +10,7 @@ use ratn_worker::endpoint::Endpoint;
 use ratn_worker::lease_watch::{Claim, ClaimStatus, LeaseWatch, ManagerLocation};
 use ratn_worker::runtime_directory::wait_for_file;
 use ratn_worker::session::Session;
+use ratn_worker::tls::ClientTls;
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -100,7 +101,7 @@ async fn a_manager_that_hangs_is_not_trusted_longer_than_a_lease_may_last() {
     let way = Way::to(&manager.endpoint, place.path());
     let leases = LeaseWatch::of(["planner-1@here"]);
     let following = leases.follow_location(
-        &Channels::new(),
+        &Channels::new(&ClientTls::none()),
         ManagerLocation::At(way.endpoint.clone()),
         "a manager of processes",
         PATIENCE,
@@ -131,7 +132,7 @@ async fn a_lookalike_of_a_pooled_worker_has_no_lease_of_the_worker() {
         let lease = provider.resources.acquire(vec![block("PathPlanner")], AcquireOptions::default()).await.unwrap();
         let leases = LeaseWatch::of([id]);
         let location = ManagerLocation::At(manager.endpoint.clone());
-        let following = leases.follow_location(&Channels::new(), location, pools.session.id(), SOON);
+        let following = leases.follow_location(&Channels::new(&ClientTls::none()), location, pools.session.id(), SOON);
         let following = tokio::spawn(following);
         until_heard(&leases, true).await;
         let said = leases.check(&Claim { resource: id, lease: lease.id, token: lease.token, session: "" });
@@ -152,7 +153,7 @@ async fn a_lookalike_of_a_pooled_worker_has_no_lease_of_the_worker() {
 async fn the_end_of_the_session_is_seen_while_the_watch_is_taken_up_again() {
     let (system, place) = (TestSystem::new(), tempfile::tempdir().unwrap());
     let manager = system.resource_manager_at(Endpoint::Unix(place.path().join("rm.sock"))).await;
-    let (way, channels) = (Way::to(&manager.endpoint, place.path()), Channels::new());
+    let (way, channels) = (Way::to(&manager.endpoint, place.path()), Channels::new(&ClientTls::none()));
     let session = Session::open(&channels, &way.endpoint, "cell", PATIENCE);
     let leases = LeaseWatch::of(["arm@here"]);
     // However patient it was told to be.
@@ -182,9 +183,9 @@ async fn a_worker_that_has_never_heard_the_manager_does_not_say_that_it_serves()
     let shutdown = CancellationToken::new();
     let running = tokio::spawn(Worker::new(options).shutdown(shutdown.clone()).run());
     let endpoint = wait_for_file(&file, "worker", SOON).await.unwrap();
-    assert!(wait_until_serving(&endpoint, PATIENCE).await.is_err());
+    assert!(wait_until_serving(&endpoint, &ClientTls::none(), PATIENCE).await.is_err());
     way.is(Line::Open);
-    in_time(wait_until_serving(&endpoint, Duration::from_secs(20))).await.unwrap();
+    in_time(wait_until_serving(&endpoint, &ClientTls::none(), Duration::from_secs(20))).await.unwrap();
     shutdown.cancel();
     running.await.unwrap().unwrap();
 }

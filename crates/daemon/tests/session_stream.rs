@@ -12,6 +12,7 @@ use ratn_proto::v1::session_response::Kind;
 use ratn_proto::v1::{self, SessionRequest};
 use ratn_worker::client::{AcquireOptions, Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::tls::ClientTls;
 use std::collections::BTreeMap;
 use support::{TestSystem, block, in_time};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -317,7 +318,7 @@ async fn a_grant_whose_answer_was_lost_goes_back_when_it_is_asked_for_again_and_
     a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
     let free = async || a.resources.get("arm").await.unwrap().free.units();
     let relay = Relay::to(&manager);
-    let client = ResourceClient::new(&Channels::new(), &relay.endpoint, b.session.id()).unwrap();
+    let client = ResourceClient::new(&Channels::new(&ClientTls::none()), &relay.endpoint, b.session.id()).unwrap();
     let options = || AcquireOptions { request: "run/i1".to_owned(), ..AcquireOptions::default() };
     let ask = || client.acquire(vec![block("Arm")], options());
     // The answer of the first question does not arrive.
@@ -361,7 +362,7 @@ async fn a_grant_whose_answer_was_lost_goes_back_where_a_refusal_came_before_the
     a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
     let free = async || a.resources.get("arm").await.unwrap().free.units();
     let relay = Relay::to(&manager);
-    let client = ResourceClient::new(&Channels::new(), &relay.endpoint, b.session.id()).unwrap();
+    let client = ResourceClient::new(&Channels::new(&ClientTls::none()), &relay.endpoint, b.session.id()).unwrap();
     let options = || AcquireOptions { request: "run/i1".to_owned(), ..AcquireOptions::default() };
     let ask = || client.acquire(vec![block("Arm")], options());
     in_time(client.release(LeaseId(1))).await.unwrap();

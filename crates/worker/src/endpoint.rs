@@ -2,6 +2,7 @@
 //! `https://host:port` or `unix:/path`. Several of them, with commas between, are servers of which one leads.
 
 use crate::leader::LeaderConnector;
+use crate::tls::ClientTls;
 use crate::tls::connect::Connector;
 use crate::trace::Traced;
 use serde::{Deserialize, Serialize};
@@ -169,37 +170,42 @@ impl TryFrom<String> for Endpoint {
     }
 }
 
-/// A channel that connects with its first call, and again whenever the connection broke. Needs a tokio runtime.
+/// A channel that connects with its first call, and again whenever the connection broke; with TLS as `tls` says at that time. Needs a tokio
+/// runtime.
 ///
 /// # Errors
 /// [`ConnectError`] when the endpoint makes no URI.
-pub fn connect_lazily(endpoint: &Endpoint) -> Result<Traced, ConnectError> {
+pub fn connect_lazily(endpoint: &Endpoint, tls: &ClientTls) -> Result<Traced, ConnectError> {
     let configured = configured(endpoint)?;
-    Ok(Traced::new(match connector_of(endpoint) {
+    Ok(Traced::new(match connector_of(endpoint, tls) {
         Some(By::Tls(connector)) => configured.connect_with_connector_lazy(connector),
         Some(By::Leader(connector)) => configured.connect_with_connector_lazy(connector),
         None => configured.connect_lazy(),
     }))
 }
 
-/// A channel that is connected.
+/// A channel that is connected, as [`connect_lazily`].
 ///
 /// # Errors
 /// [`ConnectError`] when nobody answers there within [`CONNECT_TIMEOUT`].
-pub async fn connect(endpoint: &Endpoint) -> Result<Traced, ConnectError> {
-    connected(endpoint, configured(endpoint)?).await
+pub async fn connect(endpoint: &Endpoint, tls: &ClientTls) -> Result<Traced, ConnectError> {
+    connected(endpoint, tls, configured(endpoint)?).await
 }
 
 /// As [`connect`], without pings while nothing is asked: for questions that are asked again and again, each with a deadline.
 ///
 /// # Errors
 /// As [`connect`].
-pub(crate) async fn connect_to_ask(endpoint: &Endpoint) -> Result<Traced, ConnectError> {
-    connected(endpoint, unwatched(endpoint)?).await
+pub(crate) async fn connect_to_ask(endpoint: &Endpoint, tls: &ClientTls) -> Result<Traced, ConnectError> {
+    connected(endpoint, tls, unwatched(endpoint)?).await
 }
 
-async fn connected(endpoint: &Endpoint, configured: tonic::transport::Endpoint) -> Result<Traced, ConnectError> {
-    let connected = match connector_of(endpoint) {
+async fn connected(
+    endpoint: &Endpoint,
+    tls: &ClientTls,
+    configured: tonic::transport::Endpoint,
+) -> Result<Traced, ConnectError> {
+    let connected = match connector_of(endpoint, tls) {
         Some(By::Tls(connector)) => configured.connect_with_connector(connector).await,
         Some(By::Leader(connector)) => configured.connect_with_connector(connector).await,
         None => configured.connect().await,
@@ -214,10 +220,10 @@ enum By {
     Leader(LeaderConnector),
 }
 
-fn connector_of(endpoint: &Endpoint) -> Option<By> {
+fn connector_of(endpoint: &Endpoint, tls: &ClientTls) -> Option<By> {
     match endpoint {
-        Endpoint::Tls { host, .. } => Some(By::Tls(Connector::to(host))),
-        Endpoint::AnyOf(members) => Some(By::Leader(LeaderConnector::among(members))),
+        Endpoint::Tls { host, .. } => Some(By::Tls(Connector::to(host, tls))),
+        Endpoint::AnyOf(members) => Some(By::Leader(LeaderConnector::among(members, tls))),
         Endpoint::Tcp { .. } | Endpoint::Unix(_) => None,
     }
 }

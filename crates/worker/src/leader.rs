@@ -10,6 +10,7 @@
 use crate::client::chain;
 use crate::endpoint::{Endpoint, connect_to_ask};
 use crate::panic::exit_on_panic;
+use crate::tls::ClientTls;
 use crate::tls::connect::Connector;
 use crate::trace::Traced;
 use futures::StreamExt;
@@ -49,6 +50,7 @@ const LOOK_INTERVALS: (Duration, Duration) = (Duration::from_millis(25), Duratio
 #[derive(Debug, Clone)]
 pub(crate) struct LeaderConnector {
     members: Arc<[Endpoint]>,
+    tls: ClientTls,
     found: Found,
 }
 
@@ -56,8 +58,8 @@ pub(crate) struct LeaderConnector {
 type Found = Arc<Mutex<Option<(Endpoint, Instant)>>>;
 
 impl LeaderConnector {
-    pub(crate) fn among(members: &[Endpoint]) -> LeaderConnector {
-        LeaderConnector { members: members.into(), found: Found::default() }
+    pub(crate) fn among(members: &[Endpoint], tls: &ClientTls) -> LeaderConnector {
+        LeaderConnector { members: members.into(), tls: tls.clone(), found: Found::default() }
     }
 }
 
@@ -71,17 +73,17 @@ impl Service<Uri> for LeaderConnector {
     }
 
     fn call(&mut self, _: Uri) -> Self::Future {
-        let (members, found) = (self.members.clone(), self.found.clone());
+        let (members, tls, found) = (self.members.clone(), self.tls.clone(), self.found.clone());
         Box::pin(async move {
             let hint = found.lock().unwrap_or_else(PoisonError::into_inner).take();
             if let Some((leader, at)) = hint
                 && at.elapsed() < FOUND_FOR
-                && let Ok(stream) = open(&leader).await
+                && let Ok(stream) = open(&leader, &tls).await
             {
-                return Ok(watched(stream, members, leader, found));
+                return Ok(watched(stream, members, tls, leader, found));
             }
             let said = Said::default();
-            let leader = tokio::time::timeout(FIND_DEADLINE, find(&members, None, &said)).await;
+            let leader = tokio::time::timeout(FIND_DEADLINE, find(&members, &tls, None, &said)).await;
             let leader = leader.map_err(|_| {
                 let said = said.lock().unwrap_or_else(PoisonError::into_inner);
                 let each = |member: &Endpoint| {
@@ -91,16 +93,22 @@ impl Service<Uri> for LeaderConnector {
                 let members: Vec<String> = members.iter().map(each).collect();
                 io::Error::new(io::ErrorKind::NotConnected, format!("none of these leads: {}", members.join(", ")))
             })?;
-            let stream = open(&leader).await?;
-            Ok(watched(stream, members, leader, found))
+            let stream = open(&leader, &tls).await?;
+            Ok(watched(stream, members, tls, leader, found))
         })
     }
 }
 
 /// The connection, which breaks when another one leads.
-fn watched(stream: Box<dyn Stream>, members: Arc<[Endpoint]>, leader: Endpoint, found: Found) -> TokioIo<ToLeader> {
+fn watched(
+    stream: Box<dyn Stream>,
+    members: Arc<[Endpoint]>,
+    tls: ClientTls,
+    leader: Endpoint,
+    found: Found,
+) -> TokioIo<ToLeader> {
     let (broken, watched) = (CancellationToken::new(), CancellationToken::new());
-    let watch = watch(members, leader, found, broken.clone());
+    let watch = watch(members, tls, leader, found, broken.clone());
     let watching = watched.clone().run_until_cancelled_owned(watch);
     tokio::spawn(exit_on_panic("the watch of which server leads", watching));
     TokioIo::new(ToLeader { stream, broken: Box::pin(broken.cancelled_owned()), _watched: watched.drop_guard() })
@@ -110,11 +118,11 @@ fn watched(stream: Box<dyn Stream>, members: Arc<[Endpoint]>, leader: Endpoint, 
 type Said = Mutex<BTreeMap<Endpoint, String>>;
 
 /// The first that says that it leads, apart from one of them.
-async fn find(members: &[Endpoint], apart_from: Option<&Endpoint>, said: &Said) -> Endpoint {
+async fn find(members: &[Endpoint], tls: &ClientTls, apart_from: Option<&Endpoint>, said: &Said) -> Endpoint {
     let others = members.iter().filter(|member| Some(*member) != apart_from);
     let mut seeking: FuturesUnordered<_> = others
         .map(|member| async move {
-            let mut asked = Asked { member, client: None };
+            let mut asked = Asked { member, tls, client: None };
             let mut pause = LOOK_INTERVALS.0;
             while let Err(what) = asked.leads().await {
                 said.lock().unwrap_or_else(PoisonError::into_inner).insert(member.clone(), what);
@@ -131,8 +139,8 @@ async fn find(members: &[Endpoint], apart_from: Option<&Endpoint>, said: &Said) 
 }
 
 /// Breaks a connection when its server leads no more, or says nothing, and another one leads.
-async fn watch(members: Arc<[Endpoint]>, leader: Endpoint, found: Found, broken: CancellationToken) {
-    let mut asked = Asked { member: &leader, client: None };
+async fn watch(members: Arc<[Endpoint]>, tls: ClientTls, leader: Endpoint, found: Found, broken: CancellationToken) {
+    let mut asked = Asked { member: &leader, tls: &tls, client: None };
     loop {
         tokio::time::sleep(ASK_INTERVAL).await;
         panic_point("leader-watch");
@@ -144,7 +152,7 @@ async fn watch(members: Arc<[Endpoint]>, leader: Endpoint, found: Found, broken:
         let said = Said::default();
         tokio::select! {
             () = asked.leads_again() => {}
-            other = find(&members, Some(&leader), &said) => {
+            other = find(&members, &tls, Some(&leader), &said) => {
                 tracing::info!(from = %leader, to = %other, "another server leads");
                 *found.lock().unwrap_or_else(PoisonError::into_inner) = Some((other, Instant::now()));
                 broken.cancel();
@@ -156,6 +164,7 @@ async fn watch(members: Arc<[Endpoint]>, leader: Endpoint, found: Found, broken:
 
 struct Asked<'a> {
     member: &'a Endpoint,
+    tls: &'a ClientTls,
     client: Option<HealthClient<Traced>>,
 }
 
@@ -178,7 +187,7 @@ impl Asked<'_> {
     async fn ask(&mut self) -> Result<(), String> {
         let mut client = match self.client.take() {
             Some(client) => client,
-            None => HealthClient::new(connect_to_ask(self.member).await.map_err(|error| chain(&error))?),
+            None => HealthClient::new(connect_to_ask(self.member, self.tls).await.map_err(|error| chain(&error))?),
         };
         let question = client.check(HealthCheckRequest { service: String::new() });
         let answer = tokio::time::timeout(ANSWER_DEADLINE, question).await;
@@ -190,7 +199,7 @@ impl Asked<'_> {
     }
 }
 
-async fn open(endpoint: &Endpoint) -> Result<Box<dyn Stream>, StdError> {
+async fn open(endpoint: &Endpoint, tls: &ClientTls) -> Result<Box<dyn Stream>, StdError> {
     Ok(match endpoint {
         Endpoint::Tcp { host, port } => {
             let stream = TcpStream::connect((host.as_str(), *port)).await?;
@@ -199,7 +208,7 @@ async fn open(endpoint: &Endpoint) -> Result<Box<dyn Stream>, StdError> {
         }
         Endpoint::Tls { host, port } => {
             let address = Endpoint::Tcp { host: host.clone(), port: *port }.to_string().parse()?;
-            Box::new(Connector::to(host).call(address).await?.into_inner())
+            Box::new(Connector::to(host, tls).call(address).await?.into_inner())
         }
         Endpoint::Unix(path) => Box::new(UnixStream::connect(path).await?),
         Endpoint::AnyOf(_) => return Err("a server of several is one server".into()),

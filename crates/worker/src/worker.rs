@@ -18,6 +18,7 @@ use crate::safety::Safety;
 use crate::server::{BindError, Exposure, ServeError, Services, Serving, bind_as};
 use crate::session::{DEFAULT_TTL, Session};
 use crate::shutdown;
+use crate::tls::{ClientTls, TlsError};
 use crate::vitals::Vitals;
 use ratn_model::resource::ResourceClass;
 use ratn_proto::types::Resource;
@@ -60,6 +61,9 @@ pub struct WorkerOptions {
     /// The system's config, of whose `[service.access]` callers have their roles; that which the environment names unless given
     /// ([`crate::access::ACCESS_VARIABLE`]). Without any who runs the worker, and root, are operators, and others as by default.
     pub access: Option<PathBuf>,
+    /// What it trusts and shows as a client, of the resource manager and of others; what the environment names unless given
+    /// ([`ClientTls::from_environment`]).
+    pub tls: Option<ClientTls>,
 }
 
 impl Default for WorkerOptions {
@@ -74,6 +78,7 @@ impl Default for WorkerOptions {
             host: String::new(),
             exposure: Exposure::default(),
             access: None,
+            tls: None,
         }
     }
 }
@@ -87,6 +92,9 @@ pub enum WorkerError {
     /// Nobody knows who may call it.
     #[error("the worker cannot start")]
     Access(#[from] AccessError),
+    /// Its files of TLS as a client cannot be read.
+    #[error("the worker cannot start")]
+    Tls(#[from] TlsError),
     /// It cannot serve.
     #[error("the worker cannot serve")]
     Serve(#[from] ServeError),
@@ -247,7 +255,10 @@ impl Worker {
         if options.exit_with_parent {
             shutdown::exit_with_parent(&shutdown).map_err(system("watch its parent"))?;
         }
-        let channels = Channels::new();
+        let channels = Channels::new(&match options.tls.clone() {
+            Some(tls) => tls,
+            None => ClientTls::from_environment()?,
+        });
         resources.extend((!options.id.is_empty()).then(|| options.id.clone()));
         let leases = LeaseWatch::of(resources);
         let confirms = has_resource && asked != Leases::Believed;

@@ -14,6 +14,7 @@ use ratn_worker::endpoint::Endpoint;
 use ratn_worker::lease_watch::LeaseWatch;
 use ratn_worker::safety::{Safety, SafetyClient, SafetyState};
 use ratn_worker::server::{Services, Serving, bind};
+use ratn_worker::tls::ClientTls;
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -36,13 +37,13 @@ async fn a_viewers_goal_is_refused_before_it_touches_the_fence() {
     let serving = Serving { gate: Arc::new(RoleGate::new(live.clone())), ..Serving::default() };
     let shutdown = CancellationToken::new();
     tokio::spawn(bound.serve_as(Services::new().with(server.into_service()), serving, shutdown.clone()));
-    let client = ActionClient::new(Channels::new());
+    let client = ActionClient::new(Channels::new(&ClientTls::none()));
     let refused = client.execute(&endpoint, goal("g1", "double", u64::MAX), |_, _| {}).await.unwrap_err();
     assert_eq!(refused.code(), Some(Code::PermissionDenied), "{refused}");
     assert_eq!(runs.load(Ordering::SeqCst), 0);
     live.replace(only(&[Role::Task]));
     // The younger token of the refused goal was not seen.
-    let client = ActionClient::new(Channels::new());
+    let client = ActionClient::new(Channels::new(&ClientTls::none()));
     client.execute(&endpoint, goal("g2", "double", 1), |_, _| {}).await.unwrap();
     assert_eq!(runs.load(Ordering::SeqCst), 1);
     shutdown.cancel();
@@ -67,7 +68,9 @@ async fn a_lease_of_another_is_no_lease_though_everybody_can_read_it() {
         ResourceUpdate::Snapshot { revision: Revision(1), resources: vec![resource], youngest: lease }
     };
     let give = async |id: &str| {
-        let outcome = ActionClient::new(Channels::new()).execute(&endpoint, goal(id, "double", 1), |_, _| {}).await;
+        let outcome = ActionClient::new(Channels::new(&ClientTls::none()))
+            .execute(&endpoint, goal(id, "double", 1), |_, _| {})
+            .await;
         outcome.map_err(|error| error.code())
     };
     for stranger in ["uid 65533", "control (certificate)", ""] {
@@ -102,8 +105,8 @@ async fn a_worker_asks_its_config_who_may_and_only_an_operator_lets_a_robot_move
         let worker = Worker::new(options).dangerously_believe_every_lease().safety(safety.clone());
         let worker = worker.shutdown(ends.clone()).run();
         let running = tokio::spawn(worker);
-        let channels = Channels::new();
-        ratn_worker::client::wait_until_serving(&listen, Duration::from_secs(10)).await.unwrap();
+        let channels = Channels::new(&ClientTls::none());
+        ratn_worker::client::wait_until_serving(&listen, &ClientTls::none(), Duration::from_secs(10)).await.unwrap();
         let client = SafetyClient::new(&channels, &listen).unwrap();
         assert_eq!(client.state().await.unwrap(), SafetyState::Ready, "{role} may look");
         assert_eq!(client.stop("a hand").await.is_ok(), may_stop, "{role}");
@@ -130,7 +133,7 @@ async fn a_worker_whose_config_is_none_does_not_start() {
 
 /// Whoever watches the health of `live`'s server.
 async fn watching(endpoint: &Endpoint) -> tonic::Streaming<tonic_health::pb::HealthCheckResponse> {
-    let channel = ratn_worker::endpoint::connect_lazily(endpoint).unwrap().into_channel();
+    let channel = ratn_worker::endpoint::connect_lazily(endpoint, &ClientTls::none()).unwrap().into_channel();
     let mut client = tonic_health::pb::health_client::HealthClient::new(channel);
     let mut stream = client.watch(tonic_health::pb::HealthCheckRequest::default()).await.unwrap().into_inner();
     assert!(stream.message().await.unwrap().is_some());

@@ -7,6 +7,7 @@ use common::RESOURCE;
 use ratn_worker::client::{Channels, wait_until_serving};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::safety::{Brakes, Safety, SafetyClient, SafetyError, SafetyState};
+use ratn_worker::tls::ClientTls;
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
@@ -152,18 +153,18 @@ async fn a_stop_outlives_its_caller() {
     let shutdown = CancellationToken::new();
     let worker = Worker::new(options).dangerously_believe_every_lease().safety(safety.clone());
     let running = tokio::spawn(worker.shutdown(shutdown.clone()).run());
-    wait_until_serving(&listen, LONG).await.unwrap();
+    wait_until_serving(&listen, &ClientTls::none(), LONG).await.unwrap();
 
     let calling = tokio::spawn({
         let listen = listen.clone();
-        async move { SafetyClient::new(&Channels::new(), &listen).unwrap().stop("a hand").await }
+        async move { SafetyClient::new(&Channels::new(&ClientTls::none()), &listen).unwrap().stop("a hand").await }
     });
     rig.is_asked_for(&stopped("a hand")).await;
     assert_eq!(safety.state(), stopped("a hand"), "in force before the brakes have confirmed");
     calling.abort();
     assert!(calling.await.unwrap_err().is_cancelled());
     // Another call over another connection: by then the driver has seen the end of the first one, or never needs to.
-    let client = SafetyClient::new(&Channels::new(), &listen).unwrap();
+    let client = SafetyClient::new(&Channels::new(&ClientTls::none()), &listen).unwrap();
     assert_eq!(client.state().await.unwrap(), stopped("a hand"));
     permits.add_permits(1);
     rig.has_confirmed(&stopped("a hand")).await;

@@ -15,6 +15,7 @@ use ratn_worker::endpoint::{Endpoint, connect};
 use ratn_worker::lease_watch::LeaseWatch;
 use ratn_worker::safety::{Safety, SafetyState};
 use ratn_worker::server::{Services, bind};
+use ratn_worker::tls::ClientTls;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
@@ -115,7 +116,7 @@ async fn cell(motions: &[&Motion], build: impl FnOnce(ActionServerBuilder) -> Ac
     let bound = bind(&Endpoint::Unix(directory.path().join("cell.sock"))).await.unwrap();
     let (endpoint, shutdown) = (bound.endpoint().clone(), CancellationToken::new());
     tokio::spawn(bound.serve(Services::new().with(server.clone().into_service()), shutdown.clone()));
-    let client = ActionClient::new(Channels::new());
+    let client = ActionClient::new(Channels::new(&ClientTls::none()));
     Cell { endpoint, client, server, watch, safety, shutdown, _directory: directory }
 }
 
@@ -169,7 +170,7 @@ impl Cell {
 
     /// What is answered to one question, without being patient.
     async fn ask(&self, goal: Goal) -> Result<v1::GoalResult, Status> {
-        let mut client = ActionServiceClient::new(connect(&self.endpoint).await.unwrap());
+        let mut client = ActionServiceClient::new(connect(&self.endpoint, &ClientTls::none()).await.unwrap());
         let question = v1::ExecuteRequest { goal: Some(goal.into()), known_only: false };
         let mut told = client.execute(question).await?.into_inner();
         loop {

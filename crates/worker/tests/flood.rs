@@ -6,6 +6,7 @@ use ratn_worker::client::wait_until_serving;
 use ratn_worker::connections::ConnectionLimits;
 use ratn_worker::endpoint::{Endpoint, connect_lazily};
 use ratn_worker::server::{Services, Serving, bind};
+use ratn_worker::tls::ClientTls;
 use std::time::Duration;
 use tokio::io::AsyncReadExt;
 use tokio::net::UnixStream;
@@ -25,8 +26,8 @@ async fn who_connects_all_the_time_is_told_the_quota_and_who_is_connected_is_ser
         ConnectionLimits { connections: CONNECTIONS, per_s: 1, for_operators: 0, ..ConnectionLimits::default() };
     let serving = Serving { connections: limits, ..Serving::default() };
     let served = tokio::spawn(bound.serve_as(Services::new(), serving, shutdown.clone()));
-    wait_until_serving(&endpoint, Duration::from_secs(60)).await.unwrap();
-    let mut health = HealthClient::new(connect_lazily(&endpoint).unwrap().into_channel());
+    wait_until_serving(&endpoint, &ClientTls::none(), Duration::from_secs(60)).await.unwrap();
+    let mut health = HealthClient::new(connect_lazily(&endpoint, &ClientTls::none()).unwrap().into_channel());
     health.check(HealthCheckRequest::default()).await.unwrap();
     let mut open = Vec::new();
     for _ in 0..10 * CONNECTIONS {

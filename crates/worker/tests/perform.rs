@@ -10,6 +10,7 @@ use ratn_proto::v1::perform_request::Kind as Asked;
 use ratn_proto::v1::perform_response::Kind as Heard;
 use ratn_proto::v1::{ExecuteRequest, LeaveRequest, PerformRequest, PerformResponse};
 use ratn_worker::endpoint::connect;
+use ratn_worker::tls::ClientTls;
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -24,7 +25,7 @@ struct Line {
 impl Line {
     async fn open(provider: &Provider) -> Line {
         let (questions, outgoing) = mpsc::channel(8);
-        let mut client = ActionServiceClient::new(connect(&provider.endpoint).await.unwrap());
+        let mut client = ActionServiceClient::new(connect(&provider.endpoint, &ClientTls::none()).await.unwrap());
         let heard = client.perform(ReceiverStream::new(outgoing)).await.unwrap().into_inner();
         Line { questions, heard }
     }
@@ -137,7 +138,7 @@ async fn a_provider_that_drains_says_how_goals_end_and_then_that_it_ends() {
 #[tokio::test]
 async fn an_execute_of_its_own_is_accepted_tells_its_progress_and_ends_with_its_result() {
     let provider = provider(None).await;
-    let mut client = ActionServiceClient::new(connect(&provider.endpoint).await.unwrap());
+    let mut client = ActionServiceClient::new(connect(&provider.endpoint, &ClientTls::none()).await.unwrap());
     let mut told = client.execute(execute(1, "double")).await.unwrap().into_inner();
     let mut next = async || told.message().await.unwrap().and_then(|message| message.kind);
     assert!(matches!(next().await, Some(Told::Accepted(accepted)) if !accepted.joined));

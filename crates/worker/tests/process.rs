@@ -9,6 +9,7 @@ use nix::unistd::Pid;
 use ratn_worker::client::{ActionClient, Channels, wait_until_serving};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::shutdown::{EXIT_GRACE, exit_with_parent, on_signals_within};
+use ratn_worker::tls::ClientTls;
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -71,7 +72,7 @@ async fn a_worker_ends_with_its_parent_and_removes_its_socket() {
     let directory = tempfile::tempdir().unwrap();
     let socket = directory.path().join("workers/one.sock");
     let mut child = spawn(&socket);
-    wait_until_serving(&Endpoint::Unix(socket.clone()), LONG).await.unwrap();
+    wait_until_serving(&Endpoint::Unix(socket.clone()), &ClientTls::none(), LONG).await.unwrap();
     drop(child.stdin.take());
     assert!(exit_of(child).await.success());
     assert!(!socket.exists());
@@ -105,8 +106,8 @@ async fn a_killed_worker_is_a_crash_of_its_goal() {
     let socket = directory.path().join("one.sock");
     let mut child = spawn(&socket);
     let endpoint = Endpoint::Unix(socket);
-    wait_until_serving(&endpoint, LONG).await.unwrap();
-    let client = ActionClient::new(Channels::new());
+    wait_until_serving(&endpoint, &ClientTls::none(), LONG).await.unwrap();
+    let client = ActionClient::new(Channels::new(&ClientTls::none()));
     // It is killed as soon as its goal is under way.
     let killed = client.execute(&endpoint, goal("a", "wait", 1), |_, _| child.kill().unwrap()).await.unwrap_err();
     assert!(killed.is_crash(), "{killed}");

@@ -12,6 +12,7 @@ use ratn_worker::endpoint::{Endpoint, connect};
 use ratn_worker::protocol::HEADER;
 use ratn_worker::runtime_directory::wait_for_file;
 use ratn_worker::server::{ServeError, Services, Serving, bind};
+use ratn_worker::tls::ClientTls;
 use ratn_worker::vitals::{CoreFailure, Vitals};
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::time::{Duration, Instant};
@@ -33,17 +34,18 @@ const LONG: Duration = Duration::from_secs(20);
 async fn health_is_serving_as_soon_as_a_server_answers() {
     for listen in [None, Some(Endpoint::loopback())] {
         let provider = provider(listen).await;
-        wait_until_serving(&provider.endpoint, LONG).await.unwrap();
+        wait_until_serving(&provider.endpoint, &ClientTls::none(), LONG).await.unwrap();
     }
     let nobody = Endpoint::Unix("/nonexistent/socket".into());
-    let error = wait_until_serving(&nobody, Duration::from_millis(1)).await.unwrap_err().to_string();
+    let error =
+        wait_until_serving(&nobody, &ClientTls::none(), Duration::from_millis(1)).await.unwrap_err().to_string();
     assert!(error.contains("unix:/nonexistent/socket"), "{error}");
 }
 
 #[tokio::test]
 async fn reflection_lists_the_services() {
     let provider = provider(None).await;
-    let channel = connect(&provider.endpoint).await.unwrap();
+    let channel = connect(&provider.endpoint, &ClientTls::none()).await.unwrap();
     let question = ServerReflectionRequest {
         host: String::new(),
         message_request: Some(MessageRequest::ListServices(String::new())),
@@ -106,7 +108,7 @@ fn ending(status: &tonic::Status) -> (Code, String, Option<Duration>) {
 #[tokio::test]
 async fn a_server_that_drains_ends_what_is_under_way_and_refuses_what_is_new() {
     let provider = provider_with(None, LONG).await;
-    let channel = connect(&provider.endpoint).await.unwrap();
+    let channel = connect(&provider.endpoint, &ClientTls::none()).await.unwrap();
     let mut health = HealthClient::new(channel.clone());
     let ask = |service: &str| HealthCheckRequest { service: service.to_owned() };
     let mut watched = health.watch(ask("ratn.v1.ActionService")).await.unwrap().into_inner();
@@ -144,7 +146,7 @@ async fn a_call_that_goes_on_is_dropped_at_the_deadline() {
 #[tokio::test]
 async fn an_idle_server_ends_at_once() {
     let provider = provider_with(None, LONG).await;
-    let _connection = connect(&provider.endpoint).await.unwrap();
+    let _connection = connect(&provider.endpoint, &ClientTls::none()).await.unwrap();
     provider.shutdown.cancel();
     tokio::time::timeout(LONG / 2, provider.serving).await.unwrap().unwrap();
 }
@@ -164,8 +166,8 @@ async fn a_worker_serves_from_its_options_and_leaves_nothing_behind() {
     let worker = worker.action(Double { runs: Default::default() }).shutdown(shutdown.clone());
     let running = tokio::spawn(worker.run());
     let endpoint = wait_for_file(&file, "worker", LONG).await.unwrap();
-    wait_until_serving(&endpoint, LONG).await.unwrap();
-    let client = ActionClient::new(Channels::new());
+    wait_until_serving(&endpoint, &ClientTls::none(), LONG).await.unwrap();
+    let client = ActionClient::new(Channels::new(&ClientTls::none()));
     let outcome = client.execute(&endpoint, goal("a", "double", 1), |_, _| {}).await.unwrap();
     assert_eq!(outcome.outcome, GoalOutcome::success().outcome);
     shutdown.cancel();
@@ -196,7 +198,7 @@ async fn a_client_of_a_version_without_a_protocol_in_common_is_refused_at_its_fi
         assert!(refused.message().contains(version), "{version}: {refused}");
     }
     // A client of this one says what it speaks.
-    ActionClient::new(Channels::new()).describe(&provider.endpoint).await.unwrap();
+    ActionClient::new(Channels::new(&ClientTls::none())).describe(&provider.endpoint).await.unwrap();
 }
 
 #[tokio::test]
@@ -206,8 +208,8 @@ async fn health_is_what_the_core_says_and_a_core_that_has_ended_is_served_no_mor
     let (endpoint, vitals) = (bound.endpoint().clone(), Vitals::default());
     let serving = Serving { vitals: vitals.clone(), ..Serving::default() };
     let served = tokio::spawn(bound.serve_as(Services::new(), serving, CancellationToken::new()));
-    wait_until_serving(&endpoint, LONG).await.unwrap();
-    let mut health = HealthClient::new(connect(&endpoint).await.unwrap());
+    wait_until_serving(&endpoint, &ClientTls::none(), LONG).await.unwrap();
+    let mut health = HealthClient::new(connect(&endpoint, &ClientTls::none()).await.unwrap());
     let mut told = health.watch(HealthCheckRequest::default()).await.unwrap().into_inner();
     let mut next = async || told.message().await.unwrap().unwrap().status();
     assert_eq!(next().await, ServingStatus::Serving);

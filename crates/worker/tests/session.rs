@@ -19,6 +19,7 @@ use ratn_worker::provider::Provider;
 use ratn_worker::safety::{Brakes, Safety, SafetyState};
 use ratn_worker::server::{Services, bind};
 use ratn_worker::session::Session;
+use ratn_worker::tls::ClientTls;
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex};
@@ -330,7 +331,7 @@ async fn a_session_lives_until_it_is_closed() {
     let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
     let manager = Manager::new();
     let _serving = manager.serve(&endpoint).await;
-    let session = Session::open(&Channels::new(), &endpoint, "test", TTL);
+    let session = Session::open(&Channels::new(&ClientTls::none()), &endpoint, "test", TTL);
     session.alive(LONG).await.unwrap();
     let id = session.id().to_owned();
     manager.until(|pool| pool.sessions.contains_key(&id)).await;
@@ -344,7 +345,7 @@ async fn a_session_lives_until_it_is_closed() {
 async fn a_session_without_its_manager_is_not_alive() {
     let directory = tempfile::tempdir().unwrap();
     let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
-    let session = Session::open(&Channels::new(), &endpoint, "test", TTL);
+    let session = Session::open(&Channels::new(&ClientTls::none()), &endpoint, "test", TTL);
     let error = session.alive(Duration::from_millis(1)).await.unwrap_err().to_string();
     assert!(error.contains("rm.sock") && error.contains("is it running?"), "{error}");
 }
@@ -355,7 +356,7 @@ async fn a_session_whose_id_is_another_callers_says_so_and_is_itself_again_when_
     let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
     let manager = Manager::new();
     let _serving = manager.serve(&endpoint).await;
-    let session = Session::open_as(&Channels::new(), &endpoint, "mine".to_owned(), "test", TTL);
+    let session = Session::open_as(&Channels::new(&ClientTls::none()), &endpoint, "mine".to_owned(), "test", TTL);
     session.alive(LONG).await.unwrap();
     assert!(!session.state().borrow().taken);
     {
@@ -423,7 +424,7 @@ async fn a_lost_session_says_so_and_comes_back_with_its_resources() {
     let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
     let manager = Manager::new();
     let (stop, serving) = manager.serve(&endpoint).await;
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &endpoint, "cell", TTL);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     session.alive(LONG).await.unwrap();
@@ -446,7 +447,7 @@ async fn a_session_that_was_made_anew_is_known_by_its_number_when_the_answer_tha
     let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
     let manager = Manager::new();
     let _serving = manager.serve(&endpoint).await;
-    let session = Session::open(&Channels::new(), &endpoint, "cell", LONG / 10);
+    let session = Session::open(&Channels::new(&ClientTls::none()), &endpoint, "cell", LONG / 10);
     session.alive(LONG).await.unwrap();
     let first = *session.state().borrow();
     // A connection that breaks changes nothing.
@@ -472,7 +473,7 @@ async fn a_creation_that_is_not_answered_is_asked_for_again() {
     let manager = Manager::new();
     manager.pool.lock().unwrap().unanswered = 1;
     let _serving = manager.serve(&endpoint).await;
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &endpoint, "cell", LONG);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     session.alive(LONG).await.unwrap();
@@ -516,7 +517,7 @@ async fn a_driver_of_a_fixed_session_id_begins_nothing_before_it_has_said_that_i
     let manager = with_lease();
     manager.pool.lock().unwrap().sessions.insert("cell".to_owned(), 1);
     let _serving = manager.serve(&endpoint).await;
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open_as(&channels, &endpoint, "cell".to_owned(), "cell", LONG);
     let leases = LeaseWatch::of(["arm@sim"]);
     tokio::spawn(leases.follow_session(&channels, &endpoint, &session, LONG).unwrap());
@@ -534,7 +535,8 @@ async fn a_session_is_over_when_the_machine_wakes_up_after_its_time_to_live_and_
     let (stop, serving) = manager.serve(&endpoint).await;
     let clock = BootClock::suspendable();
     let hour = Duration::from_secs(3_600);
-    let session = Session::open_by(clock.clone(), &Channels::new(), &endpoint, "cell".to_owned(), "cell", hour);
+    let session =
+        Session::open_by(clock.clone(), &Channels::new(&ClientTls::none()), &endpoint, "cell".to_owned(), "cell", hour);
     session.alive(LONG).await.unwrap();
     stop.cancel();
     serving.await.unwrap();
@@ -556,7 +558,7 @@ async fn a_lease_is_not_confirmed_when_the_machine_wakes_up_until_the_manager_is
         let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
         let manager = with_lease();
         let (stop, serving) = manager.serve(&endpoint).await;
-        let (channels, clock) = (Channels::new(), BootClock::suspendable());
+        let (channels, clock) = (Channels::new(&ClientTls::none()), BootClock::suspendable());
         let leases = LeaseWatch::by(clock.clone(), ["arm@sim"]);
         leases.brought_to_rest();
         let session = Session::open_by(clock.clone(), &channels, &endpoint, "cell".to_owned(), "cell", hour);
@@ -595,7 +597,7 @@ async fn resources_are_offered_updated_and_withdrawn() {
     let directory = tempfile::tempdir().unwrap();
     let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
     let manager = Manager::new();
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &endpoint, "cell", TTL);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     // Before there is a manager: later, by itself.
@@ -620,7 +622,7 @@ async fn what_was_withdrawn_while_nobody_answered_is_gone_once_somebody_does() {
     let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
     let manager = Manager::new();
     let (stop, serving) = manager.serve(&endpoint).await;
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &endpoint, "cell", TTL);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     session.alive(LONG).await.unwrap();
@@ -641,7 +643,7 @@ async fn a_resource_that_another_session_still_has_is_offered_until_that_one_is_
     let manager = Manager::new();
     manager.pool.lock().unwrap().taken.insert("arm@sim".to_owned());
     let _serving = manager.serve(&endpoint).await;
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &endpoint, "cell", TTL);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     session.alive(LONG).await.unwrap();
@@ -657,7 +659,7 @@ async fn a_resource_that_went_with_its_session_before_its_creation_was_answered_
     let manager = Manager::new();
     manager.pool.lock().unwrap().short_lived = 2;
     let _serving = manager.serve(&endpoint).await;
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &endpoint, "cell", TTL);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     session.alive(LONG).await.unwrap();
@@ -673,7 +675,7 @@ async fn what_a_new_watch_does_not_show_is_offered_again_although_nobody_said_th
     // The watch has begun before the arm is offered, and shows nothing yet.
     manager.pool.lock().unwrap().shows = Some(false);
     let _serving = manager.serve(&endpoint).await;
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &endpoint, "cell", LONG);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     session.alive(LONG).await.unwrap();
@@ -699,7 +701,7 @@ async fn what_may_still_move_for_who_held_it_under_a_lapsed_session_is_offered_a
     let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
     let manager = Manager::new();
     let _serving = manager.serve(&endpoint).await;
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &endpoint, "pools", TTL);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     session.alive(LONG).await.unwrap();
@@ -739,7 +741,7 @@ async fn what_was_offered_with_an_answer_that_was_lost_is_offered_again_when_its
     let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
     let manager = Manager::new();
     let _serving = manager.serve(&endpoint).await;
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &endpoint, "pools", TTL);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     session.alive(LONG).await.unwrap();
@@ -770,7 +772,7 @@ async fn a_bound_for_standstill_stays_where_the_resource_is_withdrawn_and_wanted
     let endpoint = Endpoint::Unix(directory.path().join("rm.sock"));
     let manager = Manager::new();
     let _serving = manager.serve(&endpoint).await;
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &endpoint, "pools", LONG);
     let provider = Provider::start(&channels, &endpoint, &session).unwrap();
     session.alive(LONG).await.unwrap();
@@ -806,7 +808,7 @@ async fn standstill_is_confirmed_when_the_driver_has_said_that_it_is_at_rest_and
         pool.resources.insert("arm@sim".to_owned(), arm);
     }
     let _serving = manager.serve(&endpoint).await;
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open_as(&channels, &endpoint, "cell".to_owned(), "cell", LONG);
     let leases = LeaseWatch::of(["arm@sim"]);
     let _server = ActionServer::builder("arm@sim").leases(&leases).build();

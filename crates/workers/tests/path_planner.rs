@@ -16,6 +16,7 @@ use ratn_proto::types::Goal;
 use ratn_worker::client::{ActionClient, Channels, WorldClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::{RuntimeDirectory, wait_for_file};
+use ratn_worker::tls::ClientTls;
 use ratn_worker::worker::WorkerOptions;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::collections::BTreeMap;
@@ -62,7 +63,7 @@ async fn system() -> System {
     let world_pool = directory.wait_for(world_pool::ROLE, DEADLINE).await.unwrap();
     let planner = wait_for_file(&file, "planner", DEADLINE).await.unwrap();
 
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let fact = |predicate: &str, name: &str, value| {
         let fact = FactKey { predicate: predicate.to_owned(), arguments: vec![Term::Name(name.to_owned())] };
         Change::Set { fact, value }

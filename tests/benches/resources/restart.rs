@@ -26,6 +26,7 @@ use ratn_proto::v1::action_service_client::ActionServiceClient;
 use ratn_worker::client::{AcquireOptions, Channels, ProcessClient, ResourceClient, WorkerWatch};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::{DEFAULT_TTL, Session};
+use ratn_worker::tls::ClientTls;
 use serde_json::json;
 use std::collections::BTreeMap;
 use std::os::unix::net::UnixDatagram;
@@ -88,7 +89,11 @@ impl Host {
         let arguments = ["--config", config, "--durability", "none"];
         let resources = process::role("resource-manager", directory, &arguments).await.0;
         let processes = process::role("process-manager", directory, &arguments[..2]).await.0;
-        Host { directory: directory.to_owned(), channels: Channels::new(), managers: [resources, processes] }
+        Host {
+            directory: directory.to_owned(),
+            channels: Channels::new(&ClientTls::none()),
+            managers: [resources, processes],
+        }
     }
 
     fn endpoint(&self, role: &str) -> ratn_worker::endpoint::Endpoint {

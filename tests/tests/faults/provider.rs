@@ -15,6 +15,7 @@ use ratn_worker::lease_watch::LeaseWatch;
 use ratn_worker::provider::Provider;
 use ratn_worker::server::{Services, bind};
 use ratn_worker::session::Session;
+use ratn_worker::tls::ClientTls;
 use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::PathBuf;
@@ -146,7 +147,7 @@ async fn provide(socket: PathBuf, manager: Endpoint, file: File) -> anyhow::Resu
     let endpoint = bound.endpoint().clone();
     tokio::spawn(bound.serve(Services::new().with(server.into_service()), CancellationToken::new()));
 
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open_as(&channels, &manager, KIND.to_owned(), KIND, TTL);
     let provider = Provider::start_at_rest(&channels, &manager, &session, &leases)?;
     let watching = leases.follow_session(&channels, &manager, &session, TTL)?;

@@ -18,6 +18,7 @@ use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_worker::client::{CallError, Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::tls::ClientTls;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
@@ -157,7 +158,7 @@ impl Stage {
 
     /// What there is at the beginning, and the tool.
     async fn stock(&self) -> anyhow::Result<()> {
-        let channels = Channels::new();
+        let channels = Channels::new(&ClientTls::none());
         let operator = ResourceClient::new(&channels, &self.endpoint(), "")?;
         for (id, capacity) in STOCK {
             let kind = id[..1].to_uppercase();
@@ -289,7 +290,7 @@ async fn observe(endpoint: Endpoint, record: Arc<Record>) {
     let mut position = None;
     loop {
         // One of its own every time: it is not to wait for a connection that broke.
-        if let Ok(client) = ResourceClient::new(&Channels::new(), &endpoint, "")
+        if let Ok(client) = ResourceClient::new(&Channels::new(&ClientTls::none()), &endpoint, "")
             && let Err(error) = follow(&client, &mut position, &record).await
             && error.code() == Some(tonic::Code::OutOfRange)
         {

@@ -10,6 +10,7 @@ use ratn_worker::client::Channels;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::safety::Safety;
+use ratn_worker::tls::ClientTls;
 use ratn_worker::trace::Traced;
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::collections::BTreeMap;
@@ -122,11 +123,17 @@ pub async fn servers(place: &Path, access: &LiveAccess, end: &CancellationToken)
     directory.wait_for(resource_manager::ROLE, DEADLINE).await.unwrap();
     let (to, serving) = (directory.clone(), || service.serving_with(access, &metrics));
     let (config, counted) = (world_pool::WorldPoolConfig::default(), Arc::new(Metrics::new(world_pool::ROLE)));
-    tokio::spawn(world_pool::run_as(config, to.clone(), serving(), counted, end.clone()));
+    tokio::spawn(world_pool::run_as(config, to.clone(), serving(), counted, ClientTls::none(), end.clone()));
     let config = process_manager::ProcessManagerConfig::default();
-    tokio::spawn(process_manager::run_as(config, to.clone(), serving(), end.clone()));
-    tokio::spawn(ratn_cell::run_as(ratn_cell::config::CellConfig::default(), to, serving(), end.clone()));
-    let channels = Channels::new();
+    tokio::spawn(process_manager::run_as(config, to.clone(), serving(), ClientTls::none(), end.clone()));
+    tokio::spawn(ratn_cell::run_as(
+        ratn_cell::config::CellConfig::default(),
+        to,
+        serving(),
+        ClientTls::none(),
+        end.clone(),
+    ));
+    let channels = Channels::new(&ClientTls::none());
     let mut servers = Vec::new();
     for name in [resource_manager::ROLE, world_pool::ROLE, process_manager::ROLE, ratn_cell::ROLE] {
         let endpoint = directory.wait_for(name, DEADLINE).await.unwrap();

@@ -9,6 +9,7 @@ use ratn_proto::types::Resource;
 use ratn_worker::client::{AcquireOptions, CallError, Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::Session;
+use ratn_worker::tls::ClientTls;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -106,7 +107,7 @@ async fn client(
     leave: CancellationToken,
     seed: u64,
 ) -> anyhow::Result<()> {
-    let channels = Channels::new();
+    let channels = Channels::new(&ClientTls::none());
     let session = Session::open_as(&channels, &endpoint, format!("client-{number}"), "client", TTL);
     session.alive(PATIENCE).await?;
     let resources = ResourceClient::new(&channels, &endpoint, session.id())?;
@@ -162,7 +163,7 @@ async fn delete(shared: &Shared, resources: &ResourceClient, id: &str) -> anyhow
 
 /// What the manager says now holds all that the clients were told.
 pub(crate) async fn verify(shared: &Shared, endpoint: &Endpoint) -> anyhow::Result<()> {
-    let resources = ResourceClient::new(&Channels::new(), endpoint, "")?;
+    let resources = ResourceClient::new(&Channels::new(&ClientTls::none()), endpoint, "")?;
     let before = told(shared, |told| (told.held.clone(), told.there.clone(), told.gone.clone()));
     let listed = answered(shared, || resources.list(&[])).await?;
     let after = told(shared, |told| (told.held.clone(), told.there.clone()));
@@ -197,7 +198,7 @@ impl Crowd {
     /// With tools to take.
     pub(crate) async fn begin(endpoint: &Endpoint, seed: u64) -> anyhow::Result<Crowd> {
         let (shared, end, leave) = (Shared::default(), CancellationToken::new(), CancellationToken::new());
-        let operator = ResourceClient::new(&Channels::new(), endpoint, "")?;
+        let operator = ResourceClient::new(&Channels::new(&ClientTls::none()), endpoint, "")?;
         for number in 0..TOOLS {
             let id = format!("tool-{number}");
             let tool = Resource::new(id.clone(), ResourceClass::Module, "Tool");

@@ -25,6 +25,7 @@ use ratn_worker::robot_clock::RobotClock;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::safety::Safety;
 use ratn_worker::server::{Services, Serving, bind_as};
+use ratn_worker::tls::ClientTls;
 use recorder::Recorder;
 use tokio_util::sync::CancellationToken;
 
@@ -41,10 +42,10 @@ const EARLIER_STOPPED_FILE: &str = "cell.stopped";
 /// # Errors
 /// Where the config is none, where it cannot listen or publish its endpoint, or where serving fails.
 pub async fn run(config: CellConfig, directory: RuntimeDirectory, shutdown: CancellationToken) -> anyhow::Result<()> {
-    run_as(config, directory, Serving::default(), shutdown).await
+    run_as(config, directory, Serving::default(), ClientTls::none(), shutdown).await
 }
 
-/// As [`run`], served as its host wants it.
+/// As [`run`], served as its host wants it; `tls` is what it trusts and shows as a client.
 ///
 /// # Errors
 /// As [`run`].
@@ -52,6 +53,7 @@ pub async fn run_as(
     config: CellConfig,
     directory: RuntimeDirectory,
     serving: Serving,
+    tls: ClientTls,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
     config.check()?;
@@ -66,7 +68,7 @@ pub async fn run_as(
 
     let bound = bind_as(&directory.listen(&config.listen, ROLE)?, &serving.exposure).await?;
     let endpoint = bound.endpoint().clone();
-    let channels = Channels::new();
+    let channels = Channels::new(&tls);
     let safety = safety(&config, &directory, &handle).await?;
     let leases = actions::leases(&config);
     // A simulated robot ends with its process: this one has not moved yet.

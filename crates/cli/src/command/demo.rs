@@ -22,6 +22,7 @@ use ratn_executive::protocol::Mode;
 use ratn_model::load::Files;
 use ratn_model::program::{Program, SUCCESS};
 use ratn_proto::v1::UnintendedContact;
+use ratn_worker::tls::ClientTls;
 use result::{Demonstration, Outcome, Plan};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -49,7 +50,7 @@ impl Files for BuiltIn {
 }
 
 /// Runs the task in every way and compares.
-pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
+pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Failure> {
     let config = SystemConfig::load(arguments.config.as_deref())?;
     let (file, text) = match arguments.scenario {
         Setting::Boxes if arguments.faults.fault.is_empty() => FETCH,
@@ -59,12 +60,13 @@ pub(crate) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     let goods = result::Goods::of(arguments)?;
     let program = Arc::new(check::load_from(&BuiltIn, text, file, &config.catalogue)?);
     let directory = out_directory(arguments)?;
+    let setup = Setup { goods: &goods, arguments, config: &config, program: &program, directory: &directory, tls };
     let mut demonstration = Demonstration::new(arguments, goods);
     let outcome: Result<(), Failure> = blocking_here(async {
         let interrupt = Interrupt::listen()?;
         for plan in plans(arguments) {
             output::progress(format_args!("\n{}", plan.announcement(&goods)));
-            let run = one_run(&plan, &goods, arguments, &config, &program, &directory, &interrupt);
+            let run = setup.run(&plan, &interrupt);
             // A config is large.
             let outcome = Box::pin(run).await;
             let outcome = outcome.with_context(|| plan.name())?;
@@ -121,61 +123,68 @@ fn plans(arguments: &DemoArguments) -> Vec<Plan> {
     plans
 }
 
-async fn one_run(
-    plan: &Plan,
-    goods: &result::Goods,
-    arguments: &DemoArguments,
-    config: &SystemConfig,
-    program: &Arc<Program>,
-    directory: &Path,
-    interrupt: &Interrupt,
-) -> anyhow::Result<Outcome> {
-    let mut config = config.clone();
-    config.apply(&SystemArguments {
-        scene: Some(arguments.scenario),
-        goods: GoodsArguments {
-            boxes: Some(arguments.boxes),
-            bowls: Some(arguments.bowls),
-            forks: Some(arguments.forks),
-            cups: Some(arguments.cups),
-            plates: Some(arguments.plates),
-        },
-        planners: Some(plan.planners),
-        speed: Some(arguments.speed),
-        seed: Some(arguments.seed),
-        faults: arguments.faults.clone(),
-    });
-    let mut set = goods.parameters();
-    set.push(("budget".to_owned(), plan.budget.to_string()));
-    let log_file = directory.join(format!("{}.jsonl", plan.file_stem()));
-    let run = Run {
-        program: program.clone(),
-        // Its task file is built in.
-        file: String::new(),
-        parameters: program.bind_parameters(&set)?,
-        mode: plan.mode,
-        seed: arguments.seed,
-        learned: Default::default(),
-        log: log_file.clone(),
-        quiet: false,
-        // The system ends with the demo: nobody resumes it.
-        checkpoint_every: 0,
-    };
-    let system = starting(Box::pin(System::start_private(config)), interrupt).await?;
-    let (ended, judgement) = on_system(run, system, interrupt, async |system| system.judgement().await).await?;
-    let Judgement { delivered, greatest_tilt_rad, unintended_contacts } = judgement;
-    let timeline = Timeline::of(&log::read(&log_file)?.lines);
-    if timeline.outcome.as_deref() != Some(ended.outcome.as_str()) {
-        bail!("the event log {} does not end as the run did", log_file.display());
+/// What all runs of a demonstration have in common.
+struct Setup<'a> {
+    goods: &'a result::Goods,
+    arguments: &'a DemoArguments,
+    config: &'a SystemConfig,
+    program: &'a Arc<Program>,
+    /// Where logs and charts go.
+    directory: &'a Path,
+    tls: &'a ClientTls,
+}
+
+impl Setup<'_> {
+    /// Runs the task in one way, on a system of its own.
+    async fn run(&self, plan: &Plan, interrupt: &Interrupt) -> anyhow::Result<Outcome> {
+        let Setup { goods, arguments, config, program, directory, tls } = *self;
+        let mut config = config.clone();
+        config.apply(&SystemArguments {
+            scene: Some(arguments.scenario),
+            goods: GoodsArguments {
+                boxes: Some(arguments.boxes),
+                bowls: Some(arguments.bowls),
+                forks: Some(arguments.forks),
+                cups: Some(arguments.cups),
+                plates: Some(arguments.plates),
+            },
+            planners: Some(plan.planners),
+            speed: Some(arguments.speed),
+            seed: Some(arguments.seed),
+            faults: arguments.faults.clone(),
+        });
+        let mut set = goods.parameters();
+        set.push(("budget".to_owned(), plan.budget.to_string()));
+        let log_file = directory.join(format!("{}.jsonl", plan.file_stem()));
+        let run = Run {
+            program: program.clone(),
+            // Its task file is built in.
+            file: String::new(),
+            parameters: program.bind_parameters(&set)?,
+            mode: plan.mode,
+            seed: arguments.seed,
+            learned: Default::default(),
+            log: log_file.clone(),
+            quiet: false,
+            // The system ends with the demo: nobody resumes it.
+            checkpoint_every: 0,
+        };
+        let system = starting(Box::pin(System::start_private(config, tls)), interrupt).await?;
+        let (ended, judgement) = on_system(run, system, interrupt, async |system| system.judgement().await).await?;
+        let Judgement { delivered, greatest_tilt_rad, unintended_contacts } = judgement;
+        let timeline = Timeline::of(&log::read(&log_file)?.lines);
+        if timeline.outcome.as_deref() != Some(ended.outcome.as_str()) {
+            bail!("the event log {} does not end as the run did", log_file.display());
+        }
+        let end = if ended.outcome == SUCCESS {
+            "the task ended with success".to_owned()
+        } else {
+            format!("the task ended with {}: {}", ended.outcome, ended.reason)
+        };
+        let chart = directory.join(format!("{}.html", plan.file_stem()));
+        let plan = *plan;
+        Ok(Outcome { plan, timeline, delivered, greatest_tilt_rad, unintended_contacts, end, log: log_file, chart })
     }
-    let end = if ended.outcome == SUCCESS {
-        "the task ended with success".to_owned()
-    } else {
-        format!("the task ended with {}: {}", ended.outcome, ended.reason)
-    };
-    let chart = directory.join(format!("{}.html", plan.file_stem()));
-    let plan = *plan;
-    Ok(Outcome { plan, timeline, delivered, greatest_tilt_rad, unintended_contacts, end, log: log_file, chart })
 }
 
 /// What touched that should not have, as a sentence.

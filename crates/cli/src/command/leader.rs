@@ -2,6 +2,7 @@
 
 use ratn_worker::client::Health;
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::tls::ClientTls;
 use serde_json::{Value, json};
 use std::time::Duration;
 
@@ -17,14 +18,14 @@ pub(super) struct Member {
 }
 
 /// What each of several servers says; nothing of one alone.
-pub(super) async fn ask(endpoint: &Endpoint) -> Vec<Member> {
+pub(super) async fn ask(endpoint: &Endpoint, tls: &ClientTls) -> Vec<Member> {
     let members = endpoint.members();
     if members.len() < 2 {
         return Vec::new();
     }
     let asked = members.iter().map(async |member| Member {
         endpoint: member.clone(),
-        leads: Health::of(member.clone()).is_serving(PATIENCE).await,
+        leads: Health::of(member.clone(), tls).is_serving(PATIENCE).await,
     });
     futures::future::join_all(asked).await
 }

@@ -28,6 +28,7 @@ use crate::arguments::Command;
 use crate::failure::Failure;
 use anyhow::Context;
 use ratn_worker::client::CallError;
+use ratn_worker::tls::ClientTls;
 use std::time::Duration;
 
 /// At the end of a process, for computations under way.
@@ -35,36 +36,37 @@ const LAST_WORK: Duration = Duration::from_millis(200);
 
 /// Runs one command to its end.
 pub(crate) fn run(command: Command) -> Result<(), Failure> {
-    ratn_worker::tls::install_from_environment()?;
+    // What every client of this process trusts and shows; a daemon's config may say more.
+    let tls = &ClientTls::from_environment()?;
     match command {
-        Command::Demo(arguments) => demo::run(&arguments),
-        Command::Up(arguments) => up::run(&arguments),
-        Command::Run(arguments) => run::run(&arguments),
+        Command::Demo(arguments) => demo::run(&arguments, tls),
+        Command::Up(arguments) => up::run(&arguments, tls),
+        Command::Run(arguments) => run::run(&arguments, tls),
         Command::Control(arguments) => control::run(&arguments),
-        Command::Ps(arguments) => pool::ps(&arguments),
-        Command::Logs(arguments) => pool::logs(&arguments),
-        Command::Pool(arguments) => pool::run(&arguments),
-        Command::Restart(arguments) => pool::restart(&arguments),
-        Command::Drain(arguments) => pool::drain(&arguments),
-        Command::Stop(arguments) => safety::stop(&arguments),
-        Command::Hold(arguments) => safety::hold(&arguments),
-        Command::GoOn(arguments) => safety::go_on(&arguments),
-        Command::Doctor(arguments) => doctor::run(&arguments),
-        Command::Reset(arguments) => reset::run(&arguments),
+        Command::Ps(arguments) => pool::ps(&arguments, tls),
+        Command::Logs(arguments) => pool::logs(&arguments, tls),
+        Command::Pool(arguments) => pool::run(&arguments, tls),
+        Command::Restart(arguments) => pool::restart(&arguments, tls),
+        Command::Drain(arguments) => pool::drain(&arguments, tls),
+        Command::Stop(arguments) => safety::stop(&arguments, tls),
+        Command::Hold(arguments) => safety::hold(&arguments, tls),
+        Command::GoOn(arguments) => safety::go_on(&arguments, tls),
+        Command::Doctor(arguments) => doctor::run(&arguments, tls),
+        Command::Reset(arguments) => reset::run(&arguments, tls),
         Command::Check(arguments) => check::run(&arguments),
-        Command::Resource(arguments) => resource::run(&arguments),
-        Command::World(arguments) => world::run(&arguments),
+        Command::Resource(arguments) => resource::run(&arguments, tls),
+        Command::World(arguments) => world::run(&arguments, tls),
         Command::State(arguments) => state::run(&arguments),
         Command::Certs(arguments) => certs::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Plan(arguments) => plan::run(&arguments),
         Command::Tables(arguments) => tables::run(&arguments),
-        Command::ResourceManager(arguments) => roles::resource_manager(&arguments),
-        Command::WorldPool(arguments) => roles::world_pool(&arguments),
-        Command::ProcessManager(arguments) => roles::process_manager(&arguments),
-        Command::Cell(arguments) => roles::cell(&arguments),
-        Command::Worker(arguments) => roles::worker(&arguments),
+        Command::ResourceManager(arguments) => roles::resource_manager(&arguments, tls),
+        Command::WorldPool(arguments) => roles::world_pool(&arguments, tls),
+        Command::ProcessManager(arguments) => roles::process_manager(&arguments, tls),
+        Command::Cell(arguments) => roles::cell(&arguments, tls),
+        Command::Worker(arguments) => roles::worker(&arguments, tls),
     }
 }
 

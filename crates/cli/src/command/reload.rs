@@ -6,7 +6,7 @@ use ratn_daemon::access::LiveAccess;
 use ratn_daemon::reload;
 use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_daemon::telemetry::Logs;
-use ratn_worker::tls::{self, LiveServerTls};
+use ratn_worker::tls::{self, ClientTls, LiveServerTls};
 use std::path::PathBuf;
 use tokio::sync::watch;
 
@@ -24,6 +24,8 @@ pub(super) struct Reloading {
     pub(super) logs: Logs,
     /// What is served with TLS shows this.
     pub(super) tls: Option<LiveServerTls>,
+    /// Every client of the daemon trusts and shows this.
+    pub(super) client_tls: ClientTls,
     pub(super) access: LiveAccess,
     /// Of the resource manager.
     pub(super) bounds: watch::Sender<ResourceManagerConfig>,
@@ -48,7 +50,7 @@ impl Reloading {
             None => self.running.clone(),
         };
         let (old, new) = (toml::Table::try_from(&self.running)?, toml::Table::try_from(&wanted)?);
-        let renewed = tls::read_again(self.tls.as_ref()).context("[service.tls]")?;
+        let renewed = tls::read_again(self.tls.as_ref(), &self.client_tls).context("[service.tls]")?;
         self.logs.reload(&wanted.service.log).context("[service.log]")?;
         renewed.take_over();
         self.access.replace(wanted.service.access);

@@ -17,6 +17,7 @@ use ratn_proto::v1::{GetGroundTruthRequest, ResetRequest};
 use ratn_worker::client::{Channels, Commit, ResourceClient, WorldClient, fresh_id};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::{DEFAULT_TTL, Session};
+use ratn_worker::tls::ClientTls;
 use std::collections::BTreeSet;
 use std::time::Duration;
 
@@ -24,12 +25,12 @@ use std::time::Duration;
 const SESSION_DEADLINE: Duration = Duration::from_secs(5);
 
 /// Lays the scene anew and forgets every fact.
-pub(crate) fn run(arguments: &ResetArguments) -> Result<(), Failure> {
+pub(crate) fn run(arguments: &ResetArguments, tls: &ClientTls) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()));
         let find = |role| directory.find(role).map_err(|error| Failure::Refused(format!("ratn: {error}")));
         let (manager, pool, cell) = (find(resource_manager::ROLE)?, find(world_pool::ROLE)?, find(ratn_cell::ROLE)?);
-        let channels = Channels::new();
+        let channels = Channels::new(tls);
         let session = Session::open(&channels, &manager, "ratn reset", DEFAULT_TTL);
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, &manager, session.id())?;

@@ -21,6 +21,7 @@ use ratn_worker::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use ratn_worker::panic::exit_on_panic;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{BindError, Exposure, Serving};
+use ratn_worker::tls::ClientTls;
 use ratn_worker::vitals::CoreFailure;
 use ratn_worker::worker::WorkerOptions;
 use ratn_worker::{shutdown, tls};
@@ -39,7 +40,7 @@ const STATE_VARIABLES: [&str; 2] = ["RATN_STATE_DIR", "STATE_DIRECTORY"];
 const EXIT_PATIENCE: Duration = Duration::from_secs(2);
 
 /// `ratn resource-manager`
-pub(super) fn resource_manager(arguments: &KeptRoleArguments) -> Result<(), Failure> {
+pub(super) fn resource_manager(arguments: &KeptRoleArguments, tls: &ClientTls) -> Result<(), Failure> {
     let mut system = SystemConfig::load(arguments.role.config.as_deref())?;
     let config = &mut system.resource_manager;
     arguments.apply(resource_manager::ROLE, &mut config.storage);
@@ -47,18 +48,18 @@ pub(super) fn resource_manager(arguments: &KeptRoleArguments) -> Result<(), Fail
     config.listen = arguments.listen.clone().unwrap_or(config.listen.clone());
     // On one thread requests are handled in the order in which they arrive; task control sends the most urgent first.
     let runtime = tokio::runtime::Builder::new_current_thread();
-    daemon_on(runtime, arguments, system, resource_manager::ROLE, async |_, host| {
+    daemon_on(runtime, arguments, system, tls, resource_manager::ROLE, async |_, host| {
         resource_manager::run_as(host.bounds, host.directory, host.serving, host.metrics, host.shutdown).await
     })
 }
 
 /// `ratn world-pool`
-pub(super) fn world_pool(arguments: &KeptRoleArguments) -> Result<(), Failure> {
-    daemon(&arguments.role, world_pool::ROLE, async |system, host| {
+pub(super) fn world_pool(arguments: &KeptRoleArguments, tls: &ClientTls) -> Result<(), Failure> {
+    daemon(&arguments.role, tls, world_pool::ROLE, async |system, host| {
         let mut config = system.world_pool;
         arguments.apply(world_pool::ROLE, &mut config.storage);
         config.listen = host.listen.unwrap_or(config.listen);
-        world_pool::run_as(config, host.directory, host.serving, host.metrics, host.shutdown).await
+        world_pool::run_as(config, host.directory, host.serving, host.metrics, host.tls, host.shutdown).await
     })
 }
 
@@ -77,16 +78,16 @@ fn state_of(role: &str, argument: Option<&Path>, configured: Option<PathBuf>) ->
 }
 
 /// `ratn process-manager`
-pub(super) fn process_manager(arguments: &RoleArguments) -> Result<(), Failure> {
+pub(super) fn process_manager(arguments: &RoleArguments, tls: &ClientTls) -> Result<(), Failure> {
     if arguments.check_config {
         startable(&SystemConfig::load(arguments.config.as_deref())?)?;
     }
-    daemon(arguments, process_manager::ROLE, async |system, host| {
+    daemon(arguments, tls, process_manager::ROLE, async |system, host| {
         let mut config = system.process_manager_config();
         config.owns_process = true;
         config.worker_environment = system.service.for_workers(arguments.config.as_deref());
         config.listen = host.listen.unwrap_or(config.listen);
-        process_manager::run_as(config, host.directory, host.serving, host.shutdown).await
+        process_manager::run_as(config, host.directory, host.serving, host.tls, host.shutdown).await
     })
 }
 
@@ -100,7 +101,7 @@ pub(super) fn startable(config: &SystemConfig) -> Result<(), Failure> {
 }
 
 /// `ratn cell`
-pub(super) fn cell(arguments: &CellArguments) -> Result<(), Failure> {
+pub(super) fn cell(arguments: &CellArguments, tls: &ClientTls) -> Result<(), Failure> {
     if let Some(file) = &arguments.replay {
         return replay(file);
     }
@@ -112,14 +113,14 @@ pub(super) fn cell(arguments: &CellArguments) -> Result<(), Failure> {
         output::progress(format!("{} shows the cell", file.display()));
         return Ok(());
     }
-    daemon(&arguments.role, ratn_cell::ROLE, async |system, host| {
+    daemon(&arguments.role, tls, ratn_cell::ROLE, async |system, host| {
         let mut config = system.cell;
         config.scene = arguments.scene.unwrap_or(config.scene);
         config.faults.extend(&arguments.faults.fault);
         config.state_dir = state_of(ratn_cell::ROLE, arguments.state_dir.as_deref(), config.state_dir.take());
         config.record = arguments.record.clone().or(config.record);
         config.listen = host.listen.unwrap_or(config.listen);
-        ratn_cell::run_as(config, host.directory, host.serving, host.shutdown).await
+        ratn_cell::run_as(config, host.directory, host.serving, host.tls, host.shutdown).await
     })
 }
 
@@ -138,7 +139,7 @@ fn replay(file: &Path) -> Result<(), Failure> {
 }
 
 /// `ratn worker …`
-pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
+pub(super) fn worker(arguments: &WorkerArguments, tls: &ClientTls) -> Result<(), Failure> {
     telemetry::start();
     let told = ManagerLocation::from_environment();
     let told = told.map_err(|error| Failure::Refused(format!("ratn: {RESOURCE_MANAGER_VARIABLE}: {error}")))?;
@@ -163,6 +164,7 @@ pub(super) fn worker(arguments: &WorkerArguments) -> Result<(), Failure> {
             ..Exposure::default()
         },
         access: arguments.config.clone(),
+        tls: Some(tls.clone()),
     };
     let speed = arguments.speed;
     let run = async {
@@ -181,6 +183,8 @@ struct Host {
     listen: Option<Endpoint>,
     directory: RuntimeDirectory,
     serving: Serving,
+    /// What it trusts and shows as a client.
+    tls: ClientTls,
     metrics: Arc<Metrics>,
     shutdown: CancellationToken,
     /// The resource manager's section, as it changes.
@@ -189,11 +193,12 @@ struct Host {
 
 fn daemon(
     arguments: &RoleArguments,
+    tls: &ClientTls,
     role: &'static str,
     run: impl AsyncFnOnce(SystemConfig, Host) -> anyhow::Result<()>,
 ) -> Result<(), Failure> {
     let system = SystemConfig::load(arguments.config.as_deref())?;
-    daemon_on(tokio::runtime::Builder::new_multi_thread(), arguments, system, role, run)
+    daemon_on(tokio::runtime::Builder::new_multi_thread(), arguments, system, tls, role, run)
 }
 
 /// What every daemon does around its own work.
@@ -201,6 +206,7 @@ fn daemon_on(
     runtime: tokio::runtime::Builder,
     arguments: &RoleArguments,
     system: SystemConfig,
+    tls: &ClientTls,
     role: &'static str,
     run: impl AsyncFnOnce(SystemConfig, Host) -> anyhow::Result<()>,
 ) -> Result<(), Failure> {
@@ -213,7 +219,7 @@ fn daemon_on(
     let mut service = system.service.clone();
     service.insecure |= arguments.insecure;
     let refused = |error: anyhow::Error| Failure::Refused(format!("ratn: {error:#}"));
-    service.trust().context("[service.tls]").map_err(refused)?;
+    let client_tls = service.client_tls(tls).context("[service.tls]").map_err(refused)?;
     let logs = telemetry::start_as(&service.log, service.audit_file.as_deref());
     let logs = logs.map_err(|error| refused(error.into()))?;
     blocking_on(runtime, async {
@@ -238,8 +244,9 @@ fn daemon_on(
         let serving = service.serving_with(&access, &metrics);
         let tls = serving.exposure.tls.clone();
         let (listen, bounds_of) = (arguments.listen.clone(), bounds.subscribe());
-        let host = Host { listen, directory, shutdown, bounds: bounds_of, serving, metrics };
-        let reloading = Reloading { file: arguments.config.clone(), running, role, logs, tls, access, bounds };
+        let host = Host { listen, directory, shutdown, bounds: bounds_of, serving, tls: client_tls.clone(), metrics };
+        let file = arguments.config.clone();
+        let reloading = Reloading { file, running, role, logs, tls, client_tls, access, bounds };
         // The service manager hears of the process until its state is closed, not only while it serves.
         let phase = host.serving.phase.clone();
         let followed =

@@ -18,6 +18,7 @@ use anyhow::{Context, anyhow, bail};
 use ratn_executive::protocol::Mode;
 use ratn_model::program::SUCCESS;
 use ratn_model::value::Value;
+use ratn_worker::tls::ClientTls;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -31,21 +32,29 @@ impl From<ModeArgument> for Mode {
 }
 
 /// Runs a task once, or goes on with a run.
-pub(crate) fn run(arguments: &RunArguments) -> Result<(), Failure> {
+pub(crate) fn run(arguments: &RunArguments, tls: &ClientTls) -> Result<(), Failure> {
     blocking_here(async {
         let interrupt = Interrupt::listen()?;
         let directory = public_directory(arguments.runtime_dir.as_deref());
         match (&arguments.resume, &arguments.task) {
-            (Some(log), task) => Box::pin(resume::run(arguments, log, task.as_deref(), &directory, &interrupt)).await,
-            (None, Some(task)) => Box::pin(begin(arguments, task, &directory, &interrupt)).await,
+            (Some(log), task) => {
+                Box::pin(resume::run(arguments, log, task.as_deref(), &directory, tls, &interrupt)).await
+            }
+            (None, Some(task)) => Box::pin(begin(arguments, task, &directory, tls, &interrupt)).await,
             (None, None) => Err(Failure::Refused("ratn: no task file is named".to_owned())),
         }
     })
 }
 
-async fn begin(arguments: &RunArguments, task: &Path, directory: &Path, interrupt: &Interrupt) -> Result<(), Failure> {
+async fn begin(
+    arguments: &RunArguments,
+    task: &Path,
+    directory: &Path,
+    tls: &ClientTls,
+    interrupt: &Interrupt,
+) -> Result<(), Failure> {
     let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
-    let found = System::find(directory, given.clone()).await?;
+    let found = System::find(directory, given.clone(), tls).await?;
     if found.is_none() && arguments.runtime_dir.is_some() {
         let place = directory.display();
         return Err(Failure::Refused(format!(
@@ -83,7 +92,7 @@ async fn begin(arguments: &RunArguments, task: &Path, directory: &Path, interrup
         }
         None => {
             output::progress(format_args!("no system runs in {}: starting one for this run", directory.display()));
-            let system = starting(Box::pin(System::start_private(config.clone())), interrupt).await?;
+            let system = starting(Box::pin(System::start_private(config.clone(), tls)), interrupt).await?;
             output::progress(format_args!("its runtime directory: {}", system.directory().path().display()));
             system
         }

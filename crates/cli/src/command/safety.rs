@@ -18,6 +18,7 @@ use ratn_worker::client::{CallError, Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::safety::{SafetyClient, SafetyState};
+use ratn_worker::tls::ClientTls;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 use tokio::time::timeout;
@@ -38,33 +39,33 @@ enum Question {
 type Answers = BTreeMap<Endpoint, Result<SafetyState, String>>;
 
 /// `ratn stop`
-pub(crate) fn stop(arguments: &StopArguments) -> Result<(), Failure> {
+pub(crate) fn stop(arguments: &StopArguments, tls: &ClientTls) -> Result<(), Failure> {
     let question = match (arguments.clear, arguments.show) {
         (true, _) => Question::Clear,
         (_, true) => Question::Show,
         _ => Question::Stop(reason(&arguments.reason)),
     };
-    ask_all(&arguments.drivers, &question)
+    ask_all(&arguments.drivers, tls, &question)
 }
 
 /// `ratn hold`
-pub(crate) fn hold(arguments: &HoldArguments) -> Result<(), Failure> {
-    ask_all(&arguments.drivers, &Question::Hold(reason(&arguments.reason)))
+pub(crate) fn hold(arguments: &HoldArguments, tls: &ClientTls) -> Result<(), Failure> {
+    ask_all(&arguments.drivers, tls, &Question::Hold(reason(&arguments.reason)))
 }
 
 /// `ratn go-on`
-pub(crate) fn go_on(arguments: &GoOnArguments) -> Result<(), Failure> {
-    ask_all(&arguments.drivers, &Question::GoOn)
+pub(crate) fn go_on(arguments: &GoOnArguments, tls: &ClientTls) -> Result<(), Failure> {
+    ask_all(&arguments.drivers, tls, &Question::GoOn)
 }
 
 fn reason(said: &Option<String>) -> String {
     said.clone().unwrap_or_else(|| format!("by the user with uid {}", nix::unistd::getuid()))
 }
 
-fn ask_all(arguments: &SafetyArguments, question: &Question) -> Result<(), Failure> {
+fn ask_all(arguments: &SafetyArguments, tls: &ClientTls, question: &Question) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()));
-        let channels = Channels::new();
+        let channels = Channels::new(tls);
         let known: BTreeSet<Endpoint> =
             arguments.endpoint.iter().cloned().chain(directory.find(ratn_cell::ROLE)).collect();
         // Whoever is known is asked while the others are looked for.

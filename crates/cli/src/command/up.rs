@@ -8,19 +8,20 @@ use crate::output;
 use crate::system::config::SystemConfig;
 use crate::system::{System, public_directory, running};
 use ratn_daemon::supervisor;
+use ratn_worker::tls::ClientTls;
 
 /// Starts it and keeps it running until the user or one of its processes ends it.
-pub(crate) fn run(arguments: &UpArguments) -> Result<(), Failure> {
+pub(crate) fn run(arguments: &UpArguments, tls: &ClientTls) -> Result<(), Failure> {
     let mut config = SystemConfig::load(arguments.config.as_deref())?;
     config.apply(&arguments.system);
     startable(&config)?;
     blocking(async {
         let interrupt = Interrupt::listen()?;
         let directory = public_directory(arguments.runtime_dir.as_deref());
-        if running(&directory).await.is_some() {
+        if running(&directory, tls).await.is_some() {
             return Err(Failure::Refused(format!("ratn: a system runs in {} already", directory.display())));
         }
-        let mut system = starting(Box::pin(System::start_public(config, &directory)), &interrupt).await?;
+        let mut system = starting(Box::pin(System::start_public(config, &directory, tls)), &interrupt).await?;
         output::progress(format_args!(
             "the system is ready in {}; Ctrl-C ends it",
             system.directory().path().display()

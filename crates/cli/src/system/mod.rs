@@ -16,6 +16,7 @@ use ratn_proto::v1::{GetGroundTruthRequest, UnintendedContact};
 use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::tls::ClientTls;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -47,6 +48,8 @@ const ROLES: [&str; 4] = ["resource-manager", "world-pool", CELL, "process-manag
 pub(crate) struct System {
     pub(crate) config: SystemConfig,
     pub(crate) endpoints: Endpoints,
+    /// What its clients trust and show.
+    tls: ClientTls,
     directory: RuntimeDirectory,
     processes: Processes,
     /// Removed with it.
@@ -55,22 +58,27 @@ pub(crate) struct System {
 
 impl System {
     /// Starts one in a directory of its own, which goes with it.
-    pub(crate) async fn start_private(config: SystemConfig) -> anyhow::Result<System> {
+    pub(crate) async fn start_private(config: SystemConfig, tls: &ClientTls) -> anyhow::Result<System> {
         let private = tempfile::Builder::new().prefix("ratn-").tempdir().context("cannot make a runtime directory")?;
         let path = private.path().to_owned();
         // Boxed: it holds the config of every role.
-        Box::pin(System::start(config, &path, Some(private))).await
+        Box::pin(System::start(config, &path, Some(private), tls)).await
     }
 
     /// Starts one that others find in `directory`.
-    pub(crate) async fn start_public(config: SystemConfig, directory: &Path) -> anyhow::Result<System> {
-        Box::pin(System::start(config, directory, None)).await
+    pub(crate) async fn start_public(
+        config: SystemConfig,
+        directory: &Path,
+        tls: &ClientTls,
+    ) -> anyhow::Result<System> {
+        Box::pin(System::start(config, directory, None, tls)).await
     }
 
     async fn start(
         config: SystemConfig,
         directory: &Path,
         private: Option<tempfile::TempDir>,
+        tls: &ClientTls,
     ) -> anyhow::Result<System> {
         let directory = RuntimeDirectory::create(directory).map_err(|error| {
             let error = anyhow::Error::from(error);
@@ -87,8 +95,10 @@ impl System {
         let file = directory.path().join(CONFIG_FILE);
         std::fs::write(&file, config.to_toml()?).with_context(|| format!("cannot write {}", file.display()))?;
         let mut processes = Processes::start(&ROLES, &file, directory.path())?;
-        match ready(&mut processes, &directory, &config).await {
-            Ok(endpoints) => Ok(System { config, endpoints, directory, processes, _private: private }),
+        match ready(&mut processes, &directory, &config, tls).await {
+            Ok(endpoints) => {
+                Ok(System { config, endpoints, tls: tls.clone(), directory, processes, _private: private })
+            }
             Err(error) => {
                 processes.stop().await;
                 Err(error)
@@ -97,8 +107,12 @@ impl System {
     }
 
     /// The one that runs in `directory`, if one does. Without a config of your own it is the one that it was started with.
-    pub(crate) async fn find(directory: &Path, config: Option<SystemConfig>) -> anyhow::Result<Option<System>> {
-        let Some(endpoints) = running(directory).await else { return Ok(None) };
+    pub(crate) async fn find(
+        directory: &Path,
+        config: Option<SystemConfig>,
+        tls: &ClientTls,
+    ) -> anyhow::Result<Option<System>> {
+        let Some(endpoints) = running(directory, tls).await else { return Ok(None) };
         let config = match config {
             Some(config) => config,
             None => SystemConfig::read(&directory.join(CONFIG_FILE)).with_context(|| {
@@ -107,13 +121,21 @@ impl System {
             })?,
         };
         let directory = RuntimeDirectory::at(directory);
-        Ok(Some(System { config, endpoints, directory, processes: Processes::default(), _private: None }))
+        Ok(Some(System {
+            config,
+            endpoints,
+            tls: tls.clone(),
+            directory,
+            processes: Processes::default(),
+            _private: None,
+        }))
     }
 
     /// Where a run finds what it needs of it.
     pub(crate) fn place(&self) -> Place {
         Place {
             endpoints: self.endpoints.clone(),
+            tls: self.tls.clone(),
             directory: self.directory.path().to_owned(),
             catalogue: Arc::new(self.config.catalogue.clone()),
             speed: self.config.speed,
@@ -132,7 +154,7 @@ impl System {
 
     /// What really came of a task, as only the cell knows.
     pub(crate) async fn judgement(&self) -> anyhow::Result<Judgement> {
-        let channel = Channels::new().get(&self.directory.find(CELL)?)?;
+        let channel = Channels::new(&self.tls).get(&self.directory.find(CELL)?)?;
         let truth = CellServiceClient::new(channel).get_ground_truth(GetGroundTruthRequest {}).await;
         let truth = truth.context("the cell does not say where its objects are")?.into_inner();
         let upright = truth.objects.iter().filter(|one| UPRIGHT.contains(&one.kind.as_str()));
@@ -160,11 +182,11 @@ fn forget_state(directory: &RuntimeDirectory, role: &str) -> anyhow::Result<()> 
 }
 
 /// Where the system that runs in `directory` is reached, if one does. The files of a system that was killed do not count.
-pub(crate) async fn running(directory: &Path) -> Option<Endpoints> {
+pub(crate) async fn running(directory: &Path, tls: &ClientTls) -> Option<Endpoints> {
     let directory = RuntimeDirectory::at(directory);
     let (resource_manager, world_pool) = (directory.find(ROLES[0]).ok()?, directory.find(ROLES[1]).ok()?);
-    endpoint::connect(&resource_manager).await.ok()?;
-    endpoint::connect(&world_pool).await.ok()?;
+    endpoint::connect(&resource_manager, tls).await.ok()?;
+    endpoint::connect(&world_pool, tls).await.ok()?;
     Some(Endpoints { resource_manager, world_pool })
 }
 
@@ -173,9 +195,10 @@ async fn ready(
     processes: &mut Processes,
     directory: &RuntimeDirectory,
     config: &SystemConfig,
+    tls: &ClientTls,
 ) -> anyhow::Result<Endpoints> {
     let wanted = config.promised_resources();
-    let channels = Channels::new();
+    let channels = Channels::new(tls);
     let missing = async || {
         let roles = ROLES.iter().filter(|role| directory.find(role).is_err());
         let roles: Vec<String> = roles.map(|&role| role.to_owned()).collect();

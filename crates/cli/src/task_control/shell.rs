@@ -29,6 +29,7 @@ use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use ratn_worker::client::fresh_id;
 use ratn_worker::robot_clock::RobotClock;
+use ratn_worker::tls::ClientTls;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -64,6 +65,8 @@ pub(crate) struct Run {
 #[derive(Debug, Clone)]
 pub(crate) struct Place {
     pub(crate) endpoints: Endpoints,
+    /// What the run trusts and shows there.
+    pub(crate) tls: ClientTls,
     /// Where its endpoint files are.
     pub(crate) directory: PathBuf,
     pub(crate) catalogue: Arc<Catalogue>,

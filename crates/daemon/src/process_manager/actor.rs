@@ -19,6 +19,7 @@ use ratn_model::time::Timestamp;
 use ratn_panic_point::panic_point;
 use ratn_proto::types::{Demand, HostPools, PoolStatus, Scale, TrackingMode, WorkerStatus};
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::tls::ClientTls;
 use ratn_worker::vitals::Vitals;
 use std::collections::{BTreeSet, VecDeque};
 use std::time::{Duration, Instant, SystemTime};
@@ -65,6 +66,8 @@ pub(super) struct Handle {
 pub(super) struct Parts {
     pub(super) config: ProcessManagerConfig,
     pub(super) directory: RuntimeDirectory,
+    /// What is trusted and shown where workers are asked for their health.
+    pub(super) tls: ClientTls,
     /// What workers are told of the resource manager.
     pub(super) told: ManagerContact,
     pub(super) roster: Roster,
@@ -121,7 +124,8 @@ pub(super) fn start(
     let (inbox, messages) = mpsc::channel(INBOX);
     let (config, adopted) = (parts.config, parts.adopted);
     let (drained, tracking) = (Drained::of(&parts.directory), parts.tracker.mode());
-    let (processes, events) = Processes::start(&config, parts.directory, parts.told, parts.roster, parts.tracker)?;
+    let (processes, events) =
+        Processes::start(&config, parts.directory, parts.tls, parts.told, parts.roster, parts.tracker)?;
     let mut pools = Pools::new(&config.host, config.templates).with_labels(config.labels.clone());
     pools.go_on_after(&parts.before);
     pools.moved_before(Timestamp(0), &parts.motions);

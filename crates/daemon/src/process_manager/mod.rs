@@ -53,6 +53,7 @@ use ratn_proto::v1::process_service_server::ProcessServiceServer;
 use ratn_worker::panic::exit_on_panic;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving, bind_as};
+use ratn_worker::tls::ClientTls;
 use roster::Roster;
 use session_file::SessionFile;
 use std::collections::BTreeSet;
@@ -83,10 +84,10 @@ pub async fn run(
     directory: RuntimeDirectory,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
-    run_as(config, directory, Serving::default(), shutdown).await
+    run_as(config, directory, Serving::default(), ClientTls::none(), shutdown).await
 }
 
-/// As [`run`], served as its host wants it.
+/// As [`run`], served as its host wants it; `tls` is what it trusts and shows as a client.
 ///
 /// # Errors
 /// As [`run`].
@@ -94,6 +95,7 @@ pub async fn run_as(
     config: ProcessManagerConfig,
     directory: RuntimeDirectory,
     serving: Serving,
+    tls: ClientTls,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
     if let Err(error) = open_files::raise() {
@@ -131,7 +133,11 @@ pub async fn run_as(
     let (short, shortages) = watch::channel(Shortages::new());
     let (renewals, renewed) = mpsc::channel(1);
     let link = Link {
-        manager: Manager { configured: config.resource_manager.clone(), directory: directory.clone() },
+        manager: Manager {
+            configured: config.resource_manager.clone(),
+            directory: directory.clone(),
+            tls: tls.clone(),
+        },
         client: format!("{ROLE}@{}", config.host),
         session: Some(LastingSession { id: session, renewals }),
         ttl: Duration::from_millis(config.session_ttl_ms),
@@ -156,6 +162,7 @@ pub async fn run_as(
     let parts = actor::Parts {
         config,
         directory: directory.clone(),
+        tls,
         told,
         roster,
         tracker,

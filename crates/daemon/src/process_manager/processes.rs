@@ -21,6 +21,7 @@ use ratn_worker::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use ratn_worker::panic::{exit_on_panic, exit_on_panic_blocking};
 use ratn_worker::pooled::{PROVIDER_SESSION_VARIABLE, STANDSTILL_VARIABLE};
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::tls::ClientTls;
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::io;
@@ -69,6 +70,7 @@ pub(super) enum BeginError {
 
 pub(super) struct Processes {
     host: String,
+    tls: ClientTls,
     told: ManagerContact,
     /// Variables in the environment of every worker.
     worker_environment: BTreeMap<&'static str, PathBuf>,
@@ -129,6 +131,7 @@ impl Processes {
     pub(super) fn start(
         config: &ProcessManagerConfig,
         directory: RuntimeDirectory,
+        tls: ClientTls,
         told: ManagerContact,
         roster: Roster,
         tracker: Tracker,
@@ -138,6 +141,7 @@ impl Processes {
         let (health, answered) = mpsc::channel(OUTCOMES);
         let processes = Processes {
             host: config.host.clone(),
+            tls,
             told,
             worker_environment: config.worker_environment.clone(),
             max_log_bytes: config.max_log_bytes,
@@ -185,12 +189,13 @@ impl Processes {
         let fill = |text: &str| parameter::fill(text, &builtin, &template.parameters);
         let _ = std::fs::remove_file(&endpoint_file);
         let socket = notify_socket(&directory, id);
-        let readiness_check = template.readiness.readiness_check(&socket).and_then(|readiness_check| {
-            match (&readiness_check, &account) {
-                (ReadinessCheck::Notify { .. }, Some(account)) => account.give(&socket).map(|()| readiness_check),
-                _ => Ok(readiness_check),
-            }
-        });
+        let readiness_check =
+            template.readiness.readiness_check(&socket, &self.tls).and_then(|readiness_check| {
+                match (&readiness_check, &account) {
+                    (ReadinessCheck::Notify { .. }, Some(account)) => account.give(&socket).map(|()| readiness_check),
+                    _ => Ok(readiness_check),
+                }
+            });
         let readiness_check = readiness_check
             .map_err(|error| BeginError::Socket { socket: socket.clone(), reason: error.to_string() })?;
         let mut env = environment::passed(std::env::vars_os(), &template.pass_env);
@@ -291,7 +296,7 @@ impl Processes {
         let directory = account::directory_of(&self.directory, &entry.template);
         let account = entry.template.user.as_deref().and_then(|user| Account::named(user).ok());
         let socket = notify_socket(&directory, &id);
-        let health_check = entry.template.readiness.health_check(&socket, &endpoint);
+        let health_check = entry.template.readiness.health_check(&socket, &endpoint, &self.tls);
         if let Some(account) = account {
             // A worker that does not notify has no socket.
             let _ = account.give(&socket);

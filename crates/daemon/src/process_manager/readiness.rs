@@ -4,6 +4,7 @@ use super::template::Template;
 use crate::config::{ConfigError, rule};
 use ratn_worker::client::Health;
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::tls::ClientTls;
 use serde::{Deserialize, Serialize};
 use std::io;
 use std::net::Ipv4Addr;
@@ -49,8 +50,12 @@ pub enum Readiness {
 /// What is looked at until a worker is ready.
 #[derive(Debug)]
 pub(super) enum ReadinessCheck {
-    Health,
-    Notify { socket: UnixDatagram, watchdog: bool },
+    /// Asked with what the process manager trusts and shows.
+    Health(ClientTls),
+    Notify {
+        socket: UnixDatagram,
+        watchdog: bool,
+    },
     Line(Arc<Notify>),
     Port(u16),
 }
@@ -87,9 +92,9 @@ impl Readiness {
     }
 
     /// What is asked of one that has been ready before; nothing where it cannot be.
-    pub(super) fn health_check(&self, socket: &Path, endpoint: &str) -> Option<HealthCheck> {
+    pub(super) fn health_check(&self, socket: &Path, endpoint: &str, tls: &ClientTls) -> Option<HealthCheck> {
         match self {
-            Readiness::Health => Some(HealthCheck::Health(Health::of(endpoint.parse().ok()?))),
+            Readiness::Health => Some(HealthCheck::Health(Health::of(endpoint.parse().ok()?, tls))),
             Readiness::Port { port } => Some(HealthCheck::Port(*port)),
             Readiness::Notify { watchdog: true } => {
                 bind(socket).ok().map(|socket| HealthCheck::Watchdog(Watchdog::on(socket)))
@@ -99,9 +104,9 @@ impl Readiness {
     }
 
     /// What to look at; before the worker is started. `socket` is where it may notify.
-    pub(super) fn readiness_check(&self, socket: &Path) -> io::Result<ReadinessCheck> {
+    pub(super) fn readiness_check(&self, socket: &Path, tls: &ClientTls) -> io::Result<ReadinessCheck> {
         Ok(match self {
-            Readiness::Health => ReadinessCheck::Health,
+            Readiness::Health => ReadinessCheck::Health(tls.clone()),
             Readiness::Notify { watchdog } => ReadinessCheck::Notify { socket: bind(socket)?, watchdog: *watchdog },
             Readiness::Line { .. } => ReadinessCheck::Line(Arc::default()),
             Readiness::Port { port } => ReadinessCheck::Port(*port),
@@ -120,9 +125,9 @@ impl ReadinessCheck {
         // A worker that is no server has no endpoint.
         let endpoint = || directory.find(id).map(|endpoint| endpoint.to_string()).unwrap_or_default();
         match self {
-            ReadinessCheck::Health => {
+            ReadinessCheck::Health(tls) => {
                 let endpoint = directory.wait_for(id, within).await.map_err(|error| error.to_string())?;
-                let mut health = Health::of(endpoint.clone());
+                let mut health = Health::of(endpoint.clone(), &tls);
                 health.serving(within).await.map_err(|error| error.to_string())?;
                 Ok((endpoint.to_string(), HealthCheck::Health(health)))
             }

@@ -101,7 +101,7 @@ impl LiveLeases {
 
 /// Keeps `live` up to date for ever.
 pub(super) async fn follow(manager: Manager, live: watch::Sender<LiveLeases>) {
-    let channels = Channels::new();
+    let channels = Channels::new(&manager.tls);
     loop {
         let endpoint = manager.find().await;
         if let Err(error) = follow_at(&channels, &endpoint, &live).await {

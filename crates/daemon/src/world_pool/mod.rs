@@ -40,6 +40,7 @@ use ratn_storage::Store;
 use ratn_worker::panic::exit_on_panic;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{Services, Serving};
+use ratn_worker::tls::ClientTls;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -58,10 +59,10 @@ pub async fn run(
     directory: RuntimeDirectory,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
-    run_as(config, directory, Serving::default(), Arc::new(Metrics::new(ROLE)), shutdown).await
+    run_as(config, directory, Serving::default(), Arc::new(Metrics::new(ROLE)), ClientTls::none(), shutdown).await
 }
 
-/// As [`run`], served and counted as its host wants it.
+/// As [`run`], served and counted as its host wants it; `tls` is what it trusts and shows as a client.
 ///
 /// # Errors
 /// As [`run`].
@@ -70,6 +71,7 @@ pub async fn run_as(
     directory: RuntimeDirectory,
     serving: Serving,
     metrics: Arc<Metrics>,
+    tls: ClientTls,
     shutdown: CancellationToken,
 ) -> anyhow::Result<()> {
     let ontology = config.ontology.as_deref().map(ontology).transpose()?;
@@ -85,7 +87,7 @@ pub async fn run_as(
     let Some(((history, journal), bound)) = place.take(open, &shutdown).await? else { return Ok(()) };
     let kept = (history, journal.counting(&metrics.journal));
     let endpoint = bound.endpoint().clone();
-    let manager = Manager { configured: config.resource_manager.clone(), directory: directory.clone() };
+    let manager = Manager { configured: config.resource_manager.clone(), directory: directory.clone(), tls };
     let room = Resource::new(format!("world-model@{}", config.host), ResourceClass::World, &config.kind)
         .with_capacity(config.capacity)
         .on_host(&config.host);

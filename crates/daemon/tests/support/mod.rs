@@ -9,6 +9,7 @@ use ratn_worker::client::{Channels, ProcessClient, ResourceClient, ResourceWatch
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
+use ratn_worker::tls::ClientTls;
 use std::future::Future;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -69,7 +70,7 @@ impl TestSystem {
     pub(crate) fn new() -> TestSystem {
         let parent = tempfile::tempdir().unwrap();
         let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
-        TestSystem { parent, directory, channels: Channels::new() }
+        TestSystem { parent, directory, channels: Channels::new(&ClientTls::none()) }
     }
 
     pub(crate) async fn resource_manager(&self) -> Daemon {

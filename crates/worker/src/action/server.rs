@@ -12,6 +12,7 @@ use crate::gate::ending;
 use crate::lease_watch::{Claim, ClaimStatus, EndedHolding, GRANT_WAIT, LeaseListener, LeaseWatch};
 use crate::panic::exit_on_panic;
 use crate::safety::Safety;
+use crate::tls::ClientTls;
 use crate::trace;
 use ratn_proto::types::Goal;
 use std::collections::BTreeMap;
@@ -36,7 +37,6 @@ pub struct ActionServer {
 }
 
 /// What an [`ActionServer`] shall be.
-#[derive(Default)]
 pub struct ActionServerBuilder {
     resource: String,
     actions: BTreeMap<String, Arc<dyn Action>>,
@@ -109,7 +109,7 @@ impl ActionServerBuilder {
         self
     }
 
-    /// Over channels that others use too.
+    /// What its actions ask of others goes over these channels. Without this they reach no server with TLS.
     #[must_use]
     pub fn channels(mut self, channels: Channels) -> ActionServerBuilder {
         self.channels = channels;
@@ -160,7 +160,16 @@ impl ActionServer {
     /// no lease is asked for, except by actions that name a resource of their own; of goals without a lease only the last results are
     /// known, and one that is given again later is performed again.
     pub fn builder(resource: impl Into<String>) -> ActionServerBuilder {
-        ActionServerBuilder { resource: resource.into(), ..ActionServerBuilder::default() }
+        ActionServerBuilder {
+            resource: resource.into(),
+            actions: BTreeMap::new(),
+            one_at_a_time: false,
+            results_kept: None,
+            goals_per_lease: None,
+            channels: Channels::new(&ClientTls::none()),
+            safety: Safety::default(),
+            authority: Authority::default(),
+        }
     }
 
     /// Ends with the process: begins nothing more, tells every goal to stop, and returns when all actions have returned. Their clients

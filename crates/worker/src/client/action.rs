@@ -15,7 +15,7 @@ use ratn_proto::v1::perform_response::Kind as Heard;
 use std::collections::BTreeMap;
 
 /// Gives goals to providers.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct ActionClient {
     channels: Channels,
 }

@@ -2,6 +2,7 @@
 
 use super::CallError;
 use crate::endpoint::{Endpoint, connect_to_ask};
+use crate::tls::ClientTls;
 use crate::trace::Traced;
 use std::time::Duration;
 use tonic_health::pb::HealthCheckRequest;
@@ -18,13 +19,14 @@ pub const NOT_SERVING: &str = "its health is not SERVING";
 #[derive(Debug, Clone)]
 pub struct Health {
     endpoint: Endpoint,
+    tls: ClientTls,
     client: Option<HealthClient<Traced>>,
 }
 
 impl Health {
     /// Of the server at `endpoint`, which need not be there yet.
-    pub fn of(endpoint: Endpoint) -> Health {
-        Health { endpoint, client: None }
+    pub fn of(endpoint: Endpoint, tls: &ClientTls) -> Health {
+        Health { endpoint, tls: tls.clone(), client: None }
     }
 
     /// Returns once it says SERVING.
@@ -68,7 +70,7 @@ impl Health {
         let client = match &mut self.client {
             Some(client) => client,
             client => {
-                let channel = connect_to_ask(&self.endpoint).await.map_err(|error| super::chain(&error))?;
+                let channel = connect_to_ask(&self.endpoint, &self.tls).await.map_err(|error| super::chain(&error))?;
                 client.insert(HealthClient::new(channel))
             }
         };
@@ -82,6 +84,6 @@ impl Health {
 ///
 /// # Errors
 /// [`CallError::Broken`] with the last answer when it has not within `deadline`.
-pub async fn wait_until_serving(endpoint: &Endpoint, deadline: Duration) -> Result<(), CallError> {
-    Health::of(endpoint.clone()).serving(deadline).await
+pub async fn wait_until_serving(endpoint: &Endpoint, tls: &ClientTls, deadline: Duration) -> Result<(), CallError> {
+    Health::of(endpoint.clone(), tls).serving(deadline).await
 }

@@ -21,6 +21,7 @@ pub use world::{Commit, Projection, ProjectionWatch, WorldClient, WorldWatch};
 use crate::endpoint::{Endpoint, connect_lazily};
 use crate::multiplex::GoalCalls;
 use crate::multiplex::client::Multiplexer;
+use crate::tls::ClientTls;
 use crate::trace::Traced;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -33,18 +34,19 @@ const MAX_CHANNELS: usize = 256;
 /// So many streams of goals are kept; beyond it those that are not used are forgotten.
 const MAX_STREAMS: usize = 256;
 
-/// One channel per endpoint, and one stream of goals, shared by all clients of a process. A channel connects by itself, again if it
-/// broke.
-#[derive(Debug, Clone, Default)]
+/// One channel per endpoint, and one stream of goals, shared by all clients that are made of it. A channel connects by itself, again if it
+/// broke. A handle: clones share everything.
+#[derive(Debug, Clone)]
 pub struct Channels {
+    tls: ClientTls,
     kept: Arc<Mutex<BTreeMap<Endpoint, Traced>>>,
     goals: Arc<Mutex<BTreeMap<Endpoint, Multiplexer<GoalCalls>>>>,
 }
 
 impl Channels {
-    /// None yet.
-    pub fn new() -> Channels {
-        Channels::default()
+    /// None yet. Those to `https://` endpoints will trust and show what `tls` does when they connect.
+    pub fn new(tls: &ClientTls) -> Channels {
+        Channels { tls: tls.clone(), kept: Arc::default(), goals: Arc::default() }
     }
 
     /// The channel to `endpoint`: its calls carry the trace of the task that makes them, and say the protocol. Needs a tokio runtime.
@@ -59,7 +61,7 @@ impl Channels {
         if kept.len() >= MAX_CHANNELS {
             kept.clear();
         }
-        let channel = connect_lazily(endpoint)
+        let channel = connect_lazily(endpoint, &self.tls)
             .map_err(|error| CallError::Broken { endpoint: endpoint.clone(), reason: chain(&error) })?;
         kept.insert(endpoint.clone(), channel.clone());
         Ok(channel)

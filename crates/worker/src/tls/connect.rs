@@ -1,19 +1,17 @@
-//! A client's side of handshakes: each connection is made with what the process trusts and shows at that time.
+//! A client's side of handshakes: each connection is made with what the client trusts and shows at that time.
 
-use super::{ALPN_H2, client, provider};
+use super::{ALPN_H2, CA_VARIABLE, ClientTls};
 use crate::endpoint::CONNECT_TIMEOUT;
 use hyper_util::client::legacy::connect::HttpConnector;
 use hyper_util::rt::TokioIo;
 use std::future::Future;
 use std::io;
 use std::pin::Pin;
-use std::sync::Arc;
 use std::task::{Context, Poll};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 use tokio_rustls::rustls::pki_types::ServerName;
-use tokio_rustls::rustls::{ClientConfig, RootCertStore};
 use tonic::codegen::{Service, StdError, http::Uri};
 
 /// Connects over TCP, then with TLS to the host of its certificate.
@@ -21,16 +19,17 @@ use tonic::codegen::{Service, StdError, http::Uri};
 pub(crate) struct Connector {
     tcp: HttpConnector,
     host: String,
+    tls: ClientTls,
 }
 
 impl Connector {
-    /// To `host`, as it is in the server's certificate.
-    pub(crate) fn to(host: &str) -> Connector {
+    /// To `host`, as it is in the server's certificate, with what `tls` trusts and shows.
+    pub(crate) fn to(host: &str, tls: &ClientTls) -> Connector {
         let mut tcp = HttpConnector::new();
         tcp.enforce_http(false);
         tcp.set_nodelay(true);
         tcp.set_connect_timeout(Some(CONNECT_TIMEOUT));
-        Connector { tcp, host: host.to_owned() }
+        Connector { tcp, host: host.to_owned(), tls: tls.clone() }
     }
 }
 
@@ -45,10 +44,11 @@ impl Service<Uri> for Connector {
 
     fn call(&mut self, address: Uri) -> Self::Future {
         let connected = self.tcp.call(address);
-        let host = self.host.clone();
+        let (host, tls) = (self.host.clone(), self.tls.clone());
         Box::pin(async move {
             let stream = connected.await?.into_inner();
-            let stream = TlsConnector::from(config()?).connect(ServerName::try_from(host)?, stream).await?;
+            let config = tls.current().ok_or_else(|| trusts_nobody(&host))?;
+            let stream = TlsConnector::from(config).connect(ServerName::try_from(host)?, stream).await?;
             if stream.get_ref().1.alpn_protocol() != Some(ALPN_H2) {
                 return Err(io::Error::new(io::ErrorKind::Unsupported, "who serves there does not speak HTTP/2").into());
             }
@@ -57,13 +57,9 @@ impl Service<Uri> for Connector {
     }
 }
 
-/// Without anything installed no server is trusted.
-fn config() -> Result<Arc<ClientConfig>, StdError> {
-    if let Some(tls) = client() {
-        return Ok(tls.config);
-    }
-    let builder = ClientConfig::builder_with_provider(provider()).with_safe_default_protocol_versions()?;
-    let mut config = builder.with_root_certificates(RootCertStore::empty()).with_no_client_auth();
-    config.alpn_protocols.push(ALPN_H2.into());
-    Ok(Arc::new(config))
+fn trusts_nobody(host: &str) -> io::Error {
+    let message = format!(
+        "`{host}` serves with TLS, and this client trusts no certificate authority: set {CA_VARIABLE} to the file of the system's authority"
+    );
+    io::Error::new(io::ErrorKind::NotConnected, message)
 }

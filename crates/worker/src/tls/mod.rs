@@ -1,7 +1,8 @@
 //! TLS of both sides: a server's own certificate and the authorities whose clients it lets in; what a client trusts and shows.
 //!
-//! A process has one set of [`ClientTls`], given once at its start ([`install`]) or by the environment
-//! (`RATN_TLS_CA`, `RATN_TLS_CERT`, `RATN_TLS_KEY`, which the workers of a process manager inherit). All files are PEM.
+//! A client is given its [`ClientTls`] when it is made ([`crate::client::Channels::new`]): two clients of one process may trust different
+//! authorities. A program reads its own once, at its start, from the environment ([`ClientTls::from_environment`]: `RATN_TLS_CA`,
+//! `RATN_TLS_CERT`, `RATN_TLS_KEY`, which the workers of a process manager inherit). All files are PEM.
 //!
 //! ```text
 //!   files ── read ──▶ LiveServerTls ──▶ every handshake of a server        (accept)
@@ -53,12 +54,20 @@ pub struct LiveServerTls {
     config: Arc<RwLock<Option<Arc<ServerConfig>>>>,
 }
 
-/// What a client trusts and shows.
+/// What a client trusts and shows. A handle: clones share everything, so that files which are read again count for every connection that any
+/// of them makes afterwards.
 #[derive(Clone)]
 pub struct ClientTls {
+    /// `None` where no server is trusted.
+    live: Option<Arc<LiveClientTls>>,
+}
+
+/// Files of a client and what was in them when they were last read.
+struct LiveClientTls {
     authorities: PathBuf,
+    /// A certificate and its key.
     shown: Option<(PathBuf, PathBuf)>,
-    config: Arc<ClientConfig>,
+    config: RwLock<Arc<ClientConfig>>,
 }
 
 /// A file that cannot be read, or holds nothing usable.
@@ -73,8 +82,6 @@ pub struct TlsError {
     #[source]
     pub source: io::Error,
 }
-
-static CLIENT: RwLock<Option<ClientTls>> = RwLock::new(None);
 
 impl LiveServerTls {
     /// Of these files, which are not read yet.
@@ -129,99 +136,121 @@ impl ServerTls {
 }
 
 impl ClientTls {
+    /// Trusts no server: connections with TLS are refused. For systems without TLS.
+    pub fn none() -> ClientTls {
+        ClientTls { live: None }
+    }
+
     /// Reads the files: the authorities, and the certificate and the key that are shown, if any.
     ///
     /// # Errors
     /// [`TlsError`] of the first that cannot be read or holds nothing usable.
     pub fn read(authorities: &Path, shown: Option<(&Path, &Path)>) -> Result<ClientTls, TlsError> {
-        let roots = roots(authorities, "a client's ca")?;
-        let builder = ClientConfig::builder_with_provider(provider()).with_safe_default_protocol_versions();
-        let builder = builder.map_err(|error| unusable(authorities, "a client's ca", &error))?;
-        let builder = builder.with_root_certificates(roots);
-        let mut config = match shown {
-            Some((cert, key)) => {
-                let (shown, secret) = identity((cert, "a client's cert"), (key, "a client's key"))?;
-                let config = builder.with_client_auth_cert(shown, secret);
-                config.map_err(|error| unusable(key, "a client's key", &error))?
-            }
-            None => builder.with_no_client_auth(),
-        };
-        config.alpn_protocols.push(ALPN_H2.into());
         let shown = shown.map(|(cert, key)| (cert.to_owned(), key.to_owned()));
-        Ok(ClientTls { authorities: authorities.to_owned(), shown, config: Arc::new(config) })
+        let config = RwLock::new(Arc::new(client_config(authorities, shown.as_ref())?));
+        Ok(ClientTls { live: Some(Arc::new(LiveClientTls { authorities: authorities.to_owned(), shown, config })) })
     }
 
-    fn read_again(&self) -> Result<ClientTls, TlsError> {
-        let shown = self.shown.as_ref().map(|(cert, key)| (cert.as_path(), key.as_path()));
-        ClientTls::read(&self.authorities, shown)
+    /// Reads the files that the environment names ([`CA_VARIABLE`], [`CERT_VARIABLE`] and [`KEY_VARIABLE`]); [`ClientTls::none`] where it names
+    /// no authorities.
+    ///
+    /// # Errors
+    /// [`TlsError`] of a file that it names and that cannot be read.
+    pub fn from_environment() -> Result<ClientTls, TlsError> {
+        let Some(authorities) = variable(CA_VARIABLE) else { return Ok(ClientTls::none()) };
+        let shown = variable(CERT_VARIABLE).zip(variable(KEY_VARIABLE));
+        ClientTls::read(&authorities, shown.as_ref().map(|(cert, key)| (cert.as_path(), key.as_path())))
+    }
+
+    /// Whether it trusts no server ([`ClientTls::none`]).
+    pub fn is_none(&self) -> bool {
+        self.live.is_none()
+    }
+
+    /// What was read last; `None` where no server is trusted.
+    fn current(&self) -> Option<Arc<ClientConfig>> {
+        Some(self.live.as_ref()?.config.read().unwrap_or_else(PoisonError::into_inner).clone())
+    }
+}
+
+impl LiveClientTls {
+    fn replace(&self, config: ClientConfig) {
+        *self.config.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(config);
     }
 }
 
 impl fmt::Debug for ClientTls {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("ClientTls").field("shows", &self.shown.is_some()).finish_non_exhaustive()
+        f.debug_struct("ClientTls")
+            .field("authorities", &self.live.as_ref().map(|live| &live.authorities))
+            .field("shows", &self.live.as_ref().is_some_and(|live| live.shown.is_some()))
+            .finish_non_exhaustive()
     }
 }
 
-/// What every connection of this process uses from now on; false where it has some already.
-pub fn install(tls: ClientTls) -> bool {
-    let mut client = CLIENT.write().unwrap_or_else(PoisonError::into_inner);
-    let is_first = client.is_none();
-    client.get_or_insert(tls);
-    is_first
+fn client_config(authorities: &Path, shown: Option<&(PathBuf, PathBuf)>) -> Result<ClientConfig, TlsError> {
+    let roots = roots(authorities, "a client's ca")?;
+    let builder = ClientConfig::builder_with_provider(provider()).with_safe_default_protocol_versions();
+    let builder = builder.map_err(|error| unusable(authorities, "a client's ca", &error))?;
+    let builder = builder.with_root_certificates(roots);
+    let mut config = match shown {
+        Some((cert, key)) => {
+            let (shown, secret) = identity((cert, "a client's cert"), (key, "a client's key"))?;
+            let config = builder.with_client_auth_cert(shown, secret);
+            config.map_err(|error| unusable(key, "a client's key", &error))?
+        }
+        None => builder.with_no_client_auth(),
+    };
+    config.alpn_protocols.push(ALPN_H2.into());
+    Ok(config)
 }
 
-/// As [`install`], from the environment; does nothing where that names no authorities.
-///
-/// # Errors
-/// [`TlsError`] of a file that it names and that cannot be read.
-pub fn install_from_environment() -> Result<(), TlsError> {
-    let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    let Some(authorities) = variable(CA_VARIABLE) else { return Ok(()) };
-    let shown = variable(CERT_VARIABLE).zip(variable(KEY_VARIABLE));
-    install(ClientTls::read(&authorities, shown.as_ref().map(|(cert, key)| (cert.as_path(), key.as_path())))?);
-    Ok(())
-}
-
-/// What a server shows that has no config: the certificate that clients of this process show, to clients of the same authority.
+/// What a server shows that has no config: the certificate that the environment names for clients, to clients of the same authority.
 pub fn server_from_environment() -> Option<ServerTls> {
-    let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     let (cert, key) = (variable(CERT_VARIABLE)?, variable(KEY_VARIABLE)?);
     Some(ServerTls { cert, key, client_ca: variable(CA_VARIABLE)? })
 }
 
-/// Files of this process that were read again, and are not in use yet.
-#[must_use = "nothing changes before it is taken over"]
-#[derive(Debug)]
-pub struct Renewed {
-    server: Option<(LiveServerTls, ServerConfig)>,
-    client: Option<ClientTls>,
+fn variable(name: &str) -> Option<PathBuf> {
+    std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from)
 }
 
-/// Reads the files of a server, where it has loaded them, and those of the clients of this process again.
+/// Files of a server and of a client that were read again, and are not in use yet.
+#[must_use = "nothing changes before it is taken over"]
+pub struct Renewed {
+    server: Option<(LiveServerTls, ServerConfig)>,
+    client: Option<(Arc<LiveClientTls>, ClientConfig)>,
+}
+
+/// Reads the files of a server, where it has loaded them, and those of `client` again.
 ///
 /// # Errors
 /// [`TlsError`] of the first that cannot be read or holds nothing usable.
-pub fn read_again(server: Option<&LiveServerTls>) -> Result<Renewed, TlsError> {
+pub fn read_again(server: Option<&LiveServerTls>, client: &ClientTls) -> Result<Renewed, TlsError> {
     let server = server.filter(|server| server.current().is_some());
     let server = server.map(|server| Ok((server.clone(), server.files.config()?))).transpose()?;
-    Ok(Renewed { server, client: client().as_ref().map(ClientTls::read_again).transpose()? })
+    let client = client.live.as_ref();
+    let client = client.map(|live| Ok((live.clone(), client_config(&live.authorities, live.shown.as_ref())?)));
+    Ok(Renewed { server, client: client.transpose()? })
 }
 
 impl Renewed {
-    /// Every handshake from now on, of the server and of clients, is with these.
+    /// Every handshake from now on, of the server and of everybody who shares the client's handle, is with these.
     pub fn take_over(self) {
         if let Some((server, config)) = self.server {
             server.replace(config);
         }
-        if let Some(tls) = self.client {
-            *CLIENT.write().unwrap_or_else(PoisonError::into_inner) = Some(tls);
+        if let Some((client, config)) = self.client {
+            client.replace(config);
         }
     }
 }
 
-fn client() -> Option<ClientTls> {
-    CLIENT.read().unwrap_or_else(PoisonError::into_inner).clone()
+impl fmt::Debug for Renewed {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Renewed { server, client } = self;
+        f.debug_struct("Renewed").field("server", &server.is_some()).field("client", &client.is_some()).finish()
+    }
 }
 
 fn provider() -> Arc<CryptoProvider> {

@@ -11,6 +11,7 @@ use ratn_worker::action::{
 use ratn_worker::client::{ActionClient, Channels};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::server::{DRAIN_DEADLINE, Services, Serving, bind};
+use ratn_worker::tls::ClientTls;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
@@ -213,7 +214,7 @@ pub async fn provider_built(
     let services = Services::new().with(server.clone().into_service());
     let serve = bound.serve_as(services, Serving { drain, ..Serving::default() }, shutdown.clone());
     let serving = tokio::spawn(async move { serve.await.unwrap() });
-    let client = ActionClient::new(Channels::new());
+    let client = ActionClient::new(Channels::new(&ClientTls::none()));
     Provider { endpoint, client, server, runs, ended, shutdown, serving, _directory: directory }
 }
 

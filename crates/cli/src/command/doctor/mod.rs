@@ -15,6 +15,7 @@ use crate::output;
 use crate::system::config::SystemConfig;
 use crate::system::public_directory;
 use clap::Args;
+use ratn_worker::tls::ClientTls;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -77,7 +78,7 @@ impl Findings {
 }
 
 /// Examines this machine. Fails where there is a problem; warnings are none.
-pub(super) fn run(arguments: &DoctorArguments) -> Result<(), Failure> {
+pub(super) fn run(arguments: &DoctorArguments, client_tls: &ClientTls) -> Result<(), Failure> {
     let directory = public_directory(arguments.runtime_dir.as_deref());
     let mut findings = Findings::default();
     let of_up = directory.join("system.toml");
@@ -98,7 +99,7 @@ pub(super) fn run(arguments: &DoctorArguments) -> Result<(), Failure> {
     tls::check(&mut findings, &config);
     templates::check(&mut findings, &config.process_manager);
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
-        system::check(&mut findings, &config, &directory).await;
+        system::check(&mut findings, &config, client_tls, &directory).await;
         Ok(())
     })?;
     let count = |level| findings.0.iter().filter(|finding| finding.level == level).count();

@@ -12,6 +12,7 @@ use ratn_storage::etcd::Holder;
 use ratn_worker::client::{Channels, Health, NOT_SERVING, ProcessClient, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::{FindError, RuntimeDirectory};
+use ratn_worker::tls::ClientTls;
 use std::collections::BTreeMap;
 use std::io::ErrorKind;
 use std::net::TcpListener;
@@ -29,7 +30,7 @@ const LARGE_OFFSET_MS: i64 = 5_000;
 /// Those that may stand by for one another.
 const ROLES: [&str; 2] = [resource_manager::ROLE, world_pool::ROLE];
 
-pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, directory: &Path) {
+pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, tls: &ClientTls, directory: &Path) {
     let directory = RuntimeDirectory::at(directory);
     let mut manager = None;
     let kept = [(ROLES[0], &config.resource_manager.storage), (ROLES[1], &config.world_pool.storage)];
@@ -43,22 +44,23 @@ pub(super) async fn check(findings: &mut Findings, config: &SystemConfig, direct
             // One that led and was killed has left its endpoint.
             Ok(endpoint)
                 if leads.is_some_and(|leads| leads.as_ref().is_some_and(|leads| *leads != endpoint.to_string()))
-                    && stands_by(findings, role, &endpoint).await => {}
+                    && stands_by(findings, role, tls, &endpoint).await => {}
             Ok(endpoint) => {
-                let answers = role_answers(findings, role, &endpoint).await;
+                let answers = role_answers(findings, role, tls, &endpoint).await;
                 if answers && role == resource_manager::ROLE {
                     manager = Some(endpoint);
                 }
             }
             // Who stands by publishes no endpoint.
-            Err(FindError::NotPublished { .. }) if leads.is_some() && stands_by(findings, role, &listen).await => {}
+            Err(FindError::NotPublished { .. }) if leads.is_some() && stands_by(findings, role, tls, &listen).await => {
+            }
             Err(FindError::NotPublished { .. }) => free_port(findings, role, &listen),
             Err(error) => findings.problem(role, error.to_string(), "remove the file, and start the role again"),
         }
     }
     let elsewhere = [config.process_manager.resource_manager.clone(), config.cell.resource_manager.clone()];
     if let Some(manager) = manager.or_else(|| elsewhere.into_iter().flatten().next()) {
-        hosts(findings, &manager).await;
+        hosts(findings, &Channels::new(tls), &manager).await;
     }
 }
 
@@ -83,16 +85,16 @@ async fn leader(findings: &mut Findings, role: &'static str, storage: StorageCon
 }
 
 /// Whether somebody answers there who does not lead: says so.
-async fn stands_by(findings: &mut Findings, role: &str, listen: &Endpoint) -> bool {
-    let stands_by = Health::of(listen.clone()).is_serving(PATIENCE).await == Ok(false);
+async fn stands_by(findings: &mut Findings, role: &str, tls: &ClientTls, listen: &Endpoint) -> bool {
+    let stands_by = Health::of(listen.clone(), tls).is_serving(PATIENCE).await == Ok(false);
     if stands_by {
         findings.ok(role, format!("stands by at {listen}"));
     }
     stands_by
 }
 
-async fn role_answers(findings: &mut Findings, role: &str, endpoint: &Endpoint) -> bool {
-    match Health::of(endpoint.clone()).serving(PATIENCE).await {
+async fn role_answers(findings: &mut Findings, role: &str, tls: &ClientTls, endpoint: &Endpoint) -> bool {
+    match Health::of(endpoint.clone(), tls).serving(PATIENCE).await {
         Ok(()) => {
             findings.ok(role, format!("serves at {endpoint}"));
             true
@@ -140,9 +142,8 @@ fn free_port(findings: &mut Findings, role: &str, listen: &Endpoint) {
     }
 }
 
-async fn hosts(findings: &mut Findings, manager: &Endpoint) {
-    let channels = Channels::new();
-    let listed = async { ResourceClient::new(&channels, manager, "")?.list(&[HOST_KIND]).await };
+async fn hosts(findings: &mut Findings, channels: &Channels, manager: &Endpoint) {
+    let listed = async { ResourceClient::new(channels, manager, "")?.list(&[HOST_KIND]).await };
     let hosts = match tokio::time::timeout(PATIENCE, listed).await {
         Ok(Ok(hosts)) => hosts,
         Ok(Err(error)) => {
@@ -159,7 +160,7 @@ async fn hosts(findings: &mut Findings, manager: &Endpoint) {
         findings.warning("hosts", "no process manager has offered its host", help);
     }
     for host in hosts {
-        process_manager(findings, &channels, &host).await;
+        process_manager(findings, channels, &host).await;
     }
 }
 

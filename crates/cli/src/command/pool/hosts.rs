@@ -11,6 +11,7 @@ use ratn_proto::types::HostPools;
 use ratn_worker::client::{CallError, Channels, ProcessClient, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::tls::ClientTls;
 use std::time::Duration;
 
 /// A host that has not answered by then does not count.
@@ -31,8 +32,8 @@ pub(super) struct Answered {
 }
 
 /// All process managers that can be found, in the order of their hosts' names.
-pub(super) async fn find(arguments: &HostArguments) -> Result<Vec<Host>, Failure> {
-    let channels = Channels::new();
+pub(super) async fn find(arguments: &HostArguments, tls: &ClientTls) -> Result<Vec<Host>, Failure> {
+    let channels = Channels::new(tls);
     let host = |name: &str, endpoint: Endpoint| -> Result<Host, Failure> {
         Ok(Host { name: name.to_owned(), client: ProcessClient::new(&channels, &endpoint)?, endpoint })
     };
@@ -93,10 +94,11 @@ pub(super) async fn ask_all(hosts: Vec<Host>) -> Vec<Answered> {
 /// The one that `wanted` is about; refused where it is none or several. `--host` chooses.
 pub(super) async fn the_one(
     arguments: &HostArguments,
+    tls: &ClientTls,
     what: &str,
     wanted: impl Fn(&HostPools) -> bool,
 ) -> Result<Host, Failure> {
-    let answered = ask_all(find(arguments).await?).await;
+    let answered = ask_all(find(arguments, tls).await?).await;
     let silent: Vec<String> = answered.iter().filter_map(Answered::problem).collect();
     let names: Vec<String> = answered.iter().map(|one| one.name().to_owned()).collect();
     let fits = |one: &Answered| {

@@ -11,6 +11,7 @@ use ratn_daemon::process_manager::log_file::{LogReader, log_file};
 use ratn_proto::types::HostPools;
 use ratn_worker::client::{CallError, ProcessClient};
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::tls::ClientTls;
 use std::collections::BTreeSet;
 use std::io::{self, Write};
 use std::path::PathBuf;
@@ -26,9 +27,9 @@ const PIECES: usize = 64;
 const MAX_LINE_BYTES: usize = 65_536;
 
 /// Prints the log of a worker, or of all workers of a template.
-pub(super) async fn print(arguments: &LogsArguments) -> Result<(), Failure> {
+pub(super) async fn print(arguments: &LogsArguments, tls: &ClientTls) -> Result<(), Failure> {
     let name = arguments.name.as_str();
-    let found = match hosts::find(&arguments.host).await {
+    let found = match hosts::find(&arguments.host, tls).await {
         Ok(found) => hosts::ask_all(found).await,
         Err(refused) => return local(arguments)?.ok_or(refused),
     };

@@ -13,6 +13,7 @@ use hosts::Answered;
 use ratn_daemon::resource_manager;
 use ratn_proto::types::{HostPools, Scale};
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::tls::ClientTls;
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -114,13 +115,13 @@ pub(crate) struct DrainArguments {
 }
 
 /// Shows the workers of all hosts; fails where one does not answer.
-pub(super) fn ps(arguments: &HostArguments) -> Result<(), Failure> {
+pub(super) fn ps(arguments: &HostArguments, tls: &ClientTls) -> Result<(), Failure> {
     asking(async {
         let managers = match hosts::resource_manager(arguments) {
-            Some(endpoint) => leader::ask(&endpoint).await,
+            Some(endpoint) => leader::ask(&endpoint, tls).await,
             None => Vec::new(),
         };
-        let found = hosts::find(arguments).await.inspect_err(|_| {
+        let found = hosts::find(arguments, tls).await.inspect_err(|_| {
             if !managers.is_empty() {
                 output::progress(leader::line(resource_manager::ROLE, &managers));
             }
@@ -149,28 +150,28 @@ pub(super) fn ps(arguments: &HostArguments) -> Result<(), Failure> {
 }
 
 /// Prints what workers wrote.
-pub(super) fn logs(arguments: &LogsArguments) -> Result<(), Failure> {
-    asking(logs::print(arguments))
+pub(super) fn logs(arguments: &LogsArguments, tls: &ClientTls) -> Result<(), Failure> {
+    asking(logs::print(arguments, tls))
 }
 
 /// Starts and ends workers, and changes how many there are.
-pub(super) fn run(arguments: &PoolArguments) -> Result<(), Failure> {
+pub(super) fn run(arguments: &PoolArguments, tls: &ClientTls) -> Result<(), Failure> {
     let host = &arguments.host;
     asking(async {
         match &arguments.command {
             PoolCommand::Start { template, count } => {
-                let one = hosts::the_one(host, &format!("template `{template}`"), has(template)).await?;
+                let one = hosts::the_one(host, tls, &format!("template `{template}`"), has(template)).await?;
                 ids(host, &one.client.spawn(template, *count).await.context("not started")?)
             }
             PoolCommand::Stop { workers } => {
                 for id in workers {
-                    let one = hosts::the_one(host, &format!("worker `{id}`"), runs(id)).await?;
+                    let one = hosts::the_one(host, tls, &format!("worker `{id}`"), runs(id)).await?;
                     one.client.stop(id).await.with_context(|| format!("`{id}` is not ended"))?;
                 }
                 ids(host, workers)
             }
             PoolCommand::Scale { template, size } => {
-                let one = hosts::the_one(host, &format!("template `{template}`"), has(template)).await?;
+                let one = hosts::the_one(host, tls, &format!("template `{template}`"), has(template)).await?;
                 let scale = Scale { min: size.min, max: size.max, spares: size.spares };
                 let pool = one.client.scale(template, scale).await?;
                 if host.json {
@@ -183,10 +184,10 @@ pub(super) fn run(arguments: &PoolArguments) -> Result<(), Failure> {
 }
 
 /// Replaces workers.
-pub(super) fn restart(arguments: &RestartArguments) -> Result<(), Failure> {
+pub(super) fn restart(arguments: &RestartArguments, tls: &ClientTls) -> Result<(), Failure> {
     let (name, host) = (arguments.name.as_str(), &arguments.host);
     asking(async {
-        let mut answered = hosts::ask_all(hosts::find(host).await?).await;
+        let mut answered = hosts::ask_all(hosts::find(host, tls).await?).await;
         answered.retain(|one| host.host.as_deref().is_none_or(|wanted| wanted == one.name()));
         let with = |one: &&Answered| one.pools.as_ref().is_ok_and(has(name));
         let mut going = Vec::new();
@@ -196,7 +197,7 @@ pub(super) fn restart(arguments: &RestartArguments) -> Result<(), Failure> {
             going.extend(restarted.with_context(|| format!("`{name}` on {} is not restarted", one.name()))?);
         }
         if on.is_empty() {
-            let one = hosts::the_one(host, &format!("template or worker `{name}`"), runs(name)).await?;
+            let one = hosts::the_one(host, tls, &format!("template or worker `{name}`"), runs(name)).await?;
             going = one.client.restart_worker(name).await.with_context(|| format!("`{name}` is not restarted"))?;
         }
         ids(host, &going)
@@ -204,10 +205,10 @@ pub(super) fn restart(arguments: &RestartArguments) -> Result<(), Failure> {
 }
 
 /// Lets a host take no new work, or take it again.
-pub(super) fn drain(arguments: &DrainArguments) -> Result<(), Failure> {
+pub(super) fn drain(arguments: &DrainArguments, tls: &ClientTls) -> Result<(), Failure> {
     let (name, host) = (arguments.name.as_str(), &arguments.host);
     asking(async {
-        let one = hosts::the_one(host, &format!("host `{name}`"), |pools| pools.host == name).await?;
+        let one = hosts::the_one(host, tls, &format!("host `{name}`"), |pools| pools.host == name).await?;
         let left = one.client.drain(!arguments.undo).await?;
         if host.json {
             return Ok(output::result(json!({ "host": name, "draining": !arguments.undo, "workers": left }))?);

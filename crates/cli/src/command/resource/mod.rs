@@ -24,6 +24,7 @@ use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Session;
+use ratn_worker::tls::ClientTls;
 use ratn_worker::trace::{self, TraceContext};
 use std::time::Duration;
 
@@ -41,7 +42,7 @@ struct Asking {
 }
 
 /// Performs one operation.
-pub(super) fn run(arguments: &ResourceArguments) -> Result<(), Failure> {
+pub(super) fn run(arguments: &ResourceArguments, tls: &ClientTls) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let endpoint = match &arguments.manager {
             Some(endpoint) => endpoint.clone(),
@@ -51,12 +52,12 @@ pub(super) fn run(arguments: &ResourceArguments) -> Result<(), Failure> {
         };
         // A document of JSON is all that a program gets.
         if !arguments.json {
-            let managers = leader::ask(&endpoint).await;
+            let managers = leader::ask(&endpoint, tls).await;
             if !managers.is_empty() {
                 output::progress(leader::line(ROLE, &managers));
             }
         }
-        let channels = Channels::new();
+        let channels = Channels::new(tls);
         let client = ResourceClient::new(&channels, &endpoint, "")?;
         let asking = Asking { channels, endpoint, client, json: arguments.json };
         let performed = trace::within(TraceContext::fresh(), asking.perform(&arguments.command)).await;

@@ -11,6 +11,7 @@ use crate::system::config::SystemConfig;
 use crate::task_control::history::History;
 use crate::task_control::log::LogWriter;
 use crate::task_control::shell::{self, Resumption};
+use ratn_worker::tls::ClientTls;
 use std::path::Path;
 
 /// Goes on with the run that `file` tells of.
@@ -19,6 +20,7 @@ pub(super) async fn run(
     file: &Path,
     task: Option<&Path>,
     directory: &Path,
+    tls: &ClientTls,
     interrupt: &Interrupt,
 ) -> Result<(), Failure> {
     let refused = |reason: &dyn std::fmt::Display| {
@@ -34,7 +36,7 @@ pub(super) async fn run(
     let task = task.map(Path::to_owned).or_else(|| history.task());
     let task = task.ok_or_else(|| refused(&"it does not name its task file: say `ratn run --resume LOG TASK`"))?;
     let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
-    let Some(mut system) = System::find(directory, given).await? else {
+    let Some(mut system) = System::find(directory, given, tls).await? else {
         let place = directory.display();
         return Err(refused(&format_args!(
             "no system runs in {place}: a run goes on where it was, on a system that outlives it (`ratn up`)"

@@ -24,6 +24,7 @@ use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::types::{FactRecord, WorldUpdate};
 use ratn_worker::client::{CallError, Channels, Commit, WorldClient, fresh_id};
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::tls::ClientTls;
 use ratn_worker::trace::{self, TraceContext};
 use ratn_world::query::Query;
 use ratn_world::world::World;
@@ -43,7 +44,7 @@ struct Asking {
 }
 
 /// Performs one operation.
-pub(super) fn run(arguments: &WorldArguments) -> Result<(), Failure> {
+pub(super) fn run(arguments: &WorldArguments, tls: &ClientTls) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let endpoint = match &arguments.pool {
             Some(endpoint) => endpoint.clone(),
@@ -51,7 +52,7 @@ pub(super) fn run(arguments: &WorldArguments) -> Result<(), Failure> {
                 .find(ROLE)
                 .map_err(|error| Failure::Refused(format!("ratn: {error}")))?,
         };
-        let client = WorldClient::new(&Channels::new(), &endpoint)?;
+        let client = WorldClient::new(&Channels::new(tls), &endpoint)?;
         let asking = Asking { client, json: arguments.json };
         let performed = trace::within(TraceContext::fresh(), asking.perform(&arguments.command)).await;
         performed.map_err(unanswered)

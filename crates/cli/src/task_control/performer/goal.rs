@@ -246,6 +246,7 @@ mod tests {
     use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
     use ratn_worker::client::Channels;
     use ratn_worker::server::{Services, bind};
+    use ratn_worker::tls::ClientTls;
     use tokio_util::sync::DropGuard;
 
     /// `work`: is done at once. `hang`: never, unless it is told to stop.
@@ -284,7 +285,7 @@ mod tests {
             let (endpoint, shutdown) = (bound.endpoint().clone(), CancellationToken::new());
             tokio::spawn(bound.serve(Services::new().with(server.clone().into_service()), shutdown.clone()));
             let (events, answers) = mpsc::channel(8);
-            let resources = ResourceClient::new(&Channels::new(), &endpoint, "")?;
+            let resources = ResourceClient::new(&Channels::new(&ClientTls::none()), &endpoint, "")?;
             Ok(Bench { endpoint, server, resources, events, answers, _place: place, _shutdown: shutdown.drop_guard() })
         }
 
@@ -296,7 +297,7 @@ mod tests {
                 source: "worker-1".to_owned(),
                 timeout_s,
                 speed: 10.0,
-                actions: ActionClient::new(Channels::new()),
+                actions: ActionClient::new(Channels::new(&ClientTls::none())),
                 resources: self.resources.clone(),
                 events: self.events.clone(),
                 stop: CancellationToken::new(),

@@ -135,12 +135,12 @@ impl Performer {
         task: &str,
         events: mpsc::Sender<Answer>,
     ) -> anyhow::Result<Performer> {
-        let channels = Channels::new();
+        let channels = Channels::new(&place.tls);
         let run = run.to_owned();
         let manager = &place.endpoints.resource_manager;
         let background = BackgroundRuntime::start("session").context("cannot keep a session alive")?;
         // Over a connection of its own.
-        let open = || Session::open_as(&Channels::new(), manager, run.clone(), "task-control", DEFAULT_TTL);
+        let open = || Session::open_as(&Channels::new(&place.tls), manager, run.clone(), "task-control", DEFAULT_TTL);
         let session = background.enter(open);
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, manager, session.id())?;

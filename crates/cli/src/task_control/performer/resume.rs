@@ -6,10 +6,10 @@
 
 use super::Performer;
 use super::goal::Given;
-use crate::task_control::Endpoints;
 use crate::task_control::ledger::{Confirmed, Ledger};
 use crate::task_control::outside;
 use crate::task_control::record::{Record, commit_next, operate_once, said};
+use crate::task_control::shell::Place;
 use anyhow::bail;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
@@ -22,8 +22,8 @@ use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Refuses a world that is not the run's. Changes nothing.
-pub(in crate::task_control) async fn check_world(endpoints: &Endpoints, ledger: &Ledger) -> anyhow::Result<()> {
-    let world = WorldClient::new(&Channels::new(), &endpoints.world_pool)?;
+pub(in crate::task_control) async fn check_world(place: &Place, ledger: &Ledger) -> anyhow::Result<()> {
+    let world = WorldClient::new(&Channels::new(&place.tls), &place.endpoints.world_pool)?;
     let (root, _) = retry_unanswered(|| world.root()).await?;
     if root < ledger.first_revision {
         bail!(
@@ -36,11 +36,11 @@ pub(in crate::task_control) async fn check_world(endpoints: &Endpoints, ledger: 
 }
 
 /// Whether the world pool needs no commit that the ledger has forgotten. Where it does, the run has to be resumed from its whole log.
-pub(in crate::task_control) async fn remembers(endpoints: &Endpoints, ledger: &Ledger) -> anyhow::Result<bool> {
+pub(in crate::task_control) async fn remembers(place: &Place, ledger: &Ledger) -> anyhow::Result<bool> {
     if ledger.forgotten == 0 {
         return Ok(true);
     }
-    let world = WorldClient::new(&Channels::new(), &endpoints.world_pool)?;
+    let world = WorldClient::new(&Channels::new(&place.tls), &place.endpoints.world_pool)?;
     let (root, _) = retry_unanswered(|| world.root()).await?;
     Ok(youngest_there(&world, ledger, root).await?.0.is_some())
 }

@@ -13,6 +13,7 @@ use ratn_model::resource::ResourceOperation;
 use ratn_model::time::Timestamp;
 use ratn_worker::client::fresh_id;
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::tls::ClientTls;
 use ratn_world::world::World;
 use tokio_util::sync::DropGuard;
 
@@ -26,13 +27,17 @@ async fn connect_as(
     task: &str,
     events: mpsc::Sender<Answer>,
 ) -> anyhow::Result<Performer> {
-    let place = Place {
+    Performer::connect(&place_of(endpoints), run, task, events).await
+}
+
+fn place_of(endpoints: &Endpoints) -> Place {
+    Place {
         endpoints: endpoints.clone(),
+        tls: ClientTls::none(),
         directory: std::path::PathBuf::new(),
         catalogue: Arc::default(),
         speed: 1.0,
-    };
-    Performer::connect(&place, run, task, events).await
+    }
 }
 
 fn arm() -> Vec<Requirement> {
@@ -63,7 +68,7 @@ impl Bench {
         };
         let (events, answers) = mpsc::channel(8);
         let performer = connect(&endpoints, "task", events).await?;
-        let channels = Channels::new();
+        let channels = Channels::new(&ClientTls::none());
         let robot = Session::open(&channels, &endpoints.resource_manager, "robot", DEFAULT_TTL);
         robot.alive(SESSION_DEADLINE).await?;
         let offering = ResourceClient::new(&channels, &endpoints.resource_manager, robot.id())?;
@@ -317,7 +322,7 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     let open = ledger(&run, &[commit]);
     let mut mirror = World::default();
     mirror.apply(&done())?;
-    check_world(&bench.endpoints, &open).await?;
+    check_world(&place_of(&bench.endpoints), &open).await?;
     assert_eq!(bench.performer.take_up(open.clone(), &mirror).await?, None);
     let (revision, facts) = bench.performer.root().await?;
     assert_eq!((revision, facts.len()), (Revision(1), 1));
@@ -326,13 +331,13 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     let fact = FactKey { predicate: "other".to_owned(), arguments: Vec::new() };
     let changes = vec![Change::Set { fact: fact.clone(), value: Value::Int(1) }];
     bench.performer.world.commit("other/1/2", changes, None).await?;
-    check_world(&bench.endpoints, &open).await?;
+    check_world(&place_of(&bench.endpoints), &open).await?;
     let changed = bench.performer.take_up(open.clone(), &mirror).await?;
     let facts = vec![(fact, Some(Value::Int(1)))];
     assert_eq!(changed, Some(Event::WorldChanged { revision: Revision(2), facts }));
     // A pool that began anew.
     let later = Ledger { first_revision: Revision(9), ..open };
-    let refused = check_world(&bench.endpoints, &later).await;
+    let refused = check_world(&place_of(&bench.endpoints), &later).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("lost its state")));
     bench.performer.close().await
 }
@@ -352,8 +357,8 @@ async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() ->
     // A checkpoint without the first commit, and a pool that has lost both.
     let mut short = ledger(&run, &[commit(2)]);
     short.forgotten = 1;
-    assert!(remembers(&bench.endpoints, &whole).await?);
-    assert!(!remembers(&bench.endpoints, &short).await?);
+    assert!(remembers(&place_of(&bench.endpoints), &whole).await?);
+    assert!(!remembers(&place_of(&bench.endpoints), &short).await?);
     let mut mirror = World::default();
     mirror.apply(&done())?;
     let refused = bench.performer.take_up(short.clone(), &mirror).await;
@@ -362,7 +367,7 @@ async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() ->
     // With the whole log it has both, and the checkpoint is enough from then on.
     assert_eq!(bench.performer.take_up(whole, &mirror).await?, None);
     assert_eq!(bench.performer.confirmed().commit, Revision(2));
-    assert!(remembers(&bench.endpoints, &short).await?);
+    assert!(remembers(&place_of(&bench.endpoints), &short).await?);
     assert_eq!(bench.performer.take_up(short, &mirror).await?, None);
     assert_eq!(bench.performer.root().await?.0, Revision(2));
     bench.performer.close().await

@@ -74,8 +74,8 @@ impl Resumption {
 /// under way.
 pub(crate) async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
     let ledger = &resumption.replayed.standing.ledger;
-    performer::check_world(&place.endpoints, ledger).await?;
-    if !performer::remembers(&place.endpoints, ledger).await? {
+    performer::check_world(place, ledger).await?;
+    if !performer::remembers(place, ledger).await? {
         resumption.history.say(&"the world pool has lost commits that are older");
         resumption = resumption.whole()?;
     }

@@ -47,8 +47,13 @@ impl Bench {
             quiet: true,
             checkpoint_every: 0,
         };
-        let place =
-            Place { endpoints, directory: directory.path().to_owned(), catalogue: Arc::new(catalogue), speed: 10.0 };
+        let place = Place {
+            endpoints,
+            tls: ratn_worker::tls::ClientTls::none(),
+            directory: directory.path().to_owned(),
+            catalogue: Arc::new(catalogue),
+            speed: 10.0,
+        };
         Ok(Bench { place, run, directory, _shutdown: shutdown.drop_guard() })
     }
 
