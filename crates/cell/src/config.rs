@@ -96,6 +96,8 @@ pub struct CellConfig {
     pub camera: CameraConfig,
     /// The battery.
     pub battery: BatteryConfig,
+    /// How wrong the robot is about itself.
+    pub errors: ErrorsConfig,
 }
 
 /// What drives arm and base along their trajectories. The stiffer, the less they lag.
@@ -148,6 +150,25 @@ pub struct CameraConfig {
     pub noise: Noise,
 }
 
+/// How wrong the robot is about itself: standard deviations of normal distributions, drawn from the seed. docs/cell.md says what real robots
+/// have.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ErrorsConfig {
+    /// Of the zero of each of the arm's encoders, in radians.
+    pub encoder_rad: f64,
+    /// Of the amplitude of what each of them reads too much once a turn, in radians.
+    pub encoder_wave_rad: f64,
+    /// Of the camera's place on the head along each axis, in metres.
+    pub camera_m: f64,
+    /// Of its direction about each axis, in radians.
+    pub camera_rad: f64,
+    /// Of where the base believes to stand along each axis, in metres; drawn anew at every stop.
+    pub localisation_m: f64,
+    /// Of its heading, in radians; drawn anew at every stop.
+    pub localisation_rad: f64,
+}
+
 /// The battery.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -177,6 +198,42 @@ impl Setting {
     /// The setting of that name.
     pub fn named(name: &str) -> Option<Setting> {
         Setting::ALL.into_iter().find(|setting| setting.name() == name)
+    }
+}
+
+impl ErrorsConfig {
+    /// None at all.
+    pub const NONE: ErrorsConfig = ErrorsConfig {
+        encoder_rad: 0.0,
+        encoder_wave_rad: 0.0,
+        camera_m: 0.0,
+        camera_rad: 0.0,
+        localisation_m: 0.0,
+        localisation_rad: 0.0,
+    };
+    /// Of a robot that is calibrated with care.
+    pub const REALISTIC: ErrorsConfig = ErrorsConfig {
+        encoder_rad: 2e-4,
+        encoder_wave_rad: 2e-4,
+        camera_m: 0.001,
+        camera_rad: 0.00175,
+        localisation_m: 0.005,
+        localisation_rad: 0.00524,
+    };
+    /// Of a robot that is calibrated once and used for long.
+    pub const ROUGH: ErrorsConfig = ErrorsConfig {
+        encoder_rad: 5e-4,
+        encoder_wave_rad: 5e-4,
+        camera_m: 0.003,
+        camera_rad: 0.00524,
+        localisation_m: 0.01,
+        localisation_rad: 0.00873,
+    };
+
+    /// The covariance of the camera's pose as it is told: place and a small turn, along and about the axes of its optical frame, in metres² and
+    /// radians².
+    pub fn camera_covariance(&self) -> [f64; 6] {
+        std::array::from_fn(|i| if i < 3 { self.camera_m } else { self.camera_rad }.powi(2))
     }
 }
 
@@ -333,6 +390,32 @@ impl CellConfig {
                 (0.0..1.0).contains(&self.camera.noise.projector_m),
                 "0 to 1",
             ),
+            (
+                "errors.encoder_rad",
+                self.errors.encoder_rad,
+                (0.0..=0.01).contains(&self.errors.encoder_rad),
+                "0 to 0.01",
+            ),
+            (
+                "errors.encoder_wave_rad",
+                self.errors.encoder_wave_rad,
+                (0.0..=0.01).contains(&self.errors.encoder_wave_rad),
+                "0 to 0.01",
+            ),
+            ("errors.camera_m", self.errors.camera_m, (0.0..=0.05).contains(&self.errors.camera_m), "0 to 0.05"),
+            ("errors.camera_rad", self.errors.camera_rad, (0.0..=0.05).contains(&self.errors.camera_rad), "0 to 0.05"),
+            (
+                "errors.localisation_m",
+                self.errors.localisation_m,
+                (0.0..=0.1).contains(&self.errors.localisation_m),
+                "0 to 0.1",
+            ),
+            (
+                "errors.localisation_rad",
+                self.errors.localisation_rad,
+                (0.0..=0.1).contains(&self.errors.localisation_rad),
+                "0 to 0.1",
+            ),
             ("battery.level", self.battery.level, (0.0..=1.0).contains(&self.battery.level), "0 to 1"),
             ("battery.idle_per_hour", self.battery.idle_per_hour, self.battery.idle_per_hour >= 0.0, "0 or more"),
             ("battery.motion_per_hour", self.battery.motion_per_hour, self.battery.motion_per_hour >= 0.0, "0 or more"),
@@ -374,6 +457,7 @@ impl Default for CellConfig {
             pan_tilt: PanTiltConfig::default(),
             camera: CameraConfig::default(),
             battery: BatteryConfig::default(),
+            errors: ErrorsConfig::default(),
         }
     }
 }
@@ -399,6 +483,12 @@ impl Default for PanTiltConfig {
 impl Default for CameraConfig {
     fn default() -> CameraConfig {
         CameraConfig { frames_per_s: 10.0, intrinsics: Intrinsics::DEFAULT, noise: Noise::DEFAULT }
+    }
+}
+
+impl Default for ErrorsConfig {
+    fn default() -> ErrorsConfig {
+        ErrorsConfig::NONE
     }
 }
 

@@ -98,14 +98,20 @@ fn the_arm_grasps_from_wherever_the_base_stands() {
 }
 
 #[test]
-fn a_way_through_the_table_or_from_elsewhere_is_refused_with_the_reason() {
+fn a_way_through_the_table_is_driven_and_judged() {
     let mut bench = Bench::new(1, 7);
     stow(&mut bench);
     let empty = Scene { base: Pose::IDENTITY, objects: vec![] };
     let through = way(&bench, &empty, [1.2, 0.0, 0.0]);
-    let refused = bench.perform(Request::Drive { trajectory: through });
-    assert!(matches!(&refused, Ending::Aborted(r) if r.contains("inside") && r.contains("table")), "{refused:?}");
+    bench.done(Request::Drive { trajectory: through });
+    let touched = bench.cell.unintended_contacts();
+    assert!(touched.iter().any(|c| c.bodies.contains(&"table".to_owned())), "{touched:?}");
+}
 
+#[test]
+fn a_way_from_elsewhere_is_refused_with_the_reason() {
+    let mut bench = Bench::new(1, 7);
+    stow(&mut bench);
     let request = drive(&bench, [-1.0, 0.0, 0.0]);
     bench.done(request.clone());
     let refused = bench.perform(request);

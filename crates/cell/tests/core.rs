@@ -2,7 +2,8 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test may panic and print")]
 
-use ratn_cell::config::{CellConfig, ControllersConfig, Goods};
+use ratn_cell::config::{CellConfig, ControllersConfig, ErrorsConfig, Goods};
+use ratn_cell::core::objects::TrueObject;
 use ratn_cell::core::picture::develop;
 use ratn_cell::core::protocol::{Command, Ending, Event, Module, Product, Request, Ticket};
 use ratn_cell::core::recording::Line;
@@ -11,6 +12,7 @@ use ratn_model::value::{Trajectory, TrajectoryPoint};
 use ratn_motion::aimm;
 use ratn_motion::collision::{PADDING_M, distance};
 use ratn_motion::plan::Goal;
+use ratn_perception::calibration::{Calibration, Surface};
 use ratn_perception::camera::Camera;
 use ratn_perception::detection::{ObjectClass, Prior, Region, locate, segment};
 use ratn_worker::safety::SafetyState;
@@ -83,14 +85,23 @@ fn a_box_let_go_in_the_air_is_not_delivered() {
 }
 
 #[test]
-fn a_trajectory_that_collides_or_starts_elsewhere_is_refused_with_the_reason() {
+fn a_trajectory_through_the_table_is_followed_and_judged() {
     let mut bench = Bench::new(1, 7);
     let table = Pose::from_rpy([0.62, -0.45, 0.66], PI, 0.0, 0.0);
     let empty = Scene { base: Pose::IDENTITY, objects: vec![] };
     let through_the_table = bench.plan(&empty, vec![Goal::Pose(table)], 0.0, 0.0);
-    let refused = bench.perform(Request::Follow { trajectory: through_the_table });
-    assert!(matches!(&refused, Ending::Aborted(reason) if reason.contains("table")), "{refused:?}");
+    bench.done(Request::Follow { trajectory: through_the_table });
+    let touched = bench.cell.unintended_contacts();
+    let hit = |link: &str| touched.iter().any(|c| c.bodies == [link.to_owned(), "table".to_owned()]);
+    assert!(hit("finger_left") && hit("finger_right"), "controllers do not know of the table: {touched:?}");
+}
 
+#[test]
+fn a_trajectory_that_is_too_fast_or_starts_elsewhere_or_meets_the_robot_itself_is_refused_with_the_reason() {
+    let mut bench = Bench::new(1, 7);
+    let into_itself = Request::MoveTo { joints: [0.0, -2.0, 0.0, 2.6, 0.0, 0.0, 0.0], speed: 0.3 };
+    let refused = bench.perform(into_itself);
+    assert!(matches!(&refused, Ending::Aborted(reason) if reason.contains("the trajectory is refused")), "{refused:?}");
     let from_home = bench.plan(&bench.cell.scene(), vec![Goal::Joints(aimm::OBSERVATION)], 0.0, 0.0);
     let mut too_fast = from_home.clone();
     for point in &mut too_fast.points {
@@ -207,76 +218,116 @@ fn look<T>(bench: &mut Bench, frames: u32, detect: impl Fn(&ratn_perception::cam
     detect(&image, &camera)
 }
 
-/// The whole job by belief only: look, then for each box locate, plan in the believed scene, grasp, place, retreat.
+/// The whole job by belief only: look, then for each box locate, plan in the believed scene, grasp, place, retreat. The worst error of a located
+/// box, in metres.
+fn fetch(bench: &mut Bench, boxes: usize) -> Result<f64, String> {
+    let mut worst: f64 = 0.0;
+    let calibration: Calibration = bench.cell.config().errors.camera_covariance();
+    let on_table = Surface { height_m: aimm::TABLE_HEIGHT_M, sigma_m: 0.001, sigma_rad: 0.002 };
+    let table = Region { pose: Pose::at(0.80, 0.0, 0.70), size: [0.60, 1.20] };
+    perform(bench, Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 })?;
+    perform(bench, Request::LookAt { target: [0.80, 0.0, 0.70] })?;
+    let found = look(bench, 60, |image, camera| {
+        let found = segment(image, camera, &table, &[ObjectClass::Box], &[]).unwrap().into_iter();
+        found.map(|b| b.with_calibration(camera, &calibration).standing_on(&on_table)).collect::<Vec<_>>()
+    });
+    if found.len() != boxes {
+        return Err(format!("{} of {boxes} boxes are seen", found.len()));
+    }
+    let [x, y, z] = aimm::TABLE_CENTRE;
+    let object =
+        |name: String, size, pose| SceneObject { name, shape: Shape::Box { size }, placement: Placement::World(pose) };
+    let mut believed =
+        Scene { base: Pose::IDENTITY, objects: vec![object("table".into(), aimm::TABLE_SIZE, Pose::at(x, y, z))] };
+    for (i, b) in found.iter().enumerate() {
+        believed.objects.push(object(format!("box_{}", i + 1), b.model.size(), b.pose));
+    }
+    for (i, seen) in found.iter().enumerate() {
+        let prior = Prior { pose: seen.pose, size: seen.model.size() };
+        let located = look(bench, 8, |image, camera| {
+            let located = locate(image, camera, &prior, &[ObjectClass::Box], &[]).unwrap();
+            located.map(|b| b.with_calibration(camera, &calibration).standing_on(&on_table))
+        });
+        let b = located.ok_or_else(|| format!("box {i} is not located"))?;
+        let size = b.model.size();
+        // As seen from where the robot believes to stand.
+        let stands = bench.cell.base_pose().inverse();
+        let off = |t: &TrueObject| stands.compose(&t.pose).distance(&b.pose);
+        worst = worst.max(bench.cell.ground_truth().iter().map(off).fold(f64::INFINITY, f64::min));
+        let goals = aimm::grasp_poses(&b.pose, size).map(Goal::Pose).to_vec();
+        let approach = bench.try_plan(&believed, goals, 0.0, 0.10)?;
+        perform(bench, Request::Follow { trajectory: approach })?;
+        let tool = bench.cell.robot().tool_pose(&bench.cell.measured());
+        let expected = Some(tool.inverse().compose(&b.pose));
+        let grasped = perform(bench, Request::Grasp { object: format!("box_{}", i + 1), expected })?;
+        let Product::Grasped { in_gripper: Some(in_tool), .. } = grasped else { panic!() };
+        believed.objects[i + 1].placement = Placement::Gripper(in_tool);
+        let slot = aimm::slots()[i].compose(&Pose::at(0.0, 0.0, size[2] / 2.0 + 0.003));
+        let half_turn = slot.compose(&Pose::from_rpy([0.0; 3], 0.0, 0.0, PI));
+        let goals = [slot, half_turn].map(|s| Goal::Pose(s.compose(&in_tool.inverse()))).to_vec();
+        let transfer = bench.try_plan(&believed, goals, 0.10, 0.10)?;
+        perform(bench, Request::Follow { trajectory: transfer })?;
+        perform(bench, Request::Release)?;
+        believed.objects[i + 1].placement = Placement::World(slot);
+        let retract = bench.try_plan(&believed, vec![Goal::Joints(aimm::OBSERVATION)], 0.10, 0.0)?;
+        perform(bench, Request::Follow { trajectory: retract })?;
+    }
+    let astray: Vec<_> = bench.cell.ground_truth().into_iter().filter(|b| !b.on_base).collect();
+    if !astray.is_empty() {
+        return Err(format!("not delivered: {astray:?}"));
+    }
+    if let Some(contact) = bench.cell.unintended_contacts().first() {
+        return Err(contact.to_string());
+    }
+    let stow = bench.try_plan(&believed, vec![Goal::Joints(aimm::STOWED)], 0.0, 0.0)?;
+    perform(bench, Request::Follow { trajectory: stow })?;
+    perform(bench, Request::LookAt { target: [-0.37, 0.0, 0.60] })?;
+    let deck = Region { pose: Pose::at(-0.37, 0.0, 0.60), size: [0.44, 0.58] };
+    let on_deck = look(bench, 60, |image, camera| segment(image, camera, &deck, &[ObjectClass::Box], &[])).unwrap();
+    if on_deck.len() != boxes {
+        return Err(format!("{} of {boxes} boxes are seen on the deck", on_deck.len()));
+    }
+    Ok(worst)
+}
+
+fn perform(bench: &mut Bench, request: Request) -> Result<Product, String> {
+    match bench.perform(request) {
+        Ending::Done(product) => Ok(product),
+        other => Err(format!("{other:?}")),
+    }
+}
+
 #[test]
 fn believing_only_what_the_camera_sees_the_robot_delivers_every_box() {
     let mut worst: f64 = 0.0;
     let twenty = (0..20).map(|i| (1 + i % 3, 100 + i as u64));
     for (boxes, seed) in [(1, 1), (2, 2), (3, 3), (3, 1), (5, 5), (9, 1), (9, 9)].into_iter().chain(twenty) {
-        let mut bench = Bench::new(boxes, seed);
-        bench.done(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
-        bench.done(Request::LookAt { target: [0.80, 0.0, 0.70] });
-        let table = Region { pose: Pose::at(0.80, 0.0, 0.70), size: [0.60, 1.20] };
-        let found =
-            look(&mut bench, 60, |image, camera| segment(image, camera, &table, &[ObjectClass::Box], &[])).unwrap();
-        assert_eq!(found.len(), boxes, "seed {seed}");
-        let [x, y, z] = aimm::TABLE_CENTRE;
-        let object = |name: String, size, pose| SceneObject {
-            name,
-            shape: Shape::Box { size },
-            placement: Placement::World(pose),
-        };
-        let mut believed =
-            Scene { base: Pose::IDENTITY, objects: vec![object("table".into(), aimm::TABLE_SIZE, Pose::at(x, y, z))] };
-        for (i, b) in found.iter().enumerate() {
-            believed.objects.push(object(format!("box_{}", i + 1), b.model.size(), b.pose));
-        }
-        for (i, seen) in found.iter().enumerate() {
-            let prior = Prior { pose: seen.pose, size: seen.model.size() };
-            let located = look(&mut bench, 8, |image, camera| locate(image, camera, &prior, &[ObjectClass::Box], &[]));
-            let (b, size) = located.unwrap().map(|b| (b, b.model.size())).unwrap();
-            let truths = bench.cell.ground_truth();
-            let error = truths.iter().map(|t| t.pose.distance(&b.pose)).fold(f64::INFINITY, f64::min);
-            worst = worst.max(error);
-            let goals = aimm::grasp_poses(&b.pose, size).map(Goal::Pose).to_vec();
-            let approach = bench.plan(&believed, goals, 0.0, 0.10);
-            bench.done(Request::Follow { trajectory: approach });
-            let tool = bench.cell.robot().tool_pose(&bench.cell.configuration());
-            let in_tool = tool.inverse().compose(&b.pose);
-            let Product::Grasped { in_gripper: Some(measured), .. } =
-                bench.done(Request::Grasp { object: format!("box_{}", i + 1), expected: Some(in_tool) })
-            else {
-                panic!()
-            };
-            assert!(measured.distance(&in_tool) < 0.015 && measured.angle(&in_tool) < 0.09, "seed {seed} box {i}");
-            believed.objects[i + 1].placement = Placement::Gripper(in_tool);
-            let slot = aimm::slots()[i].compose(&Pose::at(0.0, 0.0, size[2] / 2.0 + 0.003));
-            let half_turn = slot.compose(&Pose::from_rpy([0.0; 3], 0.0, 0.0, PI));
-            let goals = [slot, half_turn].map(|s| Goal::Pose(s.compose(&in_tool.inverse()))).to_vec();
-            let transfer = bench.plan(&believed, goals, 0.10, 0.10);
-            bench.done(Request::Follow { trajectory: transfer });
-            bench.done(Request::Release);
-            believed.objects[i + 1].placement = Placement::World(slot);
-            let retract = bench.plan(&believed, vec![Goal::Joints(aimm::OBSERVATION)], 0.10, 0.0);
-            bench.done(Request::Follow { trajectory: retract });
-        }
-        let truth = bench.cell.ground_truth();
-        assert!(truth.iter().all(|b| b.on_base), "seed {seed}: {truth:#?}");
-        assert_eq!(bench.cell.unintended_contacts(), [], "seed {seed}");
-        let stow = bench.plan(&believed, vec![Goal::Joints(aimm::STOWED)], 0.0, 0.0);
-        bench.done(Request::Follow { trajectory: stow });
-        bench.done(Request::LookAt { target: [-0.37, 0.0, 0.60] });
-        let deck = Region { pose: Pose::at(-0.37, 0.0, 0.60), size: [0.44, 0.58] };
-        let on_deck =
-            look(&mut bench, 60, |image, camera| segment(image, camera, &deck, &[ObjectClass::Box], &[])).unwrap();
-        println!("{boxes} boxes, seed {seed}: {:.0} s, {} seen on the deck", bench.now.seconds(), on_deck.len());
-        assert_eq!(on_deck.len(), boxes, "seed {seed}: {on_deck:#?}");
+        let mut bench = Bench::of(CellConfig { boxes, seed, errors: ErrorsConfig::NONE, ..CellConfig::default() });
+        worst = worst.max(fetch(&mut bench, boxes).unwrap_or_else(|why| panic!("{boxes} boxes, seed {seed}: {why}")));
     }
     println!(
         "worst position error of a located box: {:.1} mm (the planner keeps {:.0} mm)",
         worst * 1e3,
         PADDING_M * 1e3
     );
+}
+
+/// How often the job is done with what encoders, calibration and localisation are off. `SEEDS=100` measures more of them.
+#[test]
+fn a_robot_that_is_a_little_wrong_about_itself_delivers_every_box() {
+    let seeds: u64 = std::env::var("SEEDS").ok().and_then(|n| n.parse().ok()).unwrap_or(4);
+    for (name, errors, needed) in [("realistic", ErrorsConfig::REALISTIC, 1.0), ("rough", ErrorsConfig::ROUGH, 0.0)] {
+        let (mut done, mut worst) = (0, 0.0_f64);
+        for seed in 1..=seeds {
+            let mut bench = Bench::of(CellConfig { boxes: 3, seed, errors, ..CellConfig::default() });
+            match fetch(&mut bench, 3) {
+                Ok(off) => (done, worst) = (done + 1, worst.max(off)),
+                Err(why) => println!("{name}, seed {seed}: {why}"),
+            }
+        }
+        println!("{name}: {done} of {seeds} done; a located box is off by {:.1} mm at the most", worst * 1e3);
+        assert!(done as f64 >= needed * seeds as f64, "{name}: {done} of {seeds}");
+    }
 }
 
 #[test]

@@ -7,6 +7,7 @@
 //! robot's own body ([`mask`]) and a rough idea of where to look; ground truth never enters. [`picture`] and [`photograph`] make PNG files to
 //! look at, [`trial`] random tables to measure by. Everything is a pure function of its arguments, seeds included.
 
+pub mod calibration;
 pub mod camera;
 pub mod detection;
 pub mod mask;

@@ -13,6 +13,7 @@ use facts::Facts;
 use pictures::Pictures;
 use ratn_model::value::Value;
 use ratn_motion::robot::{Configuration, Robot};
+use ratn_perception::calibration::{Calibration, Surface};
 use ratn_perception::camera::{Camera, DepthImage, Intrinsics};
 use ratn_perception::detection::{Detection, DetectionError, ObjectClass, Prior, Region, locate, segment};
 use ratn_perception::mask::Ball;
@@ -26,6 +27,9 @@ use std::sync::Arc;
 const SEGMENT_FRAMES: i64 = 60;
 /// Frames of a picture in which one known object is looked for.
 const LOCATE_FRAMES: i64 = 8;
+/// How well a surface is known whose height a goal gives, and how level it is: as furniture and a floor are.
+const SURFACE_SIGMA_M: f64 = 0.001;
+const SURFACE_SIGMA_RAD: f64 = 0.002;
 /// Postures of the robot in one picture at the most.
 const MAX_POSTURES: usize = 64;
 
@@ -63,6 +67,7 @@ struct Seen {
     image: DepthImage,
     camera: Camera,
     body: Vec<Ball>,
+    calibration: Calibration,
 }
 
 #[tonic::async_trait]
@@ -88,7 +93,11 @@ impl Action for Segment {
         };
         let region = Region { pose, size: [x.float()?, y.float()?] };
         let (classes, facts) = (classes(&goal)?, Facts::of(&goal)?);
-        let all = move |seen: &Seen| segment(&seen.image, &seen.camera, &region, &classes, &seen.body);
+        let surface = surface(&goal)?;
+        let all = move |seen: &Seen| {
+            let found = segment(&seen.image, &seen.camera, &region, &classes, &seen.body)?;
+            Ok(found.into_iter().map(|object| seen.in_the_world(object, surface.as_ref())).collect())
+        };
         let found = self.0.find(&goal, SEGMENT_FRAMES, all).await?;
         let first = goal.optional_int("first")?.unwrap_or(1);
         goal.progress(format!("{} objects", found.len()));
@@ -125,9 +134,10 @@ impl Action for Locate {
         let prior = Prior { pose: object.field("pose").pose()?, size: object.field("size").vector3()? };
         let id = object.field("id").string()?.to_owned();
         let (classes, facts) = (classes(&goal)?, Facts::of(&goal)?);
+        let surface = surface(&goal)?;
         let one = move |seen: &Seen| {
             let found = locate(&seen.image, &seen.camera, &prior, &classes, &seen.body)?;
-            Ok(found.into_iter().collect())
+            Ok(found.into_iter().map(|object| seen.in_the_world(object, surface.as_ref())).collect())
         };
         let found = self.0.find(&goal, LOCATE_FRAMES, one).await?.pop().ok_or_else(|| {
             let [x, y, z] = prior.pose.position;
@@ -175,8 +185,33 @@ impl Eyes {
         let image = DepthImage::from_bytes(intrinsics.width, intrinsics.height, output("image").bytes()?)?;
         let postures = output("robot").list()?.iter().take(MAX_POSTURES).map(posture).collect::<Result<Vec<_>, _>>()?;
         let body = body::balls(&self.robot, &postures);
-        Ok(Seen { image, camera: Camera { intrinsics, pose: output("camera").pose()? }, body })
+        let calibration = calibration(output("camera_covariance").optional())?;
+        Ok(Seen { image, camera: Camera { intrinsics, pose: output("camera").pose()? }, body, calibration })
     }
+}
+
+impl Seen {
+    /// What was found relative to the camera's pose as given, with what is known of that pose and of the surface.
+    fn in_the_world(&self, object: Detection, surface: Option<&Surface>) -> Detection {
+        let object = object.with_calibration(&self.camera, &self.calibration);
+        surface.map_or(object, |surface| object.standing_on(surface))
+    }
+}
+
+/// The variances of the camera's pose, along and about the axes of its optical frame; none of a camera that does not say.
+fn calibration(port: Option<Port>) -> Result<Calibration, ActionFailure> {
+    let Some(port) = port else { return Ok([0.0; 6]) };
+    let variances = port.list()?.iter().map(|entry| entry.float()).collect::<Result<Vec<_>, _>>()?;
+    match Calibration::try_from(variances) {
+        Ok(variances) if variances.iter().all(|variance| *variance >= 0.0) => Ok(variances),
+        _ => Err(ActionFailure::aborted("the camera's covariance is none: expected six variances of 0 or more")),
+    }
+}
+
+/// How high what is looked at stands, where the goal knows.
+fn surface(goal: &GoalContext) -> Result<Option<Surface>, ActionFailure> {
+    let Some(height_m) = goal.optional_float("surface_m")? else { return Ok(None) };
+    Ok(Some(Surface { height_m, sigma_m: SURFACE_SIGMA_M, sigma_rad: SURFACE_SIGMA_RAD }))
 }
 
 fn posture(port: &Port) -> Result<Configuration, ActionFailure> {

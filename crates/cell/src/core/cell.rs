@@ -14,6 +14,7 @@ use super::braking::{Braking, EMERGENCY, MotionClock, Way};
 use super::contacts::{Contact, Contacts};
 use super::deviations::LOST;
 use super::environment::Environment;
+use super::errors::Errors;
 use super::faults::Faults;
 use super::grasping::Pads;
 use super::holding::Held;
@@ -42,7 +43,11 @@ pub struct Cell {
     pub(super) motion_time: Timestamp,
     pub(super) clock: MotionClock,
     pub(super) safety: SafetyState,
+    /// Where the joints that do not move are, as their encoders and the localisation have it.
     pub(super) resting: Configuration,
+    pub(super) errors: Errors,
+    /// How often the base has come to a stop.
+    pub(super) stops: u64,
     pub(super) activities: BTreeMap<Module, Activity>,
     /// What is coming to rest.
     pub(super) braking: BTreeMap<Module, Braking>,
@@ -80,7 +85,8 @@ impl Cell {
         let pads = Pads::of(&robot).expect("the gripper of the built-in robot has two fingers");
         let objects = placement::objects(&robot, config.scene, config.goods(), config.seed)?;
         let resting = first_posture(&config);
-        let (environment, ids) = environment(&robot, &resting, config.scene, &objects);
+        let errors = Errors::new(config.errors, config.seed, 0);
+        let (environment, ids) = environment(&robot, &errors.truth(&resting), config.scene, &objects);
         let now = Timestamp::default();
         Ok(Cell {
             pads,
@@ -89,6 +95,8 @@ impl Cell {
             clock: MotionClock::new(now),
             safety: SafetyState::Ready,
             resting,
+            errors,
+            stops: 0,
             activities: BTreeMap::new(),
             braking: BTreeMap::new(),
             environment,
@@ -160,8 +168,13 @@ impl Cell {
         self.braking.is_empty() && (self.clock.goes_on() || self.clock.stands(self.now))
     }
 
-    /// Where the joints are.
+    /// Where the joints truly are, and the base with them.
     pub fn configuration(&self) -> Configuration {
+        self.errors.truth(&self.measured())
+    }
+
+    /// Where the robot has them: the arm by its encoders, the base by its localisation.
+    pub fn measured(&self) -> Configuration {
         let mut configuration = self.resting;
         for activity in self.activities.values() {
             configuration.base = activity.base(self.motion_time).unwrap_or(configuration.base);
@@ -174,10 +187,14 @@ impl Cell {
         configuration
     }
 
-    /// Where the base stands, in the world frame.
+    /// Where the base truly stands, in the world frame.
     pub fn base_pose(&self) -> Pose {
-        let [x, y, heading] = self.configuration().base;
-        Pose::from_rpy([x, y, 0.0], 0.0, 0.0, heading)
+        standing(self.configuration().base)
+    }
+
+    /// Where it believes to stand.
+    pub fn believed_base_pose(&self) -> Pose {
+        standing(self.measured().base)
     }
 
     /// What is true of every object.
@@ -265,7 +282,15 @@ impl Cell {
         let configuration = self.configuration();
         let tool = self.robot.tool_pose(&configuration);
         let object = |i| (self.environment.model(i).clone(), self.pose_of(i, &tool));
-        Scenery { configuration, setting: self.config.scene, objects: (0..self.ids.len()).map(object).collect() }
+        let eye = self.errors.eye(&self.robot.camera_pose(&configuration));
+        let measured = self.measured();
+        Scenery {
+            configuration,
+            measured,
+            eye,
+            setting: self.config.scene,
+            objects: (0..self.ids.len()).map(object).collect(),
+        }
     }
 
     fn advance(&mut self, now: Timestamp, out: &mut Vec<Command>) {
@@ -308,7 +333,8 @@ impl Cell {
             Kind::Follow(Way::Base(ref motion)) => match motion.end() {
                 Ok([x, y, heading]) => {
                     self.resting.base = [x, y, wrapped(heading)];
-                    Ending::Done(Product::Driven { end: self.base_pose(), tracking: followed })
+                    self.relocalise();
+                    Ending::Done(Product::Driven { end: self.believed_base_pose(), tracking: followed })
                 }
                 Err(reason) => {
                     let ending = Ending::Aborted(reason.to_owned());
@@ -332,7 +358,7 @@ impl Cell {
                 Ending::Done(Product::Released)
             }
             Kind::SenseBase if self.is_lost() => Ending::Aborted(LOST.to_owned()),
-            Kind::SenseBase => Ending::Done(Product::BaseSensed { pose: self.base_pose() }),
+            Kind::SenseBase => Ending::Done(Product::BaseSensed { pose: self.believed_base_pose() }),
             Kind::SenseArm => Ending::Done(Product::ArmSensed { joints: self.resting.arm }),
             Kind::SenseGripper => {
                 let (width, holding) = (2.0 * self.resting.finger, self.held.is_some());
@@ -361,7 +387,7 @@ impl Cell {
         times: f64,
         out: &mut Vec<Command>,
     ) {
-        self.resting = self.configuration();
+        self.resting = self.measured();
         let stopped: Vec<Module> = self.activities.iter().filter(|(_, a)| which(a)).map(|(m, _)| *m).collect();
         for module in stopped {
             let Some(activity) = self.activities.remove(&module) else { continue };
@@ -392,9 +418,20 @@ impl Cell {
         for module in standing {
             let Some(braking) = self.braking.remove(&module) else { continue };
             braking.place(self.now, &mut self.resting);
+            if module == Module::Base {
+                self.relocalise();
+            }
             let tracking = Some(braking.tracking(self.now));
             out.push(Command::Ended { ticket: braking.ticket, ending: braking.ending, tracking });
         }
+    }
+
+    /// The base stands: where it believes to is measured anew.
+    fn relocalise(&mut self) {
+        let stands = self.errors.truth(&self.resting).base;
+        self.stops += 1;
+        self.errors.localise(self.seed, self.stops);
+        self.resting.base = self.errors.believed(stands);
     }
 
     /// What moves is to go on, or to stand.
@@ -411,7 +448,7 @@ impl Cell {
 
     /// Everything ends and is where it is, as nothing real can: for when the world is made anew.
     pub(super) fn freeze(&mut self, reason: &str, out: &mut Vec<Command>) {
-        self.resting = self.configuration();
+        self.resting = self.measured();
         let active =
             std::mem::take(&mut self.activities).into_values().map(|a| (a.ticket, a.tracking(self.motion_time)));
         let braking = std::mem::take(&mut self.braking).into_values().map(|b| (b.ticket, Some(b.tracking(self.now))));
@@ -427,12 +464,14 @@ impl Cell {
         self.freeze("the cell was reset", out);
         self.resting = first_posture(&self.config);
         self.seed = seed;
+        self.stops = 0;
+        self.errors = Errors::new(self.config.errors, seed, 0);
         // The request was checked before it became an event; a table that cannot be laid is an empty one.
         let objects = placement::objects(&self.robot, self.config.scene, goods, seed).unwrap_or_default();
         self.held = None;
         self.contacts = Contacts::default();
         self.tilts = vec![0.0; objects.len()];
-        (self.environment, self.ids) = environment(&self.robot, &self.resting, self.config.scene, &objects);
+        (self.environment, self.ids) = environment(&self.robot, &self.configuration(), self.config.scene, &objects);
         self.environment.skip_until(self.now);
     }
 
@@ -474,6 +513,11 @@ fn environment(
     let models: Vec<_> = objects.iter().map(|o| (o.model.clone(), o.pose)).collect();
     let environment = Environment::new(robot, configuration, &placement::furniture(setting), &models);
     (environment, objects.iter().map(|o| o.id.clone()).collect())
+}
+
+/// A base in the world frame.
+fn standing([x, y, heading]: [f64; 3]) -> Pose {
+    Pose::from_rpy([x, y, 0.0], 0.0, 0.0, heading)
 }
 
 fn first_posture(config: &CellConfig) -> Configuration {

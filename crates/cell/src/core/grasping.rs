@@ -175,6 +175,26 @@ impl Pads {
     }
 }
 
+/// Where something is in the tool frame after the fingers have closed around it, `width` metres apart, by what was believed before and by
+/// what two fingers measure.
+///
+/// That is the width, and that there is something. Where the middle of what was believed is between the pads, its faces are flush with them
+/// and it is in their middle: one position and the turns about the two other axes. Where it is not, as of a bowl that is held by its rim,
+/// nothing follows from the width. Whatever else was wrong, along the fingers and about the axis on which they close, nobody has measured.
+pub fn felt(believed: &Pose, width: f64) -> Pose {
+    if believed.position[1].abs() > width / 2.0 {
+        return *believed;
+    }
+    let axes = axes(believed);
+    let across = (0..3).max_by(|a, b| axes[*a][1].abs().total_cmp(&axes[*b][1].abs())).unwrap_or(1);
+    if axes[across][1].abs() < MAX_ASKEW_DEGREES.to_radians().cos() {
+        // It is round, or something else than believed: how it is turned cannot be felt.
+        let [x, _, z] = believed.position;
+        return Pose { position: [x, 0.0, z], ..*believed };
+    }
+    flush(believed, axes[across])
+}
+
 /// The pose after closing: the axis that lay roughly along ±y lies exactly so, and the cuboid is in the middle.
 fn flush(in_tool: &Pose, axis: [f64; 3]) -> Pose {
     let side = axis[1].signum();
@@ -246,6 +266,20 @@ mod tests {
     #[test]
     fn an_edge_is_not_enough() {
         assert!(matches!(close(Pose::at(0.07, 0.0, 0.0)), Err(NotGrasped::Edge { .. })));
+    }
+
+    #[test]
+    fn fingers_feel_what_is_across_them_and_believe_the_rest() {
+        let believed = Pose::from_rpy([0.02, 0.006, 0.004], PI, 0.0, 0.1);
+        let felt_box = felt(&believed, 0.07);
+        assert_eq!(felt_box.position, [0.02, 0.0, 0.004], "only the offset across the fingers is known to be none");
+        assert!(felt_box.rotate([0.0, 1.0, 0.0])[1].abs() > 1.0 - 1e-12, "a box lies flush");
+        // A cup that is seen from its side is as good as any other: its yaw is left alone.
+        let round = Pose::from_rpy([0.02, 0.006, 0.004], PI, 0.0, 0.7);
+        assert_eq!(felt(&round, 0.07), Pose { position: [0.02, 0.0, 0.004], ..round });
+        // A bowl by its wall: nobody knows how far its middle is from there.
+        let bowl = Pose::from_rpy([0.0, 0.06, 0.01], PI, 0.0, 0.0);
+        assert_eq!(felt(&bowl, 0.005), bowl);
     }
 
     #[test]

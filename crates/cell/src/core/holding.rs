@@ -1,14 +1,13 @@
 //! What happens to objects when the fingers close and open, and while they hold something.
 
 use super::cell::Cell;
-use super::environment::{GRAVITY, Grip, Hold, Kind, Load, Model, STEP, Slip, Support};
+use super::environment::{GRAVITY, Grip, Hold, Load, STEP, Slip, Support};
 use super::faults::Kind as Fault;
-use super::grasping::{Grip as GripOf, NotGrasped};
+use super::grasping::{Grip as GripOf, NotGrasped, felt};
 use super::objects::ON_BASE;
 use super::protocol::{Ending, Product};
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
-use std::f64::consts::{FRAC_PI_2, PI};
 
 /// What the fingers are closed around.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -104,8 +103,7 @@ impl Cell {
         let in_tool = grip.in_tool.compose(&parts[grip.index].0.inverse());
         self.held = Some(Held::new(grip.index, in_tool, friction));
         self.environment.carry(grip.index, &tool.compose(&in_tool));
-        let model = self.environment.model(grip.index);
-        let in_gripper = expected.map(|e| turned_like(&in_tool, model, e));
+        let in_gripper = expected.map(|believed| felt(believed, grip.width));
         Ending::Done(Product::Grasped { object, width: grip.width, in_gripper })
     }
 
@@ -188,22 +186,6 @@ impl Cell {
         }
     }
 
-    /// What goes where the base goes: what stands on it, or on something that does.
-    pub(super) fn riding(&self) -> Vec<String> {
-        let mut rides: Vec<bool> = vec![false; self.ids.len()];
-        // As many rounds as things can stand on each other.
-        for _ in 0..self.ids.len() {
-            for object in 0..self.ids.len() {
-                rides[object] |= match self.environment.rests_on(object) {
-                    Some(Support::Named(name)) => self.robot.link(name).is_some(),
-                    Some(Support::Object(below)) => rides[below],
-                    None => false,
-                };
-            }
-        }
-        self.ids.iter().zip(rides).filter(|(_, rides)| *rides).map(|(id, _)| id.clone()).collect()
-    }
-
     /// Whether an object stands at one of the places of the load deck, on whichever of its faces: a box has no top.
     pub(super) fn is_delivered(&self, pose: &Pose, on: &str) -> bool {
         let upright = |axis: usize| pose.rotate(unit(axis))[2].abs() >= MAX_LEAN_RAD.cos();
@@ -224,54 +206,5 @@ fn across(in_tool: &Pose, size: &[f64; 3]) -> [f64; 2] {
         Some(0) => [size[1], size[2]],
         Some(2) => [size[0], size[1]],
         _ => [size[0], size[2]],
-    }
-}
-
-/// The same object in whichever of its own frames is closest to `expected`.
-fn turned_like(pose: &Pose, model: &Model, expected: &Pose) -> Pose {
-    if model.is_round() {
-        let ahead = pose.inverse().compose(expected).rotate([1.0, 0.0, 0.0]);
-        return pose.compose(&Pose::from_rpy([0.0; 3], 0.0, 0.0, ahead[1].atan2(ahead[0])));
-    }
-    if model.kind == Kind::Box { box_turned_like(pose, &model.size, expected) } else { *pose }
-}
-
-/// The same box in whichever of its own frames is closest to `expected`: nobody can tell them apart. Which axis is its height was not
-/// seen when it fell over since, so any may be; of the two others the first is the longer one, unless they are about equal.
-fn box_turned_like(pose: &Pose, size: &[f64; 3], expected: &Pose) -> Pose {
-    const SQUARE_M: f64 = 0.01;
-    // Each axis upwards and downwards.
-    let upright = [[0.0, 0.0], [PI, 0.0], [FRAC_PI_2, 0.0], [-FRAC_PI_2, 0.0], [0.0, FRAC_PI_2], [0.0, -FRAC_PI_2]];
-    let frames = upright.into_iter().flat_map(|[roll, pitch]| {
-        (0..4).map(move |quarter| {
-            let quarter = Pose::from_rpy([0.0; 3], 0.0, 0.0, f64::from(quarter) * FRAC_PI_2);
-            Pose::from_rpy([0.0; 3], roll, pitch, 0.0).compose(&quarter)
-        })
-    });
-    let extent = |turn: &Pose, axis: usize| {
-        let along = turn.rotate(unit(axis));
-        (0..3).map(|i| along[i].abs() * size[i]).sum::<f64>()
-    };
-    frames
-        .filter(|turn| extent(turn, 0) > extent(turn, 1) - SQUARE_M)
-        .map(|turn| pose.compose(&turn))
-        .min_by(|a, b| a.angle(expected).total_cmp(&b.angle(expected)))
-        .unwrap_or(*pose)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_box_that_fell_over_is_held_as_it_was_seen_lying() {
-        // It lies on its side: its height along the tool's x axis.
-        let (size, lying) = ([0.08, 0.06, 0.12], Pose::from_rpy([0.0, 0.0, 0.01], 0.0, FRAC_PI_2, 0.0));
-        // What was seen is 0.12 long, 0.06 wide and 0.08 high.
-        let seen = Pose::from_rpy([0.0, 0.0, 0.012], PI, 0.0, 0.05);
-        assert!(box_turned_like(&lying, &size, &seen).angle(&seen) < 0.06);
-        // A quarter turn away it would be 0.06 long: that it was seen so badly is not hidden.
-        let across = Pose::from_rpy([0.0, 0.0, 0.012], PI, 0.0, FRAC_PI_2);
-        assert!((box_turned_like(&lying, &size, &across).angle(&across) - FRAC_PI_2).abs() < 0.01);
     }
 }

@@ -4,6 +4,7 @@ pub mod braking;
 pub mod cell;
 pub mod contacts;
 pub mod environment;
+mod errors;
 pub mod faults;
 pub mod grasping;
 pub mod objects;

@@ -15,8 +15,12 @@ use ratn_world::scene::Shape;
 /// The true scene at one moment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scenery {
-    /// Where the robot's joints are.
+    /// Where the robot truly is.
     pub configuration: Configuration,
+    /// Where it has itself.
+    pub measured: Configuration,
+    /// The camera's true optical frame, in the world.
+    pub eye: Pose,
     /// What the cell is furnished for.
     pub setting: Setting,
     /// Everything that can be moved, and where it is in the world frame.
@@ -68,10 +72,11 @@ impl Scenery {
     }
 }
 
-/// The average of all frames. Takes milliseconds per exposure.
+/// The average of all frames, each from where the camera truly was. Takes milliseconds per exposure.
 pub fn develop(robot: &Robot, camera: &Camera, noise: &Noise, seed: u64, exposures: &[Exposure]) -> DepthImage {
     let pictures = exposures.iter().map(|exposure| {
-        let clean = render(camera, &exposure.scenery.bodies(robot));
+        let eye = Camera { pose: exposure.scenery.eye, ..*camera };
+        let clean = render(&eye, &exposure.scenery.bodies(robot));
         (observe(&clean, &camera.intrinsics, noise, seed, exposure.first_frame, exposure.frames), exposure.frames)
     });
     average(camera.intrinsics.width, camera.intrinsics.height, pictures)

@@ -168,13 +168,13 @@ pub enum Product {
         object: String,
         /// The opening of the fingers around it, in metres.
         width: f64,
-        /// Where it is in the tool frame; turned like the expected pose, as far as its symmetry allows. `None` when
-        /// nothing was expected: which way round it is would be anybody's guess.
+        /// Where it is in the tool frame, by what was expected and what two fingers feel of it ([`super::grasping::felt`]). `None` when
+        /// nothing was expected: fingers feel a width and no more.
         in_gripper: Option<Pose>,
     },
     /// The fingers are open.
     Released,
-    /// Where the base is.
+    /// Where the base believes to stand.
     BaseSensed {
         /// Its frame, in the world frame.
         pose: Pose,

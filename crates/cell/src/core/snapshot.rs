@@ -7,6 +7,7 @@ use super::battery::Battery;
 use super::cell::Cell;
 use super::contacts::Contacts;
 use super::environment::{Environment, Saved};
+use super::errors::Errors;
 use super::faults::{Fault, Faults};
 use super::holding::Held;
 use super::placement::furniture;
@@ -29,6 +30,7 @@ pub struct Snapshot {
     ids: Vec<String>,
     tilts: Vec<f64>,
     environment: Saved,
+    /// As measured.
     posture: Posture,
     held: Option<SavedHold>,
     battery: f64,
@@ -38,6 +40,9 @@ pub struct Snapshot {
     drawn: u64,
     blind_until: Timestamp,
     lost_until: Timestamp,
+    /// How often the base had come to a stop.
+    #[serde(default)]
+    stops: u64,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -104,7 +109,7 @@ impl Snapshot {
 impl Cell {
     /// The state now. What goes on here and what goes on from it do so alike.
     pub(super) fn save(&mut self) -> Snapshot {
-        let Configuration { base, arm, pan, tilt, finger } = self.configuration();
+        let Configuration { base, arm, pan, tilt, finger } = self.measured();
         let (faults, drawn) = self.faults.save();
         self.battery = Battery::at(self.config.battery, self.battery.level());
         Snapshot {
@@ -124,6 +129,7 @@ impl Cell {
             drawn,
             blind_until: self.blind_until,
             lost_until: self.lost_until,
+            stops: self.stops,
         }
     }
 
@@ -132,14 +138,19 @@ impl Cell {
         self.freeze("the cell was put back to a snapshot", out);
         let Posture { base, arm, pan, tilt, finger } = snapshot.posture.clone();
         self.resting = Configuration { base, arm, pan, tilt, finger };
-        self.environment =
-            Environment::restore(&self.robot, &self.resting, &furniture(self.config.scene), &snapshot.environment);
+        (self.seed, self.stops) = (snapshot.seed, snapshot.stops);
+        self.errors = Errors::new(self.config.errors, self.seed, self.stops);
+        self.environment = Environment::restore(
+            &self.robot,
+            &self.configuration(),
+            &furniture(self.config.scene),
+            &snapshot.environment,
+        );
         self.environment.set_time(self.now);
         self.held = snapshot.held.as_ref().map(|held| Held::new(held.object, held.in_tool, held.friction));
         self.contacts = Contacts::default();
         self.ids.clone_from(&snapshot.ids);
         self.tilts.clone_from(&snapshot.tilts);
-        self.seed = snapshot.seed;
         self.battery = Battery::at(self.config.battery, snapshot.battery);
         self.frames_taken = snapshot.frames_taken;
         self.faults = Faults::restore(&snapshot.faults, snapshot.seed, snapshot.drawn);

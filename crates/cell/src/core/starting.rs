@@ -25,7 +25,7 @@ impl Cell {
         if self.battery.level() <= 0.0 {
             return Err("the battery is empty".to_owned());
         }
-        let here = self.configuration();
+        let here = self.measured();
         let (kind, lasts_s) = match request {
             Request::Drive { trajectory } => {
                 for other in [Module::Arm, Module::Gripper, Module::PanTilt, Module::Camera] {
@@ -34,22 +34,20 @@ impl Cell {
                 if self.is_lost() {
                     return Err(LOST.to_owned());
                 }
-                let trajectory =
-                    trajectory::check_base(&self.robot, &self.scene(), &here, &self.riding(), &trajectory)?;
+                let trajectory = trajectory::check_base(&self.robot, &here, &trajectory)?;
                 self.driving(trajectory)
             }
             Request::Follow { trajectory } => {
                 self.no_motion_of(Module::Base)?;
                 self.no_motion_of(Module::Gripper)?;
-                let trajectory = trajectory::check(&self.robot, &self.scene(), &here, &trajectory)?;
+                let trajectory = trajectory::check(&self.robot, &here, &trajectory)?;
                 self.following(trajectory)
             }
             Request::MoveTo { joints, speed } => {
                 self.no_motion_of(Module::Base)?;
                 self.no_motion_of(Module::Gripper)?;
-                let scene = self.scene();
                 let line = trajectory::straight(&self.robot, &here.arm, &joints, speed)?;
-                let trajectory = trajectory::check(&self.robot, &scene, &here, &line)?;
+                let trajectory = trajectory::check(&self.robot, &here, &line)?;
                 self.following(trajectory)
             }
             Request::Grasp { object, expected } => {
@@ -108,7 +106,7 @@ impl Cell {
         let controller =
             Controller { of: "arm", stiffness: config.arm_stiffness, most_off: config.arm_most_off_rad, slides: 0 };
         let breaks = self.arm_breaks_off(lasts_s);
-        let motion = Motion::new(trajectory, self.configuration().arm, controller, breaks);
+        let motion = Motion::new(trajectory, self.measured().arm, controller, breaks);
         let lasts_s = motion.lasts_s();
         (Kind::Follow(Way::Arm(motion)), lasts_s)
     }
@@ -121,7 +119,7 @@ impl Cell {
             Controller { of: "base", stiffness: config.base_stiffness, most_off: config.base_most_off, slides: 2 };
         let breaks = self.drive_breaks_off(lasts_s);
         // A heading is the same after a whole turn: the one that the trajectory begins at.
-        let ([x, y, heading], first) = (self.configuration().base, trajectory.knots()[0].positions[2]);
+        let ([x, y, heading], first) = (self.measured().base, trajectory.knots()[0].positions[2]);
         let start = [x, y, first + wrapped(heading - first)];
         let motion = Motion::new(trajectory, start, controller, breaks);
         let lasts_s = motion.lasts_s();
@@ -147,8 +145,8 @@ impl Cell {
     }
 
     fn aim(&self, target: [f64; 3]) -> Result<[f64; 2], String> {
-        let (pan, tilt) = self.robot.look_at(&self.base_pose(), target);
-        let camera = self.robot.camera_pose(&Configuration { pan, tilt, ..self.configuration() });
+        let (pan, tilt) = self.robot.look_at(&self.believed_base_pose(), target);
+        let camera = self.robot.camera_pose(&Configuration { pan, tilt, ..self.measured() });
         let seen = camera.inverse().transform(target);
         let off = seen[0].hypot(seen[1]).atan2(seen[2]);
         if off > MAX_LOOK_ERROR_RAD {

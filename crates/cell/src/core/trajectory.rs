@@ -1,5 +1,8 @@
-//! Which motions arm and base follow: those that ratn-motion finds nothing wrong with in the *true* scene.
+//! Which motions arm and base follow: those that their controllers find nothing wrong with, by what controllers know. That is the trajectory's
+//! form and limits, where the joints are by their encoders, the robot's own body, and the area in which it may drive. What else stands there they
+//! do not know: whether the robot meets it is for the physics to say ([`super::contacts`]).
 
+use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
 use ratn_motion::base::check_drive;
 use ratn_motion::collision::Contact;
@@ -10,43 +13,36 @@ use ratn_motion::trajectory::{ArmTrajectory, BaseTrajectory};
 use ratn_motion::validate::validate_trajectory;
 use ratn_world::scene::Scene;
 
-/// How deep the fingers and what they hold may press into something, in metres: what the planner takes for certain was
-/// measured, and rubber and cardboard give way. Arm links may not.
-const COMPLIANCE_M: f64 = 0.015;
-
 /// The longest motion, in seconds: every posture of it is checked before it begins.
 const MAX_MOTION_S: f64 = 600.0;
 
-/// The trajectory, ready to be followed from `here`.
+/// The trajectory, ready to be followed from `here`, as measured.
 ///
 /// # Errors
 /// Why it may not be followed.
-pub(crate) fn check(
-    robot: &Robot,
-    scene: &Scene,
-    here: &Configuration,
-    trajectory: &Trajectory,
-) -> Result<ArmTrajectory, String> {
+pub(crate) fn check(robot: &Robot, here: &Configuration, trajectory: &Trajectory) -> Result<ArmTrajectory, String> {
     is_short(trajectory)?;
-    let contact = Contact::Gripper(COMPLIANCE_M);
-    validate_trajectory(robot, scene, &here.arm, Some(here.finger), trajectory, contact)
+    validate_trajectory(robot, &nothing(), &here.arm, Some(here.finger), trajectory, Contact::None)
         .map_err(|violation| format!("the trajectory is refused: {violation}"))
 }
 
-/// The same for the base, with what rides on it.
+/// The same for the base.
 ///
 /// # Errors
 /// Why it may not be followed.
 pub(crate) fn check_base(
     robot: &Robot,
-    scene: &Scene,
     here: &Configuration,
-    riding: &[String],
     trajectory: &Trajectory,
 ) -> Result<BaseTrajectory, String> {
     is_short(trajectory)?;
-    check_drive(robot, scene, here, riding, trajectory)
+    check_drive(robot, &nothing(), here, &[], trajectory)
         .map_err(|violation| format!("the trajectory is refused: {violation}"))
+}
+
+/// What a controller knows of what stands around the robot.
+fn nothing() -> Scene {
+    Scene { base: Pose::IDENTITY, objects: Vec::new() }
 }
 
 fn is_short(trajectory: &Trajectory) -> Result<(), String> {

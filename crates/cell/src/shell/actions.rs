@@ -48,6 +48,7 @@ pub(crate) fn server(
             resource: resource_id(module, &config.host),
             handle: handle.clone(),
             seed: config.seed,
+            calibration: config.errors.camera_covariance(),
             read,
         });
     }
@@ -94,12 +95,19 @@ fn configuration_value(at: &Configuration) -> Value {
     Value::List(degrees.map(Value::Float).collect())
 }
 
+/// What a drive measures: where the base believes to stand at its stop.
+fn stands() -> FactKey {
+    FactKey { predicate: "at".to_owned(), arguments: vec![Term::Name("base".to_owned())] }
+}
+
 struct ModuleAction {
     name: &'static str,
     description: &'static str,
     resource: String,
     handle: CellHandle,
     seed: u64,
+    /// The variances of the camera's pose.
+    calibration: [f64; 6],
     read: Read,
 }
 
@@ -154,6 +162,7 @@ impl ModuleAction {
         let success = GoalOutcome::success();
         Ok(match product {
             Product::Driven { end, tracking } => success
+                .with_measured(stands(), Value::Pose(end))
                 .with_output("end", Value::Pose(end))
                 .with_output("tracking_max_m", Value::Float(tracking.most_m))
                 .with_output("tracking_rms_m", Value::Float(tracking.rms_m))
@@ -182,7 +191,7 @@ impl ModuleAction {
             }
             Product::Captured { camera, exposures } => {
                 let (handle, seed) = (self.handle.clone(), self.seed);
-                let robot = exposures.iter().map(|e| configuration_value(&e.scenery.configuration)).collect();
+                let robot = exposures.iter().map(|e| configuration_value(&e.scenery.measured)).collect();
                 let developing = tokio::task::spawn_blocking(move || handle.develop(&camera, seed, &exposures));
                 let image = developing.await?;
                 let optics = camera.intrinsics;
@@ -191,6 +200,7 @@ impl ModuleAction {
                     .with_output("width", Value::Int(image.width as i64))
                     .with_output("height", Value::Int(image.height as i64))
                     .with_output("camera", Value::Pose(camera.pose))
+                    .with_output("camera_covariance", Value::List(self.calibration.map(Value::Float).to_vec()))
                     .with_output("robot", Value::List(robot))
                     .with_output("fx", Value::Float(optics.fx))
                     .with_output("fy", Value::Float(optics.fy))

@@ -76,11 +76,23 @@ impl Bench {
         }
     }
 
+    /// Where the robot has its joints.
     pub(crate) fn arm(&self) -> Joints {
-        self.cell.configuration().arm
+        self.cell.measured().arm
     }
 
     pub(crate) fn plan(&self, scene: &Scene, goals: Vec<Goal>, depart_m: f64, approach_m: f64) -> Trajectory {
+        self.try_plan(scene, goals, depart_m, approach_m).unwrap()
+    }
+
+    /// From where the robot has its joints.
+    pub(crate) fn try_plan(
+        &self,
+        scene: &Scene,
+        goals: Vec<Goal>,
+        depart_m: f64,
+        approach_m: f64,
+    ) -> Result<Trajectory, String> {
         let request = PlanRequest {
             start: self.arm(),
             goals,
@@ -92,12 +104,19 @@ impl Bench {
             seed: 3,
             improvement_iterations: 50,
         };
-        plan(self.cell.robot(), scene, &request, &mut |_| Control::Continue).unwrap().trajectory
+        let planned = plan(self.cell.robot(), scene, &request, &mut |_| Control::Continue);
+        planned.map(|planned| planned.trajectory).map_err(|error| error.to_string())
     }
 
     /// Moves the arm by a plan in the true scene.
     pub(crate) fn go(&mut self, goals: Vec<Goal>, depart_m: f64, approach_m: f64) {
         let trajectory = self.plan(&self.cell.scene(), goals, depart_m, approach_m);
+        self.done(Request::Follow { trajectory });
+    }
+
+    /// Moves the arm by a plan in what is believed to stand there.
+    pub(crate) fn go_believing(&mut self, scene: &Scene, goal: Goal) {
+        let trajectory = self.plan(scene, vec![goal], 0.0, 0.0);
         self.done(Request::Follow { trajectory });
     }
 

@@ -1,0 +1,149 @@
+//! How wrong the robot is about itself: its encoders, its camera's place on its head, and where its base stands.
+//!
+//! Controllers and sensors work in *measured* coordinates, and so does everything that the cell tells the robot. What is true follows from
+//! that by the errors here, which are drawn from the seed: those of encoders and camera once, that of the localisation at every stop of the
+//! base. The environment, the judge and the ground truth see only what is true.
+
+use crate::config::ErrorsConfig;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use ratn_model::pose::Pose;
+use ratn_motion::robot::{Configuration, Joints};
+use std::f64::consts::TAU;
+
+/// What is wrong in one cell, at one stop of its base.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Errors {
+    config: ErrorsConfig,
+    /// What each encoder of the arm reads at its joint's zero, in radians.
+    offsets: Joints,
+    /// What it reads too much once a turn: amplitude and phase, in radians.
+    waves: [[f64; 2]; 7],
+    /// The true optical frame as seen from where it is said to be.
+    camera: Pose,
+    /// Where the base truly stands, as seen from where it believes to: x, y and heading.
+    base: [f64; 3],
+}
+
+/// Streams of the seed's generator; faults have the first.
+const CALIBRATION: u64 = 2;
+const LOCALISATION: u64 = 3;
+
+impl Errors {
+    /// Of a cell with this seed, whose base has come to a stop so many times.
+    pub(super) fn new(config: ErrorsConfig, seed: u64, stops: u64) -> Errors {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        random.set_stream(CALIBRATION);
+        let offsets = std::array::from_fn(|_| config.encoder_rad * normal(&mut random));
+        let waves =
+            std::array::from_fn(|_| [config.encoder_wave_rad * normal(&mut random), random.random_range(0.0..TAU)]);
+        let place = std::array::from_fn(|_| config.camera_m * normal(&mut random));
+        let [roll, pitch, yaw] = std::array::from_fn(|_| config.camera_rad * normal(&mut random));
+        let camera = Pose::from_rpy(place, roll, pitch, yaw);
+        let mut errors = Errors { config, offsets, waves, camera, base: [0.0; 3] };
+        errors.localise(seed, stops);
+        errors
+    }
+
+    /// The base has come to its stop of that number.
+    pub(super) fn localise(&mut self, seed: u64, stop: u64) {
+        let mut random = ChaCha8Rng::seed_from_u64(seed ^ stop.wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        random.set_stream(LOCALISATION);
+        let sigmas = [self.config.localisation_m, self.config.localisation_m, self.config.localisation_rad];
+        self.base = sigmas.map(|sigma| sigma * normal(&mut random));
+    }
+
+    /// Where everything truly is.
+    pub(super) fn truth(&self, measured: &Configuration) -> Configuration {
+        let [x, y, heading] = measured.base;
+        let [ahead, left, turn] = self.base;
+        let (sin, cos) = heading.sin_cos();
+        let base = [x + cos * ahead - sin * left, y + sin * ahead + cos * left, heading + turn];
+        let arm = std::array::from_fn(|j| {
+            let [amplitude, phase] = self.waves[j];
+            measured.arm[j] - self.offsets[j] - amplitude * (measured.arm[j] + phase).sin()
+        });
+        Configuration { base, arm, ..*measured }
+    }
+
+    /// Where the base believes to be when it truly is there.
+    pub(super) fn believed(&self, base: [f64; 3]) -> [f64; 3] {
+        let [ahead, left, turn] = self.base;
+        let heading = base[2] - turn;
+        let (sin, cos) = heading.sin_cos();
+        [base[0] - (cos * ahead - sin * left), base[1] - (sin * ahead + cos * left), heading]
+    }
+
+    /// The true optical frame, of one that would be at `nominal` were the calibration right.
+    pub(super) fn eye(&self, nominal: &Pose) -> Pose {
+        if self.camera == Pose::IDENTITY { *nominal } else { nominal.compose(&self.camera) }
+    }
+}
+
+/// A standard normal (Box and Muller 1958).
+fn normal(random: &mut ChaCha8Rng) -> f64 {
+    let (radius, angle): (f64, f64) = (random.random_range(f64::MIN_POSITIVE..1.0), random.random_range(0.0..TAU));
+    (-2.0 * radius.ln()).sqrt() * angle.cos()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SEEDS: u64 = 400;
+
+    fn rms(values: impl Iterator<Item = f64>) -> f64 {
+        let values: Vec<f64> = values.collect();
+        (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
+    }
+
+    /// Of as many samples as there are here the root mean square is within 10 % of the deviation, with hardly an exception.
+    fn about(value: f64, sigma: f64) -> bool {
+        (value / sigma - 1.0).abs() < 0.1
+    }
+
+    #[test]
+    fn errors_have_the_sizes_that_the_configuration_says() {
+        let config = ErrorsConfig::REALISTIC;
+        let all: Vec<Errors> = (0..SEEDS).map(|seed| Errors::new(config, seed, 0)).collect();
+        let here = Configuration { base: [0.3, -0.2, 1.0], ..Configuration::ZERO };
+        let truths: Vec<Configuration> = all.iter().map(|errors| errors.truth(&here)).collect();
+        assert!(about(rms(truths.iter().map(|t| t.base[2] - 1.0)), config.localisation_rad));
+        let off = |t: &Configuration| (t.base[0] - 0.3).hypot(t.base[1] + 0.2) / 2.0_f64.sqrt();
+        assert!(about(rms(truths.iter().map(off)), config.localisation_m));
+        // A wave has its amplitude's deviation times the root of a half, in the mean over phases.
+        let encoder = config.encoder_rad.hypot(config.encoder_wave_rad / 2.0_f64.sqrt());
+        assert!(about(rms(truths.iter().flat_map(|t| t.arm)), encoder));
+        let eyes: Vec<Pose> = all.iter().map(|errors| errors.eye(&Pose::at(0.0, 0.0, 1.6))).collect();
+        assert!(about(
+            rms(eyes.iter().map(|eye| eye.distance(&Pose::at(0.0, 0.0, 1.6)) / 3.0_f64.sqrt())),
+            config.camera_m
+        ));
+        assert!(about(rms(eyes.iter().map(|eye| eye.angle(&Pose::IDENTITY) / 3.0_f64.sqrt())), config.camera_rad));
+    }
+
+    #[test]
+    fn the_same_seed_has_the_same_errors_and_every_stop_its_own() {
+        let of = |seed, stop| Errors::new(ErrorsConfig::REALISTIC, seed, stop);
+        assert_eq!(of(3, 0), of(3, 0));
+        assert_ne!(of(3, 0).camera, of(4, 0).camera);
+        let (first, second) = (of(3, 0), of(3, 1));
+        assert!(first.camera == second.camera && first.offsets == second.offsets && first.base != second.base);
+    }
+
+    #[test]
+    fn what_is_believed_of_where_the_base_truly_stands_is_what_leads_there() {
+        let errors = Errors::new(ErrorsConfig::REALISTIC, 5, 2);
+        let measured = Configuration { base: [1.5, 0.2, 3.0], ..Configuration::ZERO };
+        let back = errors.believed(errors.truth(&measured).base);
+        assert!((0..3).all(|i| (back[i] - measured.base[i]).abs() < 1e-12), "{back:?}");
+    }
+
+    #[test]
+    fn without_errors_what_is_measured_is_true() {
+        let errors = Errors::new(ErrorsConfig::NONE, 5, 2);
+        let measured = Configuration { base: [1.5, 0.2, 3.0], arm: [0.3; 7], ..Configuration::ZERO };
+        assert_eq!(errors.truth(&measured), measured);
+        assert_eq!((errors.believed(measured.base), errors.eye(&Pose::IDENTITY)), (measured.base, Pose::IDENTITY));
+    }
+}
