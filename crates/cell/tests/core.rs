@@ -312,11 +312,13 @@ fn believing_only_what_the_camera_sees_the_robot_delivers_every_box() {
     );
 }
 
-/// How often the job is done with what encoders, calibration and localisation are off. `SEEDS=100` measures more of them.
+/// How often the job is done with what encoders, calibration and localisation are off: `SEEDS=20`, of both sizes.
 #[test]
+#[ignore = "a measurement that takes minutes"]
 fn a_robot_that_is_a_little_wrong_about_itself_delivers_every_box() {
     let seeds: u64 = std::env::var("SEEDS").ok().and_then(|n| n.parse().ok()).unwrap_or(4);
-    for (name, errors, needed) in [("realistic", ErrorsConfig::REALISTIC, 1.0), ("rough", ErrorsConfig::ROUGH, 0.0)] {
+    let mut failed = 0;
+    for (name, errors) in [("realistic", ErrorsConfig::REALISTIC), ("rough", ErrorsConfig::ROUGH)] {
         let (mut done, mut worst) = (0, 0.0_f64);
         for seed in 1..=seeds {
             let mut bench = Bench::of(CellConfig { boxes: 3, seed, errors, ..CellConfig::default() });
@@ -326,8 +328,9 @@ fn a_robot_that_is_a_little_wrong_about_itself_delivers_every_box() {
             }
         }
         println!("{name}: {done} of {seeds} done; a located box is off by {:.1} mm at the most", worst * 1e3);
-        assert!(done as f64 >= needed * seeds as f64, "{name}: {done} of {seeds}");
+        failed += seeds - done;
     }
+    assert_eq!(failed, 0, "of {} runs", 2 * seeds);
 }
 
 #[test]

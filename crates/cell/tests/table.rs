@@ -160,11 +160,13 @@ fn set_table(bench: &mut Bench) {
     }
 }
 
-/// How often tables are set with what encoders, calibration and localisation are off. `SEEDS=100` measures more of them.
+/// How often tables are set with what encoders, calibration and localisation are off: `SEEDS=20`, of both sizes.
 #[test]
+#[ignore = "a measurement that takes minutes"]
 fn a_robot_that_is_a_little_wrong_about_itself_sets_tables() {
-    let seeds: u64 = std::env::var("SEEDS").ok().and_then(|n| n.parse().ok()).unwrap_or(1);
+    let seeds: u64 = std::env::var("SEEDS").ok().and_then(|n| n.parse().ok()).unwrap_or(4);
     let goods = Goods { bowls: 2, forks: 2, ..NONE };
+    let mut failed = 0;
     for (name, errors) in [("realistic", ErrorsConfig::REALISTIC), ("rough", ErrorsConfig::ROUGH)] {
         let mut done = 0;
         for seed in 1..=seeds {
@@ -178,8 +180,9 @@ fn a_robot_that_is_a_little_wrong_about_itself_sets_tables() {
             done += u64::from(set.is_ok());
         }
         println!("{name}: {done} of {seeds} tables are set");
-        assert!(done == seeds || errors == ErrorsConfig::ROUGH, "{name}: {done} of {seeds}");
+        failed += seeds - done;
     }
+    assert_eq!(failed, 0, "of {} runs", 2 * seeds);
 }
 
 fn astray(bench: &Bench) -> Vec<TrueObject> {
