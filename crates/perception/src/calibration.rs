@@ -63,10 +63,10 @@ impl Detection {
             let before = self.covariance;
             let gain: [f64; 6] = std::array::from_fn(|k| before[k][of] / (before[of][of] + variance));
             let innovation = missing - change[of];
-            for k in 0..6 {
+            for (k, row) in self.covariance.iter_mut().enumerate() {
                 change[k] += gain[k] * innovation;
-                for (j, entry) in self.covariance[k].iter_mut().enumerate() {
-                    *entry -= gain[k] * before[of][j];
+                for (entry, other) in row.iter_mut().zip(&before[of]) {
+                    *entry -= gain[k] * other;
                 }
             }
         }
