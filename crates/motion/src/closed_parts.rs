@@ -32,8 +32,8 @@ struct Face {
     has_side: bool,
 }
 
-/// The closed parts of a mesh.
-pub(crate) fn closed_parts(mesh: &Mesh) -> Vec<ClosedPart> {
+/// The closed parts of a mesh, and a corner of each part that hangs together by common corners, closed or not.
+pub(crate) fn closed_parts(mesh: &Mesh) -> (Vec<ClosedPart>, Vec<Corner>) {
     let (corners, indices) = numbered(mesh);
     let faces = faces(&indices);
     let all: Vec<u32> = (0..faces.len() as u32).collect();
@@ -47,14 +47,12 @@ pub(crate) fn closed_parts(mesh: &Mesh) -> Vec<ClosedPart> {
             parts.push(part);
         }
     }
-    parts.iter().map(|part| turned(&corners, &faces, part)).collect()
+    (parts.iter().map(|part| turned(&corners, &faces, part)).collect(), first_corners(&corners, &indices))
 }
 
-/// A corner of each part that hangs together by common corners, closed or not.
-pub(crate) fn corners(mesh: &Mesh) -> Vec<Corner> {
-    let (corners, indices) = numbered(mesh);
+fn first_corners(corners: &[Corner], indices: &[Indices]) -> Vec<Corner> {
     let mut joined: Vec<u32> = (0..corners.len() as u32).collect();
-    for [a, b, c] in &indices {
+    for [a, b, c] in indices {
         join(&mut joined, *a, *b);
         join(&mut joined, *a, *c);
     }

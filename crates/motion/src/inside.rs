@@ -8,7 +8,7 @@
 //!
 //! The triangles are listed by the cells of a grid that they lie above, so a line looks at a few of them.
 
-use crate::closed_parts::{self, closed_parts};
+use crate::closed_parts::closed_parts;
 use crate::mesh::Mesh;
 use std::collections::BTreeSet;
 
@@ -29,7 +29,7 @@ type Corner = [f64; 3];
 struct Part {
     /// Whether the winding number tells what it holds; else the number of crossings.
     is_oriented: bool,
-    /// How it is turned, as [`ClosedPart::sense`](closed_parts::ClosedPart::sense).
+    /// How it is turned, as [`ClosedPart::sense`](crate::closed_parts::ClosedPart::sense).
     sense: i32,
     /// 1 where it is solid, -1 where it is a hollow.
     weight: i32,
@@ -69,7 +69,8 @@ impl Inside {
     /// The inside of a mesh.
     pub fn new(mesh: &Mesh) -> Inside {
         let (mut triangles, mut part, mut parts) = (Vec::new(), Vec::new(), Vec::new());
-        for (index, closed) in closed_parts(mesh).into_iter().enumerate() {
+        let (closed, corners_of_parts) = closed_parts(mesh);
+        for (index, closed) in closed.into_iter().enumerate() {
             part.extend(std::iter::repeat_n(index as u32, closed.triangles.len()));
             parts.push(Part { is_oriented: closed.is_oriented, sense: closed.sense, weight: 1 });
             triangles.extend(closed.triangles);
@@ -87,7 +88,7 @@ impl Inside {
             side: 0,
             starts: Vec::new(),
             listed: Vec::new(),
-            corners: closed_parts::corners(mesh),
+            corners: corners_of_parts,
             triangles,
         };
         inside.list();
