@@ -44,6 +44,9 @@ const NOT_FILLED: u32 = u32::MAX;
 /// Sixteen points, or fewer and such as are infinitely far away.
 type Points = [Block; 3];
 
+/// All of a block.
+const WHOLE: u32 = 0xffff;
+
 const FAR: Points = [Block([f32::INFINITY; 16]); 3];
 
 /// A cloud as the kernel reads it.
@@ -352,7 +355,6 @@ pub(super) fn fill<V: Lanes>(cloud: &mut Cloud, points: &[Points], reach: f32) {
     let whole = Cells { from: [0; 3], to: cloud.layout.counts };
     // A list per depth, used again and again.
     let mut rooms: Vec<Vec<Points>> = vec![Vec::new(); 3 * usize::BITS as usize];
-    let mut spare = Vec::new();
     let mut todo: Vec<(Cells, usize)> = vec![(whole, 0)];
     rooms[0] = points.to_vec();
     while let Some((part, depth)) = todo.pop() {
@@ -372,7 +374,7 @@ pub(super) fn fill<V: Lanes>(cloud: &mut Cloud, points: &[Points], reach: f32) {
         }
         room.clear();
         keep::<V>(parent, &middle, &nearest, half.map(|h| 2.0 * h), room);
-        thin::<V>(room, &middle, half.map(|h| 2.0 * h), &mut spare);
+        thin::<V>(room, &middle, half.map(|h| 2.0 * h));
         if is_cell {
             let index = layout.index(part.from);
             let first = cloud.points.len() as u32;
@@ -432,33 +434,51 @@ fn nearest<V: Lanes>(points: &[Points], to: &[f32; 3]) -> ([f32; 3], f32) {
     (at, best.sqrt())
 }
 
+/// Which points of a block are not kept from a box by `nearest`, a bit for each.
+#[inline(always)]
+fn stays<V: Lanes>(block: &Points, middle: &[f32; 3], nearest: &[f32; 3], size: [f32; 3], best: f32) -> u32 {
+    let mut stays = 0;
+    for part in 0..16 / V::WIDTH {
+        let mut room = V::splat(best);
+        for i in 0..3 {
+            let aside = V::load_part(&block[i], part).sub(V::splat(nearest[i])).abs();
+            room = aside.mul_add(V::splat(size[i]), room);
+        }
+        // Infinitely far ones are not below; the nearest itself is kept by the rounding.
+        let room = room.mul(V::splat(1.0 + 1e-6)).add(V::splat(1e-9));
+        stays |= squares::<V>(block, middle, part).below(room) << (part * V::WIDTH);
+    }
+    stays
+}
+
+/// The square of how far two places are from each other.
+fn square(a: &[f32; 3], b: &[f32; 3]) -> f32 {
+    (0..3).map(|i| (a[i] - b[i]).powi(2)).sum()
+}
+
 /// Appends the points that `nearest` does not keep from a box, in whole blocks.
 #[inline(always)]
 fn keep<V: Lanes>(points: &[Points], middle: &[f32; 3], nearest: &[f32; 3], size: [f32; 3], kept: &mut Vec<Points>) {
-    let best: f32 = (0..3).map(|i| (nearest[i] - middle[i]).powi(2)).sum();
+    let best = square(nearest, middle);
     let mut open = FAR;
     let mut filled = 0;
     for block in points {
-        for part in 0..16 / V::WIDTH {
-            let mut room = V::splat(best);
+        let mut stays = stays::<V>(block, middle, nearest, size, best);
+        if stays == WHOLE && filled == 0 {
+            kept.push(*block);
+            continue;
+        }
+        while stays != 0 {
+            let lane = stays.trailing_zeros() as usize & 15;
+            stays &= stays - 1;
             for i in 0..3 {
-                let aside = V::load_part(&block[i], part).sub(V::splat(nearest[i])).abs();
-                room = aside.mul_add(V::splat(size[i]), room);
+                open[i].0[filled] = block[i].0[lane];
             }
-            // Infinitely far ones are not below; the nearest itself is kept by the rounding.
-            let mut stays = squares::<V>(block, middle, part).below(room.mul(V::splat(1.0 + 1e-6)).add(V::splat(1e-9)));
-            while stays != 0 {
-                let lane = stays.trailing_zeros() as usize + part * V::WIDTH;
-                stays &= stays - 1;
-                for i in 0..3 {
-                    open[i].0[filled] = block[i].0[lane & 15];
-                }
-                filled += 1;
-                if filled == 16 {
-                    kept.push(open);
-                    open = FAR;
-                    filled = 0;
-                }
+            filled += 1;
+            if filled == 16 {
+                kept.push(open);
+                open = FAR;
+                filled = 0;
             }
         }
     }
@@ -467,9 +487,36 @@ fn keep<V: Lanes>(points: &[Points], middle: &[f32; 3], nearest: &[f32; 3], size
     }
 }
 
+/// Leaves only the points that `nearest` does not keep from a box. What stays where it is, which is most at last, is not copied.
+#[inline(always)]
+fn retain<V: Lanes>(points: &mut Vec<Points>, middle: &[f32; 3], nearest: &[f32; 3], size: [f32; 3]) {
+    let best = square(nearest, middle);
+    let mut filled = 0;
+    for number in 0..points.len() {
+        let mut stays = stays::<V>(&points[number], middle, nearest, size, best);
+        if stays == WHOLE && filled == number * 16 {
+            filled += 16;
+            continue;
+        }
+        let block = points[number];
+        while stays != 0 {
+            let lane = stays.trailing_zeros() as usize & 15;
+            stays &= stays - 1;
+            for i in 0..3 {
+                points[filled / 16][i].0[filled % 16] = block[i].0[lane];
+            }
+            filled += 1;
+        }
+    }
+    points.truncate(filled.div_ceil(16));
+    if let Some(last) = points.last_mut().filter(|_| filled % 16 > 0) {
+        last.iter_mut().for_each(|along| along.0[filled % 16..].fill(f32::INFINITY));
+    }
+}
+
 /// Leaves only the points that those nearest to the corners do not keep from a box either.
 #[inline(always)]
-fn thin<V: Lanes>(points: &mut Vec<Points>, middle: &[f32; 3], size: [f32; 3], spare: &mut Vec<Points>) {
+fn thin<V: Lanes>(points: &mut Vec<Points>, middle: &[f32; 3], size: [f32; 3]) {
     // Opposite corners follow each other.
     for corner in [0, 7, 1, 6, 2, 5, 3, 4] {
         if points.len() <= 1 {
@@ -477,9 +524,7 @@ fn thin<V: Lanes>(points: &mut Vec<Points>, middle: &[f32; 3], size: [f32; 3], s
         }
         let at = std::array::from_fn(|i| middle[i] + size[i] * if corner >> i & 1 == 1 { 0.5 } else { -0.5 });
         let (nearest, _) = nearest::<V>(points, &at);
-        spare.clear();
-        keep::<V>(points, middle, &nearest, size, spare);
-        std::mem::swap(points, spare);
+        retain::<V>(points, middle, &nearest, size);
     }
 }
 
