@@ -21,10 +21,8 @@ use std::f64::consts::{FRAC_PI_2, PI};
 const BEHIND: [f64; 3] = [1.6, 0.0, PI];
 
 fn way(bench: &Bench, scene: &Scene, goal: [f64; 3]) -> Trajectory {
-    let here = bench.cell.configuration();
     let request = DriveRequest {
-        start: here.base,
-        arm: here.arm,
+        start: bench.cell.measured(),
         goals: vec![goal],
         position_tolerance_m: 0.0,
         heading_tolerance_rad: 0.0,

@@ -67,8 +67,7 @@ fn under_way(drives: bool) -> (Bench, Ticket, Vec<Configuration>) {
         let request = if drives {
             bench.done(Request::MoveTo { joints: aimm::STOWED, speed: 0.5 });
             let request = DriveRequest {
-                start: [0.0; 3],
-                arm: aimm::STOWED,
+                start: bench.cell.configuration(),
                 goals: vec![[-2.0, 0.3, 0.8]],
                 position_tolerance_m: 0.0,
                 heading_tolerance_rad: 0.0,

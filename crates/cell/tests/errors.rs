@@ -9,7 +9,6 @@ use ratn_motion::aimm;
 use ratn_motion::base::{DriveRequest, plan_drive};
 use ratn_motion::pace::Control;
 use ratn_motion::plan::Goal;
-use ratn_motion::robot::Configuration;
 use ratn_world::scene::Scene;
 
 mod bench;
@@ -44,10 +43,8 @@ fn the_base_believes_to_stand_beside_where_it_stands_and_elsewhere_beside_at_eve
     for goal in [[-1.0, 0.0, 0.0], [-1.0, 0.5, 0.3], [-1.5, 0.0, 0.0]] {
         let Product::BaseSensed { pose } = bench.done(Request::SenseBase) else { panic!() };
         offs.push(pose.inverse().compose(&bench.cell.base_pose()));
-        let Configuration { base, arm, .. } = bench.cell.measured();
         let request = DriveRequest {
-            start: base,
-            arm,
+            start: bench.cell.measured(),
             goals: vec![goal],
             position_tolerance_m: 0.0,
             heading_tolerance_rad: 0.0,

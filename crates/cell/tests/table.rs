@@ -114,7 +114,7 @@ fn set_table(bench: &mut Bench) {
         let size = seen.model.size();
         found[i] = (name.clone(), seen, Placement::World(seen.pose));
         let request = |bench: &Bench, goals: Vec<Pose>| PlanRequest {
-            start: bench.arm(),
+            start: bench.cell.measured(),
             goals: goals.into_iter().map(Goal::Pose).collect(),
             depart_m: 0.10,
             approach_m: 0.10,

@@ -21,7 +21,7 @@ use ratn_motion::problems::Problems;
 use ratn_motion::refine::{End, Refinement, Shares};
 use ratn_motion::simplify::{path_length, simplify};
 use ratn_motion::space::{Isa, Obstacle, Space, State};
-use ratn_motion::timing::{Part, timed};
+use ratn_motion::timing::{Section, timed};
 use std::time::Instant;
 
 const BUDGET: Budget = Budget { iterations: 20_000, seed: 1 };
@@ -256,8 +256,9 @@ fn durations(mechanisms: &[(String, Mechanism)], tasks: &[Task]) {
         space.set_swept(true);
         let path: Vec<[f64; 7]> = path.iter().map(|s| std::array::from_fn(|j| f64::from(s[j]))).collect();
         let begin = Instant::now();
-        let curve =
-            timed(&mechanism.joints, &[Part::Free(path)], 1.0, &mut |a, b| space.is_free_motion(&state(a), &state(b)));
+        let curve = timed(&mechanism.joints, &[Section::Blended(path)], 1.0, &mut |a, b| {
+            space.is_free_motion(&state(a), &state(b))
+        });
         rows.push((&task.class, curve.duration_s(), begin.elapsed().as_secs_f64() * 1e6));
     }
     println!("class, problems, mean duration s, median us");

@@ -5,7 +5,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_motion::robot::Joint;
-use ratn_motion::timing::{Part, timed};
+use ratn_motion::timing::{Section, timed};
 use serde_json::json;
 use std::time::Instant;
 
@@ -25,7 +25,7 @@ fn limits<const N: usize>(random: &mut ChaCha8Rng) -> Vec<Joint> {
 
 fn case<const N: usize>(kind: &str, joints: &[Joint], path: &[[f64; N]]) {
     let begin = Instant::now();
-    let curve = timed(joints, &[Part::Free(path.to_vec())], 1.0, &mut |_, _| true);
+    let curve = timed(joints, &[Section::Blended(path.to_vec())], 1.0, &mut |_, _| true);
     let made_in_us = begin.elapsed().as_micros();
     let knots: Vec<_> =
         curve.knots().iter().map(|k| json!([k.time_s, k.positions.as_slice(), k.velocities.as_slice()])).collect();

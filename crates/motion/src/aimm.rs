@@ -102,7 +102,7 @@ mod tests {
     /// Some solution at the grasp from which the straight line up is free.
     fn reachable(robot: &Robot, scene: &Scene, pose: &Pose, size: [f64; 3]) -> Result<(), String> {
         let reach = arm::reach(robot);
-        let mut checker = Checker::new(robot, scene, PADDING_M);
+        let mut checker = Checker::new(robot, scene, &arm::assumed(robot, scene), PADDING_M);
         let mut random = ChaCha8Rng::seed_from_u64(1);
         let mut reasons = Vec::new();
         for grasp in grasp_poses(pose, size) {
@@ -168,7 +168,7 @@ mod tests {
         let on_table = rows.map(|(x, y)| Pose::from_rpy([x, y, TABLE_HEIGHT_M], 0.0, 0.0, FRAC_PI_2));
         let objects = on_table.chain(slots()).enumerate().map(|(i, p)| standing(&format!("box_{i}"), &p, BOX_GREATEST));
         let scene = Scene { base: Pose::IDENTITY, objects: objects.chain([table()]).collect() };
-        let mut checker = Checker::new(&robot, &scene, PADDING_M);
+        let mut checker = Checker::new(&robot, &scene, &arm::assumed(&robot, &scene), PADDING_M);
         for (name, posture) in [("HOME", HOME), ("OBSERVATION", OBSERVATION), ("STOWED", STOWED)] {
             let tool = arm::reach(&robot).pose(&arm::positions(&posture));
             assert_eq!(robot.clamp(&posture), posture, "{name} is within limits");
@@ -192,8 +192,8 @@ mod tests {
                 let way = [x - eye[0], y - eye[1], z - eye[2]].map(|c| c as f32);
                 let ray = Ray::new(Vector::from_array(eye.map(|c| c as f32)), Vector::from_array(way));
                 let meets = shapes.iter().filter(|(_, pose, shape)| shape.cast_ray(pose, &ray, 1.0, true).is_some());
-                for (link, ..) in meets.filter(|(link, ..)| robot.links[*link].name != "tilt") {
-                    hidden.push(format!("({x:.2}, {y:.2}, {z:.2}) behind {}", robot.links[*link].name));
+                for (link, ..) in meets.filter(|(link, ..)| robot.model.links[*link].name != "tilt") {
+                    hidden.push(format!("({x:.2}, {y:.2}, {z:.2}) behind {}", robot.model.links[*link].name));
                 }
             }
         }

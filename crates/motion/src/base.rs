@@ -5,7 +5,6 @@
 //! stands on the deck, and what is held, rides along. Headings of a trajectory go on beyond half a turn; those of a place do not.
 
 use crate::aimm;
-use crate::arm::finger_around_held;
 use crate::collision::length;
 use crate::connect::{Budget, ConnectError};
 use crate::drive::{Vehicle, drive_in, state, wrapped};
@@ -13,9 +12,9 @@ use crate::exact::{Exact, Touch};
 use crate::geometry::Geometry;
 use crate::pace::Control;
 use crate::request::MIN_SPEED;
-use crate::robot::{Configuration, Joint, Joints, Robot, to_f32};
+use crate::robot::{Configuration, Joint, Robot, to_f32};
 use crate::space::{Obstacle, Space};
-use crate::timing::{Part, timed};
+use crate::timing::{Section, timed};
 use crate::trajectory::{BaseTrajectory, Curve, TrajectoryError};
 use crate::validate::{Violation, check_limits, check_rest};
 use rand::{RngExt, SeedableRng};
@@ -53,10 +52,8 @@ const RESOLUTION_M: f64 = 1e-3;
 /// Where to drive.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DriveRequest {
-    /// From there: x, y and heading.
-    pub start: [f64; 3],
-    /// The posture that the arm is in all along.
-    pub arm: Joints,
+    /// The whole robot at the start. The base drives from there; everything else stays as it is all along.
+    pub start: Configuration,
     /// Alternatives, any one will do: x, y and heading.
     pub goals: Vec<[f64; 3]>,
     /// A goal that is not free may be missed by so much, in metres.
@@ -152,7 +149,7 @@ pub fn riding(robot: &Robot, scene: &Scene) -> Vec<String> {
     let Some(base) = robot.link("base") else { return Vec::new() };
     let frame = robot.poses(&standing)[base];
     let stands = |pose: &Pose, geometry: &Geometry| {
-        robot.links[base].bodies.iter().any(|deck| {
+        robot.model.links[base].bodies.iter().any(|deck| {
             let Geometry::Box { half } = deck.geometry else { return false };
             let seen = frame.compose(&deck.pose).inverse().compose(pose);
             let low = geometry.shape(0.0).compute_aabb(&to_f32(&geometry.at(seen).pose)).mins.z;
@@ -177,19 +174,20 @@ pub fn plan_drive(
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<DrivePlan, DriveError> {
     request.check()?;
-    let here = Configuration { arm: request.arm, finger: finger_around_held(robot, scene), ..Configuration::ZERO };
-    let here = here.with_base(&scene.base);
+    let here = request.start.with_base(&scene.base);
     let riding = riding(robot, scene);
     let (vehicle, obstacles) = Vehicle::of(robot, scene, &here, &riding, aimm::DRIVE_AREA, PADDING_M);
     let mechanism = vehicle.mechanism();
     let mut space = Space::new(&mechanism, &obstacles);
     let budget = Budget { iterations: ITERATIONS, seed: request.seed };
-    let found = match drive_in(&mut space, request.start, &request.goals, budget, control) {
-        Err(ConnectError::Goal { .. }) => drive_in(&mut space, request.start, &request.around(), budget, control),
+    let found = match drive_in(&mut space, request.start.base, &request.goals, budget, control) {
+        Err(ConnectError::Goal { .. }) => drive_in(&mut space, request.start.base, &request.around(), budget, control),
         other => other,
     };
     let (path, _) = found.map_err(|error| match error {
-        ConnectError::Start => DriveError::Start { touch: Exact::new(&mechanism, &obstacles).touch(&request.start) },
+        ConnectError::Start => {
+            DriveError::Start { touch: Exact::new(&mechanism, &obstacles).touch(&request.start.base) }
+        }
         ConnectError::Goal { .. } => DriveError::Goal {
             goals: request.goals.len(),
             position_m: request.position_tolerance_m,
@@ -200,7 +198,7 @@ pub fn plan_drive(
     })?;
     let joints = limits(robot);
     let mut free = |from: &[f64; 3], to: &[f64; 3]| space.is_free_motion(&state(*from), &state(*to));
-    let trajectory = timed(&joints, &[Part::Free(path.clone())], request.speed, &mut free);
+    let trajectory = timed(&joints, &[Section::Blended(path.clone())], request.speed, &mut free);
     let [x, y, heading] = trajectory.end();
     Ok(DrivePlan { trajectory: trajectory.named(&joints), end: [x, y, wrapped(heading)], length: length(&path) })
 }
@@ -305,7 +303,7 @@ impl DriveRequest {
             return malformed("the number of goals", self.goals.len().to_string(), format!("1 to {MAX_GOALS}"));
         }
         let finite = |place: &[f64; 3]| place.iter().all(|c| c.is_finite());
-        match self.goals.iter().chain([&self.start]).find(|place| !finite(place)) {
+        match self.goals.iter().chain([&self.start.base]).find(|place| !finite(place)) {
             Some(place) => malformed("a place", format!("{place:?}"), "finite numbers".to_owned()),
             None => Ok(()),
         }

@@ -6,7 +6,6 @@
 //! vector checks of `arm` and `space`. Shapes that move are grown by a padding. Between two postures no further apart than [`Checker::steps`]
 //! allows, no point is further than the padding from its place in the nearer one: where both are free, the way between is.
 
-use crate::arm::{finger_around_held, is_neighbour};
 use crate::frame::compose;
 use crate::robot::{Body, Configuration, Geometry, Joints, Robot, to_f32};
 use parry3d::math::{Pose as Pose32, Vector};
@@ -17,7 +16,7 @@ use ratn_world::scene::{Placement, Scene};
 use std::fmt;
 
 /// How much room the planner keeps around the moving shapes where it begins and ends, in metres.
-pub const PADDING_M: f64 = crate::arm::REACH_M;
+pub const PADDING_M: f64 = crate::arm::OVERHANG_M;
 
 /// How deep the fingers and the held object may press into what they touch where contact is allowed, in metres: poses are
 /// measured, the arm is compliant.
@@ -31,7 +30,8 @@ const UNPADDED_STEP_M: f64 = 0.005;
 pub struct Checker<'a> {
     robot: &'a Robot,
     padding: f64,
-    finger: f64,
+    /// Where everything is; the arm as in the posture checked last.
+    configuration: Configuration,
     obstacles: Vec<Obstacle>,
     moving: Vec<Moving>,
     /// Pairs of moving shapes that can meet.
@@ -59,7 +59,7 @@ struct Obstacle {
 struct Moving {
     name: String,
     link: usize,
-    part: Part,
+    role: Role,
     local: Pose,
     /// Grown by the padding.
     padded: SharedShape,
@@ -69,8 +69,9 @@ struct Moving {
     obstacles: Vec<usize>,
 }
 
+/// What something that moves is there for: what may touch something depends on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Part {
+enum Role {
     Arm,
     Hand,
     Finger,
@@ -109,20 +110,14 @@ impl fmt::Display for Collision {
 }
 
 impl<'a> Checker<'a> {
-    /// A checker of `robot` in `scene`, with the pan-tilt unit at rest. The fingers are taken to be around what is held, else
-    /// open.
-    pub fn new(robot: &'a Robot, scene: &Scene, padding: f64) -> Checker<'a> {
-        Checker::with_finger(robot, scene, padding, finger_around_held(robot, scene))
-    }
-
-    /// As [`Checker::new`], with each finger at `finger` metres from the middle.
-    pub fn with_finger(robot: &'a Robot, scene: &Scene, padding: f64, finger: f64) -> Checker<'a> {
-        let configuration = Configuration { finger, ..Configuration::ZERO.with_base(&scene.base) };
+    /// A checker of `robot` in `scene`, with everything but arm and base as in `here` and the base where the scene has it.
+    pub fn new(robot: &'a Robot, scene: &Scene, here: &Configuration, padding: f64) -> Checker<'a> {
+        let configuration = here.with_base(&scene.base);
         let poses = robot.poses(&configuration);
         let mut checker = Checker {
             robot,
             padding,
-            finger,
+            configuration,
             obstacles: Vec::new(),
             moving: Vec::new(),
             pairs: Vec::new(),
@@ -148,15 +143,15 @@ impl<'a> Checker<'a> {
 
     fn add_robot(&mut self) {
         let hand = self.robot.link("hand");
-        for (i, link) in self.robot.links.iter().enumerate() {
+        for (i, link) in self.robot.model.links.iter().enumerate() {
             for body in &link.bodies {
                 if self.robot.arm_links.contains(&i) {
-                    let part = match () {
-                        () if Some(i) == hand => Part::Hand,
-                        () if link.parent == hand => Part::Finger,
-                        () => Part::Arm,
+                    let role = match () {
+                        () if Some(i) == hand => Role::Hand,
+                        () if link.parent == hand => Role::Finger,
+                        () => Role::Arm,
                     };
-                    self.add_moving(format!("link {}", link.name), i, part, body);
+                    self.add_moving(format!("link {}", link.name), i, role, body);
                 } else {
                     let pose = self.poses[i].compose(&body.pose);
                     self.add_obstacle(format!("link {}", link.name), Some(i), pose, &body.geometry);
@@ -175,17 +170,17 @@ impl<'a> Checker<'a> {
                 }
                 Placement::Gripper(pose) => {
                     let body = geometry.at(*pose);
-                    self.add_moving(format!("held {}", object.name), self.robot.tool, Part::Held, &body);
+                    self.add_moving(format!("held {}", object.name), self.robot.tool, Role::Held, &body);
                 }
             }
         }
     }
 
-    fn add_moving(&mut self, name: String, link: usize, part: Part, body: &Body) {
+    fn add_moving(&mut self, name: String, link: usize, role: Role, body: &Body) {
         self.moving.push(Moving {
             name,
             link,
-            part,
+            role,
             local: body.pose,
             padded: body.geometry.shape(self.padding),
             shape: body.geometry.shape(0.0),
@@ -215,12 +210,12 @@ impl<'a> Checker<'a> {
         for i in 0..self.moving.len() {
             let a = &self.moving[i];
             let obstacles = (0..self.obstacles.len())
-                .filter(|o| self.obstacles[*o].link.is_none_or(|link| !is_neighbour(self.robot, a.link, link)))
+                .filter(|o| self.obstacles[*o].link.is_none_or(|link| !self.robot.model.is_excepted(a.link, link)))
                 .collect();
             for j in i + 1..self.moving.len() {
                 let b = &self.moving[j];
-                let gripper = |m: &Moving| m.part != Part::Arm;
-                let touching = is_neighbour(self.robot, a.link, b.link) || gripper(a) && gripper(b);
+                let gripper = |m: &Moving| m.role != Role::Arm;
+                let touching = self.robot.model.is_excepted(a.link, b.link) || gripper(a) && gripper(b);
                 if !touching {
                     self.pairs.push((i, j));
                 }
@@ -239,7 +234,7 @@ impl<'a> Checker<'a> {
                 reach = reach.max(offset.distance(&Pose::IDENTITY) + f64::from(moving.radius));
             }
             self.reach[joint] = reach;
-            beyond = reach + self.robot.links[link].origin.distance(&Pose::IDENTITY);
+            beyond = reach + self.robot.model.links[link].origin.distance(&Pose::IDENTITY);
         }
     }
 
@@ -249,7 +244,7 @@ impl<'a> Checker<'a> {
             if let Some(joint) = self.robot.arm_joint_links.iter().position(|l| *l == link) {
                 return joint;
             }
-            match self.robot.links[link].parent {
+            match self.robot.model.links[link].parent {
                 Some(parent) => link = parent,
                 None => return 0,
             }
@@ -323,10 +318,10 @@ impl<'a> Checker<'a> {
             return up_to;
         }
         let tolerance = match (contact, other) {
-            (Contact::Gripper(_), Other::Obstacle(o)) if moving.part == Part::Finger && self.obstacles[o].open => {
+            (Contact::Gripper(_), Other::Obstacle(o)) if moving.role == Role::Finger && self.obstacles[o].open => {
                 return up_to;
             }
-            (Contact::Gripper(tolerance), _) if matches!(moving.part, Part::Finger | Part::Held) => tolerance,
+            (Contact::Gripper(tolerance), _) if matches!(moving.role, Role::Finger | Role::Held) => tolerance,
             _ => 0.0,
         };
         match query::contact(&self.placed[i], &*moving.shape, pose, &**shape, up_to as f32) {
@@ -362,7 +357,8 @@ impl<'a> Checker<'a> {
     }
 
     fn hit(&mut self, arm: &Joints, contact: Contact) -> Option<(usize, Other)> {
-        self.robot.update_arm(arm, self.finger, &mut self.poses);
+        self.configuration.arm = *arm;
+        self.robot.update_arm(&self.configuration, &mut self.poses);
         for (i, moving) in self.moving.iter().enumerate() {
             let pose = to_f32(&compose(&self.poses[moving.link], &moving.local));
             self.centres[i] = pose.translation;
@@ -395,12 +391,12 @@ impl<'a> Checker<'a> {
 
     fn allowed(&self, i: usize, other: Other, contact: Contact) -> bool {
         let Contact::Gripper(tolerance) = contact else { return false };
-        if let (Part::Finger, Other::Obstacle(o)) = (self.moving[i].part, other)
+        if let (Role::Finger, Other::Obstacle(o)) = (self.moving[i].role, other)
             && self.obstacles[o].open
         {
             return true;
         }
-        matches!(self.moving[i].part, Part::Finger | Part::Held)
+        matches!(self.moving[i].role, Role::Finger | Role::Held)
             && self.depth(i, other).is_some_and(|depth| depth <= tolerance)
     }
 

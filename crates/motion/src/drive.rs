@@ -6,9 +6,9 @@
 
 use crate::connect::{Budget, ConnectError, connect};
 use crate::geometry::Body;
-use crate::mechanism::{Drive, MAX_JOINTS, Mechanism, Part};
+use crate::mechanism::{MAX_JOINTS, Mechanism};
 use crate::pace::Control;
-use crate::robot::{Configuration, Geometry, Joint, Robot};
+use crate::robot::{Configuration, Drive, Geometry, Joint, Link, Robot};
 use crate::simplify::simplify;
 use crate::space::{Obstacle, Space, State};
 use crate::spheres::cover_within;
@@ -50,7 +50,7 @@ impl Vehicle {
         let [x, y, yaw] = configuration.base;
         let base = Pose::from_rpy([x, y, 0.0], 0.0, 0.0, yaw).inverse();
         let poses = robot.poses(configuration);
-        let links = robot.links.iter().zip(&poses);
+        let links = robot.model.links.iter().zip(&poses);
         let placed = |pose: &Pose, body: &Body| Body { pose: base.compose(pose).compose(&body.pose), ..*body };
         let mut bodies: Vec<Body> =
             links.flat_map(|(link, pose)| link.bodies.iter().map(|body| placed(pose, body))).collect();
@@ -79,18 +79,9 @@ impl Vehicle {
             jerk: 10.0,
         };
         let joints = vec![joint("x", x_low, x_high), joint("y", y_low, y_high), joint("heading", -TAU, TAU)];
-        let link = |parent, drive| Part {
-            name: "base".to_owned(),
-            parent,
-            origin: Pose::IDENTITY,
-            drive,
-            bodies: Vec::new(),
-            meshes: Vec::new(),
-            padding_m: 0.0,
-            spheres: Vec::new(),
-        };
-        let slide = |joint, axis| Some(Drive { joint, axis, slides: true });
-        let turn = Some(Drive { joint: 2, axis: [0.0, 0.0, 1.0], slides: false });
+        let link = |parent, drive| Link::bare("base", parent, Pose::IDENTITY, drive);
+        let slide = |joint, axis| Some(Drive { joint, axis, slides: true, factor: 1.0 });
+        let turn = Some(Drive { joint: 2, axis: [0.0, 0.0, 1.0], slides: false, factor: 1.0 });
         let mut links = vec![link(None, slide(0, [1.0, 0.0, 0.0])), link(Some(0), slide(1, [0.0, 1.0, 0.0]))];
         let mut base = link(Some(1), turn);
         base.padding_m = self.padding_m;
@@ -98,7 +89,7 @@ impl Vehicle {
         let grown = |body: &Body| Body { geometry: body.geometry.grown(self.padding_m), ..*body };
         base.spheres = self.bodies.iter().flat_map(|body| cover_within(&grown(body), OVERHANG_M)).collect();
         links.push(base);
-        Mechanism { name: "vehicle".to_owned(), joints, links, disabled: BTreeSet::new(), allowed: BTreeSet::new() }
+        Mechanism::new("vehicle", joints, links, Some(&BTreeSet::new()))
     }
 }
 

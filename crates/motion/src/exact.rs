@@ -10,6 +10,7 @@ use crate::inside::Inside;
 use crate::mechanism::Mechanism;
 use crate::mesh::Mesh;
 use crate::robot::to_f32;
+use crate::robot_model::Link;
 use crate::space::Obstacle;
 use crate::surroundings::{MeshObstacle, Surroundings};
 use parry3d::math::{Pose as Pose32, Vector};
@@ -130,7 +131,7 @@ impl<'a> Exact<'a> {
             let body = obstacle.geometry.at(obstacle.pose);
             (&*obstacle.name, Shape::primitive(&body, 0.0))
         };
-        let bodies = |link: &crate::mechanism::Part| {
+        let bodies = |link: &Link| {
             let primitives = link.bodies.iter().map(|body| Shape::primitive(body, link.padding_m));
             let meshes = link.meshes.iter().map(|m| Shape::mesh(m.pose, &m.mesh, link.padding_m));
             primitives.chain(meshes).collect()

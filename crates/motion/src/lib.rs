@@ -40,6 +40,8 @@ pub mod reach;
 pub mod refine;
 mod request;
 pub mod robot;
+pub mod robot_model;
+pub mod robot_state;
 pub mod rrt_star;
 mod scalar;
 mod simd;

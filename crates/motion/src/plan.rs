@@ -10,7 +10,7 @@
 //! postures that have room for them; where the start or a candidate has less, a short way out of there comes first. Where the
 //! tool is to stay upright, the free path keeps it so (`constrained`), and the straight parts do anyway.
 
-use crate::arm::{self, finger_around_held, joints, positions, state};
+use crate::arm::{self, joints, positions, state};
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M, distance, length};
 use crate::connect::{Budget, ConnectError, connect};
 use crate::constrained::{self, Constraint};
@@ -22,7 +22,7 @@ pub use crate::request::{Goal, MAX_GOALS, MAX_STRAIGHT_M, MIN_SPEED, Request};
 use crate::robot::{Configuration, Joints, Robot};
 use crate::simplify::{path_length, shortened};
 use crate::space::{Space, State};
-use crate::timing::{Part, timed_while};
+use crate::timing::{Section, timed_while};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
@@ -192,10 +192,11 @@ pub fn plan(
 ) -> Result<Plan, PlanError> {
     request.check(robot)?;
     let mut pace = Pace::new(control);
-    let (mechanism, obstacles) = arm::in_scene(robot, scene, finger_around_held(robot, scene));
+    let here = request.start.with_base(&scene.base);
+    let (mechanism, obstacles) = arm::in_scene(robot, scene, &here);
     let mut planning = Planning {
         robot,
-        checker: Checker::new(robot, scene, PADDING_M).reaching_into(&request.reaches_into),
+        checker: Checker::new(robot, scene, &here, PADDING_M).reaching_into(&request.reaches_into),
         space: arm::space(&mechanism, &obstacles),
         reach: Reach::new(&mechanism, robot.tool, Pose::IDENTITY),
         base: arm::on_floor(&scene.base),
@@ -208,7 +209,8 @@ pub fn plan(
     };
     let depart = match planning.depart(request) {
         Err(_) => {
-            planning.checker = Checker::new(robot, scene, TIGHT_PADDING_M).reaching_into(&request.reaches_into);
+            let checker = Checker::new(robot, scene, &here, TIGHT_PADDING_M);
+            planning.checker = checker.reaching_into(&request.reaches_into);
             planning.depart(request)?
         }
         depart => depart?,
@@ -239,7 +241,7 @@ pub fn plan(
     let length_rad = before + f64::from(path_length(&path)) + chosen.length_rad;
     let end = chosen.approach[chosen.approach.len() - 1];
     let free = planning.whole(&start, &path, &chosen);
-    let parts = [Part::Straight(depart), Part::Free(free), Part::Straight(chosen.approach)];
+    let sections = [Section::AsGiven(depart), Section::Blended(free), Section::AsGiven(chosen.approach)];
     let (space, constraint) = (&mut planning.space, &planning.constraint);
     let mut is_free = |from: &Joints, to: &Joints| {
         let (from, to) = (state(from), state(to));
@@ -247,11 +249,12 @@ pub fn plan(
     };
     // To be timed is part of every plan, also when time is up.
     let mut goes_on = || pace.answer() != Control::Cancelled;
-    let trajectory = timed_while(robot.arm_joints(), &parts, request.speed, &mut is_free, &mut goes_on).to_model(robot);
+    let trajectory =
+        timed_while(robot.arm_joints(), &sections, request.speed, &mut is_free, &mut goes_on).to_model(robot);
     if pace.answer() == Control::Cancelled {
         return Err(PlanError::Cancelled);
     }
-    let end_pose = robot.tool_pose(&Configuration { arm: end, ..Configuration::ZERO.with_base(&scene.base) });
+    let end_pose = robot.tool_pose(&Configuration { arm: end, ..here });
     let (iterations, time_up) = (pace.iterations, improved.is_err());
     Ok(Plan { trajectory, end, end_pose, first_length_rad, length_rad, iterations, time_up })
 }
@@ -268,7 +271,7 @@ impl From<Stop> for PlanError {
 impl Planning<'_> {
     /// The straight part at the start; its end is free.
     fn depart(&mut self, request: &Request) -> Result<Vec<Joints>, PlanError> {
-        let start = request.start;
+        let start = request.start.arm;
         if request.depart_m <= 0.0 {
             return match self.checker.collision(&start, Contact::None) {
                 None => Ok(vec![start]),

@@ -3,7 +3,8 @@
 //! The format is JSON: `robot`, `joints` (names, the order of all positions) and `problems`, per class a list of `index`, `start`,
 //! `goal` (radians, metres for sliding joints) and `objects` (`name`, `position` in metres, `quat_xyzw`, and by `type` a `box`
 //! with `size`, a `cylinder` or `capsule` with `length` and `radius`, a `sphere` with `radius`; a capsule's `length` is between
-//! the centres of its ends). `attached` counts what the robot holds, which must be nothing.
+//! the centres of its ends). `attached` counts what the robot holds, which must be nothing. `state` says where joints are that are not
+//! planned for, by name: of the file for all problems, of a problem for that one. The others are at zero, or at the limit next to it.
 //!
 //! Clouds (`cloud`), meshes (`mesh`) and heights (`heightfield`) are in files of their own, which the caller reads; the points of a small
 //! cloud may stand in the problem itself.
@@ -56,6 +57,8 @@ pub struct Problem {
     pub start: Vec<f64>,
     /// Joint positions.
     pub goal: Vec<f64>,
+    /// Positions of joints that are not planned for.
+    pub state: BTreeMap<String, f64>,
 }
 
 impl Problem {
@@ -132,7 +135,7 @@ impl Problems {
         for (class, entries) in file.problems {
             let mut read = |entry: Entry| {
                 let index = entry.index;
-                entry.read(file.joints.len(), &mut files).map_err(|reason| ProblemError::Value {
+                entry.read(&file.joints, &file.state, &mut files).map_err(|reason| ProblemError::Value {
                     class: class.clone(),
                     index,
                     reason,
@@ -150,6 +153,8 @@ struct File {
     #[serde(default)]
     robot: String,
     joints: Vec<String>,
+    #[serde(default)]
+    state: BTreeMap<String, f64>,
     problems: BTreeMap<String, Vec<Entry>>,
 }
 
@@ -162,6 +167,8 @@ struct Entry {
     attached: u64,
     start: Vec<f64>,
     goal: Vec<f64>,
+    #[serde(default)]
+    state: BTreeMap<String, f64>,
 }
 
 #[derive(Deserialize)]
@@ -283,7 +290,13 @@ impl Files<'_> {
 }
 
 impl Entry {
-    fn read(self, joints: usize, files: &mut Files<'_>) -> Result<Problem, String> {
+    fn read(
+        self,
+        names: &[String],
+        everywhere: &BTreeMap<String, f64>,
+        files: &mut Files<'_>,
+    ) -> Result<Problem, String> {
+        let joints = names.len();
         for (what, positions) in [("start", &self.start), ("goal", &self.goal)] {
             if positions.len() != joints {
                 return Err(format!("its {what} has {} positions, the robot has {joints} joints", positions.len()));
@@ -295,7 +308,15 @@ impl Entry {
         if self.attached > 0 {
             return Err("attached objects are not supported".to_owned());
         }
-        let mut problem = Problem { index: self.index, start: self.start, goal: self.goal, ..Problem::default() };
+        let mut state = everywhere.clone();
+        state.extend(self.state);
+        if let Some(joint) = state.keys().find(|joint| names.contains(joint)) {
+            return Err(format!(
+                "its `state` names the joint `{joint}`, which is planned for: `start` and `goal` say where it is"
+            ));
+        }
+        let (index, start, goal) = (self.index, self.start, self.goal);
+        let mut problem = Problem { index, start, goal, state, ..Problem::default() };
         for object in self.objects {
             object.read(&mut problem, files)?;
         }

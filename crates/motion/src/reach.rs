@@ -8,8 +8,8 @@
 
 use crate::elbow::{self, Arc};
 use crate::frame::{compose, cross, difference, norm, rotate};
-use crate::mechanism::{Drive, MAX_JOINTS, Mechanism};
-use crate::robot::Joint;
+use crate::mechanism::{MAX_JOINTS, Mechanism};
+use crate::robot_model::{Drive, Joint};
 use crate::spherical::Spherical;
 use rand::{Rng, RngExt};
 use ratn_model::pose::Pose;
@@ -165,8 +165,9 @@ impl Reach {
 
     /// The frame in the frame of the root.
     pub fn pose(&self, positions: &Positions) -> Pose {
-        let place =
-            |pose: &Pose, (origin, drive): &(Pose, Drive)| compose(&compose(pose, origin), &moved(drive, positions));
+        let place = |pose: &Pose, (origin, drive): &(Pose, Drive)| {
+            compose(&compose(pose, origin), &drive.moved(positions[drive.joint]))
+        };
         compose(&self.chain.iter().fold(Pose::IDENTITY, |pose, link| place(&pose, link)), &self.tip)
     }
 
@@ -302,7 +303,7 @@ impl Reach {
         for (origin, drive) in &self.chain {
             pose = compose(&pose, origin);
             axes.push(Axis { direction: rotate(&pose, drive.axis), point: pose.position, drive: *drive });
-            pose = compose(&pose, &moved(drive, positions));
+            pose = compose(&pose, &drive.moved(positions[drive.joint]));
         }
         (axes, compose(&pose, &self.tip))
     }
@@ -320,7 +321,7 @@ fn jacobian(axes: &[Axis], tip: &Pose, view: &Pose, minded: [bool; 6]) -> [Posit
         let values = rotate(view, linear).into_iter().chain(rotate(view, angular));
         for ((row, value), _) in rows.iter_mut().zip(values).zip(minded).filter(|(_, minded)| *minded) {
             // A joint may move several links of a chain.
-            row[drive.joint] += value;
+            row[drive.joint] += value * drive.factor;
         }
     }
     rows
@@ -339,17 +340,6 @@ fn sorted(mut postures: Vec<Positions>, near: &Positions) -> Vec<Positions> {
 /// The Euclidean distance.
 pub fn distance(a: &Positions, b: &Positions) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
-}
-
-fn moved(drive: &Drive, positions: &Positions) -> Pose {
-    let position = positions[drive.joint];
-    if drive.slides {
-        let [x, y, z] = drive.axis.map(|c| c * position);
-        return Pose::at(x, y, z);
-    }
-    let (sin, cos) = (position / 2.0).sin_cos();
-    let [x, y, z] = drive.axis;
-    Pose { position: [0.0; 3], quaternion_xyzw: [x * sin, y * sin, z * sin, cos] }
 }
 
 /// The axis of a rotation times its angle, at most half a turn.

@@ -2,7 +2,7 @@
 
 use crate::constrained::LEAST_TOLERANCE;
 use crate::plan::PlanError;
-use crate::robot::{Joints, Robot};
+use crate::robot::{Configuration, Joint, Joints, Robot};
 use ratn_model::pose::Pose;
 use std::f64::consts::FRAC_PI_2;
 
@@ -18,8 +18,9 @@ pub const MIN_SPEED: f64 = 0.01;
 /// What to plan.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Request {
-    /// Where the arm is.
-    pub start: Joints,
+    /// Where the whole robot is. The arm moves from there; head and fingers stay; the base is where the scene has it, whatever is said
+    /// here. What is not known: [`assumed`](crate::arm::assumed).
+    pub start: Configuration,
     /// Alternatives; any one will do.
     pub goals: Vec<Goal>,
     /// Leave straight up (world z) this far, in metres.
@@ -74,18 +75,29 @@ impl Request {
             Goal::Joints(joints) => Some(("the goal's", joints)),
             Goal::Pose(_) => None,
         });
-        for (whose, posture) in std::iter::once(("the start's", &self.start)).chain(goals) {
-            for (q, joint) in posture.iter().zip(robot.arm_joints()) {
-                if !(joint.lower - 1e-6..=joint.upper + 1e-6).contains(q) {
-                    let range = format!("{:.3} to {:.3} rad", joint.lower, joint.upper);
-                    return malformed(&format!("{whose} {}", joint.name), q.to_string(), &range);
-                }
+        let beyond = |whose: &str, positions: &[f64], joints: &[Joint], unit| match outside(positions, joints) {
+            None => Ok(()),
+            Some((q, joint)) => {
+                let range = format!("{:.3} to {:.3} {unit}", joint.lower, joint.upper);
+                malformed(&format!("{whose} {}", joint.name), q.to_string(), &range)
             }
+        };
+        let Configuration { arm, pan, tilt, finger, .. } = &self.start;
+        for (whose, posture) in std::iter::once(("the start's", arm)).chain(goals) {
+            beyond(whose, posture, robot.arm_joints(), "rad")?;
         }
+        beyond("the start's", &[*pan, *tilt], robot.head_joints(), "rad")?;
+        beyond("the start's", &[*finger], std::slice::from_ref(robot.finger()), "m")?;
         let finite = |pose: &Pose| pose.position.iter().chain(&pose.quaternion_xyzw).all(|c| c.is_finite());
         if let Some(Goal::Pose(pose)) = self.goals.iter().find(|g| matches!(g, Goal::Pose(p) if !finite(p))) {
             return malformed("a goal pose", format!("{pose:?}"), "finite numbers");
         }
         Ok(())
     }
+}
+
+/// The first position that is beyond the limits of its joint.
+fn outside<'j>(positions: &[f64], joints: &'j [Joint]) -> Option<(f64, &'j Joint)> {
+    let mut all = positions.iter().copied().zip(joints);
+    all.find(|(q, joint)| !(joint.lower - 1e-6..=joint.upper + 1e-6).contains(q))
 }

@@ -1,17 +1,17 @@
-//! The robot as a tree of links, read from its URDF: kinematics and collision shapes.
+//! Our mobile manipulator: the indices by which its parts are known in the one model of a robot, and its state by names.
 //!
 //! Positions are `f64` throughout; only shapes and the poses handed to parry3d are `f32`. A [`Configuration`] names the 13
-//! degrees of freedom. Planning moves the seven arm joints; everything that hangs on them is recomputed by
-//! [`Robot::update_arm`], the rest keeps its place.
+//! degrees of freedom. Planning moves the seven arm joints; the others are where a configuration has them.
 
-use crate::frame::compose;
 pub use crate::geometry::{Body, Geometry};
-use crate::urdf;
+use crate::mechanism::{Mechanism, MechanismError};
+pub use crate::robot_model::{Drive, Joint, Link, RobotModel};
 pub use crate::urdf::RobotError;
 pub use crate::urdf_faults::UrdfFault;
 use parry3d::math::{Pose as Pose32, Rotation, Vector};
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
+use std::ops::Range;
 
 /// Positions of the seven arm joints, in radians.
 pub type Joints = [f64; 7];
@@ -20,7 +20,7 @@ pub type Joints = [f64; 7];
 pub const DEGREES_OF_FREEDOM: usize = 13;
 
 /// The URDF's joints in the order of the degrees of freedom.
-pub(crate) const JOINT_NAMES: [&str; DEGREES_OF_FREEDOM] = [
+const JOINT_NAMES: [&str; DEGREES_OF_FREEDOM] = [
     "base_x",
     "base_y",
     "base_yaw",
@@ -36,19 +36,21 @@ pub(crate) const JOINT_NAMES: [&str; DEGREES_OF_FREEDOM] = [
     "finger",
 ];
 
-/// Index of the first arm joint among the degrees of freedom.
-const FIRST_ARM_JOINT: usize = 3;
+/// The arm's joints, those of the head and that of the fingers among the degrees of freedom.
+const ARM: Range<usize> = 3..10;
+const PAN: usize = 10;
+const TILT: usize = 11;
+const FINGER: usize = 12;
 
 /// The robot that we ship.
 const AIMM_URDF: &str = include_str!("../robots/aimm.urdf");
+const AIMM_SRDF: &str = include_str!("../robots/aimm.srdf");
 
-/// A robot.
+/// A robot with this arm, base, head and gripper.
 #[derive(Debug, Clone)]
 pub struct Robot {
-    /// Parents before children; the first is the world.
-    pub links: Vec<Link>,
-    /// Limits, in the order of the degrees of freedom.
-    pub joints: Vec<Joint>,
+    /// Its joints are in the order of the degrees of freedom; its first link is the world.
+    pub model: RobotModel,
     /// Link indices: the tool frame, the camera's optical frame, the frame the arm is mounted at.
     pub tool: usize,
     /// The camera's optical frame: z forward, x right, y down.
@@ -59,67 +61,6 @@ pub struct Robot {
     pub arm_links: Vec<usize>,
     /// For each arm joint the link that it moves.
     pub arm_joint_links: [usize; 7],
-}
-
-/// One degree of freedom and its limits (radians, or metres for sliding joints).
-#[derive(Debug, Clone, PartialEq)]
-pub struct Joint {
-    /// As in the URDF.
-    pub name: String,
-    /// Least position.
-    pub lower: f64,
-    /// Greatest position.
-    pub upper: f64,
-    /// Greatest speed, per second.
-    pub velocity: f64,
-    /// Greatest acceleration, per second squared.
-    pub acceleration: f64,
-    /// Greatest jerk, per second cubed.
-    pub jerk: f64,
-}
-
-/// Where a URDF names no jerk, the full acceleration is reached in this time, in seconds.
-const TIME_TO_ACCELERATION_S: f64 = 0.1;
-
-/// The jerk of a URDF, or what its acceleration makes likely.
-pub(crate) fn jerk(given: f64, acceleration: f64) -> f64 {
-    if given > 0.0 && given.is_finite() { given } else { acceleration / TIME_TO_ACCELERATION_S }
-}
-
-/// A rigid link.
-#[derive(Debug, Clone)]
-pub struct Link {
-    /// As in the URDF.
-    pub name: String,
-    /// The link it hangs on.
-    pub parent: Option<usize>,
-    /// Where its joint sits in the parent's frame.
-    pub origin: Pose,
-    /// How it moves there.
-    pub motion: Motion,
-    /// What can collide.
-    pub bodies: Vec<Body>,
-}
-
-/// How a link moves relative to its parent.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Motion {
-    /// Not at all.
-    Fixed,
-    /// Turns about an axis by the position of a degree of freedom.
-    Turn {
-        /// Unit vector.
-        axis: [f64; 3],
-        /// Index of the degree of freedom.
-        joint: usize,
-    },
-    /// Slides along an axis by the position of a degree of freedom.
-    Slide {
-        /// Unit vector.
-        axis: [f64; 3],
-        /// Index of the degree of freedom.
-        joint: usize,
-    },
 }
 
 /// Positions of all degrees of freedom.
@@ -147,14 +88,13 @@ impl Configuration {
         Configuration { base: [base.position[0], base.position[1], heading[1].atan2(heading[0])], ..self }
     }
 
-    fn position(&self, joint: usize) -> f64 {
-        match joint {
-            0..=2 => self.base[joint],
-            3..=9 => self.arm[joint - FIRST_ARM_JOINT],
-            10 => self.pan,
-            11 => self.tilt,
-            _ => self.finger,
-        }
+    /// The positions in the order of the degrees of freedom.
+    pub fn positions(&self) -> [f64; DEGREES_OF_FREEDOM] {
+        let mut positions = [0.0; DEGREES_OF_FREEDOM];
+        positions[..ARM.start].copy_from_slice(&self.base);
+        positions[ARM].copy_from_slice(&self.arm);
+        (positions[PAN], positions[TILT], positions[FINGER]) = (self.pan, self.tilt, self.finger);
+        positions
     }
 }
 
@@ -162,74 +102,71 @@ impl Robot {
     /// The robot of the paper: omnidirectional base, KUKA LWR 4+, pan-tilt unit, two-finger gripper.
     pub fn aimm() -> Robot {
         #[expect(clippy::expect_used, reason = "the description is compiled in and read by every test")]
-        Robot::from_urdf(AIMM_URDF).expect("the built-in robot description is valid")
+        Robot::read(AIMM_URDF, AIMM_SRDF).expect("the built-in robot description is valid")
     }
 
-    /// Reads a robot with the joint and link names of our URDF.
+    /// Reads a robot with the joint and link names of our URDF; its SRDF says which links are not checked against each other.
     ///
     /// # Errors
-    /// [`RobotError`] names the link or joint.
-    pub fn from_urdf(text: &str) -> Result<Robot, RobotError> {
-        let (joints, links) = urdf::read(text)?;
-        let find = |name: &str| {
-            links
-                .iter()
-                .position(|l| l.name == name)
-                .ok_or_else(|| RobotError::Missing { what: "link", name: name.to_owned() })
-        };
+    /// [`MechanismError`] names the link or joint.
+    pub fn read(urdf: &str, srdf: &str) -> Result<Robot, MechanismError> {
+        let model = RobotModel::read(urdf, Some(srdf))?.in_order(&JOINT_NAMES)?;
+        let find =
+            |name: &str| model.link(name).ok_or_else(|| RobotError::Missing { what: "link", name: name.to_owned() });
         let (tool, camera, arm_foot) = (find("tool")?, find("camera")?, find("arm_0")?);
         let mut arm_joint_links = [0; 7];
-        let mut on_arm = vec![false; links.len()];
-        for (i, link) in links.iter().enumerate() {
+        let mut on_arm = vec![false; model.links.len()];
+        for (i, link) in model.links.iter().enumerate() {
             on_arm[i] = link.parent.is_some_and(|p| on_arm[p]);
-            if let Motion::Turn { joint, .. } = link.motion
-                && (FIRST_ARM_JOINT..FIRST_ARM_JOINT + 7).contains(&joint)
+            if let Some(Drive { joint, .. }) = link.drive
+                && ARM.contains(&joint)
             {
                 on_arm[i] = true;
-                arm_joint_links[joint - FIRST_ARM_JOINT] = i;
+                arm_joint_links[joint - ARM.start] = i;
             }
         }
-        let arm_links = (0..links.len()).filter(|i| on_arm[*i]).collect();
-        Ok(Robot { links, joints, tool, camera, arm_foot, arm_links, arm_joint_links })
+        let arm_links = (0..model.links.len()).filter(|i| on_arm[*i]).collect();
+        Ok(Robot { model, tool, camera, arm_foot, arm_links, arm_joint_links })
+    }
+
+    /// What is planned for where the arm alone moves, and everything else is as in a configuration.
+    pub(crate) fn arm(&self, configuration: &Configuration) -> Mechanism {
+        self.model.restricted(&ARM.collect::<Vec<usize>>(), &configuration.positions())
     }
 
     /// The limits of the seven arm joints.
     pub fn arm_joints(&self) -> &[Joint] {
-        &self.joints[FIRST_ARM_JOINT..FIRST_ARM_JOINT + 7]
+        &self.model.joints[ARM]
     }
 
     /// The limits of the base's x, y and heading.
     pub fn base_joints(&self) -> &[Joint] {
-        &self.joints[..FIRST_ARM_JOINT]
+        &self.model.joints[..ARM.start]
     }
 
     /// The finger joint: its upper limit is half of the greatest opening.
     pub fn finger(&self) -> &Joint {
-        &self.joints[12]
+        &self.model.joints[FINGER]
+    }
+
+    /// The limits of the head's pan and tilt.
+    pub fn head_joints(&self) -> &[Joint] {
+        &self.model.joints[PAN..=TILT]
     }
 
     /// The index of a link.
     pub fn link(&self, name: &str) -> Option<usize> {
-        self.links.iter().position(|l| l.name == name)
+        self.model.link(name)
     }
 
     /// The pose of every link in the world frame.
     pub fn poses(&self, configuration: &Configuration) -> Vec<Pose> {
-        let mut poses: Vec<Pose> = Vec::with_capacity(self.links.len());
-        for link in &self.links {
-            let local = local_pose(link, |joint| configuration.position(joint));
-            poses.push(link.parent.map_or(local, |parent| compose(&poses[parent], &local)));
-        }
-        poses
+        self.model.poses(&configuration.positions())
     }
 
     /// Recomputes in place the poses of the links that hang on the arm.
-    pub fn update_arm(&self, arm: &Joints, finger: f64, poses: &mut [Pose]) {
-        for &i in &self.arm_links {
-            let link = &self.links[i];
-            let local = local_pose(link, |joint| if joint == 12 { finger } else { arm[joint - FIRST_ARM_JOINT] });
-            poses[i] = link.parent.map_or(local, |parent| compose(&poses[parent], &local));
-        }
+    pub fn update_arm(&self, configuration: &Configuration, poses: &mut [Pose]) {
+        self.model.update(&self.arm_links, &configuration.positions(), poses);
     }
 
     /// The pose of one link in the world frame.
@@ -256,8 +193,8 @@ impl Robot {
             let seen = camera.inverse().transform(target);
             let pan_step = -(seen[0]).atan2((seen[2].powi(2) + seen[1].powi(2)).sqrt());
             let tilt_step = seen[1].atan2(seen[2]);
-            looking.pan = (looking.pan + pan_step).clamp(self.joints[10].lower, self.joints[10].upper);
-            looking.tilt = (looking.tilt + tilt_step).clamp(self.joints[11].lower, self.joints[11].upper);
+            looking.pan = (looking.pan + pan_step).clamp(self.head_joints()[0].lower, self.head_joints()[0].upper);
+            looking.tilt = (looking.tilt + tilt_step).clamp(self.head_joints()[1].lower, self.head_joints()[1].upper);
         }
         (looking.pan, looking.tilt)
     }
@@ -265,7 +202,7 @@ impl Robot {
     /// Every collision shape with its place in the world and the index of its link, for rendering.
     pub fn shapes(&self, configuration: &Configuration) -> Vec<(usize, Pose32, SharedShape)> {
         let poses = self.poses(configuration);
-        let bodies = self.links.iter().enumerate().flat_map(|(i, link)| link.bodies.iter().map(move |b| (i, b)));
+        let bodies = self.model.links.iter().enumerate().flat_map(|(i, link)| link.bodies.iter().map(move |b| (i, b)));
         bodies.map(|(i, body)| (i, to_f32(&poses[i].compose(&body.pose)), body.geometry.shape(0.0))).collect()
     }
 
@@ -283,18 +220,4 @@ impl Robot {
 pub fn to_f32(pose: &Pose) -> Pose32 {
     let ([x, y, z], [i, j, k, w]) = (pose.position.map(|c| c as f32), pose.quaternion_xyzw.map(|c| c as f32));
     Pose32::from_parts(Vector::new(x, y, z), Rotation::from_xyzw(i, j, k, w))
-}
-
-fn local_pose(link: &Link, position: impl Fn(usize) -> f64) -> Pose {
-    match link.motion {
-        Motion::Fixed => link.origin,
-        Motion::Turn { axis: [x, y, z], joint } => {
-            let (sin, cos) = (position(joint) / 2.0).sin_cos();
-            compose(&link.origin, &Pose { position: [0.0; 3], quaternion_xyzw: [x * sin, y * sin, z * sin, cos] })
-        }
-        Motion::Slide { axis, joint } => {
-            let along = position(joint);
-            compose(&link.origin, &Pose { position: axis.map(|c| c * along), ..Pose::IDENTITY })
-        }
-    }
 }

@@ -394,9 +394,11 @@ fn compile_robot(mechanism: &Mechanism, allowed: &[Vec<usize>], padding: f64) ->
                 let moved = origin.compose(&aligned);
                 places.push((frames.len() + 1, aligned.inverse()));
                 let joint = &mechanism.joints[drive.joint];
-                let slide = if drive.slides { joint.lower.abs().max(joint.upper.abs()) } else { 0.0 };
+                let factor = drive.factor as f32;
+                let slide =
+                    if drive.slides { joint.lower.abs().max(joint.upper.abs()) * drive.factor.abs() } else { 0.0 };
                 let (travel, origin) = (slide as f32, rows(&moved));
-                frames.push(Frame { parent, origin, joint: drive.joint, slides: drive.slides, travel });
+                frames.push(Frame { parent, origin, joint: drive.joint, slides: drive.slides, factor, travel });
                 let way = moved.distance(&Pose::IDENTITY);
                 chains.push(match parent {
                     0 => (slide, moved.position),
@@ -491,12 +493,13 @@ fn arm(compiled: &Compiled, mut frame: usize, coarse: &[f32; 4]) -> Arm {
     while frame != 0 {
         let here = &compiled.frames[frame - 1];
         // A joint may move several links of a chain.
+        let factor = here.factor.abs();
         if here.slides {
-            arm.levers[here.joint] += 1.0;
-            arm.slides[here.joint] += 1.0;
+            arm.levers[here.joint] += factor;
+            arm.slides[here.joint] += factor;
         } else {
-            arm.levers[here.joint] += reach;
-            arm.turns[here.joint] += 1.0;
+            arm.levers[here.joint] += reach * factor;
+            arm.turns[here.joint] += factor;
         }
         reach += here.origin[9].hypot(here.origin[10]).hypot(here.origin[11]) + here.travel;
         frame = here.parent;

@@ -5,8 +5,8 @@
 //! Manipulation*, 3.3).
 
 use crate::frame::{compose, cross, difference, norm, rotate};
-use crate::mechanism::Drive;
 use crate::reach::Positions;
+use crate::robot_model::Drive;
 use ratn_model::pose::Pose;
 use std::f64::consts::{PI, TAU};
 
@@ -41,7 +41,7 @@ impl Spherical {
             pose = compose(&pose, origin);
             (axes[i], points[i], joints[i]) = (rotate(&pose, drive.axis), pose.position, drive.joint);
         }
-        let turns = chain.iter().all(|(_, drive)| !drive.slides);
+        let turns = chain.iter().all(|(_, drive)| !drive.slides && drive.factor == 1.0);
         let distinct = (0..7).all(|i| !joints[..i].contains(&joints[i]));
         let square = [(0, 1), (1, 2), (4, 5), (5, 6)].iter().all(|(a, b)| dot(axes[*a], axes[*b]).abs() < MEETING);
         let meeting = |first: usize| {

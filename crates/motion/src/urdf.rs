@@ -1,12 +1,13 @@
-//! Reading the robot's description: its links, parents first, and the limits of its degrees of freedom.
+//! Reading a robot's description: its links, parents first, what moves them, and the limits of its joints.
 
 use crate::geometry::{Body, Geometry};
 use crate::mesh::{Mesh, MeshError, Meshed};
-use crate::robot::{JOINT_NAMES, Joint, Link, Motion, jerk};
+use crate::robot_model::{Drive, Joint, Link};
+use crate::spheres;
 use crate::urdf_faults;
 use crate::urdf_faults::UrdfFault;
 use ratn_model::pose::Pose;
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 /// A URDF that does not describe this kind of robot.
@@ -53,101 +54,138 @@ pub enum RobotError {
 ///
 /// # Errors
 /// [`RobotError::Fault`] names the line.
-pub(crate) fn parse(text: &str) -> Result<urdf_rs::Robot, RobotError> {
+fn parse(text: &str) -> Result<urdf_rs::Robot, RobotError> {
     urdf_faults::check(text)?;
     Ok(urdf_rs::read_from_string(text)?)
 }
 
-/// The degrees of freedom and the links of a description.
-pub(crate) fn read(text: &str) -> Result<(Vec<Joint>, Vec<Link>), RobotError> {
-    let urdf = parse(text)?;
-    let mut joints = Vec::new();
-    for name in JOINT_NAMES {
-        let joint = urdf
-            .joints
-            .iter()
-            .find(|j| j.name == name)
-            .ok_or_else(|| RobotError::Missing { what: "joint", name: name.to_owned() })?;
-        joints.push(Joint {
-            name: name.to_owned(),
-            lower: joint.limit.lower,
-            upper: joint.limit.upper,
-            velocity: joint.limit.velocity,
-            acceleration: joint.limit.acceleration,
-            jerk: jerk(joint.limit.jerk, joint.limit.acceleration),
-        });
-    }
-    Ok((joints, sorted_links(&urdf)?))
+/// What a URDF describes.
+pub(crate) struct Description {
+    pub(crate) name: String,
+    /// Those with a position of their own.
+    pub(crate) joints: Vec<Joint>,
+    /// Parents before children; each driven by the index of a joint.
+    pub(crate) links: Vec<Link>,
+    /// The names of the joints that mimic others.
+    pub(crate) mimics: BTreeSet<String>,
 }
 
-fn sorted_links(urdf: &urdf_rs::Robot) -> Result<Vec<Link>, RobotError> {
-    let descriptions: BTreeMap<&str, &urdf_rs::Link> = urdf.links.iter().map(|l| (l.name.as_str(), l)).collect();
-    let describe = |name: &str| {
-        descriptions.get(name).copied().ok_or_else(|| RobotError::Missing { what: "link", name: name.to_owned() })
-    };
-    let mut links = vec![Link {
-        name: "world".to_owned(),
-        parent: None,
-        origin: Pose::IDENTITY,
-        motion: Motion::Fixed,
-        bodies: bodies(describe("world")?)?,
-    }];
-    // Breadth first from the world: parents come before children.
+/// Limits of a joint that has none, in radians: a whole turn.
+const ENDLESS_RAD: f64 = std::f64::consts::PI;
+
+/// Where a URDF names no acceleration, the speed is reached in this time, in seconds.
+const TIME_TO_SPEED_S: f64 = 0.25;
+
+/// Where a URDF names no jerk, the full acceleration is reached in this time, in seconds.
+const TIME_TO_ACCELERATION_S: f64 = 0.1;
+
+/// Reads a description; `load` gives what is in a mesh file.
+///
+/// # Errors
+/// [`RobotError`] names the link or joint.
+pub(crate) fn read(text: &str, load: &mut Loader<'_>) -> Result<Description, RobotError> {
+    let urdf = parse(text)?;
+    let moves = |j: &&urdf_rs::Joint| j.joint_type != urdf_rs::JointType::Fixed && j.mimic.is_none();
+    let joints: Vec<Joint> = urdf.joints.iter().filter(moves).map(joint).collect();
+    let links = links(&urdf, &joints, load)?;
+    let mimics = urdf.joints.iter().filter(|j| j.mimic.is_some()).map(|j| j.name.clone()).collect();
+    Ok(Description { name: urdf.name, joints, links, mimics })
+}
+
+/// A joint with its limits; what is not given is taken from what is.
+fn joint(joint: &urdf_rs::Joint) -> Joint {
+    let limit = &joint.limit;
+    let endless = joint.joint_type == urdf_rs::JointType::Continuous;
+    let (lower, upper) = if endless { (-ENDLESS_RAD, ENDLESS_RAD) } else { (limit.lower, limit.upper) };
+    let proper = |given: f64| given > 0.0 && given.is_finite();
+    let velocity = if limit.velocity > 0.0 { limit.velocity } else { 1.0 };
+    let acceleration = if proper(limit.acceleration) { limit.acceleration } else { velocity / TIME_TO_SPEED_S };
+    let jerk = if proper(limit.jerk) { limit.jerk } else { acceleration / TIME_TO_ACCELERATION_S };
+    Joint { name: joint.name.clone(), lower, upper, velocity, acceleration, jerk }
+}
+
+/// All links, breadth first from the root: parents come before children.
+fn links(urdf: &urdf_rs::Robot, joints: &[Joint], load: &mut Loader<'_>) -> Result<Vec<Link>, RobotError> {
+    let children: BTreeSet<&str> = urdf.joints.iter().map(|j| j.child.link.as_str()).collect();
+    let root = urdf.links.iter().find(|l| !children.contains(l.name.as_str()));
+    let root = root.ok_or_else(|| RobotError::Missing { what: "link", name: "without a parent".to_owned() })?;
+    let mut links = vec![link(root, None, Pose::IDENTITY, None, load)?];
     let mut next = 0;
     while next < links.len() {
         let parent = links[next].name.clone();
         for joint in urdf.joints.iter().filter(|j| j.parent.link == parent) {
-            let child = describe(&joint.child.link)?;
-            if links.iter().any(|l| l.name == child.name) {
+            let name = &joint.child.link;
+            let child = urdf.links.iter().find(|l| l.name == *name);
+            let child = child.ok_or_else(|| RobotError::Missing { what: "link", name: name.clone() })?;
+            if links.iter().any(|l| l.name == *name) {
                 let reason = "a link has two parents";
-                return Err(RobotError::Unsupported { what: "link", name: child.name.clone(), reason });
+                return Err(RobotError::Unsupported { what: "link", name: name.clone(), reason });
             }
-            links.push(Link {
-                name: child.name.clone(),
-                parent: Some(next),
-                origin: origin(&joint.origin),
-                motion: motion(joint)?,
-                bodies: bodies(child)?,
-            });
+            let (origin, drive) = drive(urdf, joints, joint)?;
+            links.push(link(child, Some(next), origin, drive, load)?);
         }
         next += 1;
     }
     Ok(links)
 }
 
-fn motion(joint: &urdf_rs::Joint) -> Result<Motion, RobotError> {
-    let unsupported = |reason| RobotError::Unsupported { what: "joint", name: joint.name.clone(), reason };
-    if joint.joint_type == urdf_rs::JointType::Fixed {
-        return Ok(Motion::Fixed);
-    }
-    let driver = match &joint.mimic {
-        None => &joint.name,
-        Some(mimic) if mimic.multiplier.unwrap_or(1.0) == 1.0 && mimic.offset.unwrap_or(0.0) == 0.0 => &mimic.joint,
-        Some(_) => return Err(unsupported("it mimics another joint by a factor or an offset")),
-    };
-    let index = JOINT_NAMES.iter().position(|name| name == driver);
-    let index = index.ok_or_else(|| unsupported("its name is none of the robot's degrees of freedom"))?;
-    let length = joint.axis.xyz.0.iter().map(|c| c * c).sum::<f64>().sqrt();
-    let axis = joint.axis.xyz.0.map(|c| c / length);
-    match joint.joint_type {
-        urdf_rs::JointType::Revolute => Ok(Motion::Turn { axis, joint: index }),
-        urdf_rs::JointType::Prismatic => Ok(Motion::Slide { axis, joint: index }),
-        _ => Err(unsupported("only fixed, revolute and prismatic joints are known")),
-    }
+fn link(
+    link: &urdf_rs::Link,
+    parent: Option<usize>,
+    origin: Pose,
+    drive: Option<Drive>,
+    load: &mut Loader<'_>,
+) -> Result<Link, RobotError> {
+    let (bodies, meshes) = shapes(link, load)?;
+    let spheres = bodies.iter().flat_map(spheres::cover).chain(meshes.iter().flat_map(|m| m.cover(0.0))).collect();
+    Ok(Link { bodies, meshes, spheres, ..Link::bare(&link.name, parent, origin, drive) })
 }
 
-/// The primitives of a link, of which all its shapes must be.
-fn bodies(link: &urdf_rs::Link) -> Result<Vec<Body>, RobotError> {
-    let body = |collision: &urdf_rs::Collision| {
-        let reason = "collision shapes are primitives, not meshes";
-        let unsupported = || RobotError::Unsupported { what: "link", name: link.name.clone(), reason };
-        primitive(&collision.geometry).map(|geometry| geometry.at(origin(&collision.origin))).ok_or_else(unsupported)
+/// Where a joint is, and what moves it.
+fn drive(urdf: &urdf_rs::Robot, joints: &[Joint], joint: &urdf_rs::Joint) -> Result<(Pose, Option<Drive>), RobotError> {
+    let origin = origin(&joint.origin);
+    let unsupported = |reason| RobotError::Unsupported { what: "joint", name: joint.name.clone(), reason };
+    let slides = match joint.joint_type {
+        urdf_rs::JointType::Fixed => return Ok((origin, None)),
+        urdf_rs::JointType::Prismatic => true,
+        urdf_rs::JointType::Revolute | urdf_rs::JointType::Continuous => false,
+        _ => return Err(unsupported("only fixed, revolute, continuous and prismatic joints are known")),
     };
-    link.collision.iter().map(body).collect()
+    let length = joint.axis.xyz.0.iter().map(|c| c * c).sum::<f64>().sqrt();
+    if length < 1e-9 {
+        return Err(unsupported("its axis has no length"));
+    }
+    let axis = joint.axis.xyz.0.map(|c| c / length);
+    let Followed { driver, factor, offset } = followed(urdf, joint)?;
+    let still = Drive { joint: 0, axis, slides, factor: 1.0 };
+    let origin = if offset == 0.0 { origin } else { origin.compose(&still.moved(offset)) };
+    let index = joints.iter().position(|joint| joint.name == driver.name);
+    Ok((origin, index.map(|joint| Drive { joint, factor, ..still })))
+}
+
+/// What a joint's position is made of: that of a joint that mimics none, times a factor, and an offset.
+struct Followed<'u> {
+    driver: &'u urdf_rs::Joint,
+    factor: f64,
+    offset: f64,
+}
+
+/// Follows mimics to the joint at the end of their chain.
+fn followed<'u>(urdf: &'u urdf_rs::Robot, joint: &'u urdf_rs::Joint) -> Result<Followed<'u>, RobotError> {
+    let mut followed = Followed { driver: joint, factor: 1.0, offset: 0.0 };
+    for _ in 0..=urdf.joints.len() {
+        let Some(mimic) = &followed.driver.mimic else { return Ok(followed) };
+        let missing = || RobotError::Missing { what: "joint", name: mimic.joint.clone() };
+        followed.driver = urdf.joints.iter().find(|j| j.name == mimic.joint).ok_or_else(missing)?;
+        followed.offset += followed.factor * mimic.offset.unwrap_or(0.0);
+        followed.factor *= mimic.multiplier.unwrap_or(1.0);
+    }
+    let reason = "it mimics itself, directly or through other joints";
+    Err(RobotError::Unsupported { what: "joint", name: joint.name.clone(), reason })
 }
 
 /// The primitives and the meshes of a link; `load` gives what is in the file of a name.
-pub(crate) fn shapes(link: &urdf_rs::Link, load: &mut Loader<'_>) -> Result<(Vec<Body>, Vec<Meshed>), RobotError> {
+fn shapes(link: &urdf_rs::Link, load: &mut Loader<'_>) -> Result<(Vec<Body>, Vec<Meshed>), RobotError> {
     let (mut bodies, mut meshes) = (Vec::new(), Vec::new());
     for collision in &link.collision {
         let pose = origin(&collision.origin);
@@ -180,7 +218,7 @@ fn primitive(geometry: &urdf_rs::Geometry) -> Option<Geometry> {
     })
 }
 
-pub(crate) fn origin(pose: &urdf_rs::Pose) -> Pose {
+fn origin(pose: &urdf_rs::Pose) -> Pose {
     let [roll, pitch, yaw] = pose.rpy.0;
     Pose::from_rpy(pose.xyz.0, roll, pitch, yaw)
 }

@@ -2,7 +2,7 @@
 
 use crate::collision::{Checker, Collision, Contact};
 use crate::cubic::Cubic;
-use crate::robot::{Joint, Joints, Robot};
+use crate::robot::{Configuration, Joint, Joints, Robot};
 use crate::trajectory::{ArmTrajectory, Curve, Knot, TrajectoryError};
 use ratn_model::value::Trajectory;
 use ratn_world::scene::Scene;
@@ -81,27 +81,23 @@ pub enum Violation {
     },
 }
 
-/// Checks a trajectory for an arm that is at `start` in `scene`, each finger `finger` metres from the middle (`None`: around
-/// what is held, else open), with the `contact` that the motion may make. Returns it ready to be sampled.
+/// Checks a trajectory for the arm of a robot that is as in `here`, its base where the scene has it, with the `contact` that the motion may
+/// make. Returns it ready to be sampled.
 ///
 /// # Errors
 /// The first [`Violation`].
 pub fn validate_trajectory(
     robot: &Robot,
     scene: &Scene,
-    start: &Joints,
-    finger: Option<f64>,
+    here: &Configuration,
     trajectory: &Trajectory,
     contact: Contact,
 ) -> Result<ArmTrajectory, Violation> {
     let trajectory = ArmTrajectory::read(robot, trajectory)?;
-    check_start(robot, start, &trajectory)?;
+    check_start(robot, &here.arm, &trajectory)?;
     check_rest(robot.arm_joints(), &trajectory)?;
     check_limits(robot.arm_joints(), &trajectory)?;
-    let mut checker = match finger {
-        Some(finger) => Checker::with_finger(robot, scene, 0.0, finger),
-        None => Checker::new(robot, scene, 0.0),
-    };
+    let mut checker = Checker::new(robot, scene, here, 0.0);
     check_collisions(&mut checker, &trajectory, contact)?;
     Ok(trajectory)
 }

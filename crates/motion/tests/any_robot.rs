@@ -179,7 +179,7 @@ fn links_that_are_fixed_to_each_other_are_checked_as_one_by_one_whatever_each_ma
         for isa in Isa::available() {
             let mut space = Space::with_isa(&mechanism, &obstacles, isa);
             let mut smaller = Space::with_isa(&thin, &obstacles, isa);
-            for _ in 0..50 {
+            for _ in 0..150 {
                 let state = posture(&mut random, &mechanism);
                 let touch = exact.touch(&positions(&mechanism, &state));
                 match (space.is_free(&state), touch) {

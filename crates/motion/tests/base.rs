@@ -25,8 +25,7 @@ fn cell(base: Pose, more: &[SceneObject]) -> Scene {
 
 fn to(goal: [f64; 3]) -> DriveRequest {
     DriveRequest {
-        start: [0.0; 3],
-        arm: aimm::STOWED,
+        start: STANDING,
         goals: vec![goal],
         position_tolerance_m: 0.0,
         heading_tolerance_rad: 0.0,
@@ -91,7 +90,7 @@ fn what_is_in_the_way_starts_elsewhere_or_is_too_fast_is_refused_with_the_reason
 fn a_goal_that_is_not_free_is_missed_within_the_tolerance_and_no_further() {
     // The base reaches 0.35 m ahead of its middle: at 0.2 it would be in the crate.
     let scene = cell(Pose::at(-1.5, 0.0, 0.0), &[block("crate", Pose::at(0.65, 0.0, 0.2), [0.2, 2.0, 0.4])]);
-    let request = DriveRequest { start: [-1.5, 0.0, 0.0], ..to([0.21, 0.0, 0.0]) };
+    let request = DriveRequest { start: Configuration { base: [-1.5, 0.0, 0.0], ..STANDING }, ..to([0.21, 0.0, 0.0]) };
     assert!(matches!(planned(&scene, &request), Err(DriveError::Goal { .. })));
     let loose = DriveRequest { position_tolerance_m: 0.15, heading_tolerance_rad: 0.1, ..request };
     let end = planned(&scene, &loose).unwrap().end;

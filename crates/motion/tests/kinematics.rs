@@ -58,7 +58,7 @@ proptest! {
 #[test]
 fn the_robot_has_the_thirteen_degrees_of_freedom_of_the_paper() {
     let robot = Robot::aimm();
-    assert_eq!(robot.joints.len(), DEGREES_OF_FREEDOM);
+    assert_eq!(robot.model.joints.len(), DEGREES_OF_FREEDOM);
     let degrees = |x: f64| (x * 180.0 / PI).round();
     let limits: Vec<f64> = robot.arm_joints().iter().map(|j| degrees(j.upper)).collect();
     let speeds: Vec<f64> = robot.arm_joints().iter().map(|j| degrees(j.velocity)).collect();
@@ -83,6 +83,6 @@ fn looking_at_a_point_puts_it_on_the_optical_axis() {
 
 #[test]
 fn a_description_without_a_joint_is_refused_by_name() {
-    let error = Robot::from_urdf(r#"<robot name="r"><link name="world"/></robot>"#).unwrap_err();
+    let error = Robot::read(r#"<robot name="r"><link name="world"/></robot>"#, "<robot/>").unwrap_err();
     assert_eq!(error.to_string(), "the robot description has no joint `base_x`");
 }

@@ -8,10 +8,11 @@ use common::{Cell, request};
 use proptest::prelude::*;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
+use ratn_motion::arm;
 use ratn_motion::collision::{CONTACT_TOLERANCE_M, Checker, Contact};
 use ratn_motion::pace::{Control, Progress};
 use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
-use ratn_motion::robot::Robot;
+use ratn_motion::robot::{Configuration, Joints, Robot};
 use ratn_motion::trajectory::ArmTrajectory;
 use ratn_motion::validate::{Violation, validate_trajectory};
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
@@ -21,9 +22,9 @@ use std::time::{Duration, Instant};
 /// The whole trajectory touches nothing but with the gripper, checked exactly and four times as densely as it was planned.
 fn assert_valid(cell: &Cell, plan: &Plan, speed: f64) {
     let contact = Contact::Gripper(CONTACT_TOLERANCE_M);
-    let valid = validate_trajectory(&cell.robot, &cell.scene, &cell.arm, None, &plan.trajectory, contact);
+    let valid = validate_trajectory(&cell.robot, &cell.scene, &cell.state(), &plan.trajectory, contact);
     let trajectory = valid.unwrap_or_else(|violation| panic!("{violation}"));
-    let mut exact = Checker::new(&cell.robot, &cell.scene, 0.0);
+    let mut exact = Checker::new(&cell.robot, &cell.scene, &cell.state(), 0.0);
     for pair in trajectory.knots().windows(2) {
         let samples = exact.steps(&pair[0].positions, &pair[1].positions);
         for i in 0..samples {
@@ -109,10 +110,10 @@ fn a_neighbour_is_pressed_only_where_no_other_way_to_take_hold_leads_past_it() {
         let goals: Vec<Goal> =
             yaws.map(|yaw| Goal::Pose(Pose::from_rpy([x, y, aimm::TABLE_HEIGHT_M + 0.06], PI, 0.0, yaw))).collect();
         let to = |goals: &[Goal]| {
-            let request = Request { approach_m: aimm::APPROACH_M, ..request(cell.arm, goals.to_vec()) };
+            let request = Request { approach_m: aimm::APPROACH_M, ..request(cell.state(), goals.to_vec()) };
             cell.plan(&Request { improvement_iterations: 200, ..request })
         };
-        let mut exact = Checker::new(&cell.robot, &cell.scene, 0.0);
+        let mut exact = Checker::new(&cell.robot, &cell.scene, &cell.state(), 0.0);
         let mut presses = |plan: &Plan| exact.collision(&plan.end, Contact::Gripper(0.002)).is_some();
         let alone: Vec<Plan> = goals.iter().filter_map(|goal| to(&[*goal]).ok()).collect();
         let shortest = alone.iter().min_by(|a, b| a.length_rad.total_cmp(&b.length_rad)).unwrap();
@@ -246,11 +247,11 @@ fn what_stands_in_the_straight_way_is_gone_round() {
     cell.improvement_iterations = 300;
     let (shape, place) = (Shape::Box { size: [0.05, 0.4, 0.9] }, Pose::at(0.25, 0.48, 1.05));
     cell.scene.objects.push(SceneObject { name: "wall".into(), shape, placement: Placement::World(place) });
-    let mut direct = Checker::new(&cell.robot, &cell.scene, 0.0);
+    let mut direct = Checker::new(&cell.robot, &cell.scene, &cell.state(), 0.0);
     let collision = direct.edge_collision(&cell.arm, &aimm::HOME, Contact::None);
     assert_eq!(collision.map(|c| c.other).as_deref(), Some("wall"));
     for seed in 0..5 {
-        let request = Request { seed, ..request(cell.arm, vec![Goal::Joints(aimm::HOME)]) };
+        let request = Request { seed, ..request(cell.state(), vec![Goal::Joints(aimm::HOME)]) };
         let first = cell.plan(&request).unwrap();
         assert_valid(&cell, &first, 0.3);
         let improved = cell.plan(&Request { improvement_iterations: 1_000, ..request }).unwrap();
@@ -273,7 +274,7 @@ fn a_walled_in_goal_is_refused_with_what_is_in_the_way() {
 #[test]
 fn a_pose_out_of_reach_is_refused_as_such() {
     let cell = Cell::with_boxes(1, 5);
-    let error = cell.plan(&request(cell.arm, vec![Goal::Pose(Pose::at(3.0, 0.0, 1.0))])).unwrap_err();
+    let error = cell.plan(&request(cell.state(), vec![Goal::Pose(Pose::at(3.0, 0.0, 1.0))])).unwrap_err();
     assert_eq!(error.to_string(), "none of the 1 goals can be reached: the arm does not reach (3.000, 0.000, 1.000)");
 }
 
@@ -281,7 +282,7 @@ fn a_pose_out_of_reach_is_refused_as_such() {
 fn a_start_inside_the_table_is_refused() {
     let mut cell = Cell::with_boxes(0, 0);
     cell.arm = [-1.5, -1.7, 0.0, 0.3, 0.0, 0.0, 0.0];
-    let error = cell.plan(&request(cell.arm, vec![Goal::Joints(aimm::HOME)])).unwrap_err().to_string();
+    let error = cell.plan(&request(cell.state(), vec![Goal::Joints(aimm::HOME)])).unwrap_err().to_string();
     assert!(error.starts_with("at the start ") && error.contains("inside table"), "{error}");
 }
 
@@ -289,7 +290,10 @@ fn a_start_inside_the_table_is_refused() {
 fn a_trajectory_that_meets_something_or_starts_elsewhere_is_refused() {
     let cell = Cell::with_boxes(1, 6);
     let plan = cell.plan(&cell.approach("box_1")).unwrap();
-    let check = |scene, start| validate_trajectory(&cell.robot, scene, start, None, &plan.trajectory, Contact::None);
+    let check = |scene, arm: &Joints| {
+        let here = Configuration { arm: *arm, ..cell.state() };
+        validate_trajectory(&cell.robot, scene, &here, &plan.trajectory, Contact::None)
+    };
     assert!(matches!(check(&cell.scene, &aimm::HOME), Err(Violation::Start { .. })));
     let mut blocked = cell.scene.clone();
     let Placement::World(pose) = cell.object("box_1").placement else { panic!() };
@@ -306,7 +310,7 @@ fn a_trajectory_that_meets_something_or_starts_elsewhere_is_refused() {
         point.time_s /= 5.0;
         point.velocities.iter_mut().for_each(|v| *v *= 5.0);
     }
-    let outcome = validate_trajectory(&cell.robot, &cell.scene, &cell.arm, None, &hasty, Contact::Gripper(0.012));
+    let outcome = validate_trajectory(&cell.robot, &cell.scene, &cell.state(), &hasty, Contact::Gripper(0.012));
     assert!(matches!(outcome, Err(Violation::Limit { .. })), "{outcome:?}");
 }
 
@@ -374,7 +378,8 @@ fn the_fingers_reach_only_into_what_is_said_to_be_hollow() {
     let objects = vec![object("bowl", shape, bowl), object("table", Shape::Box { size: aimm::TABLE_SIZE }, table)];
     let scene = Scene { base: Pose::IDENTITY, objects };
     let rim = ratn_model::grasp::at_rim(&bowl, [0.13, 0.13, 0.05]).into_iter().map(Goal::Pose).collect();
-    let request = Request { approach_m: 0.10, ..request(aimm::OBSERVATION, rim) };
+    let start = Configuration { arm: aimm::OBSERVATION, ..arm::assumed(&robot, &scene) };
+    let request = Request { approach_m: 0.10, ..request(start, rim) };
     let refused = plan(&robot, &scene, &request, &mut |_| Control::Continue);
     assert!(matches!(&refused, Err(PlanError::NoGoal { .. })), "{refused:?}");
     let request = Request { reaches_into: vec!["bowl".to_owned()], ..request };

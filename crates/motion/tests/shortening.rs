@@ -18,7 +18,7 @@ use ratn_motion::robot::Joint;
 use ratn_motion::rrt_star::RrtStar;
 use ratn_motion::simplify::path_length;
 use ratn_motion::space::{Obstacle, Space, State};
-use ratn_motion::timing::{Part, timed};
+use ratn_motion::timing::{Section, timed};
 
 const NONE: Shares = Shares { shortcut: 0, corner: 0, turn: 0, search: 0, tree: 0 };
 
@@ -180,7 +180,7 @@ fn a_smooth_way_is_taken_where_it_is_quicker_and_only_what_is_free() {
     // The side in the middle is short: blends at its ends are narrow.
     let path = [[0.0, 0.0], [1.0, 0.0], [1.1, 0.1], [1.1, 1.1]];
     let curve = |is_free: &mut dyn FnMut(&[f64; 2], &[f64; 2]) -> bool| {
-        timed(&joints, &[Part::Free(path.to_vec())], 1.0, is_free)
+        timed(&joints, &[Section::Blended(path.to_vec())], 1.0, is_free)
     };
     let off = |at: &[f64; 2]| {
         let from_side = |pair: &[[f64; 2]]| {

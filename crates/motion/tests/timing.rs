@@ -5,7 +5,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_motion::robot::Joint;
-use ratn_motion::timing::{Part, timed};
+use ratn_motion::timing::{Section, timed};
 use ratn_motion::trajectory::{Curve, Knot};
 
 fn joint(velocity: f64, acceleration: f64, jerk: f64) -> Joint {
@@ -13,7 +13,7 @@ fn joint(velocity: f64, acceleration: f64, jerk: f64) -> Joint {
 }
 
 fn free<const N: usize>(joints: &[Joint], path: &[[f64; N]], speed: f64) -> Curve<N> {
-    timed(joints, &[Part::Free(path.to_vec())], speed, &mut |_, _| true)
+    timed(joints, &[Section::Blended(path.to_vec())], speed, &mut |_, _| true)
 }
 
 fn distance<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
@@ -73,12 +73,12 @@ fn a_corner_is_never_slower_than_stopping_at_it_however_little_room_there_is() {
         let angle = degrees.to_radians();
         let path = [[0.0, 0.0], [1.0, 0.0], [1.0 + angle.cos(), angle.sin()]];
         // Each side is too short for the full velocity: 1 = v (v / 4 + 4 / 80). Along a diagonal it is faster.
-        let stops = timed(&joints, &[Part::Free(path.to_vec())], 1.0, &mut |_, _| false);
+        let stops = timed(&joints, &[Section::Blended(path.to_vec())], 1.0, &mut |_, _| false);
         assert!(stops.duration_s() <= 2.1025, "{}", stops.duration_s());
         let mut last = stops.duration_s();
         for room in [0.001, 0.01, 0.05, 9.0] {
             let mut is_free = |from: &[f64; 2], to: &[f64; 2]| off(&path, from).max(off(&path, to)) < room;
-            let curve = timed(&joints, &[Part::Free(path.to_vec())], 1.0, &mut is_free);
+            let curve = timed(&joints, &[Section::Blended(path.to_vec())], 1.0, &mut is_free);
             assert_within(&joints, &curve, 1.0);
             assert!(
                 curve.duration_s() <= last + 0.01,
@@ -135,7 +135,7 @@ fn check_random<const N: usize>(seeds: std::ops::Range<u64>) {
         let curve = free(&joints, &path, speed);
         assert_within(&joints, &curve, speed);
         assert_eq!((curve.knots()[0].positions, curve.end()), (path[0], path[path.len() - 1]));
-        let stops = timed(&joints, &[Part::Free(path.clone())], speed, &mut |_, _| false);
+        let stops = timed(&joints, &[Section::Blended(path.clone())], speed, &mut |_, _| false);
         assert_within(&joints, &stops, speed);
         assert!(curve.duration_s() <= stops.duration_s());
     }
@@ -177,7 +177,7 @@ fn with_greater_limits_nothing_takes_longer() {
 fn postures_along_a_curve_are_followed_as_they_are_and_kinks_are_stopped_at() {
     let joints = [joint(1.0, 3.0, 40.0), joint(1.0, 3.0, 40.0)];
     let arc: Vec<[f64; 2]> = (0..=60).map(|i| f64::from(i) * 0.02).map(|a| [a.sin(), 1.0 - a.cos()]).collect();
-    let curve = timed(&joints, &[Part::Straight(arc.clone())], 1.0, &mut |_, _| false);
+    let curve = timed(&joints, &[Section::AsGiven(arc.clone())], 1.0, &mut |_, _| false);
     assert_within(&joints, &curve, 1.0);
     let steps = 500;
     for i in 0..=steps {
@@ -187,7 +187,7 @@ fn postures_along_a_curve_are_followed_as_they_are_and_kinks_are_stopped_at() {
     // A straight motion of this length takes 1.6 s.
     assert!((1.3..1.6).contains(&curve.duration_s()), "{}", curve.duration_s());
     let kinked = [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]];
-    let curve = timed(&joints, &[Part::Straight(kinked.to_vec())], 1.0, &mut |_, _| true);
+    let curve = timed(&joints, &[Section::AsGiven(kinked.to_vec())], 1.0, &mut |_, _| true);
     assert_within(&joints, &curve, 1.0);
     assert!(curve.knots().iter().any(|k| k.positions == kinked[1] && k.velocities == [0.0; 2]));
 }
@@ -198,9 +198,9 @@ fn a_dense_path_with_kinks_is_rounded_and_not_stopped_at_each_of_them() {
     // As a search on a constraint leaves them: steps to and fro.
     let path: Vec<[f64; 2]> = (0..=40).map(|i| [f64::from(i) * 0.06, if i % 2 == 0 { 0.0 } else { 0.02 }]).collect();
     let mut is_free = |from: &[f64; 2], to: &[f64; 2]| off(&path, from).max(off(&path, to)) < 0.03;
-    let curve = timed(&joints, &[Part::Free(path.clone())], 1.0, &mut is_free);
+    let curve = timed(&joints, &[Section::Blended(path.clone())], 1.0, &mut is_free);
     assert_within(&joints, &curve, 1.0);
-    let stops = timed(&joints, &[Part::Free(path.clone())], 1.0, &mut |_, _| false);
+    let stops = timed(&joints, &[Section::Blended(path.clone())], 1.0, &mut |_, _| false);
     assert!(curve.duration_s() < 3.2 && stops.duration_s() > 10.0, "{} {}", curve.duration_s(), stops.duration_s());
     for i in 0..=1000 {
         let at = curve.sample(curve.duration_s() * f64::from(i) / 1000.0).positions;
@@ -213,10 +213,10 @@ fn a_path_that_is_no_way_at_all_and_repeated_postures_are_no_trouble() {
     let joints = [joint(1.0, 3.0, 40.0), joint(1.0, 3.0, 40.0)];
     let here = [0.3, 0.4];
     for part in [
-        Part::Free(vec![here]),
-        Part::Straight(vec![here]),
-        Part::Free(vec![here, here]),
-        Part::Straight(vec![here; 3]),
+        Section::Blended(vec![here]),
+        Section::AsGiven(vec![here]),
+        Section::Blended(vec![here, here]),
+        Section::AsGiven(vec![here; 3]),
     ] {
         let curve = timed(&joints, &[part], 1.0, &mut |_, _| true);
         assert_eq!((curve.duration_s(), curve.end()), (0.0, here));
@@ -224,7 +224,8 @@ fn a_path_that_is_no_way_at_all_and_repeated_postures_are_no_trouble() {
     let there = [1.3, 0.4];
     let curve = free(&joints, &[here, here, there, there], 1.0);
     assert!((curve.duration_s() - free(&joints, &[here, there], 1.0).duration_s()).abs() < 1e-9);
-    let parts = [Part::Straight(vec![here]), Part::Free(vec![here, there]), Part::Straight(vec![there, here])];
+    let parts =
+        [Section::AsGiven(vec![here]), Section::Blended(vec![here, there]), Section::AsGiven(vec![there, here])];
     let curve = timed(&joints, &parts, 1.0, &mut |_, _| true);
     assert_eq!(curve.end(), here);
     assert_within(&joints, &curve, 1.0);

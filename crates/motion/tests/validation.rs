@@ -54,7 +54,7 @@ fn a_joint_that_leaves_its_limits_between_two_knots_and_comes_back_is_refused() 
         cell.arm[0] = joints[0].upper - ends_at - room;
         let trajectory = moving(&joints, &cell.arm, 0, &phases);
         assert!(trajectory.points.iter().all(|p| p.positions[0] < joints[0].upper - room + 1e-9));
-        let outcome = validate_trajectory(&cell.robot, &cell.scene, &cell.arm, None, &trajectory, Contact::None);
+        let outcome = validate_trajectory(&cell.robot, &cell.scene, &cell.state(), &trajectory, Contact::None);
         match outcome {
             Err(Violation::Limit { what: "position", value, .. }) => {
                 assert!(refused && (value - (joints[0].upper - room + 1.5 * 1.5 / 14.0)).abs() < 1e-6, "{value}");
@@ -69,7 +69,7 @@ fn too_much_jerk_and_a_step_of_the_acceleration_are_refused() {
     let cell = Cell::with_boxes(0, 1);
     let joints = cell.robot.arm_joints().to_vec();
     let check = |trajectory: &Trajectory| {
-        validate_trajectory(&cell.robot, &cell.scene, &cell.arm, None, trajectory, Contact::None).map(|_| ())
+        validate_trajectory(&cell.robot, &cell.scene, &cell.state(), trajectory, Contact::None).map(|_| ())
     };
     let there = |jerk: f64| {
         let t = 2.0 / jerk;

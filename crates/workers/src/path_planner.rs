@@ -66,9 +66,10 @@ impl Action for PlanAction {
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let begin = Instant::now();
-        let (request, budget_s) = goal::request(&goal)?;
+        let (asked, budget_s) = goal::asked(&goal)?;
         // Whatever the task declared that this plan depends on, and no more.
         let scene = goal.unless_cancelled(goal.scene(&self.scenes)).await??;
+        let request = asked.in_scene(&self.robot, &scene);
 
         let (robot, goal) = (Arc::clone(&self.robot), Arc::new(goal));
         let mut clock = Clock::new(begin, self.speed, budget_s, Arc::clone(&goal));

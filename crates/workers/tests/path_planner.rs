@@ -9,8 +9,9 @@ use ratn_model::pose::Pose;
 use ratn_model::resource::{Lease, LeasedResource};
 use ratn_model::value::Value;
 use ratn_motion::aimm;
+use ratn_motion::arm::assumed;
 use ratn_motion::collision::Contact;
-use ratn_motion::robot::Robot;
+use ratn_motion::robot::{Configuration, Robot};
 use ratn_motion::validate::validate_trajectory;
 use ratn_proto::types::Goal;
 use ratn_worker::client::{ActionClient, Channels, WorldClient};
@@ -123,7 +124,9 @@ async fn a_grasp_is_planned_within_its_budget_in_the_scene_of_the_world_pool() {
     );
     let scene = Scene { base: Pose::IDENTITY, objects: objects() };
     let contact = Contact::Gripper(0.01);
-    validate_trajectory(&Robot::aimm(), &scene, &aimm::OBSERVATION, None, trajectory, contact).unwrap();
+    let robot = Robot::aimm();
+    let here = Configuration { arm: aimm::OBSERVATION, ..assumed(&robot, &scene) };
+    validate_trajectory(&robot, &scene, &here, trajectory, contact).unwrap();
 }
 
 #[tokio::test]

@@ -92,10 +92,10 @@ const PAD_GIVE_M: f64 = 0.002;
 impl Pads {
     /// The pads of a robot's gripper: the inner faces of its fingers.
     pub fn of(robot: &Robot) -> Option<Pads> {
-        let finger = &robot.links[robot.link("finger_left")?];
+        let finger = &robot.model.links[robot.link("finger_left")?];
         let body = finger.bodies.first()?;
         let Geometry::Box { half } = body.geometry else { return None };
-        let tool = &robot.links[robot.tool];
+        let tool = &robot.model.links[robot.tool];
         let middle = finger.origin.position[2] + body.pose.position[2] - tool.origin.position[2];
         Some(Pads { x: half[0], z_from: middle - half[2], z_to: middle + half[2] })
     }

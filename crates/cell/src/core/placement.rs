@@ -187,7 +187,7 @@ fn all_graspable(robot: &Robot, setting: Setting, placed: &[Placed]) -> bool {
         })
     });
     let scene = Scene { base: Pose::IDENTITY, objects: parts.chain(fixed(setting)).collect() };
-    let mut checker = Checker::new(robot, &scene, PADDING_M);
+    let mut checker = Checker::new(robot, &scene, &arm::assumed(robot, &scene), PADDING_M);
     let (reach, home) = (arm::reach(robot), arm::positions(&aimm::HOME));
     let mut random = ChaCha8Rng::seed_from_u64(0);
     placed.iter().filter(|object| object.model.slips_off().is_none()).all(|object| {

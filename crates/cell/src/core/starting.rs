@@ -162,11 +162,11 @@ impl Cell {
     /// How long the head takes, with ramps of the greatest acceleration on the joint that takes longest.
     fn turning_s(&self, from: [f64; 2], to: [f64; 2]) -> f64 {
         let time = |joint: usize, way: f64| {
-            let (speed, acceleration) =
-                (self.robot.joints[joint].velocity * self.config.pan_tilt.speed, self.robot.joints[joint].acceleration);
+            let joint = &self.robot.head_joints()[joint];
+            let (speed, acceleration) = (joint.velocity * self.config.pan_tilt.speed, joint.acceleration);
             let ramp = speed * speed / acceleration;
             if way >= ramp { way / speed + speed / acceleration } else { 2.0 * (way / acceleration).sqrt() }
         };
-        time(10, (to[0] - from[0]).abs()).max(time(11, (to[1] - from[1]).abs()))
+        time(0, (to[0] - from[0]).abs()).max(time(1, (to[1] - from[1]).abs()))
     }
 }

@@ -8,7 +8,7 @@ use ratn_motion::base::check_drive;
 use ratn_motion::collision::Contact;
 use ratn_motion::plan::MIN_SPEED;
 use ratn_motion::robot::{Configuration, Joints, Robot};
-use ratn_motion::timing::{Part, parameterise};
+use ratn_motion::timing::{Section, parameterise};
 use ratn_motion::trajectory::{ArmTrajectory, BaseTrajectory};
 use ratn_motion::validate::validate_trajectory;
 use ratn_world::scene::Scene;
@@ -22,7 +22,7 @@ const MAX_MOTION_S: f64 = 600.0;
 /// Why it may not be followed.
 pub(crate) fn check(robot: &Robot, here: &Configuration, trajectory: &Trajectory) -> Result<ArmTrajectory, String> {
     is_short(trajectory)?;
-    validate_trajectory(robot, &nothing(), &here.arm, Some(here.finger), trajectory, Contact::None)
+    validate_trajectory(robot, &nothing(), here, trajectory, Contact::None)
         .map_err(|violation| format!("the trajectory is refused: {violation}"))
 }
 
@@ -62,5 +62,5 @@ pub(crate) fn straight(robot: &Robot, from: &Joints, to: &Joints, speed: f64) ->
         return Err(format!("a speed of {speed} is none: it is a fraction of the limits, from {MIN_SPEED} to 1"));
     }
     // A line without corners to round.
-    Ok(parameterise(robot, &[Part::Straight(vec![*from, *to])], speed, &mut |_, _| false))
+    Ok(parameterise(robot, &[Section::AsGiven(vec![*from, *to])], speed, &mut |_, _| false))
 }

@@ -15,8 +15,10 @@ use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Trajectory;
 use ratn_motion::aimm;
+use ratn_motion::arm::assumed;
 use ratn_motion::base::{DriveRequest, plan_drive};
 use ratn_motion::pace::Control;
+use ratn_motion::robot::Configuration;
 use ratn_worker::robot_clock::RobotClock;
 use std::time::{Duration, Instant};
 
@@ -93,8 +95,7 @@ fn way(cell: &Cell, from: [f64; 3], to: [f64; 3]) -> Trajectory {
     // Everything but the table rides along.
     scene.objects.retain(|object| object.name == "table");
     let request = DriveRequest {
-        start: from,
-        arm: aimm::STOWED,
+        start: Configuration { base: from, arm: aimm::STOWED, ..assumed(cell.robot(), &scene) },
         goals: vec![to],
         position_tolerance_m: 0.0,
         heading_tolerance_rad: 0.0,

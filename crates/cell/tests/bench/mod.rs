@@ -94,7 +94,7 @@ impl Bench {
         approach_m: f64,
     ) -> Result<Trajectory, String> {
         let request = PlanRequest {
-            start: self.arm(),
+            start: self.cell.measured(),
             goals,
             depart_m,
             approach_m,

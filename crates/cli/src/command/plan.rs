@@ -6,9 +6,12 @@ use crate::{input, output};
 use ratn_motion::connect::{Budget, ConnectError};
 use ratn_motion::mechanism::Mechanism;
 use ratn_motion::mesh_files::MeshFiles;
-use ratn_motion::problems::Problems;
+use ratn_motion::problems::{Problem, Problems};
+use ratn_motion::robot_model::RobotModel;
+use ratn_motion::robot_state::RobotState;
 use ratn_motion::trial::{self, Settings, Trial};
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Instant;
 
@@ -68,9 +71,9 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
     let beside = arguments.robot.parent().unwrap_or(Path::new("")).to_owned();
     let meshes = MeshFiles { beside, packages: arguments.packages.clone() };
     let mut load = |name: &str| meshes.read(name);
-    let mut mechanism = Mechanism::read_with_meshes(&urdf, srdf.as_deref(), &problems.joints, &mut load)
+    let model = RobotModel::read_with_meshes(&urdf, srdf.as_deref(), &mut load)
         .map_err(|error| refused(&arguments.robot, error))?;
-    mechanism.pad_all(arguments.padding_mm * 1e-3);
+    let mut robot: Option<(BTreeMap<String, f64>, Mechanism)> = None;
     let settings = Settings {
         budget: Budget { iterations: arguments.iterations, seed: arguments.seed },
         repetitions: arguments.repeat,
@@ -79,8 +82,21 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
     let mut clock = || begin.elapsed().as_secs_f64() * 1e6;
     let mut classes = Vec::new();
     for (class, list) in &problems.classes {
-        let trials = list.iter().map(|problem| (problem.index, trial::run(&mechanism, problem, settings, &mut clock)));
-        classes.push(summary(class, trials.collect(), arguments.paths));
+        let mut trials = Vec::new();
+        for problem in list {
+            // Most files have one state.
+            let mechanism = match robot.take() {
+                Some((state, mechanism)) if state == problem.state => mechanism,
+                _ => {
+                    let mut mechanism = in_state(&model, &problems.joints, problem, arguments)?;
+                    mechanism.pad_all(arguments.padding_mm * 1e-3);
+                    mechanism
+                }
+            };
+            trials.push((problem.index, trial::run(&mechanism, problem, settings, &mut clock)));
+            robot = Some((problem.state.clone(), mechanism));
+        }
+        classes.push(summary(class, trials, arguments.paths));
     }
     if arguments.json {
         output::result(serde_json::to_string(&classes)?)?;
@@ -88,6 +104,19 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
         output::result(table(&classes))?;
     }
     verdict(&classes)
+}
+
+/// The robot with the joints that are not planned for where a problem says.
+fn in_state(
+    model: &RobotModel,
+    joints: &[String],
+    problem: &Problem,
+    arguments: &PlanArguments,
+) -> Result<Mechanism, Failure> {
+    let state = RobotState::neutral(model).with(model, &problem.state).map_err(|error| {
+        refused(&arguments.problems, anyhow::anyhow!("the `state` of problem {}: {error}", problem.index))
+    })?;
+    model.planned(joints, &state).map_err(|error| refused(&arguments.robot, error))
 }
 
 /// A failure where a path is rejected, or where there is none at all.

@@ -26,6 +26,8 @@ pub(crate) struct Frame {
     /// The joint that moves it, and whether it slides.
     pub(crate) joint: usize,
     pub(crate) slides: bool,
+    /// How far it moves for one radian (or metre) of the joint.
+    pub(crate) factor: f32,
     /// How far it slides at most.
     pub(crate) travel: f32,
 }
@@ -227,7 +229,8 @@ fn kinematics<V: Lanes>(edge: &Edge<'_>, at: V, scratch: &mut Scratch) {
                 t[row] = p[2].mul_add(V::splat(o[11]), p[1].mul_add(V::splat(o[10]), moved));
             }
         }
-        let q = at.mul_add(V::splat(edge.delta[frame.joint]), V::splat(edge.start[frame.joint]));
+        let (start, delta) = (edge.start[frame.joint] * frame.factor, edge.delta[frame.joint] * frame.factor);
+        let q = at.mul_add(V::splat(delta), V::splat(start));
         if frame.slides {
             for row in 0..3 {
                 t[row] = r[3 * row + 2].mul_add(q, t[row]);

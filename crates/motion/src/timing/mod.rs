@@ -1,6 +1,6 @@
 //! When the arm is where: a path becomes a trajectory within the joints' velocity, acceleration and jerk limits.
 //!
-//! Every part starts and ends at rest. The corners of a free part are rounded in several ways: each by itself (`blend`), and all
+//! Every section starts and ends at rest. The corners of a blended section are rounded in several ways: each by itself (`blend`), and all
 //! along, more or less closely (`spline`). What comes out are smooth paths (`path`); the quickest of them is taken, and none of
 //! them where stopping at every corner is quicker. How a path is followed: `follow`.
 
@@ -39,58 +39,59 @@ const STRIDES: [usize; 2] = [2, 4];
 const FOLLOWED: usize = 2;
 const CLOSE: f64 = 1.03;
 
-/// A part of a path, from rest to rest.
+/// A section of a path, from rest to rest.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Part<const N: usize = 7> {
-    /// Corners may be rounded where nothing is touched.
-    Free(Vec<[f64; N]>),
-    /// Postures close to each other along a straight line of the tool, to be followed as they are; or two, for a straight motion.
-    Straight(Vec<[f64; N]>),
+pub enum Section<const N: usize = 7> {
+    /// Its corners may be blended where nothing is touched.
+    Blended(Vec<[f64; N]>),
+    /// Followed as it is given: postures close to each other, such as those along a straight line of the tool; or two, for a straight
+    /// motion of the joints.
+    AsGiven(Vec<[f64; N]>),
 }
 
-/// The trajectory along the parts at a fraction `speed` of the velocity and acceleration limits; those of jerk hold as they are.
+/// The trajectory along the sections at a fraction `speed` of the velocity and acceleration limits; those of jerk hold as they are.
 /// Corners are rounded where `is_free` finds the straight motions from point to point of the curve free.
 pub fn parameterise(
     robot: &Robot,
-    parts: &[Part],
+    sections: &[Section],
     speed: f64,
     is_free: &mut dyn FnMut(&Joints, &Joints) -> bool,
 ) -> Trajectory {
-    timed(robot.arm_joints(), parts, speed, is_free).to_model(robot)
+    timed(robot.arm_joints(), sections, speed, is_free).to_model(robot)
 }
 
 /// As [`parameterise`], for any joints, to the end.
 pub fn timed<const N: usize>(
     joints: &[Joint],
-    parts: &[Part<N>],
+    sections: &[Section<N>],
     speed: f64,
     is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
 ) -> Curve<N> {
-    timed_while(joints, parts, speed, is_free, &mut || true)
+    timed_while(joints, sections, speed, is_free, &mut || true)
 }
 
 /// As [`timed`]; where `goes_on`, which is asked several times per millisecond, says no, what has not been rounded yet is followed with
 /// a stop at every corner.
 pub fn timed_while<const N: usize>(
     joints: &[Joint],
-    parts: &[Part<N>],
+    sections: &[Section<N>],
     speed: f64,
     is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
     goes_on: &mut dyn FnMut() -> bool,
 ) -> Curve<N> {
     let bounds = Bounds::new(joints, speed);
-    let first = parts.first().and_then(|part| match part {
-        Part::Free(path) | Part::Straight(path) => path.first(),
+    let first = sections.first().and_then(|section| match section {
+        Section::Blended(path) | Section::AsGiven(path) => path.first(),
     });
     let start = first.copied().unwrap_or([0.0; N]);
     let mut knots = vec![Knot { time_s: 0.0, positions: start, velocities: [0.0; N] }];
-    for part in parts {
-        let quickest = match part {
-            Part::Straight(path) => straight(path, &bounds, goes_on),
-            Part::Free(path) => free(path, &bounds, is_free, goes_on),
+    for section in sections {
+        let quickest = match section {
+            Section::AsGiven(path) => straight(path, &bounds, goes_on),
+            Section::Blended(path) => free(path, &bounds, is_free, goes_on),
         };
         append(&mut knots, quickest);
-        let (Part::Free(path) | Part::Straight(path)) = part;
+        let (Section::Blended(path) | Section::AsGiven(path)) = section;
         if let (Some(knot), Some(end)) = (knots.last_mut(), path.last()) {
             // To the last bit.
             knot.positions = *end;

@@ -6,6 +6,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
+use ratn_motion::arm;
 use ratn_motion::pace::{Control, Progress};
 use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
 use ratn_motion::robot::{Configuration, Joints, Robot};
@@ -20,7 +21,7 @@ pub struct Cell {
 }
 
 /// A request without straight parts.
-pub fn request(start: Joints, goals: Vec<Goal>) -> Request {
+pub fn request(start: Configuration, goals: Vec<Goal>) -> Request {
     Request {
         start,
         goals,
@@ -88,7 +89,7 @@ impl Cell {
     }
 
     fn request(&self, goals: Vec<Goal>) -> Request {
-        Request { improvement_iterations: self.improvement_iterations, ..request(self.arm, goals) }
+        Request { improvement_iterations: self.improvement_iterations, ..request(self.state(), goals) }
     }
 
     pub fn plan(&self, request: &Request) -> Result<Plan, PlanError> {
@@ -100,9 +101,13 @@ impl Cell {
         self.arm = plan.end;
     }
 
+    /// The arm where it is, everything else as the scene lets one assume.
+    pub fn state(&self) -> Configuration {
+        Configuration { arm: self.arm, ..arm::assumed(&self.robot, &self.scene) }
+    }
+
     fn tool(&self) -> Pose {
-        let configuration = Configuration { arm: self.arm, ..Configuration::ZERO.with_base(&self.scene.base) };
-        self.robot.tool_pose(&configuration)
+        self.robot.tool_pose(&self.state())
     }
 
     pub fn grasp(&mut self, name: &str) {

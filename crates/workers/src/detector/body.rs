@@ -1,7 +1,7 @@
 //! Where the robot's own body is in a picture, by its kinematics.
 
 use ratn_motion::robot::{Configuration, DEGREES_OF_FREEDOM, Robot};
-use ratn_motion::spheres;
+use ratn_motion::spheres::Sphere;
 use ratn_perception::mask::Ball;
 
 /// Its top is what things stand on: it hides nothing, and the spheres around it reach above it.
@@ -9,13 +9,11 @@ const DECK: &str = "base";
 
 /// Spheres around every moving part of the robot, in the world, in all postures that it had.
 pub(super) fn balls(robot: &Robot, postures: &[Configuration]) -> Vec<Ball> {
-    let covers: Vec<_> = robot
-        .links
-        .iter()
-        .map(|link| if link.name == DECK { Vec::new() } else { link.bodies.iter().flat_map(spheres::cover).collect() })
-        .collect();
+    let nothing: &[Sphere] = &[];
+    let covers: Vec<&[Sphere]> =
+        robot.model.links.iter().map(|link| if link.name == DECK { nothing } else { &link.spheres[..] }).collect();
     let placed = postures.iter().flat_map(|posture| robot.poses(posture).into_iter().zip(&covers));
-    let of_link = |(pose, cover): (ratn_model::pose::Pose, &Vec<spheres::Sphere>)| -> Vec<Ball> {
+    let of_link = |(pose, cover): (ratn_model::pose::Pose, &&[Sphere])| -> Vec<Ball> {
         cover.iter().map(|s| Ball { centre: pose.transform(s.centre), radius: s.radius }).collect()
     };
     placed.flat_map(of_link).collect()
@@ -43,10 +41,10 @@ mod tests {
             balls.iter().any(|b| (0..3).map(|i| (p[i] - b.centre[i]).powi(2)).sum::<f64>() < b.radius.powi(2))
         };
         for (link, pose, shape) in robot.shapes(&home) {
-            if robot.links[link].name != DECK {
+            if robot.model.links[link].name != DECK {
                 let centre = shape.compute_aabb(&pose).center();
                 let centre = [centre.x, centre.y, centre.z].map(f64::from);
-                assert!(hidden(centre), "{} at {centre:?}", robot.links[link].name);
+                assert!(hidden(centre), "{} at {centre:?}", robot.model.links[link].name);
             }
         }
         for slot in aimm::slots() {

@@ -1,7 +1,8 @@
 //! `path_planner/drive`: a way for the base in the goal's projection. Inputs: `arm` (the posture that the arm is in), `goal` (a pose on
-//! the floor, or a list of such poses); optional `start`, `position_tolerance_m`, `heading_tolerance_rad`, `speed`.
+//! the floor, or a list of such poses); optional `start`, `position_tolerance_m`, `heading_tolerance_rad`, `speed`, and `pan`, `tilt`, `width_m` as for
+//! `path_planner/plan`.
 
-use super::goal::joints;
+use super::goal::Said;
 use ratn_model::pose::Pose;
 use ratn_model::value::Value;
 use ratn_motion::base::{DriveError, DriveRequest, plan_drive};
@@ -42,7 +43,7 @@ impl Action for DriveAction {
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let begin = Instant::now();
         let scene = goal.unless_cancelled(goal.scene(&self.scenes)).await??;
-        let request = request(&goal, &scene)?;
+        let request = request(&goal, &self.robot, &scene)?;
         let (robot, goal) = (Arc::clone(&self.robot), Arc::new(goal));
         let asking = Arc::clone(&goal);
         let mut control = move |_| if asking.cancelled.is_cancelled() { Control::Cancelled } else { Control::Continue };
@@ -59,15 +60,15 @@ impl Action for DriveAction {
     }
 }
 
-fn request(goal: &GoalContext, scene: &Scene) -> Result<DriveRequest, ActionFailure> {
+fn request(goal: &GoalContext, robot: &Robot, scene: &Scene) -> Result<DriveRequest, ActionFailure> {
     let goals = match goal.port("goal").any()? {
         Value::List(_) => goal.port("goal").list()?.iter().map(|port| port.pose()).collect::<Result<Vec<_>, _>>()?,
         _ => vec![goal.input_pose("goal")?],
     };
     let start = goal.port("start").optional().map(|port| port.pose()).transpose()?;
+    let here = Said::read(goal, "arm")?.in_scene(robot, scene);
     Ok(DriveRequest {
-        start: place(&start.unwrap_or(scene.base)),
-        arm: joints("arm", goal.input_joints("arm")?)?,
+        start: here.with_base(&start.unwrap_or(scene.base)),
         goals: goals.iter().map(place).collect(),
         position_tolerance_m: goal.optional_float("position_tolerance_m")?.unwrap_or(0.0),
         heading_tolerance_rad: goal.optional_float("heading_tolerance_rad")?.unwrap_or(0.0),

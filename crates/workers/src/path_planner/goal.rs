@@ -1,17 +1,69 @@
 //! A goal of the path planner, read from its input ports: `start`, `goal` (joints, a pose, or a list of these); optional `depart_m`,
 //! `approach_m` (straight parts), `upright_rad` (what points up in the tool stays so, at most this far off), `reaches_into` (names of hollow
-//! objects whose insides the fingers may enter on the straight parts), `speed`, `budget_s`.
+//! objects whose insides the fingers may enter on the straight parts), `speed`, `budget_s`; `pan`, `tilt` and `width_m` (where head and fingers
+//! are, as `pan_tilt` and `gripper` say; what is not said is [`assumed`]: the head looks straight ahead, the fingers are around what is held,
+//! else open).
 
 use ratn_model::value::Value;
+use ratn_motion::arm::assumed;
 use ratn_motion::plan::{Goal, Request};
-use ratn_motion::robot::Joints;
+use ratn_motion::robot::{Configuration, Joints, Robot};
 use ratn_worker::action::{ActionFailure, GoalContext};
+use ratn_world::scene::Scene;
 
 /// The fraction of the joints' limits where the goal says none.
 const DEFAULT_SPEED: f64 = 0.3;
 
-/// The request, and the budget in the robot's seconds.
-pub(super) fn request(goal: &GoalContext) -> Result<(Request, Option<f64>), ActionFailure> {
+/// Where head and fingers are, as far as it is said.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Said {
+    arm: Joints,
+    pan: Option<f64>,
+    tilt: Option<f64>,
+    width_m: Option<f64>,
+}
+
+/// A request that waits for its scene.
+#[derive(Debug)]
+pub(super) struct Asked {
+    said: Said,
+    /// Its start is not known yet.
+    request: Request,
+}
+
+impl Asked {
+    /// With the start in a scene.
+    pub(super) fn in_scene(self, robot: &Robot, scene: &Scene) -> Request {
+        Request { start: self.said.in_scene(robot, scene), ..self.request }
+    }
+}
+
+impl Said {
+    /// From the input ports `pan`, `tilt`, `width_m`, and that of the arm's posture.
+    pub(super) fn read(goal: &GoalContext, arm_port: &str) -> Result<Said, ActionFailure> {
+        Ok(Said {
+            arm: joints(arm_port, goal.input_joints(arm_port)?)?,
+            pan: goal.optional_float("pan")?,
+            tilt: goal.optional_float("tilt")?,
+            width_m: goal.optional_float("width_m")?,
+        })
+    }
+
+    /// The whole robot; what is not said is assumed.
+    pub(super) fn in_scene(self, robot: &Robot, scene: &Scene) -> Configuration {
+        let assumed = assumed(robot, scene);
+        Configuration {
+            arm: self.arm,
+            pan: self.pan.unwrap_or(assumed.pan),
+            tilt: self.tilt.unwrap_or(assumed.tilt),
+            finger: self.width_m.map_or(assumed.finger, |width| width / 2.0),
+            ..assumed
+        }
+    }
+}
+
+/// What is asked for, and the budget in the robot's seconds.
+pub(super) fn asked(goal: &GoalContext) -> Result<(Asked, Option<f64>), ActionFailure> {
     let budget_s = goal.optional_float("budget_s")?;
     if budget_s.is_some_and(|s| !s.is_finite() || s < 0.0) {
         return Err(ActionFailure::aborted(format!(
@@ -19,7 +71,7 @@ pub(super) fn request(goal: &GoalContext) -> Result<(Request, Option<f64>), Acti
         )));
     }
     let request = Request {
-        start: joints("start", goal.input_joints("start")?)?,
+        start: Configuration::ZERO,
         goals: goals(goal.port("goal").any()?)?,
         depart_m: goal.optional_float("depart_m")?.unwrap_or(0.0),
         approach_m: goal.optional_float("approach_m")?.unwrap_or(0.0),
@@ -30,7 +82,7 @@ pub(super) fn request(goal: &GoalContext) -> Result<(Request, Option<f64>), Acti
         // Improvement goes on until the budget ends.
         improvement_iterations: if budget_s.is_some() { usize::MAX } else { 0 },
     };
-    Ok((request, budget_s))
+    Ok((Asked { said: Said::read(goal, "start")?, request }, budget_s))
 }
 
 fn names(goal: &GoalContext) -> Result<Vec<String>, ActionFailure> {
@@ -59,7 +111,7 @@ fn not_a_goal(value: &Value) -> ActionFailure {
     ActionFailure::aborted(format!("input `goal` has a {found}: expected joints, a pose, or a list of these"))
 }
 
-pub(super) fn joints(port: &str, values: &[f64]) -> Result<Joints, ActionFailure> {
+fn joints(port: &str, values: &[f64]) -> Result<Joints, ActionFailure> {
     let wrong = |_| ActionFailure::aborted(format!("input `{port}` has {} joints: expected 7", values.len()));
     values.try_into().map_err(wrong)
 }

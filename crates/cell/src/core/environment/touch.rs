@@ -13,7 +13,7 @@ use rapier3d::parry::bounding_volume::{Aabb, BoundingVolume};
 use rapier3d::parry::query::contact;
 use rapier3d::prelude::{Collider, ColliderHandle, RigidBody, RigidBodyHandle};
 use ratn_motion::aimm;
-use ratn_motion::robot::{Configuration, Geometry, Motion, Robot};
+use ratn_motion::robot::{Configuration, Drive, Geometry, Robot};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
@@ -50,7 +50,7 @@ pub const NEAR_M: f64 = 5e-4;
 /// What counts as on an axis, in metres and as a sine.
 const ALIGNED: f64 = 1e-9;
 
-/// Which links may not be looked at together, by their indices in [`Robot::links`], and which stand on the floor.
+/// Which links may not be looked at together, by their indices in [`Robot::model`], and which stand on the floor.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Joined {
     links: BTreeSet<[usize; 2]>,
@@ -88,18 +88,18 @@ impl Joined {
 
 /// The next link with a shape above another.
 fn above(robot: &Robot, link: usize) -> Option<usize> {
-    let mut parents = std::iter::successors(robot.links[link].parent, |parent| robot.links[*parent].parent);
-    parents.find(|parent| !robot.links[*parent].bodies.is_empty())
+    let mut parents = std::iter::successors(robot.model.links[link].parent, |parent| robot.model.links[*parent].parent);
+    parents.find(|parent| !robot.model.links[*parent].bodies.is_empty())
 }
 
 /// Whether the joint of a link only turns it about its own axis: seen from elsewhere, it is where it was.
 fn turns_in_itself(robot: &Robot, link: usize) -> bool {
-    let Motion::Turn { axis, .. } = robot.links[link].motion else { return false };
+    let Some(Drive { axis, slides: false, .. }) = robot.model.links[link].drive else { return false };
     let off = |v: [f64; 3]| {
         let along: f64 = (0..3).map(|i| v[i] * axis[i]).sum();
         (0..3).map(|i| (v[i] - along * axis[i]).powi(2)).sum::<f64>().sqrt() < ALIGNED
     };
-    robot.links[link].bodies.iter().all(|body| {
+    robot.model.links[link].bodies.iter().all(|body| {
         let round = match body.geometry {
             Geometry::Box { .. } => false,
             Geometry::Cylinder { .. } => off(body.pose.rotate([0.0, 1.0, 0.0])),

@@ -197,7 +197,7 @@ impl Environment {
             fingers_solid: true,
             objects: Vec::new(),
             riding: Riding::restored(riders(saved)),
-            link_names: robot.links.iter().map(|link| link.name.clone()).collect(),
+            link_names: robot.model.links.iter().map(|link| link.name.clone()).collect(),
             joined,
             speeds_before: Vec::new(),
         };
@@ -483,9 +483,9 @@ impl Environment {
     }
 
     fn add_robot(&mut self, robot: &Robot, configuration: &Configuration) {
-        let bodies = robot.links.iter().flat_map(|link| &link.bodies);
+        let bodies = robot.model.links.iter().flat_map(|link| &link.bodies);
         for ((link, pose, shape), of_link) in robot.shapes(configuration).into_iter().zip(bodies) {
-            let name = &robot.links[link].name;
+            let name = &robot.model.links[link].name;
             let body = self.bodies.insert(RigidBodyBuilder::new(LINK).pose(pose));
             let collider = ColliderBuilder::new(shape).friction(ROBOT_FRICTION).collision_groups(robot_groups());
             let collider = self.colliders.insert_with_parent(collider, body, &mut self.bodies);

@@ -1,0 +1,264 @@
+//! The one model of a robot: a tree of links from its URDF, the joints that move them, the shapes that can collide, and the pairs
+//! of links that its SRDF excepts from checks.
+//!
+//! A joint that mimics another, also through further mimics, has no position of its own: its link is driven by the joint at the end of the
+//! chain, by a factor; the offset is part of where the link is mounted. A [`RobotState`](crate::robot_state::RobotState) has a
+//! position for each joint of the model. What is planned for is a [`Mechanism`]: the same links, moved by some of the joints, with the
+//! others held where a state has them.
+
+mod srdf;
+
+use crate::frame::compose;
+use crate::geometry::Body;
+use crate::mechanism::{MAX_JOINTS, Mechanism, MechanismError};
+use crate::mesh::{MeshError, Meshed};
+use crate::robot_state::RobotState;
+use crate::spheres::Sphere;
+use crate::urdf::{self, Description, Loader, RobotError};
+use ratn_model::pose::Pose;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// A robot.
+#[derive(Debug, Clone)]
+pub struct RobotModel {
+    /// As in the URDF.
+    pub name: String,
+    /// Every joint that has a position of its own, in the order of the URDF. A joint's index here is its index in a state.
+    pub joints: Vec<Joint>,
+    /// Parents before children.
+    pub links: Vec<Link>,
+    /// The names of the joints that mimic others.
+    pub(crate) mimics: BTreeSet<String>,
+    /// Pairs of links, the lower index first, that the SRDF excepts from checks; `None` where there is no SRDF.
+    pub(crate) excepted: Option<BTreeSet<(usize, usize)>>,
+}
+
+/// A joint and its limits (radians, or metres for sliding joints).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Joint {
+    /// As in the URDF.
+    pub name: String,
+    /// Least position.
+    pub lower: f64,
+    /// Greatest position.
+    pub upper: f64,
+    /// Greatest speed, per second.
+    pub velocity: f64,
+    /// Greatest acceleration, per second squared.
+    pub acceleration: f64,
+    /// Greatest jerk, per second cubed.
+    pub jerk: f64,
+}
+
+/// A rigid link.
+#[derive(Debug, Clone)]
+pub struct Link {
+    /// As in the URDF.
+    pub name: String,
+    /// The link it hangs on.
+    pub parent: Option<usize>,
+    /// Where its joint sits in the parent's frame.
+    pub origin: Pose,
+    /// The joint that moves it.
+    pub drive: Option<Drive>,
+    /// What can collide, exactly: primitives,
+    pub bodies: Vec<Body>,
+    /// and meshes.
+    pub meshes: Vec<Meshed>,
+    /// How much larger its bodies are taken, in metres.
+    pub padding_m: f64,
+    /// Spheres that hold all of it, padding included.
+    pub spheres: Vec<Sphere>,
+}
+
+/// How a joint moves a link.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Drive {
+    /// Index of the joint.
+    pub joint: usize,
+    /// Unit vector.
+    pub axis: [f64; 3],
+    /// Along the axis instead of about it.
+    pub slides: bool,
+    /// How far the link moves for one radian (or metre) of the joint: 1 but for a link whose own joint mimics.
+    pub factor: f64,
+}
+
+impl Drive {
+    /// Where the link is, as seen from its origin, when the joint is at a position.
+    #[inline]
+    pub fn moved(&self, position: f64) -> Pose {
+        let position = self.factor * position;
+        if self.slides {
+            return Pose { position: self.axis.map(|c| c * position), ..Pose::IDENTITY };
+        }
+        let (sin, cos) = (position / 2.0).sin_cos();
+        let [x, y, z] = self.axis;
+        Pose { position: [0.0; 3], quaternion_xyzw: [x * sin, y * sin, z * sin, cos] }
+    }
+}
+
+impl Link {
+    /// A link without shapes.
+    pub(crate) fn bare(name: &str, parent: Option<usize>, origin: Pose, drive: Option<Drive>) -> Link {
+        Link {
+            name: name.to_owned(),
+            parent,
+            origin,
+            drive,
+            bodies: Vec::new(),
+            meshes: Vec::new(),
+            padding_m: 0.0,
+            spheres: Vec::new(),
+        }
+    }
+
+    /// Where it is in its parent's frame.
+    #[inline]
+    fn in_parent(&self, positions: &[f64]) -> Pose {
+        match self.drive {
+            None => self.origin,
+            Some(drive) => compose(&self.origin, &drive.moved(positions[drive.joint])),
+        }
+    }
+}
+
+/// Poses of links, of which parents come before children, in the frame of the root; `positions` in the order of the joints.
+pub(crate) fn poses(links: &[Link], positions: &[f64]) -> Vec<Pose> {
+    let mut poses: Vec<Pose> = Vec::with_capacity(links.len());
+    for link in links {
+        let moved = link.in_parent(positions);
+        poses.push(link.parent.map_or(moved, |parent| compose(&poses[parent], &moved)));
+    }
+    poses
+}
+
+impl RobotModel {
+    /// Reads a robot without meshes.
+    ///
+    /// # Errors
+    /// [`MechanismError`] names the joint or link that is missing or not supported.
+    pub fn read(urdf: &str, srdf: Option<&str>) -> Result<RobotModel, MechanismError> {
+        let nowhere = |_: &str| Err(MeshError::Read { reason: "no folder to look in was named".to_owned() });
+        RobotModel::read_with_meshes(urdf, srdf, &mut { nowhere })
+    }
+
+    /// As [`RobotModel::read`]; `load` gives what is in the mesh file that the URDF names so
+    /// ([`MeshFiles::read`](crate::mesh_files::MeshFiles::read)).
+    ///
+    /// # Errors
+    /// [`MechanismError`]; for meshes [`RobotError::Mesh`] names the link and the file.
+    pub fn read_with_meshes(
+        urdf: &str,
+        srdf: Option<&str>,
+        load: &mut Loader<'_>,
+    ) -> Result<RobotModel, MechanismError> {
+        let Description { name, joints, links, mimics } = urdf::read(urdf, load)?;
+        let excepted = srdf.map(|text| srdf::excepted(text, &links)).transpose()?;
+        Ok(RobotModel { name, joints, links, mimics, excepted })
+    }
+
+    /// The index of a link.
+    pub fn link(&self, name: &str) -> Option<usize> {
+        self.links.iter().position(|link| link.name == name)
+    }
+
+    /// The index of a joint that has a position of its own.
+    pub fn joint(&self, name: &str) -> Option<usize> {
+        self.joints.iter().position(|joint| joint.name == name)
+    }
+
+    /// Poses of all links in the frame of the root; a position for each joint.
+    pub fn poses(&self, positions: &[f64]) -> Vec<Pose> {
+        poses(&self.links, positions)
+    }
+
+    /// Recomputes in place the poses of some links, parents before children; those of their parents hold.
+    #[inline]
+    pub fn update(&self, links: &[usize], positions: &[f64], poses: &mut [Pose]) {
+        for &index in links {
+            let link = &self.links[index];
+            let moved = link.in_parent(positions);
+            poses[index] = link.parent.map_or(moved, |parent| compose(&poses[parent], &moved));
+        }
+    }
+
+    /// Whether the SRDF excepts two links from checks. A link is never checked against itself.
+    pub fn is_excepted(&self, a: usize, b: usize) -> bool {
+        a == b || self.excepted.as_ref().is_some_and(|pairs| pairs.contains(&(a.min(b), a.max(b))))
+    }
+
+    /// The joints in another order, which names each of them once.
+    ///
+    /// # Errors
+    /// [`RobotError::Missing`] names a joint that the robot does not have, [`RobotError::Unsupported`] one that it has beside those.
+    pub(crate) fn in_order(mut self, names: &[&str]) -> Result<RobotModel, RobotError> {
+        let missing = |name: &str| RobotError::Missing { what: "joint", name: name.to_owned() };
+        let order = names.iter().map(|name| self.joint(name).ok_or_else(|| missing(name)));
+        let order = order.collect::<Result<Vec<usize>, _>>()?;
+        if let Some((_, other)) = self.joints.iter().enumerate().find(|(joint, _)| !order.contains(joint)) {
+            let reason = "its name is none of the robot's degrees of freedom";
+            return Err(RobotError::Unsupported { what: "joint", name: other.name.clone(), reason });
+        }
+        let places: BTreeMap<usize, usize> = order.iter().enumerate().map(|(place, joint)| (*joint, place)).collect();
+        for drive in self.links.iter_mut().filter_map(|link| link.drive.as_mut()) {
+            drive.joint = places[&drive.joint];
+        }
+        self.joints = order.iter().map(|joint| self.joints[*joint].clone()).collect();
+        Ok(self)
+    }
+
+    /// What is planned for: `joints`, in this order, without any all of them; the others stay where `state` has them.
+    ///
+    /// # Errors
+    /// [`MechanismError`] names a joint that cannot be planned for.
+    pub fn planned(&self, joints: &[String], state: &RobotState) -> Result<Mechanism, MechanismError> {
+        let all: Vec<String>;
+        let names = if joints.is_empty() {
+            all = self.joints.iter().map(|joint| joint.name.clone()).collect();
+            &all
+        } else {
+            joints
+        };
+        if names.len() > MAX_JOINTS {
+            return Err(MechanismError::TooMany { count: names.len() });
+        }
+        if let Some(joint) = names.iter().enumerate().find_map(|(i, name)| names[..i].contains(name).then_some(name)) {
+            return Err(MechanismError::Twice { joint: joint.clone() });
+        }
+        let planned = names.iter().map(|name| self.plannable(name)).collect::<Result<Vec<_>, _>>()?;
+        Ok(self.restricted(&planned, state.positions()))
+    }
+
+    /// As [`RobotModel::planned`], of joints that can be, by their indices.
+    pub(crate) fn restricted(&self, planned: &[usize], positions: &[f64]) -> Mechanism {
+        let place = |link: &Link| match link.drive {
+            None => (link.origin, None),
+            Some(drive) => match planned.iter().position(|joint| *joint == drive.joint) {
+                Some(joint) => (link.origin, Some(Drive { joint, ..drive })),
+                None => (link.origin.compose(&drive.moved(positions[drive.joint])), None),
+            },
+        };
+        let held = |link: &Link| {
+            let (origin, drive) = place(link);
+            Link { origin, drive, ..link.clone() }
+        };
+        let joints = planned.iter().map(|joint| self.joints[*joint].clone()).collect();
+        Mechanism::new(&self.name, joints, self.links.iter().map(held).collect(), self.excepted.as_ref())
+    }
+
+    /// The index of a joint that can be planned for.
+    fn plannable(&self, name: &str) -> Result<usize, RobotError> {
+        let unsupported = |reason| RobotError::Unsupported { what: "joint", name: name.to_owned(), reason };
+        if self.mimics.contains(name) {
+            return Err(unsupported("it follows another joint and cannot be planned for"));
+        }
+        let missing = || RobotError::Missing { what: "joint", name: name.to_owned() };
+        let index = self.joint(name).ok_or_else(missing)?;
+        let Joint { lower, upper, .. } = &self.joints[index];
+        if !(lower < upper && lower.is_finite() && upper.is_finite()) {
+            return Err(unsupported("its lower limit is not below its upper limit"));
+        }
+        Ok(index)
+    }
+}

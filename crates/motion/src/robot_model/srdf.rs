@@ -1,0 +1,28 @@
+//! What an SRDF says of a robot's links: the pairs of them that are not checked against each other.
+
+use super::Link;
+use crate::mechanism::MechanismError;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// The pairs of links, the lower index first, that an SRDF excepts from checks.
+///
+/// # Errors
+/// [`MechanismError::Srdf`] says where the text is not XML.
+pub(crate) fn excepted(text: &str, links: &[Link]) -> Result<BTreeSet<(usize, usize)>, MechanismError> {
+    let index: BTreeMap<&str, usize> = links.iter().enumerate().map(|(i, l)| (l.name.as_str(), i)).collect();
+    let mut pairs = BTreeSet::new();
+    for event in xml::EventReader::from_str(text) {
+        let event = event.map_err(|error| MechanismError::Srdf(error.to_string()))?;
+        let xml::reader::XmlEvent::StartElement { name, attributes, .. } = event else { continue };
+        if name.local_name != "disable_collisions" {
+            continue;
+        }
+        let link = |key: &str| attributes.iter().find(|a| a.name.local_name == key).map(|a| a.value.as_str());
+        // An SRDF may speak of links that this variant of the robot does not have.
+        let pair = (link("link1").and_then(|l| index.get(l)), link("link2").and_then(|l| index.get(l)));
+        if let (Some(&a), Some(&b)) = pair {
+            pairs.insert((a.min(b), a.max(b)));
+        }
+    }
+    Ok(pairs)
+}
