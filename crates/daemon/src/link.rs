@@ -165,15 +165,13 @@ impl Link {
         }
         let provider = Provider::start(channels, endpoint, session)?;
         let found = session.state().borrow().found;
-        let left = if found { self.withdraw_left(&provider, session.id()).await? } else { BTreeSet::new() };
-        // Who held something that the manager has lost may not have heard that yet.
-        let lost = before.values().filter(|resource| !left.contains(&resource.id));
-        provider.may_move(&lost.cloned().collect::<Vec<_>>()).await;
+        // What the provider has been asked to offer, and offers by itself as soon as it can.
+        let mut asked = self.take_over(&provider, session.id(), found, before).await?;
         let mut offered = Wanted::new();
         let mut refused = Wanted::new();
-        // What the provider has been asked to offer, and offers by itself as soon as it can.
-        let mut asked: BTreeSet<String> = BTreeSet::new();
         loop {
+            // Before what is wanted: what was withdrawn while it drained leaves both, in the other order.
+            let draining = self.draining();
             let wanted = self.wanted.borrow_and_update().clone();
             for id in asked.extract_if(.., |id| !wanted.contains_key(id)) {
                 offered.remove(&id);
@@ -182,7 +180,7 @@ impl Link {
                 }
             }
             refused.retain(|id, resource| wanted.get(id) == Some(resource));
-            let draining = self.withdraw_drained(&provider, &mut offered, &mut asked).await;
+            self.withdraw_drained(&provider, &draining, &mut offered, &mut asked).await;
             let is_new = |(id, resource): &(&String, &Resource)| {
                 offered.get(*id) != Some(*resource) && !refused.contains_key(*id) && !draining.contains(*id)
             };
@@ -205,7 +203,6 @@ impl Link {
                     }
                     Err(error) => {
                         tracing::error!(id, %error, "the resource manager does not take the resource");
-                        asked.remove(&id);
                         refused.extend(resource);
                         self.report(OfferEvent::Refused(id, error.to_string())).await;
                     }
@@ -240,30 +237,48 @@ impl Link {
         }
     }
 
-    /// Withdraws resources that an earlier process offered in the same session and that this one does not want; the ids of the others.
-    async fn withdraw_left(&mut self, provider: &Provider, session: &str) -> Result<BTreeSet<String>, CallError> {
+    /// Takes over what an earlier process offered in the same session, and withdraws what this one does not want; the ids of what is wanted
+    /// and was found. The provider knows what may be leased before the manager is asked anything more, so that a session that ends meanwhile
+    /// takes nothing with it unnoticed.
+    async fn take_over(
+        &mut self,
+        provider: &Provider,
+        session: &str,
+        found: bool,
+        before: &Wanted,
+    ) -> Result<BTreeSet<String>, CallError> {
         let own = ResourceFilter { session: session.to_owned(), ..ResourceFilter::default() };
-        let mut wanted = BTreeSet::new();
-        for left in provider.client().list_where(own).await? {
-            if self.wanted.borrow().contains_key(&left.id) {
-                wanted.insert(left.id);
-            } else {
-                provider.withdraw(&left.id).await?;
-            }
+        let there = if found { provider.client().list_where(own).await? } else { Vec::new() };
+        let wanted = self.wanted.borrow().clone();
+        let (left, unwanted): (Vec<Resource>, Vec<Resource>) =
+            there.into_iter().partition(|resource| wanted.contains_key(&resource.id));
+        let ids: BTreeSet<String> = left.iter().map(|resource| resource.id.clone()).collect();
+        let as_wanted = |left: Resource| Some((wanted.get(&left.id)?.clone(), left.standstill()));
+        provider.offered_before(left.into_iter().filter_map(as_wanted).collect()).await;
+        // Who held something that the manager has lost may not have heard that yet.
+        let lost = before.values().filter(|resource| !ids.contains(&resource.id));
+        provider.may_move(&lost.cloned().collect::<Vec<_>>()).await;
+        for resource in unwanted {
+            provider.withdraw(&resource.id).await?;
         }
-        Ok(wanted)
+        Ok(ids)
     }
 
-    /// Withdraws the draining resources that nobody holds; returns all that are draining.
+    /// The resources that are to be withdrawn as soon as nobody holds them.
+    fn draining(&mut self) -> BTreeSet<String> {
+        self.lifecycle.as_mut().map(|lifecycle| lifecycle.draining.borrow_and_update().clone()).unwrap_or_default()
+    }
+
+    /// Withdraws the draining resources that nobody holds.
     async fn withdraw_drained(
         &mut self,
         provider: &Provider,
+        draining: &BTreeSet<String>,
         offered: &mut Wanted,
         asked: &mut BTreeSet<String>,
-    ) -> BTreeSet<String> {
-        let Some(lifecycle) = &mut self.lifecycle else { return BTreeSet::new() };
-        let draining = lifecycle.draining.borrow_and_update().clone();
-        for id in &draining {
+    ) {
+        let Some(lifecycle) = &self.lifecycle else { return };
+        for id in draining {
             let gone = !asked.contains(id) || provider.withdraw_unless_held(id).await;
             if gone {
                 offered.remove(id);
@@ -274,7 +289,6 @@ impl Link {
                 .send(if gone { OfferEvent::Withdrawn(id.clone()) } else { OfferEvent::StillHeld(id.clone()) })
                 .await;
         }
-        draining
     }
 }
 

@@ -15,7 +15,7 @@ use std::sync::Arc;
 
 impl Pool {
     /// Adds a resource, bound to a session if one is given. A resource of the same id and owner is updated: the kind
-    /// stays, its attributes and capacity are replaced (holders keep what they hold). One of the id that a task has made gives way to a
+    /// stays, its attributes and capacity are replaced (holders keep what they hold); where they are equal nothing changes. One of the id that a task has made gives way to a
     /// provider's: it is deleted, and who holds it loses it.
     ///
     /// # Errors
@@ -46,9 +46,12 @@ impl Pool {
                 let owner = resource.owner.as_ref().map_or_else(|| "no session".to_owned(), ToString::to_string);
                 return Err(PoolError::ResourceTaken { id, owner });
             }
-            Some((slot, _)) => {
-                let description = Arc::new(spec.described(id.clone()));
-                self.commit(Effect::ResourceUpdated { slot, description });
+            Some((slot, resource)) => {
+                let description = spec.described(id.clone());
+                if *resource.description != description {
+                    let description = Arc::new(description);
+                    self.commit(Effect::ResourceUpdated { slot, description });
+                }
             }
             None => {
                 self.check_room(session, 0)?;

@@ -811,3 +811,18 @@ fn a_session_that_consumed_what_is_not_renewable_any_more_ends_and_what_it_consu
     assert_eq!(bench.pool.get("battery").unwrap().free, 2);
     bench.pool.check_invariants().unwrap();
 }
+
+#[test]
+fn a_resource_that_is_created_as_it_is_there_changes_nothing() {
+    let mut bench = Bench::new();
+    let spec = || ResourceSpec::new(ResourceClass::Module, "Arm").id("arm");
+    bench.create("a", spec());
+    bench.pool.take_notices();
+    let before = (bench.pool.revision(), bench.pool.take_records().len());
+    assert!(before.1 > 0);
+    bench.create("a", spec());
+    assert_eq!((bench.pool.revision(), bench.pool.take_records().len()), (before.0, 0));
+    assert!(bench.pool.take_notices().is_empty());
+    bench.create("a", spec().capacity(2));
+    assert!(bench.pool.revision() > before.0, "another capacity is a change");
+}

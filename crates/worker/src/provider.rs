@@ -7,7 +7,8 @@
 //! One of what moves ([`Provider::start_at_rest`]) offers nothing at which an earlier goal still runs, and nothing before its driver has said
 //! that it is at rest. One that does not follow the leases of what moves (a process manager's, of its pooled drivers) offers what it has
 //! offered before, and the manager has lost, when the resource's bound for standstill has passed: those who held it may not have heard yet.
-//! An offer whose answer was lost counts as one that the manager had.
+//! An offer whose answer was lost counts as one that the manager had, and so does what an earlier process offered in the same session.
+//! What the manager has had and refuses now (somebody took a role away) is asked for again, less often.
 
 mod bounds;
 
@@ -38,6 +39,8 @@ const PART: &str = "the provider of resources";
 const ANSWERED_WITHIN: Duration = Duration::from_secs(3);
 /// The pause before the manager is asked again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
+/// The same where the manager has refused what it had before.
+const REFUSED_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The `standstill_ms` of what moves, at a provider whose session lives for `session_ttl` without a ping: for so long it may not have heard
 /// that a lease has ended, and stops by itself then; its actions have returned [`STOP_GRACE`] after that.
@@ -87,6 +90,8 @@ struct DesiredState {
     /// The manager's words, where another session has a resource of the id.
     taken: Option<String>,
     presence: Presence,
+    /// The manager has confirmed just this state, and nothing has changed it since.
+    confirmed: bool,
     /// The widest bound for standstill that it was offered with.
     standstill: Option<Duration>,
 }
@@ -159,7 +164,7 @@ impl Provider {
     /// manager cannot be asked now, or another session still has one of this id: it will be offered as soon as it can.
     ///
     /// # Errors
-    /// [`CallError::Refused`] when the manager does not want it; it is not offered again.
+    /// [`CallError::Refused`] when the manager does not want it; it is not offered again, unless the manager had it before.
     pub async fn offer(&self, resource: Resource) -> Result<bool, CallError> {
         self.set_desired(resource.id.clone(), Some(resource)).await
     }
@@ -170,10 +175,21 @@ impl Provider {
         let ids: BTreeSet<String> = resources.iter().map(|resource| resource.id.clone()).collect();
         for resource in resources {
             self.shared.watch_for(&resource.kind);
-            let entry = desired.states.entry(resource.id.clone()).or_default();
-            entry.resource = Some(resource);
+            desired.want(resource.id.clone(), Some(resource));
         }
-        self.shared.ask(&mut desired, &ids).await
+        self.shared.offer(&mut desired, &ids).await
+    }
+
+    /// An earlier process offered these in the same session, and the manager still had them when it was asked: they may be leased. With each
+    /// comes the bound for standstill that it was offered with.
+    pub async fn offered_before(&self, resources: Vec<(Resource, Option<Duration>)>) {
+        let mut desired = self.shared.desired.lock().await;
+        for (resource, standstill) in resources {
+            self.shared.watch_for(&resource.kind);
+            let entry = desired.want(resource.id.clone(), Some(resource));
+            entry.presence = Presence::Unknown;
+            entry.standstill = entry.standstill.max(standstill);
+        }
     }
 
     /// These were offered by an earlier session or process, and what that was leased to may still move: each is offered when its bound for
@@ -224,8 +240,8 @@ impl Provider {
         if let Some(resource) = &resource {
             self.shared.watch_for(&resource.kind);
         }
-        desired.states.entry(id.clone()).or_default().resource = resource;
-        let asked = self.shared.ask(&mut desired, &BTreeSet::from([id])).await;
+        desired.want(id.clone(), resource);
+        let asked = self.shared.offer(&mut desired, &BTreeSet::from([id])).await;
         asked.into_iter().next().map_or(Ok(true), |(_, done)| done)
     }
 
@@ -273,8 +289,19 @@ impl Shared {
         self.missing.notify_one();
     }
 
+    /// As [`Shared::ask`], for a caller that hears of a refusal: what is refused and not there is not desired any more.
+    async fn offer(&self, desired: &mut Desired, ids: &BTreeSet<String>) -> Vec<(String, Result<bool, CallError>)> {
+        let concluded = self.ask(desired, ids).await;
+        for (id, _) in concluded.iter().filter(|(_, done)| done.is_err()) {
+            if desired.states.get(id).is_some_and(|entry| entry.presence == Presence::Absent) {
+                desired.states.remove(id);
+            }
+        }
+        concluded
+    }
+
     /// Asks for these, several at a time, if the session lives: true for what is so now, false for what will be asked for again. What
-    /// is gone, or refused for good, is not desired any more.
+    /// is gone, or may not be withdrawn, is not desired any more.
     async fn ask(&self, desired: &mut Desired, ids: &BTreeSet<String>) -> Vec<(String, Result<bool, CallError>)> {
         if !self.state.borrow().alive {
             self.missing.notify_one();
@@ -302,7 +329,9 @@ impl Shared {
             let done = entry.conclude(&id, answer);
             match &done {
                 Ok(false) => self.missing.notify_one(),
-                Ok(true) if entry.resource.is_some() => {}
+                Ok(true) if entry.resource.is_some() => entry.confirmed = true,
+                // The manager may have had it, and have leased it.
+                Err(_) if entry.resource.is_some() => {}
                 Ok(true) | Err(_) => drop(desired.states.remove(&id)),
             }
             concluded.push((id, done));
@@ -349,9 +378,19 @@ async fn answered<T>(
     })
 }
 
+impl Desired {
+    /// From now on a resource is to be like this, or gone.
+    fn want(&mut self, id: String, resource: Option<Resource>) -> &mut DesiredState {
+        let entry = self.states.entry(id).or_default();
+        (entry.resource, entry.confirmed) = (resource, false);
+        entry
+    }
+}
+
 impl DesiredState {
     /// The manager has not got it any more, and who held it may move it within its bound.
     fn gone(&mut self, id: &str, bounds: &mut Bounds) {
+        self.confirmed = false;
         if std::mem::take(&mut self.presence) != Presence::Absent {
             bounds.lost(id, self.standstill);
         }
@@ -402,7 +441,14 @@ impl DesiredState {
                 }
                 return Ok(false);
             }
-            Err(error) => return Err(error),
+            Err(error) => {
+                let problem = error.to_string();
+                if self.problem != problem {
+                    tracing::warn!(resource = %id, "the resource manager refuses: {problem}");
+                    self.problem = problem;
+                }
+                return Err(error);
+            }
             Ok(()) => {}
         }
         self.problem.clear();
@@ -423,7 +469,7 @@ fn is_transient(error: &CallError) -> bool {
     }
 }
 
-/// Asks for everything again whenever the session was made anew, and for what is not so yet.
+/// Asks whenever the session was made anew, and as long as something is not so yet.
 async fn restore(shared: Arc<Shared>) {
     let mut state = shared.state.clone();
     let mut restored = 0;
@@ -438,27 +484,29 @@ async fn restore(shared: Arc<Shared>) {
                 },
             }
         }
-        if ask_for_all(&shared).await {
-            restored = generation;
-        } else {
-            tokio::time::sleep(RETRY_INTERVAL).await;
+        if let Some(pause) = ask_for_all(&shared).await {
+            tokio::time::sleep(pause).await;
             shared.missing.notify_one();
+        } else {
+            restored = generation;
         }
     }
 }
 
-/// Asks for everything; whether all is so (or refused for good).
-async fn ask_for_all(shared: &Shared) -> bool {
+/// Asks for everything that the manager has not confirmed; the pause before it is to be asked again, nothing where all is so.
+async fn ask_for_all(shared: &Shared) -> Option<Duration> {
     let mut desired = shared.desired.lock().await;
-    let ids = desired.states.keys().cloned().collect();
-    let mut all = true;
-    for (id, done) in shared.ask(&mut desired, &ids).await {
-        match done {
-            Ok(done) => all &= done,
-            Err(error) => tracing::warn!(resource = %id, %error, "the resource manager refuses for good"),
-        }
+    if shared.state.borrow().alive {
+        shared.look_at_session(&mut desired);
     }
-    all
+    let open = desired.states.iter().filter(|(_, entry)| !entry.confirmed);
+    let ids = open.map(|(id, _)| id.clone()).collect();
+    let pause = |(_, done): (String, Result<bool, CallError>)| match done {
+        Ok(true) => None,
+        Ok(false) => Some(RETRY_INTERVAL),
+        Err(_) => Some(REFUSED_INTERVAL),
+    };
+    shared.ask(&mut desired, &ids).await.into_iter().filter_map(pause).min()
 }
 
 /// Watches what is offered, as long as anything is; from the beginning again where the watch breaks or other kinds are offered.

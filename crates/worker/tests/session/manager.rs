@@ -23,6 +23,10 @@ pub(crate) struct Pool {
     pub(crate) made: u64,
     /// So many creations are never answered, and change nothing.
     pub(crate) unanswered: usize,
+    /// How often each was to be created.
+    pub(crate) creations: BTreeMap<String, usize>,
+    /// The caller has no role any more that may create anything.
+    pub(crate) forbids: bool,
     /// Creations are done, their answers are held back, and then lost.
     pub(crate) loses_answers: bool,
     /// Pings that arrived.
@@ -79,7 +83,10 @@ impl ResourceService for Manager {
                 return Err(Status::failed_precondition("no such session"));
             }
             let resource = request.resource.unwrap();
-            if resource.kind == "Forbidden" {
+            *pool.creations.entry(resource.id.clone()).or_default() += 1;
+            if resource.kind == "Forbidden" || pool.forbids {
+                drop(pool);
+                self.changed.send_replace(());
                 return Err(Status::permission_denied("not here"));
             }
             if pool.taken.contains(&resource.id) {

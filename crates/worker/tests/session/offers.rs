@@ -7,6 +7,7 @@ use ratn_model::value::Value;
 use ratn_proto::types::Resource;
 use ratn_worker::provider::Provider;
 use ratn_worker::session::Session;
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 #[tokio::test]
@@ -190,6 +191,75 @@ async fn what_was_offered_with_an_answer_that_was_lost_is_offered_again_when_its
     assert!(!offered.unwrap());
     manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
     assert!(began.elapsed() >= bound, "after {:?}", began.elapsed());
+}
+
+#[tokio::test]
+async fn what_an_earlier_process_offered_in_a_session_that_has_ended_since_is_offered_when_the_bound_of_then_has_passed()
+ {
+    let (_directory, endpoint) = place();
+    let manager = Manager::new();
+    let _serving = manager.serve(&endpoint).await;
+    let channels = channels();
+    let session = Session::open(&channels, &endpoint, "pools", TTL);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    let bound = Duration::from_millis(1_500);
+    let wanted = arm().with_standstill(Duration::from_millis(1));
+    provider.offered_before(vec![(wanted.clone(), Some(bound))]).await;
+    let began = Instant::now();
+    {
+        let mut pool = manager.pool.lock().unwrap();
+        pool.sessions.clear();
+        pool.resources.clear();
+    }
+    session.state().wait_for(|state| state.generation == 2).await.unwrap();
+    assert!(!provider.offer(wanted).await.unwrap() || began.elapsed() >= bound);
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    assert!(began.elapsed() >= bound, "after {:?}", began.elapsed());
+}
+
+#[tokio::test]
+async fn what_the_manager_has_confirmed_is_not_asked_for_while_another_resource_waits() {
+    let (_directory, endpoint) = place();
+    let manager = Manager::new();
+    let _serving = manager.serve(&endpoint).await;
+    let channels = channels();
+    let session = Session::open(&channels, &endpoint, "pools", LONG);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    let moving = arm().with_standstill(Duration::from_millis(700));
+    let planner = Resource::new("planner@sim", ResourceClass::Process, "Planner");
+    assert!(provider.offer(planner.clone()).await.unwrap());
+    provider.may_move(std::slice::from_ref(&moving)).await;
+    assert!(!provider.offer(moving).await.unwrap());
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
+    assert_eq!(manager.pool.lock().unwrap().creations["planner@sim"], 1);
+    assert!(
+        provider.offer(planner.with_attribute("level", Value::Float(0.5))).await.unwrap(),
+        "an update is asked for"
+    );
+    assert_eq!(manager.pool.lock().unwrap().creations["planner@sim"], 2);
+}
+
+#[tokio::test]
+async fn what_the_manager_had_and_refuses_is_offered_again_when_it_does_not_any_more() {
+    let (_directory, endpoint) = place();
+    let manager = Manager::new();
+    let _serving = manager.serve(&endpoint).await;
+    let channels = channels();
+    let session = Session::open(&channels, &endpoint, "pools", TTL);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    assert!(provider.offer(arm()).await.unwrap());
+    {
+        let mut pool = manager.pool.lock().unwrap();
+        pool.sessions.clear();
+        pool.resources.clear();
+        (pool.forbids, pool.creations) = (true, BTreeMap::new());
+    }
+    manager.until(|pool| pool.creations.contains_key("arm@sim")).await;
+    manager.pool.lock().unwrap().forbids = false;
+    manager.until(|pool| pool.resources.contains_key("arm@sim")).await;
 }
 
 #[tokio::test]
