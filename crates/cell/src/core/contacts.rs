@@ -3,7 +3,7 @@
 //! ```text
 //!                    ┌─ a finger at what it closes around next, or has just let go (Approach, Depart), or at what it holds (Grasp)
 //! two bodies touch ──┼─ what is held at what it stood on when its motion began (LiftOff), or is set down on (SetDown)
-//!                    ├─ an object stands on a link (Stands); something was put there by a fault (PutThere)
+//!                    ├─ an object stands on a link that stands, too (Stands); something was put there by a fault (PutThere)
 //!                    └─ everything else is unintended
 //! ```
 //! An episode begins when two bodies are as near as touching and ends when they have come apart. Some are judged only by what comes after: a
@@ -12,6 +12,7 @@
 
 use super::environment::{Environment, Thing, Touch};
 use ratn_model::time::Timestamp;
+use ratn_motion::robot::Robot;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -61,7 +62,7 @@ pub enum Purpose {
     LiftOff,
     /// What is held comes to stand on something, and is let go there.
     SetDown,
-    /// An object stands on a link.
+    /// An object stands on a link that the arm does not move.
     Stands,
     /// A fault put it there.
     PutThere,
@@ -84,7 +85,7 @@ pub(super) struct Contacts {
     /// Fingers at objects, over before it is known what for.
     waiting: Vec<(usize, Contact)>,
     /// What the fingers have let go, or closed around in vain, until the arm has moved away from it.
-    parting: Option<usize>,
+    parting: Option<Parting>,
     /// Something has just been grasped.
     grasped: bool,
     /// What a fault put somewhere since the last step.
@@ -94,14 +95,24 @@ pub(super) struct Contacts {
     fresh: Vec<Contact>,
 }
 
+/// What the fingers part from.
+#[derive(Debug, Clone, Copy)]
+struct Parting {
+    object: usize,
+    /// A motion has set out since: the fingers are no longer where they let go of it.
+    set_out: bool,
+}
+
 /// What the robot is doing at a step.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Doing {
+pub(super) struct Doing<'a> {
     pub(super) now: Timestamp,
     /// What the fingers hold.
     pub(super) held: Option<usize>,
     /// The arm or the base is on its way.
     pub(super) moves: bool,
+    /// The robot whose arm moves its links; `None` where the arm stands.
+    pub(super) arm_of: Option<&'a Robot>,
     /// The fingers push what they meet; while they close they do not.
     pub(super) fingers_solid: bool,
 }
@@ -147,7 +158,7 @@ impl std::fmt::Display for Contact {
 
 impl Contacts {
     /// After a step: what touches what.
-    pub(super) fn observe(&mut self, touches: &[Touch], doing: Doing, environment: &Environment, ids: &[String]) {
+    pub(super) fn observe(&mut self, touches: &[Touch], doing: Doing<'_>, environment: &Environment, ids: &[String]) {
         for touch in touches {
             self.see(touch, doing, environment, ids);
         }
@@ -179,7 +190,7 @@ impl Contacts {
             let meant = (Some(object) == around).then_some(Purpose::Approach);
             self.judge(Contact { meant, ..contact });
         }
-        (self.parting, self.grasped) = (around, true);
+        (self.parting, self.grasped) = (around.map(|object| Parting { object, set_out: false }), true);
     }
 
     /// The fingers have let go of an object, on purpose or not.
@@ -191,13 +202,23 @@ impl Contacts {
             }
             self.judge(contact);
         }
-        self.parting = Some(object);
+        self.parting = Some(Parting { object, set_out: false });
     }
 
-    /// The arm or the base begins to move.
-    pub(super) fn sets_out(&mut self) {
+    /// The arm or the base begins to move, with an object in the fingers or without. A grasp in vain is over then: what the fingers
+    /// touch of it from now on is another contact.
+    pub(super) fn sets_out(&mut self, held: Option<usize>) {
         for (_, contact) in std::mem::take(&mut self.waiting) {
             self.judge(contact);
+        }
+        let in_vain = |things: &[Thing; 2], episode: &Episode| {
+            episode.contact.meant == Some(Purpose::Grasp) && finger_at(things) != held
+        };
+        for (_, episode) in self.take(in_vain) {
+            self.judge(episode.contact);
+        }
+        if let Some(parting) = &mut self.parting {
+            parting.set_out = true;
         }
     }
 
@@ -226,7 +247,7 @@ impl Contacts {
         std::mem::take(&mut self.fresh)
     }
 
-    fn see(&mut self, touch: &Touch, doing: Doing, environment: &Environment, ids: &[String]) {
+    fn see(&mut self, touch: &Touch, doing: Doing<'_>, environment: &Environment, ids: &[String]) {
         if !self.open.contains_key(&touch.things) {
             let loose = touch.things.iter().find_map(|thing| match thing {
                 Thing::Object(object) if doing.held != Some(*object) => Some(*object),
@@ -249,6 +270,12 @@ impl Contacts {
             self.open.insert(touch.things.clone(), Episode { contact, from, up: 0.0 });
         }
         let Some(Episode { contact, from, up }) = self.open.get_mut(&touch.things) else { return };
+        if contact.meant == Some(Purpose::Stands) && is_moved(touch, doing) {
+            // The link leaves, with what stood on it: from here on it is the link that pushes.
+            contact.meant = None;
+            *from = from.map(|(object, _)| (object, environment.state(object).pose.position));
+            (contact.began, contact.depth_m, contact.pushed_m) = (doing.now, 0.0, 0.0);
+        }
         contact.ended = doing.now;
         contact.speed_m_s = contact.speed_m_s.max(touch.speed_m_s);
         if touch.depth_m > contact.depth_m {
@@ -264,7 +291,7 @@ impl Contacts {
     }
 
     /// What a contact is for, where that is known as it begins.
-    fn known(&self, touch: &Touch, doing: Doing) -> Option<Purpose> {
+    fn known(&self, touch: &Touch, doing: Doing<'_>) -> Option<Purpose> {
         let lifts = (self.grasped || !doing.moves).then_some(Purpose::LiftOff);
         match &touch.things {
             things if things.iter().any(|thing| self.put.map(Thing::Object).as_ref() == Some(thing)) => {
@@ -274,11 +301,12 @@ impl Contacts {
                 if doing.held == Some(*object) {
                     return Some(Purpose::Grasp);
                 }
-                let purpose = if doing.fingers_solid { Purpose::Depart } else { Purpose::Grasp };
-                (self.parting == Some(*object)).then_some(purpose)
+                let parting = self.parting.filter(|parting| parting.object == *object)?;
+                let leaves = doing.fingers_solid || parting.set_out;
+                Some(if leaves { Purpose::Depart } else { Purpose::Grasp })
             }
             [Thing::Link(_), Thing::Object(object)] if doing.held != Some(*object) => {
-                (touch.normal[2] >= LEVEL).then_some(Purpose::Stands)
+                (touch.normal[2] >= LEVEL && !is_moved(touch, doing)).then_some(Purpose::Stands)
             }
             [_, Thing::Object(_)] => lifts,
             _ => None,
@@ -301,6 +329,12 @@ impl Contacts {
     }
 }
 
+/// Whether it is a link that the arm moves.
+fn is_moved(touch: &Touch, doing: Doing<'_>) -> bool {
+    let (Thing::Link(link), Some(robot)) = (&touch.things[0], doing.arm_of) else { return false };
+    robot.link(link).is_some_and(|link| robot.arm_links.contains(&link))
+}
+
 /// The object at which a finger is.
 fn finger_at(things: &[Thing; 2]) -> Option<usize> {
     match things {
@@ -311,7 +345,10 @@ fn finger_at(things: &[Thing; 2]) -> Option<usize> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::environment::{Kind, Model};
     use super::*;
+    use ratn_model::pose::Pose;
+    use ratn_motion::robot::Configuration;
 
     #[test]
     fn what_a_finger_hit_in_the_last_motion_is_told_though_nothing_follows_it() {
@@ -330,5 +367,82 @@ mod tests {
         // It was what the fingers came to.
         contacts.closed(Some(0));
         assert_eq!(contacts.unintended().len(), 1, "it was pushed too far for that");
+    }
+
+    /// A box in a room of its own, and what watches it.
+    struct Watched {
+        robot: Robot,
+        environment: Environment,
+        contacts: Contacts,
+    }
+
+    impl Watched {
+        fn new() -> Watched {
+            let robot = Robot::aimm();
+            let model = Model { kind: Kind::Box, size: [0.1, 0.1, 0.1] };
+            let stands = Configuration { finger: 0.055, ..Configuration::ZERO };
+            let environment = Environment::new(&robot, &stands, &[], &[(model, Pose::at(2.0, 0.0, 0.5))]);
+            Watched { robot, environment, contacts: Contacts::default() }
+        }
+
+        /// A step in which the box is `x` metres from where it was and a link is so deep in it, or none is.
+        fn step(&mut self, x: f64, link: Option<(&str, f64)>, arm_moves: bool, fingers_solid: bool) {
+            self.environment.put(0, &Pose::at(2.0 + x, 0.0, 0.5));
+            let touch = |(link, depth_m): (&str, f64)| Touch {
+                things: [Thing::Link(link.to_owned()), Thing::Object(0)],
+                depth_m,
+                at: [2.0, 0.0, 0.45],
+                normal: [0.0, 0.0, 1.0],
+                speed_m_s: 0.1,
+            };
+            let touches: Vec<Touch> = link.map(touch).into_iter().collect();
+            let arm_of = arm_moves.then_some(&self.robot);
+            let doing = Doing { now: Timestamp::default(), held: None, moves: arm_moves, arm_of, fingers_solid };
+            self.contacts.observe(&touches, doing, &self.environment, &["box_1".to_owned()]);
+        }
+
+        fn pushed_mm(&self) -> Vec<f64> {
+            self.contacts.unintended().iter().map(|contact| (contact.pushed_m * 1e3).round()).collect()
+        }
+    }
+
+    #[test]
+    fn what_stands_on_a_link_of_the_arm_is_pushed_by_it_as_soon_as_the_arm_moves() {
+        let mut watched = Watched::new();
+        // It came down on a link that stood still, and slid on it.
+        watched.step(0.0, Some(("arm_4", 0.0004)), false, true);
+        watched.step(0.03, Some(("arm_4", 0.0004)), false, true);
+        assert_eq!(watched.pushed_mm(), [0.0; 0]);
+        watched.step(0.03, Some(("arm_4", 0.0004)), true, true);
+        watched.step(0.05, Some(("arm_4", 0.0004)), true, true);
+        assert_eq!(watched.pushed_mm(), [20.0]);
+    }
+
+    #[test]
+    fn a_link_that_comes_from_below_is_no_place_to_stand_but_the_deck_is() {
+        for (link, expected) in [("arm_4", &[20.0][..]), ("base", &[])] {
+            let mut watched = Watched::new();
+            watched.step(0.0, Some((link, 0.0004)), true, true);
+            watched.step(0.02, Some((link, 0.0004)), true, true);
+            watched.step(0.02, None, true, true);
+            assert_eq!(watched.pushed_mm(), expected, "{link}");
+        }
+    }
+
+    #[test]
+    fn a_grasp_in_vain_excuses_the_fingers_until_the_next_motion_sets_out() {
+        for (moves, excused) in [(false, true), (true, false)] {
+            let mut watched = Watched::new();
+            watched.contacts.closing();
+            watched.step(0.0, Some(("finger_left", 0.03)), false, false);
+            watched.contacts.closed(Some(0));
+            if moves {
+                watched.contacts.sets_out(None);
+            }
+            watched.step(0.0, Some(("finger_left", 0.03)), moves, false);
+            watched.step(0.0, None, moves, false);
+            watched.contacts.sets_out(None);
+            assert_eq!(watched.contacts.unintended().is_empty(), excused, "{:?}", watched.contacts.unintended());
+        }
     }
 }

@@ -47,6 +47,7 @@ impl Cell {
             now: self.environment.now(),
             held: self.held.map(|held| held.object),
             moves: self.is_active(Module::Arm) || self.is_active(Module::Base),
+            arm_of: self.is_active(Module::Arm).then_some(&self.robot),
             fingers_solid: solid,
         };
         self.contacts.observe(&self.environment.touches(), doing, &self.environment, &self.ids);

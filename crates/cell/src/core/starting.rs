@@ -92,7 +92,7 @@ impl Cell {
             }
         };
         if matches!(kind, Kind::Follow(_)) {
-            self.contacts.sets_out();
+            self.contacts.sets_out(self.held.map(|held| held.object));
         }
         let (started, ends) = (self.motion_time, self.motion_time + seconds(lasts_s));
         self.activities.insert(module, Activity { ticket, started, ends, kind });
