@@ -256,6 +256,11 @@ impl<'a> Checker<'a> {
         self.robot
     }
 
+    /// How much room it keeps around the moving shapes, in metres.
+    pub fn padding(&self) -> f64 {
+        self.padding
+    }
+
     /// Into how many equal steps the straight line between two postures must be cut so that no point of the robot moves
     /// further than twice the padding in one.
     pub fn steps(&self, from: &Joints, to: &Joints) -> usize {

@@ -19,7 +19,7 @@ use crate::pace::{Control, Pace, Progress, Stop};
 use crate::reach::{Positions, Postures, Reach, Target, is_new};
 use crate::refine::{End, Refinement};
 pub use crate::request::{Goal, MAX_GOALS, MAX_STRAIGHT_M, MIN_SPEED, Request};
-use crate::robot::{Configuration, Joints, Robot};
+use crate::robot::{Configuration, Geometry, Joints, Robot};
 use crate::simplify::{path_length, shortened};
 use crate::space::{Space, State};
 use crate::timing::{Section, timed_while};
@@ -27,9 +27,10 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
-use ratn_world::scene::Scene;
+use ratn_world::scene::{Placement, Scene, SceneObject};
 
-/// The padding where the start is too close to something for the usual one, in metres.
+/// The padding where the start is too close to something for the usual one, in metres. As much room is on a free path at the least; a
+/// controller that gives up there stops a little beside it, so a start with less is left, too, as long as it touches nothing.
 const TIGHT_PADDING_M: f64 = 0.002;
 
 /// Postures looked for per goal pose, and attempts spent on it: at first, and once more if there were none.
@@ -51,9 +52,12 @@ const MAX_CANDIDATES: usize = 64;
 /// Of a hundred steps of improvement, those that look for a new candidate.
 const NEW_CANDIDATES: i32 = 8;
 
-/// How deep the fingers and what they hold press into what they touch on the way to a goal: no deeper than measurements are off, as far
-/// as a goal can be reached so; in metres. What they press into deeper may be pushed away.
-const PRESSES_M: [f64; 2] = [0.002, CONTACT_TOLERANCE_M];
+/// How far off the measured poses of objects are, in metres: as far as that the fingers keep away from what they need not touch, where
+/// there is a way.
+const MEASURED_WITHIN_M: f64 = 0.002;
+
+/// Steps from touching to the deepest that may be pressed: of the ways to a goal those count that press the least.
+const PRESS_STEPS: u32 = 4;
 
 /// A path must have become this much shorter to be worth a word, in radians.
 const LEAST_REPORT_RAD: f32 = 1e-3;
@@ -177,6 +181,8 @@ struct Planning<'a> {
     approach_m: f64,
     /// How deep an approach may press into what it touches.
     press_m: f64,
+    /// With the fingers open, and without what they hold: how the tool leaves a goal where it lets go.
+    leaving: Option<Checker<'a>>,
     candidates: Vec<Candidate>,
 }
 
@@ -204,25 +210,31 @@ pub fn plan(
         random: ChaCha8Rng::seed_from_u64(request.seed),
         goals: request.goals.clone(),
         approach_m: request.approach_m,
-        press_m: CONTACT_TOLERANCE_M,
+        press_m: 0.0,
+        leaving: None,
         candidates: Vec::new(),
     };
-    let depart = match planning.depart(request) {
-        Err(_) => {
-            let checker = Checker::new(robot, scene, &here, TIGHT_PADDING_M);
-            planning.checker = checker.reaching_into(&request.reaches_into);
-            planning.depart(request)?
+    let mut depart = planning.depart(request);
+    for padding in [TIGHT_PADDING_M, 0.0] {
+        if depart.is_err() {
+            planning.checker = Checker::new(robot, scene, &here, padding).reaching_into(&request.reaches_into);
+            depart = planning.depart(request);
         }
-        depart => depart?,
-    };
+    }
+    let depart = depart?;
     let start = depart[depart.len() - 1];
     planning.constraint = request.upright_rad.map(|tolerance| {
         let up = planning.reach.pose(&positions(&start)).inverse().rotate([0.0, 0.0, 1.0]);
         let frame = crate::space::align(up);
         Constraint::new(Reach::new(&mechanism, robot.tool, frame), Target::upright(Pose::IDENTITY, tolerance))
     });
+    planning.leaving = leaving(robot, scene, request);
     let door = planning.door(&start).ok_or_else(|| planning.no_room(&start))?;
     let way_out = if door == state(&start) { 0.0 } else { distance(&start, &joints(robot, &door)) };
+    if planning.checker.padding() < TIGHT_PADDING_M {
+        // An arm may stand so close to something, where it was stopped; it does not go there.
+        planning.checker = Checker::new(robot, scene, &here, TIGHT_PADDING_M).reaching_into(&request.reaches_into);
+    }
     let before = length(&depart) + way_out;
     planning.find_candidates(&start, &mut pace)?;
 
@@ -280,7 +292,7 @@ impl Planning<'_> {
         }
         let failed = |reason: String| PlanError::Depart { depart_m: request.depart_m, reason };
         let postures = line(&self.reach, &start, [0.0, 0.0, request.depart_m]).map_err(|e| failed(e.to_string()))?;
-        match self.straight_collision(&postures, CONTACT_TOLERANCE_M) {
+        match straight_collision(&mut self.checker, &postures, CONTACT_TOLERANCE_M) {
             Some(collision) => Err(failed(collision.to_string())),
             None => match self.checker.collision(&postures[postures.len() - 1], Contact::None) {
                 Some(collision) => Err(failed(format!("at its end {collision}"))),
@@ -289,13 +301,7 @@ impl Planning<'_> {
         }
     }
 
-    fn straight_collision(&mut self, postures: &[Joints], press_m: f64) -> Option<Collision> {
-        let contact = Contact::Gripper(press_m);
-        let first = self.checker.collision(&postures[0], contact);
-        first.or_else(|| postures.windows(2).find_map(|w| self.checker.edge_collision(&w[0], &w[1], contact)))
-    }
-
-    /// Fills the list of candidates: those that press into nothing, or else all.
+    /// Fills the list of candidates: those that keep away from what they need not touch, or else those that press the least.
     fn find_candidates(&mut self, near: &Joints, pace: &mut Pace<'_>) -> Result<(), PlanError> {
         let mut reasons: Vec<String> = Vec::new();
         for (wanted, attempts) in SOLUTIONS {
@@ -314,7 +320,7 @@ impl Planning<'_> {
                 }
             }
             let mut refused = Vec::new();
-            for press_m in PRESSES_M {
+            for press_m in presses_m(self.robot) {
                 self.press_m = press_m;
                 refused.clear();
                 for posture in &postures {
@@ -374,8 +380,12 @@ impl Planning<'_> {
         if self.approach_m > 0.0 {
             let up = [0.0, 0.0, self.approach_m];
             approach = line(&self.reach, goal, up).map_err(|e: LineError| format!("approaching the goal, {e}"))?;
-            if let Some(collision) = self.straight_collision(&approach, self.press_m) {
+            if let Some(collision) = straight_collision(&mut self.checker, &approach, self.press_m) {
                 return Err(format!("approaching the goal, {collision}"));
+            }
+            let leaving = self.leaving.as_mut();
+            if let Some(collision) = leaving.and_then(|open| straight_collision(open, &approach, self.press_m)) {
+                return Err(format!("leaving the goal with open fingers, {collision}"));
             }
             approach.reverse();
         }
@@ -532,6 +542,43 @@ impl Planning<'_> {
         let reason = collision.map_or_else(|| "there is too little room to move".to_owned(), |c| c.to_string());
         PlanError::NoRoom { reason }
     }
+}
+
+fn straight_collision(checker: &mut Checker<'_>, postures: &[Joints], press_m: f64) -> Option<Collision> {
+    let contact = Contact::Gripper(press_m);
+    let first = checker.collision(&postures[0], contact);
+    first.or_else(|| postures.windows(2).find_map(|w| checker.edge_collision(&w[0], &w[1], contact)))
+}
+
+/// How deep the fingers and what they hold may press into what they touch on the way to a goal, in metres, in the order in which it is
+/// tried; negative: how far they keep away. The deepest is half a finger's thickness: a finger that comes down beside an edge pushes
+/// it aside, and one that comes down with more than half of itself on it stands on it.
+fn presses_m(robot: &Robot) -> Vec<f64> {
+    let steps = (0..=PRESS_STEPS).map(|step| f64::from(step) / f64::from(PRESS_STEPS) * half_finger_m(robot));
+    std::iter::once(-MEASURED_WITHIN_M).chain(steps).collect()
+}
+
+/// Half of a finger's thickness along the direction in which it closes; 0 for a robot without fingers made of boxes.
+fn half_finger_m(robot: &Robot) -> f64 {
+    let halves = robot.link("finger_left").into_iter().flat_map(|link| &robot.model.links[link].bodies);
+    let thickness = halves.filter_map(|body| match body.geometry {
+        Geometry::Box { half } => Some(half[1]),
+        _ => None,
+    });
+    thickness.fold(0.0, f64::max)
+}
+
+/// The tool as it leaves a goal where it lets go of what it holds: fingers that open there may press a neighbour, too. `None` where it
+/// holds nothing.
+fn leaving<'a>(robot: &'a Robot, scene: &Scene, request: &Request) -> Option<Checker<'a>> {
+    let is_held = |object: &SceneObject| matches!(object.placement, Placement::Gripper(_));
+    if !scene.objects.iter().any(is_held) {
+        return None;
+    }
+    let left = scene.objects.iter().filter(|object| !is_held(object)).cloned().collect();
+    let scene = Scene { objects: left, ..scene.clone() };
+    let opened = Configuration { finger: robot.finger().upper, ..request.start };
+    Some(Checker::new(robot, &scene, &opened, PADDING_M).reaching_into(&request.reaches_into))
 }
 
 fn arm_of(positions: &Positions) -> Joints {

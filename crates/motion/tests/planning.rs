@@ -130,6 +130,64 @@ fn a_neighbour_is_pressed_only_where_no_other_way_to_take_hold_leads_past_it() {
 }
 
 #[test]
+fn what_is_let_go_is_put_so_that_the_open_fingers_press_nobody() {
+    let mut pressing = 0;
+    for i in 0..8 {
+        let angle = f64::from(i) * FRAC_PI_4;
+        let [x, y] = [0.7, -0.1];
+        let mut cell = Cell::with_boxes(0, 1);
+        let at_can = Pose::from_rpy([0.0, 0.0, 0.02], PI, 0.0, 0.0);
+        let mut add = |name: &str, radius: f64, placement: Placement| {
+            let shape = Shape::Cylinder { radius, length: 0.1 };
+            cell.scene.objects.push(SceneObject { name: name.into(), shape, placement });
+        };
+        add("can", 0.035, Placement::Gripper(at_can.inverse()));
+        // The fingers pass beside it closed, but not open.
+        let [post_x, post_y] = [x + 0.085 * angle.cos(), y + 0.085 * angle.sin()];
+        add("post", 0.02, Placement::World(Pose::at(post_x, post_y, aimm::TABLE_HEIGHT_M + 0.05)));
+        let goal = |k: i32| {
+            Goal::Pose(Pose::from_rpy([x, y, aimm::TABLE_HEIGHT_M + 0.073], PI, 0.0, f64::from(k) * FRAC_PI_4))
+        };
+        let goals: Vec<Goal> = (0..8).map(goal).collect();
+        let to = |goals: &[Goal]| {
+            cell.plan(&Request { approach_m: aimm::APPROACH_M, ..request(cell.state(), goals.to_vec()) })
+        };
+        let mut scene = cell.scene.clone();
+        scene.objects.retain(|object| object.name != "can");
+        let opened = Configuration { finger: cell.robot.finger().upper, ..cell.state() };
+        let mut open = Checker::new(&cell.robot, &scene, &opened, 0.0);
+        let mut presses = |plan: &Plan| open.collision(&plan.end, Contact::Gripper(0.0)).is_some();
+        assert!(!presses(&to(&goals).unwrap()), "{i}");
+        // Where there is no other way it is pressed.
+        let alone = goals.iter().filter_map(|goal| to(&[*goal]).ok());
+        pressing += alone.filter(|plan| presses(plan)).count();
+    }
+    assert!(pressing > 0);
+}
+
+#[test]
+fn an_arm_that_was_stopped_a_millimetre_beside_something_leaves_it() {
+    let mut cell = Cell::with_boxes(0, 1);
+    let configuration = Configuration { arm: cell.arm, ..Configuration::ZERO };
+    // The hand is 0.15 m wide along y, and its middle 0.085 m behind the tool's.
+    let beside = |room_m: f64| Pose::at(0.0, 0.075 + room_m + 0.025, -0.085);
+    let tool = cell.robot.tool_pose(&configuration);
+    for (room_m, leaves) in [(0.001, true), (-0.003, false)] {
+        cell.scene.objects.retain(|object| object.name != "post");
+        cell.scene.objects.push(SceneObject {
+            name: "post".into(),
+            shape: Shape::Box { size: [0.05; 3] },
+            placement: Placement::World(tool.compose(&beside(room_m))),
+        });
+        let plan = cell.plan(&request(cell.state(), vec![Goal::Joints(aimm::HOME)]));
+        assert_eq!(plan.is_ok(), leaves, "{room_m}: {plan:?}");
+        if let Ok(plan) = plan {
+            assert_valid(&cell, &plan, 0.3);
+        }
+    }
+}
+
+#[test]
 fn the_same_seed_and_iterations_give_the_same_plan() {
     let mut cell = Cell::with_boxes(3, 1);
     cell.improvement_iterations = 300;
