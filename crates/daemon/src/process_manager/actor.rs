@@ -12,6 +12,7 @@ use super::session_file::SessionFile;
 use super::spawner::Outcome;
 use super::tracking::Tracker;
 use super::usage::Usage;
+use super::withheld::Withheld;
 use crate::demand::{Shortages, Use};
 use crate::link::{OfferEvent, Wanted};
 use nix::sys::signal::Signal;
@@ -21,7 +22,7 @@ use ratn_proto::types::{Demand, HostPools, PoolStatus, Scale, TrackingMode, Work
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
 use ratn_worker::vitals::Vitals;
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::BTreeSet;
 use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
@@ -105,6 +106,7 @@ struct Actor {
     tracking: TrackingMode,
     pools: Pools,
     processes: Processes,
+    withheld: Withheld,
     start: Instant,
     wanted: watch::Sender<Wanted>,
     drains: watch::Sender<BTreeSet<String>>,
@@ -132,6 +134,7 @@ pub(super) fn start(
     let actor = Actor {
         pools,
         processes,
+        withheld: Withheld::default(),
         host: config.host,
         labels: config.labels,
         tracking,
@@ -220,7 +223,8 @@ impl Actor {
                 Some(sample) = inputs.looks.recv() => self.handle(Event::Looked(sample)),
                 Some(answer) = inputs.renewals.recv() => self.renew_session(answer),
                 Some(message) = inputs.messages.recv() => self.receive(message),
-                _ = tick.tick() => {}
+                // What could not be written is tried again, whatever else happens.
+                _ = tick.tick() => self.perform(Vec::new()),
                 () = sleep_until(deadline) => self.handle(Event::Time),
                 () = shutdown.cancelled() => break,
             }
@@ -355,8 +359,8 @@ impl Actor {
 
     fn perform(&mut self, commands: Vec<Command>) {
         // Before anything of it is offered.
-        self.processes.keep_motions(&self.pools.motions(self.now()));
-        let mut commands = VecDeque::from(commands);
+        let kept = self.processes.keep_motions(&self.pools.motions(self.now()));
+        let mut commands = self.withheld.pass(commands, kept);
         while let Some(command) = commands.pop_front() {
             match command {
                 Command::Start { id, template } => {

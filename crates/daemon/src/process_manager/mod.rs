@@ -34,6 +34,7 @@ mod status;
 mod template;
 pub mod tracking;
 mod usage;
+mod withheld;
 
 pub use config::{Label, Labels, ProcessManagerConfig};
 pub use limits::{GroupsV1, Limits};
@@ -115,7 +116,7 @@ pub async fn run_as(
     let session_file = SessionFile::of(&directory);
     let session = session_file.id().context("cannot keep the session's name")?;
     let told = ManagerContact { manager: processes::manager_of(&config, &directory), session: session.clone() };
-    let adopted = predecessor::settle(left, &config.templates, &told, &directory, &tracker).await;
+    let adopted = predecessor::settle(left, (&config.host, &config.templates), &told, &directory, &tracker).await;
     roster.keep_only(&adopted.iter().map(|one| one.entry.id.as_str()).collect());
     // Of a template with an adopted worker, the link waits where that worker was not offered before.
     motions.retain(|name, _| adopted.iter().all(|one| one.entry.template.name != *name));

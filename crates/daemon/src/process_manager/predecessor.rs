@@ -10,6 +10,7 @@
 
 use super::account;
 use super::limits::end_group;
+use super::pools;
 use super::processes::ManagerContact;
 use super::roster::{Entry, LeftBehind, Motions};
 use super::spawner;
@@ -101,7 +102,7 @@ pub(super) fn adopt_socket(directory: &RuntimeDirectory, id: &str) -> PathBuf {
 /// Adopts or ends all of them; those that were adopted. Returns when the others are gone, and so is what was being started.
 pub(super) async fn settle(
     left: LeftBehind,
-    templates: &[Template],
+    (host, templates): (&str, &[Template]),
     told: &ManagerContact,
     directory: &RuntimeDirectory,
     tracker: &Tracker,
@@ -109,7 +110,7 @@ pub(super) async fn settle(
     let motions = &left.motions;
     let settled = left.workers.into_iter().map(async |entry| {
         let adopted = match Exit::of(&entry) {
-            Some(exit) => match greet(&entry, exit, templates, motions, told, directory).await {
+            Some(exit) => match greet(&entry, exit, (host, templates), motions, told, directory).await {
                 Ok(adopted) => Some(adopted),
                 Err((exit, why)) => {
                     tracing::info!(
@@ -154,7 +155,7 @@ pub(super) async fn settle(
 async fn greet(
     entry: &Entry,
     exit: Exit,
-    templates: &[Template],
+    (host, templates): (&str, &[Template]),
     motions: &Motions,
     told: &ManagerContact,
     directory: &RuntimeDirectory,
@@ -162,6 +163,10 @@ async fn greet(
     let Some(template) = templates.iter().find(|template| template.name == entry.template.name) else {
         return Err((exit, "its template is gone"));
     };
+    // The pool gives its workers other ids, and would start one beside this one.
+    if pools::number_of(&entry.id, &template.name, host).is_none() {
+        return Err((exit, "its id is not one of this host: the host had another name"));
+    }
     if !(template.adopt && entry.template.adopt) {
         return Err((exit, "its template does not say `adopt`"));
     }
@@ -249,14 +254,14 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_worker_that_moves_something_is_not_adopted_where_its_template_has_no_bound_any_more() {
+    async fn a_worker_that_moves_something_is_not_adopted_where_its_template_has_no_bound_or_its_host_another_name() {
         let place = tempfile::tempdir().unwrap();
         let directory = RuntimeDirectory::create(place.path()).unwrap();
         let told = ManagerContact { manager: "http://127.0.0.1:2".parse().unwrap(), session: "s".to_owned() };
         let template = Template { adopt: true, ..Template::new("arm", "Arm") };
         let pid = std::process::id();
         let entry = Entry {
-            id: "arm-1".to_owned(),
+            id: "arm-1@host".to_owned(),
             pid,
             began: began(pid).unwrap(),
             endpoint: Some("unix:/w".to_owned()),
@@ -269,11 +274,19 @@ mod tests {
         let listener = tokio::net::UnixListener::bind(adopt_socket(&directory, &entry.id)).unwrap();
         let motions = Motions::from([("arm".to_owned(), Duration::from_secs(9))]);
         let exit = Exit::of(&entry).unwrap();
-        let (_, why) = greet(&entry, exit, &[template], &motions, &told, &directory).await.unwrap_err();
+        let (_, why) = greet(&entry, exit, ("host", &[template]), &motions, &told, &directory).await.unwrap_err();
         assert!(why.contains("standstill_ms"), "{why}");
+        let templates = [entry.template.clone()];
+        for (id, host) in [("arm-1@host", "new"), ("arm-x@host", "host"), ("leg-1@host", "host")] {
+            let (entry, exit) = (Entry { id: id.to_owned(), ..entry.clone() }, Exit::of(&entry).unwrap());
+            let _listener =
+                (id != "arm-1@host").then(|| tokio::net::UnixListener::bind(adopt_socket(&directory, id)).unwrap());
+            let (_, why) = greet(&entry, exit, (host, &templates), &motions, &told, &directory).await.unwrap_err();
+            assert!(why.contains("id is not one of this host"), "{id} at {host}: {why}");
+        }
         let exit = Exit::of(&entry).unwrap();
         let lower = Template { standstill_ms: Some(100), ..entry.template.clone() };
-        let adopted = greet(&entry, exit, &[lower], &motions, &told, &directory).await.unwrap();
+        let adopted = greet(&entry, exit, ("host", &[lower]), &motions, &told, &directory).await.unwrap();
         assert_eq!((adopted.standstill, adopted.outdated), (Some(Duration::from_secs(9)), true));
         drop(listener);
     }

@@ -312,9 +312,9 @@ impl Processes {
         spawner::watch_adopted(adopted, &self.log_file(&id), self.max_log_bytes, tracker, self.outcomes.clone());
     }
 
-    /// What may move from now on, for a successor.
-    pub(super) fn keep_motions(&mut self, motions: &Motions) {
-        self.roster.keep_motions(motions);
+    /// What may move from now on, for a successor; whether it would hear of it.
+    pub(super) fn keep_motions(&mut self, motions: &Motions) -> bool {
+        self.roster.keep_motions(motions)
     }
 
     /// The process of a worker has ended.

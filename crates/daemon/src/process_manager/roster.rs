@@ -115,6 +115,8 @@ pub(super) struct Roster {
     starting: BTreeMap<String, Intent>,
     /// In milliseconds.
     motions: BTreeMap<String, u64>,
+    /// A line was not written, or only its beginning: what is known is to be written anew.
+    unwritten: bool,
     _lock: File,
 }
 
@@ -153,7 +155,8 @@ impl Roster {
             motions: motions.iter().map(|(name, ms)| (name.clone(), Duration::from_millis(*ms))).collect(),
         };
         let file = File::options().append(true).create(true).open(&path).map_err(failed)?;
-        let mut roster = Roster { path: path.clone(), file, lines: 0, there, starting, motions, _lock: lock };
+        let mut roster =
+            Roster { path: path.clone(), file, lines: 0, there, starting, motions, unwritten: false, _lock: lock };
         roster.write_anew().map_err(failed)?;
         Ok((roster, left))
     }
@@ -192,12 +195,15 @@ impl Roster {
     }
 
     /// What may move now; called before a worker that moves something is offered. A successor that hears of a motion waits for its bound,
-    /// however this process manager and its workers end.
-    pub(super) fn keep_motions(&mut self, now: &Motions) {
+    /// however this process manager and its workers end. Whether it would hear of it: false where the file could not be written, also now.
+    pub(super) fn keep_motions(&mut self, now: &Motions) -> bool {
         let ms = |bound: &Duration| u64::try_from(bound.as_millis()).unwrap_or(u64::MAX);
         let now: BTreeMap<String, u64> = now.iter().map(|(name, bound)| (name.clone(), ms(bound))).collect();
-        if now == self.motions {
-            return;
+        if self.unwritten {
+            self.motions = now;
+            let written = self.write_anew();
+            self.note(written);
+            return !self.unwritten;
         }
         let before = std::mem::replace(&mut self.motions, now.clone());
         for (template, standstill_ms) in &now {
@@ -208,18 +214,32 @@ impl Roster {
         for template in before.into_keys().filter(|template| !now.contains_key(template)) {
             self.append(&Line::Rests { template });
         }
+        !self.unwritten
     }
 
-    /// The workers go on where it cannot be written: only a successor would not know of them.
+    /// The workers go on where it cannot be written: only a successor would not know of them. After a line that failed nothing is
+    /// appended, which the rest of that line would make unreadable: all that is known is written anew instead, until that succeeds.
     fn append(&mut self, line: &Line) {
         self.lines += 1;
-        let written = if self.lines > self.known() * 2 + MOST_OLD_LINES {
+        let written = if self.unwritten || self.lines > self.known() * 2 + MOST_OLD_LINES {
             self.write_anew()
         } else {
             write(&mut self.file, line)
         };
-        if let Err(error) = written {
-            tracing::warn!(file = %self.path.display(), %error, "the list of workers is not written");
+        self.note(written);
+    }
+
+    fn note(&mut self, written: io::Result<()>) {
+        let (file, before) = (self.path.display(), self.unwritten);
+        self.unwritten = written.is_err();
+        match written {
+            Err(error) if !before => tracing::error!(
+                %file, %error,
+                "the list of workers is not written: a successor would not know what is there and what moves; it is tried again, and no \
+                 worker that moves something is offered before. Is the disk full?"
+            ),
+            Ok(()) if before => tracing::info!(%file, "the list of workers is written again"),
+            _ => {}
         }
     }
 
@@ -255,17 +275,17 @@ fn write(file: &mut File, line: &Line) -> io::Result<()> {
 /// The workers that were there, those that were being started, and the motions.
 type Known = (BTreeMap<String, Entry>, BTreeMap<String, Intent>, BTreeMap<String, u64>);
 
-/// A line that was cut off by the end of its writer says nothing. A worker that moves something may have moved it also where no line says
+/// A line that cannot be read, as one that was cut off by the end of its writer, says nothing. A worker that moves something may have moved it also where no line says
 /// so: an older version wrote none, and a session of another caller may have offered a worker that this host had not offered yet.
 fn read(path: &Path) -> io::Result<Known> {
-    let text = match std::fs::read_to_string(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => String::new(),
+    let bytes = match std::fs::read(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Vec::new(),
         read => read?,
     };
     let mut there: BTreeMap<String, Entry> = BTreeMap::new();
     let mut starting: BTreeMap<String, Intent> = BTreeMap::new();
     let mut motions: BTreeMap<String, u64> = BTreeMap::new();
-    for line in text.lines().filter_map(|line| serde_json::from_str(line).ok()) {
+    for line in readable(&bytes, path) {
         match line {
             Line::Starts(intent) => drop(starting.insert(intent.id.clone(), *intent)),
             Line::Began(entry) => {
@@ -291,6 +311,18 @@ fn read(path: &Path) -> io::Result<Known> {
         *known = bound.max(*known);
     }
     Ok((there, starting, motions))
+}
+
+/// The lines that can be read. A line may be cut off inside a character.
+fn readable(bytes: &[u8], path: &Path) -> impl Iterator<Item = Line> {
+    let lines = bytes.split(|byte| *byte == b'\n').enumerate().filter(|(_, line)| !line.is_empty());
+    lines.filter_map(|(i, line)| {
+        let read = serde_json::from_str(&String::from_utf8_lossy(line));
+        let unreadable = |error: &serde_json::Error| {
+            tracing::warn!(file = %path.display(), line = i + 1, %error, "a line of the list of workers cannot be read: it is left out");
+        };
+        read.inspect_err(unreadable).ok()
+    })
 }
 
 #[cfg(test)]
@@ -382,6 +414,49 @@ mod tests {
         roster.keep_motions(&Motions::new());
         drop(roster);
         assert_eq!(Roster::take(&directory).unwrap().1, LeftBehind::default());
+    }
+
+    #[test]
+    fn a_line_that_is_cut_inside_a_character_is_left_out_and_the_next_manager_starts() {
+        let parent = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
+        let (mut roster, _) = Roster::take(&directory).unwrap();
+        roster.began(entry("a"));
+        roster.file.write_all(b"{\"gone\":{\"id\":\"\xc3").unwrap();
+        drop(roster);
+        assert_eq!(Roster::take(&directory).unwrap().1.workers, [entry("a")]);
+    }
+
+    #[test]
+    fn what_could_not_be_written_is_written_with_the_next_line_and_swallows_nothing() {
+        let parent = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
+        let (mut roster, _) = Roster::take(&directory).unwrap();
+        roster.file.write_all(b"{\"began\":{\"id\":").unwrap();
+        let real = std::mem::replace(&mut roster.file, File::options().write(true).open("/dev/full").unwrap());
+        roster.began(entry("a"));
+        roster.file = real;
+        roster.began(entry("b"));
+        drop(roster);
+        assert_eq!(Roster::take(&directory).unwrap().1.workers, [entry("a"), entry("b")]);
+    }
+
+    #[test]
+    fn a_motion_that_could_not_be_written_is_tried_again_until_a_successor_would_hear_of_it() {
+        let parent = tempfile::tempdir().unwrap();
+        let directory = RuntimeDirectory::create(parent.path().join("run")).unwrap();
+        let motions = Motions::from([("arm".to_owned(), Duration::from_secs(6))]);
+        let (mut roster, _) = Roster::take(&directory).unwrap();
+        roster.file = File::options().write(true).open("/dev/full").unwrap();
+        // Nor can it be written anew.
+        let obstacle = directory.path().join("workers.new");
+        std::fs::create_dir(&obstacle).unwrap();
+        assert!(!roster.keep_motions(&motions));
+        assert!(!roster.keep_motions(&motions));
+        std::fs::remove_dir(&obstacle).unwrap();
+        assert!(roster.keep_motions(&motions));
+        drop(roster);
+        assert_eq!(Roster::take(&directory).unwrap().1.motions, motions);
     }
 
     #[test]

@@ -386,8 +386,7 @@ impl Pools {
 
     /// Template and number of a worker's id.
     fn parts_of<'i>(&self, id: &'i str) -> Option<(&'i str, u64)> {
-        let (name, number) = id.strip_suffix(self.host.as_str())?.strip_suffix('@')?.rsplit_once('-')?;
-        Some((name, number.parse().ok()?))
+        parts_of(id, &self.host)
     }
 
     /// The pool of a worker, and its number there.
@@ -401,6 +400,17 @@ impl Pools {
         let (pool, number) = self.find(id)?;
         pool.worker(number)
     }
+}
+
+/// The number of a worker of this template on this host; nothing where the id is another one's.
+pub(super) fn number_of(id: &str, template: &str, host: &str) -> Option<u64> {
+    parts_of(id, host).filter(|(name, _)| *name == template).map(|(_, number)| number)
+}
+
+/// Template and number of the id of a worker on this host.
+fn parts_of<'i>(id: &'i str, host: &str) -> Option<(&'i str, u64)> {
+    let (name, number) = id.strip_suffix(host)?.strip_suffix('@')?.rsplit_once('-')?;
+    Some((name, number.parse().ok()?))
 }
 
 #[cfg(test)]

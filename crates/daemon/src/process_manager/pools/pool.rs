@@ -309,7 +309,7 @@ impl Pool {
     pub(super) fn withdrawn(&mut self, now: Timestamp, number: u64, commands: &mut Vec<Command>) {
         let kill_at = now + self.template.stop_timeout();
         if let Some(worker) = self.workers.get_mut(&number) {
-            worker.withdrawn(kill_at, commands);
+            worker.withdrawn(now, kill_at, commands);
         }
     }
 

@@ -31,7 +31,7 @@ pub(super) struct Worker {
     refused: Option<(Timestamp, String)>,
     /// Another one is to take its place.
     outdated: bool,
-    /// Nothing moves by it: it was not offered yet, or was withdrawn while nobody held it.
+    /// Nothing moves by it: it was not offered yet, or was withdrawn when nobody had held it for its bound.
     at_rest: bool,
     /// What it moves may go on for so long after its end; nothing for one that moves nothing.
     standstill: Option<Duration>,
@@ -186,9 +186,12 @@ impl Worker {
     }
 
     /// Its resource is gone as it was to be: nothing is given to it any more.
-    pub(super) fn withdrawn(&mut self, kill_at: Timestamp, commands: &mut Vec<Command>) {
+    ///
+    /// What its last holder moved may go on for the bound after the release: a goal that was told to stop may overrun.
+    pub(super) fn withdrawn(&mut self, now: Timestamp, kill_at: Timestamp, commands: &mut Vec<Command>) {
         if matches!(self.phase, Phase::Leaving { .. }) {
-            self.at_rest = true;
+            let bound = self.standstill.unwrap_or_default();
+            self.at_rest = self.idle_since.is_some_and(|since| since + bound <= now);
             self.stop(kill_at, commands);
         }
     }
@@ -502,7 +505,20 @@ mod tests {
     fn one_that_retires_ends_when_its_resource_is_gone() {
         let mut worker = ready();
         assert_eq!(commands(|c| worker.retire(c)), [Command::Retire { id: ID.into() }]);
-        assert_eq!(commands(|c| worker.withdrawn(at(9.0), c)), stopped());
+        assert_eq!(commands(|c| worker.withdrawn(at(7.0), at(9.0), c)), stopped());
+    }
+
+    #[test]
+    fn one_that_moves_something_is_at_rest_when_nobody_has_held_it_for_its_bound() {
+        let bound = Duration::from_secs(6);
+        for (withdrawn, motion) in [(9.9, Some(bound)), (10.0, None)] {
+            let mut worker = ready().with_standstill(Some(bound));
+            worker.used(at(2.0), true, &mut Vec::new());
+            worker.used(at(4.0), false, &mut Vec::new());
+            worker.retire(&mut Vec::new());
+            worker.withdrawn(at(withdrawn), at(20.0), &mut Vec::new());
+            assert_eq!(worker.motion(), motion, "withdrawn at {withdrawn} s");
+        }
     }
 
     #[test]
@@ -526,7 +542,7 @@ mod tests {
             assert_eq!((worker.is_leaving(), worker.deadline()), (true, Some(at(30.0))));
             if patient {
                 assert_eq!(commands(|c| worker.used(at(9.0), false, c)), [Command::Retire { id: ID.into() }]);
-                assert_eq!(commands(|c| worker.withdrawn(at(11.0), c)), stopped());
+                assert_eq!(commands(|c| worker.withdrawn(at(9.0), at(11.0), c)), stopped());
             } else {
                 assert_eq!(commands(|c| worker.advance(at(30.0), &template(), c)), stopped());
                 assert_eq!(worker.deadline(), Some(at(32.0)));
