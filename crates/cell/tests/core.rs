@@ -229,7 +229,7 @@ fn fetch(bench: &mut Bench, boxes: usize) -> Result<f64, String> {
     perform(bench, Request::LookAt { target: [0.80, 0.0, 0.70] })?;
     let found = look(bench, 60, |image, camera| {
         let found = segment(image, camera, &table, &[ObjectClass::Box], &[]).unwrap().into_iter();
-        found.map(|b| b.with_calibration(camera, &calibration).standing_on(&on_table)).collect::<Vec<_>>()
+        found.map(|b| b.with_calibration(camera, &calibration).standing_on(&on_table, camera, &calibration)).collect::<Vec<_>>()
     });
     if found.len() != boxes {
         return Err(format!("{} of {boxes} boxes are seen", found.len()));
@@ -246,7 +246,7 @@ fn fetch(bench: &mut Bench, boxes: usize) -> Result<f64, String> {
         let prior = Prior { pose: seen.pose, size: seen.model.size() };
         let located = look(bench, 8, |image, camera| {
             let located = locate(image, camera, &prior, &[ObjectClass::Box], &[]).unwrap();
-            located.map(|b| b.with_calibration(camera, &calibration).standing_on(&on_table))
+            located.map(|b| b.with_calibration(camera, &calibration).standing_on(&on_table, camera, &calibration))
         });
         let b = located.ok_or_else(|| format!("box {i} is not located"))?;
         let size = b.model.size();

@@ -53,7 +53,7 @@ fn look(bench: &mut Bench, (middle, size): ([f64; 3], [f64; 2])) -> Vec<Detectio
     let calibration: Calibration = config.errors.camera_covariance();
     let surface = Surface { height_m: middle[2], sigma_m: 0.001, sigma_rad: 0.002 };
     let found = segment(&image, &camera, &region, &classes, &[]).unwrap().into_iter();
-    found.map(|seen| seen.with_calibration(&camera, &calibration).standing_on(&surface)).collect()
+    found.map(|seen| seen.with_calibration(&camera, &calibration).standing_on(&surface, &camera, &calibration)).collect()
 }
 
 /// What the camera calls the kinds, in the order in which they are set; plates lie already.
@@ -231,7 +231,7 @@ fn a_bowl_is_held_by_its_rim_only_across_its_wall() {
         let bowl = bench.cell.ground_truth()[0].clone();
         let turned = Pose::from_rpy([0.0; 3], 0.0, 0.0, turn);
         let goals = grasp::at_rim(&bowl.pose, bowl.size).into_iter().map(|tool| Goal::Pose(tool.compose(&turned)));
-        bench.go(goals.collect(), 0.0, 0.10);
+        bench.go_regardless_of("bowl_1", goals.collect(), 0.0, 0.10);
         let grasped = bench.perform(Request::Grasp { object: "bowl_1".to_owned(), expected: None });
         assert_eq!(matches!(grasped, Ending::Done(_)), holds, "{grasped:?}");
         assert_eq!(bench.cell.ground_truth()[0].held, holds);
@@ -265,7 +265,7 @@ fn fingers_from_above_slide_off_the_rim_of_a_plate() {
         tool.position[2] += 0.008;
         Goal::Pose(tool)
     });
-    bench.go(goals.collect(), 0.0, 0.10);
+    bench.go_regardless_of(&plate.id, goals.collect(), 0.0, 0.10);
     let grasped = bench.perform(Request::Grasp { object: "plate_1".to_owned(), expected: None });
     assert!(matches!(&grasped, Ending::Aborted(why) if why.contains("the fingers slide off it")), "{grasped:?}");
 }

@@ -11,6 +11,9 @@ use crate::detection::Detection;
 use crate::vector::{cross, sub};
 use ratn_model::pose::Pose;
 
+/// Of a pose: x, y, z in metres, then small turns about these axes in radians.
+type Covariance = [[f64; 6]; 6];
+
 /// The variances of a camera's pose: place along and a small turn about the axes of its optical frame, in metres² and radians².
 pub type Calibration = [f64; 6];
 
@@ -32,43 +35,50 @@ impl Detection {
     /// The same with what the calibration of the camera may be off.
     #[must_use]
     pub fn with_calibration(mut self, camera: &Camera, calibration: &Calibration) -> Detection {
+        let shared = self.by_calibration(camera, calibration);
+        self.covariance = each(|row, column| self.covariance[row][column] + shared[row][column]);
+        self
+    }
+
+    /// The covariance that the calibration alone gives it.
+    fn by_calibration(&self, camera: &Camera, calibration: &Calibration) -> Covariance {
         let from_camera = sub(self.pose.position, camera.pose.position);
+        let mut covariance = [[0.0; 6]; 6];
         for (i, variance) in calibration.iter().enumerate() {
             let axis = camera.pose.rotate(std::array::from_fn(|k| f64::from(u8::from(k == i % 3))));
             // How an error along or about this axis moves and turns what is seen.
             let (moves, turns) = if i < 3 { (axis, [0.0; 3]) } else { (cross(axis, from_camera), axis) };
             let along = |k: usize| if k < 3 { moves[k] } else { turns[k - 3] };
-            for (row, entries) in self.covariance.iter_mut().enumerate() {
-                for (column, entry) in entries.iter_mut().enumerate() {
-                    *entry += variance * along(row) * along(column);
-                }
-            }
+            covariance = each(|row, column| covariance[row][column] + variance * along(row) * along(column));
         }
-        self
+        covariance
     }
 
-    /// The same, known to stand on a surface, unless it is too far above or below it for that.
+    /// The same, whose covariance has the calibration in it, known to stand on a surface, unless it is too far above or below it for that.
+    ///
+    /// What goes with height and slope is corrected by what the calibration says of that, not by the fit's own correlations: where a fit
+    /// leaves a direction open, its covariance says metres, and a tenth of a millimetre of height would move the object by centimetres.
     #[must_use]
-    pub fn standing_on(mut self, surface: &Surface) -> Detection {
+    pub fn standing_on(mut self, surface: &Surface, camera: &Camera, calibration: &Calibration) -> Detection {
         let up = self.pose.rotate([0.0, 0.0, 1.0]);
         let below = self.pose.position[2] - self.model.size()[2] / 2.0;
         let (missing, variance) = (surface.height_m - below, surface.sigma_m.powi(2));
         if missing.powi(2) > GATE.powi(2) * (self.covariance[2][2] + variance) {
             return self;
         }
+        // The gains are those of a detection whose own errors are independent of each other.
+        let shared = self.by_calibration(camera, calibration);
+        let own = |k: usize| self.covariance[k][k] - shared[k][k];
+        let mut gains_of = each(|row, column| shared[row][column] + if row == column { own(row) } else { 0.0 });
         // What is missing after one of them is known depends on that.
         let mut change = [0.0; 6];
         let slope = surface.sigma_rad.powi(2);
         for (of, missing, variance) in [(2, missing, variance), (3, up[1], slope), (4, -up[0], slope)] {
-            let before = self.covariance;
-            let gain: [f64; 6] = std::array::from_fn(|k| before[k][of] / (before[of][of] + variance));
+            let gain: [f64; 6] = std::array::from_fn(|k| gains_of[k][of] / (gains_of[of][of] + variance));
             let innovation = missing - change[of];
-            for (k, row) in self.covariance.iter_mut().enumerate() {
-                change[k] += gain[k] * innovation;
-                for (entry, other) in row.iter_mut().zip(&before[of]) {
-                    *entry -= gain[k] * other;
-                }
-            }
+            (0..6).for_each(|k| change[k] += gain[k] * innovation);
+            gains_of = updated(&gains_of, of, &gain, variance);
+            self.covariance = updated(&self.covariance, of, &gain, variance);
         }
         let [x, y, z, roll, pitch, yaw] = change;
         let Pose { position, .. } = self.pose;
@@ -76,6 +86,18 @@ impl Detection {
         self.pose = Pose { position: [position[0] + x, position[1] + y, position[2] + z], ..turned };
         self
     }
+}
+
+/// The covariance after a measurement of one component with a variance, for any gain (Joseph's form).
+fn updated(before: &Covariance, of: usize, gain: &[f64; 6], variance: f64) -> Covariance {
+    each(|row, column| {
+        before[row][column] - gain[row] * before[of][column] - before[row][of] * gain[column]
+            + gain[row] * (before[of][of] + variance) * gain[column]
+    })
+}
+
+fn each(entry: impl Fn(usize, usize) -> f64) -> Covariance {
+    std::array::from_fn(|row| std::array::from_fn(|column| entry(row, column)))
 }
 
 #[cfg(test)]
@@ -93,13 +115,20 @@ mod tests {
     const SIZE: [f64; 3] = [0.12, 0.07, 0.10];
     const TABLE: Surface = Surface { height_m: 0.7, sigma_m: 0.001, sigma_rad: 0.0005 };
 
+    fn camera() -> Camera {
+        Camera::looking([0.1, 0.0, 1.75], [0.8, 0.0, 0.7], Intrinsics::DEFAULT)
+    }
+
+    fn calibration() -> Calibration {
+        std::array::from_fn(|i| if i < 3 { SIGMA_M } else { SIGMA_RAD }.powi(2))
+    }
+
     /// Boxes on a table as a camera sees them whose calibration is off, and where they are.
     fn seen() -> Vec<(Detection, Pose)> {
+        let (camera, calibration) = (camera(), calibration());
         let mut random = ChaCha8Rng::seed_from_u64(7);
         // The sum of twelve uniforms.
         let mut normal = move |sigma: f64| sigma * ((0..12).map(|_| random.random::<f64>()).sum::<f64>() - 6.0);
-        let camera = Camera::looking([0.1, 0.0, 1.75], [0.8, 0.0, 0.7], Intrinsics::DEFAULT);
-        let calibration: Calibration = std::array::from_fn(|i| if i < 3 { SIGMA_M } else { SIGMA_RAD }.powi(2));
         let once = |i: usize| {
             let on = TABLE.height_m + normal(TABLE.sigma_m);
             let truth = Pose::from_rpy([0.8, 0.02 * (i % 50) as f64 - 0.5, on + SIZE[2] / 2.0], 0.0, 0.0, 0.3);
@@ -147,7 +176,7 @@ mod tests {
     #[test]
     fn a_surface_of_known_height_corrects_height_and_slope_and_what_goes_with_them() {
         let before = seen();
-        let after: Vec<_> = before.iter().map(|(seen, truth)| (seen.standing_on(&TABLE), *truth)).collect();
+        let after: Vec<_> = before.iter().map(|(seen, truth)| (seen.standing_on(&TABLE, &camera(), &calibration()), *truth)).collect();
         assert!((normalised_square(&after) - 1.0).abs() < 0.1, "{}", normalised_square(&after));
         assert!(rms(&after, &[2]) < 0.5 * rms(&before, &[2]), "{} {}", rms(&before, &[2]), rms(&after, &[2]));
         assert!(rms(&after, &[0, 1]) < 0.95 * rms(&before, &[0, 1]));
@@ -159,6 +188,19 @@ mod tests {
     #[test]
     fn what_stands_on_something_else_is_left_where_it_was_seen() {
         let (seen, _) = seen().swap_remove(0);
-        assert_eq!(seen.standing_on(&Surface { height_m: 0.75, ..TABLE }), seen);
+        assert_eq!(seen.standing_on(&Surface { height_m: 0.75, ..TABLE }, &camera(), &calibration()), seen);
+    }
+
+    #[test]
+    fn what_a_fit_leaves_open_is_not_moved_by_a_little_height() {
+        let (mut seen, _) = seen().swap_remove(0);
+        // A box whose ends were not seen: two metres along y, and a little of that goes up.
+        seen.covariance = [[0.0; 6]; 6];
+        (seen.covariance[0][0], seen.covariance[1][1], seen.covariance[2][2]) = (1e-6, 4.0, 1e-6);
+        (seen.covariance[1][2], seen.covariance[2][1]) = (1.9e-3, 1.9e-3);
+        seen.pose = Pose::at(0.8, 0.1, TABLE.height_m + SIZE[2] / 2.0 + 1e-4);
+        let stands = seen.standing_on(&TABLE, &camera(), &[0.0; 6]);
+        assert!((stands.pose.position[1] - 0.1).abs() < 1e-9, "{:?}", stands.pose);
+        assert!((stands.pose.position[2] - seen.pose.position[2]).abs() > 4e-5);
     }
 }

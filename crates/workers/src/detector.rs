@@ -194,7 +194,7 @@ impl Seen {
     /// What was found relative to the camera's pose as given, with what is known of that pose and of the surface.
     fn in_the_world(&self, object: Detection, surface: Option<&Surface>) -> Detection {
         let object = object.with_calibration(&self.camera, &self.calibration);
-        surface.map_or(object, |surface| object.standing_on(surface))
+        surface.map_or(object, |surface| object.standing_on(surface, &self.camera, &self.calibration))
     }
 }
 

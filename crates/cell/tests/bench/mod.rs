@@ -114,6 +114,14 @@ impl Bench {
         self.done(Request::Follow { trajectory });
     }
 
+    /// The same, as if an object were not there: nothing that the fingers meet of it is looked at.
+    pub(crate) fn go_regardless_of(&mut self, object: &str, goals: Vec<Goal>, depart_m: f64, approach_m: f64) {
+        let mut scene = self.cell.scene();
+        scene.objects.retain(|there| there.name != object);
+        let trajectory = self.plan(&scene, goals, depart_m, approach_m);
+        self.done(Request::Follow { trajectory });
+    }
+
     /// Moves the arm by a plan in what is believed to stand there.
     pub(crate) fn go_believing(&mut self, scene: &Scene, goal: Goal) {
         let trajectory = self.plan(scene, vec![goal], 0.0, 0.0);
