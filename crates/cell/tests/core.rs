@@ -229,7 +229,9 @@ fn fetch(bench: &mut Bench, boxes: usize) -> Result<f64, String> {
     perform(bench, Request::LookAt { target: [0.80, 0.0, 0.70] })?;
     let found = look(bench, 60, |image, camera| {
         let found = segment(image, camera, &table, &[ObjectClass::Box], &[]).unwrap().into_iter();
-        found.map(|b| b.with_calibration(camera, &calibration).standing_on(&on_table, camera, &calibration)).collect::<Vec<_>>()
+        found
+            .map(|b| b.with_calibration(camera, &calibration).standing_on(&on_table, camera, &calibration))
+            .collect::<Vec<_>>()
     });
     if found.len() != boxes {
         return Err(format!("{} of {boxes} boxes are seen", found.len()));

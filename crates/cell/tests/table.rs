@@ -53,7 +53,9 @@ fn look(bench: &mut Bench, (middle, size): ([f64; 3], [f64; 2])) -> Vec<Detectio
     let calibration: Calibration = config.errors.camera_covariance();
     let surface = Surface { height_m: middle[2], sigma_m: 0.001, sigma_rad: 0.002 };
     let found = segment(&image, &camera, &region, &classes, &[]).unwrap().into_iter();
-    found.map(|seen| seen.with_calibration(&camera, &calibration).standing_on(&surface, &camera, &calibration)).collect()
+    found
+        .map(|seen| seen.with_calibration(&camera, &calibration).standing_on(&surface, &camera, &calibration))
+        .collect()
 }
 
 /// What the camera calls the kinds, in the order in which they are set; plates lie already.

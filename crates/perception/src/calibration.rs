@@ -176,7 +176,8 @@ mod tests {
     #[test]
     fn a_surface_of_known_height_corrects_height_and_slope_and_what_goes_with_them() {
         let before = seen();
-        let after: Vec<_> = before.iter().map(|(seen, truth)| (seen.standing_on(&TABLE, &camera(), &calibration()), *truth)).collect();
+        let after: Vec<_> =
+            before.iter().map(|(seen, truth)| (seen.standing_on(&TABLE, &camera(), &calibration()), *truth)).collect();
         assert!((normalised_square(&after) - 1.0).abs() < 0.1, "{}", normalised_square(&after));
         assert!(rms(&after, &[2]) < 0.5 * rms(&before, &[2]), "{} {}", rms(&before, &[2]), rms(&after, &[2]));
         assert!(rms(&after, &[0, 1]) < 0.95 * rms(&before, &[0, 1]));
