@@ -2,7 +2,7 @@
 //! of links that its SRDF excepts from checks.
 //!
 //! A joint that mimics another, also through further mimics, has no position of its own: its link is driven by the joint at the end of the
-//! chain, by a factor; the offset is part of where the link is mounted. A [`RobotState`](crate::robot_state::RobotState) has a
+//! chain, by a factor; the offset is part of where the link is mounted. A [`RobotState`] has a
 //! position for each joint of the model. What is planned for is a [`Mechanism`]: the same links, moved by some of the joints, with the
 //! others held where a state has them.
 
