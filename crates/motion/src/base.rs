@@ -11,7 +11,7 @@ use crate::drive::{Vehicle, drive_in, state, wrapped};
 use crate::exact::{Exact, Touch};
 use crate::geometry::Geometry;
 use crate::pace::Control;
-use crate::request::MIN_SPEED;
+use crate::request::{MIN_SPEED, Outside, outside_of_limits};
 use crate::robot::{Configuration, Joint, Robot, to_f32};
 use crate::space::{Obstacle, Space};
 use crate::timing::{Section, timed};
@@ -84,7 +84,7 @@ pub enum DriveError {
     #[error("{what} is {value}: expected {expected}")]
     Malformed {
         /// Which part of it.
-        what: &'static str,
+        what: String,
         /// What it is.
         value: String,
         /// What it should be.
@@ -173,7 +173,7 @@ pub fn plan_drive(
     request: &DriveRequest,
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<DrivePlan, DriveError> {
-    request.check()?;
+    request.check(robot)?;
     let here = request.start.with_base(&scene.base);
     let riding = riding(robot, scene);
     let (vehicle, obstacles) = Vehicle::of(robot, scene, &here, &riding, aimm::DRIVE_AREA, PADDING_M);
@@ -285,8 +285,13 @@ fn limits(robot: &Robot) -> Vec<Joint> {
 }
 
 impl DriveRequest {
-    fn check(&self) -> Result<(), DriveError> {
-        let malformed = |what, value: String, expected: String| Err(DriveError::Malformed { what, value, expected });
+    fn check(&self, robot: &Robot) -> Result<(), DriveError> {
+        let malformed = |what: &str, value: String, expected: String| {
+            Err(DriveError::Malformed { what: what.to_owned(), value, expected })
+        };
+        if let Some(Outside { joint, position, range }) = outside_of_limits(robot, &self.start) {
+            return malformed(&format!("the start's {joint}"), position.to_string(), range);
+        }
         if !(MIN_SPEED..=1.0).contains(&self.speed) {
             return malformed("speed", self.speed.to_string(), format!("a fraction from {MIN_SPEED} to 1"));
         }

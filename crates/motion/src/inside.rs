@@ -1,5 +1,6 @@
 //! What is inside a mesh: where its closed parts (`closed_parts.rs`) are solid. Which way the triangles of a file are turned
-//! makes no difference to a part that stands for itself, nor where parts overlap.
+//! makes no difference to a part that stands for itself, nor where such parts overlap. Bodies that share an edge are one part: docs/robustness.md
+//! says what becomes of them.
 //!
 //! A part holds a point if a straight line upwards from there leaves it more often than it enters it (or the other way round). It is solid by
 //! itself, and so is a part wholly inside another that is turned as the outermost part around it; one that is turned the other way is a

@@ -86,6 +86,9 @@ pub enum ProblemError {
     /// No problem at all.
     #[error("it holds no problems: `problems` is a list of problems for each class")]
     None,
+    /// Nothing is planned for.
+    #[error("`joints` is empty: name the joints that are planned for, in the order of the postures' positions")]
+    NoJoints,
     /// A joint that is named twice.
     #[error("the joint `{joint}` is named twice in `joints`")]
     Twice {
@@ -124,6 +127,9 @@ impl Problems {
     ) -> Result<Problems, ProblemError> {
         let mut files = Files { load, loaded: BTreeMap::new(), meshes: BTreeMap::new(), points: 0, triangles: 0 };
         let file: File = serde_json::from_str(text)?;
+        if file.joints.is_empty() {
+            return Err(ProblemError::NoJoints);
+        }
         let twice = file.joints.iter().enumerate().find(|(i, name)| file.joints[..*i].contains(name));
         if let Some((_, joint)) = twice {
             return Err(ProblemError::Twice { joint: joint.clone() });

@@ -75,19 +75,16 @@ impl Request {
             Goal::Joints(joints) => Some(("the goal's", joints)),
             Goal::Pose(_) => None,
         });
-        let beyond = |whose: &str, positions: &[f64], joints: &[Joint], unit| match outside(positions, joints) {
+        let within = |whose: &str, outside: Option<Outside>| match outside {
             None => Ok(()),
-            Some((q, joint)) => {
-                let range = format!("{:.3} to {:.3} {unit}", joint.lower, joint.upper);
-                malformed(&format!("{whose} {}", joint.name), q.to_string(), &range)
+            Some(Outside { joint, position, range }) => {
+                malformed(&format!("{whose} {joint}"), position.to_string(), &range)
             }
         };
-        let Configuration { arm, pan, tilt, finger, .. } = &self.start;
-        for (whose, posture) in std::iter::once(("the start's", arm)).chain(goals) {
-            beyond(whose, posture, robot.arm_joints(), "rad")?;
+        within("the start's", outside_of_limits(robot, &self.start))?;
+        for (whose, posture) in goals {
+            within(whose, outside(posture, robot.arm_joints(), "rad"))?;
         }
-        beyond("the start's", &[*pan, *tilt], robot.head_joints(), "rad")?;
-        beyond("the start's", &[*finger], std::slice::from_ref(robot.finger()), "m")?;
         let finite = |pose: &Pose| pose.position.iter().chain(&pose.quaternion_xyzw).all(|c| c.is_finite());
         if let Some(Goal::Pose(pose)) = self.goals.iter().find(|g| matches!(g, Goal::Pose(p) if !finite(p))) {
             return malformed("a goal pose", format!("{pose:?}"), "finite numbers");
@@ -96,8 +93,24 @@ impl Request {
     }
 }
 
-/// The first position that is beyond the limits of its joint.
-fn outside<'j>(positions: &[f64], joints: &'j [Joint]) -> Option<(f64, &'j Joint)> {
-    let mut all = positions.iter().copied().zip(joints);
-    all.find(|(q, joint)| !(joint.lower - 1e-6..=joint.upper + 1e-6).contains(q))
+/// A position that is beyond the limits of its joint.
+pub(crate) struct Outside {
+    pub(crate) joint: String,
+    pub(crate) position: f64,
+    /// The limits, with their unit.
+    pub(crate) range: String,
+}
+
+/// The first joint of arm, head and fingers that is beyond its limits.
+pub(crate) fn outside_of_limits(robot: &Robot, at: &Configuration) -> Option<Outside> {
+    let head = || outside(&[at.pan, at.tilt], robot.head_joints(), "rad");
+    let fingers = || outside(&[at.finger], std::slice::from_ref(robot.finger()), "m");
+    outside(&at.arm, robot.arm_joints(), "rad").or_else(head).or_else(fingers)
+}
+
+fn outside(positions: &[f64], joints: &[Joint], unit: &str) -> Option<Outside> {
+    let mut all = positions.iter().zip(joints);
+    let (position, joint) = all.find(|(q, joint)| !(joint.lower - 1e-6..=joint.upper + 1e-6).contains(*q))?;
+    let range = format!("{:.3} to {:.3} {unit}", joint.lower, joint.upper);
+    Some(Outside { joint: joint.name.clone(), position: *position, range })
 }

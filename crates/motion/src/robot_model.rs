@@ -227,7 +227,12 @@ impl RobotModel {
             return Err(MechanismError::Twice { joint: joint.clone() });
         }
         let planned = names.iter().map(|name| self.plannable(name)).collect::<Result<Vec<_>, _>>()?;
-        Ok(self.restricted(&planned, state.positions()))
+        let mut mechanism = self.restricted(&planned, state.positions());
+        if self.excepted.is_none() {
+            // A state that puts a link in the way must not except it.
+            mechanism.disabled = self.restricted(&planned, RobotState::neutral(self).positions()).disabled;
+        }
+        Ok(mechanism)
     }
 
     /// As [`RobotModel::planned`], of joints that can be, by their indices.

@@ -477,14 +477,14 @@ fn pairs(mechanism: &Mechanism, compiled: &Compiled, links: &[usize]) -> Vec<Sel
     sorted.collect()
 }
 
-/// The joint next towards the root, for each joint.
+/// The joint next towards the root, for each joint, by the first link that it moves. Links that follow it farther out do not count, so no
+/// joint is towards the root of itself.
 fn parents(compiled: &Compiled) -> Vec<Option<usize>> {
-    let mut parents = vec![None; compiled.joints];
-    for frame in &compiled.frames {
-        let parent = frame.parent.checked_sub(1).map(|p| compiled.frames[p].joint);
-        parents[frame.joint] = parents[frame.joint].or(parent.filter(|p| *p != frame.joint));
-    }
-    parents
+    let parent = |joint: usize| {
+        let first = compiled.frames.iter().find(|frame| frame.joint == joint)?;
+        Some(compiled.frames[first.parent.checked_sub(1)?].joint)
+    };
+    (0..compiled.joints).map(parent).collect()
 }
 
 fn arm(compiled: &Compiled, mut frame: usize, coarse: &[f32; 4]) -> Arm {

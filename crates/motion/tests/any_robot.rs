@@ -552,6 +552,8 @@ fn a_file_of_problems_is_read_and_a_wrong_one_says_where() {
     assert_eq!(error, "problem 3 of class `shelf`: object `can` has no proper size, place or rotation");
     let error = Problems::parse(&file("[1, 2]", object).replace(r#""b"]"#, r#""a"]"#)).unwrap_err().to_string();
     assert_eq!(error, "the joint `a` is named twice in `joints`");
+    let error = Problems::parse(r#"{"joints": [], "problems": {"shelf": []}}"#).unwrap_err().to_string();
+    assert!(error.contains("`joints` is empty"), "{error}");
     let error = Problems::parse(r#"{"joints": ["a"], "problems": {"shelf": []}}"#).unwrap_err().to_string();
     assert!(error.starts_with("it holds no problems"), "{error}");
     assert!(Problems::parse("{").is_err());

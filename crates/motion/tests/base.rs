@@ -99,6 +99,16 @@ fn a_goal_that_is_not_free_is_missed_within_the_tolerance_and_no_further() {
 }
 
 #[test]
+fn a_head_or_an_arm_beyond_its_limits_is_refused() {
+    let scene = cell(Pose::IDENTITY, &[]);
+    let starts = [Configuration { pan: 90.0, ..STANDING }, Configuration { finger: -5.0, ..STANDING }];
+    for (start, joint) in starts.into_iter().zip(["pan", "finger"]) {
+        let error = planned(&scene, &DriveRequest { start, ..to([-1.0, 0.5, 0.3]) }).unwrap_err().to_string();
+        assert!(error.starts_with(&format!("the start's {joint} is")), "{error}");
+    }
+}
+
+#[test]
 fn what_stands_on_the_deck_rides_along_wherever_the_base_stands() {
     let robot = Robot::aimm();
     let base = Pose::from_rpy([1.0, -2.0, 0.0], 0.0, 0.0, FRAC_PI_2);

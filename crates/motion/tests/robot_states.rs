@@ -143,6 +143,41 @@ fn a_joint_that_is_not_planned_for_counts_where_it_is() {
     assert!(matches!(refused("b", f64::NAN), StateError::Beyond { .. }));
 }
 
+#[test]
+fn a_wrist_that_is_kept_level_by_the_shoulder_is_one_branch_of_joints() {
+    let urdf = chain(&[("a", ""), ("b", ""), ("c", "<mimic joint='a' multiplier='-1'/>")]);
+    let mechanism = Mechanism::read(&urdf, None, &["a".to_owned(), "b".to_owned()]).unwrap();
+    let mut state = [0.0; 16];
+    state[..2].copy_from_slice(&[0.4, 0.3]);
+    assert!(Space::new(&mechanism, &[]).is_free(&state));
+    assert!(is_close(ball(&mechanism, &[0.4, 0.3]), tip(&[0.4, 0.3, -0.4])));
+}
+
+#[test]
+fn a_state_that_puts_a_link_in_the_way_does_not_except_it_from_the_checks() {
+    let ball = |name: &str, parent: &str, at: &str| {
+        format!(
+            "<link name='{name}_link'><collision><origin xyz='0.3 0 0'/><geometry><sphere radius='0.05'/></geometry>\
+             </collision></link><joint name='{name}' type='revolute'><parent link='{parent}'/><child \
+             link='{name}_link'/><origin xyz='{at}'/><axis xyz='0 0 1'/><limit lower='-3.2' upper='3.2' \
+             velocity='1' effort='1'/></joint>"
+        )
+    };
+    let (near, far) = (ball("a", "base", "0 0 0"), ball("b", "base", "0.6 0 0"));
+    let model = RobotModel::read(&format!("<robot name='two'><link name='base'/>{near}{far}</robot>"), None).unwrap();
+    for b in [3.1, 2.7] {
+        let state = RobotState::neutral(&model).with(&model, &named(&[("b", b)])).unwrap();
+        let mechanism = model.planned(&["a".to_owned()], &state).unwrap();
+        // Where it meets the other one.
+        let mut at = [0.0; 16];
+        at[0] = (0.3 * f64::sin(b)).atan2(0.6 + 0.3 * f64::cos(b)) as f32;
+        let touches = (0.3 * f64::sin(b)).hypot(0.6 + 0.3 * f64::cos(b)) < 0.4;
+        assert!(touches, "the test's own");
+        assert!(!Space::new(&mechanism, &[]).is_free(&at), "{b}");
+        assert!(Exact::new(&mechanism, &[]).touch(&[f64::from(at[0])]).is_some(), "{b}");
+    }
+}
+
 /// Our robot with a long lamp beside its camera: with the head straight ahead it is far from the arm, turned to the left it reaches in front
 /// of the mast, above the arm.
 fn with_a_lamp() -> Robot {

@@ -21,6 +21,7 @@ pub mod shapes;
 pub mod trial;
 
 mod cluster;
+mod edge;
 mod fit;
 mod level;
 mod normal;

@@ -5,6 +5,7 @@
 //! Every sample is a hash of (seed, frame, pixel), so an image does not depend on the order in which it is made.
 
 use crate::camera::{DepthImage, Intrinsics};
+use crate::edge;
 use serde::{Deserialize, Serialize};
 
 /// How noisy a camera is.
@@ -21,8 +22,6 @@ pub struct Noise {
     pub projector_m: f64,
 }
 
-/// A step of the depth between neighbours that makes an edge, or casts a shadow, in metres.
-const EDGE: f32 = 0.02;
 /// No image is averaged over more frames.
 pub const MAX_FRAMES: u32 = 1000;
 
@@ -48,7 +47,7 @@ pub fn observe(
     first_frame: u64,
     frames: u32,
 ) -> DepthImage {
-    let (edges, shadows) = (edges(clean), shadows(clean, optics, noise.projector_m));
+    let (edges, shadows) = (edge::edges(clean), edge::shadows(clean, optics, noise.projector_m));
     let frames = f64::from(frames.clamp(1, MAX_FRAMES));
     let mut depth = vec![0.0; clean.depth.len()];
     for (pixel, (out, truth)) in depth.iter_mut().zip(&clean.depth).enumerate() {
@@ -86,49 +85,6 @@ pub fn average(width: usize, height: usize, pictures: impl Iterator<Item = (Dept
     }
     let depth = sums.into_iter().map(|(sum, n)| if n > 0.0 { (sum / n) as f32 } else { 0.0 }).collect();
     DepthImage { width, height, depth }
-}
-
-fn edges(image: &DepthImage) -> Vec<bool> {
-    let (width, height) = (image.width, image.height);
-    let mut edges = vec![false; image.depth.len()];
-    for row in 0..height {
-        for column in 0..width {
-            let here = row * width + column;
-            let right = (column + 1 < width).then_some(here + 1);
-            let below = (row + 1 < height).then_some(here + width);
-            for next in [right, below].into_iter().flatten() {
-                if (image.depth[here] - image.depth[next]).abs() > EDGE {
-                    edges[here] = true;
-                    edges[next] = true;
-                }
-            }
-        }
-    }
-    edges
-}
-
-/// The pixels that the projector does not light: along a row of it, which is a row of the image, something nearer is in the way.
-fn shadows(image: &DepthImage, optics: &Intrinsics, projector_m: f64) -> Vec<bool> {
-    let mut shadows = vec![false; image.depth.len()];
-    if projector_m <= 0.0 {
-        return shadows;
-    }
-    // The projector's column of a pixel is to the left of the camera's by the disparity.
-    let column = |here: usize, depth: f32| here as f64 - optics.fx * projector_m / f64::from(depth);
-    let bins = 2 * image.width;
-    let bin = |column: f64| (column + image.width as f64).round().clamp(0.0, bins as f64 - 1.0) as usize;
-    let mut nearest = vec![f32::INFINITY; bins];
-    for (row, shadowed) in image.depth.chunks(image.width).zip(shadows.chunks_mut(image.width)) {
-        nearest.fill(f32::INFINITY);
-        for (here, depth) in row.iter().enumerate().filter(|(_, depth)| **depth > 0.0) {
-            let slot = &mut nearest[bin(column(here, *depth))];
-            *slot = slot.min(*depth);
-        }
-        for (here, depth) in row.iter().enumerate().filter(|(_, depth)| **depth > 0.0) {
-            shadowed[here] = nearest[bin(column(here, *depth))] < depth - EDGE;
-        }
-    }
-    shadows
 }
 
 /// Close to a standard normal: three uniforms have variance 1/4, so twice their centred sum has 1.

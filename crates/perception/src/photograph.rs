@@ -2,9 +2,8 @@
 
 use crate::camera::Camera;
 use crate::picture::Picture;
-use crate::render::{Body, FAR, parry_pose, window};
+use crate::render::{Body, FAR, parry_pose, rays_at};
 use parry3d::math::Vector;
-use parry3d::query::Ray;
 
 /// Where nothing is.
 const SKY: [u8; 3] = [222, 230, 238];
@@ -22,23 +21,15 @@ pub fn photograph(camera: &Camera, scene: &[(Body, [u8; 3])]) -> Picture {
     let eye = parry_pose(&camera.pose);
     let up = eye.rotation.inverse() * Vector::new(0.0, 0.0, 1.0);
     for (body, colour) in scene {
-        let seen = eye.inverse() * body.pose;
-        let Some(window) = window(&camera.intrinsics, body, &seen) else { continue };
-        for row in window.rows.clone() {
-            for column in window.columns.clone() {
-                let [x, y, _] = camera.intrinsics.ray(column, row);
-                let way = Vector::new(x as f32, y as f32, 1.0);
-                let pixel = row * width + column;
-                let ray = Ray::new(Vector::ZERO, way);
-                let Some(hit) = body.shape.cast_ray_and_get_normal(&seen, &ray, nearest[pixel], true) else { continue };
-                if hit.time_of_impact < nearest[pixel] {
-                    nearest[pixel] = hit.time_of_impact;
-                    let facing = (hit.normal.dot(way) / way.length()).abs();
-                    let light = AMBIENT + HEADLIGHT * facing + LAMP * hit.normal.dot(up).max(0.0);
-                    rgb[3 * pixel..3 * pixel + 3].copy_from_slice(&colour.map(|c| (f32::from(c) * light) as u8));
-                }
+        rays_at(camera, body, |pixel, seen, ray| {
+            let Some(hit) = body.shape.cast_ray_and_get_normal(seen, &ray, nearest[pixel], true) else { return };
+            if hit.time_of_impact < nearest[pixel] {
+                nearest[pixel] = hit.time_of_impact;
+                let facing = (hit.normal.dot(ray.dir) / ray.dir.length()).abs();
+                let light = AMBIENT + HEADLIGHT * facing + LAMP * hit.normal.dot(up).max(0.0);
+                rgb[3 * pixel..3 * pixel + 3].copy_from_slice(&colour.map(|c| (f32::from(c) * light) as u8));
             }
-        }
+        });
     }
     Picture { width, height, rgb }
 }

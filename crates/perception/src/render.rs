@@ -85,24 +85,16 @@ pub fn parry_pose(pose: &ratn_model::pose::Pose) -> Pose {
 /// The depth image of the bodies, without noise.
 pub fn render(camera: &Camera, bodies: &[Body]) -> DepthImage {
     let Intrinsics { width, height, .. } = camera.intrinsics;
-    let eye = parry_pose(&camera.pose);
     let mut depth = vec![FAR; width * height];
     for body in bodies {
-        let seen = eye.inverse() * body.pose;
-        let Some(window) = window(&camera.intrinsics, body, &seen) else { continue };
-        for row in window.rows.clone() {
-            for column in window.columns.clone() {
-                let [x, y, _] = camera.intrinsics.ray(column, row);
-                // The direction has z = 1, so the time of impact is the depth.
-                let ray = Ray::new(Vector::ZERO, Vector::new(x as f32, y as f32, 1.0));
-                let nearest = &mut depth[row * width + column];
-                if let Some(hit) = body.shape.cast_ray(&seen, &ray, *nearest, true)
-                    && hit < *nearest
-                {
-                    *nearest = hit;
-                }
+        rays_at(camera, body, |pixel, seen, ray| {
+            let nearest = &mut depth[pixel];
+            if let Some(hit) = body.shape.cast_ray(seen, &ray, *nearest, true)
+                && hit < *nearest
+            {
+                *nearest = hit;
             }
-        }
+        });
     }
     for d in &mut depth {
         if *d >= FAR {
@@ -115,33 +107,23 @@ pub fn render(camera: &Camera, bodies: &[Body]) -> DepthImage {
 /// What the camera can see of bodies with their surfaces, without noise.
 pub fn scan(camera: &Camera, bodies: &[(Body, Surface)]) -> Rendering {
     let Intrinsics { width, height, .. } = camera.intrinsics;
-    let eye = parry_pose(&camera.pose);
     let mut depth = vec![FAR; width * height];
     let (mut facing, mut lost) = (vec![0.0; width * height], vec![0.0; width * height]);
     for (body, surface) in bodies {
-        let seen = eye.inverse() * body.pose;
-        let Some(window) = window(&camera.intrinsics, body, &seen) else { continue };
-        for row in window.rows.clone() {
-            for column in window.columns.clone() {
-                let [x, y, _] = camera.intrinsics.ray(column, row);
-                // The direction has z = 1, so the time of impact is the depth.
-                let way = Vector::new(x as f32, y as f32, 1.0);
-                let pixel = row * width + column;
-                let ray = Ray::new(Vector::ZERO, way);
-                let Some(hit) = body.shape.cast_ray_and_get_normal(&seen, &ray, depth[pixel], true) else { continue };
-                if hit.time_of_impact >= depth[pixel] {
-                    continue;
-                }
-                let at = seen.inverse_transform_point(way * hit.time_of_impact);
-                let local = [at.x, at.y, at.z].map(f64::from);
-                let straight = (hit.normal.dot(way) / way.length()).abs();
-                depth[pixel] = hit.time_of_impact + grain::relief(surface, local) as f32;
-                facing[pixel] = straight;
-                let mirrored = if straight > MIRRORED { surface.gloss } else { 0.0 };
-                let swallowed = if grain::is_dark(surface, local) { SWALLOWED } else { 0.0 };
-                lost[pixel] = mirrored.max(swallowed) as f32;
+        rays_at(camera, body, |pixel, seen, ray| {
+            let Some(hit) = body.shape.cast_ray_and_get_normal(seen, &ray, depth[pixel], true) else { return };
+            if hit.time_of_impact >= depth[pixel] {
+                return;
             }
-        }
+            let at = seen.inverse_transform_point(ray.dir * hit.time_of_impact);
+            let local = [at.x, at.y, at.z].map(f64::from);
+            let straight = (hit.normal.dot(ray.dir) / ray.dir.length()).abs();
+            depth[pixel] = hit.time_of_impact + grain::relief(surface, local) as f32;
+            facing[pixel] = straight;
+            let mirrored = if straight > MIRRORED { surface.gloss } else { 0.0 };
+            let swallowed = if grain::is_dark(surface, local) { SWALLOWED } else { 0.0 };
+            lost[pixel] = mirrored.max(swallowed) as f32;
+        });
     }
     for d in &mut depth {
         if *d >= FAR {
@@ -151,13 +133,27 @@ pub fn scan(camera: &Camera, bodies: &[(Body, Surface)]) -> Rendering {
     Rendering { depth: DepthImage { width, height, depth }, facing, lost }
 }
 
-pub(crate) struct Window {
-    pub(crate) columns: std::ops::Range<usize>,
-    pub(crate) rows: std::ops::Range<usize>,
+/// Shows every pixel that a body may cover, with the body's pose and the pixel's ray in the camera's frame. The ray's direction has
+/// z = 1, so a time of impact is a depth.
+pub(crate) fn rays_at(camera: &Camera, body: &Body, mut show: impl FnMut(usize, &Pose, Ray)) {
+    let seen = parry_pose(&camera.pose).inverse() * body.pose;
+    let Some(Window { columns, rows }) = window(&camera.intrinsics, body, &seen) else { return };
+    for row in rows {
+        for column in columns.clone() {
+            let [x, y, _] = camera.intrinsics.ray(column, row);
+            let ray = Ray::new(Vector::ZERO, Vector::new(x as f32, y as f32, 1.0));
+            show(row * camera.intrinsics.width + column, &seen, ray);
+        }
+    }
+}
+
+struct Window {
+    columns: std::ops::Range<usize>,
+    rows: std::ops::Range<usize>,
 }
 
 /// The pixels that a body can cover: all of them when it reaches behind the camera.
-pub(crate) fn window(camera: &Intrinsics, body: &Body, seen: &Pose) -> Option<Window> {
+fn window(camera: &Intrinsics, body: &Body, seen: &Pose) -> Option<Window> {
     let bounds = body.shape.compute_local_aabb();
     let corners = (0..8).map(|corner: u32| {
         let pick = |bit: u32, low: f32, high: f32| if corner & bit == 0 { low } else { high };

@@ -12,10 +12,10 @@
 //!
 //! Every sample is a hash of (seed, frame, pixel), so an image does not depend on the order in which it is made.
 
-mod edge;
 pub(crate) mod field;
 
 use crate::camera::{DepthImage, Intrinsics};
+use crate::edge;
 use crate::noise::MAX_FRAMES;
 use crate::render::Rendering;
 use field::{along_row, hash, normal, uniform};

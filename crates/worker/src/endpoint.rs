@@ -6,7 +6,9 @@ use crate::tls::ClientTls;
 use crate::tls::connect::Connector;
 use crate::trace::Traced;
 use serde::{Deserialize, Serialize};
+use std::error::Error;
 use std::fmt;
+use std::io;
 use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
@@ -69,6 +71,15 @@ pub struct ConnectError {
     /// Why.
     #[source]
     pub source: tonic::transport::Error,
+}
+
+impl ConnectError {
+    /// Nobody listens there: the server has ended.
+    pub fn nobody_listens(&self) -> bool {
+        let absent = [io::ErrorKind::ConnectionRefused, io::ErrorKind::NotFound];
+        let causes = std::iter::successors(self.source.source(), |cause: &&(dyn Error + 'static)| (*cause).source());
+        causes.filter_map(|cause| cause.downcast_ref::<io::Error>()).any(|error| absent.contains(&error.kind()))
+    }
 }
 
 impl Endpoint {

@@ -331,7 +331,7 @@ impl Shared {
                 Ok(false) => self.missing.notify_one(),
                 Ok(true) if entry.resource.is_some() => entry.confirmed = true,
                 // The manager may have had it, and have leased it.
-                Err(_) if entry.resource.is_some() => {}
+                Err(_) if entry.resource.is_some() => self.missing.notify_one(),
                 Ok(true) | Err(_) => drop(desired.states.remove(&id)),
             }
             concluded.push((id, done));

@@ -112,7 +112,7 @@ impl System {
         config: Option<SystemConfig>,
         tls: &ClientTls,
     ) -> anyhow::Result<Option<System>> {
-        let Some(endpoints) = running(directory, tls).await else { return Ok(None) };
+        let Some(endpoints) = running(directory, tls).await? else { return Ok(None) };
         let config = match config {
             Some(config) => config,
             None => SystemConfig::read(&directory.join(CONFIG_FILE)).with_context(|| {
@@ -182,12 +182,23 @@ fn forget_state(directory: &RuntimeDirectory, role: &str) -> anyhow::Result<()> 
 }
 
 /// Where the system that runs in `directory` is reached, if one does. The files of a system that was killed do not count.
-pub(crate) async fn running(directory: &Path, tls: &ClientTls) -> Option<Endpoints> {
-    let directory = RuntimeDirectory::at(directory);
-    let (resource_manager, world_pool) = (directory.find(ROLES[0]).ok()?, directory.find(ROLES[1]).ok()?);
-    endpoint::connect(&resource_manager, tls).await.ok()?;
-    endpoint::connect(&world_pool, tls).await.ok()?;
-    Some(Endpoints { resource_manager, world_pool })
+///
+/// # Errors
+/// Somebody listens where a system did, and cannot be spoken to: it may run, under a certificate that is not trusted here.
+pub(crate) async fn running(directory: &Path, tls: &ClientTls) -> anyhow::Result<Option<Endpoints>> {
+    let files = RuntimeDirectory::at(directory);
+    let (Ok(resource_manager), Ok(world_pool)) = (files.find(ROLES[0]), files.find(ROLES[1])) else { return Ok(None) };
+    for endpoint in [&resource_manager, &world_pool] {
+        match endpoint::connect(endpoint, tls).await {
+            Ok(_) => {}
+            Err(error) if error.nobody_listens() => return Ok(None),
+            Err(error) => {
+                let place = directory.display();
+                return Err(error).with_context(|| format!("whether a system runs in {place} cannot be told"));
+            }
+        }
+    }
+    Ok(Some(Endpoints { resource_manager, world_pool }))
 }
 
 /// Waits until every role is there and every resource that the config promises.
@@ -231,4 +242,30 @@ pub(crate) fn public_directory(given: Option<&Path>) -> PathBuf {
 /// A path that the environment says.
 pub(crate) fn variable(name: &str) -> Option<PathBuf> {
     std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use ratn_worker::endpoint::Endpoint;
+
+    #[tokio::test]
+    async fn a_system_that_is_not_trusted_here_may_run_and_one_where_nobody_listens_does_not() {
+        let directory = tempfile::tempdir().unwrap();
+        let files = RuntimeDirectory::create(directory.path()).unwrap();
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let publish = |scheme: &str| {
+            let endpoint: Endpoint = format!("{scheme}://127.0.0.1:{port}").parse().unwrap();
+            ROLES.iter().map(|role| files.publish(role, &endpoint).unwrap()).collect::<Vec<_>>()
+        };
+        let tls = ClientTls::none();
+        let with_tls = publish("https");
+        let error = running(directory.path(), &tls).await.err().unwrap();
+        assert!(format!("{error:#}").contains("RATN_TLS_CA"), "{error:#}");
+        drop((with_tls, listener));
+        let _without = publish("http");
+        assert!(running(directory.path(), &tls).await.unwrap().is_none());
+    }
 }

@@ -263,6 +263,22 @@ async fn what_the_manager_had_and_refuses_is_offered_again_when_it_does_not_any_
 }
 
 #[tokio::test]
+async fn an_update_that_is_refused_is_asked_for_again_when_it_is_not_refused_any_more() {
+    let (_directory, endpoint) = place();
+    let manager = Manager::new();
+    let _serving = manager.serve(&endpoint).await;
+    let channels = channels();
+    let session = Session::open(&channels, &endpoint, "pools", LONG);
+    let provider = Provider::start(&channels, &endpoint, &session).unwrap();
+    session.alive(LONG).await.unwrap();
+    assert!(provider.offer(arm()).await.unwrap());
+    manager.pool.lock().unwrap().forbids = true;
+    assert!(provider.offer(arm().with_attribute("level", Value::Float(0.5))).await.is_err());
+    manager.pool.lock().unwrap().forbids = false;
+    manager.until(|pool| pool.resources["arm@sim"].attributes.contains_key("level")).await;
+}
+
+#[tokio::test]
 async fn a_bound_for_standstill_stays_where_the_resource_is_withdrawn_and_wanted_again() {
     let (_directory, endpoint) = place();
     let manager = Manager::new();

@@ -6,7 +6,7 @@ use crate::camera::{DepthImage, Intrinsics};
 const STEP: f32 = 0.02;
 
 /// Of each pixel whether a neighbour is nearer or farther by a step.
-pub(super) fn edges(image: &DepthImage) -> Vec<bool> {
+pub(crate) fn edges(image: &DepthImage) -> Vec<bool> {
     let (width, height) = (image.width, image.height);
     let mut edges = vec![false; image.depth.len()];
     for row in 0..height {
@@ -26,7 +26,7 @@ pub(super) fn edges(image: &DepthImage) -> Vec<bool> {
 }
 
 /// The nearest and the farthest depth of a pixel and those around it; what is empty does not count. `None` where all is.
-pub(super) fn around(image: &DepthImage, pixel: usize) -> Option<[f32; 2]> {
+pub(crate) fn around(image: &DepthImage, pixel: usize) -> Option<[f32; 2]> {
     let (column, row) = (pixel % image.width, pixel / image.width);
     let mut bounds = None;
     for row in row.saturating_sub(1)..(row + 2).min(image.height) {
@@ -42,7 +42,7 @@ pub(super) fn around(image: &DepthImage, pixel: usize) -> Option<[f32; 2]> {
 }
 
 /// The pixels that the projector does not light: along a row of it, which is a row of the image, something nearer is in the way.
-pub(super) fn shadows(image: &DepthImage, optics: &Intrinsics, projector_m: f64) -> Vec<bool> {
+pub(crate) fn shadows(image: &DepthImage, optics: &Intrinsics, projector_m: f64) -> Vec<bool> {
     let mut shadows = vec![false; image.depth.len()];
     if projector_m <= 0.0 {
         return shadows;
