@@ -30,7 +30,8 @@ mod yaml;
 
 pub(crate) use fields::Places;
 pub use library::Files;
-pub(crate) use names::{distance, suggestion};
+pub(crate) use names::distance;
+pub use names::suggestion;
 pub use yaml::MAX_SOURCE;
 
 use crate::catalogue::Catalogue;

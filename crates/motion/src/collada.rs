@@ -6,9 +6,10 @@
 
 use crate::mesh::{MAX_TRIANGLES, MeshError};
 use crate::polygon;
+use crate::xml_text;
 use std::collections::BTreeMap;
 use std::rc::Rc;
-use xml::reader::{EventReader, XmlEvent};
+use xml::reader::XmlEvent;
 
 type Matrix = [[f64; 4]; 3];
 type Triangle = [[f64; 3]; 3];
@@ -132,7 +133,7 @@ fn determinant(m: &Matrix) -> f64 {
 
 fn read(bytes: &[u8]) -> Result<Element, MeshError> {
     use xml::common::Position;
-    let mut reader = EventReader::new(bytes);
+    let mut reader = xml_text::reader(bytes);
     let mut open = vec![Element::default()];
     let mut elements = 0;
     loop {
@@ -141,6 +142,9 @@ fn read(bytes: &[u8]) -> Result<Element, MeshError> {
         let wrong = |reason: String| MeshError::Text { line, reason };
         match event.map_err(|error| wrong(format!("it is not valid XML: {}", error.msg())))? {
             XmlEvent::StartElement { name, attributes, .. } => {
+                if reader.doctype().is_some() {
+                    return Err(wrong(xml_text::NO_DOCUMENT_TYPE.to_owned()));
+                }
                 elements += 1;
                 if elements > MOST_ELEMENTS || open.len() > 2 * DEEPEST {
                     return Err(wrong("it has too many elements; simplify it".to_owned()));

@@ -47,8 +47,9 @@ pub(crate) fn arcs(arm: &Spherical, target: &Pose, limits: &[Joint]) -> Vec<Arc>
     let mut arcs = Vec::new();
     for bend in arm.bends_for(target) {
         let within = |turn: f64| {
+            // Joints that are none of the arm's are wherever they are.
             let is_within = |posture: &Positions| {
-                limits.iter().zip(posture).all(|(joint, q)| (joint.lower..=joint.upper).contains(q))
+                arm.joints.iter().all(|i| (limits[*i].lower..=limits[*i].upper).contains(&posture[*i]))
             };
             arm.solve(target, bend, turn).iter().any(is_within)
         };

@@ -230,12 +230,15 @@ impl<'a> Exact<'a> {
         }
     }
 
-    /// What touches first along a path, looked at `per_radian` times per radian.
+    /// What touches first along a path, looked at `per_radian` times per radian, and more often where a link that mimics a joint goes further.
     pub fn touch_along(&self, path: &[Vec<f64>], per_radian: f64) -> Option<Touch> {
         let start = path.first().and_then(|first| self.touch(first));
+        let fineness = self.mechanism.fineness();
+        let square = |(delta, fineness): (f64, &f64)| (delta * fineness).powi(2);
         start.or_else(|| {
             path.windows(2).find_map(|pair| {
-                let way: f64 = pair[0].iter().zip(&pair[1]).map(|(a, b)| (b - a).powi(2)).sum::<f64>().sqrt();
+                let deltas = pair[0].iter().zip(&pair[1]).map(|(a, b)| b - a);
+                let way = deltas.zip(&fineness).map(square).sum::<f64>().sqrt();
                 let steps = (way * per_radian).ceil().max(1.0) as usize;
                 (1..=steps).find_map(|i| {
                     let t = i as f64 / steps as f64;

@@ -59,4 +59,6 @@ mod tree;
 pub mod trial;
 mod urdf;
 mod urdf_faults;
+mod urdf_tree;
 pub mod validate;
+mod xml_text;

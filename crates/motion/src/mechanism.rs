@@ -6,7 +6,7 @@
 
 use crate::geometry::Body;
 use crate::mesh::MeshError;
-use crate::robot_model::{self, Joint, Link, RobotModel};
+use crate::robot_model::{self, Drive, Joint, Link, RobotModel};
 use crate::robot_state::RobotState;
 use crate::spheres;
 use crate::urdf::RobotError;
@@ -183,6 +183,32 @@ impl Mechanism {
         let solid: Vec<usize> = (0..self.links.len()).filter(|l| !self.links[*l].spheres.is_empty()).collect();
         let pairs = solid.iter().flat_map(|b| solid.iter().take_while(move |a| *a < b).map(move |a| (*a, *b)));
         pairs.filter(|(a, b)| self.is_checked(*a, *b)).collect()
+    }
+
+    /// How many times as closely motions of each joint have to be looked at: more often than once where a link that mimics it turns or slides
+    /// several times as far. What turns near its axis does not go far: up to a metre, the reach of its shapes counts.
+    pub(crate) fn fineness(&self) -> Vec<f64> {
+        let mut fineness = vec![1.0_f64; self.joints.len()];
+        for (index, link) in self.links.iter().enumerate().filter(|(_, link)| !link.spheres.is_empty()) {
+            let length = |[x, y, z]: [f64; 3]| x.hypot(y).hypot(z);
+            let mut reach = link.spheres.iter().map(|s| length(s.centre) + s.radius).fold(0.0, f64::max);
+            let mut next = Some(index);
+            while let Some(here) = next.map(|here| &self.links[here]) {
+                if let Some(Drive { joint, slides, factor, .. }) = here.drive {
+                    let joint_limits = &self.joints[joint];
+                    let far = if slides { 1.0 } else { reach.min(1.0) };
+                    if factor.abs() > 1.0 {
+                        fineness[joint] = fineness[joint].max(factor.abs() * far);
+                    }
+                    if slides {
+                        reach += joint_limits.lower.abs().max(joint_limits.upper.abs()) * factor.abs();
+                    }
+                }
+                reach += length(here.origin.position);
+                next = here.parent;
+            }
+        }
+        fineness
     }
 
     /// Positions, of which those that are beyond a limit by no more than [`ROUNDED`] are at the limit, and which were.

@@ -112,6 +112,8 @@ pub struct Reach {
     /// The link in the frame of the last joint.
     tip: Pose,
     joints: Vec<Joint>,
+    /// Joints that are planned for and do not move the link.
+    others: Vec<usize>,
     spherical: Option<Spherical>,
 }
 
@@ -155,7 +157,9 @@ impl Reach {
         }
         let tip = fixed.compose(&frame);
         let spherical = Spherical::of(&chain, &tip);
-        Reach { chain, tip, joints: mechanism.joints.clone(), spherical }
+        let is_other = |joint: &usize| chain.iter().all(|(_, drive)| drive.joint != *joint);
+        let others = (0..mechanism.joints.len()).filter(is_other).collect();
+        Reach { chain, tip, joints: mechanism.joints.clone(), others, spherical }
     }
 
     /// How many joints the robot has.
@@ -254,7 +258,7 @@ impl Reach {
         if attempt == 0 { self.nearest(postures, near) } else { self.anywhere(postures, near, random) }
     }
 
-    /// Postures close to `near`, the nearest first.
+    /// Postures close to `near`, the nearest first. Joints that do not move the link stay where they are there.
     pub fn nearest(&self, postures: &Postures, near: &Positions) -> Vec<Positions> {
         let (Some(arm), Some(arcs)) = (&self.spherical, &postures.arcs) else {
             return self.descend(&postures.target, near).into_iter().collect();
@@ -266,14 +270,20 @@ impl Reach {
             closest.push((away, turn, arc.bend));
         }
         closest.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let found = closest.into_iter().take(ARCS_TRIED).flat_map(|(_, turn, bend)| self.solve(postures, bend, turn));
+        let found =
+            closest.into_iter().take(ARCS_TRIED).flat_map(|(_, turn, bend)| self.solve(postures, bend, turn, near));
         sorted(found.collect(), near)
     }
 
-    /// Postures anywhere, the nearest to `near` first.
+    /// Postures anywhere, the nearest to `near` first. Joints that do not move the link stay where they are there half of the time: elsewhere
+    /// they may be in nobody's way.
     pub fn anywhere(&self, postures: &Postures, near: &Positions, random: &mut impl Rng) -> Vec<Positions> {
+        let stays = self.others.is_empty() || random.random_bool(0.5);
+        let others = if stays { *near } else { self.random(random) };
         let Some(arcs) = &postures.arcs else {
-            return self.descend(&postures.target, &self.random(random)).into_iter().collect();
+            let mut seed = self.random(random);
+            self.others.iter().for_each(|joint| seed[*joint] = others[*joint]);
+            return self.descend(&postures.target, &seed).into_iter().collect();
         };
         let mut along = random.random_range(0.0..1.0) * arcs.iter().map(|arc| arc.width).sum::<f64>();
         let chosen = arcs.iter().find(|arc| {
@@ -283,16 +293,19 @@ impl Reach {
             }
             here
         });
-        let found = chosen.map(|arc| self.solve(postures, arc.bend, arc.from + along));
+        let found = chosen.map(|arc| self.solve(postures, arc.bend, arc.from + along, &others));
         sorted(found.unwrap_or_default(), near)
     }
 
-    /// The postures within the limits with the elbow at this bend and turn, in closed form.
-    fn solve(&self, postures: &Postures, bend: f64, turn: f64) -> Vec<Positions> {
+    /// The postures within the limits with the elbow at this bend and turn, in closed form, and the other joints as in `others`.
+    fn solve(&self, postures: &Postures, bend: f64, turn: f64, others: &Positions) -> Vec<Positions> {
         let target = &postures.target;
         let Some(arm) = &self.spherical else { return Vec::new() };
         // At the end of an arc a joint is at its limit, but for rounding.
-        let clamped = arm.solve(&target.pose, bend, turn).into_iter().map(|posture| self.clamp(&posture));
+        let clamped = arm.solve(&target.pose, bend, turn).into_iter().map(|mut posture| {
+            self.others.iter().for_each(|joint| posture[*joint] = others[*joint]);
+            self.clamp(&posture)
+        });
         clamped.filter(|posture| target.is_met_by(&self.pose(posture))).collect()
     }
 

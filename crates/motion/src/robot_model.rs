@@ -18,6 +18,11 @@ use crate::urdf::{self, Description, Loader, RobotError};
 use ratn_model::pose::Pose;
 use std::collections::{BTreeMap, BTreeSet};
 
+/// How far apart the limits of a joint that is planned for may be, in radians (metres for one that slides).
+const WIDEST: f64 = 1e4;
+
+const FOR_ENDLESS: &str = "a joint that turns without end is `continuous`";
+
 /// A robot.
 #[derive(Debug, Clone)]
 pub struct RobotModel {
@@ -260,9 +265,16 @@ impl RobotModel {
         }
         let missing = || RobotError::Missing { what: "joint", name: name.to_owned() };
         let index = self.joint(name).ok_or_else(missing)?;
-        let Joint { lower, upper, .. } = &self.joints[index];
-        if !(lower < upper && lower.is_finite() && upper.is_finite()) {
-            return Err(unsupported("its lower limit is not below its upper limit"));
+        let Joint { lower, upper, .. } = self.joints[index];
+        let refused = |reason: String| Err(RobotError::NotPlannable { name: name.to_owned(), reason });
+        if !(lower.is_finite() && upper.is_finite()) {
+            return refused(format!("its limits are {lower} to {upper}: planning needs finite ones; {FOR_ENDLESS}"));
+        }
+        if lower >= upper {
+            return refused(format!("its limits, and those of joints that mimic it, are {lower} to {upper}"));
+        }
+        if upper - lower > WIDEST {
+            return refused(format!("its limits {lower} to {upper} are more than {WIDEST} apart; {FOR_ENDLESS}"));
         }
         Ok(index)
     }

@@ -57,7 +57,7 @@ impl RobotState {
                 return Err(if mimics { StateError::Mimics { joint } } else { StateError::Unknown { joint } });
             };
             let Joint { lower, upper, .. } = model.joints[index];
-            if !(lower..=upper).contains(position) {
+            if !position.is_finite() || !(lower..=upper).contains(position) {
                 return Err(StateError::Beyond { joint: name.clone(), position: *position, lower, upper });
             }
             self.positions[index] = *position;

@@ -52,6 +52,8 @@ pub struct Space {
     inflate: Vec<f32>,
     lower: State,
     upper: State,
+    /// How many times as closely motions of each joint are looked at ([`Mechanism::fineness`]).
+    fineness: State,
     branches: Vec<Vec<usize>>,
     /// A part that no joint moves stands in an obstacle.
     blocked: bool,
@@ -70,7 +72,7 @@ struct Arm {
 }
 
 impl Space {
-    /// Postures per radian of a motion that the search looks at.
+    /// Postures per radian of a motion that the search looks at; more where a link that mimics the joint goes further ([`Mechanism`]).
     pub const RESOLUTION: f32 = 32.0;
 
     /// A robot among obstacles.
@@ -121,10 +123,14 @@ impl Space {
         for (j, joint) in mechanism.joints.iter().enumerate() {
             (lower[j], upper[j]) = (joint.lower as f32, joint.upper as f32);
         }
+        let mut fineness = [1.0; MAX_JOINTS];
+        for (fine, fineness) in fineness.iter_mut().zip(mechanism.fineness()) {
+            *fine = fineness as f32;
+        }
         let scratch = Scratch::new(&compiled);
         let inflate = vec![0.0; compiled.rigids.len() + compiled.groups.len()];
         let branches = branches::branches(&parents(&compiled));
-        Space { compiled, scratch, isa, arms, inflate, lower, upper, branches, blocked, swept: false }
+        Space { compiled, scratch, isa, arms, inflate, lower, upper, fineness, branches, blocked, swept: false }
     }
 
     /// How many joints there are.
@@ -174,7 +180,7 @@ impl Space {
             return self.is_swept_free(from, to);
         }
         let delta = difference(to, from);
-        let batches = self.batches(length(&delta));
+        let batches = self.batches(&delta);
         !self.blocked && self.check(from, &delta, batches)
     }
 
@@ -182,7 +188,7 @@ impl Space {
     pub fn is_swept_free(&mut self, from: &State, to: &State) -> bool {
         let delta = difference(to, from);
         // What is wrong at all is mostly found by the coarse look.
-        let batches = self.batches(length(&delta));
+        let batches = self.batches(&delta);
         !self.blocked && self.check(from, &delta, batches) && self.sweep(from, &delta, batches, LEVELS)
     }
 
@@ -194,7 +200,7 @@ impl Space {
     /// As [`Space::is_swept_free`], for a motion whose postures were looked at before.
     pub(crate) fn is_swept_free_too(&mut self, from: &State, to: &State) -> bool {
         let delta = difference(to, from);
-        let batches = self.batches(length(&delta));
+        let batches = self.batches(&delta);
         !self.blocked && self.sweep(from, &delta, batches, LEVELS)
     }
 
@@ -223,7 +229,8 @@ impl Space {
         true
     }
 
-    fn batches(&self, length: f32) -> usize {
+    fn batches(&self, delta: &State) -> usize {
+        let length = length(&std::array::from_fn(|j| delta[j] * self.fineness[j]));
         // In wholes of the widest batch, so that every machine looks at the same postures.
         let widest = ((length * Space::RESOLUTION / WIDEST as f32).ceil() as usize).max(1);
         widest * (WIDEST / self.isa.width())

@@ -7,7 +7,7 @@ use crate::spheres;
 use crate::urdf_faults;
 use crate::urdf_faults::UrdfFault;
 use ratn_model::pose::Pose;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// A URDF that does not describe this kind of robot.
@@ -26,6 +26,29 @@ pub enum RobotError {
         what: &'static str,
         /// Its name.
         name: String,
+    },
+    /// Limits of a joint that mimics another, and that leave that one no position.
+    #[error(
+        "the joint `{name}` mimics `{driver}`, but its limits {} to {} leave `{driver}` no position from {} to {}",
+        limits[0], limits[1], driver_limits[0], driver_limits[1]
+    )]
+    Contradicts {
+        /// What mimics.
+        name: String,
+        /// What is mimicked.
+        driver: String,
+        /// Of the joint that mimics, as the description has them.
+        limits: [f64; 2],
+        /// Of the other, as far as they are narrowed by others.
+        driver_limits: [f64; 2],
+    },
+    /// A joint that cannot be planned for.
+    #[error("the joint `{name}` cannot be planned for: {reason}")]
+    NotPlannable {
+        /// Its name.
+        name: String,
+        /// Why not.
+        reason: String,
     },
     /// A mesh that cannot be used.
     #[error("the mesh `{file}` of link `{link}`: {source}")]
@@ -86,41 +109,94 @@ const TIME_TO_ACCELERATION_S: f64 = 0.1;
 pub(crate) fn read(text: &str, load: &mut Loader<'_>) -> Result<Description, RobotError> {
     let urdf = parse(text)?;
     let moves = |j: &&urdf_rs::Joint| j.joint_type != urdf_rs::JointType::Fixed && j.mimic.is_none();
-    let joints: Vec<Joint> = urdf.joints.iter().filter(moves).map(joint).collect();
+    let mut driving: Vec<(&str, Limits)> =
+        urdf.joints.iter().filter(moves).map(|joint| (joint.name.as_str(), Limits::of(joint))).collect();
+    let follows = |j: &&urdf_rs::Joint| j.joint_type != urdf_rs::JointType::Fixed && j.mimic.is_some();
+    for joint in urdf.joints.iter().filter(follows) {
+        let followed = followed(&urdf, joint)?;
+        if let Some((_, limits)) = driving.iter_mut().find(|(name, _)| *name == followed.driver.name) {
+            limits.narrow(joint, &followed)?;
+        }
+    }
+    let joints: Vec<Joint> = driving.iter().map(|(name, limits)| limits.joint(name)).collect();
     let links = links(&urdf, &joints, load)?;
     let mimics = urdf.joints.iter().filter(|j| j.mimic.is_some()).map(|j| j.name.clone()).collect();
     Ok(Description { name: urdf.name, joints, links, mimics })
 }
 
-/// A joint with its limits; what is not given is taken from what is.
-fn joint(joint: &urdf_rs::Joint) -> Joint {
-    let limit = &joint.limit;
-    let endless = joint.joint_type == urdf_rs::JointType::Continuous;
-    let (lower, upper) = if endless { (-ENDLESS_RAD, ENDLESS_RAD) } else { (limit.lower, limit.upper) };
-    let proper = |given: f64| given > 0.0 && given.is_finite();
-    let velocity = if limit.velocity > 0.0 { limit.velocity } else { 1.0 };
-    let acceleration = if proper(limit.acceleration) { limit.acceleration } else { velocity / TIME_TO_SPEED_S };
-    let jerk = if proper(limit.jerk) { limit.jerk } else { acceleration / TIME_TO_ACCELERATION_S };
-    Joint { name: joint.name.clone(), lower, upper, velocity, acceleration, jerk }
+/// What a description says of how a joint may move.
+#[derive(Debug, Clone, Copy)]
+struct Limits {
+    lower: f64,
+    upper: f64,
+    velocity: Option<f64>,
+    acceleration: Option<f64>,
+    jerk: Option<f64>,
 }
 
-/// All links, breadth first from the root: parents come before children.
+impl Limits {
+    fn of(joint: &urdf_rs::Joint) -> Limits {
+        let limit = &joint.limit;
+        let proper = |given: f64| Some(given).filter(|given| *given > 0.0 && given.is_finite());
+        let endless = joint.joint_type == urdf_rs::JointType::Continuous;
+        let (lower, upper) = if endless { (-ENDLESS_RAD, ENDLESS_RAD) } else { (limit.lower, limit.upper) };
+        let (velocity, acceleration, jerk) = (proper(limit.velocity), proper(limit.acceleration), proper(limit.jerk));
+        Limits { lower, upper, velocity, acceleration, jerk }
+    }
+
+    /// Leaves of these only what a joint that mimics this one can follow. A range that is empty or a single position says nothing: writers
+    /// leave it out, as what mimics has no position of its own.
+    fn narrow(&mut self, joint: &urdf_rs::Joint, followed: &Followed<'_>) -> Result<(), RobotError> {
+        let Followed { driver, factor, offset } = *followed;
+        if factor == 0.0 {
+            return Ok(());
+        }
+        let own = Limits::of(joint);
+        if joint.joint_type != urdf_rs::JointType::Continuous && own.lower < own.upper {
+            let [a, b] = [own.lower, own.upper].map(|limit| (limit - offset) / factor);
+            // Adding zero takes the sign from a zero.
+            let (lower, upper) = (self.lower.max(a.min(b)) + 0.0, self.upper.min(a.max(b)) + 0.0);
+            if lower > upper {
+                let (name, driver) = (joint.name.clone(), driver.name.clone());
+                let (limits, driver_limits) = ([own.lower, own.upper], [self.lower, self.upper]);
+                return Err(RobotError::Contradicts { name, driver, limits, driver_limits });
+            }
+            (self.lower, self.upper) = (lower, upper);
+        }
+        let least = |a: Option<f64>, b: Option<f64>| a.into_iter().chain(b.map(|b| b / factor.abs())).reduce(f64::min);
+        self.velocity = least(self.velocity, own.velocity);
+        self.acceleration = least(self.acceleration, own.acceleration);
+        self.jerk = least(self.jerk, own.jerk);
+        Ok(())
+    }
+
+    /// A joint with these limits; what is not given is taken from what is.
+    fn joint(&self, name: &str) -> Joint {
+        let Limits { lower, upper, velocity, acceleration, jerk } = *self;
+        let velocity = velocity.unwrap_or(1.0);
+        let acceleration = acceleration.unwrap_or(velocity / TIME_TO_SPEED_S);
+        let jerk = jerk.unwrap_or(acceleration / TIME_TO_ACCELERATION_S);
+        Joint { name: name.to_owned(), lower, upper, velocity, acceleration, jerk }
+    }
+}
+
+/// All links, breadth first from the root: parents come before children. They are one tree ([`urdf_faults`]).
 fn links(urdf: &urdf_rs::Robot, joints: &[Joint], load: &mut Loader<'_>) -> Result<Vec<Link>, RobotError> {
-    let children: BTreeSet<&str> = urdf.joints.iter().map(|j| j.child.link.as_str()).collect();
+    let named: BTreeMap<&str, &urdf_rs::Link> = urdf.links.iter().map(|link| (link.name.as_str(), link)).collect();
+    let mut below: BTreeMap<&str, Vec<&urdf_rs::Joint>> = BTreeMap::new();
+    let mut children = BTreeSet::new();
+    for joint in &urdf.joints {
+        below.entry(&joint.parent.link).or_default().push(joint);
+        children.insert(joint.child.link.as_str());
+    }
+    let missing = |name: &str| RobotError::Missing { what: "link", name: name.to_owned() };
     let root = urdf.links.iter().find(|l| !children.contains(l.name.as_str()));
-    let root = root.ok_or_else(|| RobotError::Missing { what: "link", name: "without a parent".to_owned() })?;
-    let mut links = vec![link(root, None, Pose::IDENTITY, None, load)?];
+    let mut links = vec![link(root.ok_or_else(|| missing("without a parent"))?, None, Pose::IDENTITY, None, load)?];
     let mut next = 0;
     while next < links.len() {
-        let parent = links[next].name.clone();
-        for joint in urdf.joints.iter().filter(|j| j.parent.link == parent) {
-            let name = &joint.child.link;
-            let child = urdf.links.iter().find(|l| l.name == *name);
-            let child = child.ok_or_else(|| RobotError::Missing { what: "link", name: name.clone() })?;
-            if links.iter().any(|l| l.name == *name) {
-                let reason = "a link has two parents";
-                return Err(RobotError::Unsupported { what: "link", name: name.clone(), reason });
-            }
+        for joint in below.remove(links[next].name.as_str()).into_iter().flatten() {
+            let name = joint.child.link.as_str();
+            let child = named.get(name).ok_or_else(|| missing(name))?;
             let (origin, drive) = drive(urdf, joints, joint)?;
             links.push(link(child, Some(next), origin, drive, load)?);
         }

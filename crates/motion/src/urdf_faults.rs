@@ -1,8 +1,11 @@
 //! What is wrong with the text of a URDF, and where: the line of an element that is not closed, an attribute that is missing, a number that is
-//! none. The reader of the whole description ([`urdf_rs`]) loses the lines.
+//! none, limits that contradict themselves, links that are not one tree (`urdf_tree`). The reader of the whole description ([`urdf_rs`])
+//! loses the lines.
 
+use crate::urdf_tree::{Place, Tree};
+use crate::xml_text;
 use xml::common::Position;
-use xml::reader::{EventReader, XmlEvent};
+use xml::reader::XmlEvent;
 
 /// The first thing that is wrong with a URDF.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -66,20 +69,24 @@ const TYPES: [&str; 7] = ["revolute", "continuous", "prismatic", "fixed", "float
 /// # Errors
 /// [`UrdfFault`].
 pub(crate) fn check(text: &str) -> Result<(), UrdfFault> {
-    let mut reader = EventReader::from_str(text);
-    let mut open: Vec<String> = Vec::new();
+    let mut reader = xml_text::reader(text.as_bytes());
+    let (mut open, mut tree, mut has_limits): (Vec<String>, _, _) = (Vec::new(), Tree::default(), false);
     loop {
         let event = reader.next();
         let at = reader.position();
-        let fault = |reason: String| UrdfFault { line: at.row + 1, column: at.column + 1, reason };
+        let at = Place { line: at.row + 1, column: at.column + 1 };
+        let fault = |reason: String| at.fault(reason);
         match event {
             Err(error) => {
                 let at = error.position();
-                return Err(UrdfFault { line: at.row + 1, column: at.column + 1, reason: error.msg().to_owned() });
+                return Err(Place { line: at.row + 1, column: at.column + 1 }.fault(error.msg().to_owned()));
             }
             Ok(XmlEvent::StartElement { name, attributes, .. }) => {
                 let element = name.local_name;
                 let parent = open.last().map_or("", String::as_str);
+                if reader.doctype().is_some() {
+                    return Err(fault(xml_text::NO_DOCUMENT_TYPE.to_owned()));
+                }
                 if parent.is_empty() && element != "robot" {
                     return Err(fault(format!("the outermost element is `{element}` instead of `robot`")));
                 }
@@ -91,16 +98,31 @@ pub(crate) fn check(text: &str) -> Result<(), UrdfFault> {
                 {
                     wrong(&element, key, value_of(key), *value, *needed).map_or(Ok(()), |reason| Err(fault(reason)))?;
                 }
-                let kind = value_of("type").unwrap_or_default();
-                if (parent, &element[..]) == ("robot", "joint") && !TYPES.contains(&kind) {
-                    return Err(fault(format!("a joint of type `{kind}`: there is {}", TYPES.join(", "))));
+                let text = |key: &str| value_of(key).unwrap_or_default();
+                match (parent, &element[..]) {
+                    ("robot", "link") => tree.link(text("name"), at)?,
+                    ("robot", "joint") => {
+                        let kind = text("type");
+                        if !TYPES.contains(&kind) {
+                            return Err(fault(format!("a joint of type `{kind}`: there is {}", TYPES.join(", "))));
+                        }
+                        has_limits = ["revolute", "prismatic"].contains(&kind);
+                        tree.joint(text("name"), at)?;
+                    }
+                    ("joint", "parent" | "child") if open.len() == 2 => tree.end(&element, text("link"), at),
+                    ("joint", "limit") if has_limits => {
+                        contradiction(text("lower"), text("upper")).map_or(Ok(()), |reason| {
+                            Err(fault(format!("the joint `{}`: {reason}", tree.last_joint())))
+                        })?;
+                    }
+                    _ => {}
                 }
                 open.push(element);
             }
             Ok(XmlEvent::EndElement { .. }) => {
                 open.pop();
             }
-            Ok(XmlEvent::EndDocument) => return Ok(()),
+            Ok(XmlEvent::EndDocument) => return tree.check(),
             Ok(_) => {}
         }
     }
@@ -122,6 +144,16 @@ fn wrong(element: &str, key: &str, found: Option<&str>, value: Value, needed: bo
     }
 }
 
+/// What is wrong with a range; where one end is not given it is 0.
+fn contradiction(lower: &str, upper: &str) -> Option<String> {
+    let [lower, upper] = [lower, upper].map(|text| text.trim().parse().unwrap_or(0.0));
+    if lower > upper {
+        return Some(format!("its lower limit {lower} is above its upper limit {upper}"));
+    }
+    let nowhere = lower == f64::INFINITY || upper == f64::NEG_INFINITY;
+    nowhere.then(|| format!("its limits are {lower} to {upper}: nothing is there"))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -131,8 +163,9 @@ mod tests {
         let fault = |text: &str| check(text).err().map(|fault| fault.to_string()).unwrap_or_default();
         assert_eq!(check("<robot name='r'><link name='l'/></robot>"), Ok(()));
         assert_eq!(fault("<robot name='r'>\n <link/>\n</robot>"), "line 2, column 2: `link` has no attribute `name`");
-        let joint =
-            |inner: &str| format!("<robot name='r'>\n<joint name='j' type='revolute'>\n{inner}</joint></robot>");
+        let joint = |inner: &str| {
+            format!("<robot name='r'><link name='l'/>\n<joint name='j' type='revolute'>\n{inner}</joint></robot>")
+        };
         assert_eq!(check(&joint("<axis xyz='0 0 1'/>")), Ok(()));
         let said = fault(&joint("<axis xyz='0 0'/>"));
         assert_eq!(said, "line 3, column 1: `xyz` of `axis` is `0 0` instead of 3 numbers");

@@ -179,13 +179,9 @@ impl Names for NamesFrom<'_, '_> {
     }
 }
 
-/// "did you mean", or what there is, or what to do where there is nothing.
-pub(crate) fn suggestion<'n>(
-    name: &str,
-    known: impl Iterator<Item = &'n str>,
-    prefix: &str,
-    otherwise: &str,
-) -> String {
+/// For a name that is none of those that are known: "did you mean" the nearest, or what there is, or `otherwise`. `prefix` stands before
+/// each name.
+pub fn suggestion<'n>(name: &str, known: impl Iterator<Item = &'n str>, prefix: &str, otherwise: &str) -> String {
     /// More names than this are not listed.
     const MAX_LISTED: usize = 14;
     let mut known: Vec<&str> = known.collect();

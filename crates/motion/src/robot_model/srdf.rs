@@ -2,7 +2,9 @@
 
 use super::Link;
 use crate::mechanism::MechanismError;
+use crate::xml_text;
 use std::collections::{BTreeMap, BTreeSet};
+use xml::reader::XmlEvent;
 
 /// The pairs of links, the lower index first, that an SRDF excepts from checks.
 ///
@@ -11,9 +13,17 @@ use std::collections::{BTreeMap, BTreeSet};
 pub(crate) fn excepted(text: &str, links: &[Link]) -> Result<BTreeSet<(usize, usize)>, MechanismError> {
     let index: BTreeMap<&str, usize> = links.iter().enumerate().map(|(i, l)| (l.name.as_str(), i)).collect();
     let mut pairs = BTreeSet::new();
-    for event in xml::EventReader::from_str(text) {
-        let event = event.map_err(|error| MechanismError::Srdf(error.to_string()))?;
-        let xml::reader::XmlEvent::StartElement { name, attributes, .. } = event else { continue };
+    let mut reader = xml_text::reader(text.as_bytes());
+    loop {
+        let event = reader.next().map_err(|error| MechanismError::Srdf(error.to_string()))?;
+        let (name, attributes) = match event {
+            XmlEvent::StartElement { name, attributes, .. } => (name, attributes),
+            XmlEvent::EndDocument => return Ok(pairs),
+            _ => continue,
+        };
+        if reader.doctype().is_some() {
+            return Err(MechanismError::Srdf(xml_text::NO_DOCUMENT_TYPE.to_owned()));
+        }
         if name.local_name != "disable_collisions" {
             continue;
         }
@@ -24,5 +34,4 @@ pub(crate) fn excepted(text: &str, links: &[Link]) -> Result<BTreeSet<(usize, us
             pairs.insert((a.min(b), a.max(b)));
         }
     }
-    Ok(pairs)
 }

@@ -1,0 +1,153 @@
+//! Which links of a URDF hang on which, before anything else is read: every name once, every reference to something that is there, and one
+//! tree that holds all links.
+//!
+//! What breaks this is refused with its line. A reader that went on would leave out what hangs on no tree with the root.
+
+use crate::urdf_faults::UrdfFault;
+use ratn_model::load::suggestion;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Where something stands in the text.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Place {
+    pub(crate) line: u64,
+    pub(crate) column: u64,
+}
+
+impl Place {
+    pub(crate) fn fault(self, reason: String) -> UrdfFault {
+        UrdfFault { line: self.line, column: self.column, reason }
+    }
+}
+
+/// A joint's end: a link, and where the joint names it.
+type End = (String, Place);
+
+#[derive(Debug)]
+struct Joint {
+    name: String,
+    parent: Option<End>,
+    child: Option<End>,
+}
+
+/// Links and joints in the order of the text.
+#[derive(Debug, Default)]
+pub(crate) struct Tree {
+    links: Vec<End>,
+    joints: Vec<Joint>,
+    /// Where each name is, of links and of joints.
+    link_places: BTreeMap<String, Place>,
+    joint_places: BTreeMap<String, Place>,
+}
+
+impl Tree {
+    /// Adds a link.
+    ///
+    /// # Errors
+    /// [`UrdfFault`] where there is one with this name.
+    pub(crate) fn link(&mut self, name: &str, at: Place) -> Result<(), UrdfFault> {
+        self.links.push((name.to_owned(), at));
+        is_first(&mut self.link_places, "link", name, at)
+    }
+
+    /// Adds a joint, of which the ends are not known yet.
+    ///
+    /// # Errors
+    /// [`UrdfFault`] where there is one with this name.
+    pub(crate) fn joint(&mut self, name: &str, at: Place) -> Result<(), UrdfFault> {
+        self.joints.push(Joint { name: name.to_owned(), parent: None, child: None });
+        is_first(&mut self.joint_places, "joint", name, at)
+    }
+
+    /// Sets an end of the joint that was added last: its `parent` or its `child`.
+    pub(crate) fn end(&mut self, which: &str, link: &str, at: Place) {
+        if let Some(joint) = self.joints.last_mut() {
+            let end = if which == "parent" { &mut joint.parent } else { &mut joint.child };
+            *end = Some((link.to_owned(), at));
+        }
+    }
+
+    /// The name of the joint that was added last.
+    pub(crate) fn last_joint(&self) -> &str {
+        self.joints.last().map_or("", |joint| &joint.name)
+    }
+
+    /// Whether all links are one tree.
+    ///
+    /// # Errors
+    /// [`UrdfFault`] names the link or joint that is not part of it, and the likely cause.
+    pub(crate) fn check(&self) -> Result<(), UrdfFault> {
+        let mut parents: BTreeMap<&str, (&Joint, Place)> = BTreeMap::new();
+        for joint in &self.joints {
+            for (which, end) in [("parent", &joint.parent), ("child", &joint.child)] {
+                if let Some((link, at)) = end {
+                    self.is_there(joint, which, link, *at)?;
+                }
+            }
+            let Some((child, at)) = &joint.child else { continue };
+            if let Some((first, place)) = parents.insert(child, (joint, *at)) {
+                return Err(at.fault(format!(
+                    "the link `{child}` is the child of two joints, `{}` at line {} and `{}`: a link has one parent",
+                    first.name, place.line, joint.name
+                )));
+            }
+        }
+        let mut roots = self.links.iter().filter(|(name, _)| !parents.contains_key(name.as_str()));
+        let Some((root, first)) = roots.next() else {
+            let Some((link, at)) = self.links.first() else {
+                return Err(Place { line: 1, column: 1 }.fault("the robot has no link".to_owned()));
+            };
+            return Err(at.fault(format!(
+                "the links hang on each other in a circle, also `{link}`: a robot has one root, a link that is the child of no joint"
+            )));
+        };
+        if let Some((second, at)) = roots.next() {
+            return Err(at.fault(format!(
+                "neither the link `{second}` nor `{root}` at line {} is the child of a joint, but a robot has one root: is a joint \
+                 between them missing, or a link left over?",
+                first.line
+            )));
+        }
+        let mut children: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+        for joint in &self.joints {
+            if let (Some((parent, _)), Some((child, _))) = (&joint.parent, &joint.child) {
+                children.entry(parent).or_default().push(child);
+            }
+        }
+        let (mut reached, mut open) = (BTreeSet::from([root.as_str()]), vec![root.as_str()]);
+        while let Some(link) = open.pop() {
+            let below = children.get(link).into_iter().flatten();
+            // Each has one parent, so none comes twice.
+            below.for_each(|child| {
+                reached.insert(child);
+                open.push(child);
+            });
+        }
+        match self.links.iter().find(|(link, _)| !reached.contains(link.as_str())) {
+            None => Ok(()),
+            Some((link, at)) => Err(at.fault(format!(
+                "the link `{link}` does not hang on the root `{root}`: the joints towards it go in a circle"
+            ))),
+        }
+    }
+
+    fn is_there(&self, joint: &Joint, which: &str, link: &str, at: Place) -> Result<(), UrdfFault> {
+        if self.link_places.contains_key(link) {
+            return Ok(());
+        }
+        let known = self.link_places.keys().map(String::as_str);
+        let help = suggestion(link, known, "", "is its name misspelt?");
+        let name = &joint.name;
+        Err(at.fault(format!("the {which} of the joint `{name}`: the robot has no link `{link}`; {help}")))
+    }
+}
+
+fn is_first(places: &mut BTreeMap<String, Place>, what: &str, name: &str, at: Place) -> Result<(), UrdfFault> {
+    match places.insert(name.to_owned(), at) {
+        None => Ok(()),
+        Some(first) => {
+            let reason = format!("there is a {what} `{name}` at line {} already: names are given once", first.line);
+            Err(at.fault(reason))
+        }
+    }
+}
