@@ -4,6 +4,9 @@
 //! wall within a part, or between two that touch: then the part is closed without it. What is neither closed with these triangles nor without
 //! them has no inside and is left out.
 //!
+//! Bodies may touch along edges, where more than two triangles meet. What hangs together by other edges and is closed by itself is a part of
+//! its own, so that what is wrong with one body, or turned otherwise, is nothing to the body beside it.
+//!
 //! Each part is turned consistently where it can be, so that what it holds can be told by its winding number, also where it crosses itself; else
 //! only the parity of crossings tells.
 
@@ -39,15 +42,28 @@ pub(crate) fn closed_parts(mesh: &Mesh) -> (Vec<ClosedPart>, Vec<Corner>) {
     let all: Vec<u32> = (0..faces.len() as u32).collect();
     let mut parts = Vec::new();
     for part in connected(&faces, &all) {
-        let (odd, even): (Vec<u32>, Vec<u32>) = part.iter().partition(|face| faces[**face as usize].is_odd);
-        if !odd.is_empty() && is_closed(&faces, &odd) {
-            parts.extend(connected(&faces, &odd));
-            parts.extend(connected(&faces, &even).into_iter().filter(|part| is_closed(&faces, part)));
-        } else if is_closed(&faces, &part) {
-            parts.push(part);
+        let mut others = Vec::new();
+        for body in joined_at(&faces, &part, |count| count == 2) {
+            match closed(&faces, &body) {
+                Some(closed) => parts.extend(closed),
+                None => others.extend(body),
+            }
+        }
+        for part in connected(&faces, &others) {
+            parts.extend(closed(&faces, &part).into_iter().flatten());
         }
     }
     (parts.iter().map(|part| turned(&corners, &faces, part)).collect(), first_corners(&corners, &indices))
+}
+
+/// The closed parts of what hangs together; `None` where it is not closed.
+fn closed(faces: &[Face], part: &[u32]) -> Option<Vec<Vec<u32>>> {
+    let (odd, even): (Vec<u32>, Vec<u32>) = part.iter().partition(|face| faces[**face as usize].is_odd);
+    if !odd.is_empty() && is_closed(faces, &odd) {
+        let walls = connected(faces, &even).into_iter().filter(|part| is_closed(faces, part));
+        return Some(connected(faces, &odd).into_iter().chain(walls).collect());
+    }
+    is_closed(faces, part).then(|| vec![part.to_vec()])
 }
 
 fn first_corners(corners: &[Corner], indices: &[Indices]) -> Vec<Corner> {
@@ -120,8 +136,13 @@ fn at_each_edge(edges: &[Edge]) -> impl Iterator<Item = &[Edge]> {
 
 /// The parts of a list of faces that hang together by edges.
 fn connected(faces: &[Face], list: &[u32]) -> Vec<Vec<u32>> {
+    joined_at(faces, list, |_| true)
+}
+
+/// The same by those edges alone where so many faces meet.
+fn joined_at(faces: &[Face], list: &[u32], is_joint: impl Fn(usize) -> bool) -> Vec<Vec<u32>> {
     let mut joined: Vec<u32> = (0..list.len() as u32).collect();
-    for same in at_each_edge(&edges(faces, list)) {
+    for same in at_each_edge(&edges(faces, list)).filter(|same| is_joint(same.len())) {
         same.iter().for_each(|(_, place, _)| join(&mut joined, same[0].1, *place));
     }
     let mut parts: BTreeMap<u32, Vec<u32>> = BTreeMap::new();

@@ -20,8 +20,9 @@ pub const LEAST_THINNING_M: f64 = 1e-6;
 /// How far from the origin a point may be, in metres.
 const FARTHEST_M: f32 = 1e3;
 
-/// Cells at the most.
+/// Cells at the most, about, and for each point.
 const MOST_CELLS: f64 = 262_144.0;
+const CELLS_PER_POINT: f64 = 16.0;
 
 /// Why there is no cloud.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -86,8 +87,8 @@ impl Cloud {
         let side = |i: usize, pick: fn(f32, f32) -> f32| points.iter().map(|p| p[i]).reduce(pick).unwrap_or(0.0);
         let least: [f32; 3] = std::array::from_fn(|i| side(i, f32::min));
         let extents: [f64; 3] = std::array::from_fn(|i| f64::from(side(i, f32::max) - least[i]).max(1e-3));
-        let cell =
-            (extents.iter().product::<f64>() / MOST_CELLS).cbrt().max(extents.iter().fold(0.0, |a, b| b.max(a)) / 1e3);
+        let most = MOST_CELLS.min(CELLS_PER_POINT * points.len().max(1) as f64);
+        let cell = (extents.iter().product::<f64>() / most).cbrt().max(extents.iter().fold(0.0, |a, b| b.max(a)) / 1e3);
         let counts = extents.map(|e| (e / cell) as usize + 1);
         let cells = counts.iter().product::<usize>();
         let mut cloud = Cloud {

@@ -24,6 +24,9 @@ const LONG_TEXT: usize = 1_000;
 /// Elements of a file at the most.
 const MOST_ELEMENTS: usize = 1_000_000;
 
+/// Positions of all sources at the most: three for each triangle.
+const MOST_POSITIONS: usize = 3 * MAX_TRIANGLES;
+
 /// The greatest `offset` of an input and `stride` of an accessor.
 const MOST_APART: usize = 1_000;
 
@@ -38,8 +41,15 @@ pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
         Some(unit) => meter(unit)?,
         None => 1.0,
     };
-    let mut file =
-        File { by_id, geometries: BTreeMap::new(), positions: BTreeMap::new(), triangles: Vec::new(), shown: 0 };
+    let mut file = File {
+        by_id,
+        geometries: BTreeMap::new(),
+        positions: BTreeMap::new(),
+        read: 0,
+        arrays: BTreeMap::new(),
+        triangles: Vec::new(),
+        shown: 0,
+    };
     let scene = root.child("scene").and_then(|scene| scene.child("instance_visual_scene"));
     match scene {
         Some(instance) => {
@@ -184,6 +194,9 @@ struct File<'e> {
     geometries: BTreeMap<*const Element, Rc<[Triangle]>>,
     /// and positions of `vertices` and of sources.
     positions: BTreeMap<*const Element, Rc<[[f64; 3]]>>,
+    /// How many these are, and the numbers of arrays, which several sources may share.
+    read: usize,
+    arrays: BTreeMap<*const Element, Rc<[f64]>>,
     /// Of the scene.
     triangles: Vec<Triangle>,
     /// Elements so far.
@@ -323,13 +336,30 @@ impl<'e> File<'e> {
         Ok(read)
     }
 
-    fn source(&self, source: &Element) -> Result<Vec<[f64; 3]>, MeshError> {
+    fn source(&mut self, source: &'e Element) -> Result<Vec<[f64; 3]>, MeshError> {
         let accessor = source.child("technique_common").and_then(|common| common.child("accessor"));
-        let array = accessor.and_then(|accessor| self.named(accessor, "source").ok());
-        let array = array.or_else(|| source.child("float_array"));
+        let array = match accessor {
+            Some(accessor) => Some(self.named(accessor, "source")?),
+            None => source.child("float_array"),
+        };
         let array = array.filter(|array| array.name == "float_array");
         let array = array.ok_or_else(|| source.wrong("it has no `float_array`"))?;
-        positions(source, accessor, &array.numbers()?)
+        let numbers = match self.arrays.get(&std::ptr::from_ref(array)) {
+            Some(numbers) => numbers.clone(),
+            None => {
+                let numbers: Rc<[f64]> = array.numbers()?.into();
+                self.arrays.insert(array, numbers.clone());
+                numbers
+            }
+        };
+        let positions = positions(source, accessor, &numbers)?;
+        self.read += positions.len();
+        if self.read > MOST_POSITIONS {
+            return Err(
+                source.wrong(format!("with it all sources have more than {MOST_POSITIONS} positions: simplify it"))
+            );
+        }
+        Ok(positions)
     }
 }
 

@@ -17,8 +17,9 @@ use parry3d::math::{Pose as Pose32, Vector};
 use parry3d::query;
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
+use std::sync::Arc;
 
 /// Two things that touch.
 #[derive(Debug, Clone, PartialEq)]
@@ -56,7 +57,19 @@ struct Shape {
     shape: SharedShape,
     skin: f32,
     /// Of a mesh; other shapes are solid by themselves.
-    inside: Option<Inside>,
+    inside: Option<Arc<Inside>>,
+}
+
+/// The shapes of meshes, each made once, however many links and obstacles have it.
+#[derive(Default)]
+struct Meshes(BTreeMap<*const Mesh, (SharedShape, Arc<Inside>)>);
+
+impl Meshes {
+    fn shape(&mut self, at: Pose, mesh: &Arc<Mesh>, padding_m: f64) -> Shape {
+        let made = || (mesh.shape(), Arc::new(Inside::new(mesh)));
+        let (shape, inside) = self.0.entry(Arc::as_ptr(mesh)).or_insert_with(made).clone();
+        Shape { at, shape, skin: padding_m as f32, inside: Some(inside) }
+    }
 }
 
 /// A shape in its place.
@@ -69,17 +82,13 @@ impl Shape {
     fn primitive(body: &Body, padding_m: f64) -> Shape {
         Shape { at: body.pose, shape: body.geometry.shape(padding_m), skin: 0.0, inside: None }
     }
-
-    fn mesh(at: Pose, mesh: &Mesh, padding_m: f64) -> Shape {
-        Shape { at, shape: mesh.shape(), skin: padding_m as f32, inside: Some(Inside::new(mesh)) }
-    }
 }
 
 impl Placed<'_> {
     /// How deep this is in another shape whose surface it does not meet: as deep as the deepest of its parts, by a point of each.
     fn depth_inside(&self, other: &Placed<'_>) -> Option<f64> {
         let centre = [[0.0; 3]];
-        let points = self.shape.inside.as_ref().map_or(&centre[..], Inside::corners);
+        let points = self.shape.inside.as_ref().map_or(&centre[..], |inside| inside.corners());
         let deep = |point: &[f64; 3]| {
             let [x, y, z] = point.map(|c| c as f32);
             let at = other.pose.inverse_transform_point(self.pose.transform_point(Vector::new(x, y, z)));
@@ -126,23 +135,21 @@ impl<'a> Exact<'a> {
     /// A robot among obstacles.
     pub fn new(mechanism: &'a Mechanism, surroundings: impl Into<Surroundings<'a>>) -> Exact<'a> {
         let Surroundings { obstacles, clouds, meshes } = surroundings.into();
-        let meshed = |mesh: &'a MeshObstacle| (&*mesh.name, Shape::mesh(mesh.pose, &mesh.mesh, 0.0));
+        let mut shapes = Meshes::default();
         let solid = |obstacle: &'a Obstacle| {
             let body = obstacle.geometry.at(obstacle.pose);
             (&*obstacle.name, Shape::primitive(&body, 0.0))
         };
-        let bodies = |link: &Link| {
-            let primitives = link.bodies.iter().map(|body| Shape::primitive(body, link.padding_m));
-            let meshes = link.meshes.iter().map(|m| Shape::mesh(m.pose, &m.mesh, link.padding_m));
-            primitives.chain(meshes).collect()
-        };
-        Exact {
-            mechanism,
-            obstacles: obstacles.iter().map(solid).chain(meshes.iter().map(meshed)).collect(),
-            clouds,
-            bodies: mechanism.links.iter().map(bodies).collect(),
-            pairs: mechanism.pairs(),
+        let mut standing: Vec<(&str, Shape)> = obstacles.iter().map(solid).collect();
+        for MeshObstacle { name, pose, mesh, .. } in meshes {
+            standing.push((name, shapes.shape(*pose, mesh, 0.0)));
         }
+        let mut bodies = |link: &Link| -> Vec<Shape> {
+            let primitives = link.bodies.iter().map(|body| Shape::primitive(body, link.padding_m));
+            primitives.chain(link.meshes.iter().map(|m| shapes.shape(m.pose, &m.mesh, link.padding_m))).collect()
+        };
+        let bodies = mechanism.links.iter().map(&mut bodies).collect();
+        Exact { mechanism, obstacles: standing, clouds, bodies, pairs: mechanism.pairs() }
     }
 
     /// What touches first in a posture, if anything.

@@ -1,8 +1,8 @@
 //! Heights over a grid, as a solid: the ground, a pile, what a scanner saw from above.
 //!
 //! Rows run along y and columns along x, the middle of the grid is the origin. Between four heights there are two triangles. What is
-//! under the heights is filled down to a bottom. Heights are read from text (a row per line; commas, semicolons or spaces) or from a grey
-//! image (PGM, text or binary, of 8 or 16 bits); the first line is the row with the greatest y, as one sees it from above.
+//! under the heights is filled down to a bottom. Heights are read from text (a row per line; semicolons, commas or spaces, the first of these
+//! that a line has) or from a grey image (PGM, text or binary, of 8 or 16 bits); the first line is the row with the greatest y, as one sees it from above.
 
 use crate::mesh::{MAX_TRIANGLES, Mesh, MeshError};
 
@@ -124,17 +124,25 @@ impl Heights {
     }
 }
 
+const COMMA: &str = ": a comma ends a field, decimals are written with a point";
+
 fn text(bytes: &[u8]) -> Result<(usize, Vec<f64>), HeightsError> {
     let text = String::from_utf8_lossy(bytes);
     let (mut columns, mut heights) = (0, Vec::new());
     for (index, line) in text.lines().enumerate() {
         let wrong = |reason: String| HeightsError::Text { line: index + 1, reason };
-        let line = line.split('#').next().unwrap_or("");
-        let words = || line.split([',', ';', ' ', '\t', '\r']).filter(|word| !word.is_empty());
-        let count = words().count();
-        if count == 0 {
+        let line = line.split('#').next().unwrap_or("").trim();
+        if line.is_empty() {
             continue;
         }
+        let words: Vec<&str> = match [';', ','].into_iter().find(|between| line.contains(*between)) {
+            Some(between) => line.split(between).map(str::trim).collect(),
+            None => line.split_whitespace().collect(),
+        };
+        if let Some(field) = words.iter().position(|word| word.is_empty()) {
+            return Err(wrong(format!("field {} is empty: fill in what was not seen", field + 1)));
+        }
+        let count = words.len();
         if columns > 0 && count != columns {
             return Err(wrong(format!("{count} heights, the rows before it have {columns}")));
         }
@@ -143,8 +151,10 @@ fn text(bytes: &[u8]) -> Result<(usize, Vec<f64>), HeightsError> {
         if columns > MOST_ALONG || rows > MOST_ALONG {
             return Err(HeightsError::Size { columns, rows });
         }
-        for word in words() {
-            let height: f64 = word.parse().map_err(|_| wrong(format!("`{word}` is no number")))?;
+        for word in words {
+            let number =
+                |_| wrong(format!("`{word}` is no number{}", if word.contains([',', ' ']) { COMMA } else { "" }));
+            let height: f64 = word.parse().map_err(number)?;
             if !height.is_finite() {
                 return Err(wrong(format!("`{word}` is not finite: fill in what was not seen")));
             }
@@ -184,14 +194,20 @@ fn pgm(bytes: &[u8]) -> Result<(usize, Vec<f64>), HeightsError> {
         return Err(wrong(at, "the greatest grey value is from 1 to 65535"));
     }
     let count = columns * rows;
+    let fits = |value: usize, offset: usize| match value > most {
+        true => Err(wrong(offset, &format!("a grey value of {value}: {most} is announced as the greatest"))),
+        false => Ok(value as f64),
+    };
     if bytes[1] == b'2' {
-        let values = (0..count).map(|_| number(&mut at).map(|value| value as f64)).collect::<Result<_, _>>()?;
+        let values = (0..count).map(|_| number(&mut at).and_then(|value| fits(value, at))).collect::<Result<_, _>>()?;
         return Ok((columns, values));
     }
     let (wide, first) = (1 + usize::from(most > 255), at + 1);
     let values = bytes.get(first..first + count * wide).ok_or_else(|| {
         wrong(bytes.len(), &format!("it ends here, {columns} × {rows} values of {wide} bytes begin at byte {first}"))
     })?;
-    let value = |b: &[u8]| b.iter().fold(0.0, |value, byte| value * 256.0 + f64::from(*byte));
-    Ok((columns, values.chunks_exact(wide).map(value).collect()))
+    let value = |(i, b): (usize, &[u8])| {
+        fits(b.iter().fold(0, |value, byte| value * 256 + usize::from(*byte)), first + i * wide)
+    };
+    Ok((columns, values.chunks_exact(wide).enumerate().map(value).collect::<Result<_, _>>()?))
 }

@@ -1,23 +1,30 @@
 //! What is inside a mesh: where its closed parts (`closed_parts.rs`) are solid. Which way the triangles of a file are turned
-//! makes no difference to a part that stands for itself, nor where such parts overlap. Bodies that share an edge are one part: docs/robustness.md
-//! says what becomes of them.
+//! makes no difference to a part that stands for itself, nor where such parts overlap.
 //!
 //! A part holds a point if a straight line upwards from there leaves it more often than it enters it (or the other way round). It is solid by
 //! itself, and so is a part wholly inside another that is turned as the outermost part around it; one that is turned the other way is a
-//! hollow. Where the file does not say how a part is turned, it is a hollow inside what is solid, and solid inside a hollow. Solid parts
+//! hollow. Wholly inside is what has its corners and the middles of its triangles there, and a surface that does not meet the other's; a part
+//! that touches the one around it is solid. Where the file does not say how a part is turned, it is a hollow inside what is solid, and solid inside a hollow. Solid parts
 //! count one, hollows count minus one: inside is where the sum is not zero.
 //!
 //! The triangles are listed by the cells of a grid that they lie above, so a line looks at a few of them.
 
 use crate::closed_parts::closed_parts;
 use crate::mesh::Mesh;
-use std::collections::BTreeSet;
+use parry3d::math::Pose as Pose32;
+use parry3d::query;
+use parry3d::shape::SharedShape;
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 
 /// Cells along one side of the grid at the most.
 const MOST_CELLS: usize = 256;
 
 /// Triangles that are looked at to find parts inside others, at the most; parts that are left then count as solid.
 const MOST_LOOKS: usize = 200_000_000;
+
+/// Pairs of surfaces that are looked at for where they meet, at the most; parts that are left count as solid.
+const MOST_MEETINGS: usize = 20_000;
 
 /// How often triangles are listed at the most, for each of them and beside that; the grid becomes coarser where it would be more often.
 const MOST_LISTED: usize = 16;
@@ -133,16 +140,16 @@ impl Inside {
         let mut crossings = self.crossings(x, y);
         // From above.
         crossings.sort_by(|a, b| b.z.total_cmp(&a.z));
-        let mut tallies: Vec<Tally> = Vec::new();
+        let mut parts: Vec<u32> = crossings.iter().map(|crossing| crossing.part).collect();
+        parts.sort_unstable();
+        parts.dedup();
+        let mut tallies: Vec<Tally> = parts.iter().map(|part| Tally { part: *part, count: 0, sum: 0 }).collect();
         let (mut sum, mut intervals) = (0, Vec::new());
         for pair in crossings.windows(2) {
             let here = pair[0];
             let weight =
                 |tally: &Tally| if tally.holds(&self.parts) { self.parts[tally.part as usize].weight } else { 0 };
-            let known = tallies.iter().position(|tally| tally.part == here.part).unwrap_or_else(|| {
-                tallies.push(Tally { part: here.part, count: 0, sum: 0 });
-                tallies.len() - 1
-            });
+            let known = parts.partition_point(|part| *part < here.part);
             sum -= weight(&tallies[known]);
             tallies[known].add(here.turn);
             sum += weight(&tallies[known]);
@@ -189,7 +196,7 @@ impl Inside {
             return;
         }
         // The triangles of a part follow each other.
-        let ranges: Vec<std::ops::Range<usize>> = self
+        let ranges: Vec<Range<usize>> = self
             .part
             .chunk_by(|a, b| a == b)
             .scan(0, |end, same| {
@@ -198,7 +205,7 @@ impl Inside {
                 Some(start..*end)
             })
             .collect();
-        let size = |range: &std::ops::Range<usize>| -> f64 {
+        let size = |range: &Range<usize>| -> f64 {
             let corners = || self.triangles[range.clone()].iter().flatten();
             let side = |i: usize| {
                 let [least, greatest] =
@@ -210,9 +217,10 @@ impl Inside {
         let sizes: Vec<f64> = ranges.iter().map(size).collect();
         let mut order: Vec<usize> = (0..sizes.len()).collect();
         order.sort_by(|a, b| sizes[*b].total_cmp(&sizes[*a]));
-        let mut looks = 0;
+        let (mut looks, mut surfaces) = (0, Surfaces::default());
         for part in order {
-            let around = self.around(part, &ranges[part], &mut looks);
+            let mut around = self.around(part, &ranges[part], &mut looks);
+            around.retain(|other| !surfaces.meet(&self.triangles, &ranges[part], &ranges[*other]));
             let outermost = around.iter().copied().filter(|other| self.parts[*other].sense != 0);
             let outermost = outermost.max_by(|a, b| sizes[*a].total_cmp(&sizes[*b]));
             let solid: i32 = around.iter().map(|other| self.parts[*other].weight).sum();
@@ -226,7 +234,7 @@ impl Inside {
     }
 
     /// The parts that a part is wholly inside of, by all its corners and the middles of its triangles.
-    fn around(&self, part: usize, range: &std::ops::Range<usize>, looks: &mut usize) -> Vec<usize> {
+    fn around(&self, part: usize, range: &Range<usize>, looks: &mut usize) -> Vec<usize> {
         let mut around: Option<BTreeSet<u32>> = None;
         for triangle in &self.triangles[range.clone()] {
             let [a, b, c] = *triangle;
@@ -312,6 +320,30 @@ impl Inside {
                 (y[0]..=y[1]).for_each(|column| show(row * self.side + column, number as u32));
             }
         }
+    }
+}
+
+/// The surfaces of parts, by where their triangles begin.
+#[derive(Default)]
+struct Surfaces {
+    shapes: BTreeMap<usize, SharedShape>,
+    looks: usize,
+}
+
+impl Surfaces {
+    /// Whether two parts meet, as far as one can tell.
+    fn meet(&mut self, triangles: &[[Corner; 3]], a: &Range<usize>, b: &Range<usize>) -> bool {
+        self.looks += 1;
+        if self.looks > MOST_MEETINGS {
+            return true;
+        }
+        for range in [a, b] {
+            let shape = || Mesh::placed(triangles[range.clone()].to_vec()).shape();
+            self.shapes.entry(range.start).or_insert_with(shape);
+        }
+        let here = Pose32::IDENTITY;
+        query::intersection_test(&here, &*self.shapes[&a.start], &here, &*self.shapes[&b.start])
+            .map_or(true, |found| found.intersecting)
     }
 }
 

@@ -2,6 +2,7 @@
 
 use crate::mesh::{MAX_TRIANGLES, MeshError};
 use crate::polygon;
+use std::borrow::Cow;
 
 /// The triangles of a file; a face of more corners is cut ([`polygon`]).
 pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<[[f64; 3]; 3]>, MeshError> {
@@ -10,8 +11,10 @@ pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<[[f64; 3]; 3]>, MeshError> {
         MeshError::Text { line, reason: "it is no text in UTF-8".to_owned() }
     })?;
     let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
-    for (index, line) in text.lines().enumerate() {
+    let mut lines = text.lines().enumerate();
+    while let Some((index, line)) = lines.next() {
         let wrong = |reason: String| MeshError::Text { line: index + 1, reason };
+        let line = continued(line, &mut lines).map_err(wrong)?;
         let mut words = line.split('#').next().unwrap_or("").split_whitespace();
         match words.next() {
             Some("v") => {
@@ -34,6 +37,22 @@ pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<[[f64; 3]; 3]>, MeshError> {
         }
     }
     Ok(triangles)
+}
+
+/// A line with those that it goes on with: after a backslash at its end.
+fn continued<'t>(line: &'t str, lines: &mut impl Iterator<Item = (usize, &'t str)>) -> Result<Cow<'t, str>, String> {
+    let mut whole = Cow::Borrowed(line);
+    while let Some(before) = whole.strip_suffix('\\') {
+        let Some((_, next)) = lines.next() else {
+            return Err("the line goes on after its `\\`, but the file ends: it was cut off".to_owned());
+        };
+        let is_apart = before.ends_with(char::is_whitespace) || next.starts_with(char::is_whitespace);
+        if !is_apart && !before.is_empty() && !next.is_empty() {
+            return Err("whether a number goes on after the `\\` cannot be told: put a blank before it".to_owned());
+        }
+        whole = Cow::Owned(format!("{before} {next}"));
+    }
+    Ok(whole)
 }
 
 /// The vertex that a corner `7`, `7/1` or `7//2` names; negative numbers count from the last vertex so far.

@@ -25,6 +25,14 @@ const MOST_PER_SIDE: usize = 32;
 const MOST_SMALL_CELLS: usize = 1 << 29;
 const MOST_LOOKS: usize = 1 << 26;
 
+/// Meshes that may each take as much as one alone; where there are more, they share that.
+const FULL_SHARES: usize = 8;
+
+/// By how much what one of so many meshes may take is divided.
+pub(crate) fn share(meshes: usize) -> usize {
+    meshes.div_ceil(FULL_SHARES).max(1)
+}
+
 /// A robot's spheres.
 #[derive(Debug, Clone)]
 pub(crate) struct Reached {
@@ -49,11 +57,11 @@ impl Reached {
     }
 }
 
-/// The balls of a cloud that the robot reaches; `None` without any.
-pub(crate) fn cloud(cloud: &Cloud, robot: &Reached, isa: Isa) -> Option<simd::Cloud> {
-    let radius = cloud.radius_m();
+/// The balls of some clouds of one radius that the robot reaches; `None` without any.
+pub(crate) fn cloud(clouds: &[&Cloud], robot: &Reached, isa: Isa) -> Option<simd::Cloud> {
+    let radius = clouds.first()?.radius_m();
     let reached = |p: &&[f32; 3]| robot.reaches(&p.map(f64::from), radius);
-    let points: Vec<[f32; 3]> = cloud.points().iter().filter(reached).copied().collect();
+    let points: Vec<[f32; 3]> = clouds.iter().flat_map(|cloud| cloud.points()).filter(reached).copied().collect();
     let reach = (robot.radii[1] + radius + GROWTH_M) as f32;
     let side = |i: usize, pick: fn(f32, f32) -> f32| points.iter().map(|p| p[i]).reduce(pick);
     let (mut least, mut greatest) = ([0.0; 3], [0.0; 3]);
@@ -64,14 +72,15 @@ pub(crate) fn cloud(cloud: &Cloud, robot: &Reached, isa: Isa) -> Option<simd::Cl
     Some(simd::Cloud::new(&points, radius as f32, layout, reach, isa))
 }
 
-/// A mesh, where the robot reaches it; `None` where it does not.
-pub(crate) fn mesh(obstacle: &MeshObstacle, robot: &Reached, isa: Isa) -> Option<simd::Cloud> {
+/// A mesh, where the robot reaches it; `None` where it does not. It takes one `share`-th of what it may at the most.
+pub(crate) fn mesh(obstacle: &MeshObstacle, robot: &Reached, isa: Isa, share: usize) -> Option<simd::Cloud> {
     let in_world = |triangle: &[[f64; 3]; 3]| triangle.map(|corner| obstacle.pose.transform(corner));
     let triangles: Vec<[[f64; 3]; 3]> = obstacle.mesh.triangles().iter().map(in_world).collect();
     let near = robot.bounds().and(&Bounds::about(triangles.iter().flatten().copied()))?;
     let margin = |radius: f64| robot.radii[1] + radius + GROWTH_M;
     let wanted = obstacle.overhang_m;
-    let (radius, count) = surface::balls(&triangles, &near.grown(margin(wanted)), wanted);
+    let (radius, count) =
+        surface::balls(&triangles, &near.grown(margin(wanted)), wanted, surface::MOST_SAMPLES / share);
     let reach = margin(radius) as f32;
     let [least, greatest] = [near.least, near.greatest].map(|corner| corner.map(|c| c as f32));
     let layout = Layout::over(count, least, greatest, reach, radius as f32);
@@ -99,7 +108,7 @@ pub(crate) fn mesh(obstacle: &MeshObstacle, robot: &Reached, isa: Isa) -> Option
     let half_diagonal = f64::from(layout.cell) * 3_f64.sqrt() / 2.0;
     let is_reached = |cell: &usize| robot.reaches(&layout.centre(*cell).map(f64::from), half_diagonal);
     let split: Vec<usize> = crossed.cells().filter(is_reached).collect();
-    cloud.fill_with(filling(&inside, &layout, &split, (&points, radius), robot.radii[0]));
+    cloud.fill_with(filling(&inside, &layout, &split, (&points, radius), robot.radii[0], share));
     is_solid.then_some(cloud)
 }
 
@@ -114,6 +123,7 @@ fn filling(
     cells: &[usize],
     (points, radius): (&[[f32; 3]], f64),
     least_radius: f64,
+    share: usize,
 ) -> Filling {
     let cell = f64::from(layout.cell);
     // Half of the diagonal of a small cell is less than the smallest sphere's radius.
@@ -141,7 +151,7 @@ fn filling(
     };
     let fits = |per_side: usize| {
         let small_cells = per_side.pow(3) * cells.len();
-        small_cells <= MOST_SMALL_CELLS && per_side.pow(2) * load + marked(per_side) <= MOST_LOOKS
+        small_cells <= MOST_SMALL_CELLS / share && per_side.pow(2) * load + marked(per_side) <= MOST_LOOKS / share
     };
     while per_side > 1 && !fits(per_side) {
         per_side -= 1;

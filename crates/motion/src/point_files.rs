@@ -1,6 +1,8 @@
 //! Reading points from files: PCD and PLY, or three numbers per line (`.xyz`, `.csv`, `.txt`).
 //!
-//! A file that was cut off is refused where its format says how long it is; a list of lines does not.
+//! A file that was cut off is refused where its format says how long it is. A list of lines does not: it is refused where its last line does
+//! not end and has fewer fields than the one before it. One that was cut within its last number, or between two lines, cannot be told from
+//! a whole one.
 
 use crate::cloud::MAX_POINTS;
 use crate::{pcd, ply};
@@ -49,8 +51,10 @@ pub fn points(name: &str, bytes: &[u8]) -> Result<Vec<[f32; 3]>, PointsError> {
 
 /// Three numbers at the beginning of each line, between semicolons, commas or spaces, the first of these that is there.
 fn columns(bytes: &[u8]) -> Result<Vec<[f64; 3]>, PointsError> {
-    let mut points = Vec::new();
-    for (index, line) in Lines::new(bytes) {
+    let (mut points, mut fields_before) = (Vec::new(), 0);
+    let mut lines = Lines::new(bytes);
+    while let Some((index, line)) = lines.next() {
+        let ends = !lines.rest().is_empty() || bytes.ends_with(b"\n");
         let wrong = |reason: String| PointsError::Line { line: index, reason };
         let line = line.split('#').next().unwrap_or("").trim();
         if line.is_empty() {
@@ -60,15 +64,39 @@ fn columns(bytes: &[u8]) -> Result<Vec<[f64; 3]>, PointsError> {
             return Err(wrong(format!("more than {MAX_POINTS} points: thin it first")));
         }
         let between = [';', ','].into_iter().find(|between| line.contains(*between));
-        let words: Vec<&str> = match between {
-            Some(between) => line.split(between).take(3).map(str::trim).collect(),
-            None => line.split_whitespace().take(3).collect(),
+        let words = || match between {
+            Some(between) => Words::Split(line.split(between)),
+            None => Words::Blanks(line.split_whitespace()),
         };
-        let numbers: Vec<f64> = words.iter().map_while(|word| word.parse().ok()).collect();
+        let fields = words().count();
+        if !ends && fields < fields_before {
+            return Err(wrong(format!(
+                "the last line has {fields} fields and no end, the one before it has {fields_before}: the file was cut off"
+            )));
+        }
+        fields_before = fields;
+        let numbers: Vec<f64> = words().take(3).map_while(|word| word.parse().ok()).collect();
         let point = <[f64; 3]>::try_from(numbers).map_err(|_| wrong("a point has three numbers".to_owned()))?;
         points.push(point);
     }
     Ok(points)
+}
+
+/// The fields of a line.
+enum Words<'l> {
+    Split(std::str::Split<'l, char>),
+    Blanks(std::str::SplitWhitespace<'l>),
+}
+
+impl<'l> Iterator for Words<'l> {
+    type Item = &'l str;
+
+    fn next(&mut self) -> Option<&'l str> {
+        match self {
+            Words::Split(words) => words.next().map(str::trim),
+            Words::Blanks(words) => words.next(),
+        }
+    }
 }
 
 /// The lines of a file, counted from 1; after some of them it may be binary.

@@ -22,7 +22,8 @@ use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Points of all clouds of a file, and triangles of all its meshes and heightfields, at the most: a file may name a large one often.
+/// Points of all clouds of a file, and triangles of all its meshes and heightfields, at the most: a file may name a large one often. As many
+/// triangles has one problem, with each mesh as often as it stands there.
 const MOST_POINTS: usize = 4 * cloud::MAX_POINTS;
 const MOST_TRIANGLES: usize = 4 * mesh::MAX_TRIANGLES;
 
@@ -382,7 +383,14 @@ fn add_mesh(
     file: &str,
     read: Result<(Arc<Mesh>, f64), String>,
 ) -> Result<(), String> {
-    let (mesh, overhang_m) = read.map_err(|reason| format!("object `{name}`, file `{file}`: {reason}"))?;
+    let wrong = |reason: String| format!("object `{name}`, file `{file}`: {reason}");
+    let (mesh, overhang_m) = read.map_err(wrong)?;
+    let sum = mesh.triangles().len() + problem.meshes.iter().map(|m| m.mesh.triangles().len()).sum::<usize>();
+    if sum > MOST_TRIANGLES {
+        return Err(wrong(format!(
+            "with it the meshes of this problem have {sum} triangles, each as often as it stands there, at most {MOST_TRIANGLES}: simplify them"
+        )));
+    }
     problem.meshes.push(MeshObstacle { name, pose, mesh, overhang_m });
     Ok(())
 }

@@ -6,6 +6,7 @@
 //! How far it can move is half of its step to the next posture, and what the curvature of its way allows beside that.
 
 use crate::branches;
+use crate::cloud::Cloud;
 use crate::geometry::Geometry;
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 use crate::occupied::{self, Reached};
@@ -26,6 +27,9 @@ const ROUNDING_M: f64 = 2e-5;
 /// How much finer each level of a swept check is than the one before, and how many levels there are.
 const FINER: usize = 4;
 const LEVELS: usize = 3;
+
+/// Points of a cloud that is joined with others at the most.
+const SMALL_CLOUD: usize = 1_000;
 
 /// Postures of the widest batch.
 const WIDEST: usize = 16;
@@ -333,8 +337,10 @@ fn add_clouds(
         _ => (shells[i].anchor, shells[i].reach),
     };
     let robot = Reached { shells: (0..shells.len()).map(shell).collect(), radii: [least, greatest] };
-    let clouds = surroundings.clouds.iter().map(|c| (&c.name, occupied::cloud(c, &robot, isa)));
-    let meshes = surroundings.meshes.iter().map(|m| (&m.name, occupied::mesh(m, &robot, isa)));
+    let joined = joined(surroundings.clouds, mechanism);
+    let clouds = joined.iter().map(|c| (&c[0].name, occupied::cloud(c, &robot, isa)));
+    let share = occupied::share(surroundings.meshes.len());
+    let meshes = surroundings.meshes.iter().map(|m| (&m.name, occupied::mesh(m, &robot, isa, share)));
     let mut blocked = false;
     for (name, cloud) in clouds.chain(meshes) {
         let Some(cloud) = cloud else { continue };
@@ -356,6 +362,18 @@ fn add_clouds(
         compiled.clouds.push(Arc::new(cloud));
     }
     blocked
+}
+
+/// Small clouds of one radius that the same links may touch, and each other cloud by itself: every one of these gets a grid of its own.
+fn joined<'c>(clouds: &'c [Cloud], mechanism: &Mechanism) -> Vec<Vec<&'c Cloud>> {
+    let mut joined: BTreeMap<(u64, Vec<usize>), Vec<&Cloud>> = BTreeMap::new();
+    let (small, large): (Vec<&Cloud>, Vec<&Cloud>) =
+        clouds.iter().partition(|cloud| cloud.points().len() <= SMALL_CLOUD);
+    for cloud in small {
+        let free = (0..mechanism.links.len()).filter(|link| !mechanism.is_kept_from(*link, &cloud.name));
+        joined.entry((cloud.radius_m().to_bits(), free.collect())).or_default().push(cloud);
+    }
+    large.into_iter().map(|cloud| vec![cloud]).chain(joined.into_values()).collect()
 }
 
 fn compile_row(order: &[usize], obstacles: &[Obstacle]) -> Row {

@@ -55,7 +55,15 @@ fn lines(text: &str) -> Result<Vec<Triangle>, MeshError> {
         let Some(keyword) = words.next().map(str::to_ascii_lowercase) else { continue };
         last = index + 1;
         open = match (keyword.as_str(), open) {
-            ("solid", Open::Nothing) => Open::Solid,
+            ("solid", Open::Nothing) => {
+                // The rest of the line is the solid's name.
+                if words.any(|word| word.eq_ignore_ascii_case("facet")) {
+                    let reason =
+                        "`facet` on the line of its `solid` is read as a name: begin a new line before it".to_owned();
+                    return Err(MeshError::Text { line: index + 1, reason });
+                }
+                Open::Solid
+            }
             ("facet", Open::Solid) => Open::Facet(Vec::new()),
             ("vertex", Open::Facet(mut corners)) => {
                 let numbers: Vec<f64> = words.map_while(|word| word.parse().ok()).take(4).collect();

@@ -65,11 +65,11 @@ impl Bounds {
 
 /// The radius of the balls for this mesh and a radius wanted, in metres.
 pub fn radius(mesh: &Mesh, wanted: f64) -> f64 {
-    balls(mesh.triangles(), &Bounds::EVERYWHERE, wanted).0
+    balls(mesh.triangles(), &Bounds::EVERYWHERE, wanted, MOST_SAMPLES).0
 }
 
-/// The radius of the balls for what of some triangles is within bounds, and about how many they are.
-pub(crate) fn balls(triangles: &[[[f64; 3]; 3]], within: &Bounds, wanted: f64) -> (f64, usize) {
+/// The radius of the balls for what of some triangles is within bounds, `most` of them beside one for each, and about how many they are.
+pub(crate) fn balls(triangles: &[[[f64; 3]; 3]], within: &Bounds, wanted: f64, most: usize) -> (f64, usize) {
     // Of each piece, its area and its longest extent.
     let sizes: Vec<[f64; 2]> =
         triangles.iter().filter_map(|t| Piece::new(t, within)).map(|piece| piece.size()).collect();
@@ -81,7 +81,7 @@ pub(crate) fn balls(triangles: &[[[f64; 3]; 3]], within: &Bounds, wanted: f64) -
     };
     // Always of the same series, so that less of a mesh has no larger balls.
     let mut radius = wanted;
-    while more(radius) > MOST_SAMPLES as f64 {
+    while more(radius) > most as f64 {
         radius *= LARGER;
     }
     (radius, sizes.len() + more(radius) as usize)

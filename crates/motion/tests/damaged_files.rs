@@ -1,16 +1,24 @@
 //! Small files of every format, cut and changed at random: reading them neither panics nor takes long, and takes memory in proportion to the
-//! file.
+//! file. Nor do many small obstacles take memory out of proportion.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 #![allow(clippy::disallowed_methods, reason = "what hangs is noticed by the clock")]
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use ratn_model::pose::Pose;
+use ratn_motion::cloud::Cloud;
+use ratn_motion::exact::Exact;
 use ratn_motion::inside::Inside;
+use ratn_motion::mechanism::Mechanism;
 use ratn_motion::mesh::Mesh;
 use ratn_motion::point_files;
+use ratn_motion::problems::Problems;
+use ratn_motion::space::Space;
+use ratn_motion::surroundings::MeshObstacle;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// Files of each format that are made.
@@ -193,8 +201,82 @@ fn read(name: &str, bytes: &[u8]) -> bool {
     }
 }
 
+/// One test at a time: what is held is counted for all.
+static COUNTED: Mutex<()> = Mutex::new(());
+
+/// What making something holds at the most, in bytes.
+fn most_held<T>(make: impl FnOnce() -> T) -> usize {
+    let held = HELD.load(Ordering::Relaxed);
+    MOST.store(held, Ordering::Relaxed);
+    drop(make());
+    MOST.load(Ordering::Relaxed) - held
+}
+
+#[test]
+fn many_small_clouds_and_a_mesh_that_stands_there_often_take_little_memory() {
+    let _alone = COUNTED.lock();
+    let shape = "<collision><origin xyz='0.4 0 0'/><geometry><sphere radius='0.05'/></geometry></collision>";
+    let urdf = format!(
+        "<robot name='r'><link name='base'/><link name='l'>{shape}</link><joint name='j' type='revolute'><parent link='base'/>\
+         <child link='l'/><axis xyz='0 0 1'/><limit lower='-1' upper='1' velocity='1' effort='1'/></joint></robot>"
+    );
+    let mechanism = Mechanism::read(&urdf, None, &[]).unwrap();
+    let at = |i: usize| [0.4 + 1e-4 * i as f32, 0.001 * (i % 7) as f32, 0.2];
+    let cloud = |i: usize| Cloud::new("crumb", &[at(i)], 0.01).unwrap();
+    let clouds: Vec<Cloud> = (0..300).map(cloud).collect();
+    let held = most_held(|| (0..300).map(cloud).collect::<Vec<_>>());
+    assert!(held < 1 << 20, "{held} bytes for 300 points");
+    let held = most_held(|| Space::new(&mechanism, &clouds[..]));
+    assert!(held < 8 << 20, "{held} bytes for 300 points in a space");
+    let whole = Cloud::new("all", &(0..300).map(at).collect::<Vec<_>>(), 0.01).unwrap();
+    let (mut many, mut one) = (Space::new(&mechanism, &clouds[..]), Space::new(&mechanism, &[whole][..]));
+    for i in -50..50 {
+        let state = std::array::from_fn(|j| if j == 0 { 0.02 * i as f32 } else { 0.0 });
+        assert_eq!(many.is_free(&state), one.is_free(&state), "{state:?}");
+    }
+    // 2,048 triangles, two hundred times.
+    let grid = |x: usize, y: usize| [0.01 * x as f64, 0.01 * y as f64, 0.001 * ((x * y) % 5) as f64];
+    let cell = |x: usize, y: usize| {
+        let [a, b, c, d] = [grid(x, y), grid(x + 1, y), grid(x + 1, y + 1), grid(x, y + 1)];
+        [[a, b, c], [a, c, d]]
+    };
+    let triangles = (0..1024).flat_map(|i| cell(i % 32, i / 32)).collect();
+    let mesh = Arc::new(Mesh::new(triangles).unwrap());
+    let obstacle = |i: usize| {
+        let pose = Pose::at(5.0 + i as f64, 0.0, 0.0);
+        MeshObstacle { name: format!("sheet {i}"), pose, mesh: Arc::clone(&mesh), overhang_m: 0.005 }
+    };
+    let meshes: Vec<MeshObstacle> = (0..200).map(obstacle).collect();
+    let one = most_held(|| Exact::new(&mechanism, &meshes[..1]));
+    let all = most_held(|| Exact::new(&mechanism, &meshes[..]));
+    assert!(all < 2 * one, "{one} bytes for one, {all} for two hundred");
+}
+
+#[test]
+fn the_meshes_of_a_problem_count_as_often_as_they_stand_there() {
+    let _alone = COUNTED.lock();
+    let stl = {
+        let mut bytes = vec![b' '; 80];
+        bytes.extend(50_000_u32.to_le_bytes());
+        bytes.resize(84 + 50_000 * 50, 0);
+        bytes
+    };
+    let problems = |count: usize| {
+        let object = r#"{"name": "part", "type": "mesh", "file": "part.stl"}"#;
+        let text = format!(
+            r#"{{"joints": ["j"], "problems": {{"a": [{{"start": [0], "goal": [1], "objects": [{}]}}]}}}}"#,
+            vec![object; count].join(",")
+        );
+        Problems::parse_with_files(&text, &mut |_| Ok(stl.clone())).map_err(|error| error.to_string())
+    };
+    assert_eq!(problems(80).unwrap().classes["a"][0].meshes.len(), 80);
+    let refused = problems(81).unwrap_err();
+    assert!(refused.contains("4050000") && refused.contains("4000000") && refused.contains("`part`"), "{refused}");
+}
+
 #[test]
 fn a_damaged_file_is_read_or_refused_at_once_and_in_little_memory() {
+    let _alone = COUNTED.lock();
     for (format, (name, whole)) in files().into_iter().enumerate() {
         assert!(read(name, &whole), "{name}, format {format}");
         let mut random = ChaCha8Rng::seed_from_u64(format as u64);

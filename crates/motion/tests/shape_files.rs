@@ -348,3 +348,199 @@ fn columns_of_points_are_not_taken_for_each_other() {
     assert_eq!(points("a.csv", b"1,5;2,5;3,5\n").unwrap_err(), "line 1: a point has three numbers");
     assert!(points("a.xyz", b"1 2 3\n4 5").is_err());
 }
+
+#[test]
+fn entities_of_a_document_type_are_refused() {
+    let plain = collada("", &polylist("<vcount>4 4 4 4 4 4</vcount>", CUBE), "", SHOWN);
+    let entities = "<!DOCTYPE COLLADA [<!ENTITY a '1 2 3 4 5 6 7 8'><!ENTITY b '&a;&a;&a;&a;'>]>\n";
+    let refused = mesh("a.dae", &format!("<?xml version='1.0'?>\n{entities}{plain}")).unwrap_err();
+    assert!(refused.contains("line 3") && refused.contains("DOCTYPE"), "{refused}");
+    // In the attributes of the outermost element, too.
+    let long = format!("<!DOCTYPE COLLADA [<!ENTITY a '{}'>]>\n", "x".repeat(1 << 18));
+    let root = plain.replacen("version='1.4.1'", &format!("version='{}'", "&a;".repeat(64)), 1);
+    let refused = mesh("a.dae", &format!("{long}{root}")).unwrap_err();
+    assert!(refused.contains("attribute") || refused.contains("DOCTYPE"), "{refused}");
+}
+
+#[test]
+fn a_collada_accessor_names_an_array_that_is_there() {
+    let plain = collada("", &polylist("<vcount>4 4 4 4 4 4</vcount>", CUBE), "", SHOWN);
+    assert!(mesh("a.dae", &plain).is_ok());
+    let refused = mesh("a.dae", &plain.replace("accessor source='#a'", "accessor source='#b'")).unwrap_err();
+    assert!(refused.contains("`b`"), "{refused}");
+    let refused = mesh("a.dae", &plain.replace("accessor source='#a'", "accessor")).unwrap_err();
+    assert!(refused.contains("`accessor`") && refused.contains("`source`"), "{refused}");
+}
+
+/// `count` geometries whose sources all read one array of `numbers` numbers.
+fn shared_array(count: usize, numbers: usize) -> String {
+    let array = vec!["1"; numbers].join(" ");
+    let geometry = |i: usize| {
+        format!(
+            "<geometry id='g{i}'><mesh><source id='s{i}'><technique_common><accessor source='#a' count='{}' stride='3'/>\
+             </technique_common></source><vertices id='v{i}'><input semantic='POSITION' source='#s{i}'/></vertices>\
+             <triangles><input semantic='VERTEX' source='#v{i}' offset='0'/><p>0 1 2</p></triangles></mesh></geometry>",
+            numbers / 3
+        )
+    };
+    let all: String = (0..count).map(geometry).collect();
+    format!(
+        "<COLLADA><library_geometries>{all}<source><float_array id='a'>{array}</float_array></source></library_geometries></COLLADA>"
+    )
+}
+
+#[test]
+fn sources_that_share_a_long_array_are_bounded() {
+    assert_eq!(mesh("a.dae", &shared_array(3, 30_000)).unwrap().triangles().len(), 3);
+    let refused = mesh("a.dae", &shared_array(400, 30_000)).unwrap_err();
+    assert!(refused.contains("positions") && refused.contains("3000000"), "{refused}");
+}
+
+#[test]
+fn a_line_of_an_obj_goes_on_after_a_backslash() {
+    let corners = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n";
+    let all = mesh("a.obj", &format!("{corners}f 1//1 2//1 3//1 4//1\n")).unwrap();
+    for face in ["f 1//1 2//1 \\\n3//1 4//1\n", "f 1//1 2//1 3//1\\\n 4//1\n", "f 1//1 2//1 \\\r\n  3//1 \\\r\n 4//1"] {
+        assert_eq!(mesh("a.obj", &format!("{corners}{face}")).as_ref(), Ok(&all), "{face}");
+    }
+    // Whether a number goes on cannot be told.
+    let refused = mesh("a.obj", &format!("{corners}f 1//1 2//1 3//1\\\n4//1\n")).unwrap_err();
+    assert!(refused.contains("line 5") && refused.contains('\\'), "{refused}");
+    let refused = mesh("a.obj", &format!("{corners}f 1 2 3 \\")).unwrap_err();
+    assert!(refused.contains("line 5") && refused.contains("cut off"), "{refused}");
+    // Lines are counted as in the file.
+    let refused = mesh("a.obj", &format!("{corners}f 1 \\\n 2 3\nf 1 2 9\n")).unwrap_err();
+    assert!(refused.contains("line 7"), "{refused}");
+}
+
+#[test]
+fn a_facet_on_the_line_of_its_solid_is_refused() {
+    let facet = "facet normal 0 0 1 outer loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n";
+    let whole = format!("solid a\n{facet}{facet}endsolid a\n");
+    assert_eq!(mesh("a.stl", &whole).unwrap().triangles().len(), 2);
+    let joined = facet.replace('\n', " ");
+    let refused = mesh("a.stl", &format!("solid a {joined}\n{facet}endsolid a\n")).unwrap_err();
+    assert!(refused.contains("line 1") && refused.contains("`facet`"), "{refused}");
+}
+
+#[test]
+fn a_list_of_points_that_was_cut_within_its_last_line_is_refused() {
+    let whole = "1 2 3 255 0 0\n4 5 6 0 255 0\n";
+    assert_eq!(points("a.xyz", whole.as_bytes()).as_deref(), Ok(&EXPECTED[..]));
+    assert_eq!(points("a.xyz", whole.trim_end().as_bytes()).as_deref(), Ok(&EXPECTED[..]));
+    for end in ["4 5 6", "4 5 6 0", "4 5 6 0 255"] {
+        let refused = points("a.xyz", format!("1 2 3 255 0 0\n{end}").as_bytes()).unwrap_err();
+        assert!(refused.contains("line 2") && refused.contains("cut off"), "{refused}");
+    }
+    // A number that ends early cannot be told from a whole one, nor a file that ends with a line.
+    assert!(points("a.xyz", b"1 2 3\n4 5 6.2").is_ok());
+    // Of a line that ends, more or fewer columns behind the point say nothing.
+    assert!(points("a.xyz", b"1 2 3 255\n4 5 6\n").is_ok());
+}
+
+#[test]
+fn heights_with_empty_fields_decimal_commas_or_values_above_the_greatest_are_refused() {
+    use ratn_motion::heightfield::Heights;
+    let heights = |bytes: &[u8]| Heights::read(bytes, 1.0).map_err(|error| error.to_string());
+    let plain = heights(b"1 2 3\n4 5 6\n").unwrap();
+    for same in
+        ["1,2,3\n4,5,6\n", "1; 2 ;3\n4;5;6", "1\t2  3\r\n4 5 6\r\n", "# heights\n 1, 2, 3\n\n4, 5, 6 # the last\n"]
+    {
+        assert_eq!(heights(same.as_bytes()).as_ref(), Ok(&plain), "{same}");
+    }
+    for (wrong, parts) in [
+        ("1,2,3\n4,,6\n", &["line 2", "field 2", "empty"][..]),
+        ("1,2,3\n4,5,\n", &["line 2", "field 3", "empty"]),
+        (",1,2\n,4,5\n", &["line 1", "field 1", "empty"]),
+        ("1;;3\n4;5;6\n", &["line 1", "field 2", "empty"]),
+        ("1,5;2,5\n3,5;4,5\n", &["line 1", "`1,5`", "comma"]),
+        ("1,5 2,5\n3,5 4,5\n", &["line 1", "comma"]),
+        ("1 2,3\n4 5,6\n", &["line 1", "`1 2`"]),
+    ] {
+        let refused = heights(wrong.as_bytes()).unwrap_err();
+        assert!(parts.iter().all(|part| refused.contains(part)), "{wrong}: {refused}");
+    }
+    let grey = |most: &str, values: &[u8]| [format!("P5\n2 2\n{most}\n").as_bytes(), values].concat();
+    assert!(heights(&grey("100", &[0, 50, 99, 100])).is_ok());
+    for refused in [
+        heights(&grey("100", &[0, 50, 101, 7])),
+        heights(b"P2 2 2 100\n0 50\n101 7\n"),
+        heights(&grey("300", &[0, 1, 1, 45, 1, 44, 0, 0])),
+    ] {
+        let refused = refused.unwrap_err();
+        assert!(refused.contains("101") || refused.contains("301"), "{refused}");
+        assert!(refused.contains("at byte") && refused.contains("greatest"), "{refused}");
+    }
+}
+
+/// Two triangles per side.
+fn block(least: [f64; 3], greatest: [f64; 3]) -> Vec<Triangle> {
+    let corner = |i: usize| std::array::from_fn(|axis| if i >> axis & 1 == 0 { least[axis] } else { greatest[axis] });
+    let sides = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+    sides.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]).map(|t| t.map(corner)).collect()
+}
+
+fn turned(triangles: &[Triangle]) -> Vec<Triangle> {
+    triangles.iter().map(|[a, b, c]| [*a, *c, *b]).collect()
+}
+
+fn inside(parts: &[Vec<Triangle>]) -> Inside {
+    Inside::new(&Mesh::new(parts.concat()).unwrap())
+}
+
+#[test]
+fn bodies_that_touch_along_an_edge_are_solid_each_by_itself() {
+    let (first, second) = (block([0.0; 3], [2.0; 3]), block([2.0, 2.0, 0.0], [4.0, 4.0, 2.0]));
+    // A third overlaps the second.
+    let third = block([3.0, 3.0, 0.5], [5.0, 5.0, 1.5]);
+    let some = second[..3].to_vec();
+    let cases = [
+        vec![first.clone(), second.clone(), third.clone()],
+        vec![first.clone(), turned(&second), third.clone()],
+        vec![turned(&first), second.clone(), turned(&third)],
+        // Triangles from both sides, and twice.
+        vec![first.clone(), second.clone(), turned(&some), third.clone()],
+        vec![first.clone(), second.clone(), some, third.clone()],
+    ];
+    for (case, parts) in cases.iter().enumerate() {
+        let all = inside(parts);
+        for at in [[1.0, 1.0, 1.1], [2.5, 2.5, 0.9], [3.5, 3.6, 1.0], [4.5, 4.4, 1.0], [3.2, 3.1, 0.2]] {
+            assert!(all.contains(at), "case {case}: {at:?}");
+        }
+        for at in [[1.0, 3.0, 1.0], [3.0, 1.0, 1.0], [4.5, 4.4, 0.2]] {
+            assert!(!all.contains(at), "case {case}: {at:?}");
+        }
+    }
+    // What is open has no inside, and takes nothing from the body beside it.
+    let all = inside(&[first, second[..second.len() - 1].to_vec()]);
+    assert!(all.contains([1.0, 1.0, 1.1]) && !all.contains([2.5, 2.5, 0.9]));
+}
+
+#[test]
+fn a_part_that_stands_out_between_its_corners_is_no_hollow() {
+    // A dish, thick at its rim and thin in the middle, and a plate that is turned the other way and goes through it there.
+    let rim = [[-2.0, -2.0], [2.0, -2.0], [2.0, 2.0], [-2.0, 2.0]];
+    let mut dish = Vec::new();
+    for i in 0..4 {
+        let ([a, b], [c, d]) = (rim[i], rim[(i + 1) % 4]);
+        dish.push([[a, b, 1.0], [c, d, 1.0], [0.3, 0.1, 0.05]]);
+        dish.push([[a, b, -1.0], [0.3, 0.1, -0.05], [c, d, -1.0]]);
+        dish.extend([[[a, b, -1.0], [c, d, -1.0], [c, d, 1.0]], [[a, b, -1.0], [c, d, 1.0], [a, b, 1.0]]]);
+    }
+    let plate = |half: f64| turned(&block([-1.4, -1.4, -half], [1.4, 1.4, half]));
+    assert!(!inside(&[dish.clone(), plate(0.02)]).contains([0.9, 0.7, 0.0]), "a hollow within the dish");
+    for at in [[0.3, 0.1, 0.08], [0.9, 0.7, 0.0]] {
+        assert!(inside(&[dish.clone(), plate(0.1)]).contains(at), "{at:?} is in the plate that goes through the dish");
+    }
+}
+
+#[test]
+#[allow(clippy::disallowed_methods, reason = "what takes long is noticed by the clock")]
+fn many_parts_above_one_another_are_one_column_after_another() {
+    const PARTS: usize = 80_000;
+    let part = |i: usize| block([0.0, 0.0, i as f64 * 1e-2], [1.0, 1.0, i as f64 * 1e-2 + 5e-3]);
+    let stack = inside(&(0..PARTS).map(part).collect::<Vec<_>>());
+    let start = std::time::Instant::now();
+    assert_eq!(stack.column(0.3, 0.4).len(), PARTS);
+    assert!(start.elapsed().as_secs_f64() < 1.0, "{:?}", start.elapsed());
+}
