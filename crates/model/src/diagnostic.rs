@@ -98,6 +98,11 @@ impl Findings {
         }
     }
 
+    /// Whether a rule has found something in a place.
+    pub(crate) fn has(&self, rule: &str, location: Location) -> bool {
+        self.list.iter().any(|d| d.rule == rule && d.location == location)
+    }
+
     pub(crate) fn has_errors(&self) -> bool {
         self.list.iter().any(|d| d.severity == Severity::Error)
     }

@@ -16,6 +16,7 @@
 //!     do: [...]
 //! ```
 
+mod advice;
 mod effects;
 mod fields;
 mod flow;
@@ -142,7 +143,8 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     let root = match yaml::read(source) {
         Ok(root) => root,
         Err(error) => {
-            out.findings.error("invalid-yaml", error.at, "", error.message, "");
+            let help = advice::advice(source, &error);
+            out.findings.error("invalid-yaml", error.at, "", error.message, help);
             return None;
         }
     };

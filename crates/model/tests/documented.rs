@@ -67,6 +67,16 @@ fn every_fragment_of_the_document_reads_but_for_what_it_takes_from_elsewhere() {
 }
 
 #[test]
+fn no_state_of_the_document_is_called_what_other_readers_of_yaml_take_for_a_boolean() {
+    for block in blocks("yaml").into_iter().chain(blocks("yaml fragment")) {
+        for key in block.lines().filter_map(|line| line.trim_start().trim_start_matches("- ").split_once(':')) {
+            let name = key.0.to_ascii_lowercase();
+            assert!(!["y", "n", "yes", "no", "on", "off", "true", "false"].contains(&name.as_str()), "{name}\n{block}");
+        }
+    }
+}
+
+#[test]
 fn the_document_lists_the_rules_that_there_is_a_bad_task_for_and_no_others() {
     let documented: BTreeSet<String> =
         rows("The rules of `check`").iter().map(|cells| quoted(cells[0])[0].to_owned()).collect();

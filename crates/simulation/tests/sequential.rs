@@ -4,14 +4,20 @@
 
 mod support;
 
+use ratn_model::resource::Quantity;
 use ratn_simulation::sequential::{Assumptions, Obstacle, Sequential, sequential};
 use std::collections::BTreeMap;
 use support::{NoFiles, catalogue, load};
 
 fn check(text: &str) -> Result<Sequential, Obstacle> {
+    check_with_brains(text, 2)
+}
+
+fn check_with_brains(text: &str, brains: u32) -> Result<Sequential, Obstacle> {
     let program = load(text, "task.yaml", &NoFiles);
     let parameters = program.bind_parameters(&[]).unwrap();
-    let assumptions = Assumptions { parameters, elements: 2, durations_s: BTreeMap::new(), units: BTreeMap::new() };
+    let units = BTreeMap::from([("Brain".to_owned(), Quantity::whole(brains))]);
+    let assumptions = Assumptions { parameters, elements: 2, durations_s: BTreeMap::new(), units };
     sequential(&program, &catalogue(), &assumptions)
 }
 
@@ -103,4 +109,51 @@ fn a_task_that_cannot_be_brought_to_its_end_says_why() {
     let obstacle = check(task).unwrap_err().to_string();
     assert!(obstacle.starts_with("with assumed outputs the task ends in HSM mode with `aborted`"), "{obstacle}");
     assert!(obstacle.contains("door(open)"), "{obstacle}");
+}
+
+#[test]
+fn of_two_visits_that_end_together_the_chain_names_the_one_whose_output_is_taken() {
+    let task = "task: t\nstates:\n  - for: b in [1, 2]\n    do:
+    - plan: { action: brain/think, in: { a: $b }, computes: true, reads: [], resources: [{ block: Brain }], duration: 5 }
+    - go: { action: arm/move, in: { a: plan.x }, pia: true, reads: [], effects: [], resources: [{ block: Arm }], duration: 1 }\n";
+    let found = check(task).unwrap();
+    assert_eq!(found.cdtn_s, 7.0);
+    let chain: Vec<(&str, &str)> = found.chain.iter().map(|l| (l.path.as_str(), l.because.as_str())).collect();
+    assert_eq!(
+        chain,
+        [
+            ("for_b[0]/plan", "it is the first"),
+            ("for_b[0]/go", "it takes an output of the one before"),
+            ("for_b[1]/go", "the one before held Arm")
+        ]
+    );
+}
+
+#[test]
+fn a_handler_that_is_planned_for_in_vain_could_be_exceptional() {
+    let think = |name: &str, input: &str, more: &str| {
+        format!(
+            "  - {name}: {{ action: brain/think, in: {{ a: {input} }}, computes: true, reads: [], \
+             resources: [{{ block: Brain }}], duration: 8{more} }}\n"
+        )
+    };
+    let task = |marked: &str| {
+        format!(
+            "task: t\nstates:\n  - look: {{ action: eye/look, computes: true, reads: [], resources: [{{ block: Eye }}], duration: 2 }}\n  \
+             - go: {{ action: arm/move, in: {{ a: 1 }}, pia: true, reads: [], effects: [], \
+             resources: [{{ block: Arm }}], duration: 10, transitions: {{ aborted: rescue }}{marked} }}\n{}{}{}{}",
+            think("next", "look.list", ""),
+            "  - come: { action: arm/move, in: { a: next.x }, pia: true, reads: [], effects: [], resources: [{ block: Arm }], \
+             duration: 1, transitions: { success: success } }\n",
+            think("rescue", "3", ""),
+            "  - home: { action: arm/move, in: { a: rescue.x }, pia: true, reads: [], effects: [], resources: [{ block: Arm }], \
+             duration: 20 }\n"
+        )
+    };
+    let found = check_with_brains(&task(""), 1).unwrap();
+    let gains: Vec<(&str, f64)> = found.exceptional.iter().map(|gain| (gain.path.as_str(), gain.alone_s)).collect();
+    let marked = check_with_brains(&task(", exceptional: [aborted]"), 1).unwrap();
+    assert!(marked.exceptional.is_empty(), "{:?}", marked.exceptional);
+    assert_eq!(gains, [("go", found.cdtn_s - marked.cdtn_s)]);
+    assert!(found.cdtn_s > marked.cdtn_s, "{} {}", found.cdtn_s, marked.cdtn_s);
 }

@@ -116,21 +116,30 @@ fn report(sequential: &Sequential) -> String {
     for Link { path, began_s, ended_s, because } in sequential.chain.iter().skip(hidden) {
         lines.push(format!("{began_s:>9.1} – {ended_s:>7.1} s  {path:<width$}  {because}"));
     }
+    if !sequential.exceptional.is_empty() {
+        lines.push("\nwhat not computing ahead for a failure would gain, if it is seldom:".to_owned());
+        lines.extend(gains(&sequential.exceptional));
+    }
     if sequential.gains.is_empty() {
         lines.push("\nevery state that is executed says what it reads and changes".to_owned());
         return lines.join("\n");
     }
     lines.push("\nwhat annotating would gain, if nothing is read or changed but what the state names:".to_owned());
-    lines.push("    alone           with all the others".to_owned());
-    for Gain { path, missing, alone_s, alone_percent, last_s } in &sequential.gains {
-        let keys = missing.join(", ");
-        lines.push(format!("{alone_s:>7.1} s {alone_percent:>5.1} %  {last_s:>8.1} s          {path}: {keys}"));
-    }
+    lines.extend(gains(&sequential.gains));
     if let Some(annotated_s) = sequential.annotated_s {
         let less = improvement(*hsm_s, annotated_s);
         lines.push(format!("all of them: {annotated_s:.1} s ({less:.1} % less than as written)"));
     }
     lines.join("\n")
+}
+
+/// A table of what could be said, under a head.
+fn gains(gains: &[Gain]) -> Vec<String> {
+    let row = |gain: &Gain| {
+        let Gain { path, missing, alone_s, alone_percent, last_s } = gain;
+        format!("{alone_s:>7.1} s {alone_percent:>5.1} %  {last_s:>8.1} s          {path}: {}", missing.join(", "))
+    };
+    std::iter::once("    alone           with all the others".to_owned()).chain(gains.iter().map(row)).collect()
 }
 
 fn read(path: &Path) -> Result<String, Failure> {

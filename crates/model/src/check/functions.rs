@@ -2,11 +2,14 @@
 //! the task says that there is such a fact and a function is called almost so, it is meant; and a fact that nothing writes or declares
 //! is told of, since it is null wherever it is read.
 
+use super::types::Wrong;
 use super::{Subject, expressions, named};
 use crate::diagnostic::Findings;
-use crate::expression::{Comprehension, EffectExpr, Expr, Function};
+use crate::expression::{Comprehension, EffectExpr, Expr, FactExpr, Function};
 use crate::load::distance;
+use crate::program::Program;
 use crate::slot::Slot;
+use crate::value::Type;
 use std::collections::BTreeSet;
 
 /// So long a name may differ in two letters, a shorter one in one.
@@ -14,41 +17,67 @@ const LONG_NAME: usize = 8;
 /// So short a function's name is close to too many words to refuse one.
 const SHORT_NAME: usize = 3;
 
-/// Functions of other languages that people write: none of them is here, and no task has facts of such names unless it says so.
-const OF_OTHER_LANGUAGES: [&str; 32] = [
-    "acos",
-    "asin",
-    "atan",
-    "atan2",
-    "avg",
-    "bool",
-    "ceil",
-    "contains",
-    "cos",
-    "count",
-    "degrees",
-    "dist",
-    "enumerate",
-    "exp",
-    "float",
-    "int",
-    "keys",
-    "length",
-    "log",
-    "mean",
-    "norm",
-    "now",
-    "pow",
-    "radians",
-    "random",
-    "round",
-    "sin",
-    "size",
-    "str",
-    "tan",
-    "values",
-    "zip",
+/// Functions of other languages that people write, and what does the same here: none of them is here, and no task has facts of such
+/// names unless it says so.
+const OF_OTHER_LANGUAGES: [(&str, &str); 36] = [
+    ("acos", ""),
+    ("asin", ""),
+    ("atan", ""),
+    ("atan2", ""),
+    ("avg", "sum(list) / len(list)"),
+    ("bool", ""),
+    ("ceil", "-floor(-x)"),
+    ("contains", "x in list"),
+    ("cos", ""),
+    ("count", "len(list)"),
+    ("degrees", "x * 57.29578"),
+    ("dist", "distance(pose, pose)"),
+    ("enumerate", "for: x in list, with index: i"),
+    ("exp", ""),
+    ("float", "1.0 * x"),
+    ("int", "floor(x)"),
+    ("keys", ""),
+    ("length", "len(list)"),
+    ("log", ""),
+    ("mean", "sum(list) / len(list)"),
+    ("norm", "distance(pose, pose)"),
+    ("now", ""),
+    ("pow", "x * x"),
+    ("radians", "x / 57.29578"),
+    ("random", ""),
+    ("reversed", "reverse(list)"),
+    ("round", "floor(x + 0.5)"),
+    ("rotate", "compose(pose, pose)"),
+    ("sin", ""),
+    ("size", "len(list)"),
+    ("sorted", "sort(list)"),
+    ("str", "concat(a, b, …)"),
+    ("tan", ""),
+    ("transform", "compose(pose, pose)"),
+    ("values", ""),
+    ("zip", ""),
 ];
+
+/// Why a fact that is about what no fact can be about is a function that is not there.
+pub(super) fn no_fact(program: &Program, fact: &FactExpr, about: &Type) -> Wrong {
+    let name = fact.predicate.as_str();
+    let whole = named(program, &Expr::Fact(fact.clone()));
+    let article = if matches!(about, Type::Record(_)) { "a map" } else { &format!("{about}") };
+    let message = format!(
+        "`{whole}`: there is no function `{name}`, and it is no fact: those are about individuals and ints, not about {article}"
+    );
+    let help = match (meant(name, fact.arguments.len()), elsewhere(name)) {
+        (Some((_, usage, _)), _) => format!("did you mean `{usage}`?"),
+        (None, Some(here)) if !here.is_empty() => format!("write `{here}`"),
+        _ => "the functions that there are stand in docs/task-files.md".to_owned(),
+    };
+    Wrong { rule: "unknown-function", message, help }
+}
+
+/// What does here what a function of another language does; empty where nothing does.
+fn elsewhere(name: &str) -> Option<&'static str> {
+    OF_OTHER_LANGUAGES.iter().find(|(other, _)| *other == name).map(|(_, here)| *here)
+}
 
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     let program = subject.program;
@@ -56,12 +85,16 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     let mut told = BTreeSet::new();
     for state in &program.states {
         for (slot, expr) in expressions(program, state) {
+            let at = subject.place_of(state, slot);
+            // One is refused already, for what it is about.
+            if findings.has("unknown-function", at) {
+                continue;
+            }
             for fact in expr.fact_expressions() {
                 let name = fact.predicate.as_str();
                 if known.contains(name) || fact.arguments.iter().any(Option::is_none) {
                     continue;
                 }
-                let at = subject.place_of(state, slot);
                 let whole = named(program, &Expr::Fact(fact.clone()));
                 let message = format!("`{whole}` is read as a fact, and nothing in the task says that there is one");
                 let declare = "name it in `reads`, `world` or the effects of a state";
@@ -76,10 +109,12 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
                             findings.warning("unknown-function", at, &state.path, message, help);
                         }
                     }
-                    (None, _) if OF_OTHER_LANGUAGES.contains(&name) => {
-                        let help = format!(
-                            "there is no function `{name}`; those that there are stand in docs/task-files.md. If it is a fact, {declare}"
-                        );
+                    (None, _) if let Some(here) = elsewhere(name) => {
+                        let instead = match here {
+                            "" => "those that there are stand in docs/task-files.md".to_owned(),
+                            here => format!("write `{here}`"),
+                        };
+                        let help = format!("there is no function `{name}`: {instead}. If it is a fact, {declare}");
                         findings.error("unknown-function", at, &state.path, message, help);
                     }
                     // `unestablished-precondition` says it.

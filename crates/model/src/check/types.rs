@@ -1,6 +1,6 @@
 //! The types of expressions, as far as they are known before anything runs; `any` fits everywhere and is checked then.
 
-use super::{Subject, Variables, constants, expressions, named};
+use super::{Subject, Variables, constants, expressions, functions, named};
 use crate::diagnostic::Findings;
 use crate::expression::{BinaryOperator, Comprehension, EffectExpr, Expr, Function, UnaryOperator};
 use crate::program::{Program, State, StateKind, TaskOutput};
@@ -25,19 +25,46 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
             }
             let at = subject.place_of(state, slot);
             match types.of(expr) {
-                Err(message) => findings.error("type-mismatch", at, &state.path, message, ""),
+                Err(Wrong { rule, message, help }) => findings.error(rule, at, &state.path, message, help),
                 Ok(found) => {
                     if let Some(wanted) = wanted(subject, state, slot)
                         && !fits(&wanted, &found, expr)
                     {
                         let message = format!("`{}` is {wanted}; `{}` is {found}", what(slot), named(program, expr));
-                        findings.error("type-mismatch", at, &state.path, message, "");
+                        findings.error("type-mismatch", at, &state.path, message, written(&wanted, program, expr));
                     } else {
                         constants::check(subject, state, slot, expr, findings);
                     }
                 }
             }
         }
+    }
+}
+
+/// What is meant by a text where a boolean is wanted, if other languages have it for one.
+pub(crate) fn truth(text: &str) -> Option<&'static str> {
+    match text.to_ascii_lowercase().as_str() {
+        "true" | "yes" | "on" => Some("write `true`"),
+        "false" | "no" | "off" => Some("write `false`"),
+        _ => None,
+    }
+}
+
+/// How a value of another type is written as one of the wanted type; empty where nothing is known.
+fn written(wanted: &Type, program: &Program, expr: &Expr) -> String {
+    let called = |function: &str, items: &[Expr]| {
+        let items: Vec<String> = items.iter().map(|item| named(program, item)).collect();
+        format!("write \"{function}({})\"", items.join(", "))
+    };
+    match (wanted, expr) {
+        (Type::Joints, Expr::List(items)) => called("joints", items),
+        (Type::Pose, Expr::List(items)) if matches!(items.len(), 3 | 6) => called("pose", items),
+        (Type::Pose, Expr::List(_) | Expr::Map(_)) => {
+            "write \"pose(x, y, z)\" or \"pose(x, y, z, roll, pitch, yaw)\", in metres and radians".to_owned()
+        }
+        (Type::Bool, Expr::Literal(Value::String(text))) => truth(text).unwrap_or_default().to_owned(),
+        (Type::List(_), Expr::Literal(_)) => format!("write `[{}]`", named(program, expr)),
+        _ => String::new(),
     }
 }
 
@@ -157,11 +184,21 @@ struct Types<'a> {
     indirection: usize,
 }
 
-type Found = Result<Type, String>;
+type Found = Result<Type, Wrong>;
+
+/// Why an expression has no type.
+pub(super) struct Wrong {
+    pub(super) rule: &'static str,
+    pub(super) message: String,
+    pub(super) help: String,
+}
 
 impl Types<'_> {
     fn of(&self, expr: &Expr) -> Found {
-        let wrong = |message: String| Err(format!("`{}`: {message}", named(self.program, expr)));
+        let wrong = |message: String| {
+            let message = format!("`{}`: {message}", named(self.program, expr));
+            Err(Wrong { rule: "type-mismatch", message, help: String::new() })
+        };
         Ok(match expr {
             Expr::Literal(value) => of_value(value),
             Expr::Variable(name) => self.variables.get(name).cloned().unwrap_or(Type::Any),
@@ -201,7 +238,7 @@ impl Types<'_> {
             }
             Expr::Map(fields) => {
                 let typed = fields.iter().map(|(name, value)| Ok((name.clone(), self.of(value)?)));
-                Type::Record(typed.collect::<Result<BTreeMap<_, _>, String>>()?)
+                Type::Record(typed.collect::<Result<BTreeMap<_, _>, Wrong>>()?)
             }
             Expr::Call(function, arguments) => {
                 let types = arguments.iter().map(|a| self.of(a)).collect::<Result<Vec<_>, _>>()?;
@@ -211,7 +248,12 @@ impl Types<'_> {
                 }
             }
             Expr::Fact(fact) | Expr::Exists(fact) => {
-                fact.arguments.iter().flatten().try_for_each(|a| self.of(a).map(drop))?;
+                for argument in fact.arguments.iter().flatten() {
+                    let found = self.of(argument)?;
+                    if !(Type::String.accepts_type(&found) || Type::Int.accepts_type(&found) || found == Type::Any) {
+                        return Err(functions::no_fact(self.program, fact, &found));
+                    }
+                }
                 if matches!(expr, Expr::Exists(_)) { Type::Bool } else { Type::Any }
             }
             Expr::Query(conditions) => {
@@ -285,7 +327,7 @@ impl Types<'_> {
     }
 }
 
-fn call(function: Function, arguments: &[Expr], types: &[Type]) -> Found {
+fn call(function: Function, arguments: &[Expr], types: &[Type]) -> Result<Type, String> {
     let expect = |i: usize, wanted: Type| match types.get(i) {
         Some(found) if !wanted.accepts_type(found) => Err(format!("argument {} is {wanted}, found {found}", i + 1)),
         _ => Ok(()),
@@ -393,7 +435,7 @@ fn call(function: Function, arguments: &[Expr], types: &[Type]) -> Found {
     })
 }
 
-fn binary(operator: BinaryOperator, a: Type, b: Type) -> Found {
+fn binary(operator: BinaryOperator, a: Type, b: Type) -> Result<Type, String> {
     use BinaryOperator as Op;
     let both = |wanted: Type| match [&a, &b].into_iter().find(|found| !wanted.accepts_type(found)) {
         Some(found) => Err(format!("expected {wanted}, found {found}")),

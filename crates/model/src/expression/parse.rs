@@ -82,6 +82,10 @@ impl ParseError {
         ParseError { offset, rule: INVALID_EXPRESSION, message: message.into(), help: String::new() }
     }
 
+    pub(crate) fn with_help(self, help: impl Into<String>) -> ParseError {
+        ParseError { help: help.into(), ..self }
+    }
+
     fn name(offset: usize, error: NameError) -> ParseError {
         ParseError { offset, rule: error.rule, message: error.message, help: error.help }
     }
@@ -131,7 +135,24 @@ fn parse<T>(
     let result = what(&mut parser)?;
     match parser.peek() {
         Token::End => Ok(result),
-        other => Err(parser.unexpected(&format!("expected an operator or the end, found {}", other.described()))),
+        other => {
+            let error = parser.unexpected(&format!("expected an operator or the end, found {}", other.described()));
+            Err(error.with_help(meant(other)))
+        }
+    }
+}
+
+/// What somebody means by a token where an expression could have ended; empty where nothing is known.
+fn meant(token: &Token) -> String {
+    match token {
+        Token::Symbol("?") => "write `if(condition, a, b)`".to_owned(),
+        Token::Word(word) => match word.to_ascii_lowercase().as_str() {
+            lower @ ("and" | "or" | "not" | "in") => format!("write `{lower}`, in small letters"),
+            "is" => "write `=`".to_owned(),
+            "if" | "then" | "else" => "write `if(condition, a, b)`".to_owned(),
+            _ => String::new(),
+        },
+        _ => String::new(),
     }
 }
 

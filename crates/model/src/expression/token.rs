@@ -25,6 +25,9 @@ pub(crate) enum Token {
 const SYMBOLS: [&str; 22] =
     ["==", "!=", "<=", ">=", "=", "<", ">", "+", "-", "*", "/", "(", ")", "[", "]", "{", "}", ",", ".", ":", "?", "|"];
 
+/// What other languages write for a word of this one.
+const FOREIGN: [(&str, &str); 4] = [("&&", "and"), ("&", "and"), ("||", "or"), ("!", "not")];
+
 impl Token {
     /// As it stands in a message.
     pub(crate) fn described(&self) -> String {
@@ -69,8 +72,15 @@ pub(crate) fn tokens(text: &str) -> Result<Vec<(usize, Token)>, ParseError> {
         } else if c == '"' || c == '\'' {
             quoted(&characters, &mut at)?
         } else {
-            let symbol =
-                SYMBOLS.iter().find(|s| s.chars().enumerate().all(|(i, c)| characters.get(at + i) == Some(&c)));
+            let stands_here = |s: &str| s.chars().enumerate().all(|(i, c)| characters.get(at + i) == Some(&c));
+            let symbol = SYMBOLS.iter().find(|s| stands_here(s));
+            let foreign = FOREIGN.iter().find(|(foreign, _)| stands_here(foreign));
+            if let Some((foreign, word)) = foreign
+                && symbol.is_none_or(|symbol| foreign.len() > symbol.len())
+            {
+                let error = ParseError::syntax(start, format!("`{foreign}` is no operator here"));
+                return Err(error.with_help(format!("write `{word}`")));
+            }
             let Some(symbol) = symbol else {
                 return Err(ParseError::syntax(start, format!("unexpected character `{}`", c.escape_debug())));
             };

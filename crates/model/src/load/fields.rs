@@ -54,12 +54,18 @@ impl<'t, 'a> Fields<'t, 'a> {
 
     /// Complains of keys that are not known.
     pub(crate) fn keys(&mut self, node: &Node, known: &[&str]) {
+        // A key of nothing that is followed by one that does not belong here: its value is not indented.
+        let mut empty: Option<&str> = None;
         for entry in node.entries() {
             let key = entry.key.as_str();
             if known.contains(&key) {
+                empty = (entry.value.content == Content::Null).then_some(key);
                 continue;
             }
-            let help = suggestion(key, known.iter().copied(), "", "leave it out");
+            let help = match empty {
+                Some(above) => format!("if it belongs to `{above}`, indent it by two more blanks"),
+                None => suggestion(key, known.iter().copied(), "", "leave it out"),
+            };
             self.error("unknown-key", entry.at, format!("there is no key `{key}` here"), help);
         }
     }
@@ -144,7 +150,12 @@ impl<'t, 'a> Fields<'t, 'a> {
         match node.content {
             Content::Bool(b) => b,
             _ => {
-                self.error("type-mismatch", node.at, format!("expected true or false, found {}", node.described()), "");
+                let help = match &node.content {
+                    Content::Text(text) => crate::check::types::truth(text).unwrap_or_default(),
+                    _ => "",
+                };
+                let message = format!("expected true or false, found {}", node.described());
+                self.error("type-mismatch", node.at, message, help);
                 false
             }
         }

@@ -169,7 +169,9 @@ impl<'a> Builder<'a, '_> {
         let path = self.steps[parent.0 as usize].path.clone();
         let Content::List(items) = &list.content else {
             let message = format!("expected a list of states, found {}", list.described());
-            self.findings.error("invalid-state", list.at, &path, message, "write each state as `- name: {…}`");
+            let first = list.entries().first().map_or("name", |entry| entry.key.as_str());
+            let help = format!("write each state as `- {first}: {{…}}`, or with its keys in lines of their own below");
+            self.findings.error("invalid-state", list.at, &path, message, help);
             return Vec::new();
         };
         if depth >= MAX_DEPTH || self.steps.len() + items.len() > MAX_STATES {
@@ -201,6 +203,18 @@ impl<'a> Builder<'a, '_> {
     fn named(&mut self, item: &'a Node, path: &str) -> Option<(Option<String>, Location, &'a Node)> {
         let entries = item.entries();
         let is_form = |entry: &Entry| FORMS.contains(&entry.key.as_str());
+        // `- tuck:` with what belongs to it in the same column: the name is a key without a value.
+        if let [name, rest @ ..] = entries
+            && rest.iter().any(is_form)
+            && !is_form(name)
+            && is_word(&name.key)
+            && name.value.content == Content::Null
+        {
+            let message = format!("`{}` stands beside `{}` instead of in it", rest[0].key, name.key);
+            let help = format!("indent what belongs to `{}` by two more blanks", name.key);
+            self.findings.error("invalid-state", name.at, path, message, help);
+            return None;
+        }
         if let Some(form) = entries.iter().find(|e| is_form(e)) {
             if matches!(form.key.as_str(), "action" | "library" | "concurrency") {
                 let message = "this state has no name";
@@ -211,9 +225,22 @@ impl<'a> Builder<'a, '_> {
             return Some((None, item.at, item));
         }
         let [entry] = entries else {
-            let message = format!("expected `name: {{…}}`, found {}", item.described());
-            let help = "each state is one list item `- name: {…}`; mind the indentation of what belongs to it";
-            self.findings.error("invalid-state", item.at, path, message, help);
+            let (at, message, help) = match entries {
+                [name, other, ..] if matches!(name.value.content, Content::Map(_)) => (
+                    other.at,
+                    format!("`{}` stands beside the state `{}`", other.key, name.key),
+                    format!(
+                        "indent it as the keys of `{}` if it belongs to it; a state of its own begins with `- `",
+                        name.key
+                    ),
+                ),
+                _ => (
+                    item.at,
+                    format!("expected `name: {{…}}`, found {}", item.described()),
+                    "each state is one list item `- name: {…}`; mind the indentation of what belongs to it".to_owned(),
+                ),
+            };
+            self.findings.error("invalid-state", at, path, message, help);
             return None;
         };
         if !is_word(&entry.key) || Function::named(&entry.key).is_some() {
@@ -254,7 +281,11 @@ impl<'a> Builder<'a, '_> {
                 [a, b, ..] => format!("a state is `{}` or `{}`, not both", a.key, b.key),
                 [_] => String::new(),
             };
-            let help = format!("give it one of {}", FORMS.join(", "));
+            let is_glued = |e: &&Entry| e.key.split_once(':').is_some_and(|(form, _)| FORMS.contains(&form));
+            let help = match body.entries().iter().find(is_glued).and_then(|e| e.key.split_once(':')) {
+                Some((form, value)) => format!("put a blank behind the colon: `{form}: {value}`"),
+                None => format!("give it one of {}", FORMS.join(", ")),
+            };
             self.findings.error("invalid-state", at, &path, message, help);
             return None;
         };

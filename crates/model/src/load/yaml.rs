@@ -57,14 +57,36 @@ pub(crate) fn read(source: &str) -> Result<Node, InvalidYaml> {
     }
     let mut options = serde_saphyr::Options::default();
     options.strict_booleans = true;
+    // `!hand_empty(gripper)` without quotes would be a tag of nothing, and a condition that never holds.
+    options.reject_unsupported_tags = true;
     options.with_snippet = false;
     match serde_saphyr::from_str_with_options::<Spanned<Content>>(source, options) {
-        Ok(spanned) => Ok(node(spanned)),
+        Ok(spanned) => {
+            let root = node(spanned);
+            match negated(&root, source) {
+                Some(at) => Err(InvalidYaml { at, message: "unsupported tag `!`".to_owned() }),
+                None => Ok(root),
+            }
+        }
         Err(error) => {
             let at = error.location().map_or(start, location);
             let text = error.without_snippet().to_string();
             Err(InvalidYaml { at: if at.line == 0 { start } else { at }, message: message(&text) })
         }
+    }
+}
+
+/// Where a `!` stands alone before a value: to YAML it says nothing, to its writer the contrary.
+fn negated(node: &Node, source: &str) -> Option<Location> {
+    let before = node.offset.and_then(|offset| source.get(..offset)).unwrap_or_default();
+    let own = node.offset.and_then(|offset| source.get(offset..)).unwrap_or_default();
+    if before.trim_end_matches(' ').ends_with('!') || own.starts_with("! ") {
+        return Some(node.at);
+    }
+    match &node.content {
+        Content::List(items) => items.iter().find_map(|item| negated(item, source)),
+        Content::Map(entries) => entries.iter().find_map(|entry| negated(&entry.value, source)),
+        _ => None,
     }
 }
 

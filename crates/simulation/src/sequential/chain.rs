@@ -45,7 +45,7 @@ pub(super) fn chain(program: &Program, log: &[LogLine]) -> Vec<Link> {
             .filter(|(other, earlier)| {
                 **other != id && earlier.ended == Some(began) && earlier.began.is_some_and(|b| b < began)
             })
-            .map(|(other, earlier)| (bond(program, earlier.state, visit.state), *other, earlier))
+            .map(|(other, earlier)| (bond(program, &visits, *other, id), *other, earlier))
             .max_by_key(|(bond, other, _)| (std::cmp::Reverse(bond.clone()), *other));
         let because = match &before {
             Some((bond, _, _)) => bond.sentence(),
@@ -94,6 +94,8 @@ enum Bond {
     Looking,
     Order,
     World,
+    /// They only ended and began together, as far as the program says.
+    Coincidence,
 }
 
 impl Bond {
@@ -105,17 +107,20 @@ impl Bond {
             Bond::Looking => "it looks at what the one before changes".to_owned(),
             Bond::Order => "it may be irreversible: everything older must have ended".to_owned(),
             Bond::World => "it reads what the one before may change".to_owned(),
+            Bond::Coincidence => "the one before ended just then".to_owned(),
         }
     }
 }
 
-fn bond(program: &Program, before: StateId, behind: StateId) -> Bond {
-    let state = program.state(behind);
-    let around = || around(program, state);
-    let is_of_before = |id: StateId| {
-        std::iter::successors(Some(before), |id| program.state(*id).parent).any(|ancestor| ancestor == id)
+/// Why the visit `behind` waits for the visit `before`. Where a state is visited several times, each visit takes the outputs of one visit.
+fn bond(program: &Program, visits: &BTreeMap<InstanceId, Visit>, before: InstanceId, behind: InstanceId) -> Bond {
+    let (earlier, visit) = (&visits[&before], &visits[&behind]);
+    let state = program.state(visit.state);
+    let takes = |expression: &Expr| {
+        expression.flows().into_iter().any(|source| {
+            is_within(program, earlier.state, source) && source_visit(program, visits, source, behind) == Some(before)
+        })
     };
-    let takes = |expression: &Expr| expression.flows().into_iter().any(is_of_before);
     let takes_in = |state: &State, is_meant: fn(Slot<'_>) -> bool| {
         state.expressions().into_iter().any(|(slot, expression)| is_meant(slot) && takes(expression))
     };
@@ -123,18 +128,49 @@ fn bond(program: &Program, before: StateId, behind: StateId) -> Bond {
         return Bond::Output;
     }
     let decides = |slot: Slot<'_>| matches!(slot, Slot::Collection | Slot::While | Slot::Condition);
-    if around().any(|state| takes_in(state, decides)) {
+    if around(program, state).any(|state| takes_in(state, decides)) {
         return Bond::Decision;
     }
-    if let Some(kind) = blocked(program, state).find(|kind| blocked(program, program.state(before)).any(|k| k == *kind))
-    {
+    let blocked_before = || blocked(program, program.state(earlier.state));
+    if let Some(kind) = blocked(program, state).find(|kind| blocked_before().any(|k| k == *kind)) {
         return Bond::Resource(kind.to_owned());
+    }
+    // What is younger is waited for over its resources only.
+    if before > behind {
+        return Bond::Coincidence;
     }
     match state.annotations.nature {
         Nature::Senses(_) => Bond::Looking,
         Nature::Irreversible => Bond::Order,
         Nature::Computes => Bond::World,
     }
+}
+
+/// Whether a state is another one or within it.
+fn is_within(program: &Program, state: StateId, outer: StateId) -> bool {
+    std::iter::successors(Some(state), |id| program.state(*id).parent).any(|ancestor| ancestor == outer)
+}
+
+/// The visit that writes what a visit takes of `source`: the latest before it, in the same iterations of the loops around both, and of
+/// what is within `source` the one that ended last.
+fn source_visit(
+    program: &Program,
+    visits: &BTreeMap<InstanceId, Visit>,
+    source: StateId,
+    behind: InstanceId,
+) -> Option<InstanceId> {
+    // The states around the source, which are those around the visit too, with their iterations and visits.
+    let depth = program.state(source).path.split('/').count() - 1;
+    let place = |path: &str, depth: usize| path.split('/').take(depth).map(str::to_owned).collect::<Vec<_>>();
+    let shared = place(&visits[&behind].path, depth);
+    let written = visits.range(..behind).filter(|(_, visit)| {
+        visit.began.is_some() && is_within(program, visit.state, source) && place(&visit.path, depth) == shared
+    });
+    // All that is within one visit of the source has its place in common.
+    let (_, latest) = written.clone().next_back()?;
+    let own = place(&latest.path, depth + 1);
+    let within = written.filter(|(_, visit)| place(&visit.path, depth + 1) == own);
+    within.max_by_key(|(id, visit)| (visit.ended, **id)).map(|(id, _)| *id)
 }
 
 fn around<'a>(program: &'a Program, state: &'a State) -> impl Iterator<Item = &'a State> {

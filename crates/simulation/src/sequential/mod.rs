@@ -17,7 +17,7 @@ use ratn_executive::protocol::{Command, LogEntry};
 use ratn_executive::protocol::{Mode, Note};
 use ratn_model::catalogue::{Catalogue, ResourceOffer};
 use ratn_model::id::StateId;
-use ratn_model::program::{Program, SUCCESS};
+use ratn_model::program::{ABORTED, Program, SUCCESS};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
@@ -61,6 +61,9 @@ pub struct Sequential {
     pub gains: Vec<Gain>,
     /// As a dataflow network if all of these were annotated, in seconds; `None` where that cannot be simulated.
     pub annotated_s: Option<f64>,
+    /// The states whose failure is handled, and what `exceptional: [aborted]` would gain: what follows a failure would not be computed
+    /// ahead. Only those that gain something.
+    pub exceptional: Vec<Gain>,
     /// The actions whose duration nobody knows: a second is assumed.
     pub unknown_durations: Vec<String>,
 }
@@ -115,7 +118,7 @@ pub fn sequential(program: &Program, catalogue: &Catalogue, assumptions: &Assump
         let program = annotated(program, catalogue, annotating);
         simulate(&program, catalogue, assumptions, Mode::Cdtn, &mut unknown).ok().map(|run| run.end_s)
     };
-    let candidates = candidates(program, catalogue, &cdtn);
+    let candidates = executed(&cdtn, |id| !missing(program, catalogue, id).is_empty());
     let annotated_s = if candidates.is_empty() { Some(cdtn.end_s) } else { ends_s(&candidates) };
     let mut gains: Vec<Gain> = candidates
         .iter()
@@ -123,7 +126,6 @@ pub fn sequential(program: &Program, catalogue: &Catalogue, assumptions: &Assump
             let alone_s = cdtn.end_s - ends_s(&[*id])?;
             let others: Vec<StateId> = candidates.iter().copied().filter(|other| other != id).collect();
             let last_s = ends_s(&others).zip(annotated_s).map_or(0.0, |(without_s, with_s)| without_s - with_s);
-            let rounded = |seconds: f64| if seconds.abs() < NO_GAIN_S { 0.0 } else { (seconds * 1e6).round() / 1e6 };
             Some(Gain {
                 path: program.state(*id).path.clone(),
                 missing: missing(program, catalogue, *id),
@@ -134,18 +136,57 @@ pub fn sequential(program: &Program, catalogue: &Catalogue, assumptions: &Assump
         })
         .collect();
     gains.sort_by(|a, b| b.alone_s.total_cmp(&a.alone_s).then(b.last_s.total_cmp(&a.last_s)));
+    let exceptional = exceptional(program, &cdtn, |program| {
+        simulate(program, catalogue, assumptions, Mode::Cdtn, &mut unknown).ok().map(|run| run.end_s)
+    });
     Ok(Sequential {
         hsm_s: hsm.end_s,
         cdtn_s: cdtn.end_s,
         chain: chain::chain(program, &cdtn.log),
         gains,
         annotated_s,
+        exceptional,
         unknown_durations: unknown.into_iter().collect(),
     })
 }
 
-/// The actions that say too little and are executed; of many, those that take longest.
-fn candidates(program: &Program, catalogue: &Catalogue, run: &Run) -> Vec<StateId> {
+/// The states whose failure is handled and could be exceptional, with what that gains.
+fn exceptional(program: &Program, run: &Run, mut ends_s: impl FnMut(&Program) -> Option<f64>) -> Vec<Gain> {
+    let handled = executed(run, |id| !program.is_exceptional(id, ABORTED));
+    let mut gain_s = |ids: &[StateId]| {
+        let mut marked = program.clone();
+        for id in ids {
+            marked.states[id.0 as usize].annotations.exceptional.push(ABORTED.to_owned());
+        }
+        ends_s(&marked).map(|end_s| rounded(run.end_s - end_s))
+    };
+    let Some(all_s) = gain_s(&handled).filter(|gain_s| *gain_s > 0.0) else { return Vec::new() };
+    let mut gains = Vec::new();
+    for id in &handled {
+        let others: Vec<StateId> = handled.iter().copied().filter(|other| other != id).collect();
+        let alone_s = gain_s(&[*id]).unwrap_or(0.0);
+        let last_s = gain_s(&others).map_or(0.0, |without_s| rounded(all_s - without_s));
+        if alone_s > 0.0 || last_s > 0.0 {
+            gains.push(Gain {
+                path: program.state(*id).path.clone(),
+                missing: vec!["exceptional: [aborted]"],
+                alone_s,
+                alone_percent: 100.0 * alone_s / run.end_s,
+                last_s,
+            });
+        }
+    }
+    gains.sort_by(|a, b| b.alone_s.total_cmp(&a.alone_s).then(b.last_s.total_cmp(&a.last_s)));
+    gains
+}
+
+/// A gain to the microsecond.
+fn rounded(seconds: f64) -> f64 {
+    if seconds.abs() < NO_GAIN_S { 0.0 } else { (seconds * 1e6).round() / 1e6 }
+}
+
+/// The states that are executed and of such a kind; of many, those that take longest.
+fn executed(run: &Run, is_meant: impl Fn(StateId) -> bool) -> Vec<StateId> {
     let mut busy_s: BTreeMap<StateId, f64> = BTreeMap::new();
     let mut states = BTreeMap::new();
     let mut began = BTreeMap::new();
@@ -166,8 +207,7 @@ fn candidates(program: &Program, catalogue: &Catalogue, run: &Run) -> Vec<StateI
             _ => {}
         }
     }
-    let mut found: Vec<(StateId, f64)> =
-        busy_s.into_iter().filter(|(id, _)| !missing(program, catalogue, *id).is_empty()).collect();
+    let mut found: Vec<(StateId, f64)> = busy_s.into_iter().filter(|(id, _)| is_meant(*id)).collect();
     found.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
     let goals = began.len().max(1);
     found.truncate((MAX_GOALS / (SIMULATIONS * goals)).clamp(1, MAX_CANDIDATES));
