@@ -8,13 +8,13 @@ use crate::connect::{Budget, ConnectError, connect};
 use crate::geometry::Body;
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 use crate::pace::Control;
+use crate::pairs::Checks;
 use crate::robot::{Configuration, Drive, Geometry, Joint, Link, Robot};
 use crate::simplify::simplify;
 use crate::space::{Obstacle, Space, State};
 use crate::spheres::cover_within;
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene};
-use std::collections::BTreeSet;
 use std::f64::consts::TAU;
 
 /// How far the spheres may stand out of what drives, in metres.
@@ -89,7 +89,7 @@ impl Vehicle {
         let grown = |body: &Body| Body { geometry: body.geometry.grown(self.padding_m), ..*body };
         base.spheres = self.bodies.iter().flat_map(|body| cover_within(&grown(body), OVERHANG_M)).collect();
         links.push(base);
-        Mechanism::new("vehicle", joints, links, Some(&BTreeSet::new()))
+        Mechanism::new("vehicle", joints, links, Checks::default())
     }
 }
 

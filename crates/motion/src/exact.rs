@@ -179,6 +179,14 @@ impl<'a> Exact<'a> {
         deepest
     }
 
+    /// Whether two links meet where all links are in these poses, whatever is excepted.
+    pub(crate) fn do_meet(&self, poses: &[Pose], a: usize, b: usize) -> bool {
+        let placed = |link: usize| {
+            self.bodies[link].iter().map(move |shape| Placed { pose: to_f32(&compose(&poses[link], &shape.at)), shape })
+        };
+        placed(a).any(|body| placed(b).any(|other| depth(&body, &other).is_some()))
+    }
+
     /// The numbers of a cloud's points whose balls come within `margin_m` metres of the robot.
     pub(crate) fn points_near(&self, positions: &[f64], cloud: &Cloud, margin_m: f64) -> BTreeSet<usize> {
         let mut near = BTreeSet::new();

@@ -30,6 +30,7 @@ pub mod mesh_files;
 mod obj;
 mod occupied;
 pub mod pace;
+pub mod pairs;
 mod pcd;
 pub mod plan;
 mod ply;

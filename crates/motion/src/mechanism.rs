@@ -1,11 +1,11 @@
 //! What is planned for of a robot: its links moved by some of its joints, bounding spheres for the fast checks, the exact shapes for the
 //! others, and the pairs of links that may meet.
 //!
-//! The other joints are held where a [`RobotState`] has them. Without an SRDF, links that are neighbours or that meet at the middle of
-//! all limits are taken as made so.
+//! The other joints are held where a [`RobotState`] has them.
 
 use crate::geometry::Body;
 use crate::mesh::MeshError;
+use crate::pairs::Checks;
 use crate::robot_model::{self, Drive, Joint, Link, RobotModel};
 use crate::robot_state::RobotState;
 use crate::spheres;
@@ -31,6 +31,8 @@ pub struct Mechanism {
     pub links: Vec<Link>,
     /// Pairs of links, the lower index first, that are never checked against each other.
     pub disabled: BTreeSet<(usize, usize)>,
+    /// Pairs that are checked by their exact shapes alone: their spheres say nothing ([`pairs`](crate::pairs)).
+    pub by_shapes: BTreeSet<(usize, usize)>,
     /// Links and the names of obstacles that they may touch.
     pub allowed: BTreeSet<(usize, String)>,
 }
@@ -102,20 +104,10 @@ impl Mechanism {
         model.planned(joints, &RobotState::neutral(&model))
     }
 
-    /// Links moved by the joints that are planned for; without `excepted` pairs, those that are made to touch are not checked.
-    pub(crate) fn new(
-        name: &str,
-        joints: Vec<Joint>,
-        links: Vec<Link>,
-        excepted: Option<&BTreeSet<(usize, usize)>>,
-    ) -> Mechanism {
-        let (disabled, allowed) = (BTreeSet::new(), BTreeSet::new());
-        let mut mechanism = Mechanism { name: name.to_owned(), joints, links, disabled, allowed };
-        mechanism.disabled = match excepted {
-            Some(pairs) => pairs.clone(),
-            None => mechanism.touching(),
-        };
-        mechanism
+    /// Links moved by the joints that are planned for, of which those pairs are checked.
+    pub(crate) fn new(name: &str, joints: Vec<Joint>, links: Vec<Link>, checks: Checks) -> Mechanism {
+        let Checks { excepted: disabled, by_shapes } = checks;
+        Mechanism { name: name.to_owned(), joints, links, disabled, by_shapes, allowed: BTreeSet::new() }
     }
 
     /// Poses of all links, in their order; `positions` in the order of the joints.
@@ -226,28 +218,9 @@ impl Mechanism {
         (self.joints.iter().zip(positions).map(clamp).collect(), beyond)
     }
 
-    /// Pairs that the robot is made to have in touch.
-    fn touching(&self) -> BTreeSet<(usize, usize)> {
-        let middle: Vec<f64> = self.joints.iter().map(|j| (j.lower + j.upper) / 2.0).collect();
-        let poses = self.poses(&middle);
-        let meet = |a: usize, b: usize| {
-            self.links[a].spheres.iter().any(|s| {
-                let at = poses[a].transform(s.centre);
-                self.links[b].spheres.iter().any(|o| {
-                    let gap: f64 = (0..3).map(|i| (at[i] - poses[b].transform(o.centre)[i]).powi(2)).sum();
-                    gap < (s.radius + o.radius).powi(2)
-                })
-            })
-        };
-        let mut pairs = BTreeSet::new();
-        for b in 0..self.links.len() {
-            for a in 0..b {
-                if self.solid_parent(b) == Some(a) || self.solid_parent(a) == Some(b) || meet(a, b) {
-                    pairs.insert((a, b));
-                }
-            }
-        }
-        pairs
+    /// Whether nothing with a shape is between two links.
+    pub(crate) fn are_neighbours(&self, a: usize, b: usize) -> bool {
+        self.solid_parent(b) == Some(a) || self.solid_parent(a) == Some(b)
     }
 
     /// The next link towards the root that has a shape.

@@ -1,5 +1,5 @@
 //! The one model of a robot: a tree of links from its URDF, the joints that move them, the shapes that can collide, and the pairs
-//! of links that its SRDF excepts from checks.
+//! of links that its SRDF excepts from checks, or that are made to touch where there is none.
 //!
 //! A joint that mimics another, also through further mimics, has no position of its own: its link is driven by the joint at the end of the
 //! chain, by a factor; the offset is part of where the link is mounted. A [`RobotState`] has a
@@ -12,6 +12,7 @@ use crate::frame::compose;
 use crate::geometry::Body;
 use crate::mechanism::{MAX_JOINTS, Mechanism, MechanismError};
 use crate::mesh::{MeshError, Meshed};
+use crate::pairs::{self, Checks};
 use crate::robot_state::RobotState;
 use crate::spheres::Sphere;
 use crate::urdf::{self, Description, Loader, RobotError};
@@ -34,8 +35,8 @@ pub struct RobotModel {
     pub links: Vec<Link>,
     /// The names of the joints that mimic others.
     pub(crate) mimics: BTreeSet<String>,
-    /// Pairs of links, the lower index first, that the SRDF excepts from checks; `None` where there is no SRDF.
-    pub(crate) excepted: Option<BTreeSet<(usize, usize)>>,
+    /// What the SRDF says of pairs of links, or, without one, what follows from how they meet ([`pairs`]).
+    pub(crate) checks: Checks,
 }
 
 /// A joint and its limits (radians, or metres for sliding joints).
@@ -160,7 +161,12 @@ impl RobotModel {
     ) -> Result<RobotModel, MechanismError> {
         let Description { name, joints, links, mimics } = urdf::read(urdf, load)?;
         let excepted = srdf.map(|text| srdf::excepted(text, &links)).transpose()?;
-        Ok(RobotModel { name, joints, links, mimics, excepted })
+        let mut model = RobotModel { name, joints, links, mimics, checks: Checks::default() };
+        model.checks = match excepted {
+            Some(excepted) => Checks { excepted, ..Checks::default() },
+            None => pairs::checks(&model),
+        };
+        Ok(model)
     }
 
     /// The index of a link.
@@ -188,9 +194,14 @@ impl RobotModel {
         }
     }
 
-    /// Whether the SRDF excepts two links from checks. A link is never checked against itself.
+    /// What is checked of pairs of links.
+    pub fn checks(&self) -> &Checks {
+        &self.checks
+    }
+
+    /// Whether two links are excepted from checks. A link is never checked against itself.
     pub fn is_excepted(&self, a: usize, b: usize) -> bool {
-        a == b || self.excepted.as_ref().is_some_and(|pairs| pairs.contains(&(a.min(b), a.max(b))))
+        a == b || self.checks.excepted.contains(&(a.min(b), a.max(b)))
     }
 
     /// The joints in another order, which names each of them once.
@@ -232,16 +243,16 @@ impl RobotModel {
             return Err(MechanismError::Twice { joint: joint.clone() });
         }
         let planned = names.iter().map(|name| self.plannable(name)).collect::<Result<Vec<_>, _>>()?;
-        let mut mechanism = self.restricted(&planned, state.positions());
-        if self.excepted.is_none() {
-            // A state that puts a link in the way must not except it.
-            mechanism.disabled = self.restricted(&planned, RobotState::neutral(self).positions()).disabled;
-        }
-        Ok(mechanism)
+        Ok(self.restricted(&planned, state.positions()))
     }
 
     /// As [`RobotModel::planned`], of joints that can be, by their indices.
     pub(crate) fn restricted(&self, planned: &[usize], positions: &[f64]) -> Mechanism {
+        self.moved_by(planned, positions, self.checks.clone())
+    }
+
+    /// The links moved by some joints, the others where `positions` has them.
+    pub(crate) fn moved_by(&self, planned: &[usize], positions: &[f64], checks: Checks) -> Mechanism {
         let place = |link: &Link| match link.drive {
             None => (link.origin, None),
             Some(drive) => match planned.iter().position(|joint| *joint == drive.joint) {
@@ -254,7 +265,7 @@ impl RobotModel {
             Link { origin, drive, ..link.clone() }
         };
         let joints = planned.iter().map(|joint| self.joints[*joint].clone()).collect();
-        Mechanism::new(&self.name, joints, self.links.iter().map(held).collect(), self.excepted.as_ref())
+        Mechanism::new(&self.name, joints, self.links.iter().map(held).collect(), checks)
     }
 
     /// The index of a joint that can be planned for.

@@ -491,7 +491,7 @@ fn pairs(mechanism: &Mechanism, compiled: &Compiled, links: &[usize]) -> Vec<Sel
         }
     }
     let mut pairs: BTreeMap<(u32, u32), Vec<(u32, u32)>> = BTreeMap::new();
-    for (a, b) in mechanism.pairs() {
+    for (a, b) in mechanism.pairs().into_iter().filter(|pair| !mechanism.by_shapes.contains(pair)) {
         let (a, b) = (places[a].min(places[b]), places[a].max(places[b]));
         pairs.entry((a.0, b.0)).or_default().push((a.1, b.1));
     }

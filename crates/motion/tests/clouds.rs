@@ -23,7 +23,7 @@ use std::sync::Arc;
 
 const BUDGET: Budget = Budget { iterations: 20_000, seed: 1 };
 
-/// Joints about z and y in turn, each link three spheres along x.
+/// Joints about z and y in turn, each link three spheres along x; neighbours may fold onto each other.
 fn chain(joints: usize) -> Mechanism {
     let mut urdf = String::from("<robot name='chain'><link name='l0'/>");
     let mut names = Vec::new();
@@ -42,7 +42,9 @@ fn chain(joints: usize) -> Mechanism {
         );
         names.push(format!("j{i}"));
     }
-    Mechanism::read(&(urdf + "</robot>"), None, &names).unwrap()
+    let fold = |i: usize| format!("<disable_collisions link1='l{i}' link2='l{}' reason='Adjacent'/>", i + 1);
+    let srdf = format!("<robot name='chain'>{}</robot>", (1..joints).map(fold).collect::<String>());
+    Mechanism::read(&(urdf + "</robot>"), Some(&srdf), &names).unwrap()
 }
 
 fn posture(random: &mut impl Rng, mechanism: &Mechanism) -> State {

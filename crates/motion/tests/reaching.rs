@@ -13,9 +13,12 @@ use ratn_motion::geometry::Geometry;
 use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
 use ratn_motion::pace::Control;
 use ratn_motion::reach::{Positions, Reach, Target, distance};
+use ratn_motion::robot_model::RobotModel;
+use ratn_motion::robot_state::RobotState;
 use ratn_motion::simplify::path_length;
 use ratn_motion::space::{Obstacle, Space, State, between};
 use std::f64::consts::PI;
+use std::sync::LazyLock;
 
 const AIMM: &str = include_str!("../robots/aimm.urdf");
 
@@ -26,7 +29,11 @@ fn go_on(_: usize) -> Control {
 /// The arm of seven joints, or some of them: the closed form is for all seven.
 fn arm(joints: std::ops::RangeInclusive<usize>) -> Mechanism {
     let names: Vec<String> = joints.map(|i| format!("arm_joint_{i}")).collect();
-    Mechanism::read(AIMM, None, &names).unwrap()
+    static MODEL: LazyLock<RobotModel> = LazyLock::new(|| RobotModel::read(AIMM, None).unwrap());
+    let mut mechanism = MODEL.planned(&names, &RobotState::neutral(&MODEL)).unwrap();
+    // Pairs that only the exact check sees are nothing to the search.
+    mechanism.disabled.extend(mechanism.by_shapes.clone());
+    mechanism
 }
 
 fn tool(mechanism: &Mechanism) -> Reach {

@@ -6,6 +6,7 @@ use crate::{input, output};
 use ratn_motion::connect::{Budget, ConnectError};
 use ratn_motion::mechanism::Mechanism;
 use ratn_motion::mesh_files::MeshFiles;
+use ratn_motion::pairs::{self, Kind, Pair};
 use ratn_motion::problems::{Problem, Problems};
 use ratn_motion::robot_model::RobotModel;
 use ratn_motion::robot_state::RobotState;
@@ -73,6 +74,9 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
     let mut load = |name: &str| meshes.read(name);
     let model = RobotModel::read_with_meshes(&urdf, srdf.as_deref(), &mut load)
         .map_err(|error| refused(&arguments.robot, error))?;
+    if srdf.is_none() {
+        output::progress(pairs_without_srdf(&model));
+    }
     let mut robot: Option<(BTreeMap<String, f64>, Mechanism)> = None;
     let settings = Settings {
         budget: Budget { iterations: arguments.iterations, seed: arguments.seed },
@@ -104,6 +108,38 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
         output::result(table(&classes))?;
     }
     verdict(&classes)
+}
+
+/// What is checked of the pairs of links where no SRDF says so.
+fn pairs_without_srdf(model: &RobotModel) -> String {
+    /// More pairs of a kind are not named.
+    const MOST_NAMED: usize = 8;
+    let name = |(a, b): &Pair| format!("{} and {}", model.links[*a].name, model.links[*b].name);
+    let named = |pairs: &mut dyn Iterator<Item = &Pair>| {
+        let mut names: Vec<String> = pairs.map(name).collect();
+        let more = names.len().saturating_sub(MOST_NAMED);
+        names.truncate(MOST_NAMED);
+        names.join(", ") + &if more > 0 { format!(" and {more} more") } else { String::new() }
+    };
+    let mut lines = vec!["Without an SRDF (--srdf), pairs of links are told apart by how they meet:".to_owned()];
+    for (kind, pairs) in pairs::kinds(model) {
+        let names = match kind {
+            Kind::Sometimes | Kind::Never => String::new(),
+            _ => format!(": {}", named(&mut pairs.iter())),
+        };
+        let is_excepted = matches!(kind, Kind::Neighbours | Kind::Always);
+        let checked = if is_excepted { "not checked" } else { "checked" };
+        lines.push(format!("  {} {kind}, {checked}{names}", pairs.len()));
+    }
+    let by_shapes = &model.checks().by_shapes;
+    if !by_shapes.is_empty() {
+        let names = named(&mut by_shapes.iter());
+        lines.push(format!(
+            "  {} of them by the check of the finished path alone, their spheres are too coarse: {names}",
+            by_shapes.len()
+        ));
+    }
+    lines.join("\n")
 }
 
 /// The robot with the joints that are not planned for where a problem says.

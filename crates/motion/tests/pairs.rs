@@ -1,0 +1,106 @@
+//! Which pairs of links are checked where no SRDF says so: none is freed that can meet and part.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use ratn_motion::exact::Exact;
+use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
+use ratn_motion::pairs::{self, Kind, Pair};
+use ratn_motion::robot_model::RobotModel;
+use ratn_motion::space::Space;
+
+const AIMM: &str = include_str!("../robots/aimm.urdf");
+const AIMM_SRDF: &str = include_str!("../robots/aimm.srdf");
+
+/// A link with a ball, 0.05 m in radius, and the joint that turns it about z.
+fn ball(name: &str, parent: &str, joint_at: &str, ball_at: &str) -> String {
+    format!(
+        "<link name='{name}'><collision><origin xyz='{ball_at}'/><geometry><sphere radius='0.05'/></geometry></collision></link>\
+         <joint name='{name}_joint' type='revolute'><parent link='{parent}'/><child link='{name}'/><origin xyz='{joint_at}'/>\
+         <axis xyz='0 0 1'/><limit lower='-3' upper='3' velocity='1' effort='1'/></joint>"
+    )
+}
+
+/// An arm whose wrist is so short that its first and last link always overlap, a lever that stands in its way at zero, and a lamp above.
+fn model() -> RobotModel {
+    let links = [
+        ball("upper", "base", "0 0 0", "0.3 0 0"),
+        ball("wrist", "upper", "0.3 0 0", "0.06 0 0"),
+        ball("hand", "wrist", "0.06 0 0", "0.02 0 0"),
+        ball("lever", "base", "0.3 0.5 0", "0 -0.42 0"),
+        ball("lamp", "base", "0 0 1", "0 0 0"),
+    ];
+    RobotModel::read(&format!("<robot name='r'><link name='base'/>{}</robot>", links.concat()), None).unwrap()
+}
+
+fn pair(model: &RobotModel, a: &str, b: &str) -> Pair {
+    let (a, b) = (model.link(a).unwrap(), model.link(b).unwrap());
+    (a.min(b), a.max(b))
+}
+
+#[test]
+fn pairs_are_told_apart_by_how_they_meet() {
+    let model = model();
+    let kinds = pairs::kinds(&model);
+    let is = |kind: Kind, a: &str, b: &str| kinds.get(&kind).is_some_and(|pairs| pairs.contains(&pair(&model, a, b)));
+    assert!(is(Kind::Neighbours, "upper", "wrist") && is(Kind::Neighbours, "wrist", "hand"), "{kinds:?}");
+    assert!(is(Kind::Always, "upper", "hand"), "{kinds:?}");
+    assert!(is(Kind::ByDefault, "upper", "lever"), "{kinds:?}");
+    assert!(is(Kind::Sometimes, "hand", "lever"), "{kinds:?}");
+    assert!(["upper", "wrist", "hand", "lever"].iter().all(|link| is(Kind::Never, link, "lamp")), "{kinds:?}");
+    assert_eq!(kinds.values().map(Vec::len).sum::<usize>(), 10);
+    // The same again.
+    assert_eq!(pairs::kinds(&model), kinds);
+}
+
+#[test]
+fn only_neighbours_that_touch_and_what_always_meets_are_not_checked() {
+    let model = model();
+    let excepted = [("upper", "wrist"), ("wrist", "hand"), ("upper", "hand")].map(|(a, b)| pair(&model, a, b));
+    assert_eq!(model.checks().excepted, excepted.into());
+    assert!(model.checks().by_shapes.is_empty());
+    // What meets in the default state is told, and is free elsewhere.
+    let mechanism = model.planned(&[], &ratn_motion::robot_state::RobotState::neutral(&model)).unwrap();
+    let (mut space, exact) = (Space::new(&mechanism, &[]), Exact::new(&mechanism, &[]));
+    let state = |lever: f32| std::array::from_fn(|j| if j == 3 { lever } else { 0.0 });
+    assert!(!space.is_free(&[0.0; MAX_JOINTS]) && space.is_free(&state(1.5)));
+    let touch = exact.touch(&[0.0; 5]).unwrap();
+    assert_eq!((&touch.link[..], &touch.other[..]), ("upper", "lever"));
+    assert_eq!(exact.touch(&[0.0, 0.0, 0.0, 1.5, 0.0]), None);
+}
+
+#[test]
+fn neighbours_that_fold_onto_each_other_are_checked() {
+    // Beyond its elbow, which is wide open at zero, the forearm meets the upper arm.
+    let links = [ball("upper", "base", "0 0 0", "0.1 0 0"), ball("fore", "upper", "0.2 0 0", "0.1 0 0")];
+    let urdf = format!("<robot name='r'><link name='base'/>{}</robot>", links.concat());
+    let mechanism = Mechanism::read(&urdf, None, &[]).unwrap();
+    let folded = [0.0, 2.9];
+    assert!(Exact::new(&mechanism, &[]).touch(&folded).is_some());
+    let state = std::array::from_fn(|j| if j == 1 { 2.9 } else { 0.0 });
+    assert!(!Space::new(&mechanism, &[]).is_free(&state) && Space::new(&mechanism, &[]).is_free(&[0.0; MAX_JOINTS]));
+}
+
+#[test]
+fn of_our_robot_nothing_is_freed_that_its_srdf_has_checked_and_that_can_part() {
+    let (with, without) = (RobotModel::read(AIMM, Some(AIMM_SRDF)).unwrap(), RobotModel::read(AIMM, None).unwrap());
+    let names = |(a, b): &Pair| format!("{} and {}", without.links[*a].name, without.links[*b].name);
+    let freed: Vec<String> = without.checks().excepted.difference(&with.checks().excepted).map(names).collect();
+    assert!(freed.is_empty(), "{freed:?}");
+    // Many postures are free by the spheres, so planning is possible; those are free by the shapes.
+    let joints: Vec<String> = (1..=7).map(|i| format!("arm_joint_{i}")).collect();
+    let mechanism = Mechanism::read(AIMM, None, &joints).unwrap();
+    let (mut space, exact) = (Space::new(&mechanism, &[]), Exact::new(&mechanism, &[]));
+    let mut random = ChaCha8Rng::seed_from_u64(3);
+    let (mut free, mut by_shapes) = (0, 0);
+    for _ in 0..300 {
+        let posture: Vec<f64> = mechanism.joints.iter().map(|j| random.random_range(j.lower..j.upper)).collect();
+        let state = std::array::from_fn(|j| posture.get(j).map_or(0.0, |q| *q as f32));
+        let is_free = exact.touch(&posture).is_none();
+        by_shapes += usize::from(is_free);
+        free += usize::from(space.is_free(&state));
+        assert!(!space.is_free(&state) || is_free || !mechanism.by_shapes.is_empty(), "{posture:?}");
+    }
+    assert!(2 * free > by_shapes && free > 50, "{free} of {by_shapes}");
+}
