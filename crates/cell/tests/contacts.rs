@@ -2,17 +2,17 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
-use ratn_cell::config::Setting;
-use ratn_cell::core::contacts::{PRESS_M, TOLERANCE_M};
+use ratn_cell::config::{CellConfig, Setting};
+use ratn_cell::core::contacts::{Contact, PRESS_M, TOLERANCE_M};
 use ratn_cell::core::environment::{Environment, Furniture, Kind, Model, Thing, Touch};
 use ratn_cell::core::placement::furniture;
-use ratn_cell::core::protocol::{Event, Request};
+use ratn_cell::core::protocol::{Ending, Event, Request};
 use ratn_cell::core::recording::Line;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::plan::Goal;
 use ratn_motion::robot::{Configuration, Robot};
-use std::f64::consts::FRAC_PI_2;
+use std::f64::consts::{FRAC_PI_2, PI};
 
 mod bench;
 use bench::{Bench, grasp};
@@ -148,4 +148,63 @@ fn a_finger_may_push_what_it_closes_around_and_nothing_else() {
         bench.cell.handle(bench.now, Event::Reset { seed: 5, goods: bench.cell.config().goods() });
         assert_eq!(bench.cell.unintended_contacts(), []);
     }
+}
+
+#[test]
+fn what_was_let_go_may_be_pushed_until_the_fingers_are_away_from_it_though_the_motion_was_cut_short() {
+    let mut bench = Bench::of(CellConfig { boxes: 1, seed: 4, ..CellConfig::default() });
+    bench.reach_for(0);
+    bench.done(grasp());
+    bench.done(Request::Release);
+    // The arm gives up half-way home, far above the box.
+    bench.cell.handle(bench.now, Event::Fault { fault: "controller_abort:1".parse().unwrap() });
+    let home = bench.plan(&bench.cell.scene(), vec![Goal::Joints(aimm::HOME)], 0.10, 0.0);
+    assert!(matches!(bench.perform(Request::Follow { trajectory: home }), Ending::Aborted(_)));
+    // One finger comes down 3 mm beyond the edge of the box, and closes around nothing.
+    let truth = bench.cell.ground_truth()[0].clone();
+    let aside = Pose::at(0.0, 0.055 - truth.size[1] / 2.0 + 0.003, 0.0);
+    let goals = aimm::grasp_poses(&truth.pose, truth.size).map(|tool| Goal::Pose(tool.compose(&aside)));
+    bench.go(goals.to_vec(), 0.0, 0.10);
+    bench.go(vec![Goal::Joints(aimm::HOME)], 0.10, 0.0);
+    let [contact] = &bench.cell.unintended_contacts()[..] else { panic!("{:?}", bench.cell.unintended_contacts()) };
+    assert!(contact.bodies[0].starts_with("finger") && contact.pushed_m > TOLERANCE_M, "{contact}");
+}
+
+#[test]
+fn fingers_that_were_stopped_around_what_they_let_go_may_still_leave_it() {
+    let mut bench = Bench::of(CellConfig { boxes: 1, seed: 4, ..CellConfig::default() });
+    bench.reach_for(0);
+    bench.done(grasp());
+    bench.done(Request::Release);
+    let up = bench.plan(&bench.cell.scene(), vec![Goal::Joints(aimm::HOME)], 0.10, 0.0);
+    let (ticket, _) = bench.start(Request::Follow { trajectory: up });
+    bench.pass(0.15);
+    bench.cell.handle(bench.now, Event::Stop { ticket, reason: "a test".to_owned() });
+    bench.pass(2.0);
+    bench.go(vec![Goal::Joints(aimm::HOME)], 0.10, 0.0);
+    assert_eq!(bench.cell.unintended_contacts(), []);
+}
+
+#[test]
+fn what_is_let_go_on_the_edge_of_its_neighbour_was_not_set_down_there() {
+    let mut bench = Bench::new(2, 4);
+    let truth = bench.cell.ground_truth();
+    bench.reach_for(0);
+    bench.done(grasp());
+    let in_tool = bench.cell.robot().tool_pose(&bench.cell.configuration()).inverse().compose(&truth[0].pose);
+    // Over the other one's edge by a centimetre, and 6 mm deep in its top.
+    let (held, other) = (&truth[0], &truth[1]);
+    let aside = other.size[0] / 2.0 + held.size[1] / 2.0 - 0.01;
+    let height = other.size[2] / 2.0 + held.size[2] / 2.0 - 0.006;
+    let over = |turn: f64| {
+        let target = other.pose.compose(&Pose::from_rpy([turn.cos() * aside, 0.0, height], 0.0, 0.0, FRAC_PI_2));
+        Goal::Pose(target.compose(&in_tool.inverse()))
+    };
+    bench.go(vec![over(0.0), over(PI)], 0.10, 0.10);
+    bench.done(Request::Release);
+    bench.go(vec![Goal::Joints(aimm::HOME)], 0.10, 0.0);
+    bench.pass(5.0);
+    let both = |contact: &Contact| contact.bodies.iter().all(|body| body.starts_with("slc_"));
+    let found = bench.cell.unintended_contacts();
+    assert!(found.iter().any(|contact| both(contact) && contact.depth_m > 0.004), "{found:#?}");
 }

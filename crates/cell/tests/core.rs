@@ -26,7 +26,7 @@ use bench::{Bench, grasp};
 fn a_box_is_held_only_when_the_fingers_are_around_it() {
     let mut bench = Bench::new(2, 4);
     assert!(
-        matches!(bench.perform(grasp()), Ending::Aborted(reason) if reason.contains("nothing is between the fingers"))
+        matches!(bench.perform(grasp()), Ending::Aborted(reason) if reason.contains("nothing stopped the fingers"))
     );
     bench.done(Request::Release);
     bench.reach_for(0);
@@ -370,10 +370,9 @@ fn a_held_motion_stands_still_and_then_takes_the_rest_of_its_time() {
     assert_eq!(bench.cell.next_wake(), None);
     assert!(bench.pass(3600.0).is_empty());
     assert_eq!(bench.arm(), here);
-    // What is begun meanwhile does not move either.
-    let (head, none) = bench.start(Request::LookAt { target: [0.8, 0.0, 0.7] });
-    let looks = bench.cell.configuration().pan;
-    assert!(none.is_empty() && bench.pass(60.0).is_empty() && bench.cell.configuration().pan == looks);
+    // What is begun meanwhile does not go on either.
+    let (picture, none) = bench.start(Request::Capture { frames: 300 });
+    assert!(none.is_empty() && bench.pass(60.0).is_empty());
 
     assert!(safety(&mut bench, SafetyState::Ready).is_empty());
     assert_eq!(bench.arm(), here);
@@ -393,14 +392,14 @@ fn a_held_motion_stands_still_and_then_takes_the_rest_of_its_time() {
         ended.iter().filter(is).count() == 1
     };
     assert!(done(ticket) && bench.arm() == aimm::OBSERVATION, "{ended:?}");
-    assert!(done(head), "{ended:?}");
+    assert!(done(picture), "{ended:?}");
 }
 
 #[test]
 fn an_emergency_stop_ends_whatever_moves_and_whatever_is_begun_until_it_is_cleared() {
     let mut bench = Bench::new(1, 1);
     let (arm, _) = bench.start(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 });
-    let (head, _) = bench.start(Request::LookAt { target: [0.8, 0.0, 0.7] });
+    let (picture, _) = bench.start(Request::Capture { frames: 600 });
     bench.pass(0.2);
     let stop = SafetyState::Stopped { reason: "a hand".to_owned() };
     let stopped = |commands: &[Command]| -> Vec<Ticket> {
@@ -410,7 +409,7 @@ fn an_emergency_stop_ends_whatever_moves_and_whatever_is_begun_until_it_is_clear
         };
         commands.iter().map(by_hand).collect()
     };
-    assert_eq!(stopped(&safety(&mut bench, stop.clone())), [head]);
+    assert_eq!(stopped(&safety(&mut bench, stop.clone())), [picture]);
     assert_eq!(stopped(&bench.pass(2.0)), [arm]);
     let here = bench.arm();
     assert!(bench.pass(60.0).is_empty() && bench.arm() == here);
@@ -453,4 +452,34 @@ fn a_motion_lags_a_little_and_settles_and_a_weak_controller_gives_up_with_the_re
     assert!(*ended == ticket && reason.contains("rad from its trajectory, 0.05 rad are allowed"), "{reason}");
     assert!(tracking.most_rad > 0.05 && tracking.most_rad < 0.06, "{tracking:?}");
     assert!(distance(&weak.arm(), &aimm::HOME) > 0.01 && distance(&weak.arm(), &aimm::OBSERVATION) > 0.1);
+}
+
+#[test]
+fn head_and_arm_do_not_move_at_once_for_the_arm_was_checked_with_the_head_where_it_was() {
+    let refused = |commands: &[Command], module: &str| {
+        let [Command::Ended { ending: Ending::Aborted(reason), .. }] = commands else { panic!("{commands:?}") };
+        assert!(reason.contains(&format!("the {module} is under way")), "{reason}");
+        assert!(reason.contains("let one of both states block `Arm` and `PanTilt`"), "{reason}");
+    };
+    let look = || Request::LookAt { target: aimm::TABLE_CENTRE };
+    let follow = |bench: &Bench| {
+        let way = bench.plan(&bench.cell.scene(), vec![Goal::Joints(aimm::OBSERVATION)], 0.0, 0.0);
+        [Request::Follow { trajectory: way }, Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 }]
+    };
+    for i in 0..2 {
+        let mut bench = Bench::new(1, 1);
+        let moves = follow(&bench)[i].clone();
+        bench.start(moves.clone());
+        bench.pass(0.2);
+        refused(&bench.start(look()).1, "Arm");
+
+        let mut bench = Bench::new(1, 1);
+        bench.start(look());
+        bench.pass(0.2);
+        refused(&bench.start(moves.clone()).1, "PanTilt");
+        // One after the other they may.
+        let mut bench = Bench::new(1, 1);
+        bench.done(look());
+        bench.done(moves);
+    }
 }

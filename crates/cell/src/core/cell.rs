@@ -344,7 +344,7 @@ impl Cell {
             Kind::Follow(Way::Arm(ref motion)) => match motion.end() {
                 Ok(end) => {
                     self.resting.arm = end;
-                    self.contacts.arrived();
+                    self.contacts.parted();
                     Ending::Done(Product::Moved { end, tracking: followed })
                 }
                 Err(reason) => {
@@ -352,7 +352,7 @@ impl Cell {
                     return self.brake(module, activity, ending, 1.0);
                 }
             },
-            Kind::Close { from, object, expected, .. } => self.close(from, object, expected.as_ref()),
+            Kind::Close { from, object, expected, .. } => self.close(from, object, expected.as_ref(), out),
             Kind::Open { to, .. } => {
                 self.resting.finger = to;
                 Ending::Done(Product::Released)

@@ -2,13 +2,13 @@
 //!
 //! ```text
 //!                    ┌─ a finger at what it closes around next, or has just let go (Approach, Depart), or at what it holds (Grasp)
-//! two bodies touch ──┼─ what is held at what it stood on when its motion began (LiftOff), or is set down on (SetDown)
+//! two bodies touch ──┼─ what is held above what it stood on when its motion began (LiftOff), or is set down on (SetDown)
 //!                    ├─ an object stands on a link that stands, too (Stands); something was put there by a fault (PutThere)
 //!                    └─ everything else is unintended
 //! ```
 //! An episode begins when two bodies are as near as touching and ends when they have come apart. Some are judged only by what comes after: a
-//! finger may brush what it is about to grasp, but what it brushed and did not close around was hit. No episode is forgiven for how
-//! deep it went at the worst where contact was meant: [`PRESS_M`] bounds those, too.
+//! finger may brush what it is about to grasp, but what it brushed and did not close around was hit; what is let go is set down on what it
+//! comes to stand on. No episode is forgiven for how deep it went at the worst where contact was meant: [`PRESS_M`] bounds those, too.
 
 use super::environment::{Environment, Thing, Touch};
 use ratn_model::time::Timestamp;
@@ -58,9 +58,9 @@ pub enum Purpose {
     Grasp,
     /// A finger leaves what it has let go.
     Depart,
-    /// What is held leaves what it stood on.
+    /// What is held leaves what it stood on, which is below it.
     LiftOff,
-    /// What is held comes to stand on something, and is let go there.
+    /// What is held is let go on something, and comes to stand on it; on another object only where nothing else bears it.
     SetDown,
     /// An object stands on a link that the arm does not move.
     Stands,
@@ -84,8 +84,10 @@ pub(super) struct Contacts {
     open: BTreeMap<[Thing; 2], Episode>,
     /// Fingers at objects, over before it is known what for.
     waiting: Vec<(usize, Contact)>,
-    /// What the fingers have let go, or closed around in vain, until the arm has moved away from it.
+    /// What the fingers have let go, or closed around in vain, until they are away from it.
     parting: Option<Parting>,
+    /// What was let go above something, until it has come to rest.
+    settling: Vec<(usize, Thing, Contact)>,
     /// Something has just been grasped.
     grasped: bool,
     /// What a fault put somewhere since the last step.
@@ -159,6 +161,13 @@ impl std::fmt::Display for Contact {
 impl Contacts {
     /// After a step: what touches what.
     pub(super) fn observe(&mut self, touches: &[Touch], doing: Doing<'_>, environment: &Environment, ids: &[String]) {
+        if doing.fingers_solid {
+            // They have opened after a grasp in vain: what they are in from now on they push.
+            let in_vain = |things: &[Thing; 2], e: &Episode| {
+                e.contact.meant == Some(Purpose::Grasp) && finger_at(things) != doing.held
+            };
+            self.end(in_vain);
+        }
         for touch in touches {
             self.see(touch, doing, environment, ids);
         }
@@ -170,6 +179,7 @@ impl Contacts {
                 _ => self.judge(episode.contact),
             }
         }
+        self.settle(|object| environment.state(object).at_rest, environment);
         (self.put, self.grasped) = (None, false);
     }
 
@@ -180,7 +190,8 @@ impl Contacts {
     }
 
     /// The fingers have closed around an object, in vain or not; `None`: around nothing.
-    pub(super) fn closed(&mut self, around: Option<usize>) {
+    pub(super) fn closed(&mut self, around: Option<usize>, environment: &Environment) {
+        self.settle(|object| Some(object) == around, environment);
         for (things, episode) in &mut self.open {
             if finger_at(things).is_some() && finger_at(things) == around {
                 episode.contact.meant = Some(Purpose::Grasp);
@@ -195,12 +206,14 @@ impl Contacts {
 
     /// The fingers have let go of an object, on purpose or not.
     pub(super) fn let_go(&mut self, object: usize, on_purpose: bool) {
-        for (_, Episode { mut contact, up, .. }) in self.take(|things, _| things[1] == Thing::Object(object)) {
+        for ([below, _], Episode { mut contact, up, .. }) in self.take(|things, _| things[1] == Thing::Object(object)) {
             // The normal leads from what it stands on to what is held.
             if contact.meant.is_none() && on_purpose && up >= LEVEL {
                 contact.meant = Some(Purpose::SetDown);
+                self.settling.push((object, below, contact));
+            } else {
+                self.judge(contact);
             }
-            self.judge(contact);
         }
         self.parting = Some(Parting { object, set_out: false });
     }
@@ -214,16 +227,19 @@ impl Contacts {
         let in_vain = |things: &[Thing; 2], episode: &Episode| {
             episode.contact.meant == Some(Purpose::Grasp) && finger_at(things) != held
         };
-        for (_, episode) in self.take(in_vain) {
-            self.judge(episode.contact);
-        }
+        self.end(in_vain);
         if let Some(parting) = &mut self.parting {
             parting.set_out = true;
         }
     }
 
-    /// The arm has come to the end of a motion.
-    pub(super) fn arrived(&mut self) {
+    /// From what a motion is about to part.
+    pub(super) fn parts_from(&self) -> Option<usize> {
+        self.parting.filter(|parting| parting.set_out).map(|parting| parting.object)
+    }
+
+    /// The arm has come to the end of a motion, or the fingers are away from what they part from.
+    pub(super) fn parted(&mut self) {
         self.parting = None;
     }
 
@@ -239,6 +255,7 @@ impl Contacts {
     pub(super) fn unintended(&self) -> Vec<Contact> {
         let open = self.open.values().map(|episode| &episode.contact);
         let undecided = open.chain(self.waiting.iter().map(|(_, contact)| contact));
+        let undecided = undecided.chain(self.settling.iter().map(|(_, _, contact)| contact));
         self.judged.iter().chain(undecided.filter(|contact| contact.is_unintended())).cloned().collect()
     }
 
@@ -280,6 +297,9 @@ impl Contacts {
         contact.speed_m_s = contact.speed_m_s.max(touch.speed_m_s);
         if touch.depth_m > contact.depth_m {
             (contact.depth_m, contact.at, *up) = (touch.depth_m, touch.at, touch.normal[2]);
+            if contact.meant == Some(Purpose::LiftOff) && *up < LEVEL {
+                contact.meant = None;
+            }
         }
         if let Some((object, from)) = from
             && doing.held != Some(*object)
@@ -292,7 +312,7 @@ impl Contacts {
 
     /// What a contact is for, where that is known as it begins.
     fn known(&self, touch: &Touch, doing: Doing<'_>) -> Option<Purpose> {
-        let lifts = (self.grasped || !doing.moves).then_some(Purpose::LiftOff);
+        let lifts = ((self.grasped || !doing.moves) && touch.normal[2] >= LEVEL).then_some(Purpose::LiftOff);
         match &touch.things {
             things if things.iter().any(|thing| self.put.map(Thing::Object).as_ref() == Some(thing)) => {
                 Some(Purpose::PutThere)
@@ -310,6 +330,27 @@ impl Contacts {
             }
             [_, Thing::Object(_)] => lifts,
             _ => None,
+        }
+    }
+
+    /// Judges what was let go where it has come to rest, or begins to be held again.
+    fn settle(&mut self, settles: impl Fn(usize) -> bool, environment: &Environment) {
+        let (settled, rest) = std::mem::take(&mut self.settling).into_iter().partition(|(object, ..)| settles(*object));
+        self.settling = rest;
+        let settled: Vec<(usize, Thing, Contact)> = settled;
+        for (object, below, mut contact) in settled {
+            let bears = environment.supports_of(object);
+            let of_objects = bears.iter().all(|thing| matches!(thing, Thing::Object(_)));
+            let stands = bears.contains(&below) && (of_objects || !matches!(below, Thing::Object(_)));
+            contact.meant = stands.then_some(Purpose::SetDown);
+            self.judge(contact);
+        }
+    }
+
+    /// These episodes are over.
+    fn end(&mut self, which: impl Fn(&[Thing; 2], &Episode) -> bool) {
+        for (_, episode) in self.take(which) {
+            self.judge(episode.contact);
         }
     }
 
@@ -365,7 +406,7 @@ mod tests {
         let mut contacts = Contacts { waiting: vec![(0, hit.clone())], ..Contacts::default() };
         assert_eq!(contacts.unintended(), [hit]);
         // It was what the fingers came to.
-        contacts.closed(Some(0));
+        contacts.closed(Some(0), &Watched::new().environment);
         assert_eq!(contacts.unintended().len(), 1, "it was pushed too far for that");
     }
 
@@ -435,7 +476,7 @@ mod tests {
             let mut watched = Watched::new();
             watched.contacts.closing();
             watched.step(0.0, Some(("finger_left", 0.03)), false, false);
-            watched.contacts.closed(Some(0));
+            watched.contacts.closed(Some(0), &watched.environment);
             if moves {
                 watched.contacts.sets_out(None);
             }
@@ -444,5 +485,45 @@ mod tests {
             watched.contacts.sets_out(None);
             assert_eq!(watched.contacts.unintended().is_empty(), excused, "{:?}", watched.contacts.unintended());
         }
+    }
+
+    /// How far a box is pressed when it is grasped, in the direction of a normal that leads out of the table.
+    fn grasped_along(normal: [f64; 3]) -> Vec<Contact> {
+        let mut watched = Watched::new();
+        let touch = |depth_m: f64| Touch {
+            things: [Thing::Fixed("table".to_owned()), Thing::Object(0)],
+            depth_m,
+            at: [2.0, 0.0, 0.45],
+            normal,
+            speed_m_s: 0.1,
+        };
+        let doing =
+            |moves| Doing { now: Timestamp::default(), held: Some(0), moves, arm_of: None, fingers_solid: true };
+        watched.contacts.closed(Some(0), &watched.environment);
+        for (depth_m, moves) in [(0.0004, false), (0.006, true)] {
+            watched.contacts.observe(&[touch(depth_m)], doing(moves), &watched.environment, &["box_1".to_owned()]);
+        }
+        watched.contacts.observe(&[], doing(true), &watched.environment, &["box_1".to_owned()]);
+        watched.contacts.unintended()
+    }
+
+    #[test]
+    fn what_is_held_may_press_what_is_below_it_when_it_is_lifted_and_nothing_beside_it() {
+        assert_eq!(grasped_along([0.0, 0.0, 1.0]), []);
+        assert_eq!(grasped_along([1.0, 0.0, 0.0]).len(), 1);
+    }
+
+    #[test]
+    fn fingers_that_have_opened_inside_of_what_they_closed_around_in_vain_push_it() {
+        let mut watched = Watched::new();
+        watched.contacts.closing();
+        watched.step(0.0, Some(("finger_left", 0.03)), false, false);
+        watched.contacts.closed(Some(0), &watched.environment);
+        watched.step(0.0, Some(("finger_left", 0.03)), false, false);
+        assert_eq!(watched.contacts.unintended(), [], "they closed in it");
+        watched.step(0.0, Some(("finger_left", 0.02)), false, true);
+        watched.step(0.02, None, false, true);
+        let [contact] = &watched.contacts.unintended()[..] else { panic!("{:?}", watched.contacts.unintended()) };
+        assert_eq!(contact.meant, Some(Purpose::Depart), "{contact}");
     }
 }

@@ -18,6 +18,8 @@ pub struct Pads {
     pub z_from: f64,
     /// to here (the tips).
     pub z_to: f64,
+    /// How thick the fingers are behind them.
+    pub thick: f64,
 }
 
 /// A grasp.
@@ -97,7 +99,7 @@ impl Pads {
         let Geometry::Box { half } = body.geometry else { return None };
         let tool = &robot.model.links[robot.tool];
         let middle = finger.origin.position[2] + body.pose.position[2] - tool.origin.position[2];
-        Some(Pads { x: half[0], z_from: middle - half[2], z_to: middle + half[2] })
+        Some(Pads { x: half[0], z_from: middle - half[2], z_to: middle + half[2], thick: 2.0 * half[1] })
     }
 
     /// What the fingers hold when they close from `finger` metres on each side of the middle.
@@ -131,6 +133,11 @@ impl Pads {
         });
         let enough = [x, z].iter().all(|[low, high]| high - low >= MIN_HOLD_M);
         enough.then_some([x, z])
+    }
+
+    /// Whether a cuboid is between the fingers, `finger` metres on each side of the middle, or in one of them.
+    pub fn are_at(&self, finger: f64, in_tool: &Pose, size: &[f64; 3]) -> bool {
+        self.meets(finger + self.thick, in_tool, size)
     }
 
     /// Whether a cuboid is in the one that the pads sweep: whether no axis of either separates the two.
@@ -223,7 +230,7 @@ mod tests {
     use super::*;
     use std::f64::consts::PI;
 
-    const PADS: Pads = Pads { x: 0.0125, z_from: -0.055, z_to: 0.015 };
+    const PADS: Pads = Pads { x: 0.0125, z_from: -0.055, z_to: 0.015, thick: 0.014 };
     const SIZE: [f64; 3] = [0.12, 0.07, 0.10];
 
     /// The tool looks down from 3 cm below the top of a box at the origin.
@@ -280,6 +287,18 @@ mod tests {
         // A bowl by its wall: nobody knows how far its middle is from there.
         let bowl = Pose::from_rpy([0.0, 0.06, 0.01], PI, 0.0, 0.0);
         assert_eq!(felt(&bowl, 0.005), bowl);
+    }
+
+    #[test]
+    fn fingers_are_at_a_box_until_their_tips_are_above_it() {
+        let at = |up: f64, aside: f64| {
+            let tool = Pose { position: [0.0, aside, 0.02 + up], ..tool() };
+            PADS.are_at(0.055, &tool.inverse(), &SIZE)
+        };
+        // The tips are 15 mm below the tool, the top of the box is 30 mm above it.
+        assert!(at(0.0, 0.0) && at(0.04, 0.0) && !at(0.05, 0.0));
+        // A finger that is all in it, and one that is beside it.
+        assert!(at(0.0, 0.055 + 0.014) && !at(0.0, 0.035 + 0.055 + 0.015));
     }
 
     #[test]

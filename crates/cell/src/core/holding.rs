@@ -5,7 +5,7 @@ use super::environment::{GRAVITY, Grip, Hold, Load, STEP, Slip, Support};
 use super::faults::Kind as Fault;
 use super::grasping::{Grip as GripOf, NotGrasped, felt};
 use super::objects::ON_BASE;
-use super::protocol::{Ending, Product};
+use super::protocol::{Command, Ending, Product};
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 
@@ -70,34 +70,45 @@ impl Cell {
         (parts, closed)
     }
 
-    /// The fingers have closed from `from` metres on each side of the middle.
-    pub(super) fn close(&mut self, from: f64, object: String, expected: Option<&Pose>) -> Ending {
+    /// The fingers have closed from `from` metres on each side of the middle. Who asked hears what fingers know: how wide what stopped them
+    /// was, and whether it still does. Why they hold nothing only the cell knows, and tells it apart from that.
+    pub(super) fn close(
+        &mut self,
+        from: f64,
+        object: String,
+        expected: Option<&Pose>,
+        out: &mut Vec<Command>,
+    ) -> Ending {
         let tool = self.robot.tool_pose(&self.configuration());
         let (parts, closed) = self.between(from, &tool);
         let around = match &closed {
             Ok(grip) => Some(grip.index),
             Err(reason) => reason.object().and_then(|id| self.ids.iter().position(|known| known == id)),
         };
-        self.contacts.closed(around);
-        let grip = match closed {
+        self.contacts.closed(around, &self.environment);
+        let held = closed.map_err(|reason| (None, reason.to_string())).and_then(|grip| {
+            let slips = |reason: String| Err((Some(grip.width), reason));
+            let id = &self.ids[grip.index];
+            if let Some(lean) = self.environment.model(grip.index).slips_off() {
+                let degrees = lean.to_degrees();
+                return slips(format!("the rim of {id} leans outwards by {degrees:.0}°, the fingers slide off it"));
+            }
+            if self.faults.occurs(Fault::GraspSlips).is_some() {
+                return slips(format!("{id} slipped by a fault"));
+            }
+            Ok(grip)
+        });
+        let grip = match held {
             Ok(grip) => grip,
-            Err(reason) => {
-                // Something stopped the fingers, or nothing did: either way they hold nothing.
+            Err((stopped, reason)) => {
                 self.resting.finger = 0.0;
-                return Ending::Aborted(format!("{object} is not grasped: {reason}"));
+                let felt = stopped.map_or("nothing stopped the fingers".to_owned(), |width| {
+                    format!("something {:.0} mm wide slipped out of the fingers", width * 1e3)
+                });
+                out.push(Command::Missed { reason });
+                return Ending::Aborted(format!("{object} is not grasped: {felt}, they are closed fully"));
             }
         };
-        if let Some(lean) = self.environment.model(grip.index).slips_off() {
-            self.resting.finger = 0.0;
-            let (id, degrees) = (&self.ids[grip.index], lean.to_degrees());
-            let reason = format!("the rim of {id} leans outwards by {degrees:.0}°, the fingers slide off it");
-            return Ending::Aborted(format!("{object} is not grasped: {reason}"));
-        }
-        if self.faults.occurs(Fault::GraspSlips).is_some() {
-            self.resting.finger = 0.0;
-            let id = &self.ids[grip.index];
-            return Ending::Aborted(format!("{object} is not grasped: {id} slipped out of the fingers"));
-        }
         self.resting.finger = grip.width / 2.0;
         let friction = self.environment.model(grip.index).kind.friction();
         let in_tool = grip.in_tool.compose(&parts[grip.index].0.inverse());
@@ -157,6 +168,11 @@ impl Cell {
         // Nothing is left to stop the fingers.
         self.resting.finger = 0.0;
         Some(held.object)
+    }
+
+    /// Whether an object is between the fingers, or in one of them, with the tool at `tool`.
+    pub(super) fn fingers_are_at(&self, object: usize, tool: &Pose, finger: f64) -> bool {
+        self.pads.are_at(finger, &tool.inverse().compose(&self.pose_of(object, tool)), &self.size_of(object))
     }
 
     /// What the fingers can close around of an object that is there in the tool frame.

@@ -43,6 +43,9 @@ impl Cell {
         let solid = open || self.held.is_some();
         self.environment.set_fingers_solid(solid);
         self.environment.step(&self.robot, &configuration);
+        if self.contacts.parts_from().is_some_and(|object| !self.fingers_are_at(object, &tool, configuration.finger)) {
+            self.contacts.parted();
+        }
         let doing = Doing {
             now: self.environment.now(),
             held: self.held.map(|held| held.object),

@@ -130,6 +130,11 @@ pub enum Command {
         /// Which, and how.
         contact: Contact,
     },
+    /// Fingers hold nothing of what they closed around: why, as nobody but the cell knows. For its log.
+    Missed {
+        /// Why.
+        reason: String,
+    },
 }
 
 /// How a goal ends.

@@ -16,6 +16,14 @@ use ratn_perception::noise::MAX_FRAMES;
 /// How far the camera may look past its target, in radians.
 const MAX_LOOK_ERROR_RAD: f64 = 0.02;
 
+/// Why two modules do not move at once, and what a task does about it.
+const BASE: &str = "nothing else happens while the base drives, so let both states block `Base`";
+const HAND: &str = "arm and gripper do not move at once, so let one of both states block `Arm` and `Gripper`";
+const PICTURE: &str =
+    "no picture is taken while the head moves, so let one of both states block `PanTilt` and `Camera`";
+const HEAD: &str =
+    "a motion of the arm is checked with the head where it is, so let one of both states block `Arm` and `PanTilt`";
+
 impl Cell {
     pub(super) fn start(&mut self, ticket: Ticket, request: Request) -> Result<(), String> {
         let module = request.module();
@@ -29,7 +37,7 @@ impl Cell {
         let (kind, lasts_s) = match request {
             Request::Drive { trajectory } => {
                 for other in [Module::Arm, Module::Gripper, Module::PanTilt, Module::Camera] {
-                    self.no_motion_of(other)?;
+                    self.no_motion_of(other, BASE)?;
                 }
                 if self.is_lost() {
                     return Err(LOST.to_owned());
@@ -38,21 +46,23 @@ impl Cell {
                 self.driving(trajectory)
             }
             Request::Follow { trajectory } => {
-                self.no_motion_of(Module::Base)?;
-                self.no_motion_of(Module::Gripper)?;
+                self.no_motion_of(Module::Base, BASE)?;
+                self.no_motion_of(Module::Gripper, HAND)?;
+                self.no_motion_of(Module::PanTilt, HEAD)?;
                 let trajectory = trajectory::check(&self.robot, &here, &trajectory)?;
                 self.following(trajectory)
             }
             Request::MoveTo { joints, speed } => {
-                self.no_motion_of(Module::Base)?;
-                self.no_motion_of(Module::Gripper)?;
+                self.no_motion_of(Module::Base, BASE)?;
+                self.no_motion_of(Module::Gripper, HAND)?;
+                self.no_motion_of(Module::PanTilt, HEAD)?;
                 let line = trajectory::straight(&self.robot, &here.arm, &joints, speed)?;
                 let trajectory = trajectory::check(&self.robot, &here, &line)?;
                 self.following(trajectory)
             }
             Request::Grasp { object, expected } => {
-                self.no_motion_of(Module::Base)?;
-                self.no_motion_of(Module::Arm)?;
+                self.no_motion_of(Module::Base, BASE)?;
+                self.no_motion_of(Module::Arm, HAND)?;
                 if let Some(held) = self.held {
                     return Err(format!("the gripper holds {} already", self.ids[held.object]));
                 }
@@ -61,8 +71,8 @@ impl Cell {
                 (Kind::Close { from: here.finger, to, object, expected }, self.config.gripper.close_s)
             }
             Request::Release => {
-                self.no_motion_of(Module::Base)?;
-                self.no_motion_of(Module::Arm)?;
+                self.no_motion_of(Module::Base, BASE)?;
+                self.no_motion_of(Module::Arm, HAND)?;
                 self.let_go();
                 let to = self.config.gripper.opening_m / 2.0;
                 (Kind::Open { from: here.finger, to }, self.config.gripper.open_s)
@@ -71,16 +81,17 @@ impl Cell {
             Request::SenseArm => (Kind::SenseArm, 0.0),
             Request::SenseGripper => (Kind::SenseGripper, 0.0),
             Request::LookAt { target } => {
-                self.no_motion_of(Module::Base)?;
-                self.no_motion_of(Module::Camera)?;
+                self.no_motion_of(Module::Base, BASE)?;
+                self.no_motion_of(Module::Camera, PICTURE)?;
+                self.no_motion_of(Module::Arm, HEAD)?;
                 let to = self.aim(target)?;
                 let from = [here.pan, here.tilt];
                 let lasts_s = self.turning_s(from, to) + self.config.pan_tilt.settle_s;
                 (Kind::Look { from, to }, lasts_s)
             }
             Request::Capture { frames } => {
-                self.no_motion_of(Module::Base)?;
-                self.no_motion_of(Module::PanTilt)?;
+                self.no_motion_of(Module::Base, BASE)?;
+                self.no_motion_of(Module::PanTilt, PICTURE)?;
                 if !(1..=MAX_FRAMES).contains(&frames) {
                     return Err(format!("a picture has 1 to {MAX_FRAMES} frames, not {frames}"));
                 }
@@ -126,21 +137,10 @@ impl Cell {
         (Kind::Follow(Way::Base(motion)), lasts_s)
     }
 
-    fn no_motion_of(&self, module: Module) -> Result<(), String> {
+    fn no_motion_of(&self, module: Module, why: &str) -> Result<(), String> {
         match self.busy_with(module) {
             None => Ok(()),
-            Some(other) => Err(format!(
-                "the {} is under way with goal {}: {}",
-                module.kind(),
-                other.0,
-                match module {
-                    Module::Base => "nothing else happens while the base drives, so let both states block `Base`",
-                    Module::Arm | Module::Gripper =>
-                        "arm and gripper do not move at once, so let one of both states block `Arm` and `Gripper`",
-                    Module::PanTilt | Module::Camera =>
-                        "no picture is taken while the head moves, so let one of both states block `PanTilt` and `Camera`",
-                }
-            )),
+            Some(other) => Err(format!("the {} is under way with goal {}: {why}", module.kind(), other.0)),
         }
     }
 

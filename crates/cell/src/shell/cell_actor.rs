@@ -320,6 +320,7 @@ fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Recei
                     }
                 }
                 Command::Touched { contact } => tracing::warn!(%contact, "bodies touched that should not have"),
+                Command::Missed { reason } => tracing::info!("the fingers hold nothing: {reason}"),
             }
         }
         applying.extend(safety);

@@ -25,6 +25,8 @@ pub(crate) struct Bench {
     pub(crate) tick: Option<Duration>,
     /// What happened.
     pub(crate) lines: Vec<Line>,
+    /// Why fingers hold nothing of what they closed around.
+    pub(crate) missed: Vec<String>,
 }
 
 impl Bench {
@@ -34,7 +36,7 @@ impl Bench {
 
     pub(crate) fn of(config: CellConfig) -> Bench {
         let cell = Cell::new(config).unwrap();
-        Bench { cell, now: Timestamp::default(), tickets: 0, tick: None, lines: Vec::new() }
+        Bench { cell, now: Timestamp::default(), tickets: 0, tick: None, lines: Vec::new(), missed: Vec::new() }
     }
 
     pub(crate) fn start(&mut self, request: Request) -> (Ticket, Vec<Command>) {
@@ -52,7 +54,11 @@ impl Bench {
         let mut commands = self.cell.handle(self.now, event.clone());
         self.lines.extend(Line::of_step(self.now, event, &commands, &self.cell));
         // They stay with the cell.
-        commands.retain(|command| !matches!(command, Command::Touched { .. }));
+        self.missed.extend(commands.iter().filter_map(|command| match command {
+            Command::Missed { reason } => Some(reason.clone()),
+            _ => None,
+        }));
+        commands.retain(|command| !matches!(command, Command::Touched { .. } | Command::Missed { .. }));
         commands
     }
 

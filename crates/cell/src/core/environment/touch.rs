@@ -7,7 +7,7 @@
 //! which a single joint decides (the flange and the link before the wrist): its limits keep them apart, not who plans.
 //! What is shared with the planner: the reader of the robot's description and its forward kinematics.
 
-use super::world::{Environment, FLOOR};
+use super::world::{Environment, FLOOR, LEVEL, TOUCH_M};
 use rapier3d::math::{Pose as Pose32, Vector};
 use rapier3d::parry::bounding_volume::{Aabb, BoundingVolume};
 use rapier3d::parry::query::contact;
@@ -184,6 +184,27 @@ impl Environment {
             }
         }
         deepest(found)
+    }
+
+    /// What an object stands on: all that touches it from below.
+    pub fn supports_of(&self, object: usize) -> Vec<Thing> {
+        let mine: Vec<Part<'_>> = self.object_colliders(object).map(|c| self.part(c)).collect();
+        let link = |(link, c)| (Thing::Link(self.link_name(link).to_owned()), c);
+        let fixed = |(name, c): (&str, _)| (Thing::Fixed(name.to_owned()), c);
+        let others = (0..self.len()).filter(|other| *other != object);
+        let others = others.flat_map(|other| self.object_colliders(other).map(move |c| (Thing::Object(other), c)));
+        let all = self.link_colliders().map(link).chain(self.fixed_colliders().map(fixed)).chain(others);
+        let bears = |(_, collider): &(Thing, ColliderHandle)| {
+            let below = self.part(*collider);
+            let found = |part: &Part<'_>| {
+                contact(&below.place, below.collider.shape(), &part.place, part.collider.shape(), TOUCH_M)
+            };
+            let up = |part: &Part<'_>| found(part).ok().flatten().is_some_and(|found| found.normal1.z >= LEVEL);
+            mine.iter().any(up)
+        };
+        let mut found: Vec<Thing> = all.filter(bears).map(|(thing, _)| thing).collect();
+        found.dedup();
+        found
     }
 
     fn part<'a>(&'a self, collider: ColliderHandle) -> Part<'a> {

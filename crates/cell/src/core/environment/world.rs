@@ -31,9 +31,9 @@ const LENGTH_UNIT_M: f32 = 0.1;
 /// What moves slower than a twentieth of the length unit a second for so long stands still.
 const STILL_S: f32 = 0.3;
 /// How near something must be to what it rests on, in metres.
-const TOUCH_M: f32 = 0.003;
+pub(super) const TOUCH_M: f32 = 0.003;
 /// How steep a support may be: the least upward part of its normal.
-const LEVEL: f32 = 0.7;
+pub(super) const LEVEL: f32 = 0.7;
 /// What fell out of the world is not followed any farther, in metres below the floor.
 pub(super) const LOST_M: f32 = -5.0;
 /// How much fingers and links rub.
