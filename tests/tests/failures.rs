@@ -48,6 +48,7 @@ fn a_planner_that_is_killed_is_replaced_and_the_task_goes_on() -> anyhow::Result
     let crashed = text.lines().any(|line| line.contains("\"event\":\"crashed\""));
     let again = text.lines().any(|line| line.contains("\"command\":\"start\"") && line.contains("\"attempt\":2"));
     ensure!(crashed && again, "no second attempt\n{said}");
+    ensure!(said.contains(&format!("plan_approach: {at_work}: killed by signal 9")), "not how it ended\n{said}");
     place.wait_until_empty()
 }
 

@@ -56,13 +56,33 @@ fn a_task_runs_on_the_system_that_is_up_and_leaves_it_running() -> anyhow::Resul
     ensure!(facts.contains("(confidence 0.") || facts.contains("(confidence 1)"), "{facts}{err}");
     ensure!(std::fs::read_to_string(&log)?.contains("\"covariance\""), "no covariance in the log");
 
+    // What is asked of facts that nobody wrote is told, and what is shown can be pasted into a task.
+    let (none, err) = support::texts(&place.ratn(&["world", "query", "shap(?x)"]).output()?);
+    ensure!(err.contains("no fact of this world is about `shap`: did you mean `shape`?"), "{none}{err}");
+    let (world, err) = support::texts(&place.ratn(&["world", "facts", "--task"]).output()?);
+    let pasted = place.path().join("pasted.yaml");
+    std::fs::write(&pasted, format!("task: pasted\n{world}states: []\n"))?;
+    let output = place.ratn(&["check", "--no-simulation", pasted.to_str().context("a path")?]).output()?;
+    ensure!(output.status.success() && world.contains("shape(box_1)"), "{world}{err}{}", support::texts(&output).1);
+    let (status, err) = support::texts(&place.ratn(&["status"]).output()?);
+    ensure!(status.contains("no run is under way") && status.contains("free: "), "{status}{err}");
+
     // Once more, on a table like the first, of which nothing is known.
     let output = place.ratn(&["reset"]).output()?;
     let (out, err) = support::texts(&output);
     ensure!(output.status.success() && out.contains("1 boxes") && !out.contains(" 0 facts"), "{out}{err}");
     let again = ["run", task, "--set", "boxes=1", "--set", "budget=false"];
     let (out, err) = support::texts(&place.ratn(&again).output()?);
-    ensure!(out.contains("delivered = 1"), "{out}{err}");
+    ensure!(out.contains("delivered = 1") && !err.contains("ratn reset"), "{out}{err}");
+
+    // A task that ends with an outcome of its own is told from one that fails, and what was there before from a new table.
+    let own = place.path().join("own.yaml");
+    let found_nothing = "task: own\noutcomes: [nothing_found]\nstates:\n  - look: { states: [], transitions: { success: nothing_found } }\n";
+    std::fs::write(&own, found_nothing)?;
+    let output = place.ratn(&["run", own.to_str().context("a path")?]).output()?;
+    let err = support::texts(&output).1;
+    ensure!(output.status.code() == Some(4) && err.contains("nothing_found, an outcome of its own"), "{err}");
+    ensure!(err.contains("`ratn reset` lays a new table"), "{err}");
 
     // One run at a time: a second is refused and leaves no log.
     let waits = place.path().join("waits.yaml");
@@ -74,6 +94,21 @@ fn a_task_runs_on_the_system_that_is_up_and_leaves_it_running() -> anyhow::Resul
         Ok(list.status.success().then_some(()))
     })
     .with_context(|| first.said())?;
+    // It is told by the names of its states what runs and what waits, also of who holds something.
+    let (status, err) = wait_for("what waits", || {
+        let told = support::texts(&place.ratn(&["status"]).output()?);
+        Ok(told.0.contains("wait: want  ").then_some(told))
+    })?;
+    ensure!(
+        status.starts_with("wait in CDTN mode") && status.contains("Token") && !status.contains('\x1b'),
+        "{status}{err}"
+    );
+    let output = place.ratn(&["control", "pause"]).output()?;
+    let (said, err) = support::texts(&output);
+    ensure!(output.status.success() && said.starts_with("wait is paused"), "{said}{err}");
+    let json = support::texts(&place.ratn(&["status", "--json"]).output()?).0;
+    let json: serde_json::Value = serde_json::from_str(&json)?;
+    ensure!(json["run"]["paused"] == true && json["waiting"][0]["holder"] == "wait: want", "{json}");
     let second = place.path().join("second.jsonl");
     let output = place.ratn(&["run", waits, "--log", second.to_str().context("a path")?]).output()?;
     let err = support::texts(&output).1;
@@ -92,5 +127,33 @@ fn a_task_runs_on_the_system_that_is_up_and_leaves_it_running() -> anyhow::Resul
     ensure!(code == Some(0), "{code:?}\n{said}");
     let left = place.processes();
     ensure!(left.is_empty(), "{left:?}");
+    Ok(())
+}
+
+#[test]
+fn a_system_of_another_user_is_told_as_such() -> anyhow::Result<()> {
+    use std::os::unix::fs::PermissionsExt;
+    use std::os::unix::process::CommandExt;
+    if !nix::unistd::geteuid().is_root() {
+        eprintln!("skipped: only root runs a command as somebody else");
+        return Ok(());
+    }
+    const NOBODY: u32 = 65_534;
+    let place = Place::new()?;
+    std::fs::set_permissions(place.path(), PermissionsExt::from_mode(0o755))?;
+    let directory = place.path().join("theirs");
+    std::fs::create_dir(&directory)?;
+    std::fs::write(directory.join("resource-manager.endpoint"), "unix:/nowhere\n")?;
+    std::fs::set_permissions(&directory, PermissionsExt::from_mode(0o700))?;
+    let directory = directory.to_str().context("a path")?;
+    for command in [["ps"].as_slice(), &["status"], &["resource", "list"], &["up"], &["control", "pause"], &["stop"]] {
+        let output = place.ratn(&[command, &["--runtime-dir", directory]].concat()).uid(NOBODY).gid(NOBODY).output()?;
+        let err = support::texts(&output).1;
+        ensure!(output.status.code() == Some(2), "{command:?}: {err}");
+        ensure!(err.contains("permission denied") && err.contains("belongs to uid 0, and you are uid 65534"), "{err}");
+    }
+    let doctor = place.ratn(&["doctor", "--runtime-dir", directory]).uid(NOBODY).gid(NOBODY).output()?;
+    let (out, err) = support::texts(&doctor);
+    ensure!(out.contains("belongs to uid 0") && !out.contains("remove the file"), "{out}{err}");
     Ok(())
 }

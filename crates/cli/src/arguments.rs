@@ -19,7 +19,7 @@ pub(crate) use roles::{CellArguments, KeptRoleArguments, RoleArguments, WorkerAr
 pub(crate) use systems::{Budget, DemoArguments, GoodsArguments, ResetArguments, SystemArguments, UpArguments};
 pub(crate) use tasks::{
     CheckArguments, ControlArguments, ModeArgument, PlanArguments, ReportArguments, RunArguments, SimulateArguments,
-    TablesArguments,
+    StatusArguments, TablesArguments,
 };
 
 /// Runs robot tasks, written as sequential state machines, as fast as their real dependencies allow.
@@ -41,6 +41,8 @@ pub(crate) enum Command {
     Run(RunArguments),
     /// Pause a run that is under way, let it go on, let it do one step, or end it
     Control(ControlArguments),
+    /// Show what runs, by the names of its states, who holds what, and who waits for what
+    Status(StatusArguments),
     /// Show the worker processes of all hosts
     Ps(HostArguments),
     /// Print what a worker writes, on whichever host it is

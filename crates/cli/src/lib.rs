@@ -3,10 +3,11 @@
 //! [`main`] reads the command line and runs one of the commands in `command/`. Task control (`task_control/`) is the shell
 //! around `ratn-executive`; `system/` starts and finds the other processes; `report/` reads event logs.
 //! Results go to stdout, everything else to stderr. Exit code 0 is success, 1 a failure, 2 something refused before anything
-//! was started: a task file, a config or a command line.
+//! was started: a task file, a config or a command line; 4 a task's own outcome.
 
 mod arguments;
 mod background_runtime;
+mod colour;
 mod columns;
 mod command;
 mod failure;

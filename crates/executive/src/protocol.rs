@@ -50,6 +50,23 @@ pub struct Origin {
     /// Paths (without visits) of PIAs beside which younger ones may run: their exceptions are imprecise.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub imprecise: Vec<String>,
+    /// What its actions are, so that a log can be read without the task. Nothing in logs of earlier versions.
+    #[serde(default)]
+    pub natures: Box<Natures>,
+}
+
+/// What the actions of a run are.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Natures {
+    /// Paths (without visits) of the actions that only compute.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub computes: Vec<String>,
+    /// Paths (without visits) of the actions that look at the environment.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub senses: Vec<String>,
+    /// The kinds of resources that move the robot.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub actuating: Vec<String>,
 }
 
 /// What happened.

@@ -101,6 +101,11 @@ impl Query {
         all.map(str::to_owned).collect()
     }
 
+    /// The predicates of the facts that it is about.
+    pub fn predicates(&self) -> BTreeSet<&str> {
+        self.conditions.iter().flat_map(Expr::fact_expressions).map(|fact| fact.predicate.as_str()).collect()
+    }
+
     /// Plans it, and checks it against what facts may say.
     ///
     /// # Errors

@@ -94,6 +94,19 @@ pub(crate) struct ControlArguments {
 }
 
 #[derive(Debug, Clone, Args)]
+pub(crate) struct StatusArguments {
+    /// Show it again whenever it changes, until Ctrl-C
+    #[arg(long)]
+    pub(crate) watch: bool,
+    /// Where the endpoint files of the system are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+    /// Print JSON on standard output: one document, with --watch one a line
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Clone, Args)]
 pub(crate) struct ReportArguments {
     /// The event log
     #[arg(value_name = "LOG")]

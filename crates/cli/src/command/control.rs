@@ -3,22 +3,67 @@
 use super::blocking_on;
 use crate::arguments::ControlArguments;
 use crate::failure::Failure;
+use crate::output;
 use crate::system::public_directory;
-use crate::task_control::control;
+use crate::task_control::control::{self, RunStatus, Word};
 use anyhow::Context;
-use std::io::ErrorKind;
 
 /// Tells the run of a system.
 pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
-        let directory = public_directory(arguments.runtime_dir.as_deref());
+        let directory = public_directory(arguments.runtime_dir.as_deref())?;
         let told = control::tell(&directory, arguments.word).await;
         let place = directory.display();
         match told {
-            Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::ConnectionRefused) => {
+            Err(error) if control::is_nobody(&error) => {
                 Err(anyhow::anyhow!("no run is under way in {place}: say the `--runtime-dir` of its system").into())
             }
-            told => Ok(told.with_context(|| format!("the run in {place} does not take that"))?),
+            told => {
+                told.with_context(|| format!("the run in {place} does not take that"))?;
+                // One that has ended meanwhile says nothing any more.
+                let run = control::status(&directory).await.ok().flatten();
+                Ok(output::result(said(arguments.word, run.as_ref()))?)
+            }
         }
     })
+}
+
+/// What the run does now.
+fn said(word: Word, run: Option<&RunStatus>) -> String {
+    let task = run.map_or("the run", |run| run.task.as_str());
+    let what = match word {
+        Word::Pause => "is paused: no PIA begins any more; `ratn control step` lets one begin, `resume` all",
+        Word::Resume => "goes on",
+        Word::Step => "may begin one more PIA, and is paused then",
+        Word::Abort => "is told to end: what moves stops and holds, and everything is given back",
+    };
+    let under_way: Vec<&str> = run.into_iter().flat_map(|run| &run.under_way).map(|one| one.path.as_str()).collect();
+    match under_way.as_slice() {
+        [] => format!("{task} {what}"),
+        paths => format!("{task} {what}; under way: {}", paths.join(", ")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::task_control::progress::UnderWay;
+    use ratn_executive::protocol::Mode;
+
+    #[test]
+    fn what_was_done_is_said_with_what_goes_on() {
+        let run = RunStatus {
+            run: "run-1".to_owned(),
+            task: "fetch".to_owned(),
+            mode: Mode::Hsm,
+            log: "l".into(),
+            at_s: 1.0,
+            paused: true,
+            ended: 0,
+            under_way: vec![UnderWay { path: "move[1]".to_owned(), for_s: 0.5 }],
+        };
+        let pause = said(Word::Pause, Some(&run));
+        assert!(pause.starts_with("fetch is paused") && pause.ends_with("under way: move[1]"), "{pause}");
+        assert_eq!(said(Word::Resume, None), "the run goes on");
+    }
 }

@@ -17,6 +17,7 @@ mod run;
 mod safety;
 mod simulate;
 mod state;
+mod status;
 mod tables;
 mod up;
 pub(crate) mod world;
@@ -43,6 +44,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Up(arguments) => up::run(&arguments, tls),
         Command::Run(arguments) => run::run(&arguments, tls),
         Command::Control(arguments) => control::run(&arguments),
+        Command::Status(arguments) => status::run(&arguments, tls),
         Command::Ps(arguments) => pool::ps(&arguments, tls),
         Command::Logs(arguments) => pool::logs(&arguments, tls),
         Command::Pool(arguments) => pool::run(&arguments, tls),

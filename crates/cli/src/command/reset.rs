@@ -27,7 +27,7 @@ const SESSION_DEADLINE: Duration = Duration::from_secs(5);
 /// Lays the scene anew and forgets every fact.
 pub(crate) fn run(arguments: &ResetArguments, tls: &ClientTls) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
-        let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()));
+        let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref())?);
         let find = |role| directory.find(role).map_err(|error| Failure::Refused(format!("ratn: {error}")));
         let (manager, pool, cell) = (find(resource_manager::ROLE)?, find(world_pool::ROLE)?, find(ratn_cell::ROLE)?);
         let channels = Channels::new(tls);

@@ -230,7 +230,7 @@ fn daemon_on(
         if arguments.exit_with_parent {
             shutdown::exit_with_parent(&shutdown).context("cannot watch standard input")?;
         }
-        let directory = public_directory(arguments.runtime_dir.as_deref());
+        let directory = public_directory(arguments.runtime_dir.as_deref())?;
         let directory = RuntimeDirectory::create(&directory)
             .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
         let metrics = Arc::new(Metrics::new(role));

@@ -16,7 +16,7 @@ use crate::task_control::shell::{self, Ended, Run};
 use crate::task_control::{learn, log};
 use anyhow::{Context, anyhow, bail};
 use ratn_executive::protocol::Mode;
-use ratn_model::program::SUCCESS;
+use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS};
 use ratn_model::value::Value;
 use ratn_worker::tls::ClientTls;
 use std::path::{Path, PathBuf};
@@ -35,7 +35,7 @@ impl From<ModeArgument> for Mode {
 pub(crate) fn run(arguments: &RunArguments, tls: &ClientTls) -> Result<(), Failure> {
     blocking_here(async {
         let interrupt = Interrupt::listen()?;
-        let directory = public_directory(arguments.runtime_dir.as_deref());
+        let directory = public_directory(arguments.runtime_dir.as_deref())?;
         match (&arguments.resume, &arguments.task) {
             (Some(log), task) => {
                 Box::pin(resume::run(arguments, log, task.as_deref(), &directory, tls, &interrupt)).await
@@ -88,6 +88,9 @@ async fn begin(
     let system = match found {
         Some(system) => {
             output::progress(format_args!("on the system in {}", directory.display()));
+            if let Some(before) = system.left_behind().await {
+                output::progress(before);
+            }
             system
         }
         None => {
@@ -116,7 +119,11 @@ async fn begin(
 
 fn conclude(ended: &Ended, log: &Path, arguments: &RunArguments) -> Result<(), Failure> {
     say(ended, log, arguments)?;
-    if ended.outcome == SUCCESS { Ok(()) } else { Err(anyhow!("the task ended with {}", ended.outcome).into()) }
+    match ended.outcome.as_str() {
+        SUCCESS => Ok(()),
+        outcome @ (ABORTED | PREEMPTED) => Err(anyhow!("the task ended with {outcome}").into()),
+        outcome => Err(Failure::Outcome(outcome.to_owned())),
+    }
 }
 
 /// Starts something, unless the user has enough of it first.

@@ -64,7 +64,7 @@ fn reason(said: &Option<String>) -> String {
 
 fn ask_all(arguments: &SafetyArguments, tls: &ClientTls, question: &Question) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
-        let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()));
+        let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref())?);
         let channels = Channels::new(tls);
         let known: BTreeSet<Endpoint> =
             arguments.endpoint.iter().cloned().chain(directory.find(ratn_cell::ROLE)).collect();

@@ -17,7 +17,7 @@ pub(crate) fn run(arguments: &UpArguments, tls: &ClientTls) -> Result<(), Failur
     startable(&config)?;
     blocking(async {
         let interrupt = Interrupt::listen()?;
-        let directory = public_directory(arguments.runtime_dir.as_deref());
+        let directory = public_directory(arguments.runtime_dir.as_deref())?;
         if running(&directory, tls).await?.is_some() {
             return Err(Failure::Refused(format!("ratn: a system runs in {} already", directory.display())));
         }

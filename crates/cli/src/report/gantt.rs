@@ -116,9 +116,11 @@ fn legend(out: &mut String, run: &Timeline) {
         ("none\" stroke=\"#c3362b\" stroke-width=\"2", "aborted or crashed"),
         ("#c4c9d2", "discarded"),
     ];
+    let other = run.jobs().any(|(_, job)| job.activity == Activity::Other);
+    let other = other.then(|| (colour(Activity::Other, 0), "other work"));
     let bands = [(!run.pauses.is_empty(), PAUSED, "paused"), (!run.absences.is_empty(), ABSENT, "task control gone")];
     let bands = bands.into_iter().filter_map(|(there, fill, what)| there.then_some((fill, what)));
-    for (fill, what) in entries.into_iter().chain(bands) {
+    for (fill, what) in entries.into_iter().chain(other).chain(bands) {
         let _ = writeln!(
             out,
             "<rect x=\"{x:.0}\" y=\"46\" width=\"16\" height=\"12\" rx=\"2\" fill=\"{fill}\"/>\
@@ -252,7 +254,8 @@ impl Row<'_> {
 
 fn draw_job(out: &mut String, axis: &Axis, y: f64, instance: &Instance, job: &Job) {
     let (x, width) = (axis.x(job.from_s), (axis.x(job.to_s) - axis.x(job.from_s)).max(1.0));
-    let discarded = instance.squashed || job.ending == Ending::Cancelled || job.invalidated.is_some();
+    let unused = instance.squashed || job.invalidated.is_some();
+    let discarded = (unused && !job.used_elsewhere) || job.ending == Ending::Cancelled;
     let fill = if discarded { "#c4c9d2" } else { colour(job.activity, visit(&instance.path)) };
     let (how, failed) = match &job.ending {
         Ending::Outcome(outcome, reason) if outcome == "aborted" => (format!("aborted: {reason}"), true),
@@ -264,6 +267,7 @@ fn draw_job(out: &mut String, axis: &Axis, y: f64, instance: &Instance, job: &Jo
     let stroke = if failed { "#c3362b\" stroke-width=\"2" } else { "#ffffff\" stroke-width=\"0.8" };
     let attempt = if job.attempt > 1 { format!(", attempt {}", job.attempt) } else { String::new() };
     let discarded = match &job.invalidated {
+        _ if job.used_elsewhere => ", its result was used by an equal visit".into(),
         Some(reason) => format!(", done again: {}", escaped(reason)),
         None if discarded => ", discarded".into(),
         None => String::new(),
@@ -298,6 +302,7 @@ fn colour(activity: Activity, shade: usize) -> &'static str {
     let shades = match activity {
         Activity::Motion => ["#8fb8e8", "#b3d0f2", "#74a3da"],
         Activity::Detection => ["#8fcf9b", "#b4e0bb", "#72ba80"],
+        Activity::Other => ["#c9b6e4", "#ddd0ef", "#b39ad6"],
         Activity::Planning => ["#f5c06b", "#fad79c", "#e8aa45"],
     };
     shades[shade % shades.len()]

@@ -9,6 +9,7 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::{gantt, statistics::Statistics, timeline::Timeline};
     use crate::task_control::log;
+    use ratn_executive::protocol::LogLine;
     use std::path::Path;
 
     /// A run with a wait, a crash and its second attempt, a discarded plan and an aborted motion.
@@ -31,7 +32,7 @@ mod tests {
     fn where_the_time_went_adds_up_to_the_makespan() {
         let statistics = Statistics::of(&two_boxes());
         let time = statistics.time;
-        let sum = time.motion_s + time.detection_s + time.planning_waited_for_s + time.idle_s;
+        let sum = time.motion_s + time.detection_s + time.other_s + time.planning_waited_for_s + time.idle_s;
         assert!((sum - statistics.makespan_s).abs() < 1e-9);
     }
 
@@ -51,6 +52,46 @@ mod tests {
         task control was gone for 2.0 s
         exceptions were imprecise: turn began beside move, which might have failed (1 in all)
         ");
+    }
+
+    /// A log of one run: a look ahead on two branches, of which the second takes the result of the first, and a label that is read.
+    fn told(lines: &str) -> Timeline {
+        let lines: Vec<LogLine> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        Timeline::of(&lines)
+    }
+
+    const WITH_A_LABEL: &str = r#"{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":7,"world":[],"revision":1,"origin":{"run":"r","natures":{"computes":["plan"],"actuating":["Arm"]}}}
+{"at":0,"command":"note","note":"expanded","instance":1,"state":1,"path":"read","speculative":false}
+{"at":0,"command":"note","note":"expanded","instance":2,"state":2,"path":"move","speculative":false}
+{"at":0,"command":"note","note":"expanded","instance":3,"state":3,"path":"plan","speculative":true}
+{"at":0,"command":"note","note":"expanded","instance":4,"state":3,"path":"plan","speculative":true}
+{"at":0,"command":"start","instance":1,"attempt":1,"goal":{"provider":"reader","action":"read","inputs":{},"seed":1,"lease":{"id":1,"token":1,"resources":[{"id":"label-1@compute","kind":"LabelReader","endpoint":""}]},"projection":null,"expected_s":null}}
+{"at":0,"command":"start","instance":3,"attempt":1,"goal":{"provider":"brain","action":"think","inputs":{},"seed":1,"lease":null,"projection":null,"expected_s":null}}
+{"at":2000000000,"event":"finished","instance":1,"attempt":1,"outcome":"success","outputs":{},"measured":[],"reason":""}
+{"at":3000000000,"event":"finished","instance":3,"attempt":1,"outcome":"success","outputs":{},"measured":[],"reason":""}
+{"at":3000000000,"command":"start","instance":2,"attempt":1,"goal":{"provider":"arm","action":"move","inputs":{},"seed":1,"lease":{"id":2,"token":2,"resources":[{"id":"arm@sim","kind":"Arm","endpoint":""}]},"projection":null,"expected_s":null}}
+{"at":4000000000,"event":"finished","instance":2,"attempt":1,"outcome":"success","outputs":{},"measured":[],"reason":""}
+{"at":4000000000,"command":"note","note":"squashed","instance":3}
+{"at":4000000000,"command":"note","note":"reused","instance":4}"#;
+
+    #[test]
+    fn what_holds_nothing_that_moves_is_no_motion() {
+        let time = Statistics::of(&told(WITH_A_LABEL)).time;
+        assert_eq!(
+            (time.motion_s, time.other_s, time.planning_waited_for_s, time.detection_s, time.idle_s),
+            (1.0, 2.0, 1.0, 0.0, 0.0)
+        );
+        assert!(Statistics::of(&told(WITH_A_LABEL)).to_string().contains("other work"));
+    }
+
+    #[test]
+    fn work_whose_result_an_equal_visit_took_is_not_discarded() {
+        let chart = gantt::svg(&told(WITH_A_LABEL), None);
+        assert!(chart.contains("its result was used by an equal visit") && !chart.contains(", discarded<"), "{chart}");
+        let alone = WITH_A_LABEL.rsplit_once('\n').unwrap().0;
+        assert!(gantt::svg(&told(alone), None).contains(", discarded<"));
+        let ahead = |lines: &str| Statistics::of(&told(lines)).ahead_of_time;
+        assert_eq!((ahead(WITH_A_LABEL).used, ahead(alone).used), (1, 0));
     }
 
     #[test]

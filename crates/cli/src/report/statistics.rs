@@ -1,7 +1,7 @@
 //! Where the time of a run went.
 //!
-//! Every moment of a run counts once in [`Shares`]: to motion if anything moves, else to detection, else to planning that
-//! everything waits for, else to idleness; the four add up to the makespan.
+//! Every moment of a run counts once in [`Shares`]: to motion if anything moves, else to detection, else to other work, else to planning
+//! that everything waits for, else to idleness; they add up to the makespan.
 
 use super::timeline::{Activity, Ending, Job, Span, Timeline};
 use ratn_executive::protocol::Mode;
@@ -45,8 +45,15 @@ pub(crate) struct Statistics {
 pub(crate) struct Shares {
     pub(crate) motion_s: f64,
     pub(crate) detection_s: f64,
+    /// What neither moves the robot nor looks nor computes.
+    #[serde(skip_serializing_if = "is_nothing")]
+    pub(crate) other_s: f64,
     pub(crate) planning_waited_for_s: f64,
     pub(crate) idle_s: f64,
+}
+
+fn is_nothing(seconds: &f64) -> bool {
+    *seconds == 0.0
 }
 
 /// How many instances there were.
@@ -163,6 +170,7 @@ fn divide(end_s: f64, jobs: &[&Job]) -> (Shares, f64) {
         *match running().map(|job| job.activity).min() {
             Some(Activity::Motion) => &mut shares.motion_s,
             Some(Activity::Detection) => &mut shares.detection_s,
+            Some(Activity::Other) => &mut shares.other_s,
             Some(Activity::Planning) => &mut shares.planning_waited_for_s,
             None => &mut shares.idle_s,
         } += length;
@@ -176,9 +184,16 @@ fn divide(end_s: f64, jobs: &[&Job]) -> (Shares, f64) {
 fn ahead_of_time(run: &Timeline) -> AheadOfTime {
     let mut count = AheadOfTime::default();
     for instance in &run.instances {
-        if instance.jobs.iter().any(|job| job.ahead_of_time && job.activity != Activity::Motion) {
-            count.used += usize::from(instance.retired);
-            count.squashed += usize::from(instance.squashed);
+        let ahead = || {
+            instance
+                .jobs
+                .iter()
+                .filter(|job| job.ahead_of_time && matches!(job.activity, Activity::Detection | Activity::Planning))
+        };
+        if ahead().next().is_some() {
+            let used_elsewhere = ahead().any(|job| job.used_elsewhere);
+            count.used += usize::from(instance.retired || used_elsewhere);
+            count.squashed += usize::from(instance.squashed && !used_elsewhere);
         }
     }
     count
@@ -263,9 +278,13 @@ impl fmt::Display for Statistics {
         for (what, seconds) in [
             ("motion", self.time.motion_s),
             ("detection", self.time.detection_s),
+            ("other work", self.time.other_s),
             ("planning waited for", self.time.planning_waited_for_s),
             ("idle", self.time.idle_s),
-        ] {
+        ]
+        .into_iter()
+        .filter(|(what, seconds)| *what != "other work" || *seconds > 0.0)
+        {
             writeln!(f, "  {what:<22} {seconds:>7.1} {:>6.1}", percent(seconds))?;
         }
         writeln!(

@@ -4,9 +4,10 @@
 //! without the task file and the system that made it.
 
 use super::statistics::without_visits;
-use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Mode, Note};
+use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Mode, Note};
 use ratn_model::id::InstanceId;
 use ratn_model::program::WORLD_MODEL;
+use ratn_model::resource::LeasedResource;
 use ratn_model::value::Value;
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
@@ -93,6 +94,8 @@ pub(crate) struct Job {
     pub(crate) ahead_of_time: bool,
     /// Why it had to be done again, where it had to.
     pub(crate) invalidated: Option<String>,
+    /// Another visit took its result, or a later try of the same.
+    pub(crate) used_elsewhere: bool,
 }
 
 /// What a job is, as far as a log tells.
@@ -103,6 +106,8 @@ pub(crate) enum Activity {
     Motion,
     /// It looks at the environment.
     Detection,
+    /// It may change the environment, and holds nothing that moves the robot.
+    Other,
     /// It works on a projection.
     Planning,
 }
@@ -120,7 +125,7 @@ pub(crate) enum Ending {
     Open,
 }
 
-/// Kinds whose holder looks at the environment.
+/// Kinds whose holder looks at the environment, where a log does not say who does.
 const LOOKING: [&str; 2] = ["Camera", "Detector"];
 
 impl Timeline {
@@ -160,6 +165,11 @@ struct Fold {
     paused: Option<f64>,
     /// Plain paths of PIAs whose exceptions are imprecise.
     imprecise: BTreeSet<String>,
+    /// Plain paths of what only computes, and of what looks at the environment.
+    computes: BTreeSet<String>,
+    senses: BTreeSet<String>,
+    /// Kinds that move the robot; none where the log does not say.
+    actuating: BTreeSet<String>,
 }
 
 impl Default for Fold {
@@ -179,7 +189,17 @@ impl Default for Fold {
             beside: Vec::new(),
             instances: Vec::new(),
         };
-        Fold { run, index: BTreeMap::new(), asked: BTreeMap::new(), paused: None, imprecise: BTreeSet::new() }
+        let none = BTreeSet::new;
+        Fold {
+            run,
+            index: BTreeMap::new(),
+            asked: BTreeMap::new(),
+            paused: None,
+            imprecise: none(),
+            computes: none(),
+            senses: none(),
+            actuating: none(),
+        }
     }
 }
 
@@ -187,7 +207,11 @@ impl Fold {
     fn event(&mut self, at: f64, event: &Event) {
         match event {
             Event::Started { task, mode, parameters, seed, origin, .. } => {
-                self.imprecise = origin.imprecise.iter().cloned().collect();
+                let all = |paths: &[String]| paths.iter().cloned().collect();
+                self.imprecise = all(&origin.imprecise);
+                self.computes = all(&origin.natures.computes);
+                self.senses = all(&origin.natures.senses);
+                self.actuating = all(&origin.natures.actuating);
                 self.run.task.clone_from(task);
                 self.run.mode = *mode;
                 self.run.parameters.clone_from(parameters);
@@ -233,7 +257,7 @@ impl Fold {
             Command::Note(Note::Finished { instance, .. }) => self.instance(*instance).finished = true,
             Command::Note(Note::Retired { instance }) => self.instance(*instance).retired = true,
             Command::Note(Note::Squashed { instance }) => self.instance(*instance).squashed = true,
-            Command::Note(Note::Reused { instance }) => self.instance(*instance).reused = true,
+            Command::Note(Note::Reused { instance }) => self.reuses(*instance),
             Command::Note(Note::Invalidated { instance, reason }) => {
                 let instance = self.instance(*instance);
                 instance.invalidations.push(reason.clone());
@@ -250,18 +274,13 @@ impl Fold {
             }
             Command::Start { instance, attempt, goal } => {
                 let leased = goal.lease.iter().flat_map(|lease| &lease.resources);
-                let looks = leased.clone().any(|r| LOOKING.contains(&r.kind.as_str()));
-                let activity = match (goal.projection.is_some(), looks) {
-                    (true, _) => Activity::Planning,
-                    (false, true) => Activity::Detection,
-                    (false, false) => Activity::Motion,
-                };
+                let activity = self.activity(*instance, goal);
                 let ahead_of_time = self
                     .run
                     .instances
                     .iter()
                     .any(|other| other.id < *instance && !(other.finished || other.retired || other.squashed));
-                if activity == Activity::Motion {
+                if matches!(activity, Activity::Motion | Activity::Other) {
                     self.begins_beside(*instance);
                 }
                 let job = Job {
@@ -276,6 +295,7 @@ impl Fold {
                     outputs: BTreeMap::new(),
                     ahead_of_time,
                     invalidated: None,
+                    used_elsewhere: false,
                 };
                 self.instance(*instance).jobs.push(job);
             }
@@ -295,9 +315,38 @@ impl Fold {
         }
     }
 
+    /// The result is that of an equal visit: of the same path, with a result. Of several, the one that ended last.
+    fn reuses(&mut self, id: InstanceId) {
+        self.instance(id).reused = true;
+        let path = self.instance(id).path.clone();
+        let equal = self.run.instances.iter_mut().filter(|other| other.path == path).flat_map(|other| &mut other.jobs);
+        let with_result = equal.filter(|job| matches!(job.ending, Ending::Outcome(..)));
+        if let Some(job) = with_result.max_by(|a, b| a.to_s.total_cmp(&b.to_s)) {
+            job.used_elsewhere = true;
+        }
+    }
+
     fn goes_on(&mut self, at: f64) {
         if let Some(from_s) = self.paused.take() {
             self.run.pauses.push(Span { from_s, to_s: at });
+        }
+    }
+
+    /// What a goal is: as the task says, else by what it holds.
+    fn activity(&mut self, id: InstanceId, goal: &Goal) -> Activity {
+        let state = without_visits(&self.instance(id).path);
+        let holds = |is_meant: &dyn Fn(&LeasedResource) -> bool| {
+            goal.lease.iter().flat_map(|lease| &lease.resources).any(is_meant)
+        };
+        let moves = |one: &LeasedResource| self.actuating.iter().any(|kind| one.is_a(kind));
+        if goal.projection.is_some() || self.computes.contains(&state) {
+            Activity::Planning
+        } else if self.senses.contains(&state) || holds(&|one| LOOKING.contains(&one.kind.as_str())) {
+            Activity::Detection
+        } else if self.actuating.is_empty() || holds(&moves) {
+            Activity::Motion
+        } else {
+            Activity::Other
         }
     }
 

@@ -133,6 +133,13 @@ impl SystemConfig {
         self.settle();
     }
 
+    /// The same at another speed.
+    pub(crate) fn at_speed(mut self, speed: f64) -> SystemConfig {
+        self.speed = speed;
+        self.settle();
+        self
+    }
+
     /// The process manager's section with the speed filled in.
     pub(crate) fn process_manager_config(&self) -> ProcessManagerConfig {
         let mut config = self.process_manager.clone();

@@ -3,21 +3,23 @@
 pub(crate) mod config;
 mod launch;
 
-use crate::failure::NotStarted;
+use crate::failure::{Failure, NotStarted};
 use crate::task_control::Endpoints;
 use crate::task_control::shell::Place;
 use anyhow::Context;
 use config::SystemConfig;
 use launch::Processes;
+use nix::unistd::{AccessFlags, access};
 use ratn_daemon::config::{Durability, state_directory};
 use ratn_model::resource::Quantity;
 use ratn_proto::v1::cell_service_client::CellServiceClient;
 use ratn_proto::v1::{GetGroundTruthRequest, UnintendedContact};
-use ratn_worker::client::{Channels, ResourceClient};
+use ratn_worker::client::{Channels, ResourceClient, WorldClient};
 use ratn_worker::endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
 use std::collections::BTreeMap;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -80,6 +82,7 @@ impl System {
         private: Option<tempfile::TempDir>,
         tls: &ClientTls,
     ) -> anyhow::Result<System> {
+        sockets_fit(&config, directory)?;
         let directory = RuntimeDirectory::create(directory).map_err(|error| {
             let error = anyhow::Error::from(error);
             NotStarted(format!("cannot make the runtime directory {}: {error:#}", directory.display()))
@@ -113,13 +116,7 @@ impl System {
         tls: &ClientTls,
     ) -> anyhow::Result<Option<System>> {
         let Some(endpoints) = running(directory, tls).await? else { return Ok(None) };
-        let config = match config {
-            Some(config) => config,
-            None => SystemConfig::read(&directory.join(CONFIG_FILE)).with_context(|| {
-                let place = directory.display();
-                format!("a system runs in {place}, but not under `ratn up`: say its config with --config FILE")
-            })?,
-        };
+        let config = config_of(directory, config)?;
         let directory = RuntimeDirectory::at(directory);
         Ok(Some(System {
             config,
@@ -165,9 +162,67 @@ impl System {
         })
     }
 
+    /// What to know of a system that others have used: its facts stay, and things stand where they were left.
+    pub(crate) async fn left_behind(&self) -> Option<String> {
+        let world = WorldClient::new(&Channels::new(&self.tls), &self.endpoints.world_pool).ok()?;
+        let (_, facts) = world.root().await.ok()?;
+        let reset = match self.directory.find(CELL) {
+            Ok(_) => "; `ratn reset` lays a new table and forgets them",
+            Err(_) => "",
+        };
+        let many = if facts.len() == 1 { "1 fact".to_owned() } else { format!("{} facts", facts.len()) };
+        (!facts.is_empty())
+            .then(|| format!("its world has {many} from before, and things are where earlier runs left them{reset}"))
+    }
+
     /// Ends what was started for it.
     pub(crate) async fn stop(self) {
         self.processes.stop().await;
+    }
+}
+
+/// A path of a Unix socket has so many bytes at the most (`sun_path` has 108, one of them ends it).
+const MAX_SOCKET_PATH: usize = 107;
+
+/// Refuses a directory that is too deep for the sockets in it, before anything is started.
+fn sockets_fit(config: &SystemConfig, directory: &Path) -> Result<(), NotStarted> {
+    let listens = [
+        &config.resource_manager.listen,
+        &config.world_pool.listen,
+        &config.cell.listen,
+        &config.process_manager.listen,
+    ];
+    let absolute = std::path::absolute(directory).unwrap_or_else(|_| directory.to_owned());
+    let place = absolute.canonicalize().unwrap_or(absolute);
+    let local = ROLES.iter().zip(listens).filter(|(_, listen)| listen.is_local());
+    let Some(longest) =
+        local.map(|(role, _)| place.join(format!("{role}.sock"))).max_by_key(|path| path.as_os_str().len())
+    else {
+        return Ok(());
+    };
+    let length = longest.as_os_str().len();
+    if length <= MAX_SOCKET_PATH {
+        return Ok(());
+    }
+    Err(NotStarted(format!(
+        "the runtime directory {} is too deep: {} would have {length} bytes, and the path of a Unix socket has {MAX_SOCKET_PATH} at the \
+         most; name one that is at least {} bytes shorter (--runtime-dir, $RATN_RUNTIME_DIR, or $TMPDIR for a system that `run` starts)",
+        place.display(),
+        longest.display(),
+        length - MAX_SOCKET_PATH
+    )))
+}
+
+/// The config of the system that runs in `directory`. One that is given says what there is; how fast it goes is decided already.
+fn config_of(directory: &Path, given: Option<SystemConfig>) -> anyhow::Result<SystemConfig> {
+    let own = SystemConfig::read(&directory.join(CONFIG_FILE));
+    match (given, own) {
+        (Some(given), Ok(own)) => Ok(given.at_speed(own.speed)),
+        (Some(given), Err(_)) => Ok(given),
+        (None, own) => own.with_context(|| {
+            let place = directory.display();
+            format!("a system runs in {place}, but not under `ratn up`: say its config with --config FILE")
+        }),
     }
 }
 
@@ -229,8 +284,53 @@ async fn ready(
     Ok(Endpoints { resource_manager: directory.find(ROLES[0])?, world_pool: directory.find(ROLES[1])? })
 }
 
+/// Where endpoint files are, as [`directory_of`] says.
+///
+/// # Errors
+/// Where they are another user's, and not to be looked at.
+pub(crate) fn public_directory(given: Option<&Path>) -> Result<PathBuf, Failure> {
+    let directory = directory_of(given);
+    match denied(&directory) {
+        None => Ok(directory),
+        Some(why) => {
+            let help = "name one of your own with --runtime-dir DIR or $RATN_RUNTIME_DIR";
+            Err(Failure::Refused(format!("ratn: {why}; {help}")))
+        }
+    }
+}
+
+/// Why the system in a directory is not to be spoken to: it is another user's, who lets this one neither look nor connect.
+pub(crate) fn denied(directory: &Path) -> Option<String> {
+    let is = match directory.metadata() {
+        Ok(is) => is,
+        Err(error) if error.kind() == std::io::ErrorKind::PermissionDenied => {
+            return Some(format!(
+                "permission denied: {} is below a directory that you may not enter",
+                directory.display()
+            ));
+        }
+        Err(_) => return None,
+    };
+    let me = nix::unistd::geteuid();
+    if is.uid() == me.as_raw() {
+        return None;
+    }
+    let may = |path: &Path, how: AccessFlags| access(path, how).is_ok();
+    let sockets = ROLES.iter().map(|role| directory.join(format!("{role}.sock"))).filter(|socket| socket.exists());
+    let closed: Vec<bool> = sockets.map(|socket| !may(&socket, AccessFlags::W_OK)).collect();
+    let is_closed = !may(directory, AccessFlags::R_OK | AccessFlags::X_OK)
+        || (!closed.is_empty() && closed.into_iter().all(|closed| closed));
+    is_closed.then(|| {
+        format!(
+            "permission denied: the system in {} belongs to uid {}, and you are uid {me}",
+            directory.display(),
+            is.uid()
+        )
+    })
+}
+
 /// Where endpoint files are unless said otherwise: as the environment says, else a directory of this user.
-pub(crate) fn public_directory(given: Option<&Path>) -> PathBuf {
+pub(crate) fn directory_of(given: Option<&Path>) -> PathBuf {
     if let Some(path) = given {
         return path.to_owned();
     }
@@ -249,6 +349,39 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
     use ratn_worker::endpoint::Endpoint;
+
+    #[test]
+    fn a_directory_that_is_too_deep_for_a_socket_is_refused_before_anything_is_made() {
+        let config = SystemConfig::load(None).unwrap();
+        let root = tempfile::tempdir().unwrap();
+        let room =
+            MAX_SOCKET_PATH - root.path().canonicalize().unwrap().as_os_str().len() - "//resource-manager.sock".len();
+        let fits = root.path().join("x".repeat(room));
+        assert!(sockets_fit(&config, &fits).is_ok());
+        let deep = root.path().join("x".repeat(room + 3));
+        let refused = sockets_fit(&config, &deep).unwrap_err().to_string();
+        assert!(refused.contains("110 bytes") && refused.contains("3 bytes shorter"), "{refused}");
+        assert!(!deep.exists());
+    }
+
+    #[test]
+    fn a_directory_of_ones_own_and_one_that_is_not_there_are_not_denied() {
+        let place = tempfile::tempdir().unwrap();
+        assert_eq!(denied(place.path()), None);
+        assert_eq!(denied(&place.path().join("nowhere")), None);
+    }
+
+    #[test]
+    fn a_running_system_keeps_its_speed_whatever_config_is_given() {
+        let place = tempfile::tempdir().unwrap();
+        let given = || SystemConfig::load(None).unwrap();
+        assert!(config_of(place.path(), None).is_err());
+        assert_eq!(config_of(place.path(), Some(given())).unwrap().speed, given().speed);
+        let running = given().at_speed(17.0);
+        std::fs::write(place.path().join(CONFIG_FILE), running.to_toml().unwrap()).unwrap();
+        assert_eq!(config_of(place.path(), Some(given())).unwrap().speed, 17.0);
+        assert_eq!(config_of(place.path(), None).unwrap().speed, 17.0);
+    }
 
     #[tokio::test]
     async fn a_system_that_is_not_trusted_here_may_run_and_one_where_nobody_listens_does_not() {

@@ -1,14 +1,16 @@
 //! A run's ear: a Unix socket in the runtime directory of its system, over which `ratn control` pauses it, lets it go on, lets
-//! one PIA begin, or ends it. One word per line; each is answered by one line.
+//! one PIA begin, or ends it, and `ratn status` asks what it is doing. One word per line; each is answered by one line.
 
+use super::progress::UnderWay;
 use crate::output;
-use ratn_executive::protocol::Event;
+use ratn_executive::protocol::{Event, Mode};
+use serde::{Deserialize, Serialize};
 use std::io::{Error, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{UnixListener, UnixStream};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 /// In a system's runtime directory: where its run listens.
@@ -20,6 +22,37 @@ const MAX_LINE_BYTES: u64 = 64;
 /// A run that does not answer for so long does not listen.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
 const DONE: &str = "ok";
+/// The word that asks what the run is doing.
+const STATUS: &str = "status";
+/// No run has so much to say of itself.
+const MAX_STATUS_BYTES: u64 = 4 << 20;
+
+/// What a run is doing.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct RunStatus {
+    /// Its id.
+    pub(crate) run: String,
+    pub(crate) task: String,
+    pub(crate) mode: Mode,
+    /// The event log.
+    pub(crate) log: PathBuf,
+    /// The robot's seconds since it began.
+    pub(crate) at_s: f64,
+    /// Whether the user has paused it.
+    pub(crate) paused: bool,
+    /// How many states have ended for good.
+    pub(crate) ended: u64,
+    pub(crate) under_way: Vec<UnderWay>,
+}
+
+/// What somebody wants of a run.
+#[derive(Debug)]
+pub(crate) enum Asked {
+    /// It shall do something.
+    Told(Box<Event>),
+    /// It shall say what it is doing.
+    Status(oneshot::Sender<RunStatus>),
+}
 
 /// What a run can be told.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -59,7 +92,7 @@ impl Word {
 /// Listens until dropped.
 #[derive(Debug)]
 pub(crate) struct Control {
-    words: mpsc::Receiver<Event>,
+    words: mpsc::Receiver<Asked>,
     path: PathBuf,
     _end: DropGuard,
 }
@@ -92,8 +125,8 @@ impl Control {
         listening.ok()
     }
 
-    /// What the run is told next.
-    pub(crate) async fn told(&mut self) -> Event {
+    /// What the run is asked next.
+    pub(crate) async fn asked(&mut self) -> Asked {
         match self.words.recv().await {
             Some(event) => event,
             None => std::future::pending().await,
@@ -107,7 +140,7 @@ impl Drop for Control {
     }
 }
 
-async fn accept(listener: UnixListener, tell: mpsc::Sender<Event>) {
+async fn accept(listener: UnixListener, tell: mpsc::Sender<Asked>) {
     loop {
         // One after the other: whoever is slow is given up after a while.
         if let Ok((stream, _)) = listener.accept().await {
@@ -116,15 +149,23 @@ async fn accept(listener: UnixListener, tell: mpsc::Sender<Event>) {
     }
 }
 
-async fn hear(mut stream: UnixStream, tell: &mpsc::Sender<Event>) -> std::io::Result<()> {
+async fn hear(mut stream: UnixStream, tell: &mpsc::Sender<Asked>) -> std::io::Result<()> {
     let (reader, mut writer) = stream.split();
     let mut line = String::new();
     BufReader::new(reader.take(MAX_LINE_BYTES)).read_line(&mut line).await?;
+    const BEHIND: &str = "the run is too far behind";
     let word = Word::ALL.into_iter().find(|word| word.text() == line.trim());
     let answer = match word {
-        Some(word) if tell.try_send(word.event()).is_ok() => DONE,
-        Some(_) => "the run is too far behind",
-        None => "expected pause, resume, step or abort",
+        Some(word) if tell.try_send(Asked::Told(Box::new(word.event()))).is_ok() => DONE.to_owned(),
+        Some(_) => BEHIND.to_owned(),
+        None if line.trim() == STATUS => {
+            let (say, said) = oneshot::channel();
+            match tell.try_send(Asked::Status(say)) {
+                Ok(()) => said.await.map_err(Error::other).and_then(|status| Ok(serde_json::to_string(&status)?))?,
+                Err(_) => BEHIND.to_owned(),
+            }
+        }
+        None => "expected pause, resume, step, abort or status".to_owned(),
     };
     writer.write_all(format!("{answer}\n").as_bytes()).await
 }
@@ -134,15 +175,39 @@ async fn hear(mut stream: UnixStream, tell: &mpsc::Sender<Event>) -> std::io::Re
 /// # Errors
 /// Where no run listens, or it does not take the word.
 pub(crate) async fn tell(directory: &Path, word: Word) -> std::io::Result<()> {
+    match ask(directory, word.text(), MAX_LINE_BYTES).await?.as_str() {
+        DONE => Ok(()),
+        other => Err(Error::other(other.to_owned())),
+    }
+}
+
+/// What the run of the system in `directory` is doing; `None` where none is under way.
+///
+/// # Errors
+/// Where it does not say.
+pub(crate) async fn status(directory: &Path) -> std::io::Result<Option<RunStatus>> {
+    match ask(directory, STATUS, MAX_STATUS_BYTES).await {
+        Ok(answer) => serde_json::from_str(&answer).map(Some).map_err(|_| Error::other(answer)),
+        Err(error) if is_nobody(&error) => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+/// Whether an error says that no run listens.
+pub(crate) fn is_nobody(error: &Error) -> bool {
+    matches!(error.kind(), ErrorKind::NotFound | ErrorKind::ConnectionRefused)
+}
+
+/// Says a word and hears the line that answers it.
+async fn ask(directory: &Path, word: &str, most: u64) -> std::io::Result<String> {
     let asking = async {
         let mut stream = UnixStream::connect(directory.join(SOCKET)).await?;
-        stream.write_all(format!("{}\n", word.text()).as_bytes()).await?;
+        stream.write_all(format!("{word}\n").as_bytes()).await?;
         let mut answer = String::new();
-        BufReader::new(stream.take(MAX_LINE_BYTES)).read_line(&mut answer).await?;
+        BufReader::new(stream.take(most)).read_line(&mut answer).await?;
         match answer.trim() {
-            DONE => Ok(()),
             "" => Err(Error::new(ErrorKind::UnexpectedEof, "it has just ended")),
-            other => Err(Error::other(other.to_owned())),
+            answer => Ok(answer.to_owned()),
         }
     };
     tokio::time::timeout(ANSWER_DEADLINE, asking).await.unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()))
@@ -161,9 +226,40 @@ mod tests {
         for word in [Word::Pause, Word::Step] {
             tell(place.path(), word).await?;
         }
-        assert_eq!((control.told().await, control.told().await), (Event::PauseRequested, Event::StepRequested));
+        for expected in [Event::PauseRequested, Event::StepRequested] {
+            assert!(matches!(control.asked().await, Asked::Told(event) if *event == expected));
+        }
         drop(control);
         assert!(tell(place.path(), Word::Resume).await.is_err());
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn a_run_says_what_it_is_doing_and_where_none_listens_there_is_none() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        assert_eq!(status(place.path()).await?, None);
+        let mut control = Control::listen(place.path())?;
+        let doing = RunStatus {
+            run: "run-1".to_owned(),
+            task: "sort".to_owned(),
+            mode: Mode::Cdtn,
+            log: PathBuf::from("log.jsonl"),
+            at_s: 3.5,
+            paused: true,
+            ended: 2,
+            under_way: vec![UnderWay { path: "place[2]/plan".to_owned(), for_s: 1.5 }],
+        };
+        let said = doing.clone();
+        let answering = tokio::spawn(async move {
+            if let Asked::Status(say) = control.asked().await {
+                let _ = say.send(said);
+            }
+        });
+        assert_eq!(status(place.path()).await?, Some(doing));
+        answering.await?;
+        // The socket of a run that was killed.
+        std::fs::write(place.path().join(SOCKET), "")?;
+        assert_eq!(status(place.path()).await?, None);
         Ok(())
     }
 
@@ -179,7 +275,7 @@ mod tests {
             assert!(control.words.try_recv().is_err());
         }
         tell(place.path(), Word::Abort).await?;
-        assert!(matches!(control.told().await, Event::AbortRequested { .. }));
+        assert!(matches!(control.asked().await, Asked::Told(event) if matches!(*event, Event::AbortRequested { .. })));
         Ok(())
     }
 }

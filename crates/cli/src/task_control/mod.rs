@@ -9,7 +9,7 @@ mod ledger;
 pub(crate) mod log;
 mod outside;
 mod performer;
-mod progress;
+pub(crate) mod progress;
 mod record;
 mod replay;
 pub(crate) mod shell;

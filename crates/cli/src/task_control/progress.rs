@@ -21,8 +21,21 @@ pub(crate) struct Progress {
     /// Those that have left it, the oldest first.
     gone: VecDeque<InstanceId>,
     started: BTreeMap<InstanceId, Timestamp>,
+    /// How many states have ended for good.
+    retired: u64,
+    /// Whether no PIA is to begin.
+    paused: bool,
     #[serde(skip)]
     quiet: bool,
+}
+
+/// A state that is under way.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct UnderWay {
+    /// Its path with visits.
+    pub(crate) path: String,
+    /// Since when, in the robot's seconds.
+    pub(crate) for_s: f64,
 }
 
 impl Progress {
@@ -41,6 +54,7 @@ impl Progress {
         if let Event::Finished { instance, .. } = event {
             self.started.remove(instance);
         }
+        self.hear(event);
         for command in commands.clone() {
             match command {
                 Command::Note(Note::Expanded { instance, path, .. }) => {
@@ -54,11 +68,43 @@ impl Progress {
         self.forget(commands);
     }
 
+    /// Whether PIAs may begin after an event.
+    fn hear(&mut self, event: &Event) {
+        match event {
+            Event::PauseRequested | Event::StepRequested => self.paused = true,
+            Event::ResumeRequested => self.paused = false,
+            _ => {}
+        }
+    }
+
+    /// Whether the user has paused the run.
+    pub(crate) fn is_paused(&self) -> bool {
+        self.paused
+    }
+
+    /// How many states have ended for good.
+    pub(crate) fn retired(&self) -> u64 {
+        self.retired
+    }
+
+    /// The states that are under way, those that began first first.
+    pub(crate) fn under_way(&self, now: Timestamp) -> Vec<UnderWay> {
+        let mut all: Vec<(Timestamp, InstanceId)> = self.started.iter().map(|(id, at)| (*at, *id)).collect();
+        all.sort_unstable();
+        all.into_iter().map(|(at, id)| UnderWay { path: self.path(id), for_s: now.since(at).as_secs_f64() }).collect()
+    }
+
+    /// The paths of the instances that are known.
+    pub(crate) fn paths(&self) -> &BTreeMap<InstanceId, String> {
+        &self.paths
+    }
+
     /// Of an instance that has left the window only a failure to make it real can still be told.
     fn forget<'a>(&mut self, commands: impl Iterator<Item = &'a Command>) {
         for command in commands {
             if let Command::Note(Note::Retired { instance } | Note::Squashed { instance }) = command {
                 self.started.remove(instance);
+                self.retired += u64::from(matches!(command, Command::Note(Note::Retired { .. })));
                 self.gone.push_back(*instance);
                 if self.gone.len() > MOST_GONE
                     && let Some(oldest) = self.gone.pop_front()
@@ -74,6 +120,7 @@ impl Progress {
         if self.quiet {
             return self.catch_up(at, event, commands.iter());
         }
+        self.hear(event);
         match event {
             Event::Finished { instance, outcome, reason, .. } => {
                 let path = self.path(*instance);

@@ -10,7 +10,7 @@ pub(crate) use resume::{Resumption, resume};
 use super::Endpoints;
 use super::advisor::{self, Advisor};
 use super::checkpoint::Checkpointer;
-use super::control::Control;
+use super::control::{Asked, Control, RunStatus};
 use super::ledger::Ledger;
 use super::log::LogWriter;
 use super::performer::{self, Performer};
@@ -20,7 +20,7 @@ use crate::interrupt::Interrupt;
 use anyhow::{Context, bail};
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::Lookout;
-use ratn_executive::protocol::{Command, Event, Learned, Mode, Origin};
+use ratn_executive::protocol::{Command, Event, Learned, Mode, Natures, Origin};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{Exceptions, Nature, Program, SUCCESS, State, StateKind};
@@ -99,6 +99,7 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
     let shell = Shell {
         executive: Executive::new(run.program.clone(), Tolerance::ROBOT),
         states: BTreeMap::new(),
+        mode: run.mode,
         timers: BTreeSet::new(),
         progress: Progress::new(run.quiet),
         program: run.program.clone(),
@@ -133,6 +134,7 @@ pub(crate) async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyho
                 file: run.file,
                 began_unix_ms,
                 imprecise: imprecise(&run.program),
+                natures: Box::new(natures(&run.program, &place.catalogue)),
             },
         };
         shell.step(begun)
@@ -146,6 +148,7 @@ struct Shell {
     executive: Executive,
     /// Which states the instances are of.
     states: BTreeMap<InstanceId, StateId>,
+    mode: Mode,
     /// When the executive wants to be woken.
     timers: BTreeSet<Timestamp>,
     log: LogWriter,
@@ -257,6 +260,21 @@ impl Shell {
         }
     }
 
+    /// What the run is doing, for whoever asks.
+    fn status(&self) -> RunStatus {
+        let now = self.clock.now();
+        RunStatus {
+            run: self.performer.run().to_owned(),
+            task: self.program.name.clone(),
+            mode: self.mode,
+            log: std::path::absolute(self.log.path()).unwrap_or_else(|_| self.log.path().to_owned()),
+            at_s: now.seconds(),
+            paused: self.progress.is_paused(),
+            ended: self.progress.retired(),
+            under_way: self.progress.under_way(now),
+        }
+    }
+
     /// Whoever resumes this run begins here. Between two events all that was logged has been performed.
     fn make_checkpoint(&mut self) {
         if let Some(checkpointer) = &mut self.checkpointer {
@@ -297,14 +315,21 @@ impl Shell {
             };
             let told = async {
                 match &mut self.control {
-                    Some(control) => control.told().await,
+                    Some(control) => control.asked().await,
                     None => std::future::pending().await,
                 }
             };
             let answer = tokio::select! {
                 answer = self.answers.recv() => answer.context("nothing can answer any more")?,
                 () = due => return Ok(Event::Woken),
-                event = told => return Ok(event),
+                asked = told => match asked {
+                    Asked::Told(event) => return Ok(*event),
+                    Asked::Status(say) => {
+                        // Whoever asked may have gone.
+                        let _ = say.send(self.status());
+                        continue;
+                    }
+                },
                 event = advised => return Ok(event),
                 () = to_ask => {
                     self.ask_for_advice();
@@ -353,6 +378,20 @@ fn advisor_of(mode: Mode, seed: u64) -> Option<Advisor> {
     match mode {
         Mode::Hsm => None,
         Mode::Cdtn => Advisor::start(seed).inspect_err(|error| tracing::warn!(%error, "nobody looks ahead")).ok(),
+    }
+}
+
+/// What the actions of a program are, by path, and which kinds of resources move the robot.
+fn natures(program: &Program, catalogue: &Catalogue) -> Natures {
+    let is_action = |state: &&State| matches!(state.kind, StateKind::Action { .. });
+    let actions = |is_meant: fn(&Nature) -> bool| {
+        let meant = program.states.iter().filter(is_action).filter(|state| is_meant(&state.annotations.nature));
+        meant.map(|state| state.path.clone()).collect()
+    };
+    Natures {
+        computes: actions(|nature| *nature == Nature::Computes),
+        senses: actions(|nature| matches!(nature, Nature::Senses(_))),
+        actuating: catalogue.resources.iter().filter(|r| r.1.actuates).map(|r| r.0.clone()).collect(),
     }
 }
 

@@ -71,6 +71,18 @@ pub(super) enum HealthCheck {
 }
 
 impl Readiness {
+    /// What a worker has not done that was not ready in time.
+    pub(super) fn missing(&self, id: &str) -> String {
+        match self {
+            Readiness::Health => {
+                format!("its endpoint file {id}.endpoint is not there, or its gRPC health there does not say SERVING")
+            }
+            Readiness::Notify { .. } => "it has not said READY=1 to the socket of NOTIFY_SOCKET".to_owned(),
+            Readiness::Line { contains } => format!("no line of its standard output has `{contains}` in it"),
+            Readiness::Port { port } => format!("port {port} of loopback takes no connection"),
+        }
+    }
+
     pub(super) fn check(&self, at: &str, template: &Template) -> Result<(), ConfigError> {
         match self {
             Readiness::Health | Readiness::Notify { .. } => Ok(()),

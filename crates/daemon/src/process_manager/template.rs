@@ -168,6 +168,12 @@ impl Liveness {
 }
 
 impl Template {
+    /// What is run, for messages.
+    pub(super) fn command_line(&self) -> String {
+        let program = self.program.as_ref().map_or_else(|| "ratn".to_owned(), |program| program.display().to_string());
+        std::iter::once(program).chain(self.args.iter().cloned()).collect::<Vec<_>>().join(" ")
+    }
+
     /// A template with the default of every optional key.
     pub fn new(name: impl Into<String>, kind: impl Into<String>) -> Template {
         Template {

@@ -13,7 +13,7 @@ use super::blocking_on;
 use crate::failure::Failure;
 use crate::output;
 use crate::system::config::SystemConfig;
-use crate::system::public_directory;
+use crate::system::{denied, directory_of};
 use clap::Args;
 use ratn_worker::tls::ClientTls;
 use serde::Serialize;
@@ -79,7 +79,7 @@ impl Findings {
 
 /// Examines this machine. Fails where there is a problem; warnings are none.
 pub(super) fn run(arguments: &DoctorArguments, client_tls: &ClientTls) -> Result<(), Failure> {
-    let directory = public_directory(arguments.runtime_dir.as_deref());
+    let directory = directory_of(arguments.runtime_dir.as_deref());
     let mut findings = Findings::default();
     let of_up = directory.join("system.toml");
     let file = arguments.config.clone().or_else(|| of_up.is_file().then_some(of_up));
@@ -98,10 +98,19 @@ pub(super) fn run(arguments: &DoctorArguments, client_tls: &ClientTls) -> Result
     machine::check(&mut findings, &config, &directory);
     tls::check(&mut findings, &config);
     templates::check(&mut findings, &config.process_manager);
+    if let Some(why) = denied(&directory) {
+        findings.problem("system", why, "look at one of your own: --runtime-dir DIR, or $RATN_RUNTIME_DIR");
+        return conclude(arguments, findings);
+    }
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         system::check(&mut findings, &config, client_tls, &directory).await;
         Ok(())
     })?;
+    conclude(arguments, findings)
+}
+
+/// Shows what was found.
+fn conclude(arguments: &DoctorArguments, mut findings: Findings) -> Result<(), Failure> {
     let count = |level| findings.0.iter().filter(|finding| finding.level == level).count();
     let (problems, warnings) = (count(Level::Problem), count(Level::Warning));
     if arguments.quiet {

@@ -40,7 +40,7 @@ pub(super) async fn find(arguments: &HostArguments, tls: &ClientTls) -> Result<V
     if let Some(manager) = &arguments.manager {
         return Ok(vec![host("", manager.clone())?]);
     }
-    let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()));
+    let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref())?);
     let own = directory.find(process_manager::ROLE);
     let known = match resource_manager(arguments) {
         Some(endpoint) => registered(&channels, &endpoint).await.map_err(|error| {
@@ -67,7 +67,7 @@ pub(super) fn resource_manager(arguments: &HostArguments) -> Option<Endpoint> {
     if arguments.manager.is_some() {
         return None;
     }
-    let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()));
+    let directory = RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()).ok()?);
     arguments.resource_manager.clone().or_else(|| directory.find(resource_manager::ROLE).ok())
 }
 

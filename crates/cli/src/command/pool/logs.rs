@@ -5,7 +5,7 @@
 use super::LogsArguments;
 use super::hosts::{self, Host};
 use crate::failure::Failure;
-use crate::system::public_directory;
+use crate::system::directory_of;
 use anyhow::Context;
 use ratn_daemon::process_manager::log_file::{LogReader, log_file};
 use ratn_proto::types::HostPools;
@@ -156,7 +156,7 @@ fn named_lines(id: &str, text: &[u8]) -> Vec<u8> {
 
 /// From the files of this host; nothing where there is none.
 fn local(arguments: &LogsArguments) -> anyhow::Result<Option<()>> {
-    let directory = RuntimeDirectory::at(public_directory(arguments.host.runtime_dir.as_deref()));
+    let directory = RuntimeDirectory::at(directory_of(arguments.host.runtime_dir.as_deref()));
     let name = arguments.name.as_str();
     if name.is_empty() || name.contains('/') {
         return Ok(None);

@@ -46,7 +46,7 @@ pub(super) fn run(arguments: &ResourceArguments, tls: &ClientTls) -> Result<(), 
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let endpoint = match &arguments.manager {
             Some(endpoint) => endpoint.clone(),
-            None => RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()))
+            None => RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref())?)
                 .find(ROLE)
                 .map_err(|error| Failure::Refused(format!("ratn: {error}")))?,
         };

@@ -31,6 +31,9 @@ pub(super) enum WorldCommand {
         /// As they were at this revision
         #[arg(long, value_name = "REVISION")]
         at: Option<u64>,
+        /// As the `world` of a task file
+        #[arg(long)]
+        task: bool,
     },
     /// Answer a query, `at(?box) = ?pose, not in_gripper(?box)`
     Query {

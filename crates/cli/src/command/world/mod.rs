@@ -8,6 +8,7 @@ mod dump;
 mod pattern;
 mod show;
 mod sparql;
+mod task_text;
 mod turtle;
 
 pub(crate) use arguments::WorldArguments;
@@ -20,6 +21,7 @@ use anyhow::Context;
 use arguments::{Format, WorldCommand};
 use ratn_model::fact::{Change, FactPattern};
 use ratn_model::id::Revision;
+use ratn_model::load::suggestion;
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::types::{FactRecord, WorldUpdate};
 use ratn_worker::client::{CallError, Channels, Commit, WorldClient, fresh_id};
@@ -48,7 +50,7 @@ pub(super) fn run(arguments: &WorldArguments, tls: &ClientTls) -> Result<(), Fai
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let endpoint = match &arguments.pool {
             Some(endpoint) => endpoint.clone(),
-            None => RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref()))
+            None => RuntimeDirectory::at(public_directory(arguments.runtime_dir.as_deref())?)
                 .find(ROLE)
                 .map_err(|error| Failure::Refused(format!("ratn: {error}")))?,
         };
@@ -59,13 +61,27 @@ pub(super) fn run(arguments: &WorldArguments, tls: &ClientTls) -> Result<(), Fai
     })
 }
 
+/// Says which predicates no fact is about: an answer of nothing may be a slip of the pen.
+fn unheard_of<'a>(asked: impl Iterator<Item = &'a str>, facts: &[FactRecord]) {
+    let known: BTreeSet<&str> = facts.iter().map(|fact| fact.key.predicate.as_str()).collect();
+    for predicate in asked.filter(|predicate| !known.contains(predicate)).collect::<BTreeSet<_>>() {
+        let help = suggestion(predicate, known.iter().copied(), "", "`ratn world facts` shows what there is");
+        output::progress(format_args!("no fact of this world is about `{predicate}`: {help}"));
+    }
+}
+
 impl Asking {
     async fn perform(&self, command: &WorldCommand) -> Result<(), Failure> {
         let client = &self.client;
         match command {
-            WorldCommand::Facts { patterns, at } => {
+            WorldCommand::Facts { patterns, at, task } => {
                 let (revision, facts) = client.root_at(at.map(Revision), patterns).await?;
-                self.show(&dump::json(revision, &facts), || show::facts(&facts))?;
+                let text = || if *task { task_text::world(&facts) } else { show::facts(&facts) };
+                self.show(&dump::json(revision, &facts), text)?;
+                if facts.is_empty() && !patterns.is_empty() {
+                    let (_, all) = client.root_at(at.map(Revision), &[]).await?;
+                    unheard_of(patterns.iter().map(|pattern| pattern.predicate.as_str()), &all);
+                }
             }
             WorldCommand::Query { query, sparql: true, at, limit } => {
                 self.sparql(query, at.map(Revision), *limit).await?;
@@ -98,8 +114,10 @@ impl Asking {
 
     async fn query(&self, text: &str, at: Option<Revision>, limit: usize) -> Result<(), Failure> {
         let refused = |error| Failure::Refused(format!("ratn: {error}"));
-        let query = Query::parse(text).and_then(|query| query.prepare(None)).map_err(refused)?;
+        let asked = Query::parse(text).map_err(refused)?;
+        let query = asked.prepare(None).map_err(refused)?;
         let (revision, facts) = self.client.root_at(at, &[]).await?;
+        unheard_of(asked.predicates().into_iter(), &facts);
         let world = World::from_facts(facts.into_iter().map(|fact| (fact.key, fact.value)), revision);
         let rows = query.run(&world, &BTreeMap::new(), limit).map_err(refused)?;
         Ok(self.show(&show::rows_json(revision, &rows), || show::rows(&rows))?)

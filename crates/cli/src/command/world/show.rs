@@ -1,6 +1,6 @@
 //! Facts, differences and histories as tables for people and as JSON for programs.
 
-use super::dump;
+use super::{dump, task_text};
 use crate::columns::columns;
 use ratn_model::fact::FactKey;
 use ratn_model::id::Revision;
@@ -14,8 +14,8 @@ use serde_json::json;
 pub(super) fn facts(facts: &[FactRecord]) -> String {
     let rows = facts.iter().map(|fact| {
         [
-            fact.key.to_string(),
-            fact.value.to_string(),
+            task_text::key(&fact.key),
+            task_text::value(&fact.value).unwrap_or_else(|| fact.value.to_string()),
             fact.revision.0.to_string(),
             fact.writer.as_deref().unwrap_or("-").to_owned(),
             fact.measured.as_deref().map_or_else(String::new, |by| measured(by, &fact.value)),

@@ -2,6 +2,7 @@
 
 use super::Answer;
 use crate::task_control::record::said;
+use ratn_daemon::process_manager::HOST_KIND;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId};
@@ -10,7 +11,7 @@ use ratn_model::program::{ABORTED, PREEMPTED};
 use ratn_model::value::Value;
 use ratn_proto::types::{Goal, GoalOutcome};
 use ratn_worker::client::retry_unanswered;
-use ratn_worker::client::{ActionClient, CallError, ResourceClient};
+use ratn_worker::client::{ActionClient, CallError, Channels, ProcessClient, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::DEFAULT_TTL;
 use std::collections::BTreeMap;
@@ -28,6 +29,8 @@ pub(super) const GRACE_MS: u64 = DEFAULT_TTL.as_millis() as u64;
 const WITHDRAWAL_DEADLINE: Duration = Duration::from_secs(DEFAULT_TTL.as_secs() + 1);
 /// How often that is looked at.
 const WITHDRAWAL_POLL: Duration = Duration::from_millis(100);
+/// Who does not say within this time how a provider ended is not waited for.
+const END_DEADLINE: Duration = Duration::from_secs(1);
 /// How much longer than its time a session may be seen.
 const SESSION_SLACK: Duration = Duration::from_millis(500);
 /// The executive ends a goal that takes too long. The provider does so this much later, where nobody tells it to.
@@ -53,6 +56,7 @@ pub(super) struct Performing {
     pub(super) speed: f64,
     pub(super) actions: ActionClient,
     pub(super) resources: ResourceClient,
+    pub(super) channels: Channels,
     pub(super) events: mpsc::Sender<Answer>,
     pub(super) stop: CancellationToken,
     pub(super) goal: Goal,
@@ -166,7 +170,28 @@ impl Performing {
 
     async fn lost(&self, endpoint: &Endpoint, error: &CallError) -> Event {
         self.withdrawn(endpoint, error).await;
-        self.crashed(said(error))
+        let reason = match (self.provider(endpoint), error) {
+            (Some((_, provider)), CallError::Broken { reason, .. }) => match self.end_of(&provider).await {
+                Some(end) => format!("{provider}: {end}"),
+                None => format!("{provider} does not answer: {reason}"),
+            },
+            _ => said(error),
+        };
+        self.crashed(reason)
+    }
+
+    /// How the process of a provider ended, as the process manager of its host says; `None` where none knows.
+    async fn end_of(&self, provider: &str) -> Option<String> {
+        let host = provider.rsplit_once('@')?.1;
+        let asking = async {
+            let hosts = self.resources.list(&[HOST_KIND]).await.ok()?;
+            let manager = hosts.iter().find(|one| one.host == host)?.endpoint().parse().ok()?;
+            let pools = ProcessClient::new(&self.channels, &manager).ok()?.pools().await.ok()?.pools;
+            let end = pools.iter().find_map(|pool| pool.last_exit.strip_prefix(&format!("{provider}: ")));
+            // What it wrote at last is in `ratn logs`.
+            Some(end?.split("; its last words").next()?.to_owned())
+        };
+        tokio::time::timeout(END_DEADLINE, asking).await.ok().flatten()
     }
 
     /// Who tries again at once would be given the same provider again, and nothing would come of any of its attempts: it is over when
@@ -244,7 +269,6 @@ impl Performing {
 mod tests {
     use super::*;
     use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
-    use ratn_worker::client::Channels;
     use ratn_worker::server::{Services, bind};
     use ratn_worker::tls::ClientTls;
     use tokio_util::sync::DropGuard;
@@ -298,6 +322,7 @@ mod tests {
                 timeout_s,
                 speed: 10.0,
                 actions: ActionClient::new(Channels::new(&ClientTls::none())),
+                channels: Channels::new(&ClientTls::none()),
                 resources: self.resources.clone(),
                 events: self.events.clone(),
                 stop: CancellationToken::new(),

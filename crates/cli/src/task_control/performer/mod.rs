@@ -21,7 +21,7 @@ use anyhow::{Context, bail};
 use futures::FutureExt;
 use goal::{Given, Performing};
 use handover::{Handover, Leases};
-use ratn_executive::protocol::{Command, Event, Goal};
+use ratn_executive::protocol::{Command, Event, Goal, Note};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::condition::Condition;
 use ratn_model::fact::FactKey;
@@ -57,6 +57,19 @@ const RUN: &str = "run";
 /// At the end of a run, for everything that is still being given back.
 const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
 
+/// A holder's name has so many characters at the most, half of it the task's: the resource manager takes 128 unless told otherwise.
+const MAX_HOLDER: usize = 120;
+
+/// Who holds a lease, for people: the task and the state, of a longer path its end.
+fn holder(task: &str, path: &str) -> String {
+    let task: String = task.chars().take(MAX_HOLDER / 2).collect();
+    let room = MAX_HOLDER - task.chars().count() - ": …".chars().count();
+    match path.chars().count() {
+        length if length <= room => format!("{task}: {path}"),
+        length => format!("{task}: …{}", path.chars().skip(length - room).collect::<String>()),
+    }
+}
+
 /// What is on its way to the executive.
 #[derive(Debug)]
 pub(super) enum Answer {
@@ -85,6 +98,7 @@ pub(super) struct Performer {
     catalogue: Arc<Catalogue>,
     resources: ResourceClient,
     actions: ActionClient,
+    channels: Channels,
     world: WorldClient,
     session: Session,
     /// Where the session is kept alive, whatever this thread does.
@@ -98,6 +112,8 @@ pub(super) struct Performer {
     recorded: Recorded,
     asking: BTreeMap<InstanceId, Asking>,
     leases: Leases,
+    /// What the instances of the window are called, for whoever asks who holds something.
+    paths: BTreeMap<InstanceId, String>,
     /// Of the commands that are performed now.
     handover: Option<Handover>,
     jobs: BTreeMap<InstanceId, Job>,
@@ -166,7 +182,8 @@ impl Performer {
             speed: place.speed,
             catalogue: place.catalogue.clone(),
             resources,
-            actions: ActionClient::new(channels),
+            actions: ActionClient::new(channels.clone()),
+            channels,
             world,
             session,
             _background: background,
@@ -178,6 +195,7 @@ impl Performer {
             recorded,
             asking: BTreeMap::new(),
             leases: Leases::default(),
+            paths: BTreeMap::new(),
             handover: None,
             jobs: BTreeMap::new(),
             giving_back: JoinSet::new(),
@@ -220,8 +238,29 @@ impl Performer {
 
     /// What the executive made of an event is performed next, all of it.
     pub(super) fn prepare(&mut self, event: &Event, commands: &[Command]) {
+        for command in commands {
+            match command {
+                Command::Note(Note::Expanded { instance, path, .. }) => {
+                    self.paths.insert(*instance, path.clone());
+                }
+                Command::Note(Note::Retired { instance } | Note::Squashed { instance }) => {
+                    self.paths.remove(instance);
+                }
+                _ => {}
+            }
+        }
         let waiting = self.asking.values().map(|asking| asking.requirements.as_slice());
         self.handover = self.leases.handover(event, commands, waiting, Instant::now());
+    }
+
+    /// What instances are called that were expanded before this performer was there.
+    pub(super) fn know(&mut self, paths: &BTreeMap<InstanceId, String>) {
+        self.paths.extend(paths.iter().map(|(instance, path)| (*instance, path.clone())));
+    }
+
+    /// The id of the run.
+    pub(super) fn run(&self) -> &str {
+        &self.run
     }
 
     /// Begins to perform a command.
@@ -312,7 +351,7 @@ impl Performer {
             request,
             priority,
             deadline: ACQUIRE_DEADLINE,
-            holder: format!("{} {instance}", self.task),
+            holder: holder(&self.task, self.paths.get(&instance).map_or(&instance.to_string(), |path| path)),
         };
         let requirements: Vec<Requirement> = requirements.into_iter().map(|one| self.of_performers(one)).collect();
         let (resources, events) = (self.resources.clone(), self.events.clone());
@@ -433,6 +472,7 @@ impl Performer {
             speed: self.speed,
             actions: self.actions.clone(),
             resources: self.resources.clone(),
+            channels: self.channels.clone(),
             events: self.events.clone(),
             stop: stop.clone(),
             goal: types::Goal {

@@ -93,6 +93,7 @@ pub(crate) async fn resume(mut resumption: Resumption, place: &Place, interrupt:
     let shell = Shell {
         executive,
         states,
+        mode,
         timers: std::mem::take(&mut ledger.wakes),
         progress,
         program,
@@ -114,6 +115,7 @@ pub(crate) async fn resume(mut resumption: Resumption, place: &Place, interrupt:
         let (now, commands) = shell.decide(&Event::Resumed)?;
         shell.log.make_durable()?;
         ledger.event(now, &Event::Resumed);
+        shell.performer.know(shell.progress.paths());
         let changed = shell.performer.take_up(ledger, &mirror).await?;
         // Commits are there by now.
         let missing = missing.into_iter().filter(|command| !matches!(command, Command::Commit { .. }));

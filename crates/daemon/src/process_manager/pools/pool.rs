@@ -217,7 +217,7 @@ impl Pool {
             let words = if last_words.is_empty() { String::new() } else { format!("; its last words: {last_words}") };
             let what = format!("{id}: {reason}{words}");
             self.crashes += 1;
-            self.last_exit = format!("{id}: {reason}");
+            self.last_exit.clone_from(&what);
             self.restarts.crashed(now, &self.template, worker.serves_since(), &what);
         }
     }

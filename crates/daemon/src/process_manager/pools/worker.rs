@@ -257,7 +257,14 @@ impl Worker {
     pub(super) fn advance(&mut self, now: Timestamp, template: &Template, commands: &mut Vec<Command>) {
         match self.phase {
             Phase::Starting { until } if until <= now => {
-                self.fail(format!("not ready within {} s", template.start_timeout_s), commands);
+                let Template { start_timeout_s, readiness, .. } = template;
+                let why = format!(
+                    "not ready within {start_timeout_s} s: {}; it was started as `{}`, and `ratn logs {}` shows what it wrote",
+                    readiness.missing(&self.id),
+                    template.command_line(),
+                    self.id
+                );
+                self.fail(why, commands);
             }
             Phase::Serving { .. } if self.refused.as_ref().is_some_and(|(until, _)| *until <= now) => {
                 let why = self.refused.take().map(|(_, why)| why).unwrap_or_default();
@@ -457,7 +464,13 @@ mod tests {
         assert!(commands(|c| worker.offer("PathPlanner", c)).is_empty());
         // Its process came only now.
         assert_eq!(commands(|c| worker.spawned(4711, String::new(), c)), [Command::Kill { id: ID.into() }]);
-        assert_eq!(worker.exited("killed by signal 9").reason, "not ready within 3 s");
+        assert_eq!(
+            worker.exited("killed by signal 9").reason,
+            format!(
+                "not ready within 3 s: its endpoint file {ID}.endpoint is not there, or its gRPC health there does not say SERVING; \
+                 it was started as `ratn`, and `ratn logs {ID}` shows what it wrote"
+            )
+        );
     }
 
     #[test]

@@ -1,0 +1,52 @@
+//! Colours, where somebody sees them: on a terminal, unless `NO_COLOR` says otherwise (<https://no-color.org>).
+
+use std::io::IsTerminal;
+
+/// Whether standard output is coloured.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct Colours(bool);
+
+impl Colours {
+    /// As standard output and the environment are.
+    pub(crate) fn of_output() -> Colours {
+        let is_set = |name: &str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
+        let is_dumb = std::env::var_os("TERM").is_some_and(|term| term == "dumb");
+        Colours::chosen(std::io::stdout().is_terminal(), is_set("NO_COLOR"), is_dumb)
+    }
+
+    fn chosen(is_terminal: bool, unwanted: bool, is_dumb: bool) -> Colours {
+        Colours(is_terminal && !unwanted && !is_dumb)
+    }
+
+    /// A head.
+    pub(crate) fn bold(self, text: &str) -> String {
+        self.painted("1", text)
+    }
+
+    /// What goes on.
+    pub(crate) fn green(self, text: &str) -> String {
+        self.painted("32", text)
+    }
+
+    /// What waits, or is held up.
+    pub(crate) fn yellow(self, text: &str) -> String {
+        self.painted("33", text)
+    }
+
+    fn painted(self, code: &str, text: &str) -> String {
+        if self.0 { format!("\x1b[{code}m{text}\x1b[0m") } else { text.to_owned() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_a_terminal_is_coloured_and_only_where_nobody_minds() {
+        assert_eq!(Colours::chosen(true, false, false).green("x"), "\x1b[32mx\x1b[0m");
+        for plain in [(false, false, false), (true, true, false), (true, false, true)] {
+            assert_eq!(Colours::chosen(plain.0, plain.1, plain.2).bold("x"), "x");
+        }
+    }
+}

@@ -1,0 +1,212 @@
+//! `ratn status`: what runs, who holds what, and who waits for what and why.
+//!
+//! What the run is doing it says itself, over its socket in the runtime directory; who holds and who waits is the resource manager's
+//! word. Exit code 0 also where no run is under way; 2 where no system is.
+
+use super::{blocking_on, unanswered};
+use crate::arguments::StatusArguments;
+use crate::colour::Colours;
+use crate::columns::aligned;
+use crate::failure::Failure;
+use crate::output;
+use crate::report::statistics::mode_name;
+use crate::system::public_directory;
+use crate::task_control::control::{self, RunStatus};
+use anyhow::Context;
+use ratn_daemon::resource_manager;
+use ratn_model::program::WORLD_MODEL;
+use ratn_model::resource::Quantity;
+use ratn_proto::types::{Resource, WaitingAcquire};
+use ratn_worker::client::{Channels, ResourceClient};
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::tls::ClientTls;
+use serde::Serialize;
+use std::io::IsTerminal;
+use std::path::Path;
+use std::time::Duration;
+
+/// How often it is looked at.
+const PERIOD: Duration = Duration::from_millis(500);
+/// More lines of one kind are counted, not shown.
+const MOST_LINES: usize = 40;
+
+/// What is shown.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+struct Status {
+    /// None where no run is under way.
+    run: Option<RunStatus>,
+    held: Vec<Held>,
+    waiting: Vec<Waiting>,
+    /// Resources that nobody holds.
+    free: Vec<String>,
+}
+
+/// A part of a resource that somebody holds.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+struct Held {
+    resource: String,
+    kind: String,
+    holder: String,
+    lease: u64,
+}
+
+/// Somebody who waits.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+struct Waiting {
+    holder: String,
+    /// What is in the way.
+    obstacles: Vec<String>,
+}
+
+/// Shows it once, or until the user has seen enough.
+pub(crate) fn run(arguments: &StatusArguments, tls: &ClientTls) -> Result<(), Failure> {
+    blocking_on(tokio::runtime::Builder::new_current_thread(), async {
+        let directory = public_directory(arguments.runtime_dir.as_deref())?;
+        let manager = RuntimeDirectory::at(&directory).find(resource_manager::ROLE);
+        let manager = manager.map_err(|error| Failure::Refused(format!("ratn: {error}")))?;
+        let client = ResourceClient::new(&Channels::new(tls), &manager, "")?;
+        let colours = Colours::of_output();
+        let mut shown = None;
+        loop {
+            let status = Status::of(&directory, &client).await.map_err(unanswered)?;
+            if shown.as_ref() != Some(&status) {
+                let text = match (arguments.json, arguments.watch) {
+                    (true, true) => serde_json::to_string(&status)?,
+                    (true, false) => serde_json::to_string_pretty(&status)?,
+                    (false, _) => status.text(&directory, colours),
+                };
+                // A terminal shows one state after the other in the same place.
+                let again = arguments.watch && !arguments.json && std::io::stdout().is_terminal();
+                let text = if again { format!("\x1b[H\x1b[J{text}") } else { text };
+                if !output::line(text)? || !arguments.watch {
+                    return Ok(());
+                }
+                shown = Some(status);
+            }
+            tokio::time::sleep(PERIOD).await;
+        }
+    })
+}
+
+impl Status {
+    async fn of(directory: &Path, client: &ResourceClient) -> Result<Status, Failure> {
+        let run = control::status(directory).await;
+        let run = run.with_context(|| format!("the run in {} does not say what it is doing", directory.display()))?;
+        let resources = client.list(&[]).await?;
+        let waiting = client.explain("").await?;
+        Ok(Status::from(run, &resources, waiting))
+    }
+
+    fn from(run: Option<RunStatus>, resources: &[Resource], waiting: Vec<WaitingAcquire>) -> Status {
+        let held = |resource: &Resource| {
+            let held = |holding: &ratn_proto::types::Holding| Held {
+                resource: resource.id.clone(),
+                kind: resource.kind.clone(),
+                holder: if holding.holder.is_empty() { holding.session.clone() } else { holding.holder.clone() },
+                lease: holding.lease.0,
+            };
+            resource.holdings.iter().map(held).collect::<Vec<_>>()
+        };
+        // Room for projections is no thing that somebody looks for.
+        let things = || resources.iter().filter(|resource| resource.kind != WORLD_MODEL);
+        let is_free = |resource: &&Resource| resource.holdings.is_empty() && resource.free > Quantity::ZERO;
+        Status {
+            run,
+            held: things().flat_map(held).collect(),
+            waiting: waiting
+                .into_iter()
+                .map(|one| Waiting {
+                    holder: if one.holder.is_empty() { one.session } else { one.holder },
+                    obstacles: one.obstacles,
+                })
+                .collect(),
+            free: things().filter(is_free).map(|resource| resource.id.clone()).collect(),
+        }
+    }
+
+    fn text(&self, directory: &Path, colours: Colours) -> String {
+        let mut lines = Vec::new();
+        match &self.run {
+            None => lines.push(format!("no run is under way in {}", directory.display())),
+            Some(run) => {
+                let RunStatus { task, mode, at_s, ended, log, .. } = run;
+                let paused = if run.paused { format!(", {}", colours.yellow("paused")) } else { String::new() };
+                let states = if *ended == 1 { "state has" } else { "states have" };
+                let head = colours.bold(task);
+                lines.push(format!("{head} in {} mode: {at_s:.1} s{paused}; {ended} {states} ended", mode_name(*mode)));
+                lines.push(format!("event log: {}", log.display()));
+                let rows = run.under_way.iter().map(|one| [one.path.clone(), format!("for {:.1} s", one.for_s)]);
+                section(&mut lines, &colours.green("under way"), rows.collect());
+            }
+        }
+        let rows = self.held.iter().map(|held| [held.resource.clone(), held.holder.clone()]);
+        section(&mut lines, &colours.bold("held"), rows.collect());
+        let why =
+            |one: &Waiting| if one.obstacles.is_empty() { "its turn".to_owned() } else { one.obstacles.join("; ") };
+        let rows = self.waiting.iter().map(|one| [one.holder.clone(), why(one)]);
+        section(&mut lines, &colours.yellow("waiting"), rows.collect());
+        if !self.free.is_empty() {
+            lines.push(format!("{}: {}", colours.bold("free"), self.free.join(", ")));
+        }
+        lines.join("\n")
+    }
+}
+
+/// A head and a line each; nothing where there are none.
+fn section(lines: &mut Vec<String>, head: &str, mut rows: Vec<[String; 2]>) {
+    if rows.is_empty() {
+        return;
+    }
+    let hidden = rows.len().saturating_sub(MOST_LINES);
+    rows.truncate(MOST_LINES);
+    lines.push(format!("{head}:"));
+    lines.extend(aligned(&rows).into_iter().map(|line| format!("  {line}")));
+    if hidden > 0 {
+        lines.push(format!("  and {hidden} more"));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::task_control::progress::UnderWay;
+    use insta::assert_snapshot;
+    use ratn_executive::protocol::Mode;
+
+    #[test]
+    fn what_runs_is_told_by_the_names_of_states_and_who_holds_what() {
+        let status = Status {
+            run: Some(RunStatus {
+                run: "run-1".to_owned(),
+                task: "sort_boxes".to_owned(),
+                mode: Mode::Cdtn,
+                log: "log.jsonl".into(),
+                at_s: 12.34,
+                paused: true,
+                ended: 3,
+                under_way: vec![UnderWay { path: "place[2]/plan".to_owned(), for_s: 1.5 }],
+            }),
+            held: vec![Held {
+                resource: "path-planner-1@compute".to_owned(),
+                kind: "PathPlanner".to_owned(),
+                holder: "sort_boxes: place[2]/plan".to_owned(),
+                lease: 7,
+            }],
+            waiting: vec![Waiting { holder: "sort_boxes: look".to_owned(), obstacles: Vec::new() }],
+            free: vec!["arm@sim".to_owned(), "base@sim".to_owned()],
+        };
+        assert_snapshot!(status.text(Path::new("/run/ratn"), Colours::default()), @r"
+        sort_boxes in CDTN mode: 12.3 s, paused; 3 states have ended
+        event log: log.jsonl
+        under way:
+          place[2]/plan  for 1.5 s
+        held:
+          path-planner-1@compute  sort_boxes: place[2]/plan
+        waiting:
+          sort_boxes: look  its turn
+        free: arm@sim, base@sim
+        ");
+        let nothing = Status { run: None, held: Vec::new(), waiting: Vec::new(), free: Vec::new() };
+        assert_snapshot!(nothing.text(Path::new("/run/ratn"), Colours::default()), @"no run is under way in /run/ratn");
+    }
+}
