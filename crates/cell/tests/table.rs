@@ -14,6 +14,7 @@ use ratn_motion::aimm;
 use ratn_motion::pace::Control;
 use ratn_motion::plan::{Goal, Request as PlanRequest, plan};
 use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::straight::Straight;
 use ratn_perception::calibration::{Calibration, Surface};
 use ratn_perception::detection::{Detection, ObjectClass, Region, segment};
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
@@ -129,22 +130,21 @@ fn set_table(bench: &mut Bench) {
         let size = seen.model.size();
         found[i] = (name.clone(), seen, Placement::World(seen.pose));
         let request = |bench: &Bench, goals: Vec<Pose>| PlanRequest {
-            start: bench.cell.measured(),
-            goals: goals.into_iter().map(Goal::Pose).collect(),
-            depart_m: 0.10,
-            approach_m: 0.10,
+            depart: Straight::up(0.10),
+            approach: Straight::down(0.10),
             upright_rad: (kind != Kind::Fork).then_some(UPRIGHT_RAD),
             reaches_into: vec![name.clone()],
             speed: 0.3,
             seed: 3,
             improvement_iterations: 50,
+            ..PlanRequest::new(bench.cell.measured(), goals.into_iter().map(Goal::Pose).collect())
         };
         let grasps = match kind {
             Kind::Bowl => grasp::at_rim(&seen.pose, size),
             Kind::Cup => grasp::around(&seen.pose, size),
             _ => grasp::from_above(&seen.pose, size).to_vec(),
         };
-        let approach = PlanRequest { upright_rad: None, depart_m: 0.0, ..request(bench, grasps) };
+        let approach = PlanRequest { upright_rad: None, depart: Straight::up(0.0), ..request(bench, grasps) };
         go(bench, &believed(&found), approach);
 
         let tool = bench.cell.robot().tool_pose(&bench.cell.measured());
@@ -167,7 +167,7 @@ fn set_table(bench: &mut Bench) {
 
         let retract = PlanRequest {
             goals: vec![Goal::Joints(aimm::OBSERVATION)],
-            approach_m: 0.0,
+            approach: Straight::down(0.0),
             upright_rad: None,
             ..request(bench, Vec::new())
         };

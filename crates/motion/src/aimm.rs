@@ -78,8 +78,8 @@ mod tests {
 
     use super::*;
     use crate::arm;
+    use crate::arm::line;
     use crate::collision::{Checker, Contact, PADDING_M};
-    use crate::line::line;
     use crate::reach::Target;
     use crate::robot::{Configuration, Robot};
     use parry3d::math::Vector;

@@ -5,6 +5,7 @@
 //! at most [`OVERHANG_M`] and hold them with at least [`CLEARANCE_M`] to spare. So what the exact check with a padding of `OVERHANG_M`
 //! finds clear of obstacles the spheres do too, and what the spheres find free is free by the exact check with `CLEARANCE_M`.
 
+use crate::line::{self, LineError};
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 use crate::reach::{Positions, Reach};
 use crate::robot::{Body, Configuration, Geometry, Joints, Link, Robot};
@@ -106,6 +107,18 @@ fn cover(link: &mut Link) {
     let grown = |body: &Body| Body { geometry: body.geometry.grown(CLEARANCE_M), ..*body };
     link.spheres = link.bodies.iter().flat_map(|body| cover_within(&grown(body), OVERHANG_M - CLEARANCE_M)).collect();
     link.padding_m = CLEARANCE_M;
+}
+
+/// Postures along the straight line of the tool from `start` by `offset` (in the frame of the base, metres), its rotation kept; the first
+/// is `start`.
+///
+/// # Errors
+/// [`LineError`] where limits or a singular posture end the line early.
+pub fn line(reach: &Reach, start: &Joints, offset: [f64; 3]) -> Result<Vec<Joints>, LineError> {
+    let start = positions(start);
+    let tool = reach.pose(&start);
+    let to = Pose { position: std::array::from_fn(|i| tool.position[i] + offset[i]), ..tool };
+    Ok(line::line(reach, &start, &to)?.iter().map(|posture| std::array::from_fn(|j| posture[j])).collect())
 }
 
 /// A posture for the vector checks.

@@ -1,7 +1,7 @@
 //! Planning one motion of the arm: find a path, then keep shortening it until the caller says that time is up.
 //!
 //! ```text
-//! start ─ straight up (depart) ─ free path: RRT-Connect, then improvement ─ straight down (approach) ─ goal
+//! start ─ straight (depart) ─ free path: RRT-Connect, then improvement ─ straight (approach) ─ goal
 //! ```
 //!
 //! A goal is a list of alternatives, and a pose has many postures: every posture from which the approach is free is a
@@ -14,14 +14,15 @@ use crate::arm::{self, joints, positions, state};
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M, distance, length};
 use crate::connect::{Budget, ConnectError, connect};
 use crate::constrained::{self, Constraint};
-use crate::line::{LineError, line};
+use crate::line::LineError;
 use crate::pace::{Control, Pace, Progress, Stop};
 use crate::reach::{Positions, Postures, Reach, Target, is_new};
 use crate::refine::{End, Refinement};
-pub use crate::request::{Goal, MAX_GOALS, MAX_STRAIGHT_M, MIN_SPEED, Request};
+pub use crate::request::{Goal, MAX_GOALS, MIN_SPEED, Request};
 use crate::robot::{Configuration, Geometry, Joints, Robot};
 use crate::simplify::{path_length, shortened};
 use crate::space::{Space, State};
+use crate::straight::Straight;
 use crate::timing::{Section, timed_while};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -101,10 +102,10 @@ pub enum PlanError {
         collision: Collision,
     },
     /// The straight part at the start cannot be followed.
-    #[error("departing {depart_m:.3} m straight up: {reason}")]
+    #[error("departing {part}: {reason}")]
     Depart {
-        /// How far it should go, in metres.
-        depart_m: f64,
+        /// How far it should go, and where.
+        part: String,
         /// What is in the way.
         reason: String,
     },
@@ -169,6 +170,7 @@ struct Way {
 /// The tools and the knowledge of one planning.
 struct Planning<'a> {
     robot: &'a Robot,
+    scene: &'a Scene,
     checker: Checker<'a>,
     space: Space,
     /// The tool, in the frame of the base, which is at `base`.
@@ -178,7 +180,7 @@ struct Planning<'a> {
     constraint: Option<Constraint>,
     random: ChaCha8Rng,
     goals: Vec<Goal>,
-    approach_m: f64,
+    approach: Straight,
     /// How deep an approach may press into what it touches.
     press_m: f64,
     /// With the fingers open, and without what they hold: how the tool leaves a goal where it lets go.
@@ -196,12 +198,13 @@ pub fn plan(
     request: &Request,
     control: &mut dyn FnMut(Progress) -> Control,
 ) -> Result<Plan, PlanError> {
-    request.check(robot)?;
+    request.check(robot, scene)?;
     let mut pace = Pace::new(control);
     let here = request.start.with_base(&scene.base);
     let (mechanism, obstacles) = arm::in_scene(robot, scene, &here);
     let mut planning = Planning {
         robot,
+        scene,
         checker: Checker::new(robot, scene, &here, PADDING_M).reaching_into(&request.reaches_into),
         space: arm::space(&mechanism, &obstacles),
         reach: Reach::new(&mechanism, robot.tool, Pose::IDENTITY),
@@ -209,7 +212,7 @@ pub fn plan(
         constraint: None,
         random: ChaCha8Rng::seed_from_u64(request.seed),
         goals: request.goals.clone(),
-        approach_m: request.approach_m,
+        approach: request.approach.clone(),
         press_m: 0.0,
         leaving: None,
         candidates: Vec::new(),
@@ -228,13 +231,13 @@ pub fn plan(
         let frame = crate::space::align(up);
         Constraint::new(Reach::new(&mechanism, robot.tool, frame), Target::upright(Pose::IDENTITY, tolerance))
     });
-    planning.leaving = leaving(robot, scene, request);
     let door = planning.door(&start).ok_or_else(|| planning.no_room(&start))?;
     let way_out = if door == state(&start) { 0.0 } else { distance(&start, &joints(robot, &door)) };
     if planning.checker.padding() < TIGHT_PADDING_M {
         // An arm may stand so close to something, where it was stopped; it does not go there.
         planning.checker = Checker::new(robot, scene, &here, TIGHT_PADDING_M).reaching_into(&request.reaches_into);
     }
+    planning.leaving = leaving(robot, scene, request, planning.checker.padding());
     let before = length(&depart) + way_out;
     planning.find_candidates(&start, &mut pace)?;
 
@@ -284,21 +287,33 @@ impl Planning<'_> {
     /// The straight part at the start; its end is free.
     fn depart(&mut self, request: &Request) -> Result<Vec<Joints>, PlanError> {
         let start = request.start.arm;
-        if request.depart_m <= 0.0 {
+        if !request.depart.is_some() {
             return match self.checker.collision(&start, Contact::None) {
                 None => Ok(vec![start]),
                 Some(collision) => Err(PlanError::StartInCollision { collision }),
             };
         }
-        let failed = |reason: String| PlanError::Depart { depart_m: request.depart_m, reason };
-        let postures = line(&self.reach, &start, [0.0, 0.0, request.depart_m]).map_err(|e| failed(e.to_string()))?;
-        match straight_collision(&mut self.checker, &postures, CONTACT_TOLERANCE_M) {
+        let failed = |reason: String| PlanError::Depart { part: request.depart.to_string(), reason };
+        let postures = self.line(&start, &request.depart, 1.0).map_err(|e| failed(e.to_string()))?;
+        // There is one such line, so it is looked at once, with the most that may be pressed: as on an approach, or what is pressed already.
+        let usual = Contact::Gripper(half_finger_m(self.robot));
+        let is_deep = self.checker.collision(&start, usual).is_some();
+        let press_m = if is_deep { CONTACT_TOLERANCE_M } else { half_finger_m(self.robot) };
+        match straight_collision(&mut self.checker, &postures, press_m) {
             Some(collision) => Err(failed(collision.to_string())),
             None => match self.checker.collision(&postures[postures.len() - 1], Contact::None) {
                 Some(collision) => Err(failed(format!("at its end {collision}"))),
                 None => Ok(postures),
             },
         }
+    }
+
+    /// Postures along a straight part (`sense` 1) or against its direction (-1), from the first of them.
+    fn line(&self, from: &Joints, part: &Straight, sense: f64) -> Result<Vec<Joints>, LineError> {
+        let tool = self.reach.pose(&positions(from));
+        // A request that names an object which is not there has been refused.
+        let way = part.way(self.scene, &self.base, &tool).unwrap_or_default();
+        arm::line(&self.reach, from, way.map(|c| sense * c))
     }
 
     /// Fills the list of candidates: those that keep away from what they need not touch, or else those that press the least.
@@ -377,9 +392,10 @@ impl Planning<'_> {
     /// The goal posture with its approach, or why it is none.
     fn candidate(&mut self, goal: &Joints) -> Result<Candidate, String> {
         let mut approach = vec![*goal];
-        if self.approach_m > 0.0 {
-            let up = [0.0, 0.0, self.approach_m];
-            approach = line(&self.reach, goal, up).map_err(|e: LineError| format!("approaching the goal, {e}"))?;
+        if self.approach.is_some() {
+            let back = self.line(goal, &self.approach, -1.0);
+            approach =
+                back.map_err(|e| format!("approaching the goal {}, backwards from there: {e}", self.approach))?;
             if let Some(collision) = straight_collision(&mut self.checker, &approach, self.press_m) {
                 return Err(format!("approaching the goal, {collision}"));
             }
@@ -390,7 +406,7 @@ impl Planning<'_> {
             approach.reverse();
         }
         match self.checker.collision(&approach[0], Contact::None) {
-            Some(collision) if self.approach_m > 0.0 => Err(format!("before the approach, {collision}")),
+            Some(collision) if self.approach.is_some() => Err(format!("before the approach, {collision}")),
             Some(collision) => Err(format!("at the goal, {collision}")),
             None => self.with_door(approach),
         }
@@ -570,7 +586,7 @@ fn half_finger_m(robot: &Robot) -> f64 {
 
 /// The tool as it leaves a goal where it lets go of what it holds: fingers that open there may press a neighbour, too. `None` where it
 /// holds nothing.
-fn leaving<'a>(robot: &'a Robot, scene: &Scene, request: &Request) -> Option<Checker<'a>> {
+fn leaving<'a>(robot: &'a Robot, scene: &Scene, request: &Request, padding: f64) -> Option<Checker<'a>> {
     let is_held = |object: &SceneObject| matches!(object.placement, Placement::Gripper(_));
     if !scene.objects.iter().any(is_held) {
         return None;
@@ -578,7 +594,7 @@ fn leaving<'a>(robot: &'a Robot, scene: &Scene, request: &Request) -> Option<Che
     let left = scene.objects.iter().filter(|object| !is_held(object)).cloned().collect();
     let scene = Scene { objects: left, ..scene.clone() };
     let opened = Configuration { finger: robot.finger().upper, ..request.start };
-    Some(Checker::new(robot, &scene, &opened, PADDING_M).reaching_into(&request.reaches_into))
+    Some(Checker::new(robot, &scene, &opened, padding).reaching_into(&request.reaches_into))
 }
 
 fn arm_of(positions: &Positions) -> Joints {

@@ -8,6 +8,7 @@
 
 use crate::elbow::{self, Arc};
 use crate::frame::{compose, cross, difference, norm, rotate};
+use crate::levers::Levers;
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 use crate::robot_model::{Drive, Joint};
 use crate::spherical::Spherical;
@@ -115,6 +116,7 @@ pub struct Reach {
     /// Joints that are planned for and do not move the link.
     others: Vec<usize>,
     spherical: Option<Spherical>,
+    levers: Levers,
 }
 
 /// All postures that meet a target, in closed form where the arm allows it.
@@ -157,9 +159,21 @@ impl Reach {
         }
         let tip = fixed.compose(&frame);
         let spherical = Spherical::of(&chain, &tip);
+        let joints = mechanism.joints.clone();
         let is_other = |joint: &usize| chain.iter().all(|(_, drive)| drive.joint != *joint);
-        let others = (0..mechanism.joints.len()).filter(is_other).collect();
-        Reach { chain, tip, joints: mechanism.joints.clone(), others, spherical }
+        let others = (0..joints.len()).filter(is_other).collect();
+        let levers = Levers::new(&chain, &tip, &joints);
+        Reach { chain, tip, joints, others, spherical, levers }
+    }
+
+    /// The joints, in the order of the positions.
+    pub(crate) fn limits(&self) -> &[Joint] {
+        &self.joints
+    }
+
+    /// How far the frame moves while the joints do.
+    pub(crate) fn levers(&self) -> &Levers {
+        &self.levers
     }
 
     /// How many joints the robot has.

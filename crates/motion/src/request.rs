@@ -3,14 +3,13 @@
 use crate::constrained::LEAST_TOLERANCE;
 use crate::plan::PlanError;
 use crate::robot::{Configuration, Joint, Joints, Robot};
+use crate::straight::Straight;
 use ratn_model::pose::Pose;
+use ratn_world::scene::Scene;
 use std::f64::consts::FRAC_PI_2;
 
 /// The most alternatives of one goal.
 pub const MAX_GOALS: usize = 64;
-
-/// The longest straight part, in metres.
-pub const MAX_STRAIGHT_M: f64 = 0.5;
 
 /// The slowest motion, as a fraction of the limits: a trajectory's points are as many as its time is long.
 pub const MIN_SPEED: f64 = 0.01;
@@ -23,10 +22,10 @@ pub struct Request {
     pub start: Configuration,
     /// Alternatives; any one will do.
     pub goals: Vec<Goal>,
-    /// Leave straight up (world z) this far, in metres.
-    pub depart_m: f64,
-    /// Arrive straight down (world -z) this far, in metres.
-    pub approach_m: f64,
+    /// Leave in a straight line.
+    pub depart: Straight,
+    /// Arrive in a straight line, moving in this direction.
+    pub approach: Straight,
     /// What points up in the tool at the end of the departure points up all along the free path, at most this far off, in radians.
     pub upright_rad: Option<f64>,
     /// Hollow things that the fingers may reach into on the straight parts, by their names in the scene: their shapes there are filled.
@@ -49,19 +48,31 @@ pub enum Goal {
 }
 
 impl Request {
+    /// The quickest motion to one of the goals, without straight parts and improvement.
+    pub fn new(start: Configuration, goals: Vec<Goal>) -> Request {
+        Request {
+            start,
+            goals,
+            depart: Straight::up(0.0),
+            approach: Straight::down(0.0),
+            upright_rad: None,
+            reaches_into: Vec::new(),
+            speed: 1.0,
+            seed: 0,
+            improvement_iterations: 0,
+        }
+    }
+
     /// Refuses what makes no sense before anything is planned.
-    pub(crate) fn check(&self, robot: &Robot) -> Result<(), PlanError> {
+    pub(crate) fn check(&self, robot: &Robot, scene: &Scene) -> Result<(), PlanError> {
         let malformed = |what: &str, value: String, expected: &str| {
             Err(PlanError::Malformed { what: what.to_owned(), value, expected: expected.to_owned() })
         };
         if !(MIN_SPEED..=1.0).contains(&self.speed) {
             return malformed("speed", self.speed.to_string(), &format!("a fraction from {MIN_SPEED} to 1"));
         }
-        for (what, value) in [("depart_m", self.depart_m), ("approach_m", self.approach_m)] {
-            if !(0.0..=MAX_STRAIGHT_M).contains(&value) {
-                return malformed(what, value.to_string(), &format!("0 to {MAX_STRAIGHT_M} m"));
-            }
-        }
+        self.depart.check("depart", scene)?;
+        self.approach.check("approach", scene)?;
         if let Some(tolerance) = self.upright_rad
             && !(LEAST_TOLERANCE..=FRAC_PI_2).contains(&tolerance)
         {

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::arm;
-use ratn_motion::line::line;
+use ratn_motion::arm::line;
 use ratn_motion::robot::{Configuration, DEGREES_OF_FREEDOM, Joints, Robot};
 use std::f64::consts::{FRAC_PI_2, PI};
 

@@ -13,6 +13,7 @@ use ratn_motion::collision::{CONTACT_TOLERANCE_M, Checker, Contact};
 use ratn_motion::pace::{Control, Progress};
 use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
 use ratn_motion::robot::{Configuration, Joints, Robot};
+use ratn_motion::straight::Straight;
 use ratn_motion::trajectory::ArmTrajectory;
 use ratn_motion::validate::{Violation, validate_trajectory};
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
@@ -110,7 +111,8 @@ fn a_neighbour_is_pressed_only_where_no_other_way_to_take_hold_leads_past_it() {
         let goals: Vec<Goal> =
             yaws.map(|yaw| Goal::Pose(Pose::from_rpy([x, y, aimm::TABLE_HEIGHT_M + 0.06], PI, 0.0, yaw))).collect();
         let to = |goals: &[Goal]| {
-            let request = Request { approach_m: aimm::APPROACH_M, ..request(cell.state(), goals.to_vec()) };
+            let request =
+                Request { approach: Straight::down(aimm::APPROACH_M), ..request(cell.state(), goals.to_vec()) };
             cell.plan(&Request { improvement_iterations: 200, ..request })
         };
         let mut exact = Checker::new(&cell.robot, &cell.scene, &cell.state(), 0.0);
@@ -150,7 +152,7 @@ fn what_is_let_go_is_put_so_that_the_open_fingers_press_nobody() {
         };
         let goals: Vec<Goal> = (0..8).map(goal).collect();
         let to = |goals: &[Goal]| {
-            cell.plan(&Request { approach_m: aimm::APPROACH_M, ..request(cell.state(), goals.to_vec()) })
+            cell.plan(&Request { approach: Straight::down(aimm::APPROACH_M), ..request(cell.state(), goals.to_vec()) })
         };
         let mut scene = cell.scene.clone();
         scene.objects.retain(|object| object.name != "can");
@@ -437,7 +439,7 @@ fn the_fingers_reach_only_into_what_is_said_to_be_hollow() {
     let scene = Scene { base: Pose::IDENTITY, objects };
     let rim = ratn_model::grasp::at_rim(&bowl, [0.13, 0.13, 0.05]).into_iter().map(Goal::Pose).collect();
     let start = Configuration { arm: aimm::OBSERVATION, ..arm::assumed(&robot, &scene) };
-    let request = Request { approach_m: 0.10, ..request(start, rim) };
+    let request = Request { approach: Straight::down(0.10), ..request(start, rim) };
     let refused = plan(&robot, &scene, &request, &mut |_| Control::Continue);
     assert!(matches!(&refused, Err(PlanError::NoGoal { .. })), "{refused:?}");
     let request = Request { reaches_into: vec!["bowl".to_owned()], ..request };

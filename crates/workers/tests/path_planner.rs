@@ -174,6 +174,34 @@ async fn what_cannot_be_planned_is_aborted_with_the_reason() {
 }
 
 #[tokio::test]
+async fn a_straight_part_goes_along_the_axes_that_the_goal_names() {
+    let system = system().await;
+    let direction = |xyz: &[f64]| Value::List(xyz.iter().map(|c| Value::Float(*c)).collect());
+    let frame = |name: &str| Value::String(name.to_owned());
+    let ahead = [("approach_direction", direction(&[0.0, 0.0, 1.0])), ("approach_frame", frame("tool"))];
+    let outcome = system.client.execute(&system.planner, system.grasp("a", &ahead), |_, _| {}).await.unwrap();
+    assert!(outcome.is_success(), "{}", outcome.reason);
+    for (id, inputs, reason) in [
+        (
+            "b",
+            vec![("approach_frame", frame("tool"))],
+            "input `approach_frame` is tool, but `approach_direction` is missing",
+        ),
+        ("c", vec![("approach_direction", direction(&[1.0, 0.0]))], "expected a list of three numbers"),
+        (
+            "d",
+            vec![("depart_direction", direction(&[0.0; 3]))],
+            "depart_direction is [0.0, 0.0, 0.0]: expected a direction",
+        ),
+        ("e", vec![ahead[0].clone(), ("approach_frame", frame("box_2"))], "or an object of the scene (box_1, table)"),
+    ] {
+        let outcome = system.client.execute(&system.planner, system.grasp(id, &inputs), |_, _| {}).await.unwrap();
+        assert_eq!(outcome.outcome, "aborted", "{id}");
+        assert!(outcome.reason.contains(reason), "{}", outcome.reason);
+    }
+}
+
+#[tokio::test]
 async fn a_plan_for_a_crawling_arm_is_refused_and_not_written_out_for_hours_of_motion() {
     let system = system().await;
     let goal = system.grasp("a", &[("speed", Value::Float(0.001))]);

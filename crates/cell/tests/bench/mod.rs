@@ -13,6 +13,7 @@ use ratn_motion::aimm;
 use ratn_motion::pace::Control;
 use ratn_motion::plan::{Goal, Request as PlanRequest, plan};
 use ratn_motion::robot::Joints;
+use ratn_motion::straight::Straight;
 use ratn_world::scene::Scene;
 use std::time::Duration;
 
@@ -100,15 +101,12 @@ impl Bench {
         approach_m: f64,
     ) -> Result<Trajectory, String> {
         let request = PlanRequest {
-            start: self.cell.measured(),
-            goals,
-            depart_m,
-            approach_m,
-            upright_rad: None,
-            reaches_into: Vec::new(),
+            depart: Straight::up(depart_m),
+            approach: Straight::down(approach_m),
             speed: 0.5,
             seed: 3,
             improvement_iterations: 50,
+            ..PlanRequest::new(self.cell.measured(), goals)
         };
         let planned = plan(self.cell.robot(), scene, &request, &mut |_| Control::Continue);
         planned.map(|planned| planned.trajectory).map_err(|error| error.to_string())

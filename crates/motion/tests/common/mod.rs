@@ -10,6 +10,7 @@ use ratn_motion::arm;
 use ratn_motion::pace::{Control, Progress};
 use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
 use ratn_motion::robot::{Configuration, Joints, Robot};
+use ratn_motion::straight::Straight;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::TAU;
 
@@ -22,17 +23,7 @@ pub struct Cell {
 
 /// A request without straight parts.
 pub fn request(start: Configuration, goals: Vec<Goal>) -> Request {
-    Request {
-        start,
-        goals,
-        depart_m: 0.0,
-        approach_m: 0.0,
-        upright_rad: None,
-        reaches_into: Vec::new(),
-        speed: 0.3,
-        seed: 7,
-        improvement_iterations: 0,
-    }
+    Request { speed: 0.3, seed: 7, ..Request::new(start, goals) }
 }
 
 impl Cell {
@@ -71,7 +62,7 @@ impl Cell {
         let object = self.object(name);
         let (Placement::World(pose), Shape::Box { size }) = (object.placement, object.shape) else { panic!("{name}") };
         let goals = aimm::grasp_poses(&pose, size).map(Goal::Pose).to_vec();
-        Request { approach_m: aimm::APPROACH_M, ..self.request(goals) }
+        Request { approach: Straight::down(aimm::APPROACH_M), ..self.request(goals) }
     }
 
     pub fn transfer(&self, name: &str, slot: usize) -> Request {
@@ -81,11 +72,15 @@ impl Cell {
         };
         let target = self.scene.base.compose(&aimm::slots()[slot]).compose(&Pose::at(0.0, 0.0, size[2] / 2.0));
         let goals = aimm::grasp_poses(&target, size).map(Goal::Pose).to_vec();
-        Request { depart_m: aimm::APPROACH_M, approach_m: aimm::APPROACH_M, ..self.request(goals) }
+        Request {
+            depart: Straight::up(aimm::APPROACH_M),
+            approach: Straight::down(aimm::APPROACH_M),
+            ..self.request(goals)
+        }
     }
 
     pub fn retract(&self) -> Request {
-        Request { depart_m: aimm::APPROACH_M, ..self.request(vec![Goal::Joints(aimm::OBSERVATION)]) }
+        Request { depart: Straight::up(aimm::APPROACH_M), ..self.request(vec![Goal::Joints(aimm::OBSERVATION)]) }
     }
 
     fn request(&self, goals: Vec<Goal>) -> Request {

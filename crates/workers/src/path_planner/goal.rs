@@ -1,5 +1,5 @@
 //! A goal of the path planner, read from its input ports: `start`, `goal` (joints, a pose, or a list of these); optional `depart_m`,
-//! `approach_m` (straight parts), `upright_rad` (what points up in the tool stays so, at most this far off), `reaches_into` (names of hollow
+//! `approach_m` (straight parts; with `…_direction` and `…_frame`, else straight up and straight down), `upright_rad` (what points up in the tool stays so, at most this far off), `reaches_into` (names of hollow
 //! objects whose insides the fingers may enter on the straight parts), `speed`, `budget_s`; `pan`, `tilt` and `width_m` (where head and fingers
 //! are, as `pan_tilt` and `gripper` say; what is not said is [`assumed`]: the head looks straight ahead, the fingers are around what is held,
 //! else open).
@@ -8,6 +8,7 @@ use ratn_model::value::Value;
 use ratn_motion::arm::assumed;
 use ratn_motion::plan::{Goal, Request};
 use ratn_motion::robot::{Configuration, Joints, Robot};
+use ratn_motion::straight::{Frame, Straight};
 use ratn_worker::action::{ActionFailure, GoalContext};
 use ratn_world::scene::Scene;
 
@@ -71,18 +72,35 @@ pub(super) fn asked(goal: &GoalContext) -> Result<(Asked, Option<f64>), ActionFa
         )));
     }
     let request = Request {
-        start: Configuration::ZERO,
-        goals: goals(goal.port("goal").any()?)?,
-        depart_m: goal.optional_float("depart_m")?.unwrap_or(0.0),
-        approach_m: goal.optional_float("approach_m")?.unwrap_or(0.0),
+        depart: straight(goal, "depart", Straight::up)?,
+        approach: straight(goal, "approach", Straight::down)?,
         upright_rad: goal.optional_float("upright_rad")?,
         reaches_into: names(goal)?,
         speed: goal.optional_float("speed")?.unwrap_or(DEFAULT_SPEED),
         seed: goal.seed,
         // Improvement goes on until the budget ends.
         improvement_iterations: if budget_s.is_some() { usize::MAX } else { 0 },
+        // The start is known when the scene is.
+        ..Request::new(Configuration::ZERO, goals(goal.port("goal").any()?)?)
     };
     Ok((Asked { said: Said::read(goal, "start")?, request }, budget_s))
+}
+
+/// A straight part by the ports `…_m`, `…_direction` and `…_frame`; `usual` is the part where no direction is said.
+fn straight(goal: &GoalContext, which: &str, usual: fn(f64) -> Straight) -> Result<Straight, ActionFailure> {
+    let port = |end: &str| format!("{which}_{end}");
+    let length_m = goal.optional_float(&port("m"))?.unwrap_or(0.0);
+    let direction = goal.port(&port("direction")).optional().map(|port| port.vector3()).transpose()?;
+    let frame = goal.port(&port("frame")).optional().map(|port| port.string()).transpose()?;
+    match (direction, frame) {
+        (None, None) => Ok(usual(length_m)),
+        (Some(direction), frame) => {
+            Ok(Straight { direction, frame: frame.map_or(Frame::World, Frame::from), length_m })
+        }
+        (None, Some(frame)) => Err(ActionFailure::aborted(format!(
+            "input `{which}_frame` is {frame}, but `{which}_direction` is missing: say along which direction of that frame"
+        ))),
+    }
 }
 
 fn names(goal: &GoalContext) -> Result<Vec<String>, ActionFailure> {

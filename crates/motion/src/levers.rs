@@ -1,0 +1,58 @@
+//! How far the end of a chain of joints moves at the most while its joints do.
+//!
+//! The end of a chain is no further from a joint's axis than its lever: the sum of all offsets that follow, and of all that can slide.
+//! These bounds hold in every posture. They say what cannot happen between two postures that were looked at.
+
+use crate::mechanism::MAX_JOINTS;
+use crate::reach::Positions;
+use crate::robot_model::{Drive, Joint};
+use ratn_model::pose::Pose;
+
+/// The levers of a chain, from its root to its end.
+#[derive(Debug, Clone)]
+pub(crate) struct Levers(Vec<Lever>);
+
+#[derive(Debug, Clone, Copy)]
+struct Lever {
+    drive: Drive,
+    /// How far the end moves per radian (1 for what slides, per metre).
+    length_m: f64,
+}
+
+impl Levers {
+    /// Of joints, each at its place in the frame before it, and an end in the frame of the last.
+    pub(crate) fn new(chain: &[(Pose, Drive)], tip: &Pose, joints: &[Joint]) -> Levers {
+        let mut levers = Vec::with_capacity(chain.len());
+        let mut beyond = tip.distance(&Pose::IDENTITY);
+        for (origin, drive) in chain.iter().rev() {
+            levers.push(Lever { drive: *drive, length_m: if drive.slides { 1.0 } else { beyond } });
+            if drive.slides {
+                let Joint { lower, upper, .. } = &joints[drive.joint];
+                beyond += drive.factor.abs() * lower.abs().max(upper.abs());
+            }
+            beyond += origin.distance(&Pose::IDENTITY);
+        }
+        levers.reverse();
+        Levers(levers)
+    }
+
+    /// How far the end is at the most from the straight line between its two places, where the joints go straight from one posture to
+    /// another that differs by so much, in metres: an eighth of the greatest second derivative.
+    pub(crate) fn bend_m(&self, by: &Positions) -> f64 {
+        // ∂²p / ∂i ∂j with i before j is the axis of i times ∂p / ∂j, and nothing where i slides.
+        let (mut before, mut second) = (0.0, 0.0);
+        for lever in &self.0 {
+            let amount = lever.amount(by);
+            let turns = if lever.drive.slides { 0.0 } else { amount };
+            second += amount * lever.length_m * (2.0 * before + turns);
+            before += turns;
+        }
+        second / 8.0
+    }
+}
+
+impl Lever {
+    fn amount(&self, by: &[f64; MAX_JOINTS]) -> f64 {
+        (self.drive.factor * by[self.drive.joint]).abs()
+    }
+}

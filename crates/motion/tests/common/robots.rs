@@ -1,0 +1,102 @@
+//! Arms of other makes than ours, by their kinematics: seven joints with offsets at elbow and wrist, six joints without a spherical wrist,
+//! and the latter on a column that slides.
+
+use ratn_model::pose::Pose;
+use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
+use ratn_motion::reach::{Positions, Reach};
+use std::f64::consts::{FRAC_PI_2, PI};
+
+/// An arm with the frame at its end, and a posture in the middle of what it can do.
+pub struct Arm {
+    pub mechanism: Mechanism,
+    pub tool: Reach,
+    pub home: Positions,
+}
+
+/// Where a joint sits, its axis, its limits and its speed; what slides has the second axis.
+struct Part {
+    xyz: [f64; 3],
+    rpy: [f64; 3],
+    axis: &'static str,
+    slides: bool,
+    limits: [f64; 2],
+    velocity: f64,
+}
+
+fn turn(xyz: [f64; 3], rpy: [f64; 3], axis: &'static str, limits: [f64; 2], velocity: f64) -> Part {
+    Part { xyz, rpy, axis, slides: false, limits, velocity }
+}
+
+/// As long as the Panda's, with its offsets.
+pub fn seven() -> Arm {
+    let z = "0 0 1";
+    let flat = [FRAC_PI_2, 0.0, 0.0];
+    let back = [-FRAC_PI_2, 0.0, 0.0];
+    let parts = [
+        turn([0.0, 0.0, 0.333], [0.0; 3], z, [-2.8973, 2.8973], 2.175),
+        turn([0.0; 3], back, z, [-1.7628, 1.7628], 2.175),
+        turn([0.0, -0.316, 0.0], flat, z, [-2.8973, 2.8973], 2.175),
+        turn([0.0825, 0.0, 0.0], flat, z, [-3.0718, -0.0698], 2.175),
+        turn([-0.0825, 0.384, 0.0], back, z, [-2.8973, 2.8973], 2.61),
+        turn([0.0; 3], flat, z, [-0.0175, 3.7525], 2.61),
+        turn([0.088, 0.0, 0.0], flat, z, [-2.8973, 2.8973], 2.61),
+    ];
+    arm("seven", &parts, Pose::at(0.0, 0.0, 0.107), &[0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+}
+
+/// As long as the UR5's.
+fn six_parts() -> [Part; 6] {
+    let (y, z) = ("0 1 0", "0 0 1");
+    let over = [0.0, FRAC_PI_2, 0.0];
+    let round = [-PI, PI];
+    [
+        turn([0.0, 0.0, 0.0892], [0.0; 3], z, round, 3.15),
+        turn([0.0, 0.1358, 0.0], over, y, round, 3.15),
+        turn([0.0, -0.1197, 0.425], [0.0; 3], y, round, 3.15),
+        turn([0.0, 0.0, 0.3922], over, y, round, 3.2),
+        turn([0.0, 0.093, 0.0], [0.0; 3], z, round, 3.2),
+        turn([0.0, 0.0, 0.0947], [0.0; 3], y, round, 3.2),
+    ]
+}
+
+const SIX_HOME: [f64; 6] = [0.0, -1.3, 1.6, -1.9, -1.57, 0.3];
+
+pub fn six() -> Arm {
+    arm("six", &six_parts(), Pose::at(0.0, 0.0823, 0.0), &SIX_HOME)
+}
+
+/// The same on a column.
+pub fn lifted() -> Arm {
+    let column =
+        Part { xyz: [0.0, 0.0, 0.3], rpy: [0.0; 3], axis: "0 0 1", slides: true, limits: [0.0, 0.5], velocity: 0.2 };
+    let parts: Vec<Part> = std::iter::once(column).chain(six_parts()).collect();
+    let home: Vec<f64> = std::iter::once(0.2).chain(SIX_HOME).collect();
+    arm("lifted", &parts, Pose::at(0.0, 0.0823, 0.0), &home)
+}
+
+pub fn all() -> [Arm; 3] {
+    [seven(), six(), lifted()]
+}
+
+fn arm(name: &str, parts: &[Part], tool: Pose, home: &[f64]) -> Arm {
+    let mut urdf = format!("<robot name='{name}'><link name='l0'/>");
+    let mut names = Vec::new();
+    for (i, part) in parts.iter().enumerate() {
+        let Part { xyz: [x, y, z], rpy: [roll, pitch, yaw], axis, slides, limits: [lower, upper], velocity } = part;
+        let kind = if *slides { "prismatic" } else { "revolute" };
+        let radius = 0.03;
+        urdf += &format!(
+            "<link name='l{next}'><collision><geometry><sphere radius='{radius}'/></geometry></collision></link>\
+             <joint name='j{next}' type='{kind}'><origin xyz='{x} {y} {z}' rpy='{roll} {pitch} {yaw}'/>\
+             <parent link='l{i}'/><child link='l{next}'/><axis xyz='{axis}'/>\
+             <limit lower='{lower}' upper='{upper}' effort='1' velocity='{velocity}'/></joint>",
+            next = i + 1
+        );
+        names.push(format!("j{}", i + 1));
+    }
+    let mechanism = Mechanism::read(&(urdf + "</robot>"), None, &names).unwrap();
+    let tool = Reach::new(&mechanism, mechanism.link(&format!("l{}", parts.len())).unwrap(), tool);
+    let mut positions = [0.0; MAX_JOINTS];
+    positions[..home.len()].copy_from_slice(home);
+    Arm { mechanism, tool, home: positions }
+}

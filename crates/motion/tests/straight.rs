@@ -1,0 +1,250 @@
+//! Straight parts of motions: in any direction, in any frame, of any arm, and how straight they are when they are followed.
+
+#![allow(clippy::unwrap_used, clippy::panic, unreachable_pub, reason = "a test may panic, and shares modules")]
+
+mod common;
+#[path = "common/robots.rs"]
+mod robots;
+
+use common::{Cell, request};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use ratn_model::pose::Pose;
+use ratn_motion::aimm;
+use ratn_motion::arm;
+use ratn_motion::collision::{Checker, Contact};
+use ratn_motion::geometry::Geometry;
+use ratn_motion::line::{Cause, line};
+use ratn_motion::plan::{Goal, Plan, PlanError, Request};
+use ratn_motion::robot::Joint;
+use ratn_motion::straight::{Frame, Straight};
+use ratn_motion::timing::{Section, timed};
+use ratn_motion::trajectory::ArmTrajectory;
+use ratn_world::scene::{Placement, SceneObject, Shape};
+use robots::Arm;
+use std::f64::consts::{FRAC_PI_2, FRAC_PI_4};
+
+/// How far a straight part may be from straight, in metres and radians.
+const STRAIGHT_M: f64 = 1e-3;
+const STRAIGHT_RAD: f64 = 2e-3;
+
+/// How far a point is from a line through another.
+fn off(point: [f64; 3], through: [f64; 3], direction: [f64; 3]) -> f64 {
+    let unit = direction.map(|c| c / direction.iter().map(|c| c * c).sum::<f64>().sqrt());
+    let way: [f64; 3] = std::array::from_fn(|i| point[i] - through[i]);
+    let along: f64 = (0..3).map(|i| way[i] * unit[i]).sum();
+    (0..3).map(|i| (way[i] - along * unit[i]).powi(2)).sum::<f64>().sqrt()
+}
+
+/// Along lines of random directions and turns the tool is where it should be, a hundred times between any two knots of the timed motion.
+fn check_timed<const N: usize>(arm: &Arm, seed: u64) {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let joints: &[Joint] = &arm.mechanism.joints;
+    let (mut followed, mut refused) = (0, 0);
+    for _ in 0..12 {
+        let from = arm.tool.pose(&arm.home);
+        let mut range = |most: f64| random.random_range(-most..most);
+        let to =
+            from.compose(&Pose::from_rpy([range(0.2), range(0.2), range(0.2)], range(0.5), range(0.5), range(0.5)));
+        let Ok(postures) = line(&arm.tool, &arm.home, &to) else {
+            refused += 1;
+            continue;
+        };
+        followed += 1;
+        let end = arm.tool.pose(postures.last().unwrap());
+        assert!(end.distance(&to) < 1e-5 && end.angle(&to) < 1e-4);
+        let path: Vec<[f64; N]> = postures.iter().map(|p| std::array::from_fn(|j| p[j])).collect();
+        let curve = timed(joints, &[Section::AsGiven(path)], 1.0, &mut |_, _| true);
+        let way: [f64; 3] = std::array::from_fn(|i| to.position[i] - from.position[i]);
+        let (whole, turn) = (from.distance(&to), from.angle(&to));
+        for pair in curve.knots().windows(2) {
+            for i in 0..100 {
+                let t = pair[0].time_s + (pair[1].time_s - pair[0].time_s) * f64::from(i) / 100.0;
+                let mut positions = arm.home;
+                positions[..N].copy_from_slice(&curve.sample(t).positions);
+                let tool = arm.tool.pose(&positions);
+                assert!(off(tool.position, from.position, way) < STRAIGHT_M, "{}", arm.mechanism.name);
+                // It has turned by as much as it has gone.
+                let share = tool.distance(&from) / whole;
+                assert!((tool.angle(&from) - share * turn).abs() < STRAIGHT_RAD + turn * STRAIGHT_M / whole);
+            }
+        }
+    }
+    assert!(followed >= 6, "{}: {followed} followed, {refused} refused", arm.mechanism.name);
+}
+
+#[test]
+fn the_tool_of_any_arm_goes_straight_between_all_samples() {
+    check_timed::<7>(&robots::seven(), 1);
+    check_timed::<6>(&robots::six(), 2);
+    check_timed::<7>(&robots::lifted(), 3);
+}
+
+#[test]
+fn a_line_that_cannot_be_followed_says_how_far_and_which_joint_ends_it() {
+    for arm in robots::all() {
+        let from = arm.tool.pose(&arm.home);
+        let far = Pose { position: [from.position[0], from.position[1], from.position[2] + 2.0], ..from };
+        let error = line(&arm.tool, &arm.home, &far).unwrap_err();
+        assert!(error.reached_m > 0.0 && error.reached_m < 1.5 && (error.wanted_m - 2.0).abs() < 1e-9, "{error}");
+        let said = error.to_string();
+        assert!(said.contains("m of 2.000 m: "), "{said}");
+    }
+    // The first joint has a limit on the way round.
+    let arm = robots::six();
+    let mut held = arm.home;
+    held[0] = 3.1;
+    let from = arm.tool.pose(&held);
+    let turned = Pose::from_rpy([0.0; 3], 0.0, 0.0, 0.2).compose(&from);
+    let error = line(&arm.tool, &held, &turned).unwrap_err();
+    assert!(matches!(&error.cause, Cause::Limit { joint } if joint == "j1"), "{error}");
+    // The wrist is stretched: it would have to flip.
+    let mut singular = arm.home;
+    singular[4] = 1e-4;
+    let from = arm.tool.pose(&singular);
+    let aside = Pose { position: [from.position[0], from.position[1] + 0.15, from.position[2]], ..from };
+    if let Err(error) = line(&arm.tool, &singular, &aside) {
+        assert!(matches!(&error.cause, Cause::Flip { .. } | Cause::OutOfReach), "{error}");
+    }
+}
+
+/// How far the tool is from the straight line, in metres and radians, at the end of a motion (from its beginning where `sense` is -1) for
+/// half of `part`, a hundred times between any two knots; and where it goes, in the world.
+fn strays(cell: &Cell, plan: &Plan, at_end: bool, length_m: f64) -> (f64, f64, [f64; 3]) {
+    let trajectory = ArmTrajectory::read(&cell.robot, &plan.trajectory).unwrap();
+    let (reach, base) = (arm::reach(&cell.robot), arm::on_floor(&cell.scene.base));
+    let tool = |t: f64| base.compose(&reach.pose(&arm::positions(&trajectory.sample(t).positions)));
+    let rest = tool(if at_end { trajectory.duration_s() } else { 0.0 });
+    let mut times = Vec::new();
+    for pair in trajectory.knots().windows(2) {
+        let h = pair[1].time_s - pair[0].time_s;
+        times.extend((0..100).map(|i| pair[0].time_s + h * f64::from(i) / 100.0));
+    }
+    if at_end {
+        times.reverse();
+    }
+    let near: Vec<Pose> = times.into_iter().map(tool).take_while(|t| t.distance(&rest) <= length_m / 2.0).collect();
+    let far = near.last().unwrap();
+    let sign = if at_end { 1.0 } else { -1.0 };
+    let way: [f64; 3] = std::array::from_fn(|i| sign * (rest.position[i] - far.position[i]) / rest.distance(far));
+    let most = |f: &dyn Fn(&Pose) -> f64| near.iter().map(f).fold(0.0, f64::max);
+    (most(&|t| off(t.position, rest.position, way)), most(&|t| t.angle(&rest)), way)
+}
+
+fn assert_goes(cell: &Cell, plan: &Plan, at_end: bool, length_m: f64, direction: [f64; 3]) {
+    let (stray_m, turn_rad, way) = strays(cell, plan, at_end, length_m);
+    assert!(stray_m < STRAIGHT_M && turn_rad < STRAIGHT_RAD, "{stray_m} m, {turn_rad} rad off");
+    let length = direction.iter().map(|c| c * c).sum::<f64>().sqrt();
+    let along: f64 = (0..3).map(|i| way[i] * direction[i] / length).sum();
+    assert!(along > 0.999, "it goes along {way:?} instead of {direction:?}");
+}
+
+/// A cell without boxes whose base is turned, a goal in the air whose tool points ahead and down, and something that stands turned.
+fn turned_cell() -> (Cell, Pose) {
+    let mut cell = Cell::with_boxes(0, 1);
+    cell.scene.base = Pose::from_rpy([-0.1, 0.05, 0.0], 0.0, 0.0, 0.3);
+    cell.scene.objects.push(SceneObject {
+        name: "shelf".into(),
+        shape: Shape::Box { size: [0.1, 0.2, 0.3] },
+        placement: Placement::World(Pose::from_rpy([0.0, 1.5, 0.5], 0.0, 0.0, FRAC_PI_4)),
+    });
+    let home = arm::reach(&cell.robot).pose(&arm::positions(&aimm::HOME));
+    let goal = cell.scene.base.compose(&home).compose(&Pose::from_rpy([0.03, 0.02, 0.0], 0.1, -0.6, 0.2));
+    (cell, goal)
+}
+
+#[test]
+fn an_approach_and_a_departure_go_in_any_direction_of_any_frame() {
+    let (mut cell, goal) = turned_cell();
+    let in_frame = |frame: Frame, direction: [f64; 3], goal: &Pose| match frame {
+        Frame::World => direction,
+        Frame::Base => Pose::from_rpy([0.0; 3], 0.0, 0.0, 0.3).rotate(direction),
+        Frame::Tool => goal.rotate(direction),
+        Frame::Object(_) => Pose::from_rpy([0.0; 3], 0.0, 0.0, FRAC_PI_4).rotate(direction),
+    };
+    for (frame, direction) in [
+        (Frame::World, [1.0, 0.0, 0.0]),
+        (Frame::Base, [2.0, 0.0, -1.0]),
+        (Frame::Tool, [0.0, 0.0, 1.0]),
+        (Frame::from("shelf"), [0.0, 1.0, -0.5]),
+    ] {
+        let part = Straight { direction, frame: frame.clone(), length_m: 0.08 };
+        let there = Request { approach: part, ..request(cell.state(), vec![Goal::Pose(goal)]) };
+        let plan = cell.plan(&there).unwrap_or_else(|e| panic!("{frame:?}: {e}"));
+        assert!(plan.end_pose.distance(&goal) < 1e-5 && plan.end_pose.angle(&goal) < 1e-4);
+        assert_goes(&cell, &plan, true, 0.08, in_frame(frame.clone(), direction, &goal));
+
+        let begin = cell.arm;
+        cell.follow(&plan);
+        let back = direction.map(|c| -c);
+        let part = Straight { direction: back, frame: frame.clone(), length_m: 0.08 };
+        let away = Request { depart: part, ..request(cell.state(), vec![Goal::Joints(begin)]) };
+        let plan = cell.plan(&away).unwrap_or_else(|e| panic!("{frame:?}: {e}"));
+        assert_goes(&cell, &plan, false, 0.08, in_frame(frame, back, &goal));
+        cell.follow(&plan);
+    }
+}
+
+#[test]
+fn what_is_held_lends_its_axes_too() {
+    let (mut cell, goal) = turned_cell();
+    let held = Pose::from_rpy([0.0, 0.0, 0.05], 0.0, FRAC_PI_2, 0.0);
+    let shape = Shape::Box { size: [0.04; 3] };
+    cell.scene.objects.push(SceneObject { name: "peg".into(), shape, placement: Placement::Gripper(held) });
+    let part = Straight { direction: [-1.0, 0.0, 0.0], frame: Frame::from("peg"), length_m: 0.06 };
+    let request = Request { approach: part, ..request(cell.state(), vec![Goal::Pose(goal)]) };
+    let plan = cell.plan(&request).unwrap();
+    assert_goes(&cell, &plan, true, 0.06, goal.rotate(held.rotate([-1.0, 0.0, 0.0])));
+}
+
+#[test]
+fn a_straight_part_that_makes_no_sense_is_refused_with_what_is_expected() {
+    let (cell, goal) = turned_cell();
+    let part = |direction: [f64; 3], frame: &str, length_m: f64| Straight { direction, frame: frame.into(), length_m };
+    for (part, expected) in [
+        (part([0.0; 3], "world", 0.1), "approach_direction is [0.0, 0.0, 0.0]: expected a direction"),
+        (part([f64::NAN, 0.0, 1.0], "world", 0.1), "approach_direction is [NaN, 0.0, 1.0]: expected a direction"),
+        (
+            part([1.0, 0.0, 0.0], "self", 0.1),
+            "approach_frame is self: expected world, base, tool, or an object of the scene (table, shelf)",
+        ),
+        (part([1.0, 0.0, 0.0], "tool", 0.6), "approach_m is 0.6: expected 0 to 0.5 m"),
+    ] {
+        let request = Request { approach: part, ..request(cell.state(), vec![Goal::Pose(goal)]) };
+        let error = cell.plan(&request).unwrap_err();
+        assert!(matches!(error, PlanError::Malformed { .. }) && error.to_string().starts_with(expected), "{error}");
+    }
+    // What does not fit the arm says which part, where it goes, how far the arm gets and why.
+    let ahead = part([1.0, 0.0, 0.0], "world", 0.5);
+    let far = request(cell.state(), vec![Goal::Joints(aimm::HOME)]);
+    let said = cell.plan(&Request { depart: ahead, ..far }).unwrap_err().to_string();
+    assert!(said.starts_with("departing 0.500 m along (1, 0, 0) of the world: "), "{said}");
+}
+
+#[test]
+fn a_departure_presses_no_neighbour_deeper_than_an_approach_would() {
+    // The fingers leave sideways, past a post that one of them presses by so much, but not at the start.
+    let leaves = |press_m: f64| {
+        let mut cell = Cell::with_boxes(0, 1);
+        cell.follow(&cell.plan(&request(cell.state(), vec![Goal::Joints(aimm::HOME)])).unwrap());
+        let tool = cell.robot.tool_pose(&cell.state());
+        let finger = cell.robot.link("finger_left").unwrap();
+        let body = cell.robot.model.links[finger].bodies[0];
+        let Geometry::Box { half } = body.geometry else { panic!("{body:?}") };
+        let centre = tool.inverse().compose(&cell.robot.pose(&cell.state(), finger)).compose(&body.pose).position;
+        let aside = centre[1] + centre[1].signum() * (half[1] + 0.015 - press_m);
+        let place = Pose::at(centre[0] + half[0] + 0.05, aside, centre[2]);
+        cell.scene.objects.push(SceneObject {
+            name: "post".into(),
+            shape: Shape::Box { size: [0.03; 3] },
+            placement: Placement::World(tool.compose(&place)),
+        });
+        let mut exact = Checker::new(&cell.robot, &cell.scene, &cell.state(), 0.0);
+        assert_eq!(exact.collision(&cell.arm, Contact::None), None);
+        let depart = Straight { direction: [1.0, 0.0, 0.0], frame: Frame::Tool, length_m: 0.16 };
+        cell.plan(&Request { depart, ..request(cell.state(), vec![Goal::Joints(aimm::OBSERVATION)]) })
+    };
+    leaves(0.005).unwrap();
+    let refused = leaves(0.010).unwrap_err();
+    assert!(matches!(refused, PlanError::Depart { .. }) && refused.to_string().contains("post"), "{refused}");
+}
