@@ -2,11 +2,11 @@
 //! steps, each projected onto the constraint (Berenson, Srinivasa, Ferguson, Kuffner: *Manipulation Planning on Constraint
 //! Manifolds*, ICRA 2009).
 //!
-//! A step is taken only if it is free and if the constraint holds at the postures between its ends as well, [`Space::RESOLUTION`]
-//! per radian; so the path that comes out is a dense list of postures to be followed as they are. Steps are projected to half of
+//! A step is taken only if it is free and if the constraint holds between its ends as well; so the path that comes out is a dense list of postures to be followed as they are. Steps are projected to half of
 //! the tolerance, which leaves the other half for what is between them: tolerances below [`LEAST_TOLERANCE`] ask for too much.
 
 use crate::connect::{Budget, ConnectError, Route};
+use crate::levers::Levers;
 use crate::pace::Control;
 use crate::reach::{Positions, Reach, Target};
 use crate::simplify::path_length;
@@ -29,10 +29,19 @@ const MOST_ASTRAY: f32 = 2.0;
 /// Attempts at shortcuts that make most paths short.
 pub const SHORTCUTS: usize = 60;
 
+/// Kept back of every tolerance for what lies between the postures that are looked at, in radians and metres, and the greatest share of it.
+const RESERVE: f64 = 5e-4;
+const RESERVED_SHARE: f64 = 0.1;
+
+/// Steps are projected this far into a large tolerance of position, in metres.
+const INWARD_M: f64 = 0.01;
+
 /// What all postures of a path keep.
 #[derive(Debug, Clone)]
 pub struct Constraint {
     reach: Reach,
+    /// What is asked for, what is looked at, and what steps are projected to.
+    asked: Target,
     target: Target,
     inner: Target,
 }
@@ -40,15 +49,40 @@ pub struct Constraint {
 impl Constraint {
     /// The frame of `reach` stays within the tolerances of `target`.
     pub fn new(reach: Reach, target: Target) -> Constraint {
+        let less = |tolerance: [f64; 3]| tolerance.map(|t| t - RESERVE.min(RESERVED_SHARE * t));
         let half = |tolerance: [f64; 3]| tolerance.map(|t| if t < std::f64::consts::PI { t / 2.0 } else { t });
+        let inward = |tolerance: [f64; 3]| tolerance.map(|t| t - INWARD_M.min(t / 2.0));
+        let kept = Target {
+            tolerance_m: less(target.tolerance_m),
+            tolerance_rad: free_or(target.tolerance_rad, less),
+            ..target
+        };
         let inner =
-            Target { tolerance_m: half(target.tolerance_m), tolerance_rad: half(target.tolerance_rad), ..target };
-        Constraint { reach, target, inner }
+            Target { tolerance_m: inward(target.tolerance_m), tolerance_rad: half(target.tolerance_rad), ..target };
+        Constraint { reach, asked: target, target: kept, inner }
     }
 
     /// Whether a posture keeps it.
     pub fn holds(&self, state: &State) -> bool {
         self.target.is_met_by(&self.reach.pose(&positions(state)))
+    }
+
+    /// How far the frame may move, in metres, and turn, in radians, from a posture; less than nothing where it does not keep what is asked.
+    pub(crate) fn room(&self, positions: &Positions) -> [f64; 2] {
+        self.asked.room(&self.reach.pose(positions))
+    }
+
+    pub(crate) fn levers(&self) -> &Levers {
+        self.reach.levers()
+    }
+
+    /// What a posture that does not keep it breaks.
+    pub(crate) fn breach(&self, state: &State) -> String {
+        let [left_m, left_rad] = self.room(&positions(state));
+        match left_m < left_rad {
+            true => format!("the tool is {:.3} m outside the box", (-left_m).max(0.0)),
+            false => format!("the tool is {:.3} rad off the direction that it keeps", self.tilt_rad(state)),
+        }
     }
 
     /// How far the frame's z axis is off that of the target, in radians.
@@ -58,9 +92,13 @@ impl Constraint {
         (0..3).map(|i| have[i] * want[i]).sum::<f64>().clamp(-1.0, 1.0).acos()
     }
 
-    /// Whether all postures of a straight motion keep it, as far as one looks.
+    /// Whether all postures of a straight motion keep it: those that are looked at are so close that what lies between them differs from the
+    /// line between their frames by less than half of what is kept back.
     pub fn holds_along(&self, from: &State, to: &State) -> bool {
-        let steps = (distance(from, to) * Space::RESOLUTION).ceil().max(1.0) as usize;
+        let by: Positions = std::array::from_fn(|j| f64::from((from[j] - to[j]).abs()));
+        let bends = [self.levers().bend_m(&by), self.levers().turns_rad(&by).powi(2) / 8.0];
+        let close = bends.map(|bend| (bend / (RESERVE / 2.0)).sqrt()).into_iter().fold(0.0, f64::max);
+        let steps = f64::from(distance(from, to) * Space::RESOLUTION).max(close).ceil().max(1.0) as usize;
         (1..=steps).all(|i| self.holds(&between(from, to, i as f32 / steps as f32)))
     }
 
@@ -71,6 +109,12 @@ impl Constraint {
         }
         self.reach.descend(&self.inner, &positions).map(|p| p.map(|q| q as f32))
     }
+}
+
+/// Tolerances of rotation, but for those that leave a turn free.
+fn free_or(tolerance: [f64; 3], less: impl Fn([f64; 3]) -> [f64; 3]) -> [f64; 3] {
+    let reduced = less(tolerance);
+    std::array::from_fn(|i| if tolerance[i] < std::f64::consts::PI { reduced[i] } else { tolerance[i] })
 }
 
 fn positions(state: &State) -> Positions {

@@ -36,6 +36,30 @@ impl Levers {
         Levers(levers)
     }
 
+    /// How far the end moves at the most where no joint moves by more than so much, in metres.
+    pub(crate) fn moves_m(&self, by: &Positions) -> f64 {
+        self.0.iter().map(|lever| lever.amount(by) * lever.length_m).sum()
+    }
+
+    /// How far it turns at the most, in radians.
+    pub(crate) fn turns_rad(&self, by: &Positions) -> f64 {
+        self.0.iter().filter(|lever| !lever.drive.slides).map(|lever| lever.amount(by)).sum()
+    }
+
+    /// How much the end's velocity changes at the most, where joints of these speeds move by so much, in metres per second.
+    pub(crate) fn swing_m(&self, by: &Positions, speeds: &Positions) -> f64 {
+        // As below, for two different amounts.
+        let (mut turned, mut turning, mut sum) = (0.0, 0.0, 0.0);
+        for lever in &self.0 {
+            let (amount, speed) = (lever.amount(by), lever.amount(speeds));
+            let turns = if lever.drive.slides { 0.0 } else { 1.0 };
+            sum += lever.length_m * (turned * speed + turning * amount + turns * amount * speed);
+            turned += turns * amount;
+            turning += turns * speed;
+        }
+        sum
+    }
+
     /// How far the end is at the most from the straight line between its two places, where the joints go straight from one posture to
     /// another that differs by so much, in metres: an eighth of the greatest second derivative.
     pub(crate) fn bend_m(&self, by: &Positions) -> f64 {

@@ -4,6 +4,7 @@
 //! hands in the seed.
 
 pub mod aimm;
+mod along;
 pub mod arm;
 pub mod base;
 mod branches;
@@ -23,6 +24,7 @@ mod frame;
 pub mod geometry;
 pub mod heightfield;
 pub mod inside;
+pub mod keep;
 mod levers;
 pub mod line;
 pub mod mechanism;
@@ -57,6 +59,7 @@ pub mod straight;
 pub mod surface;
 pub mod surroundings;
 pub mod timing;
+pub mod tool_speed;
 pub mod trajectory;
 mod tree;
 pub mod trial;
@@ -64,4 +67,5 @@ mod urdf;
 mod urdf_faults;
 mod urdf_tree;
 pub mod validate;
+pub mod way_points;
 mod xml_text;

@@ -1,10 +1,12 @@
-//! The tool in a straight line from one pose to another: its position along the segment, its rotation by the shortest turn, both evenly.
+//! The tool along straight lines from pose to pose: its position along the segment, its rotation by the shortest turn, both evenly; corners
+//! sharp or rounded.
 //!
 //! The arm is solved at postures a few millimetres apart, each from the one before. The tool is exactly on the line there; where the joints
 //! go straight from one of them to the next it is at most [`STRAY_M`] beside the line, which is bounded and not sampled (`levers`). All or
 //! an error, which says how far the arm gets and which joint ends the line. Any robot.
 
 use crate::frame::{compose, difference, norm};
+use crate::pace::{Control, Stop};
 use crate::reach::{Positions, Reach, Target, rotation_vector};
 use crate::robot_model::Joint;
 use ratn_model::pose::Pose;
@@ -17,14 +19,20 @@ pub const STRAY_M: f64 = 2.5e-4;
 const STEP_M: f64 = 0.0025;
 const STEP_RAD: f64 = 0.01;
 
-/// The most solved postures of one line.
-const MAX_STEPS: usize = 4_000;
+/// The most solved postures of one motion.
+const MAX_STEPS: usize = 16_000;
+
+/// Solved postures of a rounded corner at the least: so many that none of them is a kink at which the arm would stop.
+const CORNER_STEPS: usize = 48;
 
 /// A joint that moves more than this between two solved postures jumps to another branch, in radians or metres.
 const MAX_JUMP: f64 = 0.1;
 
 /// A joint this close to a limit is taken as held by it, in radians or metres.
 const AT_LIMIT: f64 = 0.01;
+
+/// The control points of a rounded corner on each side, from its end to the corner: the curve has no bend where it begins and ends.
+const CONTROLS: [f64; 3] = [0.0, 0.4, 0.8];
 
 /// A straight line that the arm cannot follow to its end.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -53,7 +61,7 @@ pub enum Cause {
         /// Which joint.
         joint: String,
     },
-    /// More postures than are solved for one line.
+    /// More postures than are solved for one motion.
     TooLong,
 }
 
@@ -63,8 +71,30 @@ impl fmt::Display for Cause {
             Cause::Limit { joint } => write!(f, "{joint} is at its limit"),
             Cause::OutOfReach => write!(f, "what follows is out of its reach"),
             Cause::Flip { joint } => write!(f, "{joint} would have to flip there (a singular posture)"),
-            Cause::TooLong => write!(f, "it would take more than {MAX_STEPS} postures: divide it"),
+            Cause::TooLong => write!(f, "it would take more than {MAX_STEPS} postures: divide the motion"),
         }
+    }
+}
+
+/// Postures along straight lines, as far as the arm gets.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Traced {
+    /// The first is where it starts.
+    pub postures: Vec<Positions>,
+    /// How far the tool has come at each of them, in metres.
+    pub along_m: Vec<f64>,
+    /// Which pose each of them leads to, by its index.
+    pub towards: Vec<usize>,
+    /// The length of all lines, in metres.
+    pub wanted_m: f64,
+    /// What ends the lines early.
+    pub ended: Option<Cause>,
+}
+
+impl Traced {
+    fn beginning(lines: &Lines, start: &Positions) -> Traced {
+        let wanted_m = lines.pieces.iter().map(|piece| piece.length_m).sum();
+        Traced { postures: vec![*start], along_m: vec![0.0], towards: vec![0], wanted_m, ended: None }
     }
 }
 
@@ -74,24 +104,61 @@ impl fmt::Display for Cause {
 /// # Errors
 /// [`LineError`] where limits or a singular posture end the line early.
 pub fn line(reach: &Reach, start: &Positions, to: &Pose) -> Result<Vec<Positions>, LineError> {
-    let from = reach.pose(start);
-    let leg = Leg::new(from, *to);
-    let steps = ((leg.length_m() / STEP_M).max(leg.turn_rad() / STEP_RAD).ceil() as usize).max(1);
-    let error = |done: usize, cause| LineError {
-        reached_m: leg.length_m() * done as f64 / steps as f64,
-        wanted_m: leg.length_m(),
-        cause,
-    };
-    if steps > MAX_STEPS {
-        return Err(error(0, Cause::TooLong));
+    let Traced { postures, along_m, wanted_m, ended, .. } = through(reach, start, &[*to], 0.0);
+    match ended {
+        None => Ok(postures),
+        Some(cause) => Err(LineError { reached_m: along_m[along_m.len() - 1], wanted_m, cause }),
     }
-    let mut postures = vec![*start];
-    for i in 1..=steps {
-        let here = postures[i - 1];
-        let next = step(reach, &here, &leg.at(i as f64 / steps as f64)).map_err(|cause| error(i - 1, cause))?;
-        postures.push(next);
+}
+
+/// Postures along straight lines from where the frame of `reach` is in the posture `start` through poses (in the frame of the root), as far as
+/// the arm gets. At each pose but the last the tool may leave the lines as far as `blend_m` from it.
+pub fn through(reach: &Reach, start: &Positions, to: &[Pose], blend_m: f64) -> Traced {
+    let lines = Lines::new(reach.pose(start), to, blend_m);
+    let traced = trace(reach, &lines, start, &mut || Control::Continue);
+    // It is never told to stop.
+    traced.unwrap_or_else(|_| Traced::beginning(&lines, start))
+}
+
+/// Postures along lines, each solved from the one before; `control` is asked between them.
+///
+/// # Errors
+/// What `control` said, when that was not to go on.
+pub(crate) fn trace(
+    reach: &Reach,
+    lines: &Lines,
+    start: &Positions,
+    control: &mut dyn FnMut() -> Control,
+) -> Result<Traced, Stop> {
+    let mut traced = Traced::beginning(lines, start);
+    let mut before_m = 0.0;
+    for piece in &lines.pieces {
+        let steps = (piece.length_m / STEP_M).max(piece.turn_rad / STEP_RAD).ceil() as usize;
+        let steps = steps.max(if matches!(piece.curve, Curve::Corner(_)) { CORNER_STEPS } else { 1 });
+        if traced.postures.len() + steps > MAX_STEPS {
+            traced.ended = Some(Cause::TooLong);
+            return Ok(traced);
+        }
+        for i in 1..=steps {
+            let answer = control();
+            if answer != Control::Continue {
+                return Err(answer.into());
+            }
+            let share = i as f64 / steps as f64;
+            let here = traced.postures[traced.postures.len() - 1];
+            match step(reach, &here, &piece.curve.at(share)) {
+                Ok(next) => traced.postures.push(next),
+                Err(cause) => {
+                    traced.ended = Some(cause);
+                    return Ok(traced);
+                }
+            }
+            traced.along_m.push(before_m + share * piece.length_m);
+            traced.towards.push(piece.towards);
+        }
+        before_m += piece.length_m;
     }
-    Ok(postures)
+    Ok(traced)
 }
 
 /// From one posture to the next on a line.
@@ -110,9 +177,86 @@ fn step(reach: &Reach, here: &Positions, to: &Pose) -> Result<Positions, Cause> 
     Ok(next)
 }
 
+/// Lines from pose to pose with their corners, piece after piece.
+#[derive(Debug, Clone)]
+pub(crate) struct Lines {
+    pieces: Vec<Piece>,
+}
+
+/// A part of a line, or a rounded corner.
+#[derive(Debug, Clone)]
+struct Piece {
+    curve: Curve,
+    /// Of a corner at the most.
+    length_m: f64,
+    turn_rad: f64,
+    /// The index of the pose that it leads to.
+    towards: usize,
+}
+
+#[derive(Debug, Clone)]
+enum Curve {
+    /// From one share of a leg to another.
+    Straight(Leg, f64, f64),
+    /// A Bézier curve.
+    Corner(Box<[Pose; 6]>),
+}
+
+impl Lines {
+    /// From a pose through others to the last of them. At each but the last the tool may leave the lines as far as `blend_m` from it, and no
+    /// further than the middle of either line.
+    pub(crate) fn new(from: Pose, to: &[Pose], blend_m: f64) -> Lines {
+        let starts = std::iter::once(&from).chain(to);
+        let legs: Vec<Leg> = starts.zip(to).map(|(from, to)| Leg::new(*from, *to)).collect();
+        let mut pieces = Vec::new();
+        let mut begins = 0.0;
+        for (i, leg) in legs.iter().enumerate() {
+            let next = legs.get(i + 1);
+            let radius = next.map_or(0.0, |next| blend_m.min(leg.length_m() / 2.0).min(next.length_m() / 2.0));
+            // Less would be no corner that the arm can pass any faster.
+            let radius = if radius < STEP_M { 0.0 } else { radius };
+            let ends = if radius > 0.0 { 1.0 - radius / leg.length_m() } else { 1.0 };
+            if ends > begins {
+                let part = ends - begins;
+                let (length_m, turn_rad) = (part * leg.length_m(), part * leg.turn_rad());
+                pieces.push(Piece { curve: Curve::Straight(*leg, begins, ends), length_m, turn_rad, towards: i });
+            }
+            begins = 0.0;
+            if let Some(next) = next.filter(|_| radius > 0.0) {
+                let share = radius / next.length_m();
+                let before = CONTROLS.map(|c| leg.at(1.0 - (1.0 - c) * (1.0 - ends)));
+                let after = CONTROLS.map(|c| next.at((1.0 - c) * share));
+                let corner = [before[0], before[1], before[2], after[2], after[1], after[0]];
+                let turn_rad = (1.0 - ends) * leg.turn_rad() + share * next.turn_rad();
+                let curve = Curve::Corner(Box::new(corner));
+                pieces.push(Piece { curve, length_m: 2.0 * radius, turn_rad, towards: i });
+                begins = share;
+            }
+        }
+        Lines { pieces }
+    }
+}
+
+impl Curve {
+    fn at(&self, share: f64) -> Pose {
+        match self {
+            Curve::Straight(leg, from, to) => leg.at(from + share * (to - from)),
+            Curve::Corner(controls) => {
+                let mut level = **controls;
+                for last in (1..level.len()).rev() {
+                    for i in 0..last {
+                        level[i] = Leg::new(level[i], level[i + 1]).at(share);
+                    }
+                }
+                level[0]
+            }
+        }
+    }
+}
+
 /// A straight line from pose to pose.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Leg {
+struct Leg {
     from: Pose,
     way: [f64; 3],
     /// Rotation vector.
@@ -120,28 +264,28 @@ pub(crate) struct Leg {
 }
 
 impl Leg {
-    pub(crate) fn new(from: Pose, to: Pose) -> Leg {
+    fn new(from: Pose, to: Pose) -> Leg {
         let turn = rotation_vector(&compose(&to, &from.inverse()));
         Leg { from, way: difference(to.position, from.position), turn }
     }
 
-    pub(crate) fn length_m(&self) -> f64 {
+    fn length_m(&self) -> f64 {
         norm(self.way)
     }
 
-    pub(crate) fn turn_rad(&self) -> f64 {
+    fn turn_rad(&self) -> f64 {
         norm(self.turn)
     }
 
     /// The pose at a share of the way.
-    pub(crate) fn at(&self, share: f64) -> Pose {
+    fn at(&self, share: f64) -> Pose {
         let turned = compose(&turned_by(self.turn.map(|c| c * share)), &self.from);
         Pose { position: std::array::from_fn(|i| self.from.position[i] + share * self.way[i]), ..turned }
     }
 }
 
 /// The rotation by a rotation vector.
-pub(crate) fn turned_by(vector: [f64; 3]) -> Pose {
+fn turned_by(vector: [f64; 3]) -> Pose {
     let angle = norm(vector);
     // Near zero the sine of half of the angle is half of the angle.
     let scale = if angle > 1e-9 { (angle / 2.0).sin() / angle } else { 0.5 };

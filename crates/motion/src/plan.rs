@@ -8,12 +8,14 @@
 //! candidate end of the free path. On straight parts, checked by exact shapes, the fingers and what they hold may touch their
 //! surroundings, the arm may not. On the free path nothing touches anything: it is searched with the vector checks, between
 //! postures that have room for them; where the start or a candidate has less, a short way out of there comes first. Where the
-//! tool is to stay upright, the free path keeps it so (`constrained`), and the straight parts do anyway.
+//! tool is to stay upright, the free path keeps it so (`constrained`), and the straight parts do anyway. Where the tool is to go in
+//! straight lines, they take the place of the free path (`way_points`).
 
 use crate::arm::{self, joints, positions, state};
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M, distance, length};
 use crate::connect::{Budget, ConnectError, connect};
 use crate::constrained::{self, Constraint};
+use crate::keep::{KeptAxis, timed_keeping};
 use crate::line::LineError;
 use crate::pace::{Control, Pace, Progress, Stop};
 use crate::reach::{Positions, Postures, Reach, Target, is_new};
@@ -24,6 +26,7 @@ use crate::simplify::{path_length, shortened};
 use crate::space::{Space, State};
 use crate::straight::Straight;
 use crate::timing::{Section, timed_while};
+use crate::way_points::{Follower, WayPoints};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
@@ -122,6 +125,22 @@ pub enum PlanError {
         goals: usize,
         /// The different reasons.
         reasons: Vec<String>,
+    },
+    /// The tool cannot go straight to any of the goals.
+    #[error("no straight way to any of the {goals} goals: {}", reasons.join("; "))]
+    NoStraightWay {
+        /// How many alternatives there were.
+        goals: usize,
+        /// How far the tool gets and why no further, of some of them.
+        reasons: Vec<String>,
+    },
+    /// What the tool is to keep does not hold.
+    #[error("{place} {reason}")]
+    NotKept {
+        /// Where.
+        place: &'static str,
+        /// What is broken.
+        reason: String,
     },
     /// There are goals, but no way was found.
     #[error(
@@ -226,11 +245,20 @@ pub fn plan(
     }
     let depart = depart?;
     let start = depart[depart.len() - 1];
-    planning.constraint = request.upright_rad.map(|tolerance| {
-        let up = planning.reach.pose(&positions(&start)).inverse().rotate([0.0, 0.0, 1.0]);
-        let frame = crate::space::align(up);
-        Constraint::new(Reach::new(&mechanism, robot.tool, frame), Target::upright(Pose::IDENTITY, tolerance))
-    });
+    let tool = planning.reach.pose(&positions(&start));
+    let mut keep = request.keep;
+    if let Some(tolerance_rad) = request.upright_rad {
+        let up = [0.0, 0.0, 1.0];
+        keep.axis = Some(KeptAxis { axis: tool.inverse().rotate(up), direction: Some(up), tolerance_rad });
+    }
+    planning.constraint = keep.constraint(&mechanism, robot.tool, &planning.base, &tool);
+    planning.kept_along(&depart).map_err(|reason| PlanError::NotKept { place: "on the departure", reason })?;
+    if let Some(constraint) = planning.constraint.as_ref().filter(|c| !c.holds(&state(&start))) {
+        return Err(PlanError::NotKept { place: "at the start", reason: constraint.breach(&state(&start)) });
+    }
+    if let Some(way) = &request.straight {
+        return planning.straight(request, way, depart, &mut pace);
+    }
     let door = planning.door(&start).ok_or_else(|| planning.no_room(&start))?;
     let way_out = if door == state(&start) { 0.0 } else { distance(&start, &joints(robot, &door)) };
     if planning.checker.padding() < TIGHT_PADDING_M {
@@ -257,21 +285,22 @@ pub fn plan(
     let end = chosen.approach[chosen.approach.len() - 1];
     let free = planning.whole(&start, &path, &chosen);
     let sections = [Section::AsGiven(depart), Section::Blended(free), Section::AsGiven(chosen.approach)];
-    let (space, constraint) = (&mut planning.space, &planning.constraint);
-    let mut is_free = |from: &Joints, to: &Joints| {
-        let (from, to) = (state(from), state(to));
-        constraint.as_ref().is_none_or(|c| c.holds_along(&from, &to)) && space.is_free_motion(&from, &to)
-    };
     // To be timed is part of every plan, also when time is up.
-    let mut goes_on = || pace.answer() != Control::Cancelled;
-    let trajectory =
-        timed_while(robot.arm_joints(), &sections, request.speed, &mut is_free, &mut goes_on).to_model(robot);
+    let trajectory = planning.timed(request, &sections, &mut || pace.answer() != Control::Cancelled)?;
     if pace.answer() == Control::Cancelled {
         return Err(PlanError::Cancelled);
     }
     let end_pose = robot.tool_pose(&Configuration { arm: end, ..here });
     let (iterations, time_up) = (pace.iterations, improved.is_err());
     Ok(Plan { trajectory, end, end_pose, first_length_rad, length_rad, iterations, time_up })
+}
+
+impl PlanError {
+    pub(crate) fn no_straight_way(mut reasons: Vec<String>) -> PlanError {
+        let goals = reasons.len();
+        reasons.truncate(MAX_REASONS);
+        PlanError::NoStraightWay { goals, reasons }
+    }
 }
 
 impl From<Stop> for PlanError {
@@ -314,6 +343,65 @@ impl Planning<'_> {
         // A request that names an object which is not there has been refused.
         let way = part.way(self.scene, &self.base, &tool).unwrap_or_default();
         arm::line(&self.reach, from, way.map(|c| sense * c))
+    }
+
+    /// The whole motion in straight lines.
+    fn straight(
+        mut self,
+        request: &Request,
+        way: &WayPoints,
+        depart: Vec<Joints>,
+        pace: &mut Pace<'_>,
+    ) -> Result<Plan, PlanError> {
+        let robot = self.robot;
+        let start = depart[depart.len() - 1];
+        let mut leaving = leaving(robot, self.scene, request, self.checker.padding());
+        let mut best: Option<Plan> = None;
+        let mut failed = None;
+        // Within limits of jerk a corner that is rounded closely may take longer than a stop.
+        let blends = [way.blend_m, 0.0];
+        for blend_m in blends.into_iter().take(if way.blend_m > 0.0 { 2 } else { 1 }) {
+            let way = WayPoints { blend_m, ..way.clone() };
+            let mut follower = Follower {
+                scene: self.scene,
+                reach: &self.reach,
+                base: self.base,
+                checker: &mut self.checker,
+                leaving: leaving.as_mut(),
+                constraint: self.constraint.as_ref(),
+                presses_m: presses_m(robot),
+            };
+            let followed = match follower.follow(&start, request, &way, pace) {
+                Ok(followed) => followed,
+                Err(error @ PlanError::NoStraightWay { .. }) => {
+                    failed = failed.or(Some(error));
+                    continue;
+                }
+                Err(error) => return Err(error),
+            };
+            let length_rad = length(&depart) + followed.length_rad();
+            if best.is_none() && pace.report(Progress::FirstPath { length_rad }) == Err(Stop::Cancelled) {
+                return Err(PlanError::Cancelled);
+            }
+            let end = followed.approach[followed.approach.len() - 1];
+            let sections = [depart.clone(), followed.lines, followed.approach].map(Section::AsGiven);
+            let trajectory = self.timed(request, &sections, &mut || pace.answer() != Control::Cancelled)?;
+            if pace.answer() == Control::Cancelled {
+                return Err(PlanError::Cancelled);
+            }
+            if best.as_ref().is_none_or(|best| trajectory.duration_s() < best.trajectory.duration_s()) {
+                best = Some(Plan {
+                    trajectory,
+                    end,
+                    end_pose: self.base.compose(&self.reach.pose(&positions(&end))),
+                    first_length_rad: length_rad,
+                    length_rad,
+                    iterations: 0,
+                    time_up: false,
+                });
+            }
+        }
+        best.ok_or_else(|| failed.unwrap_or_else(|| PlanError::no_straight_way(Vec::new())))
     }
 
     /// Fills the list of candidates: those that keep away from what they need not touch, or else those that press the least.
@@ -412,12 +500,48 @@ impl Planning<'_> {
         }
     }
 
+    /// What the tool keeps is kept along postures, or what is broken.
+    fn kept_along(&self, postures: &[Joints]) -> Result<(), String> {
+        let Some(constraint) = &self.constraint else { return Ok(()) };
+        let breaks = |pair: &&[Joints]| !constraint.holds_along(&state(&pair[0]), &state(&pair[1]));
+        match postures.windows(2).find(breaks) {
+            Some(pair) => Err(constraint.breach(&state(&pair[1]))),
+            None => Ok(()),
+        }
+    }
+
+    /// The sections as one motion within the limits that were asked for, which keeps what is to be kept between all its knots as well.
+    fn timed(
+        &mut self,
+        request: &Request,
+        sections: &[Section],
+        goes_on: &mut dyn FnMut() -> bool,
+    ) -> Result<Trajectory, PlanError> {
+        let joints = request.joints(self.robot);
+        let (space, constraint) = (&mut self.space, &self.constraint);
+        let mut is_free = |from: &Joints, to: &Joints| {
+            let (from, to) = (state(from), state(to));
+            constraint.as_ref().is_none_or(|c| c.holds_along(&from, &to)) && space.is_free_motion(&from, &to)
+        };
+        let curve = match constraint {
+            None => timed_while(&joints, sections, request.speed, &mut is_free, goes_on),
+            Some(constraint) => timed_keeping(&joints, sections, request.speed, constraint, &mut is_free, goes_on)
+                .ok_or(PlanError::NotKept {
+                    place: "on the way",
+                    reason: "the tool does not keep what it is to keep between the postures that were planned"
+                        .to_owned(),
+                })?,
+        };
+        Ok(request.tool_speed.keep(&self.reach, curve).to_model(self.robot))
+    }
+
     fn with_door(&mut self, approach: Vec<Joints>) -> Result<Candidate, String> {
         let entry = approach[0];
         let door = self.door(&entry).ok_or_else(|| "there is too little room before the goal".to_owned())?;
         if let Some(constraint) = self.constraint.as_ref().filter(|c| !c.holds(&door)) {
-            return Err(format!("at the goal the tool is {:.3} rad off upright", constraint.tilt_rad(&door)));
+            return Err(format!("at the goal {}", constraint.breach(&door)));
         }
+        self.kept_along(&approach).map_err(|reason| format!("approaching the goal {reason}"))?;
         let way_in = (door != state(&entry)).then(|| joints(self.robot, &door));
         let length_rad = length(&approach) + way_in.map_or(0.0, |way_in| distance(&way_in, &entry));
         Ok(Candidate { door, way_in, approach, length_rad })
@@ -560,7 +684,8 @@ impl Planning<'_> {
     }
 }
 
-fn straight_collision(checker: &mut Checker<'_>, postures: &[Joints], press_m: f64) -> Option<Collision> {
+/// What a straight part touches first that it may not.
+pub(crate) fn straight_collision(checker: &mut Checker<'_>, postures: &[Joints], press_m: f64) -> Option<Collision> {
     let contact = Contact::Gripper(press_m);
     let first = checker.collision(&postures[0], contact);
     first.or_else(|| postures.windows(2).find_map(|w| checker.edge_collision(&w[0], &w[1], contact)))

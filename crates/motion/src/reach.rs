@@ -47,24 +47,27 @@ pub struct Target {
     /// How far it may be turned about them, in radians. A half turn about z or more means: any turn about z, and x and y count
     /// for the direction of the z axis together.
     pub tolerance_rad: [f64; 3],
+    /// The middle and the axes of the tolerances of position, where they are not those of `pose`.
+    pub bounds: Option<Pose>,
 }
 
 impl Target {
     /// The pose itself, to within a micrometre and a microradian.
     pub fn at(pose: Pose) -> Target {
-        Target { pose, tolerance_m: [1e-6; 3], tolerance_rad: [1e-6; 3] }
+        Target { pose, tolerance_m: [1e-6; 3], tolerance_rad: [1e-6; 3], bounds: None }
     }
 
     /// Anywhere, with the z axis of a frame whose rotation is that of `pose` at most `tolerance_rad` off its direction.
     pub fn upright(pose: Pose, tolerance_rad: f64) -> Target {
-        Target { pose, tolerance_m: [f64::INFINITY; 3], tolerance_rad: [tolerance_rad, tolerance_rad, PI] }
+        let tolerance_rad = [tolerance_rad, tolerance_rad, PI];
+        Target { pose, tolerance_m: [f64::INFINITY; 3], tolerance_rad, bounds: None }
     }
 
     /// What is missing from a pose to this beyond the tolerances, position and rotation vector in the target's frame; zero where
     /// it is reached.
     fn error(&self, have: &Pose, share: f64) -> [f64; 6] {
         let inverse = self.pose.inverse();
-        let off = rotate(&inverse, difference(self.pose.position, have.position));
+        let off = self.off(have);
         let about_z = self.tolerance_rad[2] >= PI;
         let turn = if about_z {
             let axis = rotate(have, [0.0, 0.0, 1.0]);
@@ -86,6 +89,27 @@ impl Target {
         };
         let ([x, y, z], [i, j, k]) = (off, turn);
         [x, y, z, i, j, k]
+    }
+
+    /// From a pose to the middle of the tolerances of position, along their axes.
+    fn off(&self, have: &Pose) -> [f64; 3] {
+        let middle = self.bounds.as_ref().unwrap_or(&self.pose);
+        rotate(&middle.inverse(), difference(middle.position, have.position))
+    }
+
+    /// How far the frame may move from a pose, in metres, and turn, in radians, within the tolerances; less than nothing beyond them.
+    pub(crate) fn room(&self, have: &Pose) -> [f64; 2] {
+        let off = self.off(have);
+        let left_m = (0..3).map(|i| self.tolerance_m[i] - off[i].abs()).fold(f64::INFINITY, f64::min);
+        let left_rad = if self.tolerance_rad[2] >= PI {
+            let up = [0.0, 0.0, 1.0];
+            let turn = norm(between_directions(rotate(have, up), rotate(&self.pose, up)));
+            self.tolerance_rad[0].min(self.tolerance_rad[1]) - turn
+        } else {
+            let turn = rotate(&self.pose.inverse(), rotation_vector(&compose(&self.pose, &have.inverse())));
+            (0..3).map(|i| self.tolerance_rad[i] - turn[i].abs()).fold(f64::INFINITY, f64::min)
+        };
+        [left_m, left_rad]
     }
 
     /// Which parts of an error a step has to mind: those that are free to change are left out.
@@ -189,6 +213,14 @@ impl Reach {
         compose(&self.chain.iter().fold(Pose::IDENTITY, |pose, link| place(&pose, link)), &self.tip)
     }
 
+    /// How fast the frame moves, in metres per second, and turns, in radians per second, where the joints have these velocities.
+    pub(crate) fn speeds(&self, positions: &Positions, velocities: &Positions) -> [f64; 2] {
+        let (axes, tip) = self.axes(positions);
+        let rows = jacobian(&axes, &tip, &[Pose::IDENTITY; 2], [true; 6]);
+        let along = |row: usize| (0..self.joints.len()).map(|j| rows[row][j] * velocities[j]).sum::<f64>();
+        [norm([along(0), along(1), along(2)]), norm([along(3), along(4), along(5)])]
+    }
+
     /// Positions held within the limits.
     pub fn clamp(&self, positions: &Positions) -> Positions {
         let mut clamped = *positions;
@@ -216,7 +248,8 @@ impl Reach {
                 return Some(positions);
             }
             let error = target.error(&tip, INNER);
-            let rows = jacobian(&axes, &tip, &target.pose.inverse(), target.minds(&error));
+            let views = [target.bounds.as_ref().unwrap_or(&target.pose), &target.pose].map(Pose::inverse);
+            let rows = jacobian(&axes, &tip, &views, target.minds(&error));
             let (off, turned) = (norm([error[0], error[1], error[2]]), norm([error[3], error[4], error[5]]));
             // Far away a heavily damped step keeps the descent steady; close by it is nearly Newton's.
             let damping = f64::clamp(1e-3 * (off + turned), 1e-9, 1e-3);
@@ -336,16 +369,16 @@ impl Reach {
     }
 }
 
-/// Rows: the velocity of the tip and its angular velocity per joint, as seen from a frame turned by `view`; those that are not
-/// minded are zero.
-fn jacobian(axes: &[Axis], tip: &Pose, view: &Pose, minded: [bool; 6]) -> [Positions; 6] {
+/// Rows: the velocity of the tip and its angular velocity per joint, as seen from frames turned by `views`; those that are not minded
+/// are zero.
+fn jacobian(axes: &[Axis], tip: &Pose, views: &[Pose; 2], minded: [bool; 6]) -> [Positions; 6] {
     let mut rows = [[0.0; MAX_JOINTS]; 6];
     for Axis { direction, point, drive } in axes {
         let (linear, angular) = match drive.slides {
             true => (*direction, [0.0; 3]),
             false => (cross(*direction, difference(tip.position, *point)), *direction),
         };
-        let values = rotate(view, linear).into_iter().chain(rotate(view, angular));
+        let values = rotate(&views[0], linear).into_iter().chain(rotate(&views[1], angular));
         for ((row, value), _) in rows.iter_mut().zip(values).zip(minded).filter(|(_, minded)| *minded) {
             // A joint may move several links of a chain.
             row[drive.joint] += value * drive.factor;

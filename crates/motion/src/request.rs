@@ -1,9 +1,12 @@
 //! What the planner is asked for.
 
 use crate::constrained::LEAST_TOLERANCE;
+use crate::keep::Keep;
 use crate::plan::PlanError;
 use crate::robot::{Configuration, Joint, Joints, Robot};
 use crate::straight::Straight;
+use crate::tool_speed::ToolSpeed;
+use crate::way_points::WayPoints;
 use ratn_model::pose::Pose;
 use ratn_world::scene::Scene;
 use std::f64::consts::FRAC_PI_2;
@@ -26,12 +29,20 @@ pub struct Request {
     pub depart: Straight,
     /// Arrive in a straight line, moving in this direction.
     pub approach: Straight,
+    /// Go in straight lines of the tool from the end of the departure to the beginning of the approach, instead of along a free path.
+    pub straight: Option<WayPoints>,
     /// What points up in the tool at the end of the departure points up all along the free path, at most this far off, in radians.
     pub upright_rad: Option<f64>,
+    /// What else the tool keeps, all along.
+    pub keep: Keep,
     /// Hollow things that the fingers may reach into on the straight parts, by their names in the scene: their shapes there are filled.
     pub reaches_into: Vec<String>,
     /// Fraction of the joints' velocity and acceleration limits.
     pub speed: f64,
+    /// Fractions of the joints' limits of velocity (beside `speed`), acceleration (beside `speed`) and jerk, joint by joint.
+    pub scales: [Joints; 3],
+    /// How fast the tool may be.
+    pub tool_speed: ToolSpeed,
     /// The same seed, scene and iterations give the same plan.
     pub seed: u64,
     /// Iterations of improvement after the first path and its shortcutting; time may be up before.
@@ -55,12 +66,28 @@ impl Request {
             goals,
             depart: Straight::up(0.0),
             approach: Straight::down(0.0),
+            straight: None,
             upright_rad: None,
+            keep: Keep::default(),
             reaches_into: Vec::new(),
             speed: 1.0,
+            scales: [[1.0; 7]; 3],
+            tool_speed: ToolSpeed::default(),
             seed: 0,
             improvement_iterations: 0,
         }
+    }
+
+    /// The arm's joints with the limits of this motion.
+    pub(crate) fn joints(&self, robot: &Robot) -> Vec<Joint> {
+        let [velocity, acceleration, jerk] = &self.scales;
+        let scaled = |(j, joint): (usize, &Joint)| Joint {
+            velocity: joint.velocity * velocity[j],
+            acceleration: joint.acceleration * acceleration[j],
+            jerk: joint.jerk * jerk[j],
+            ..joint.clone()
+        };
+        robot.arm_joints().iter().enumerate().map(scaled).collect()
     }
 
     /// Refuses what makes no sense before anything is planned.
@@ -73,11 +100,25 @@ impl Request {
         }
         self.depart.check("depart", scene)?;
         self.approach.check("approach", scene)?;
+        if let Some(way) = &self.straight {
+            way.check(&self.goals)?;
+        }
         if let Some(tolerance) = self.upright_rad
             && !(LEAST_TOLERANCE..=FRAC_PI_2).contains(&tolerance)
         {
             let range = format!("{LEAST_TOLERANCE} to {FRAC_PI_2:.3} rad");
             return malformed("upright_rad", tolerance.to_string(), &range);
+        }
+        if self.upright_rad.is_some() && self.keep.axis.is_some() {
+            let expected = "one of them: both say which direction the tool keeps";
+            return malformed("upright_rad", "there beside keep_axis".to_owned(), expected);
+        }
+        self.keep.check()?;
+        self.tool_speed.check()?;
+        for (what, scales) in ["velocity_scale", "acceleration_scale", "jerk_scale"].iter().zip(&self.scales) {
+            if let Some(scale) = scales.iter().find(|scale| !(MIN_SPEED..=1.0).contains(*scale)) {
+                return malformed(what, scale.to_string(), &format!("fractions from {MIN_SPEED} to 1"));
+            }
         }
         if self.goals.is_empty() || self.goals.len() > MAX_GOALS {
             return malformed("the number of goals", self.goals.len().to_string(), &format!("1 to {MAX_GOALS}"));

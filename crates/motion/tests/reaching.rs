@@ -111,7 +111,7 @@ proptest! {
         let reach = tool(&arm(1..=7));
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let pose = reach.pose(&reach.random(&mut random));
-        let target = Target { pose, tolerance_m: [0.02, 0.0, 0.05], tolerance_rad: [0.1, 0.1, PI] };
+        let target = Target { pose, tolerance_m: [0.02, 0.0, 0.05], tolerance_rad: [0.1, 0.1, PI], bounds: None };
         for posture in reach.solutions(&target, &[0.0; MAX_JOINTS], 3, 30, &mut random) {
             let off = pose.inverse().compose(&reach.pose(&posture));
             let [x, y, z] = off.position;

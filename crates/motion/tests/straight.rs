@@ -1,6 +1,6 @@
 //! Straight parts of motions: in any direction, in any frame, of any arm, and how straight they are when they are followed.
 
-#![allow(clippy::unwrap_used, clippy::panic, unreachable_pub, reason = "a test may panic, and shares modules")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
 mod common;
 #[path = "common/robots.rs"]

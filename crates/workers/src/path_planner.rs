@@ -4,6 +4,7 @@
 //! trajectory. All durations in its goals and answers are in the robot's seconds; `clock` knows how many of them pass in
 //! one of ours. Where `budget_s` is given, planning takes exactly that long and gets a shorter path for it.
 
+mod bounds;
 mod clock;
 mod drive;
 mod goal;

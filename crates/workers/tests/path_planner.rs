@@ -201,6 +201,93 @@ async fn a_straight_part_goes_along_the_axes_that_the_goal_names() {
     }
 }
 
+fn numbers(values: &[f64]) -> Value {
+    Value::List(values.iter().map(|c| Value::Float(*c)).collect())
+}
+
+#[tokio::test]
+async fn a_straight_way_through_way_points_is_all_or_an_error_that_says_how_far() {
+    let system = system().await;
+    let tool = Robot::aimm().tool_pose(&Configuration { arm: aimm::HOME, ..Configuration::ZERO });
+    let by = |x: f64, y: f64, z: f64| {
+        let [a, b, c] = tool.position;
+        Value::Pose(Pose { position: [a + x, b + y, c + z], ..tool })
+    };
+    let start = ("start", Value::Joints(aimm::HOME.to_vec()));
+    let way_points = ("way_points", Value::List(vec![by(0.05, 0.0, 0.05), by(0.05, 0.1, 0.05)]));
+    let rounded = [start.clone(), ("goal", by(0.0, 0.1, 0.0)), way_points.clone(), ("blend_m", Value::Float(0.02))];
+    let outcome = system.client.execute(&system.planner, system.goal("a", &rounded), |_, _| {}).await.unwrap();
+    assert!(outcome.is_success(), "{}", outcome.reason);
+    let straight = ("straight", Value::Bool(true));
+    for (id, inputs, reason) in [
+        ("b", vec![start.clone(), ("goal", by(1.5, 0.0, 0.3)), straight.clone()], "the tool can go straight for 0."),
+        ("c", vec![start.clone(), ("goal", Value::Joints(aimm::STOWED.to_vec())), straight], "expected poses"),
+        (
+            "d",
+            vec![start, ("goal", by(0.0, 0.1, 0.0)), way_points, ("straight", Value::Bool(false))],
+            "input `straight` is false, but `way_points` are there",
+        ),
+    ] {
+        let outcome = system.client.execute(&system.planner, system.goal(id, &inputs), |_, _| {}).await.unwrap();
+        assert_eq!(outcome.outcome, "aborted", "{id}");
+        assert!(outcome.reason.contains(reason), "{}", outcome.reason);
+    }
+}
+
+#[tokio::test]
+async fn what_bounds_a_motion_is_read_from_the_goal() {
+    let system = system().await;
+    let there = ("goal", Value::Joints(aimm::HOME.to_vec()));
+    let lasts_s = async |id: &str, more: &[(&str, Value)]| {
+        let goal = system.goal(id, &[std::slice::from_ref(&there), more].concat());
+        let outcome = system.client.execute(&system.planner, goal, |_, _| {}).await.unwrap();
+        match &outcome.outputs.get("trajectory") {
+            Some(Value::Trajectory(trajectory)) => Ok(trajectory.duration_s()),
+            _ => Err(outcome.reason),
+        }
+    };
+    let usual = lasts_s("a", &[]).await.unwrap();
+    for (i, slower) in [
+        ("velocity_scale", Value::Float(0.3)),
+        ("acceleration_scale", numbers(&[0.2; 7])),
+        ("jerk_scale", Value::Float(0.05)),
+        ("tool_speed_m_s", Value::Float(0.05)),
+        ("tool_turning_rad_s", Value::Float(0.02)),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let lasts = lasts_s(&format!("slower {i}"), std::slice::from_ref(&slower)).await;
+        assert!(lasts.clone().unwrap() > usual, "{slower:?}: {lasts:?}, {usual}");
+    }
+    let size: BTreeMap<String, Value> =
+        [("pose".to_owned(), Value::Pose(Pose::at(9.0, 0.0, 1.0))), ("size".to_owned(), numbers(&[0.2; 3]))].into();
+    for (i, (inputs, reason)) in [
+        (
+            vec![("velocity_scale", numbers(&[0.5; 6]))],
+            "input `velocity_scale` has 6 numbers: expected a number, or one for each of 7 joints",
+        ),
+        (vec![("jerk_scale", Value::Bool(true))], "input `jerk_scale` is a bool"),
+        (vec![("keep_rad", Value::Float(0.1))], "some are missing"),
+        (vec![("keep_axis", numbers(&[0.0, 0.0, 1.0]))], "some are missing"),
+        (vec![("inside", Value::Map(size))], "at the start the tool is"),
+        (
+            vec![
+                ("keep_axis", numbers(&[0.0, 0.0, 1.0])),
+                ("keep_direction", numbers(&[1.0, 0.0, 0.0])),
+                ("keep_rad", Value::Float(0.1)),
+            ],
+            "rad off the direction that it keeps",
+        ),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let said = lasts_s(&format!("refused {i}"), &inputs).await.unwrap_err();
+        assert!(said.contains(reason), "{said}");
+    }
+}
+
 #[tokio::test]
 async fn a_plan_for_a_crawling_arm_is_refused_and_not_written_out_for_hours_of_motion() {
     let system = system().await;

@@ -1,6 +1,8 @@
 //! Arms of other makes than ours, by their kinematics: seven joints with offsets at elbow and wrist, six joints without a spherical wrist,
 //! and the latter on a column that slides.
 
+#![allow(clippy::unwrap_used, unreachable_pub, dead_code, reason = "shared by several test programs, which may panic")]
+
 use ratn_model::pose::Pose;
 use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
 use ratn_motion::reach::{Positions, Reach};

@@ -1,14 +1,17 @@
 //! A goal of the path planner, read from its input ports: `start`, `goal` (joints, a pose, or a list of these); optional `depart_m`,
-//! `approach_m` (straight parts; with `…_direction` and `…_frame`, else straight up and straight down), `upright_rad` (what points up in the tool stays so, at most this far off), `reaches_into` (names of hollow
-//! objects whose insides the fingers may enter on the straight parts), `speed`, `budget_s`; `pan`, `tilt` and `width_m` (where head and fingers
-//! are, as `pan_tilt` and `gripper` say; what is not said is [`assumed`]: the head looks straight ahead, the fingers are around what is held,
-//! else open).
+//! `approach_m` (straight parts; with `…_direction` and `…_frame`, else straight up and straight down), `straight`, `way_points`, `blend_m`
+//! (between them straight lines of the tool, too), `upright_rad` (what points up in the tool stays so, at most this far off), `reaches_into`
+//! (names of hollow objects whose insides the fingers may enter on the straight parts), `speed`, `budget_s`; `pan`, `tilt` and `width_m`
+//! (where head and fingers are, as `pan_tilt` and `gripper` say; what is not said is [`assumed`]: the head looks straight ahead, the fingers
+//! are around what is held, else open). What bounds the motion: `bounds`.
 
+use super::bounds;
 use ratn_model::value::Value;
 use ratn_motion::arm::assumed;
 use ratn_motion::plan::{Goal, Request};
 use ratn_motion::robot::{Configuration, Joints, Robot};
 use ratn_motion::straight::{Frame, Straight};
+use ratn_motion::way_points::WayPoints;
 use ratn_worker::action::{ActionFailure, GoalContext};
 use ratn_world::scene::Scene;
 
@@ -74,7 +77,11 @@ pub(super) fn asked(goal: &GoalContext) -> Result<(Asked, Option<f64>), ActionFa
     let request = Request {
         depart: straight(goal, "depart", Straight::up)?,
         approach: straight(goal, "approach", Straight::down)?,
+        straight: way_points(goal)?,
         upright_rad: goal.optional_float("upright_rad")?,
+        keep: bounds::keep(goal)?,
+        scales: bounds::scales(goal)?,
+        tool_speed: bounds::tool_speed(goal)?,
         reaches_into: names(goal)?,
         speed: goal.optional_float("speed")?.unwrap_or(DEFAULT_SPEED),
         seed: goal.seed,
@@ -100,6 +107,25 @@ fn straight(goal: &GoalContext, which: &str, usual: fn(f64) -> Straight) -> Resu
         (None, Some(frame)) => Err(ActionFailure::aborted(format!(
             "input `{which}_frame` is {frame}, but `{which}_direction` is missing: say along which direction of that frame"
         ))),
+    }
+}
+
+/// Whether the tool goes in straight lines all the way, and through which poses.
+fn way_points(goal: &GoalContext) -> Result<Option<WayPoints>, ActionFailure> {
+    let straight = goal.port("straight").optional().map(|port| port.bool()).transpose()?;
+    let through = match goal.port("way_points").optional() {
+        Some(port) => Some(port.list()?.iter().map(|pose| pose.pose()).collect::<Result<Vec<_>, _>>()?),
+        None => None,
+    };
+    match (straight, through) {
+        (Some(false), Some(_)) => Err(ActionFailure::aborted(
+            "input `straight` is false, but `way_points` are there, which are passed in straight lines: leave one of them out",
+        )),
+        (Some(false) | None, None) => Ok(None),
+        (_, through) => {
+            let blend_m = goal.optional_float("blend_m")?.unwrap_or(0.0);
+            Ok(Some(WayPoints { through: through.unwrap_or_default(), blend_m }))
+        }
     }
 }
 

@@ -1,0 +1,148 @@
+//! What the tool keeps on its way: an axis of it near a direction of the world, its place inside a box.
+//!
+//! The free path is searched among postures that keep it (`constrained`). What was timed is looked at once more: the executed curve keeps it
+//! between all samples (`along`), or corners are followed more closely until it does.
+
+use crate::along::first_breach;
+use crate::collision::between;
+use crate::constrained::{Constraint, LEAST_TOLERANCE};
+use crate::frame::norm;
+use crate::mechanism::{MAX_JOINTS, Mechanism};
+use crate::plan::PlanError;
+use crate::reach::{Reach, Target};
+use crate::robot_model::Joint;
+use crate::space::align;
+use crate::timing::{Section, timed_while};
+use crate::trajectory::Curve;
+use ratn_model::pose::Pose;
+use std::f64::consts::{FRAC_PI_2, PI};
+
+/// Vectors that are shorter have no direction.
+const LEAST_DIRECTION: f64 = 1e-6;
+
+/// The largest box, in metres.
+const MAX_SIZE_M: f64 = 100.0;
+
+/// Parts that each motion of a path is divided into where it is to be followed closely.
+const DIVIDED: usize = 4;
+
+/// An axis of the tool that stays near a direction.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct KeptAxis {
+    /// In the frame of the tool, of any length but zero.
+    pub axis: [f64; 3],
+    /// In the world, of any length but zero; none: where the axis points at the start.
+    pub direction: Option<[f64; 3]>,
+    /// How far it may be off, in radians.
+    pub tolerance_rad: f64,
+}
+
+/// A box that the origin of the tool frame stays in.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Region {
+    /// Its middle and its axes, in the world.
+    pub pose: Pose,
+    /// Its edges, in metres.
+    pub size: [f64; 3],
+}
+
+/// What the tool keeps; nothing unless said.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Keep {
+    /// Its direction.
+    pub axis: Option<KeptAxis>,
+    /// Its place.
+    pub inside: Option<Region>,
+}
+
+impl Keep {
+    /// Refuses what makes no sense.
+    pub(crate) fn check(&self) -> Result<(), PlanError> {
+        let malformed = |what: &str, value: String, expected: String| {
+            Err(PlanError::Malformed { what: what.to_owned(), value, expected })
+        };
+        if let Some(KeptAxis { axis, direction, tolerance_rad }) = self.axis {
+            for (what, vector) in [("keep_axis", Some(axis)), ("keep_direction", direction)] {
+                if let Some(vector) = vector.filter(|v| !norm(*v).is_finite() || norm(*v) < LEAST_DIRECTION) {
+                    let expected = format!("finite numbers, and a length of more than {LEAST_DIRECTION}");
+                    return malformed(what, format!("{vector:?}"), expected);
+                }
+            }
+            if !(LEAST_TOLERANCE..=FRAC_PI_2).contains(&tolerance_rad) {
+                let expected = format!("{LEAST_TOLERANCE} to {FRAC_PI_2:.3} rad");
+                return malformed("keep_rad", tolerance_rad.to_string(), expected);
+            }
+        }
+        if let Some(Region { pose, size }) = self.inside {
+            if !pose.position.iter().chain(&pose.quaternion_xyzw).all(|c| c.is_finite()) {
+                return malformed("the pose of `inside`", format!("{pose:?}"), "finite numbers".to_owned());
+            }
+            if !size.iter().all(|edge| (2.0 * LEAST_TOLERANCE..=MAX_SIZE_M).contains(edge)) {
+                let expected = format!("edges of {} to {MAX_SIZE_M} m", 2.0 * LEAST_TOLERANCE);
+                return malformed("the size of `inside`", format!("{size:?}"), expected);
+            }
+        }
+        Ok(())
+    }
+
+    /// As a constraint of the frame of a link, from where that frame is at the start, in the frame of the root, which is at `base`.
+    pub fn constraint(&self, mechanism: &Mechanism, link: usize, base: &Pose, start: &Pose) -> Option<Constraint> {
+        if *self == Keep::default() {
+            return None;
+        }
+        let unit = |v: [f64; 3]| v.map(|c| c / norm(v));
+        let from_world = base.inverse();
+        let mut target = Target { tolerance_m: [f64::INFINITY; 3], ..Target::upright(Pose::IDENTITY, f64::INFINITY) };
+        let mut frame = Pose::IDENTITY;
+        if let Some(KeptAxis { axis, direction, tolerance_rad }) = self.axis {
+            let axis = unit(axis);
+            let direction = direction.map_or_else(|| start.rotate(axis), |d| from_world.rotate(unit(d)));
+            frame = align(axis);
+            target.pose = align(unit(direction));
+            target.tolerance_rad = [tolerance_rad, tolerance_rad, PI];
+        }
+        if let Some(Region { pose, size }) = self.inside {
+            target.bounds = Some(from_world.compose(&pose));
+            target.tolerance_m = size.map(|edge| edge / 2.0);
+        }
+        Some(Constraint::new(Reach::new(mechanism, link, frame), target))
+    }
+}
+
+/// The trajectory along sections that keeps a constraint all along, as quick as can be; none where even the straight motions from posture
+/// to posture do not keep it. For the rest as [`timed_while`].
+pub fn timed_keeping<const N: usize>(
+    joints: &[Joint],
+    sections: &[Section<N>],
+    speed: f64,
+    constraint: &Constraint,
+    is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Option<Curve<N>> {
+    let keeps = |curve: &Curve<N>| {
+        let room = &mut |positions: &[f64; MAX_JOINTS]| constraint.room(positions);
+        first_breach(curve, constraint.levers(), room).is_none()
+    };
+    let curve = timed_while(joints, sections, speed, is_free, goes_on);
+    if keeps(&curve) {
+        return Some(curve);
+    }
+    // Along the postures themselves, then with a stop at each of them.
+    let closely = |section: &Section<N>| match section {
+        Section::Blended(path) => Section::AsGiven(divided(path)),
+        given => given.clone(),
+    };
+    let closer: Vec<Section<N>> = sections.iter().map(closely).collect();
+    let curve = timed_while(joints, &closer, speed, is_free, goes_on);
+    if keeps(&curve) {
+        return Some(curve);
+    }
+    let curve = timed_while(joints, sections, speed, &mut |_, _| false, goes_on);
+    keeps(&curve).then_some(curve)
+}
+
+fn divided<const N: usize>(path: &[[f64; N]]) -> Vec<[f64; N]> {
+    let parts =
+        path.windows(2).flat_map(|pair| (0..DIVIDED).map(|i| between(&pair[0], &pair[1], i as f64 / DIVIDED as f64)));
+    parts.chain(path.last().copied()).collect()
+}

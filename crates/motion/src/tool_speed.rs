@@ -1,0 +1,98 @@
+//! Limits of how fast the tool moves and turns, along the whole of a timed curve.
+//!
+//! The greatest speed of the tool on the curve is bounded, not sampled: at the middle of a piece it is worked out, and within the piece it
+//! differs by no more than the joints' motions and speeds do there, times the levers of the arm; pieces are halved until the bound is as
+//! close as a thousandth. Where a limit is exceeded the whole motion is slowed by one factor, so that its fastest moment keeps the limit:
+//! whatever else held goes on to hold, and nothing but the time changes. Any robot.
+
+use crate::mechanism::MAX_JOINTS;
+use crate::plan::PlanError;
+use crate::reach::{Positions, Reach};
+use crate::trajectory::{Curve, Knot};
+
+/// How close the bound is, as a share.
+const CLOSE: f64 = 1e-3;
+
+/// Speeds below are none, in metres or radians per second: the slowest limits.
+pub const LEAST_SPEED: f64 = 1e-3;
+
+/// How fast the tool may be.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct ToolSpeed {
+    /// Of its origin, in metres per second.
+    pub m_per_s: Option<f64>,
+    /// Of its rotation, in radians per second.
+    pub rad_per_s: Option<f64>,
+}
+
+impl ToolSpeed {
+    /// Refuses what makes no sense.
+    pub(crate) fn check(&self) -> Result<(), PlanError> {
+        for (what, limit, unit) in
+            [("tool_speed_m_s", self.m_per_s, "m/s"), ("tool_turning_rad_s", self.rad_per_s, "rad/s")]
+        {
+            if let Some(limit) = limit.filter(|limit| !(LEAST_SPEED..f64::INFINITY).contains(limit)) {
+                let expected = format!("{LEAST_SPEED} {unit} or more");
+                return Err(PlanError::Malformed { what: what.to_owned(), value: limit.to_string(), expected });
+            }
+        }
+        Ok(())
+    }
+
+    /// The curve, slowed where the frame of `reach` would be too fast on it.
+    pub fn keep<const N: usize>(&self, reach: &Reach, curve: Curve<N>) -> Curve<N> {
+        let limits = [self.m_per_s, self.rad_per_s].map(|limit| limit.unwrap_or(f64::INFINITY));
+        if limits == [f64::INFINITY; 2] {
+            return curve;
+        }
+        let greatest = greatest(reach, &curve, limits);
+        let factor = (0..2).map(|k| greatest[k] / limits[k]).fold(1.0, f64::max);
+        if factor > 1.0 { slowed(&curve, factor) } else { curve }
+    }
+}
+
+/// The same motion in so many times the time.
+fn slowed<const N: usize>(curve: &Curve<N>, factor: f64) -> Curve<N> {
+    let slow = |knot: &Knot<N>| Knot {
+        time_s: knot.time_s * factor,
+        positions: knot.positions,
+        velocities: knot.velocities.map(|v| v / factor),
+    };
+    Curve::new(curve.knots().iter().map(slow).collect())
+}
+
+/// Bounds of the tool's greatest speed and turning on the curve: at most [`CLOSE`] above what they are, or no more than `limits`.
+fn greatest<const N: usize>(reach: &Reach, curve: &Curve<N>, limits: [f64; 2]) -> [f64; 2] {
+    let padded = |joints: [f64; N]| {
+        let mut positions: Positions = [0.0; MAX_JOINTS];
+        positions[..N].copy_from_slice(&joints);
+        positions
+    };
+    let mut enough = limits;
+    let mut bounds = [0.0_f64; 2];
+    for (i, pair) in curve.knots().windows(2).enumerate() {
+        let cubics = curve.cubics(i);
+        let mut pieces = vec![[0.0, pair[1].time_s - pair[0].time_s]];
+        while let Some([from, to]) = pieces.pop() {
+            let (middle, half) = ((from + to) / 2.0, (to - from) / 2.0);
+            let velocities = padded(cubics.map(|cubic| cubic.velocity_at(middle)));
+            let speeds = reach.speeds(&padded(cubics.map(|cubic| cubic.position_at(middle))), &velocities);
+            let faster = padded(cubics.map(|c| half * c.acceleration_at(from).abs().max(c.acceleration_at(to).abs())));
+            let fastest: Positions = std::array::from_fn(|j| velocities[j].abs() + faster[j]);
+            let further = fastest.map(|v| half * v);
+            let levers = reach.levers();
+            let above = [
+                levers.moves_m(&faster) + levers.swing_m(&further, &fastest),
+                levers.turns_rad(&faster) + levers.turns_rad(&further) * levers.turns_rad(&fastest),
+            ];
+            enough = std::array::from_fn(|k| enough[k].max(speeds[k] * (1.0 + CLOSE)));
+            let bound: [f64; 2] = std::array::from_fn(|k| speeds[k] + above[k]);
+            if (0..2).all(|k| bound[k] <= enough[k]) {
+                bounds = std::array::from_fn(|k| bounds[k].max(bound[k]));
+            } else {
+                pieces.extend([[middle, to], [from, middle]]);
+            }
+        }
+    }
+    bounds
+}

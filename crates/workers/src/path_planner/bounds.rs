@@ -1,0 +1,56 @@
+//! What bounds a motion, read from the input ports of a goal: `keep_axis`, `keep_direction`, `keep_rad` and `inside` (what the tool keeps);
+//! `velocity_scale`, `acceleration_scale`, `jerk_scale` (fractions of the joints' limits: a number for all, or one for each joint);
+//! `tool_speed_m_s`, `tool_turning_rad_s`.
+
+use ratn_model::value::Value;
+use ratn_motion::keep::{Keep, KeptAxis, Region};
+use ratn_motion::robot::Joints;
+use ratn_motion::tool_speed::ToolSpeed;
+use ratn_worker::action::{ActionFailure, GoalContext};
+
+/// What the tool keeps.
+pub(super) fn keep(goal: &GoalContext) -> Result<Keep, ActionFailure> {
+    let vector = |name: &str| goal.port(name).optional().map(|port| port.vector3()).transpose();
+    let (axis, direction, tolerance) =
+        (vector("keep_axis")?, vector("keep_direction")?, goal.optional_float("keep_rad")?);
+    let axis = match (axis, tolerance) {
+        (Some(axis), Some(tolerance_rad)) => Some(KeptAxis { axis, direction, tolerance_rad }),
+        (None, None) if direction.is_none() => None,
+        _ => {
+            return Err(ActionFailure::aborted(
+                "of the inputs `keep_axis`, `keep_direction` and `keep_rad` some are missing: say which axis of the tool stays how near its direction",
+            ));
+        }
+    };
+    let region = |port: ratn_worker::action::Port<'_>| -> Result<Region, ActionFailure> {
+        Ok(Region { pose: port.field("pose").pose()?, size: port.field("size").vector3()? })
+    };
+    let inside = goal.port("inside").optional().map(region).transpose()?;
+    Ok(Keep { axis, inside })
+}
+
+/// Fractions of the limits of velocity, acceleration and jerk.
+pub(super) fn scales(goal: &GoalContext) -> Result<[Joints; 3], ActionFailure> {
+    Ok([scale(goal, "velocity_scale")?, scale(goal, "acceleration_scale")?, scale(goal, "jerk_scale")?])
+}
+
+fn scale(goal: &GoalContext, name: &str) -> Result<Joints, ActionFailure> {
+    let Some(port) = goal.port(name).optional() else { return Ok([1.0; 7]) };
+    if let Some(all) = port.any()?.as_number() {
+        return Ok([all; 7]);
+    }
+    let wrong = |found: String| {
+        ActionFailure::aborted(format!("input `{name}` {found}: expected a number, or one for each of 7 joints"))
+    };
+    let Value::List(values) = port.any()? else { return Err(wrong(format!("is a {}", port.any()?.type_name()))) };
+    let numbers: Option<Vec<f64>> = values.iter().map(Value::as_number).collect();
+    let numbers = numbers.ok_or_else(|| wrong("has an element that is no number".to_owned()))?;
+    let count = numbers.len();
+    numbers.try_into().map_err(|_| wrong(format!("has {count} numbers")))
+}
+
+/// How fast the tool may be.
+pub(super) fn tool_speed(goal: &GoalContext) -> Result<ToolSpeed, ActionFailure> {
+    let m_per_s = goal.optional_float("tool_speed_m_s")?;
+    Ok(ToolSpeed { m_per_s, rad_per_s: goal.optional_float("tool_turning_rad_s")? })
+}
