@@ -1,5 +1,6 @@
 //! Measures what shortens and times paths, and the checks that all of it is made of: `cargo run --release -p ratn-motion --example shorten -- WHAT [URDF SRDF PROBLEMS]`.
-//! WHAT is `batch`, `simplify`, `time`, or `refine` and shares of its ways, as in `refine:42,38,8,11,1:42,38,8,0,12`. Beside the file's problems,
+//! WHAT is `batch`, `simplify`, `time`, `refine` and shares of its ways, as in `refine:42,38,8,11,1:42,38,8,0,12`, or `quicken` and a speed: how
+//! long motions take after improvement by length and by duration. Beside the file's problems,
 //! if there is one, the robots among random things of four kinds.
 
 #![allow(
@@ -18,9 +19,11 @@ use ratn_motion::geometry::Geometry;
 use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
 use ratn_motion::pace::Control;
 use ratn_motion::problems::Problems;
-use ratn_motion::refine::{End, Refinement, Shares};
+use ratn_motion::refine::{End, Measure, Refinement, Shares};
+use ratn_motion::robot::Joint;
 use ratn_motion::simplify::{path_length, simplify};
 use ratn_motion::space::{Isa, Obstacle, Space, State};
+use ratn_motion::timing::rough::Rough;
 use ratn_motion::timing::{Section, timed};
 use std::time::Instant;
 
@@ -175,8 +178,9 @@ fn refine(mechanisms: &[(String, Mechanism)], tasks: &[Task], variants: &[&str])
         space.set_swept(true);
         let mut rows = Vec::new();
         for (_, shares) in &all {
-            let ends = vec![End { state: task.goal, rest: 0.0 }];
-            let mut refinement = Refinement::new(path.clone(), 0, ends, seed as u64).with_shares(*shares);
+            let ends = vec![End { state: task.goal, rest: 0.0, rest_s: 0.0 }];
+            let new = Refinement::new(path.clone(), 0, ends, Measure::Length, seed as u64);
+            let mut refinement = new.with_shares(*shares);
             let begin = Instant::now();
             let mut row = [0.0; 4];
             for (at, after) in AFTER_MS.iter().enumerate() {
@@ -269,6 +273,58 @@ fn durations(mechanisms: &[(String, Mechanism)], tasks: &[Task]) {
     }
 }
 
+/// How long motions take after the same processor time of improvement by length and by duration, in turn on each problem.
+fn quicken(mechanisms: &[(String, Mechanism)], tasks: &[Task], speed: f64) {
+    const AFTER_MS: [f64; 3] = [0.0, 10.0, 50.0];
+    let mut rows: Vec<(&str, [[f64; 3]; 2])> = Vec::new();
+    for (seed, task) in tasks.iter().enumerate() {
+        let mechanism = &mechanisms[task.mechanism].1;
+        let mut space = Space::new(mechanism, &task.obstacles);
+        let Ok(route) = connect(&mut space, &task.start, &[task.goal], BUDGET, &mut go_on) else { continue };
+        let Ok(path) = simplify(&mut space, &route.path, BUDGET, &mut go_on) else { continue };
+        space.set_swept(true);
+        let by_duration = Measure::Duration(Box::new(Rough::new(&mechanism.joints, speed)));
+        let row = [Measure::Length, by_duration].map(|measure| {
+            let ends = vec![End { state: task.goal, rest: 0.0, rest_s: 0.0 }];
+            let mut refinement = Refinement::new(path.clone(), 0, ends, measure, seed as u64);
+            let mut spent = 0.0;
+            AFTER_MS.map(|after| {
+                while spent < after {
+                    let begin = Instant::now();
+                    refinement.step(&mut space, &mut go_on).unwrap();
+                    // What others made it wait is not its own.
+                    spent += (begin.elapsed().as_secs_f64() * 1e3).min(2.0);
+                }
+                let path: Vec<[f64; MAX_JOINTS]> = refinement.path().iter().map(|s| s.map(f64::from)).collect();
+                let joints: Vec<Joint> =
+                    (0..MAX_JOINTS).map(|j| mechanism.joints[j.min(mechanism.joints.len() - 1)].clone()).collect();
+                let curve = timed(&joints, &[Section::Blended(path)], speed, &mut |a, b| {
+                    space.is_free_motion(&state(a), &state(b))
+                });
+                curve.duration_s()
+            })
+        });
+        rows.push((&task.class, row));
+    }
+    println!(
+        "class, problems, mean duration after {AFTER_MS:?} ms by length and by duration, median of the ratios after each"
+    );
+    for class in classes(tasks).iter().map(String::as_str).chain(["all"]) {
+        let of: Vec<&[[f64; 3]; 2]> = rows.iter().filter(|r| r.0 == class || class == "all").map(|r| &r.1).collect();
+        let mean = |which: usize, at: usize| of.iter().map(|r| r[which][at]).sum::<f64>() / of.len() as f64;
+        let ratio = |at: usize| rank(of.iter().map(|r| r[1][at] / r[0][at]).collect(), 0.5);
+        let [first, length, duration] = [mean(0, 0), mean(0, 2), mean(1, 2)];
+        println!(
+            "{class:18} {:4}  {first:.3}  {:.3} {length:.3}  {:.3} {duration:.3}  {:.3} {:.3}",
+            of.len(),
+            mean(0, 1),
+            mean(1, 1),
+            ratio(1),
+            ratio(2)
+        );
+    }
+}
+
 /// What a batch of postures costs that are all free, close to the start of each task.
 fn batches(mechanisms: &[(String, Mechanism)], tasks: &[Task]) {
     const CHECKS: u32 = 2_000;
@@ -303,6 +359,7 @@ fn main() {
         ["batch"] => batches(&mechanisms, &tasks),
         ["simplify"] => simplification(&mechanisms, &tasks),
         ["time"] => durations(&mechanisms, &tasks),
-        _ => panic!("batch, simplify, time or refine:SHARES"),
+        ["quicken", speed] => quicken(&mechanisms, &tasks, speed.parse().unwrap()),
+        _ => panic!("batch, simplify, time, refine:SHARES or quicken:SPEED"),
     }
 }

@@ -102,7 +102,8 @@ impl Constraint {
         (1..=steps).all(|i| self.holds(&between(from, to, i as f32 / steps as f32)))
     }
 
-    fn project(&self, state: &State) -> Option<State> {
+    /// The posture itself where it keeps it with room to spare, else one near it that does.
+    pub(crate) fn project(&self, state: &State) -> Option<State> {
         let positions = positions(state);
         if self.inner.is_met_by(&self.reach.pose(&positions)) {
             return Some(*state);
@@ -218,7 +219,7 @@ fn extend(
 }
 
 /// Postures on the constraint from one, which is left out, towards another, as far as they get.
-fn walk(
+pub(crate) fn walk(
     space: &mut Space,
     constraint: &Constraint,
     from: &State,

@@ -10,10 +10,10 @@ pub enum Progress {
         /// Its length in joint space.
         length_rad: f64,
     },
-    /// The path became shorter.
-    Shorter {
-        /// Its length now.
-        length_rad: f64,
+    /// The path became quicker.
+    Quicker {
+        /// About how long what follows the departure takes now, in seconds.
+        about_s: f64,
     },
 }
 

@@ -19,13 +19,15 @@ use crate::keep::{KeptAxis, timed_keeping};
 use crate::line::LineError;
 use crate::pace::{Control, Pace, Progress, Stop};
 use crate::reach::{Positions, Postures, Reach, Target, is_new};
-use crate::refine::{End, Refinement};
+use crate::refine::{End, Measure, Refinement};
 pub use crate::request::{Goal, MAX_GOALS, MIN_SPEED, Request};
 use crate::robot::{Configuration, Geometry, Joints, Robot};
 use crate::simplify::{path_length, shortened};
 use crate::space::{Space, State};
 use crate::straight::Straight;
+use crate::timing::rough::Rough;
 use crate::timing::{Section, timed_while};
+use crate::trajectory::ArmTrajectory;
 use crate::way_points::{Follower, WayPoints};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -63,8 +65,15 @@ const MEASURED_WITHIN_M: f64 = 0.002;
 /// Steps from touching to the deepest that may be pressed: of the ways to a goal those count that press the least.
 const PRESS_STEPS: u32 = 4;
 
-/// A path must have become this much shorter to be worth a word, in radians.
-const LEAST_REPORT_RAD: f32 = 1e-3;
+/// A path must have become this much quicker to be worth a word, in seconds.
+const LEAST_REPORT_S: f32 = 1e-3;
+
+/// The motion is timed exactly after so many steps of improvement, and after four times as many, again and again.
+const FIRST_TIMED: usize = 64;
+const TIMED_AGAIN: usize = 4;
+
+/// How much of a straight part a blend may take, at the end that is away from what it leads to or from.
+const BLENDED_SHARE: f64 = 0.5;
 
 /// A motion.
 #[derive(Debug, Clone, PartialEq)]
@@ -79,6 +88,8 @@ pub struct Plan {
     pub first_length_rad: f64,
     /// Length of the path that the trajectory follows, before its corners were rounded.
     pub length_rad: f64,
+    /// How long the motion along the first path takes, after its shortcutting, in seconds: never less than the trajectory does.
+    pub first_duration_s: f64,
     /// Iterations of search and improvement.
     pub iterations: usize,
     /// The caller's time was up before all iterations of improvement were done: with more of it the path may differ.
@@ -172,18 +183,34 @@ struct Candidate {
     approach: Vec<Joints>,
     /// Length of both.
     length_rad: f64,
+    /// How long both take, roughly.
+    lasts_s: f64,
 }
 
 impl Candidate {
     fn end(&self) -> End {
-        End { state: self.door, rest: self.length_rad as f32 }
+        End { state: self.door, rest: self.length_rad as f32, rest_s: self.lasts_s as f32 }
     }
 }
 
 /// A free path from the door at the start to that of a candidate.
+#[derive(Debug, Clone, PartialEq)]
 struct Way {
     path: Vec<State>,
     candidate: usize,
+}
+
+/// What came of improvement.
+struct Improved {
+    first_duration_s: f64,
+    /// The quickest that was timed.
+    motion: Motion,
+}
+
+/// A way, and the whole motion along it.
+struct Motion {
+    way: Way,
+    curve: ArmTrajectory,
 }
 
 /// The tools and the knowledge of one planning.
@@ -197,6 +224,9 @@ struct Planning<'a> {
     base: Pose,
     /// What the free path keeps.
     constraint: Option<Constraint>,
+    rough: Rough,
+    /// The straight part at the start.
+    depart: Vec<Joints>,
     random: ChaCha8Rng,
     goals: Vec<Goal>,
     approach: Straight,
@@ -229,6 +259,8 @@ pub fn plan(
         reach: Reach::new(&mechanism, robot.tool, Pose::IDENTITY),
         base: arm::on_floor(&scene.base),
         constraint: None,
+        rough: Rough::new(&request.joints(robot), request.speed),
+        depart: Vec::new(),
         random: ChaCha8Rng::seed_from_u64(request.seed),
         goals: request.goals.clone(),
         approach: request.approach.clone(),
@@ -259,6 +291,8 @@ pub fn plan(
     if let Some(way) = &request.straight {
         return planning.straight(request, way, depart, &mut pace);
     }
+    let departure_rad = length(&depart);
+    planning.depart = depart;
     let door = planning.door(&start).ok_or_else(|| planning.no_room(&start))?;
     let way_out = if door == state(&start) { 0.0 } else { distance(&start, &joints(robot, &door)) };
     if planning.checker.padding() < TIGHT_PADDING_M {
@@ -266,33 +300,37 @@ pub fn plan(
         planning.checker = Checker::new(robot, scene, &here, TIGHT_PADDING_M).reaching_into(&request.reaches_into);
     }
     planning.leaving = leaving(robot, scene, request, planning.checker.padding());
-    let before = length(&depart) + way_out;
+    let before = departure_rad + way_out;
     planning.find_candidates(&start, &mut pace)?;
 
     let (path, candidate) = planning.first_path(&start, &door, request.seed, &mut pace)?;
     let first_length_rad = before + f64::from(path_length(&path)) + planning.candidates[candidate].length_rad;
-    let mut way = Way { path, candidate };
+    let mut best = None;
+    let first = Way { path, candidate };
     let improved = pace
         .report(Progress::FirstPath { length_rad: first_length_rad })
-        .and_then(|()| planning.improve(&mut way, before, request, &mut pace));
+        .and_then(|()| planning.improve(&first, &mut best, request, &mut pace));
     if improved == Err(Stop::Cancelled) {
         return Err(PlanError::Cancelled);
     }
-    let Way { path, candidate } = way;
-
-    let chosen = planning.candidates[candidate].clone();
-    let length_rad = before + f64::from(path_length(&path)) + chosen.length_rad;
-    let end = chosen.approach[chosen.approach.len() - 1];
-    let free = planning.whole(&start, &path, &chosen);
-    let sections = [Section::AsGiven(depart), Section::Blended(free), Section::AsGiven(chosen.approach)];
     // To be timed is part of every plan, also when time is up.
-    let trajectory = planning.timed(request, &sections, &mut || pace.answer() != Control::Cancelled)?;
+    let Improved { first_duration_s, motion: Motion { way, curve } } = match best {
+        Some(best) => best,
+        None => {
+            let motion = planning.motion(request, first, &mut || pace.answer() != Control::Cancelled)?;
+            Improved { first_duration_s: motion.curve.duration_s(), motion }
+        }
+    };
     if pace.answer() == Control::Cancelled {
         return Err(PlanError::Cancelled);
     }
+    let chosen = &planning.candidates[way.candidate];
+    let length_rad = before + f64::from(path_length(&way.path)) + chosen.length_rad;
+    let end = chosen.approach[chosen.approach.len() - 1];
+    let trajectory = curve.to_model(robot);
     let end_pose = robot.tool_pose(&Configuration { arm: end, ..here });
     let (iterations, time_up) = (pace.iterations, improved.is_err());
-    Ok(Plan { trajectory, end, end_pose, first_length_rad, length_rad, iterations, time_up })
+    Ok(Plan { trajectory, end, end_pose, first_length_rad, length_rad, first_duration_s, iterations, time_up })
 }
 
 impl PlanError {
@@ -385,13 +423,14 @@ impl Planning<'_> {
             }
             let end = followed.approach[followed.approach.len() - 1];
             let sections = [depart.clone(), followed.lines, followed.approach].map(Section::AsGiven);
-            let trajectory = self.timed(request, &sections, &mut || pace.answer() != Control::Cancelled)?;
+            let curve = self.timed(request, &sections, &mut || pace.answer() != Control::Cancelled)?;
             if pace.answer() == Control::Cancelled {
                 return Err(PlanError::Cancelled);
             }
-            if best.as_ref().is_none_or(|best| trajectory.duration_s() < best.trajectory.duration_s()) {
+            if best.as_ref().is_none_or(|best| curve.duration_s() < best.trajectory.duration_s()) {
                 best = Some(Plan {
-                    trajectory,
+                    trajectory: curve.to_model(robot),
+                    first_duration_s: curve.duration_s(),
                     end,
                     end_pose: self.base.compose(&self.reach.pose(&positions(&end))),
                     first_length_rad: length_rad,
@@ -516,7 +555,7 @@ impl Planning<'_> {
         request: &Request,
         sections: &[Section],
         goes_on: &mut dyn FnMut() -> bool,
-    ) -> Result<Trajectory, PlanError> {
+    ) -> Result<ArmTrajectory, PlanError> {
         let joints = request.joints(self.robot);
         let (space, constraint) = (&mut self.space, &self.constraint);
         let mut is_free = |from: &Joints, to: &Joints| {
@@ -532,7 +571,7 @@ impl Planning<'_> {
                         .to_owned(),
                 })?,
         };
-        Ok(request.tool_speed.keep(&self.reach, curve).to_model(self.robot))
+        Ok(request.tool_speed.keep(&self.reach, curve))
     }
 
     fn with_door(&mut self, approach: Vec<Joints>) -> Result<Candidate, String> {
@@ -544,7 +583,9 @@ impl Planning<'_> {
         self.kept_along(&approach).map_err(|reason| format!("approaching the goal {reason}"))?;
         let way_in = (door != state(&entry)).then(|| joints(self.robot, &door));
         let length_rad = length(&approach) + way_in.map_or(0.0, |way_in| distance(&way_in, &entry));
-        Ok(Candidate { door, way_in, approach, length_rad })
+        let way_in_s = way_in.map_or(0.0, |way_in| self.rough.duration_s(&[state(&way_in), state(&entry)]));
+        let lasts_s = way_in_s + self.rough.duration_s(&approach.iter().map(state).collect::<Vec<_>>());
+        Ok(Candidate { door, way_in, approach, length_rad, lasts_s })
     }
 
     /// The posture itself where the vector checks find room for it, else one close by that can be reached from it.
@@ -599,42 +640,112 @@ impl Planning<'_> {
         }
     }
 
-    /// Makes the way shorter; `before` is the length of what lies before it.
-    fn improve(&mut self, way: &mut Way, before: f64, request: &Request, pace: &mut Pace<'_>) -> Result<(), Stop> {
+    /// Makes the motion quicker, and leaves the best that was timed; with an error where that was all there was time for.
+    fn improve(
+        &mut self,
+        first: &Way,
+        best: &mut Option<Improved>,
+        request: &Request,
+        pace: &mut Pace<'_>,
+    ) -> Result<(), Stop> {
+        let mut way = first.clone();
+        let shortened = self.shorten(&mut way, request.seed, pace);
+        if shortened == Err(Stop::Cancelled) {
+            return shortened;
+        }
+        let timed = self.motion(request, way, &mut || pace.answer() != Control::Cancelled);
+        // Where it cannot be timed so that it keeps what it is to keep, the first path is left as it was found.
+        let Ok(motion) = timed else { return Ok(()) };
+        let best = best.insert(Improved { first_duration_s: motion.curve.duration_s(), motion });
+        shortened?;
+        let Way { path, candidate } = best.motion.way.clone();
+        let ends = self.candidates.iter().map(Candidate::end).collect();
+        let measure = Measure::Duration(Box::new(self.rough.clone()));
+        let mut refinement = Refinement::new(path, candidate, ends, measure, request.seed);
         if let Some(constraint) = &self.constraint {
-            let attempts = request.improvement_iterations.max(constrained::SHORTCUTS);
-            let control = &mut |_: usize| pace.answer();
-            let stopped =
-                constrained::shorten(&mut self.space, constraint, &mut way.path, attempts, request.seed, control);
+            refinement = refinement.keeping(constraint.clone());
+        }
+        let stopped = self.refine(&mut refinement, best, request, pace);
+        if stopped != Err(Stop::Cancelled) {
+            self.time_if_new(request, &refinement, best, &mut || pace.answer() != Control::Cancelled);
+        }
+        stopped
+    }
+
+    /// Fewer and shorter motions before the first is timed.
+    fn shorten(&mut self, way: &mut Way, seed: u64, pace: &mut Pace<'_>) -> Result<(), Stop> {
+        let control = &mut |_: usize| pace.answer();
+        if let Some(constraint) = &self.constraint {
+            let shortcuts = constrained::SHORTCUTS;
+            let stopped = constrained::shorten(&mut self.space, constraint, &mut way.path, shortcuts, seed, control);
             return stopped.map_err(Stop::from);
         }
-        match shortened(&mut self.space, &way.path, &mut |_| pace.answer()) {
+        match shortened(&mut self.space, &way.path, control) {
             Ok(short) => way.path = short,
             Err(ConnectError::Cancelled) => return Err(Stop::Cancelled),
             Err(_) => {}
         }
-        let ends = self.candidates.iter().map(Candidate::end).collect();
-        let mut refinement = Refinement::new(way.path.clone(), way.candidate, ends, request.seed);
-        let mut reported = refinement.length();
-        let mut improve = || {
-            for _ in 0..request.improvement_iterations {
-                pace.iteration()?;
-                if self.random.random_range(0..100) < NEW_CANDIDATES {
-                    self.find_another(&mut refinement);
-                } else {
-                    refinement.step(&mut self.space, &mut |_| pace.answer())?;
-                }
-                let length = refinement.length();
-                if length < reported - LEAST_REPORT_RAD {
-                    reported = length;
-                    pace.report(Progress::Shorter { length_rad: before + f64::from(length) })?;
-                }
+        Ok(())
+    }
+
+    /// So many steps of improvement; from time to time what they have led to is timed.
+    fn refine(
+        &mut self,
+        refinement: &mut Refinement,
+        best: &mut Improved,
+        request: &Request,
+        pace: &mut Pace<'_>,
+    ) -> Result<(), Stop> {
+        let (mut reported, mut timed_at) = (refinement.cost(), FIRST_TIMED);
+        for iteration in 1..=request.improvement_iterations {
+            pace.iteration()?;
+            if self.random.random_range(0..100) < NEW_CANDIDATES {
+                self.find_another(refinement);
+            } else {
+                refinement.step(&mut self.space, &mut |_| pace.answer())?;
             }
-            Ok(())
-        };
-        let stopped = improve();
-        *way = Way { path: refinement.path().to_vec(), candidate: refinement.end() };
-        stopped
+            let about_s = refinement.cost();
+            if about_s < reported - LEAST_REPORT_S {
+                reported = about_s;
+                pace.report(Progress::Quicker { about_s: f64::from(about_s) })?;
+            }
+            if iteration == timed_at {
+                timed_at = timed_at.saturating_mul(TIMED_AGAIN);
+                self.time_if_new(request, refinement, best, &mut || pace.answer() == Control::Continue);
+            }
+        }
+        Ok(())
+    }
+
+    /// Times the path of a refinement, and takes it where the motion is quicker: never one that is slower, whatever the estimate says.
+    fn time_if_new(
+        &mut self,
+        request: &Request,
+        refinement: &Refinement,
+        best: &mut Improved,
+        goes_on: &mut dyn FnMut() -> bool,
+    ) {
+        let way = Way { path: refinement.path().to_vec(), candidate: refinement.end() };
+        if way == best.motion.way {
+            return;
+        }
+        match self.motion(request, way, goes_on) {
+            Ok(motion) if motion.curve.duration_s() < best.motion.curve.duration_s() => best.motion = motion,
+            _ => {}
+        }
+    }
+
+    /// The whole motion along a way, as quick as the limits allow.
+    fn motion(&mut self, request: &Request, way: Way, goes_on: &mut dyn FnMut() -> bool) -> Result<Motion, PlanError> {
+        let chosen = &self.candidates[way.candidate];
+        let start = self.depart[self.depart.len() - 1];
+        let sections = [
+            Section::Loose(self.depart.clone(), [0.0, BLENDED_SHARE]),
+            Section::Blended(self.whole(&start, &way.path, chosen)),
+            Section::Loose(chosen.approach.clone(), [BLENDED_SHARE, 0.0]),
+        ];
+        let curve = self.timed(request, &sections, goes_on)?;
+        Ok(Motion { way, curve })
     }
 
     /// Looks for a posture at the goal that a shorter path could lead to.
@@ -644,18 +755,17 @@ impl Planning<'_> {
         if self.candidates.len() >= MAX_CANDIDATES {
             return;
         }
-        let start = joints(self.robot, &refinement.path()[0]);
         let along = self.random.random_range(0.0..=1.0) * path_length(refinement.path());
         let near = joints(self.robot, &refinement.point(along).0);
         let seed = near.map(|q| q + self.random.random_range(-0.5..0.5));
-        let bound = f64::from(refinement.length());
         let postures = self.reach.nearest(&self.goal(&pose), &positions(&seed));
         let Some(posture) = postures.first().map(arm_of) else { return };
-        if distance(&start, &posture) >= bound * 1.1 {
+        // The posture itself is no end of the path, but where the end is cannot be much nearer.
+        if !refinement.is_promising(&End { state: state(&posture), rest: 0.0, rest_s: 0.0 }) {
             return;
         }
         let Ok(candidate) = self.candidate(&posture) else { return };
-        if distance(&start, &joints(self.robot, &candidate.door)) + candidate.length_rad < bound {
+        if refinement.is_promising(&candidate.end()) {
             refinement.add(candidate.end());
             self.candidates.push(candidate);
         }

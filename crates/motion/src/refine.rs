@@ -1,22 +1,28 @@
-//! Anytime improvement: as long as there is time, the path gets shorter.
+//! Anytime improvement: as long as there is time, the path gets better.
 //!
-//! Five ways, chosen at random: shortcuts between two points of the path; corners moved towards where the path would rather be;
+//! Better is quicker by a rough estimate of its duration (`timing::rough`), or shorter, as the caller measures. Five ways, chosen at
+//! random: shortcuts between two points of the path; corners moved towards where the path would rather be;
 //! other ends that the path can turn to on its way; a new search where a shorter path could run at all (the ellipsoids
 //! between the start and the ends); and a tree of shortest ways that grows there from step to step (`rrt_star`), takes in the path
-//! whenever that has become shorter, and gives back what is shorter still. The best path is never lost. Its motions are as
-//! certain as the space checks them.
+//! whenever that has become better, and gives back what is better still. The best path is never lost. Its motions are as
+//! certain as the space checks them. A path that keeps a constraint has the first three, along the constraint.
 
 use crate::connect::{ConnectError, grow};
+use crate::constrained::{Constraint, walk};
 use crate::ellipsoid;
 use crate::pace::Control;
 use crate::rrt_star::RrtStar;
 use crate::simplify::{path_length, shortened};
 use crate::space::{Space, State, between, distance};
+use crate::timing::rough::Rough;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// A step must gain at least this much, in radians.
+/// A step must gain at least this much, in radians or seconds.
 const LEAST_GAIN: f32 = 1e-4;
+
+/// How much longer than the path a quicker one is looked for, as a share of it.
+const LONGER: f32 = 0.2;
 
 /// Iterations of one new search.
 const SEARCH_ITERATIONS: usize = 200;
@@ -46,6 +52,18 @@ pub struct Shares {
 impl Shares {
     /// For arms: with seven joints new searches find more than the tree does (docs/performance.md).
     pub const MIXED: Shares = Shares { shortcut: 42, corner: 38, turn: 8, search: 11, tree: 1 };
+
+    /// For paths that keep a constraint.
+    const CONSTRAINED: Shares = Shares { shortcut: 45, corner: 45, turn: 10, search: 0, tree: 0 };
+}
+
+/// What makes a path good.
+#[derive(Debug, Clone)]
+pub enum Measure {
+    /// It is short, in radians.
+    Length,
+    /// It is quick, in seconds.
+    Duration(Box<Rough>),
 }
 
 /// Where a path may end.
@@ -55,15 +73,23 @@ pub struct End {
     pub state: State,
     /// Length of what follows there, in radians.
     pub rest: f32,
+    /// How long that takes, in seconds.
+    pub rest_s: f32,
 }
 
-/// A path that becomes shorter.
+/// A path that becomes better.
 #[derive(Debug)]
 pub struct Refinement {
     path: Vec<State>,
     /// Which end the path leads to.
     end: usize,
     ends: Vec<End>,
+    measure: Measure,
+    /// Of the path and what follows it, as it is measured.
+    cost: f32,
+    /// Whether that has regard to the room that there is for blends.
+    is_certain: bool,
+    constraint: Option<Constraint>,
     random: ChaCha8Rng,
     shares: Shares,
     tree: Option<RrtStar>,
@@ -73,9 +99,23 @@ pub struct Refinement {
 
 impl Refinement {
     /// Begins with a path that leads to the end with the index `end`.
-    pub fn new(path: Vec<State>, end: usize, ends: Vec<End>, seed: u64) -> Refinement {
+    pub fn new(path: Vec<State>, end: usize, ends: Vec<End>, measure: Measure, seed: u64) -> Refinement {
         let random = ChaCha8Rng::seed_from_u64(seed);
-        Refinement { path, end, ends, random, shares: Shares::MIXED, tree: None, adopted: Vec::new() }
+        let mut new = Refinement {
+            path,
+            end,
+            ends,
+            measure,
+            cost: f32::INFINITY,
+            is_certain: false,
+            constraint: None,
+            random,
+            shares: Shares::MIXED,
+            tree: None,
+            adopted: Vec::new(),
+        };
+        new.cost = new.cost_of(&new.path.clone(), end);
+        new
     }
 
     /// With other shares; their sum is not zero.
@@ -84,7 +124,13 @@ impl Refinement {
         Refinement { shares, ..self }
     }
 
-    /// The shortest path so far.
+    /// Of a path that keeps a constraint, and goes on keeping it.
+    #[must_use]
+    pub fn keeping(self, constraint: Constraint) -> Refinement {
+        Refinement { constraint: Some(constraint), shares: Shares::CONSTRAINED, ..self }
+    }
+
+    /// The best path so far.
     pub fn path(&self) -> &[State] {
         &self.path
     }
@@ -109,11 +155,73 @@ impl Refinement {
         path_length(&self.path) + self.ends[self.end].rest
     }
 
-    /// Tries one way to make the path shorter; some hundreds of microseconds at the most, unless `control` ends it before.
+    /// What is made less: that length, or about how long both take, in seconds.
+    pub fn cost(&self) -> f32 {
+        self.cost
+    }
+
+    /// Whether a straight motion to an end would be better than the path.
+    pub fn is_promising(&mut self, end: &End) -> bool {
+        let straight = [self.path[0], end.state];
+        let rest = self.rest(end);
+        self.measured(&straight) + rest < self.cost
+    }
+
+    fn rest(&self, end: &End) -> f32 {
+        match &self.measure {
+            Measure::Length => end.rest,
+            Measure::Duration(_) => end.rest_s,
+        }
+    }
+
+    fn measured(&mut self, path: &[State]) -> f32 {
+        match &mut self.measure {
+            Measure::Length => path_length(path),
+            Measure::Duration(rough) => rough.duration_s(path) as f32,
+        }
+    }
+
+    fn cost_of(&mut self, path: &[State], end: usize) -> f32 {
+        self.measured(path) + self.rest(&self.ends[end])
+    }
+
+    /// As [`Refinement::cost_of`], with blends as wide as there is room for.
+    fn certain_cost_of(&mut self, space: &mut Space, path: &[State], end: usize) -> f32 {
+        let rest = self.rest(&self.ends[end]);
+        match &mut self.measure {
+            // Along a constraint there is no room to tell of: the path is smoothed as a whole.
+            Measure::Duration(rough) if self.constraint.is_none() => {
+                rough.duration_among_s(path, &mut |from, to| space.is_free_motion(from, to)) as f32 + rest
+            }
+            _ => self.cost_of(path, end),
+        }
+    }
+
+    /// Whether a path would be better if there was room for every blend.
+    fn may_be_better(&mut self, path: &[State], end: usize) -> bool {
+        self.cost_of(path, end) < self.cost - LEAST_GAIN
+    }
+
+    /// Takes a path that is possible, if it is better.
+    fn take(&mut self, space: &mut Space, path: Vec<State>, end: usize) {
+        if !self.may_be_better(&path, end) {
+            return;
+        }
+        let cost = self.certain_cost_of(space, &path, end);
+        if cost < self.cost - LEAST_GAIN {
+            (self.path, self.end, self.cost) = (path, end, cost);
+        }
+    }
+
+    /// Tries one way to make the path better; some hundreds of microseconds at the most, unless `control` ends it before.
     ///
     /// # Errors
     /// What `control` said, when that was not to go on; the path is whole all the same.
     pub fn step(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
+        if !self.is_certain {
+            self.cost = self.certain_cost_of(space, &self.path.clone(), self.end);
+            self.is_certain = true;
+        }
         let Shares { shortcut, corner, turn, search, tree } = self.shares;
         let mut drawn = self.random.random_range(0..shortcut + corner + turn + search + tree);
         let mut is = |share: u32| {
@@ -122,17 +230,31 @@ impl Refinement {
             here
         };
         if is(shortcut) {
-            self.shortcut(space);
+            return self.shortcut(space, control);
         } else if is(corner) {
-            self.move_corner(space);
+            return if self.constraint.is_some() { self.pull(space, control) } else { self.move_corner(space) };
         } else if is(turn) {
-            self.turn(space);
+            return self.turn(space, control);
         } else if is(search) {
             return self.search_again(space, control);
-        } else {
-            return self.grow_tree(space, control);
         }
-        Ok(())
+        self.grow_tree(space, control)
+    }
+
+    /// The postures from one, which is left out, to another on the straight motion, or as straight as the constraint allows; none where
+    /// something is in the way.
+    fn motion(
+        &self,
+        space: &mut Space,
+        from: &State,
+        to: &State,
+        control: &mut dyn FnMut(usize) -> Control,
+    ) -> Result<Option<Vec<State>>, Control> {
+        let Some(constraint) = &self.constraint else {
+            return Ok(space.is_free_motion(from, to).then(|| vec![*to]));
+        };
+        let steps = walk(space, constraint, from, to, control)?;
+        Ok(steps.last().is_some_and(|last| last == to).then_some(steps))
     }
 
     /// A point of the path so far along it, and the index of the posture that follows it.
@@ -149,64 +271,122 @@ impl Refinement {
         (self.path[last], last)
     }
 
-    /// Replaces a random part of the path by a straight motion.
-    fn shortcut(&mut self, space: &mut Space) {
-        if self.path.len() < 3 {
-            return;
-        }
+    /// The path up to a point of it, along some motions, and on from another point.
+    fn detour(&self, (from, before): (State, usize), between: &[State], after: usize) -> Vec<State> {
+        let mut path = self.path[..before].to_vec();
+        path.push(from);
+        path.extend_from_slice(between);
+        path.extend_from_slice(&self.path[after..]);
+        path.dedup();
+        path
+    }
+
+    /// How far along the path two random points of it are, the first one first.
+    fn stretch(&mut self) -> (f32, f32) {
         let whole = path_length(&self.path);
         let (a, b) = (self.random.random_range(0.0..=1.0) * whole, self.random.random_range(0.0..=1.0) * whole);
-        let (low, high) = (a.min(b), a.max(b));
-        let ((from, after_from), (to, after_to)) = (self.point(low), self.point(high));
-        let gains = after_from != after_to && distance(&from, &to) < high - low - LEAST_GAIN;
-        if gains && space.is_free_motion(&from, &to) {
-            self.path.splice(after_from..after_to, [from, to]);
-            self.path.dedup();
+        (a.min(b), a.max(b))
+    }
+
+    /// Replaces a random part of the path by a straight motion.
+    fn shortcut(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
+        if self.path.len() < 3 {
+            return Ok(());
         }
+        let (low, high) = self.stretch();
+        let ((from, after_from), (to, after_to)) = (self.point(low), self.point(high));
+        // Along a constraint it gets no better than the straight motion.
+        let straight = self.detour((from, after_from), &[to], after_to);
+        if after_from == after_to || !self.may_be_better(&straight, self.end) {
+            return Ok(());
+        }
+        if let Some(steps) = self.motion(space, &from, &to, control)? {
+            self.take(space, self.detour((from, after_from), &steps, after_to), self.end);
+        }
+        Ok(())
     }
 
     /// Moves a random corner towards a straight motion past it.
-    fn move_corner(&mut self, space: &mut Space) {
+    fn move_corner(&mut self, space: &mut Space) -> Result<(), Control> {
         if self.path.len() < 3 {
-            return;
+            return Ok(());
         }
         let i = self.random.random_range(1..self.path.len() - 1);
         let (before, here, after) = (self.path[i - 1], self.path[i], self.path[i + 1]);
         let sides = distance(&before, &here) + distance(&here, &after);
         let middle = between(&before, &after, self.random.random_range(0.0..=1.0));
-        let mut moved = between(&here, &middle, self.random.random_range(0.0..0.6));
-        let stray = STRAY.min(sides * STRAY_SHARE);
+        let moved = between(&here, &middle, self.random.random_range(0.0..0.6));
+        let moved = self.aside(space, &moved, STRAY.min(sides * STRAY_SHARE));
+        let mut path = self.path.clone();
+        path[i] = moved;
+        let may_be_better = self.may_be_better(&path, self.end);
+        if may_be_better && space.is_free_motion(&before, &moved) && space.is_free_motion(&moved, &after) {
+            self.take(space, path, self.end);
+        }
+        Ok(())
+    }
+
+    /// Leads a random part of the path over a posture towards the straight motion, along the constraint.
+    fn pull(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
+        let (low, high) = self.stretch();
+        let ((from, after_from), (to, after_to)) = (self.point(low), self.point(high));
+        let (here, _) = self.point((low + high) / 2.0);
+        let moved = between(&here, &between(&from, &to, 0.5), self.random.random_range(0.0..1.0));
+        let moved = self.aside(space, &moved, STRAY.min((high - low) * STRAY_SHARE));
+        let Some(over) = self.constraint.as_ref().and_then(|constraint| constraint.project(&moved)) else {
+            return Ok(());
+        };
+        let straight = self.detour((from, after_from), &[over, to], after_to);
+        if !self.may_be_better(&straight, self.end) {
+            return Ok(());
+        }
+        let Some(mut steps) = self.motion(space, &from, &over, control)? else { return Ok(()) };
+        let Some(rest) = self.motion(space, &over, &to, control)? else { return Ok(()) };
+        steps.extend(rest);
+        self.take(space, self.detour((from, after_from), &steps, after_to), self.end);
+        Ok(())
+    }
+
+    /// A posture beside another, within the limits.
+    fn aside(&mut self, space: &Space, posture: &State, stray: f32) -> State {
         let (lower, upper) = space.limits();
+        let mut moved = *posture;
         for j in 0..space.joints() {
             moved[j] = (moved[j] + stray * self.random.random_range(-1.0..1.0)).clamp(lower[j], upper[j]);
         }
-        let gain = sides - distance(&before, &moved) - distance(&moved, &after);
-        if gain > LEAST_GAIN && space.is_free_motion(&before, &moved) && space.is_free_motion(&moved, &after) {
-            self.path[i] = moved;
-        }
+        moved
     }
 
     /// Leaves the path somewhere for another end.
-    fn turn(&mut self, space: &mut Space) {
+    fn turn(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
         let other = self.random.random_range(0..self.ends.len());
         let along = self.random.random_range(0.0..=1.0) * path_length(&self.path);
         if other == self.end {
-            return;
+            return Ok(());
         }
         let (from, after) = self.point(along);
-        let End { state, rest } = self.ends[other];
-        let shorter = along + distance(&from, &state) + rest < self.length() - LEAST_GAIN;
-        if shorter && space.is_free_motion(&from, &state) {
-            self.path.truncate(after);
-            self.path.extend([from, state]);
-            self.path.dedup();
-            self.end = other;
+        let to = self.ends[other].state;
+        let straight = self.detour((from, after), &[to], self.path.len());
+        if !self.may_be_better(&straight, other) {
+            return Ok(());
+        }
+        if let Some(steps) = self.motion(space, &from, &to, control)? {
+            self.take(space, self.detour((from, after), &steps, self.path.len()), other);
+        }
+        Ok(())
+    }
+
+    /// How long a path may be that is better, what follows it included.
+    fn bound(&self) -> f32 {
+        match self.measure {
+            Measure::Length => self.length(),
+            Measure::Duration(_) => self.length() * (1.0 + LONGER),
         }
     }
 
-    /// Searches from scratch where a shorter path could run.
+    /// Searches from scratch where a better path could run.
     fn search_again(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
-        let bound = self.length();
+        let bound = self.bound();
         let start = self.path[0];
         let room = |end: &End| bound - LEAST_GAIN - end.rest - distance(&start, &end.state);
         let useful: Vec<usize> = (0..self.ends.len()).filter(|i| room(&self.ends[*i]) > 0.0).collect();
@@ -228,9 +408,7 @@ impl Refinement {
             Ok(path) => {
                 let last = path[path.len() - 1];
                 let end = useful.into_iter().find(|i| self.ends[*i].state == last).unwrap_or(self.end);
-                if path_length(&path) + self.ends[end].rest < bound {
-                    (self.path, self.end) = (path, end);
-                }
+                self.take(space, path, end);
                 Ok(())
             }
             Err(ConnectError::TimeUp { .. }) => Err(Control::TimeUp),
@@ -239,20 +417,19 @@ impl Refinement {
         }
     }
 
-    /// Grows the tree of shortest ways, and follows it where it knows a shorter one.
+    /// Grows the tree of shortest ways, and follows it where it knows a better one.
     fn grow_tree(&mut self, space: &mut Space, control: &mut dyn FnMut(usize) -> Control) -> Result<(), Control> {
-        let bound = self.length();
+        let bound = self.bound();
         let tree = self.tree.get_or_insert_with(|| RrtStar::new(&self.path[0], space.joints()));
         if self.adopted != self.path {
             tree.adopt(&self.path, &self.ends, self.end);
             self.adopted.clone_from(&self.path);
         }
         let grown = tree.grow(space, &self.ends, bound, TREE_SAMPLES, &mut self.random, control);
-        if let Some((end, length)) = tree.best(&self.ends)
-            && length < bound - LEAST_GAIN
+        if let Some((end, _)) = tree.best(&self.ends)
             && let Some(path) = tree.path(end)
         {
-            (self.path, self.end) = (path, end);
+            self.take(space, path, end);
         }
         grown
     }

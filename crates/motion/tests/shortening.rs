@@ -13,11 +13,12 @@ use ratn_motion::exact::Exact;
 use ratn_motion::geometry::Geometry;
 use ratn_motion::mechanism::Mechanism;
 use ratn_motion::pace::Control;
-use ratn_motion::refine::{End, Refinement, Shares};
+use ratn_motion::refine::{End, Measure, Refinement, Shares};
 use ratn_motion::robot::Joint;
 use ratn_motion::rrt_star::RrtStar;
 use ratn_motion::simplify::path_length;
 use ratn_motion::space::{Obstacle, Space, State};
+use ratn_motion::timing::rough::Rough;
 use ratn_motion::timing::{Section, timed};
 
 const NONE: Shares = Shares { shortcut: 0, corner: 0, turn: 0, search: 0, tree: 0 };
@@ -70,7 +71,7 @@ fn the_tree_alone_comes_down_to_the_shortest_way_as_samples_grow() {
         for seed in 0..3 {
             let mut random = ChaCha8Rng::seed_from_u64(seed);
             let mut tree = RrtStar::new(&start, space.joints());
-            let ends = [End { state: goal, rest: 0.0 }];
+            let ends = [End { state: goal, rest: 0.0, rest_s: 0.0 }];
             let mut excess = |samples: usize| {
                 tree.grow(&mut space, &ends, 6.0, samples, &mut random, &mut go_on).unwrap();
                 let (_, length) = tree.best(&ends).unwrap();
@@ -91,8 +92,8 @@ fn improvement_comes_down_to_the_shortest_way_from_a_path_on_the_wrong_side() {
     space.set_swept(true);
     for seed in 0..4 {
         let mut improve = |iterations: usize| {
-            let end = End { state: above()[3], rest: 0.0 };
-            let mut refinement = Refinement::new(above(), 0, vec![end], seed);
+            let end = End { state: above()[3], rest: 0.0, rest_s: 0.0 };
+            let mut refinement = Refinement::new(above(), 0, vec![end], Measure::Length, seed);
             let mut lengths = vec![refinement.length()];
             for _ in 0..iterations {
                 refinement.step(&mut space, &mut go_on).unwrap();
@@ -120,8 +121,8 @@ fn the_tree_finds_the_shorter_side_that_no_shortcut_leads_to() {
     let above = above();
     for seed in 0..3 {
         let mut improved = |shares: Shares, steps: usize| {
-            let ends = vec![End { state: above[3], rest: 0.0 }];
-            let mut refinement = Refinement::new(above.clone(), 0, ends, seed).with_shares(shares);
+            let ends = vec![End { state: above[3], rest: 0.0, rest_s: 0.0 }];
+            let mut refinement = Refinement::new(above.clone(), 0, ends, Measure::Length, seed).with_shares(shares);
             for _ in 0..steps {
                 let before = refinement.length();
                 refinement.step(&mut space, &mut go_on).unwrap();
@@ -146,11 +147,12 @@ fn the_tree_finds_the_shorter_side_that_no_shortcut_leads_to() {
 fn the_tree_goes_to_the_end_with_the_shortest_way_and_rest_also_one_that_comes_later() {
     let mechanism = ball(2);
     let mut space = Space::new(&mechanism, &wall());
-    let far = End { state: at([1.0, 0.0]), rest: 0.0 };
-    let near = End { state: at([0.0, -1.0]), rest: 0.6 };
-    let dear = End { state: at([-0.9, 0.0]), rest: 3.0 };
+    let far = End { state: at([1.0, 0.0]), rest: 0.0, rest_s: 0.0 };
+    let near = End { state: at([0.0, -1.0]), rest: 0.6, rest_s: 0.0 };
+    let dear = End { state: at([-0.9, 0.0]), rest: 3.0, rest_s: 0.0 };
     let path = vec![at([-1.0, 0.0]), at([-0.3, 1.5]), at([0.3, 1.5]), far.state];
-    let mut refinement = Refinement::new(path, 0, vec![far, dear], 1).with_shares(Shares { tree: 1, ..NONE });
+    let mut refinement =
+        Refinement::new(path, 0, vec![far, dear], Measure::Length, 1).with_shares(Shares { tree: 1, ..NONE });
     for _ in 0..100 {
         refinement.step(&mut space, &mut go_on).unwrap();
     }
@@ -164,6 +166,41 @@ fn the_tree_goes_to_the_end_with_the_shortest_way_and_rest_also_one_that_comes_l
     assert_eq!(refinement.end(), 2);
     let straight = 2.0_f32.sqrt();
     assert!(refinement.length() < before && refinement.length() < (straight + rest) * 1.01, "{}", refinement.length());
+}
+
+#[test]
+fn the_quicker_end_is_taken_though_it_is_farther_where_quickness_is_measured() {
+    let mechanism = ball(2);
+    let mut space = Space::new(&mechanism, &wall());
+    let joint = |name: &str, velocity: f64| Joint {
+        name: name.to_owned(),
+        lower: -9.0,
+        upper: 9.0,
+        velocity,
+        acceleration: 10.0 * velocity,
+        jerk: 100.0 * velocity,
+    };
+    let rough = Rough::new(&[joint("slow", 0.1), joint("quick", 2.0)], 1.0);
+    let start = at([-1.0, 0.0]);
+    let ends = || {
+        vec![
+            End { state: at([-0.5, 0.0]), rest: 0.0, rest_s: 0.0 },
+            End { state: at([-1.0, 1.0]), rest: 0.0, rest_s: 0.5 },
+        ]
+    };
+    let ended = |space: &mut Space, measure: Measure| {
+        let mut refinement = Refinement::new(vec![start, ends()[0].state], 0, ends(), measure, 1);
+        for _ in 0..200 {
+            let before = refinement.cost();
+            refinement.step(space, &mut go_on).unwrap();
+            assert!(refinement.cost() <= before);
+        }
+        (refinement.end(), refinement.cost())
+    };
+    // 5 s at the slow joint's speed and 0.1 s each to reach it and to stop; 1 m at twenty times the speed, and what follows.
+    let (end, cost) = ended(&mut space, Measure::Duration(Box::new(rough)));
+    assert!(end == 1 && (cost - 1.2).abs() < 0.1, "{end} {cost}");
+    assert_eq!(ended(&mut space, Measure::Length).0, 0);
 }
 
 #[test]

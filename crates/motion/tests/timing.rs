@@ -5,6 +5,8 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_motion::robot::Joint;
+use ratn_motion::space::State;
+use ratn_motion::timing::rough::Rough;
 use ratn_motion::timing::{Section, timed};
 use ratn_motion::trajectory::{Curve, Knot};
 
@@ -229,4 +231,105 @@ fn a_path_that_is_no_way_at_all_and_repeated_postures_are_no_trouble() {
     let curve = timed(&joints, &parts, 1.0, &mut |_, _| true);
     assert_eq!(curve.end(), here);
     assert_within(&joints, &curve, 1.0);
+}
+
+/// Postures along a straight line, as those of a straight motion of the tool.
+fn dense<const N: usize>(from: &[f64; N], to: &[f64; N]) -> Vec<[f64; N]> {
+    (0..=40).map(|i| std::array::from_fn(|j| from[j] + (to[j] - from[j]) * f64::from(i) / 40.0)).collect()
+}
+
+#[test]
+fn a_seam_is_passed_without_a_stop_where_that_is_free_and_within_the_share_that_is_given_for_it() {
+    let joints = [joint(1.0, 3.0, 40.0), joint(1.0, 3.0, 40.0)];
+    let (up, over, down) = ([0.0, 0.4], [1.0, 0.4], [1.0, 0.0]);
+    let sections = |share: f64| {
+        [
+            Section::Loose(dense(&[0.0, 0.0], &up), [0.0, share]),
+            Section::Blended(vec![up, over]),
+            Section::Loose(dense(&over, &down), [share, 0.0]),
+        ]
+    };
+    let corners = [[0.0, 0.0], up, over, down];
+    // Stopping twice: 0.4 = v (v / 3 + 3 / 40), and 1 / 1 + 1 / 3 + 3 / 40 for the way between them.
+    let peak = 3.0 * ((0.075_f64.powi(2) + 4.0 * 0.4 / 3.0).sqrt() - 0.075) / 2.0;
+    let by_hand = 2.0 * 2.0 * (peak / 3.0 + 0.075) + 1.0 + 1.0 / 3.0 + 0.075;
+    let stops = timed(&joints, &sections(0.0), 1.0, &mut |_, _| true);
+    assert!((stops.duration_s() / by_hand - 1.0).abs() < 5e-3, "{} of {by_hand}", stops.duration_s());
+    for share in [0.05, 0.2, 0.5] {
+        let curve = timed(&joints, &sections(share), 1.0, &mut |_, _| true);
+        assert_within(&joints, &curve, 1.0);
+        assert_eq!(curve.end(), down);
+        // No way between the seams is quicker than one that is followed at full speed.
+        let saved = stops.duration_s() - curve.duration_s();
+        assert!((0.02..1.0).contains(&saved), "share {share} saves {saved} s");
+        let way = 0.1 * curve.duration_s()..0.9 * curve.duration_s();
+        let inner = curve.knots().iter().filter(|k| way.contains(&k.time_s));
+        assert!(inner.clone().count() > 20 && inner.clone().all(|k| k.velocities.iter().any(|v| v.abs() > 0.05)));
+        for i in 0..=2000 {
+            let at = curve.sample(curve.duration_s() * f64::from(i) / 2000.0).positions;
+            if at[1] < 0.4 * (1.0 - share) - 1e-3 {
+                assert!(off(&corners, &at) < 2e-4, "{at:?} with share {share}");
+            }
+            assert!(off(&corners, &at) < 0.4 * share, "{at:?} with share {share}");
+        }
+        // Where there is room on one side only, one stop stays; where there is none, both do.
+        let mut on_the_left =
+            |a: &[f64; 2], b: &[f64; 2]| off(&corners, a).max(off(&corners, b)) < 1e-6 || a[0].max(b[0]) < 0.5;
+        let left = timed(&joints, &sections(share), 1.0, &mut on_the_left);
+        assert_within(&joints, &left, 1.0);
+        assert!(left.duration_s() < stops.duration_s() - 0.01 && left.duration_s() > curve.duration_s() + 0.01);
+        let none = timed(&joints, &sections(share), 1.0, &mut |a, b| off(&corners, a).max(off(&corners, b)) < 1e-6);
+        assert_eq!(none, stops);
+    }
+}
+
+#[test]
+fn sections_with_loose_ends_never_take_longer_than_with_stops_and_keep_within_all_limits() {
+    let mut quicker = 0;
+    for seed in 0..12 {
+        let mut random = ChaCha8Rng::seed_from_u64(200 + seed);
+        let postures = random.random_range(4..7);
+        let (joints, path) = random_path::<7>(&mut random, postures);
+        let speed = random.random_range(0.1..=1.0);
+        let share = random.random_range(0.05..=1.0);
+        let last = path.len() - 1;
+        let (before, after) = (dense(&path[0], &path[1]), dense(&path[last - 1], &path[last]));
+        let sections = |share: f64| {
+            let (before, after) = (before.clone(), after.clone());
+            let middle = Section::Blended(path[1..last].to_vec());
+            [Section::Loose(before, [0.0, share]), middle, Section::Loose(after, [share, 0.0])]
+        };
+        let stops = timed(&joints, &sections(0.0), speed, &mut |_, _| true);
+        let curve = timed(&joints, &sections(share), speed, &mut |_, _| true);
+        assert_within(&joints, &curve, speed);
+        assert_eq!((curve.knots()[0].positions, curve.end()), (before[0], after[40]));
+        assert!(curve.duration_s() <= stops.duration_s(), "{seed}");
+        quicker += i32::from(curve.duration_s() < 0.99 * stops.duration_s());
+    }
+    assert!(quicker >= 8, "{quicker} of 12");
+}
+
+#[test]
+fn the_rough_duration_of_a_path_is_about_the_exact_one() {
+    let (mut ratios, mut sums) = (Vec::new(), [0.0; 2]);
+    for seed in 0..24 {
+        let mut random = ChaCha8Rng::seed_from_u64(300 + seed);
+        let postures = random.random_range(2..7);
+        let (joints, path) = random_path::<7>(&mut random, postures);
+        let speed = random.random_range(0.1..=1.0);
+        let state = |q: &[f64; 7]| -> State { std::array::from_fn(|j| q.get(j).map_or(0.0, |q| *q as f32)) };
+        let states: Vec<State> = path.iter().map(state).collect();
+        let mut rough = Rough::new(&joints, speed);
+        let about = rough.duration_s(&states);
+        ratios.push(about / free(&joints, &path, speed).duration_s());
+        // With room for blends it is the same; without any every corner is stopped at.
+        assert_eq!(rough.duration_among_s(&states, &mut |_, _| true), about);
+        let mut rough = Rough::new(&joints, speed);
+        let stopping = rough.duration_among_s(&states, &mut |_, _| false);
+        let exact = timed(&joints, &[Section::Blended(path.clone())], speed, &mut |_, _| false).duration_s();
+        assert!((stopping / exact - 1.0).abs() < 0.1, "{stopping} of {exact}");
+        sums = [sums[0] + about, sums[1] + stopping];
+    }
+    assert!(sums[1] > sums[0], "{sums:?}");
+    assert!(ratios.iter().all(|r| (0.7..1.3).contains(r)), "{ratios:?}");
 }

@@ -2,7 +2,8 @@
 //!
 //! It has the scene of the goal's projection sent, as what it differs by from one that it knows, plans on a thread of its own and answers with a timed
 //! trajectory. All durations in its goals and answers are in the robot's seconds; `clock` knows how many of them pass in
-//! one of ours. Where `budget_s` is given, planning takes exactly that long and gets a shorter path for it.
+//! one of ours. Where `budget_s` is given, planning takes exactly that long and gets a quicker motion for it; else the first path is
+//! improved for 50 ms of our time.
 
 mod bounds;
 mod clock;

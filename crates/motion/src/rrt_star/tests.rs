@@ -55,7 +55,7 @@ fn posts() -> Space {
 }
 
 fn ends() -> Vec<End> {
-    let end = |x, y, rest| End { state: state(x, y), rest };
+    let end = |x, y, rest| End { state: state(x, y), rest, rest_s: 0.0 };
     vec![end(1.5, 1.5, 0.0), end(1.5, -1.5, 0.3), end(0.3, 1.4, 1.0)]
 }
 
@@ -101,7 +101,7 @@ fn as_long_as_none_has_to_go_no_node_ever_costs_more_than_before() {
     let mut tree = RrtStar::new(&state(-1.5, -1.5), 2);
     let (mut before, mut turned): (Vec<(f32, usize)>, usize) = (Vec::new(), 0);
     // Within a post: no way to it bounds what is of interest.
-    let nowhere = [End { state: state(0.6, 0.6), rest: 0.0 }];
+    let nowhere = [End { state: state(0.6, 0.6), rest: 0.0, rest_s: 0.0 }];
     for _ in 0..200 {
         tree.grow(&mut space, &nowhere, 9.0, 5, &mut random, &mut go_on).unwrap();
         assert_eq!(tree.best(&nowhere), None);

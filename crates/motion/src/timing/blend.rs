@@ -6,14 +6,14 @@ use super::{SAGITTA_RAD, STRAIGHT_RAD};
 use crate::collision::{between, distance};
 
 /// The widest that a corner is cut on each side, and the least, in radians.
-const BLEND_RAD: f64 = 0.5;
-const LEAST_RAD: f64 = 0.002;
+pub(super) const BLEND_RAD: f64 = 0.5;
+pub(super) const LEAST_RAD: f64 = 0.002;
 
 /// How often a blend that touches something is halved before the arm stops at the corner instead.
-const BLEND_HALVINGS: usize = 5;
+pub(super) const BLEND_HALVINGS: usize = 5;
 
 /// A corner that turns by more is no corner but a way back: the arm stops there, in radians.
-const SHARPEST_RAD: f64 = 3.0;
+pub(super) const SHARPEST_RAD: f64 = 3.0;
 
 /// Where its control points are on each side, from its end to the corner.
 const CONTROLS: [f64; 3] = [0.0, 0.4, 0.8];

@@ -1,8 +1,9 @@
 //! When the arm is where: a path becomes a trajectory within the joints' velocity, acceleration and jerk limits.
 //!
-//! Every section starts and ends at rest. The corners of a blended section are rounded in several ways: each by itself (`blend`), and all
-//! along, more or less closely (`spline`). What comes out are smooth paths (`path`); the quickest of them is taken, and none of
-//! them where stopping at every corner is quicker. How a path is followed: `follow`.
+//! The corners of a blended section are rounded in several ways: each by itself (`blend`), and all along, more or less closely (`spline`).
+//! What comes out are smooth paths (`path`); the quickest of them is taken, and none of them where stopping at every corner is quicker. How a
+//! path is followed: `follow`. Every section starts and ends at rest, unless both at a seam leave room to pass it without a stop (`seam`)
+//! and the whole is quicker so.
 
 mod blend;
 mod cubics;
@@ -10,6 +11,8 @@ mod double_s;
 mod follow;
 mod path;
 mod reachability;
+pub mod rough;
+mod seam;
 mod spline;
 mod third_order;
 
@@ -20,6 +23,7 @@ use blend::rounded;
 use follow::{Bounds, estimate, follow};
 use path::{Path, Segment};
 use ratn_model::value::Trajectory;
+use seam::{Loose, joined};
 use spline::{Sides, smoothed, through};
 
 /// The chords for which a curve is asked to be free are at most this far from it, in radians.
@@ -39,14 +43,37 @@ const STRIDES: [usize; 2] = [2, 4];
 const FOLLOWED: usize = 2;
 const CLOSE: f64 = 1.03;
 
-/// A section of a path, from rest to rest.
+/// How much of a blended section a seam may take at each end: two seams leave the middle.
+const LOOSE_SHARE: f64 = 0.5;
+
+/// A section of a path.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Section<const N: usize = 7> {
     /// Its corners may be blended where nothing is touched.
     Blended(Vec<[f64; N]>),
-    /// Followed as it is given: postures close to each other, such as those along a straight line of the tool; or two, for a straight
-    /// motion of the joints.
+    /// Followed as it is given, from rest to rest: postures close to each other, such as those along a straight line of the tool; or two, for a
+    /// straight motion of the joints.
     AsGiven(Vec<[f64; N]>),
+    /// As given but for its ends: shares of its way, at its beginning and at its end, that may be left to pass into a neighbour without a stop,
+    /// where nothing is touched.
+    Loose(Vec<[f64; N]>, [f64; 2]),
+}
+
+impl<const N: usize> Section<N> {
+    /// Its postures.
+    pub fn path(&self) -> &[[f64; N]] {
+        let (Section::Blended(path) | Section::AsGiven(path) | Section::Loose(path, _)) = self;
+        path
+    }
+
+    /// The shares of its way that seams may take.
+    fn loose(&self) -> [f64; 2] {
+        match self {
+            Section::Blended(_) => [LOOSE_SHARE; 2],
+            Section::AsGiven(_) => [0.0; 2],
+            Section::Loose(_, shares) => *shares,
+        }
+    }
 }
 
 /// The trajectory along the sections at a fraction `speed` of the velocity and acceleration limits; those of jerk hold as they are.
@@ -80,39 +107,81 @@ pub fn timed_while<const N: usize>(
     goes_on: &mut dyn FnMut() -> bool,
 ) -> Curve<N> {
     let bounds = Bounds::new(joints, speed);
-    let first = sections.first().and_then(|section| match section {
-        Section::Blended(path) | Section::AsGiven(path) => path.first(),
-    });
-    let start = first.copied().unwrap_or([0.0; N]);
-    let mut knots = vec![Knot { time_s: 0.0, positions: start, velocities: [0.0; N] }];
+    let mut ways = Vec::new();
     for section in sections {
-        let quickest = match section {
-            Section::AsGiven(path) => straight(path, &bounds, goes_on),
-            Section::Blended(path) => free(path, &bounds, is_free, goes_on),
-        };
-        append(&mut knots, quickest);
-        let (Section::Blended(path) | Section::AsGiven(path)) = section;
-        if let (Some(knot), Some(end)) = (knots.last_mut(), path.last()) {
-            // To the last bit.
-            knot.positions = *end;
+        let path = without_repeats(section.path());
+        ways.push(match section {
+            _ if path.len() < 2 => Way { pieces: Vec::new(), knots: Vec::new() },
+            Section::Blended(_) => free(&path, &bounds, is_free, goes_on),
+            Section::AsGiven(_) | Section::Loose(..) => straight(&path, &bounds, goes_on),
+        });
+    }
+    let stops: f64 = ways.iter().map(|way| lasts_s(&way.knots)).sum();
+    let passing = passing(sections, &ways, &bounds, is_free, goes_on).filter(|knots| lasts_s(knots) < stops);
+    let start = sections.first().and_then(|section| section.path().first()).copied().unwrap_or([0.0; N]);
+    let mut knots = vec![Knot { time_s: 0.0, positions: start, velocities: [0.0; N] }];
+    match passing {
+        Some(passing) => append(&mut knots, passing),
+        None => {
+            for (section, way) in sections.iter().zip(ways) {
+                append(&mut knots, way.knots);
+                end_at(&mut knots, section);
+            }
         }
+    }
+    if let Some(section) = sections.last() {
+        end_at(&mut knots, section);
     }
     Curve::new(knots)
 }
 
-/// Along postures as they are, or with a stop at each of them if there is no time for more.
-fn straight<const N: usize>(path: &[[f64; N]], bounds: &Bounds<N>, goes_on: &mut dyn FnMut() -> bool) -> Vec<Knot<N>> {
-    let path = without_repeats(path);
-    if path.len() < 2 {
-        return Vec::new();
+/// To the last bit.
+fn end_at<const N: usize>(knots: &mut [Knot<N>], section: &Section<N>) {
+    if let (Some(knot), Some(end)) = (knots.last_mut(), section.path().last()) {
+        knot.positions = *end;
     }
-    followed(&through(&path), bounds, goes_on).unwrap_or_else(|| stopping(&path, bounds))
+}
+
+/// Smooth pieces from rest to rest, and what they are followed by.
+struct Way<const N: usize> {
+    pieces: Vec<Path<N>>,
+    knots: Vec<Knot<N>>,
+}
+
+/// Through all sections, without a stop where that is free and quicker by the estimate; none where every seam stays.
+fn passing<const N: usize>(
+    sections: &[Section<N>],
+    ways: &[Way<N>],
+    bounds: &Bounds<N>,
+    is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Option<Vec<Knot<N>>> {
+    if ways.len() < 2 {
+        return None;
+    }
+    let loose = |(section, way): (&Section<N>, &Way<N>)| -> Vec<Loose<N>> {
+        let shares = section.loose();
+        let of = |piece: &Path<N>| Loose { path: piece.clone(), ends: shares.map(|share| share * piece.length()) };
+        way.pieces.iter().map(of).collect()
+    };
+    let pieces: Vec<Vec<Loose<N>>> = sections.iter().zip(ways).map(loose).collect();
+    followed(&joined(&pieces, bounds, is_free, goes_on)?, bounds, goes_on)
+}
+
+/// Along postures as they are, or with a stop at each of them if there is no time for more.
+fn straight<const N: usize>(path: &[[f64; N]], bounds: &Bounds<N>, goes_on: &mut dyn FnMut() -> bool) -> Way<N> {
+    let pieces = through(path);
+    match followed(&pieces, bounds, goes_on) {
+        Some(knots) => Way { pieces, knots },
+        None => stopping(path, bounds),
+    }
 }
 
 /// With a stop at every posture.
-fn stopping<const N: usize>(path: &[[f64; N]], bounds: &Bounds<N>) -> Vec<Knot<N>> {
-    let stops: Vec<Path<N>> = path.windows(2).map(|pair| line(&pair[0], &pair[1])).collect();
-    followed(&stops, bounds, &mut || true).unwrap_or_default()
+fn stopping<const N: usize>(path: &[[f64; N]], bounds: &Bounds<N>) -> Way<N> {
+    let pieces: Vec<Path<N>> = path.windows(2).map(|pair| line(&pair[0], &pair[1])).collect();
+    let knots = followed(&pieces, bounds, &mut || true).unwrap_or_default();
+    Way { pieces, knots }
 }
 
 /// The quickest way along a path whose corners may be rounded.
@@ -121,18 +190,14 @@ fn free<const N: usize>(
     bounds: &Bounds<N>,
     is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
     goes_on: &mut dyn FnMut() -> bool,
-) -> Vec<Knot<N>> {
-    let path = without_repeats(path);
-    if path.len() < 2 {
-        return Vec::new();
-    }
-    let mut best = stopping(&path, bounds);
+) -> Way<N> {
+    let mut best = stopping(path, bounds);
     if path.len() == 2 {
         return best;
     }
-    let mut candidates = vec![rounded(&path, is_free)];
+    let mut candidates = vec![rounded(path, is_free)];
     for spacing in SPACINGS_RAD {
-        candidates.extend(smoothed(&path, Sides::Free, spacing, is_free));
+        candidates.extend(smoothed(path, Sides::Free, spacing, is_free));
     }
     let length: f64 = path.windows(2).map(|pair| distance(&pair[0], &pair[1])).sum();
     if length / (path.len() as f64) < DENSE_RAD {
@@ -146,10 +211,10 @@ fn free<const N: usize>(
     let mut ranked: Vec<(f64, Vec<Path<N>>)> = candidates.into_iter().map(|c| (rough(&c), c)).collect();
     ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
     let quickest = ranked[0].0;
-    for (_, pieces) in ranked.iter().filter(|(rough_s, _)| *rough_s < quickest * CLOSE).take(FOLLOWED) {
-        let Some(knots) = followed(pieces, bounds, goes_on) else { continue };
-        if lasts_s(&knots) < lasts_s(&best) {
-            best = knots;
+    for (_, pieces) in ranked.into_iter().filter(|(rough_s, _)| *rough_s < quickest * CLOSE).take(FOLLOWED) {
+        let Some(knots) = followed(&pieces, bounds, goes_on) else { continue };
+        if lasts_s(&knots) < lasts_s(&best.knots) {
+            best = Way { pieces, knots };
         }
     }
     best

@@ -58,6 +58,30 @@ impl<const N: usize> Segment<N> {
         Segment { length, coefficients }
     }
 
+    /// A quintic that begins and ends with the positions and the first two derivatives of others, along a parameter from 0 to `length`.
+    pub(crate) fn between(from: &Derivatives<N>, to: &Derivatives<N>, length: f64) -> Segment<N> {
+        let fifth = length / 5.0;
+        let bend = length * length / 20.0;
+        let near = |end: &Derivatives<N>, way: f64| -> [[f64; N]; 2] {
+            let next: [f64; N] = std::array::from_fn(|j| end.position[j] + way * end.first[j]);
+            [next, std::array::from_fn(|j| 2.0 * next[j] - end.position[j] + bend * end.second[j])]
+        };
+        let ([a, b], [d, c]) = (near(from, fifth), near(to, -fifth));
+        Segment::bezier(&[from.position, a, b, c, d, to.position], length)
+    }
+
+    /// The part of it from one s to another.
+    fn part(&self, from: f64, to: f64) -> Segment<N> {
+        let mut coefficients = self.coefficients;
+        // Taylor's shift: Horner's scheme again and again.
+        for low in 0..COEFFICIENTS - 1 {
+            for k in (low..COEFFICIENTS - 1).rev() {
+                coefficients[k] = std::array::from_fn(|j| coefficients[k][j] + from * coefficients[k + 1][j]);
+            }
+        }
+        Segment { length: to - from, coefficients }
+    }
+
     /// A cubic from its values and second derivatives at both ends.
     pub(crate) fn cubic(from: &[f64; N], to: &[f64; N], bends: [&[f64; N]; 2], length: f64) -> Segment<N> {
         let mut coefficients = [[0.0; N]; COEFFICIENTS];
@@ -111,6 +135,29 @@ impl<const N: usize> Path<N> {
         self.starts.push(self.length);
         self.length += segment.length;
         self.segments.push(segment);
+    }
+
+    /// Appends a path that begins where this one ends, with the same first and second derivative.
+    pub(crate) fn append(&mut self, path: Path<N>) {
+        path.segments.into_iter().for_each(|segment| self.push(segment));
+    }
+
+    /// The part of it from one s to another.
+    pub(crate) fn part(&self, from: f64, to: f64) -> Path<N> {
+        let mut part = Path::default();
+        for (segment, start) in self.segments.iter().zip(&self.starts) {
+            let (low, high) = ((from - start).max(0.0), (to - start).min(segment.length));
+            if high - low > 1e-9 {
+                part.push(segment.part(low, high));
+            }
+        }
+        part
+    }
+
+    /// What it is at s.
+    pub(crate) fn at(&self, s: f64) -> Derivatives<N> {
+        let index = self.starts.partition_point(|start| *start <= s).saturating_sub(1);
+        self.segments[index].at(s - self.starts[index])
     }
 
     /// The greatest s.

@@ -1,4 +1,4 @@
-//! The planner's clock: says when the budget is over, and gives the processor away where more planning hardly helps.
+//! The planner's clock: says when the budget is over, or what improvement gets without one, and gives the processor away where more planning hardly helps.
 
 use ratn_model::value::Value;
 use ratn_motion::pace::{Control, Progress};
@@ -10,7 +10,10 @@ use std::time::{Duration, Instant};
 /// How long a first path is looked for at the most, in our time, where the budget is shorter.
 const FIRST_PATH_LIMIT: Duration = Duration::from_secs(10);
 
-/// After this long without a shorter path the planner lets others have the processor between its iterations, …
+/// How long a path is improved where no budget is given, in our time: that is what the processor needs, however fast the robot's time goes.
+const IMPROVEMENT: Duration = Duration::from_millis(50);
+
+/// After this long without a quicker path the planner lets others have the processor between its iterations, …
 const STAGNATION: Duration = Duration::from_millis(100);
 
 /// … for this long each time. Short, because a cancelled goal is noticed only afterwards.
@@ -22,8 +25,8 @@ pub(super) struct Clock {
     speed: f64,
     budget: Option<Duration>,
     first_path: Option<Duration>,
-    /// When the path last became shorter.
-    shortened: Instant,
+    /// When the path last became quicker.
+    improved: Instant,
     goal: Arc<GoalContext>,
 }
 
@@ -40,7 +43,7 @@ impl Clock {
     pub(super) fn new(begin: Instant, speed: f64, budget_s: Option<f64>, goal: Arc<GoalContext>) -> Clock {
         // A budget too long for a duration is none that ends.
         let budget = budget_s.map(|s| Duration::try_from_secs_f64(s / speed).unwrap_or(Duration::MAX));
-        Clock { begin, speed, budget, first_path: None, shortened: begin, goal }
+        Clock { begin, speed, budget, first_path: None, improved: begin, goal }
     }
 
     /// What the planner shall do now.
@@ -52,25 +55,24 @@ impl Clock {
         match progress {
             Progress::FirstPath { length_rad } => {
                 self.first_path = Some(elapsed);
-                self.shortened = self.begin + elapsed;
+                self.improved = self.begin + elapsed;
                 let first_path_s = Value::Float(elapsed.as_secs_f64() * self.speed);
                 let values = [("first_path_s", first_path_s), ("length_rad", Value::Float(length_rad))];
                 let values: BTreeMap<String, Value> = values.map(|(name, value)| (name.to_owned(), value)).into();
                 self.goal.progress_with("first path", values);
             }
-            Progress::Shorter { .. } => self.shortened = self.begin + elapsed,
+            Progress::Quicker { .. } => self.improved = self.begin + elapsed,
             Progress::Working => {}
         }
         let limit = match (self.first_path, self.budget) {
             (Some(_), Some(budget)) => budget,
-            // Without a budget the planner ends by itself.
-            (Some(_), None) => return Control::Continue,
+            (Some(first_path), None) => first_path + IMPROVEMENT,
             (None, budget) => budget.unwrap_or_default().max(FIRST_PATH_LIMIT),
         };
         if elapsed >= limit {
             return Control::TimeUp;
         }
-        if self.first_path.is_some() && self.shortened.elapsed() > STAGNATION {
+        if self.first_path.is_some() && self.improved.elapsed() > STAGNATION {
             std::thread::sleep(PAUSE.min(limit - elapsed));
         }
         Control::Continue

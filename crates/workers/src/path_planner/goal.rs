@@ -85,8 +85,8 @@ pub(super) fn asked(goal: &GoalContext) -> Result<(Asked, Option<f64>), ActionFa
         reaches_into: names(goal)?,
         speed: goal.optional_float("speed")?.unwrap_or(DEFAULT_SPEED),
         seed: goal.seed,
-        // Improvement goes on until the budget ends.
-        improvement_iterations: if budget_s.is_some() { usize::MAX } else { 0 },
+        // The clock says when improvement ends.
+        improvement_iterations: usize::MAX,
         // The start is known when the scene is.
         ..Request::new(Configuration::ZERO, goals(goal.port("goal").any()?)?)
     };
