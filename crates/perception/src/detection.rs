@@ -73,6 +73,8 @@ pub enum DetectionError {
 const MIN_EXPLAINED: f64 = 0.7;
 /// How badly it may explain what was measured, see `Fit::score`.
 const MAX_SCORE: f64 = 0.6;
+/// A place that is less certain than this is none: a standard deviation in metres.
+const MOST_UNCERTAIN: f64 = 0.010;
 /// How far apart the middles of two parts of one thing are at the most, in metres.
 const MAX_APART: f64 = 0.12;
 /// How far around a known object is looked for it, in metres.
@@ -88,15 +90,17 @@ const SIZE_SLACK: (f64, f64) = (0.025, 0.25);
 const SCORE_SCALE: f64 = 0.06;
 /// Classes whose scores differ by less are compared with more points.
 const CLOSE: f64 = 0.15;
+/// Scores that differ by less say nothing.
+const ALIKE: f64 = 0.05;
 /// What does not average out over an object's points: noise also decides which of them are told from the surface, and from which
 /// side an edge is seen. As a part of one point's deviation along its ray, as measured on random tables.
 const COMMON_NOISE: f64 = 0.12;
-/// Points, rays beside them, and iterations, to tell what something could be and to say where it is.
-const COARSE: (usize, usize, usize) = (140, 60, 8);
-const FINE: (usize, usize, usize) = (500, 200, 9);
+/// Points, rays beside them, edges, and iterations, to tell what something could be and to say where it is.
+const COARSE: ([usize; 3], usize) = ([140, 50, 30], 8);
+const FINE: ([usize; 3], usize) = ([500, 120, 100], 9);
 
 /// Starts that are followed to tell which way round a fork lies, iterations for that, and to say where it does.
-const RELIEF: (usize, usize, usize) = (3, 3, 10);
+const RELIEF: (usize, usize, usize) = (4, 4, 12);
 
 /// Every object of these classes on the surface, those nearest to the camera first. `body` is where the robot is itself.
 ///
@@ -177,7 +181,7 @@ fn objects_on(
         let whole = found.iter().enumerate().find_map(|(i, part)| {
             let whole = view.joined(part.cluster, fragment, MAX_APART)?;
             let whole = explanation(&view, whole, classes)?;
-            (whole.score <= part.score).then_some((i, whole))
+            (whole.score <= part.score + ALIKE).then_some((i, whole))
         });
         match whole {
             Some((i, whole)) => found[i] = whole,
@@ -217,40 +221,48 @@ impl Explained {
 fn explanation(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Option<Explained> {
     let tried = likeliest(view, cluster, classes);
     let best = tried.first()?.1;
-    let evidence = view.evidence(cluster, FINE.0, FINE.1);
+    let evidence = view.evidence(cluster, FINE.0);
     // Those that come close are told apart by more points.
     let close = tried.iter().filter(|(_, score)| score - best < CLOSE);
     let mut close: Vec<(Fit, f64)> =
-        close.map(|(fit, _)| fit.clone().refined(&evidence, FINE.2).scored(&evidence)).collect();
+        close.map(|(fit, _)| fit.clone().refined(&evidence, FINE.1).scored(&evidence)).collect();
     close.sort_by(|a, b| a.1.total_cmp(&b.1));
     let (fit, score) = close.swap_remove(0);
     let explained = fit.explains(&evidence);
-    if explained < MIN_EXPLAINED || score > MAX_SCORE {
+    // Of a fork the depths of all pixels around it say whether there is one.
+    if fit.class != ObjectClass::Fork && (explained < MIN_EXPLAINED || score > MAX_SCORE) {
         return None;
     }
     let far = tried.iter().filter(|(_, score)| score - best >= CLOSE).map(|(_, rival)| best - rival);
     let rivals: f64 = close.iter().map(|(_, rival)| score - rival).chain(far).map(|d| (d / SCORE_SCALE).exp()).sum();
     let confidence = explained / (1.0 + rivals);
     let (fit, covariance, common) = if fit.class == ObjectClass::Fork {
-        let (fit, covariance) = lying(view, &fit);
+        let (fit, covariance) = lying(view, &fit)?;
         (fit, covariance, [0.0; 3])
     } else {
         let covariance = fit.covariance(&evidence);
         let common = common(&fit, &evidence);
         (fit, covariance, common)
     };
+    // Also what is not a number is too uncertain.
+    let certain =
+        (0..2).all(|i| covariance.pose[i][i] < MOST_UNCERTAIN.powi(2)) && covariance.height < MOST_UNCERTAIN.powi(2);
+    if !certain {
+        return None;
+    }
     let object = detection(view, &fit, &covariance, common, confidence);
     Some(Explained { cluster, fit, score, object })
 }
 
-/// Where a fork lies, by the depths around it; whichever way round explains them better.
-fn lying(view: &View<'_>, fit: &Fit) -> (Fit, Covariance) {
+/// Where a fork lies, by the depths around it; whichever way round explains them better. `None` where the surface alone does as well.
+fn lying(view: &View<'_>, fit: &Fit) -> Option<(Fit, Covariance)> {
     let relief = view.relief(fit);
     let starts = relief.starts(fit).into_iter().take(RELIEF.0);
     let refined = starts.map(|start| relief.refined(start, RELIEF.1)).min_by(|a, b| a.1.total_cmp(&b.1));
     let (near, ..) = refined.unwrap_or_else(|| relief.refined(fit.clone(), RELIEF.1));
-    let (fit, _, covariance) = view.relief(&near).refined(near, RELIEF.2);
-    (fit, covariance)
+    let relief = view.relief(&near);
+    let (fit, cost, covariance) = relief.refined(near, RELIEF.2);
+    relief.shows(cost).then_some((fit, covariance))
 }
 
 /// What noise has in common over an object's points: a shift along the ray.
@@ -262,11 +274,11 @@ fn common(fit: &Fit, evidence: &Evidence) -> Vector {
 
 /// Of each class that a cluster could be the best fit to some of its points and how badly it explains them, the likeliest first.
 fn likeliest(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Vec<(Fit, f64)> {
-    let evidence = view.evidence(cluster, COARSE.0, COARSE.1);
+    let evidence = view.evidence(cluster, COARSE.0);
     let Some(outline) = Outline::of(&evidence.points) else { return Vec::new() };
     let mut tried: Vec<(Fit, f64)> = Vec::new();
     for start in outline.starts(&evidence.points, classes) {
-        let (fit, score) = start.refined(&evidence, COARSE.2).scored(&evidence);
+        let (fit, score) = start.refined(&evidence, COARSE.1).scored(&evidence);
         match tried.iter_mut().find(|(other, _)| other.class == fit.class) {
             Some(other) if other.1 > score => *other = (fit, score),
             Some(_) => {}

@@ -10,10 +10,11 @@ mod placed;
 pub(crate) mod relief;
 pub(crate) mod start;
 
+use crate::model::form::Form;
 use crate::model::{Model, ObjectClass, Symmetry};
-use crate::normal::Normal;
+use crate::normal::{Blocks, N as MAX_PARAMETERS, Normal};
 use crate::vector::Vector;
-use placed::{Deepest, Placed};
+use placed::{Deepest, NEAR, Placed};
 
 /// What was measured of a cluster and around it, in the frame of the supporting surface.
 #[derive(Debug, Clone)]
@@ -24,20 +25,48 @@ pub(crate) struct Evidence {
     pub(crate) points: Vec<Vector>,
     /// Where rays beside the cluster ended, at or below the surface.
     pub(crate) free: Vec<Vector>,
+    /// Rays along the cluster's silhouette.
+    pub(crate) edges: Vec<Edge>,
     /// Below this height points are not counted on: only those that noise has lifted were told from the surface.
     pub(crate) floor: f64,
     /// Standard deviation of a point, in metres.
     pub(crate) sigma: f64,
+    /// Standard deviation of what the noise of neighbouring points has in common, in metres.
+    pub(crate) shared: f64,
     /// The distance between neighbouring pixels at the cluster, in metres.
     pub(crate) pitch: f64,
+}
+
+/// A ray beside a place that is half-way between a pixel that sees the cluster and one that sees far past it. Within a corner a ray is less
+/// deep than it is far from the silhouette; beside it, distances are true.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Edge {
+    /// Where the ray reaches the surface.
+    pub(crate) end: Vector,
+    /// How far outside of the silhouette it passes, in metres.
+    pub(crate) beside: f64,
+    /// Standard deviation of where the silhouette is, across the ray, in metres.
+    pub(crate) sigma: f64,
 }
 
 /// A model in its place: z = 0 is below it.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Fit {
     pub(crate) class: ObjectClass,
-    /// x, y, yaw, and then the model's dimensions.
+    /// x, y, yaw, the model's dimensions, its form.
     parameters: Parameters,
+}
+
+impl Evidence {
+    /// Standard deviation of a point about a model, in metres: things are not quite their models.
+    fn spread(&self) -> f64 {
+        self.sigma.hypot(UNLIKE)
+    }
+
+    /// A point farther away is none of a model's, in metres.
+    fn cut_off(&self) -> f64 {
+        (3.0 * self.spread()).max(EXPLAINED)
+    }
 }
 
 /// How uncertain a fit is: variances and covariances of x, y, yaw; the variance of its height.
@@ -46,11 +75,11 @@ pub(crate) struct Covariance {
     pub(crate) height: f64,
 }
 
-/// x, y, yaw and at most three dimensions.
+/// x, y, yaw, at most three dimensions, and a form.
 type Parameters = [f64; MAX_PARAMETERS];
-const MAX_PARAMETERS: usize = 6;
 const YAW: usize = 2;
 const FIRST_DIMENSION: usize = 3;
+const FIRST_FORM: usize = 6;
 
 /// The step of numeric derivatives, in metres and radians.
 const DIFFERENCE: f64 = 1e-4;
@@ -60,6 +89,15 @@ const FIRST_CUT_OFF: f64 = 0.015;
 const CUT_OFF_FADE: f64 = 0.7;
 /// A point this near, or within three deviations, is explained, in metres.
 const EXPLAINED: f64 = 0.004;
+/// How far things are from models, as a standard deviation in metres: of a point, and of a silhouette.
+const UNLIKE: f64 = 0.0015;
+pub(crate) const UNLIKE_AT_EDGES: f64 = 0.001;
+/// The same of points that are next to each other, all of them alike.
+const UNLIKE_AROUND: f64 = 0.0003;
+/// An edge of the silhouette that is more deviations off than this is none of the model's: a handle's.
+const EDGE_CUT_OFF: f64 = 3.5;
+/// Points that are less than this apart share noise, and what the model is not, in metres.
+const BLOCK: f64 = 0.02;
 /// The variance of what the evidence does not determine, in metres² and radians².
 const UNKNOWN: f64 = 0.01;
 /// A step below which a fit has settled, in metres and radians.
@@ -69,7 +107,11 @@ const LONGEST_STEP: f64 = 0.02;
 
 impl Fit {
     pub(crate) fn new(class: ObjectClass, at: [f64; 2], yaw: f64, dimensions: &[f64]) -> Fit {
-        let mut parameters = [at[0], at[1], yaw, 0.0, 0.0, 0.0];
+        let mut parameters = [0.0; MAX_PARAMETERS];
+        parameters[..FIRST_DIMENSION].copy_from_slice(&[at[0], at[1], yaw]);
+        for (form, usual) in parameters[FIRST_FORM..].iter_mut().zip(class.usual()) {
+            *form = usual.mean;
+        }
         parameters[FIRST_DIMENSION..FIRST_DIMENSION + dimensions.len()].copy_from_slice(dimensions);
         Fit { class, parameters }.bounded()
     }
@@ -93,9 +135,13 @@ impl Fit {
         self.class.model(&self.parameters[FIRST_DIMENSION..FIRST_DIMENSION + self.class.ranges().len()])
     }
 
+    fn form(&self) -> Form {
+        std::array::from_fn(|i| self.parameters[FIRST_FORM + i])
+    }
+
     /// The fit near this one that agrees best with the evidence.
     pub(crate) fn refined(self, evidence: &Evidence, iterations: usize) -> Fit {
-        let last_cut_off = (3.0 * evidence.sigma).max(EXPLAINED);
+        let last_cut_off = evidence.cut_off();
         let mut cut_off = FIRST_CUT_OFF.max(last_cut_off);
         let (mut here, mut damping) = (self, 1e-3);
         let mut residuals = here.residuals(evidence);
@@ -104,7 +150,10 @@ impl Fit {
             let normal = here.linearised(evidence, &residuals, &used, cut_off);
             let Some(next) = here.stepped(&normal, damping) else { break };
             let next_residuals = next.residuals(evidence);
-            if next_residuals.cost(&used, cut_off) <= residuals.cost(&used, cut_off) {
+            let cost = |fit: &Fit, residuals: &Residuals| {
+                residuals.cost(&used, cut_off) + residuals.edge_cost(evidence, cut_off) + fit.unusual(evidence)
+            };
+            if cost(&next, &next_residuals) <= cost(&here, &residuals) {
                 let moved = here.parameters.iter().zip(next.parameters).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
                 (here, residuals) = (next, next_residuals);
                 damping = (damping * 0.3).max(1e-6);
@@ -121,7 +170,7 @@ impl Fit {
 
     /// How badly it explains the evidence, per point: 0 is perfect, 1 not at all.
     pub(crate) fn score(&self, evidence: &Evidence) -> f64 {
-        let cut_off = (3.0 * evidence.sigma).max(EXPLAINED);
+        let cut_off = evidence.cut_off();
         let all = vec![true; evidence.points.len()];
         self.residuals(evidence).cost(&all, cut_off) * 2.0 / cut_off.powi(2) / all.len().max(1) as f64
     }
@@ -135,7 +184,7 @@ impl Fit {
     /// How many of the points lie on its surface, 0 to 1.
     pub(crate) fn explains(&self, evidence: &Evidence) -> f64 {
         let placed = Placed::of(self, evidence.eye);
-        let near = (3.0 * evidence.sigma).max(EXPLAINED);
+        let near = evidence.cut_off();
         let explained = evidence.points.iter().filter(|p| placed.distance(**p).abs() < near).count();
         explained as f64 / evidence.points.len().max(1) as f64
     }
@@ -150,42 +199,57 @@ impl Fit {
 
     /// How well the evidence determines it, by its noise and the size of pixels.
     pub(crate) fn covariance(&self, evidence: &Evidence) -> Covariance {
-        let cut_off = (3.0 * evidence.sigma).max(EXPLAINED);
-        let mut normal = Normal::default();
+        let cut_off = evidence.cut_off();
+        let (mut normal, mut blocks) = (Normal::default(), Blocks::default());
         let placed = Placed::of(self, evidence.eye);
         let moved = self.neighbours(evidence.eye);
-        let (mut squares, mut count) = (0.0, 0.0);
+        let block = |place: Vector| place.map(|c| (c / BLOCK).floor() as i32);
         for point in &evidence.points {
             let residual = placed.distance(*point);
             if residual.abs() < cut_off {
-                squares += residual * residual;
-                count += 1.0;
-                normal.add(&self.slope(&moved, residual, |p| p.distance(*point)), residual, evidence.sigma.powi(-2));
+                let slope = self.slope(&moved, residual, |p| p.distance(*point));
+                normal.add(&slope, residual, evidence.sigma.powi(-2));
+                blocks.add(block(*point), &slope, residual, evidence.sigma.powi(-2));
             }
         }
         // A ray that passes within a pixel says where the edge is, to about a pixel.
-        for ray in evidence.free.iter().filter_map(|end| placed.deepest(evidence, *end)) {
+        for ray in evidence.free.iter().filter_map(|end| placed.deepest(evidence, *end, NEAR)) {
             if ray.depth.abs() < evidence.pitch / 2.0 {
-                let slope = self.slope(&moved, ray.depth, |p| p.model.fill_distance(p.local(ray.place)));
+                let slope = self.slope(&moved, ray.depth, |p| p.fill_distance(ray.place));
                 normal.add(&slope, ray.depth, evidence.pitch.powi(-2));
             }
         }
-        // More scattered than the noise says: the model is not quite the thing.
-        let inflation = (squares / f64::max(count, 1.0) / evidence.sigma.powi(2)).max(1.0);
+        for edge in &evidence.edges {
+            if let Some(ray) = placed.at_edge(evidence, edge)
+                && (ray.depth - edge.beside).abs() < EDGE_CUT_OFF * edge.sigma
+            {
+                let slope = self.slope(&moved, ray.depth, |p| p.fill_distance(ray.place));
+                normal.add(&slope, ray.depth - edge.beside, edge.sigma.powi(-2));
+                blocks.add(block(ray.place), &slope, ray.depth - edge.beside, edge.sigma.powi(-2));
+            }
+        }
+        for (i, usual) in self.class.usual().iter().enumerate().filter(|(_, usual)| usual.is_free()) {
+            normal.expect(FIRST_FORM + i, 0.0, usual.deviation.powi(-2));
+        }
         let unknown = std::array::from_fn(|i| std::array::from_fn(|j| if i == j { UNKNOWN } else { 0.0 }));
-        let inverse = normal.inverse(&self.fixed()).unwrap_or(unknown);
-        let pose = std::array::from_fn(|row| std::array::from_fn(|column| inverse[row][column] * inflation));
+        let fixed = self.fixed();
+        let shared = evidence.shared.powi(2) + UNLIKE_AROUND.powi(2);
+        let covariance = normal.with_shared(&blocks, shared).inverse(&fixed).unwrap_or(unknown);
+        let pose = std::array::from_fn(|row| std::array::from_fn(|column| covariance[row][column]));
         // A fork's height follows its length.
         let last = FIRST_DIMENSION + self.class.ranges().len() - 1;
-        let height = if self.class == ObjectClass::Fork { 0.0 } else { inverse[last][last] * inflation };
+        let height = if self.class == ObjectClass::Fork { 0.0 } else { covariance[last][last] };
         Covariance { pose, height }
     }
 
     /// The parameters that do not exist or change nothing.
     fn fixed(&self) -> [bool; MAX_PARAMETERS] {
         let dimensions = self.class.ranges().len();
-        std::array::from_fn(|i| {
-            (i == YAW && self.class.symmetry() == Symmetry::Round) || i >= FIRST_DIMENSION + dimensions
+        std::array::from_fn(|i| match i {
+            YAW => self.class.symmetry() == Symmetry::Round,
+            ..FIRST_DIMENSION => false,
+            FIRST_FORM.. => self.class == ObjectClass::Fork || !self.class.usual()[i - FIRST_FORM].is_free(),
+            _ => i >= FIRST_DIMENSION + dimensions,
         })
     }
 
@@ -214,7 +278,8 @@ impl Fit {
         let placed = Placed::of(self, evidence.eye);
         Residuals {
             points: evidence.points.iter().map(|p| placed.distance(*p)).collect(),
-            rays: evidence.free.iter().filter_map(|end| placed.deepest(evidence, *end)).collect(),
+            edges: evidence.edges.iter().map(|edge| placed.at_edge(evidence, edge)).collect(),
+            rays: evidence.free.iter().filter_map(|end| placed.deepest(evidence, *end, NEAR)).collect(),
         }
     }
 
@@ -228,10 +293,30 @@ impl Fit {
             }
         }
         for ray in residuals.rays.iter().filter(|ray| ray.depth < 0.0) {
-            let slope = self.slope(&moved, ray.depth, |p| p.model.fill_distance(p.local(ray.place)));
+            let slope = self.slope(&moved, ray.depth, |p| p.fill_distance(ray.place));
             normal.add(&slope, ray.depth, weight(ray.depth, cut_off).max(RAY_WEIGHT));
         }
+        let spread = evidence.spread();
+        for (edge, ray) in evidence.edges.iter().zip(&residuals.edges) {
+            let Some(ray) = ray else { continue };
+            let off = ray.depth - edge.beside;
+            let weight = weight(off, (EDGE_CUT_OFF * edge.sigma).max(cut_off)) * (spread / edge.sigma).powi(2);
+            if weight > 0.0 {
+                normal.add(&self.slope(&moved, ray.depth, |p| p.fill_distance(ray.place)), off, weight);
+            }
+        }
+        for (i, usual) in self.class.usual().iter().enumerate().filter(|(_, usual)| usual.is_free()) {
+            let off = self.parameters[FIRST_FORM + i] - usual.mean;
+            normal.expect(FIRST_FORM + i, off, weight(0.0, 1.0) * (spread / usual.deviation).powi(2));
+        }
         normal
+    }
+
+    /// How unusual its form is, as a cost.
+    fn unusual(&self, evidence: &Evidence) -> f64 {
+        let usual = self.class.usual().iter().zip(&self.parameters[FIRST_FORM..]);
+        let off = usual.filter(|(usual, _)| usual.is_free()).map(|(usual, form)| (form - usual.mean) / usual.deviation);
+        0.5 * weight(0.0, 1.0) * evidence.spread().powi(2) * off.map(|off| off * off).sum::<f64>()
     }
 
     fn stepped(&self, normal: &Normal, damping: f64) -> Option<Fit> {
@@ -248,6 +333,9 @@ impl Fit {
         for (parameter, range) in self.parameters[FIRST_DIMENSION..].iter_mut().zip(self.class.ranges()) {
             *parameter = parameter.clamp(*range.start(), *range.end());
         }
+        for (form, usual) in self.parameters[FIRST_FORM..].iter_mut().zip(self.class.usual()) {
+            *form = form.clamp(*usual.range.start(), *usual.range.end());
+        }
         self
     }
 }
@@ -256,6 +344,8 @@ impl Fit {
 struct Residuals {
     /// Of each point, in metres.
     points: Vec<f64>,
+    /// Of each edge, where its ray passes near it.
+    edges: Vec<Option<Deepest>>,
     /// Of the rays that pass near it.
     rays: Vec<Deepest>,
 }
@@ -270,6 +360,16 @@ impl Residuals {
         let points = self.points.iter().zip(used).filter(|(_, used)| **used).map(|(r, _)| robust(*r, cut_off));
         let rays = self.rays.iter().map(|ray| robust(ray.depth.min(0.0), cut_off));
         points.sum::<f64>() + rays.sum::<f64>()
+    }
+
+    fn edge_cost(&self, evidence: &Evidence, cut_off: f64) -> f64 {
+        let spread = evidence.spread();
+        let of = |(edge, ray): (&Edge, &Option<Deepest>)| {
+            let cut_off = (EDGE_CUT_OFF * edge.sigma).max(cut_off);
+            let cost = ray.as_ref().map_or(cut_off * cut_off / 2.0, |ray| robust(ray.depth - edge.beside, cut_off));
+            cost * (spread / edge.sigma).powi(2)
+        };
+        evidence.edges.iter().zip(&self.edges).map(of).sum()
     }
 }
 

@@ -1,6 +1,8 @@
 //! Mean heights of pixels and those around them: noise falls by the window's side, so that what is flat is told from the
 //! surface it lies on. What is clearly above or below is left out of a mean, or it would spread over its edges.
 
+use crate::vector::median;
+
 /// Rows and columns of the window.
 pub(crate) const SIDE: usize = 3;
 
@@ -32,9 +34,49 @@ pub(crate) fn means(heights: &[f32], width: usize, limit: f32) -> Vec<f32> {
     means
 }
 
+/// Rows and columns of a block of pixels whose noise is alike where a camera's noise is smooth.
+pub(crate) const BLOCK: usize = 8;
+/// Of fewer pairs of blocks nothing is told.
+const LEAST_PAIRS: usize = 24;
+
+/// The standard deviation of what heights on the surface have in common in a block, beside their own of `sigma`: from the means of blocks that
+/// are on it as a whole, two blocks apart so that slopes and what is wrong about the surface hardly count. 0 where it cannot be told.
+pub(crate) fn shared(heights: &[f32], width: usize, limit: f32, sigma: f64) -> f64 {
+    let columns = width / BLOCK;
+    let mean = |row: usize, column: usize| -> Option<f32> {
+        let mut sum = 0.0;
+        for line in 0..BLOCK {
+            let start = (row * BLOCK + line) * width + column * BLOCK;
+            for height in &heights[start..start + BLOCK] {
+                if height.is_nan() || height.abs() >= limit {
+                    return None;
+                }
+                sum += height;
+            }
+        }
+        Some(sum / (BLOCK * BLOCK) as f32)
+    };
+    let mut apart = Vec::new();
+    for row in 0..heights.len() / width / BLOCK {
+        let means: Vec<Option<f32>> = (0..columns).map(|column| mean(row, column)).collect();
+        for pair in means.windows(3) {
+            if let [Some(left), _, Some(right)] = pair {
+                apart.push(f64::from((left - right).abs()));
+            }
+        }
+    }
+    if apart.len() < LEAST_PAIRS {
+        return 0.0;
+    }
+    // 1.4826 times the median is a normal distribution's deviation.
+    let variance = (1.4826 * median(&mut apart).unwrap_or(0.0)).powi(2) / 2.0;
+    (variance - sigma * sigma / (BLOCK * BLOCK) as f64).max(0.0).sqrt()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sensor::field::{hash, normal};
 
     #[test]
     fn a_mean_is_of_the_window_and_leaves_out_what_is_clear_and_what_is_missing() {
@@ -43,6 +85,20 @@ mod tests {
         assert_eq!(means[0], (1.0 + 2.0 + 4.0 + 5.0) / 4.0);
         assert_eq!(means[4], (1.0 + 2.0 + 3.0 + 4.0 + 5.0 + 7.0) / 6.0);
         assert_eq!(means[8], 5.0);
+    }
+
+    #[test]
+    fn what_a_block_shares_is_told_from_what_each_height_has_of_its_own() {
+        const WIDE: usize = 320;
+        let normal = |i: usize| normal(hash(i as u64));
+        let of = |own: f64, common: f64| -> Vec<f32> {
+            let block = |i: usize| (i / WIDE / BLOCK) * (WIDE / BLOCK) + (i % WIDE) / BLOCK;
+            (0..WIDE * 240).map(|i| (own * normal(i) + common * normal(1_000_000 + 31 * block(i))) as f32).collect()
+        };
+        let told = |own: f64, common: f64| shared(&of(own, common), WIDE, 0.1, own);
+        assert!(told(0.003, 0.0) < 0.0003, "{}", told(0.003, 0.0));
+        assert!((told(0.003, 0.002) / 0.002 - 1.0).abs() < 0.12, "{}", told(0.003, 0.002));
+        assert_eq!(shared(&[0.0; 64], 8, 0.1, 0.0), 0.0);
     }
 
     #[test]

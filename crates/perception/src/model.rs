@@ -6,11 +6,14 @@
 //! come from one description.
 
 mod fork;
+pub(crate) mod form;
 mod revolved;
 mod solid;
 
 use crate::vector::Vector;
 pub(crate) use fork::Strip;
+use form::{FORMS, Form, ROUNDED};
+use revolved::Turned;
 use serde::{Deserialize, Serialize};
 use std::ops::RangeInclusive;
 
@@ -192,34 +195,41 @@ impl Model {
     /// How much the topmost part of its wall leans outwards, in radians from upright; none for what has no rim.
     pub fn rim_lean(&self) -> Option<f64> {
         match *self {
-            Model::Round { kind, radius, height } => revolved::rim_lean(kind, radius, height),
+            Model::Round { kind, radius, height } => {
+                revolved::rim_lean(&Turned { kind, radius, height, form: [0.0; FORMS] })
+            }
             Model::Box { .. } | Model::Fork { .. } => None,
         }
     }
 
     /// How far a point of its frame is from its surface as seen from `eye`, in metres; negative behind it.
-    pub(crate) fn distance(&self, point: Vector, eye: Vector) -> f64 {
+    pub(crate) fn distance(&self, form: Form, point: Vector, eye: Vector) -> f64 {
         match *self {
-            Model::Box { size } => box_distance(point, size),
+            Model::Box { size } => seen_box_distance(point, size, eye),
             Model::Round { kind, radius, height } => {
                 let [x, y, z] = point;
                 let from_axis = (x * x + y * y).sqrt();
                 let outwards = (x * (eye[0] - x) + y * (eye[1] - y)) / from_axis.max(1e-9);
-                revolved::distance(kind, radius, height, [from_axis, z + height / 2.0], [outwards, eye[2] - z])
+                let of = Turned { kind, radius, height, form };
+                revolved::distance(&of, [from_axis, z + height / 2.0], [outwards, eye[2] - z])
             }
             Model::Fork { length } => fork::distance(length, point),
         }
     }
 
     /// How far a point of its frame is from what no ray from outside passes: itself, hollows filled.
-    pub(crate) fn fill_distance(&self, point: Vector) -> f64 {
+    pub(crate) fn fill_distance(&self, form: Form, point: Vector) -> f64 {
         match *self {
             Model::Round { kind, radius, height } => {
                 let [x, y, z] = point;
-                revolved::fill_distance(kind, radius, height, [(x * x + y * y).sqrt(), z + height / 2.0])
+                let of = Turned { kind, radius, height, form };
+                revolved::fill_distance(&of, [(x * x + y * y).sqrt(), z + height / 2.0])
             }
             Model::Fork { length } => fork::fill_distance(length, point),
-            Model::Box { size } => box_distance(point, size),
+            Model::Box { size } => {
+                let rounded = form[ROUNDED];
+                box_distance(point, size.map(|edge| edge - 2.0 * rounded)) - rounded
+            }
         }
     }
 }
@@ -228,6 +238,31 @@ fn box_distance(point: Vector, size: [f64; 3]) -> f64 {
     let beyond: Vector = std::array::from_fn(|i| point[i].abs() - size[i] / 2.0);
     let outside: f64 = beyond.iter().map(|b| b.max(0.0).powi(2)).sum::<f64>().sqrt();
     outside + beyond[0].max(beyond[1]).max(beyond[2]).min(0.0)
+}
+
+/// The same for a point that noise has moved along its ray: where that ray meets the box, in front of it the distance is that from the face
+/// which it meets, and behind that from the nearest face that the eye sees. To take the nearest of all of it would pull on the faces beside an edge
+/// with what is in front of it, but not with what is behind.
+fn seen_box_distance(point: Vector, size: [f64; 3], eye: Vector) -> f64 {
+    let (mut enters, mut leaves, mut front) = (0.0_f64, f64::INFINITY, 0.0);
+    let mut behind = f64::NEG_INFINITY;
+    for i in 0..3 {
+        let (half, way) = (size[i] / 2.0, point[i] - eye[i]);
+        let (near, far) = ((-half.copysign(way) - eye[i]) / way, (half.copysign(way) - eye[i]) / way);
+        // Along a face, numbers are infinite or none, and compare as they should.
+        if near > enters {
+            (enters, front) = (near, -(point[i] * way.signum() + half));
+        }
+        leaves = leaves.min(far);
+        if near > 0.0 {
+            behind = behind.max(-(point[i] * way.signum() + half));
+        }
+    }
+    match (enters < leaves, enters > 1.0) {
+        (true, true) => front,
+        (true, false) if behind.is_finite() => behind.min(0.0),
+        _ => box_distance(point, size),
+    }
 }
 
 #[cfg(test)]
@@ -264,9 +299,13 @@ mod tests {
                 // Between the tines, light reaches their sides; the fit takes the head as closed.
                 let among_tines = class == ObjectClass::Fork && hit[0] > 0.35 * x;
                 let least = if among_tines { -fork::THICKNESS * x } else { 0.0 };
-                let distance = model.distance(hit, from);
+                let distance = model.distance([0.0; FORMS], hit, from);
                 assert!((least - 8e-4..8e-4).contains(&distance), "{class:?} {hit:?}: {distance}");
-                assert!(model.fill_distance(hit) < 8e-4, "{class:?} {hit:?}: {}", model.fill_distance(hit));
+                assert!(
+                    model.fill_distance([0.0; FORMS], hit) < 8e-4,
+                    "{class:?} {hit:?}: {}",
+                    model.fill_distance([0.0; FORMS], hit)
+                );
             }
             assert!(hits > 500, "{class:?}: {hits}");
         }
@@ -276,7 +315,7 @@ mod tests {
     fn rays_from_above_meet_the_strip_where_they_meet_what_is_rendered() {
         let length = 0.19;
         let body = Body { shape: Model::Fork { length }.solid(), pose: Pose::IDENTITY };
-        let (strip, half) = (Strip::new(), fork::size(1.0)[2] / 2.0);
+        let (strip, half) = (Strip::new([0.0; FORMS]), fork::size(1.0)[2] / 2.0);
         let (mut met, mut exact, mut missed) = (0, 0, 0);
         for i in 0..4000_u32 {
             let (turn, rise) = (f64::from(i) * 2.4, 0.6 + 0.8 * f64::from(i % 37) / 37.0);

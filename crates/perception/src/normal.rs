@@ -1,7 +1,46 @@
 //! Normal equations of small least-squares problems, solved by Cholesky's decomposition.
 
+use std::collections::BTreeMap;
+
 /// How many unknowns there are at the most.
-const N: usize = 6;
+pub(crate) const N: usize = 9;
+
+/// What the residuals of a block of neighbours have in common: an error that they share, of a known variance, beside their own. Of each block
+/// the sums of the weights, and of slopes and residuals by them.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Blocks {
+    sums: BTreeMap<[i32; 3], Shared>,
+}
+
+#[derive(Debug, Clone, Default)]
+struct Shared {
+    weight: f64,
+    residual: f64,
+    slope: [f64; N],
+}
+
+impl Blocks {
+    pub(crate) fn add(&mut self, block: [i32; 3], slope: &[f64; N], residual: f64, weight: f64) {
+        let sums = self.sums.entry(block).or_default();
+        sums.weight += weight;
+        sums.residual += weight * residual;
+        for (sum, slope) in sums.slope.iter_mut().zip(slope) {
+            *sum += weight * slope;
+        }
+    }
+
+    /// By how much the sum of squares is less where the blocks' errors have this variance.
+    pub(crate) fn relief(&self, variance: f64) -> f64 {
+        self.sums.values().map(|block| block.residual.powi(2) * block.gain(variance)).sum()
+    }
+}
+
+impl Shared {
+    /// The inverse of `1 / variance + Σ w`: how much of a block's sums is its shared error (Sherman and Morrison 1950).
+    fn gain(&self, variance: f64) -> f64 {
+        variance / (1.0 + variance * self.weight)
+    }
+}
 
 /// `Jᵀ W J` and `Jᵀ W r`.
 #[derive(Debug, Clone, Copy, Default)]
@@ -20,6 +59,21 @@ impl Normal {
             }
             self.right[row] += weighted * residual;
         }
+    }
+
+    /// The same, where blocks of the residuals share errors of this variance.
+    pub(crate) fn with_shared(mut self, blocks: &Blocks, variance: f64) -> Normal {
+        for block in blocks.sums.values() {
+            let gain = block.gain(variance);
+            self.add(&block.slope, block.residual, -gain);
+        }
+        self
+    }
+
+    /// An unknown that is expected to have a value, `residual` less than it has.
+    pub(crate) fn expect(&mut self, unknown: usize, residual: f64, weight: f64) {
+        self.matrix[unknown][unknown] += weight;
+        self.right[unknown] += weight * residual;
     }
 
     /// The step to subtract, with the diagonal increased by a part of itself (Marquardt 1963). `None` where nothing is
@@ -89,9 +143,26 @@ mod tests {
     use super::*;
 
     #[test]
+    fn an_error_that_a_block_shares_is_no_measurement_of_each_of_its_residuals() {
+        // Twenty residuals of one unknown, all in a block: by its shared error alone they are worth one of its variance, and one more.
+        let (mut normal, mut blocks) = (Normal::default(), Blocks::default());
+        let slope: [f64; N] = std::array::from_fn(|i| f64::from(u8::from(i == 0)));
+        for i in 0..20 {
+            normal.add(&slope, 0.1 * f64::from(i), 4.0);
+            blocks.add([0; 3], &slope, 0.1 * f64::from(i), 4.0);
+        }
+        let fixed = std::array::from_fn(|i| i != 0);
+        let variance = |shared: f64| normal.with_shared(&blocks, shared).inverse(&fixed).unwrap()[0][0];
+        assert!((variance(0.0) - 1.0 / 80.0).abs() < 1e-9 && (variance(0.5) - 0.5 - 1.0 / 80.0).abs() < 1e-9);
+        // Where nothing tells the two apart the solution is the same mean.
+        let step = normal.with_shared(&blocks, 0.5).step(&fixed, 0.0).unwrap();
+        assert!((step[0] - 0.95).abs() < 1e-9, "{step:?}");
+    }
+
+    #[test]
     fn a_linear_problem_is_solved_in_one_step_and_fixed_unknowns_stay() {
-        let truth = [1.0, -2.0, 0.0, 0.5, 3.0, 0.0];
-        let fixed = [false, false, true, false, false, true];
+        let truth = [1.0, -2.0, 0.0, 0.5, 3.0, 0.0, -1.0, 2.0, 0.25];
+        let fixed = [false, false, true, false, false, true, false, false, false];
         let mut normal = Normal::default();
         for i in 0..40 {
             let slope: [f64; N] = std::array::from_fn(|k| ((i * (k + 2)) as f64 * 0.37).sin());

@@ -5,11 +5,13 @@ use crate::camera::{Camera, DepthImage};
 use crate::cluster;
 use crate::detection::{DetectionError, Region};
 use crate::fit::relief::{Depth, Relief};
-use crate::fit::{Evidence, Fit};
+use crate::fit::{Edge, Evidence, Fit, UNLIKE_AT_EDGES};
+use crate::flying::Heights;
 use crate::level;
 use crate::mask::{Ball, Mask};
 use crate::plane::Plane;
-use crate::vector::{Vector, cross, dot, length, median, sub};
+use crate::silhouette::{self, Sight};
+use crate::vector::{Vector, cross, dot, length, median, scale, sub};
 use ratn_model::pose::Pose;
 
 /// How far above or below its given pose the surface may be, in metres.
@@ -27,6 +29,16 @@ const UNBIASED: f64 = 1.5;
 const PLANE_POINTS: usize = 12_000;
 /// The least part of a depth's deviation that counts as height above the plane: a camera that looks along it says nothing else.
 const LEAST_FALL: f64 = 0.2;
+/// The least part of a ray that is taken for level: straight from above no wall is seen.
+const LEAST_LEVEL: f64 = 0.3;
+/// An edge is on the far side of something where the way across it goes up by this cosine: nothing else says where it ends there.
+const UPWARDS: f64 = 0.6;
+/// How far outside of the silhouette the rays are whose distance from a model is compared, in pixels.
+const BESIDE_EDGE: f64 = 2.5;
+/// What is so many deviations nearer than what a ray met has been passed by it.
+const PASSED: f64 = 3.0;
+/// What is higher than a wall of so many pixels, and than noise in so many deviations, hides some of the surface behind it.
+const HIDES: (f64, f64) = (2.0, 4.0);
 /// A depth is not more certain than this, in metres.
 const LEAST_SIGMA: f64 = 0.0004;
 /// Which pixels around a cluster's are asked whether they see past it, in steps along rows and columns.
@@ -38,6 +50,8 @@ const LOW: f64 = 0.035;
 const MOST_DEPTHS: f64 = 1200.0;
 /// What stands on the plane lifts it by about so much of its points' deviation: low parts are taken for it.
 const LIFT: f64 = 0.08;
+/// No cluster.
+const NOBODY: u16 = u16::MAX;
 /// RANSAC's choices: any number does; the same image gives the same objects.
 const SEED: u64 = 0x5EED;
 
@@ -45,14 +59,21 @@ const SEED: u64 = 0x5EED;
 pub(crate) struct View<'a> {
     image: &'a DepthImage,
     rays: Rays,
-    /// Pixels that see the surface, or what is behind and below it: nothing stands in their way.
-    free: Vec<bool>,
+    /// What each pixel says of the surface.
+    sights: Vec<Sight>,
     /// The surface's frame in the world: on the plane as seen, its z axis the plane's normal.
     pub(crate) frame: Pose,
     /// What stands on it: pixels, the largest cluster first.
     pub(crate) clusters: Vec<Vec<Seen>>,
-    /// Standard deviation of a depth, in metres.
+    /// Of each cluster, which ones of the first it is made of.
+    parts: Vec<[u16; 2]>,
+    /// Of each pixel, which of the first clusters it belongs to.
+    owners: Vec<u16>,
+    /// Standard deviation of a depth, and of a height above the surface, in metres.
     sigma: f64,
+    sigma_above: f64,
+    /// Of what the noise of neighbouring pixels has in common, in metres of depth.
+    shared: f64,
     /// See [`Evidence`].
     floor: f64,
     /// How well the plane is known: the variance of its height, in metres², and of its slope.
@@ -95,7 +116,11 @@ impl Rays {
 
     /// The direction of a pixel's ray: times the depth it is the way from the eye.
     fn way(&self, column: usize, row: usize) -> Vector {
-        std::array::from_fn(|i| self.origin[i] + column as f64 * self.per_column[i] + row as f64 * self.per_row[i])
+        self.way_at(column as f64, row as f64)
+    }
+
+    fn way_at(&self, column: f64, row: f64) -> Vector {
+        std::array::from_fn(|i| self.origin[i] + column * self.per_column[i] + row * self.per_row[i])
     }
 
     /// Column and row at which a point appears; `None` behind the camera.
@@ -140,9 +165,13 @@ impl<'a> View<'a> {
         let mut view = View {
             image,
             rays: Rays::new(camera, &frame),
-            free: vec![false; image.depth.len()],
+            shared: 1.0 / fall,
+            sights: vec![Sight::Missing; image.depth.len()],
+            sigma_above,
             frame,
             clusters: Vec::new(),
+            parts: Vec::new(),
+            owners: vec![NOBODY; image.depth.len()],
             sigma: (sigma_above / fall).max(LEAST_SIGMA),
             floor: clear_in_mean + UNBIASED * sigma_in_mean,
             // The variance of places spread evenly over the region's shorter edge is a third of its half, squared.
@@ -161,14 +190,24 @@ impl<'a> View<'a> {
         let heights = self.heights();
         let width = self.image.width;
         let means = level::means(&heights, width, clear as f32);
+        self.shared *= level::shared(&heights, width, clear as f32, self.sigma_above);
+        let seen = Heights { of: &heights, width, sigma: self.sigma_above };
         let mut above = Vec::new();
         for (pixel, (z, mean)) in heights.iter().zip(means).enumerate() {
-            if z.is_nan() || f64::from(*z) >= TALLEST {
+            if z.is_nan() {
+                continue;
+            }
+            self.sights[pixel] = Sight::Standing;
+            if f64::from(*z) >= TALLEST {
                 continue;
             }
             let stands = f64::from(*z) >= clear || (f64::from(*z) > -clear && f64::from(mean) >= clear_in_mean);
             if !stands {
-                self.free[pixel] = true;
+                self.sights[pixel] = Sight::Free;
+                continue;
+            }
+            if seen.is_flying(pixel, self.rise(pixel)) {
+                self.sights[pixel] = Sight::Flying;
                 continue;
             }
             let point = self.rays.point(pixel, f64::from(self.image.depth[pixel]));
@@ -177,6 +216,13 @@ impl<'a> View<'a> {
             }
         }
         above
+    }
+
+    /// How much higher an upright wall is by a pixel where this one sees it, in metres.
+    fn rise(&self, pixel: usize) -> f64 {
+        let way = self.rays.way(pixel % self.image.width, pixel / self.image.width);
+        let level = (way[0].hypot(way[1]) / length(way)).max(LEAST_LEVEL);
+        f64::from(self.image.depth[pixel]) * length(self.rays.per_row) / level
     }
 
     /// How far each pixel's point is above the surface, in metres; not a number where nothing came back.
@@ -204,10 +250,15 @@ impl<'a> View<'a> {
         let seen = clusters.map(|members| members.into_iter().map(|i| above[i as usize]).collect::<Vec<Seen>>());
         // What the image cuts off is not known to its end.
         self.clusters = seen.filter(|cluster| !cluster.iter().any(at_border)).collect();
+        for (number, cluster) in self.clusters.iter().enumerate() {
+            self.parts.push([number as u16; 2]);
+            cluster.iter().for_each(|seen| self.owners[seen.pixel as usize] = number as u16);
+        }
     }
 
     /// Two clusters as one more, unless their middles are farther apart than `most`.
     pub(crate) fn joined(&mut self, a: usize, b: usize, most: f64) -> Option<usize> {
+        let parts = [self.parts[a][0], self.parts[b][0]];
         let [a, b] = [a, b].map(|cluster| &self.clusters[cluster]);
         let middle = |cluster: &[Seen]| -> Vector {
             std::array::from_fn(|i| cluster.iter().map(|seen| seen.point[i]).sum::<f64>() / cluster.len().max(1) as f64)
@@ -217,11 +268,12 @@ impl<'a> View<'a> {
         }
         let both = a.iter().chain(b).copied().collect();
         self.clusters.push(both);
+        self.parts.push(parts);
         Some(self.clusters.len() - 1)
     }
 
     /// At most `points` of a cluster's points, evenly, and at most `free` of the rays beside it.
-    pub(crate) fn evidence(&self, cluster: usize, points: usize, free: usize) -> Evidence {
+    pub(crate) fn evidence(&self, cluster: usize, [points, free, edges]: [usize; 3]) -> Evidence {
         let members = &self.clusters[cluster];
         let beside = self.beside(cluster);
         let thinned = |count: usize, most: usize| (0..count).step_by(count.div_ceil(most).max(1));
@@ -229,13 +281,51 @@ impl<'a> View<'a> {
         Evidence {
             eye: self.rays.eye,
             points: thinned(members.len(), points).map(|i| members[i].point).collect(),
-            free: thinned(beside.len(), free)
-                .map(|i| self.rays.point(beside[i], f64::from(self.image.depth[beside[i]])))
-                .collect(),
+            free: thinned(beside.len(), free).map(|i| self.rays.point(beside[i], self.passed(beside[i]))).collect(),
+            edges: self.edges(cluster, edges),
             floor: self.floor,
             sigma: self.sigma,
+            shared: self.shared,
             pitch: length(sub(first, self.rays.eye)) * length(self.rays.per_column),
         }
+    }
+
+    /// How far a ray has surely passed, in metres of depth: where it met something, noise may have put it a little behind.
+    fn passed(&self, pixel: usize) -> f64 {
+        let depth = f64::from(self.image.depth[pixel]);
+        if self.sights[pixel] == Sight::Standing { depth - PASSED * self.sigma } else { depth }
+    }
+
+    /// At most so many rays along a cluster's silhouette, evenly.
+    fn edges(&self, cluster: usize, most: usize) -> Vec<Edge> {
+        let width = self.image.width;
+        let hides =
+            |seen: &&Seen| seen.point[2] > HIDES.0 * self.rise(seen.pixel as usize) + HIDES.1 * self.sigma_above;
+        let crossings: Vec<(Vector, silhouette::Crossing)> = self.clusters[cluster]
+            .iter()
+            .filter(hides)
+            .flat_map(|seen| silhouette::beside(&self.sights, width, seen.pixel as usize).map(|at| (seen.point, at)))
+            .collect();
+        let edge = |(point, at): &(Vector, silhouette::Crossing)| {
+            let [right, down] = silhouette::outwards(&self.sights, width, at)?;
+            let [edge, way] =
+                [0.0, BESIDE_EDGE].map(|off| self.rays.way_at(at.column + off * right, at.row + off * down));
+            let (to_surface, away) = (-self.rays.eye[2] / way[2], length(sub(*point, self.rays.eye)));
+            let [from, to] = [edge, way].map(|way| scale(way, 1.0 / length(way)));
+            let (turn, level) = (length(sub(to, from)), from[0].hypot(from[1]).max(LEAST_LEVEL));
+            // At the sides, points and the rays past them say where it ends.
+            if (to[2] - from[2]) / turn < UPWARDS * level {
+                return None;
+            }
+            let beside = turn * away;
+            Some(Edge {
+                end: std::array::from_fn(|i| self.rays.eye[i] + to_surface * way[i]),
+                beside,
+                sigma: UNLIKE_AT_EDGES.hypot(at.sigma * beside / BESIDE_EDGE),
+            })
+        };
+        let stride = crossings.len().div_ceil(most).max(1);
+        crossings.iter().step_by(stride).filter_map(edge).collect()
     }
 
     /// The depths around a fork, as it lies now.
@@ -266,7 +356,7 @@ impl<'a> View<'a> {
                 let (u, v) = (self.rays.eye[0] + surface * way[0] - x, self.rays.eye[1] + surface * way[1] - y);
                 let beside = (cos * u + sin * v).abs() > along || (cos * v - sin * u).abs() > across;
                 if !beside && (self.rays.eye[2] + depth * way[2]).abs() < LOW {
-                    depths.push(Depth { way, depth });
+                    depths.push(Depth { way, depth, pixel: [column as i32, row as i32] });
                 }
             }
         }
@@ -276,12 +366,19 @@ impl<'a> View<'a> {
             eye: self.rays.eye,
             depths: depths.into_iter().step_by(stride).collect(),
             sigma: self.sigma,
+            shared: self.shared,
             pitch: distance * length(self.rays.per_column),
         }
     }
 
-    /// Pixels beside a cluster that see past it, each once.
+    /// Pixels beside a cluster that see past it, the surface or another cluster, each once.
     fn beside(&self, cluster: usize) -> Vec<usize> {
+        let own = self.parts[cluster];
+        let passes = |pixel: usize| match self.sights[pixel] {
+            Sight::Free => true,
+            Sight::Standing => self.owners[pixel] != NOBODY && !own.contains(&self.owners[pixel]),
+            Sight::Missing | Sight::Flying => false,
+        };
         let (width, rows) = (self.image.width as isize, self.image.height as isize);
         let mut found = Vec::new();
         for seen in &self.clusters[cluster] {
@@ -292,7 +389,7 @@ impl<'a> View<'a> {
                 {
                     if (0..width).contains(&column) && (0..rows).contains(&row) {
                         let pixel = (row * width + column) as usize;
-                        if self.free[pixel] {
+                        if passes(pixel) {
                             found.push(pixel);
                         }
                     }

@@ -8,7 +8,10 @@ use ratn_perception::detection::{Detection, DetectionError, ObjectClass, Prior, 
 use ratn_perception::mask::Ball;
 use ratn_perception::noise::Noise;
 use ratn_perception::render::{Body, render};
-use ratn_perception::trial::{self, OPTICS, Placed, compare, mast_camera, random_table, region, table_image};
+use ratn_perception::sensor::Sensor;
+use ratn_perception::trial::{
+    self, OPTICS, Placed, compare, mast_camera, random_table, random_things, region, table_image, things_image,
+};
 use ratn_world::scene::Shape;
 
 /// Tables of 1 to 8 objects.
@@ -58,6 +61,22 @@ fn are_found(frames: u32, least_confidence: f64) {
     // 1 in the mean where covariances are true.
     let consistency = squares.iter().sum::<f64>() / squares.len() as f64;
     assert!((0.5..1.5).contains(&consistency), "{consistency}");
+}
+
+#[test]
+fn things_that_no_model_is_exactly_are_found_by_a_sensor_with_flying_pixels_too() {
+    let camera = mast_camera(OPTICS);
+    let (mut objects, mut good, mut phantoms) = (0, 0, 0);
+    for seed in 500..516 {
+        let table = random_things(seed, 1 + seed as usize % 8, &camera);
+        let image = things_image(&table, &camera, &Sensor::DEFAULT, seed, FRAMES);
+        let found = segment(&image, &camera, &region(), &ObjectClass::ALL, &[]).unwrap();
+        let (matches, phantom) = compare(&table, &found);
+        objects += matches.len();
+        good += matches.iter().filter(|m| m.is_good()).count();
+        phantoms += phantom.len();
+    }
+    assert!(good as f64 >= 0.9 * objects as f64 && phantoms == 0, "{good} of {objects}, {phantoms} false");
 }
 
 #[test]

@@ -1,18 +1,20 @@
 //! A model in its place, ready for many questions: how far points are from it, and how deep rays pass through it.
 
-use super::{Evidence, Fit};
+use super::{EDGE_CUT_OFF, Edge, Evidence, Fit};
 use crate::model::Model;
+use crate::model::form::Form;
 use crate::vector::{Vector, length, sub};
 
 /// How exactly the deepest place of a ray is found, in metres.
 const RESOLUTION: f64 = 0.002;
 /// A ray that stays farther from the model than this passes well clear, in metres.
-const NEAR: f64 = 0.004;
+pub(super) const NEAR: f64 = 0.004;
 
 /// A fit ready for many questions.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Placed {
-    pub(super) model: Model,
+    model: Model,
+    form: Form,
     at: Vector,
     sin: f64,
     cos: f64,
@@ -32,41 +34,52 @@ impl Placed {
         let model = fit.model();
         let (sin, cos) = fit.yaw().sin_cos();
         let at = [fit.parameters[0], fit.parameters[1], model.size()[2] / 2.0];
-        let mut placed = Placed { model, at, sin, cos, eye };
+        let mut placed = Placed { model, form: fit.form(), at, sin, cos, eye };
         placed.eye = placed.local(eye);
         placed
     }
 
     /// How far a point is from the surface that the camera sees.
     pub(super) fn distance(&self, point: Vector) -> f64 {
-        self.model.distance(self.local(point), self.eye)
+        self.model.distance(self.form, self.local(point), self.eye)
+    }
+
+    /// How far a point is from what no ray passes.
+    pub(super) fn fill_distance(&self, point: Vector) -> f64 {
+        self.model.fill_distance(self.form, self.local(point))
     }
 
     /// A point in the model's frame.
-    pub(super) fn local(&self, p: Vector) -> Vector {
+    fn local(&self, p: Vector) -> Vector {
         let (x, y) = (p[0] - self.at[0], p[1] - self.at[1]);
         [self.cos * x + self.sin * y, self.cos * y - self.sin * x, p[2] - self.at[2]]
     }
 
-    /// Where the ray from the eye to `end` is deepest, above the floor; `None` where it passes well clear. Golden section: along
+    /// Where a ray beside the silhouette is nearest; `None` far from the model.
+    pub(super) fn at_edge(&self, evidence: &Evidence, edge: &Edge) -> Option<Deepest> {
+        self.deepest(evidence, edge.end, edge.beside + EDGE_CUT_OFF * edge.sigma)
+    }
+
+    /// Where the ray from the eye to `end` is deepest, above the floor; `None` where it stays farther from the model than `near`. Golden section: along
     /// a line the distance to a convex body has one minimum.
-    pub(super) fn deepest(&self, evidence: &Evidence, end: Vector) -> Option<Deepest> {
+    pub(super) fn deepest(&self, evidence: &Evidence, end: Vector, near: f64) -> Option<Deepest> {
         let eye = evidence.eye;
         let fall = eye[2] - end[2];
         let [long, width, height] = self.model.size();
-        if fall < 1e-3 || eye[2] <= height || height <= evidence.floor {
+        if fall < 1e-3 || eye[2] <= height || height <= end[2].max(evidence.floor) {
             return None;
         }
         let at = |z: f64| -> Vector {
             let t = (eye[2] - z) / fall;
             std::array::from_fn(|i| eye[i] + t * (end[i] - eye[i]))
         };
-        let (top, bottom) = (at(height), at(evidence.floor));
-        if self.passes_clear(top, bottom, long.hypot(width) / 2.0) {
+        // What is nearest to a ray that passes over an edge is above that.
+        let (top, bottom) = (at((height + near).min(eye[2])), at(end[2].max(evidence.floor)));
+        if self.passes_clear(top, bottom, long.hypot(width) / 2.0 + near) {
             return None;
         }
         let point = |s: f64| -> Vector { std::array::from_fn(|i| top[i] + s * (bottom[i] - top[i])) };
-        let depth = |s: f64| self.model.fill_distance(self.local(point(s)));
+        let depth = |s: f64| self.fill_distance(point(s));
         const GOLDEN: f64 = 0.618_033_988_749_895;
         let (mut low, mut high) = (0.0, 1.0);
         let (mut a, mut b) = (high - GOLDEN * (high - low), low + GOLDEN * (high - low));
@@ -74,7 +87,7 @@ impl Placed {
         let mut left = length(sub(bottom, top));
         while left > RESOLUTION {
             // Distances change by no more than the way: nothing within what is left gets near.
-            if depth_a.min(depth_b) > (1.0 - GOLDEN) * left + NEAR {
+            if depth_a.min(depth_b) > (1.0 - GOLDEN) * left + near {
                 return None;
             }
             left *= GOLDEN;
@@ -97,6 +110,6 @@ impl Placed {
         let (dx, dy) = (bottom[0] - top[0], bottom[1] - top[1]);
         let (px, py) = (self.at[0] - top[0], self.at[1] - top[1]);
         let t = ((px * dx + py * dy) / (dx * dx + dy * dy).max(1e-12)).clamp(0.0, 1.0);
-        (px - t * dx).powi(2) + (py - t * dy).powi(2) > (radius + NEAR).powi(2)
+        (px - t * dx).powi(2) + (py - t * dy).powi(2) > radius.powi(2)
     }
 }

@@ -6,9 +6,10 @@
 //! the fork is where all of them together are likeliest (a matched filter; Turin 1960), by Gauss and Newton. So the inverse of
 //! the normal equations is the covariance.
 
-use super::{Covariance, FIRST_DIMENSION, Fit, MAX_PARAMETERS, YAW};
+use super::{Covariance, FIRST_DIMENSION, FIRST_FORM, Fit};
+use crate::level;
 use crate::model::{ObjectClass, Strip};
-use crate::normal::Normal;
+use crate::normal::{Blocks, N as MAX_PARAMETERS, Normal};
 use crate::vector::Vector;
 use std::f64::consts::PI;
 
@@ -21,6 +22,8 @@ pub(crate) struct Relief {
     pub(crate) depths: Vec<Depth>,
     /// Standard deviation of a depth, in metres.
     pub(crate) sigma: f64,
+    /// Standard deviation of what the noise of neighbouring pixels has in common, in metres.
+    pub(crate) shared: f64,
     /// The distance between neighbouring pixels' rays, in metres.
     pub(crate) pitch: f64,
 }
@@ -32,45 +35,56 @@ pub(crate) struct Depth {
     pub(crate) way: Vector,
     /// Along the optical axis, in metres.
     pub(crate) depth: f64,
+    /// Its column and row.
+    pub(crate) pixel: [i32; 2],
 }
 
-/// The steps of numeric derivatives: of place and length in metres, of yaw in radians.
-const DIFFERENCE: f64 = 5e-4;
-const TURN: f64 = 4e-3;
-/// How wide an edge is, in pixels: they are longer on the surface than across their rays.
-const EDGE: f64 = 1.5;
-/// How much larger variances are than the normal equations say, as measured on random tables, much the same from near, from far and
+/// Of each parameter whether a fit finds it, the step of its numeric derivative and the longest step of an iteration; metres, radians, parts.
+const FREE: [(bool, f64, f64); MAX_PARAMETERS] = [
+    (true, 5e-4, 0.008),
+    (true, 5e-4, 0.008),
+    (true, 4e-3, 0.06),
+    (true, 5e-4, 0.008),
+    (false, 0.0, 0.0),
+    (false, 0.0, 0.0),
+    (true, 0.02, 0.1),
+    (true, 1e-3, 0.004),
+    (true, 0.02, 0.1),
+];
+/// What is usual of a fork's length: its mean and deviation, in metres.
+const USUAL_LENGTH: (f64, f64) = (0.19, 0.015);
+/// Rows and columns of a block of pixels that share noise.
+const BLOCK: i32 = level::BLOCK as i32;
+/// By how much a fork must explain the depths better than the surface alone does, as a sum of squares by their variance.
+const LEAST_GAIN: f64 = 120.0;
+/// How much larger variances are than the normal equations say, as measured on random tables of exact forks, much the same from near, from far and
 /// with ten frames: pixels do not see the soft edges that they are compared with.
 const EXCESS: f64 = 2.2;
+/// How wide an edge is, in pixels: they are longer on the surface than across their rays.
+const EDGE: f64 = 1.5;
 /// A residual beyond so many deviations counts no more than this.
 const CUT_OFF: f64 = 4.0;
-/// Steps below which it has settled, in metres and radians.
-const SETTLED: f64 = 5e-5;
-/// The longest step, in metres and radians.
-const LONGEST: (f64, f64) = (0.008, 0.06);
-/// Where along a fork, and how much longer than it, is tried to begin with; metres, and parts.
-const SHIFTS: [f64; 7] = [-0.030, -0.020, -0.010, 0.0, 0.010, 0.020, 0.030];
-const LONGER: [f64; 2] = [1.0, 1.12];
-/// Place, yaw and length.
-const FREE: [bool; MAX_PARAMETERS] = [true, true, true, true, false, false];
+/// A step below which it has settled, as a part of the longest one.
+const SETTLED: f64 = 0.006;
+/// Where along a fork is tried to begin with, in metres.
+const SHIFTS: [f64; 9] = [-0.048, -0.036, -0.024, -0.012, 0.0, 0.012, 0.024, 0.036, 0.048];
 
 impl Relief {
     /// Forks near this one to begin with, the likeliest first: either way round, and along it, since of a fork whose ends are lost in
     /// noise the middle is known badly.
     pub(crate) fn starts(&self, around: &Fit) -> Vec<Fit> {
-        let strip = Strip::new();
         let few = Relief { depths: self.depths.iter().step_by(3).copied().collect(), ..*self };
         let (sin, cos) = around.yaw().sin_cos();
         let mut starts: Vec<(f64, Fit)> = Vec::new();
         for turn in [0.0, PI] {
             for along in SHIFTS {
-                for longer in LONGER {
+                for length in [USUAL_LENGTH.0 - USUAL_LENGTH.1, USUAL_LENGTH.0 + USUAL_LENGTH.1] {
                     let mut start = around.turned(turn);
                     start.parameters[0] += along * cos;
                     start.parameters[1] += along * sin;
-                    start.parameters[FIRST_DIMENSION] *= longer;
+                    start.parameters[FIRST_DIMENSION] = length;
                     let start = start.bounded();
-                    starts.push((few.cost(&few.expected(&strip, &start)), start));
+                    starts.push((few.cost(&start, &few.expected(&start)), start));
                 }
             }
         }
@@ -78,30 +92,31 @@ impl Relief {
         starts.into_iter().map(|(_, start)| start).collect()
     }
 
-    /// The fork near this one that is likeliest, how badly it explains the depths (the mean square of their residuals by their
+    /// The fork near this one that is likeliest, how badly it explains the depths (the sum of the squares of their residuals by their
     /// variance, and that variance's logarithm), and how uncertain it is.
     pub(crate) fn refined(&self, start: Fit, iterations: usize) -> (Fit, f64, Covariance) {
         debug_assert_eq!(start.class, ObjectClass::Fork);
-        let strip = Strip::new();
         let (mut here, mut damping) = (start, 1e-3);
-        let mut expected = self.expected(&strip, &here);
-        let mut cost = self.cost(&expected);
-        let mut normal = self.normal(&strip, &here, &expected);
+        let mut expected = self.expected(&here);
+        let mut cost = self.cost(&here, &expected);
+        let shared = self.shared.powi(2);
+        let mut normal = self.normal(&here, &expected, shared);
+        let fixed = FREE.map(|(free, ..)| !free);
         for _ in 0..iterations {
-            let Some(step) = normal.step(&FREE.map(|free| !free), damping) else { break };
+            let Some(step) = normal.step(&fixed, damping) else { break };
             let mut next = here.clone();
-            for (i, (parameter, step)) in next.parameters.iter_mut().zip(step).enumerate() {
-                let longest = if i == YAW { LONGEST.1 } else { LONGEST.0 };
+            for ((parameter, step), (_, _, longest)) in next.parameters.iter_mut().zip(step).zip(FREE) {
                 *parameter -= step.clamp(-longest, longest);
             }
             let next = next.bounded();
-            let next_expected = self.expected(&strip, &next);
-            let next_cost = self.cost(&next_expected);
+            let next_expected = self.expected(&next);
+            let next_cost = self.cost(&next, &next_expected);
             if next_cost < cost {
                 let gained = cost - next_cost;
-                let moved = here.parameters.iter().zip(next.parameters).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                let moved = here.parameters.iter().zip(next.parameters).zip(FREE).filter(|(_, (free, ..))| *free);
+                let moved = moved.map(|((a, b), (.., longest))| (a - b).abs() / longest).fold(0.0, f64::max);
                 (here, expected, cost) = (next, next_expected, next_cost);
-                normal = self.normal(&strip, &here, &expected);
+                normal = self.normal(&here, &expected, shared);
                 damping = (damping * 0.2_f64).max(1e-6);
                 if moved < SETTLED || gained < 0.01 {
                     break;
@@ -114,17 +129,45 @@ impl Relief {
             }
         }
         let unknown = std::array::from_fn(|i| std::array::from_fn(|j| if i == j { super::UNKNOWN } else { 0.0 }));
-        let inverse = normal.inverse(&FREE.map(|free| !free)).unwrap_or(unknown);
-        let pose = std::array::from_fn(|row| std::array::from_fn(|column| EXCESS * inverse[row][column]));
+        // What the depths scatter more than their noise does is the fork's being unlike the model, and neighbours share that.
+        let unlike = (self.scatter(&expected) - 1.0).max(0.0) * self.sigma.powi(2);
+        let normal = self.normal(&here, &expected, self.shared.powi(2) + unlike);
+        let covariance = normal.inverse(&fixed).map_or(unknown, |inverse| inverse.map(|row| row.map(|c| EXCESS * c)));
+        let pose = std::array::from_fn(|row| std::array::from_fn(|column| covariance[row][column]));
         // Its height follows its length.
         let grows = here.model().size()[2] / here.parameters[FIRST_DIMENSION];
-        let height = EXCESS * inverse[FIRST_DIMENSION][FIRST_DIMENSION] * grows * grows;
-        (here, cost / self.depths.len().max(1) as f64, Covariance { pose, height })
+        let height = covariance[FIRST_DIMENSION][FIRST_DIMENSION] * grows * grows;
+        (here, cost, Covariance { pose, height })
+    }
+
+    /// The mean square of the residuals by their variance.
+    fn scatter(&self, expected: &[(f64, f64)]) -> f64 {
+        let squares = self
+            .depths
+            .iter()
+            .zip(expected)
+            .map(|(depth, (mean, variance))| ((depth.depth - mean).powi(2) / variance).min(CUT_OFF * CUT_OFF));
+        squares.sum::<f64>() / self.depths.len().max(1) as f64
+    }
+
+    /// Whether a fork that explains the depths so badly explains them better than the surface alone.
+    pub(crate) fn shows(&self, cost: f64) -> bool {
+        let mut blocks = Blocks::default();
+        let square = |depth: &Depth| {
+            let residual = depth.depth + self.eye[2] / depth.way[2];
+            let square = (residual / self.sigma).powi(2);
+            if square < CUT_OFF * CUT_OFF {
+                blocks.add(depth.block(), &[0.0; MAX_PARAMETERS], residual, self.sigma.powi(-2));
+            }
+            square.min(CUT_OFF * CUT_OFF)
+        };
+        let squares: f64 = self.depths.iter().map(square).sum();
+        squares - blocks.relief(self.shared.powi(2)) - cost > LEAST_GAIN
     }
 
     /// The depth of each pixel and its variance, if the fork lay so.
-    fn expected(&self, strip: &Strip, fit: &Fit) -> Vec<(f64, f64)> {
-        let length = fit.parameters[FIRST_DIMENSION];
+    fn expected(&self, fit: &Fit) -> Vec<(f64, f64)> {
+        let (strip, length) = (Strip::new(fit.form()), fit.parameters[FIRST_DIMENSION]);
         let (sin, cos) = fit.yaw().sin_cos();
         let turned =
             |p: Vector| [(cos * p[0] + sin * p[1]) / length, (cos * p[1] - sin * p[0]) / length, p[2] / length];
@@ -144,38 +187,63 @@ impl Relief {
         self.depths.iter().map(of).collect()
     }
 
-    fn cost(&self, expected: &[(f64, f64)]) -> f64 {
+    fn cost(&self, fit: &Fit, expected: &[(f64, f64)]) -> f64 {
+        let mut blocks = Blocks::default();
         let square = |(depth, (mean, variance)): (&Depth, &(f64, f64))| {
-            ((depth.depth - mean).powi(2) / variance).min(CUT_OFF * CUT_OFF)
-                + (variance / (self.sigma * self.sigma)).ln()
+            let residual = depth.depth - mean;
+            if residual * residual < CUT_OFF * CUT_OFF * variance {
+                blocks.add(depth.block(), &[0.0; MAX_PARAMETERS], residual, 1.0 / variance);
+            }
+            (residual.powi(2) / variance).min(CUT_OFF * CUT_OFF) + (variance / (self.sigma * self.sigma)).ln()
         };
-        self.depths.iter().zip(expected).map(square).sum()
+        let squares: f64 = self.depths.iter().zip(expected).map(square).sum();
+        let unusual = usual(fit).map(|(_, off, deviation)| (off / deviation).powi(2));
+        squares - blocks.relief(self.shared.powi(2)) + unusual.sum::<f64>()
     }
 
-    fn normal(&self, strip: &Strip, here: &Fit, expected: &[(f64, f64)]) -> Normal {
-        let slopes: Vec<Vec<f64>> = (0..=FIRST_DIMENSION)
+    fn normal(&self, here: &Fit, expected: &[(f64, f64)], shared: f64) -> Normal {
+        let slopes: Vec<Option<Vec<f64>>> = (0..MAX_PARAMETERS)
             .map(|i| {
-                let step = if i == YAW { TURN } else { DIFFERENCE };
+                let (free, step, _) = FREE[i];
                 let mut next = here.clone();
                 next.parameters[i] += step;
-                self.expected(strip, &next)
-                    .iter()
-                    .zip(expected)
-                    .map(|(there, here)| (there.0 - here.0) / step)
-                    .collect()
+                let along = |there: Vec<(f64, f64)>| {
+                    there.iter().zip(expected).map(|(there, here)| (there.0 - here.0) / step).collect()
+                };
+                free.then(|| along(self.expected(&next)))
             })
             .collect();
-        let mut normal = Normal::default();
+        let (mut normal, mut blocks) = (Normal::default(), Blocks::default());
         for (i, (depth, (mean, variance))) in self.depths.iter().zip(expected).enumerate() {
             let residual = mean - depth.depth;
             if residual * residual > CUT_OFF * CUT_OFF * variance {
                 continue;
             }
-            let slope = std::array::from_fn(|k| slopes.get(k).map_or(0.0, |slopes| slopes[i]));
+            let slope = std::array::from_fn(|k| slopes[k].as_ref().map_or(0.0, |slopes| slopes[i]));
             if slope != [0.0; MAX_PARAMETERS] {
                 normal.add(&slope, residual, 1.0 / variance);
             }
+            blocks.add(depth.block(), &slope, residual, 1.0 / variance);
+        }
+        let mut normal = normal.with_shared(&blocks, shared);
+        for (i, off, deviation) in usual(here) {
+            normal.expect(i, off, deviation.powi(-2));
         }
         normal
     }
+}
+
+impl Depth {
+    /// Which pixels share its noise.
+    fn block(&self) -> [i32; 3] {
+        [self.pixel[0] / BLOCK, self.pixel[1] / BLOCK, 0]
+    }
+}
+
+/// Of each parameter that has a usual value how far it is from that, and by what deviation.
+fn usual(fit: &Fit) -> impl Iterator<Item = (usize, f64, f64)> {
+    let length = (FIRST_DIMENSION, fit.parameters[FIRST_DIMENSION] - USUAL_LENGTH.0, USUAL_LENGTH.1);
+    let form = fit.form();
+    let of_form = ObjectClass::Fork.usual().iter().enumerate();
+    of_form.map(move |(i, usual)| (FIRST_FORM + i, form[i] - usual.mean, usual.deviation)).chain([length])
 }

@@ -26,6 +26,13 @@ const SLACK: f64 = 0.25;
 /// Points of the top face are within this of its height, in metres.
 const TOP: f64 = 0.010;
 
+/// How much of a fork is seen at least, as a part of its length.
+const FORK_IN_PARTS: f64 = 0.65;
+/// The upper part of what is round, in which it has no handle, as a part of its height.
+const RING: f64 = 0.15;
+/// A handle moves the middle of the extents by more than this, in metres.
+const HANDLE: f64 = 0.006;
+
 impl Outline {
     /// The principal axes of the points seen from above (Pearson 1901), by the closed form for two dimensions.
     pub(crate) fn of(points: &[Vector]) -> Option<Outline> {
@@ -66,7 +73,10 @@ impl Outline {
         match class {
             ObjectClass::Box => within(self.height, *ranges[2].start(), *ranges[2].end()) && long > *ranges[0].start(),
             ObjectClass::Fork => {
-                within(long, *ranges[0].start(), *ranges[0].end()) && short < 0.4 * long && self.height < 0.035
+                // Head and handle come apart where the bow is as low as noise.
+                within(long, FORK_IN_PARTS * ranges[0].start(), *ranges[0].end())
+                    && short < 0.4 * long
+                    && self.height < 0.035
             }
             _ => {
                 within(long, 2.0 * ranges[0].start(), 2.0 * ranges[0].end())
@@ -83,8 +93,26 @@ impl Outline {
                 [self.top_rectangle(points), Some(by_axes)].into_iter().flatten().collect()
             }
             ObjectClass::Fork => [0.0, PI].map(|turn| Fit::new(class, self.middle, self.yaw + turn, &[long])).to_vec(),
-            _ => vec![Fit::new(class, self.middle, 0.0, &[long / 2.0, self.height])],
+            _ => {
+                let by_axes = Fit::new(class, self.middle, 0.0, &[long / 2.0, self.height]);
+                let by_top = self.top_ring(points).filter(|(at, _)| {
+                    (at[0] - self.middle[0]).hypot(at[1] - self.middle[1]) > HANDLE || class == ObjectClass::Cup
+                });
+                let by_top = by_top.map(|(at, radius)| Fit::new(class, at, 0.0, &[radius, self.height]));
+                [Some(by_axes), by_top].into_iter().flatten().collect()
+            }
         }
+    }
+
+    /// Around what is round at the top: the middle of the extents there, and half of them. A handle is lower.
+    fn top_ring(&self, points: &[Vector]) -> Option<([f64; 2], f64)> {
+        let top = points.iter().filter(|p| p[2] > (1.0 - RING) * self.height);
+        let along = |axis: usize| {
+            let mut at: Vec<f64> = top.clone().map(|p| p[axis]).collect();
+            Some((quantile(&mut at, TAIL)?, quantile(&mut at, 1.0 - TAIL)?))
+        };
+        let (x, y) = (along(0)?, along(1)?);
+        Some(([(x.0 + x.1) / 2.0, (y.0 + y.1) / 2.0], (x.1 - x.0).max(y.1 - y.0) / 2.0))
     }
 
     /// The least rectangle around a box's top face: where its sides are alike, the principal axes say nothing of its yaw.

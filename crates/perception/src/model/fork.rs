@@ -2,6 +2,7 @@
 //!
 //! A bent strip along x: nodes give its height and width, everything grows with its length.
 
+use super::form::{BOW, Form, GAPS, RISE};
 use crate::vector::Vector;
 
 /// One cross section, of a fork of unit length.
@@ -23,6 +24,9 @@ pub(super) const NODES: [Node; 6] = [
     Node { x: 0.36, z: 0.0240, width: 0.125 },
     Node { x: 0.50, z: 0.0640, width: 0.115 },
 ];
+
+/// How much of a bow that is lower lowers each node.
+const BENT: [f64; NODES.len()] = [0.0, 0.0, 0.0, 0.7, 1.0, 0.0];
 
 /// The strip's thickness.
 pub(super) const THICKNESS: f64 = 0.015;
@@ -57,7 +61,11 @@ pub(super) fn fill_distance(length: f64, point: Vector) -> f64 {
 
 /// The strip in parts, as rays from above meet it: of a fork of unit length in its frame, but with z = 0 at the table.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Strip([Part; NODES.len() - 1]);
+pub(crate) struct Strip {
+    parts: [Part; NODES.len() - 1],
+    /// How much of a tine's pitch is metal at its root and, less, at its tip.
+    metal: [f64; 2],
+}
 
 /// A straight part of the strip: the middle of its cross section goes from `start` along `along`.
 #[derive(Debug, Clone, Copy)]
@@ -72,9 +80,15 @@ struct Part {
 }
 
 impl Strip {
-    pub(crate) fn new() -> Strip {
-        Strip(std::array::from_fn(|i| {
-            let (a, b) = (NODES[i], NODES[i + 1]);
+    /// The strip of a fork of this form.
+    pub(crate) fn new(form: Form) -> Strip {
+        let node = |i: usize| {
+            let lower = form[BOW] * BENT[i];
+            let z = (NODES[i].z * (1.0 + form[RISE]) - lower).max(THICKNESS / 2.0);
+            Node { z, ..NODES[i] }
+        };
+        let parts = std::array::from_fn(|i| {
+            let (a, b) = (node(i), node(i + 1));
             let (dx, dz) = (b.x - a.x, b.z - a.z);
             let length = dx.hypot(dz);
             Part {
@@ -84,7 +98,8 @@ impl Strip {
                 width: [a.width, (b.width - a.width) / length],
                 ends: [i == 0, i + 2 == NODES.len()],
             }
-        }))
+        });
+        Strip { parts, metal: [TINE - 0.5 * form[GAPS], TINE - 1.5 * form[GAPS]].map(|metal| metal.max(0.05)) }
     }
 
     /// How much of a pixel sees the strip, 0 to 1, and how far along its ray, in lengths of `way`. A pixel is as wide as `pixel`; of
@@ -102,8 +117,8 @@ impl Strip {
         let mut best: Option<(f64, f64)> = None;
         let near =
             |part: &&Part| x + slack_x >= part.start[0] && x - slack_x <= part.start[0] + part.along[0] * part.length;
-        for part in self.0.iter().filter(near) {
-            if let Some((covered, at)) = part.met(eye, way, pixel)
+        for part in self.parts.iter().filter(near) {
+            if let Some((covered, at)) = part.met(eye, way, pixel, self.metal)
                 && best.is_none_or(|(most, first)| covered > most || (covered == most && at < first))
             {
                 best = Some((covered, at));
@@ -114,7 +129,7 @@ impl Strip {
 }
 
 impl Part {
-    fn met(&self, eye: Vector, way: Vector, pixel: f64) -> Option<(f64, f64)> {
+    fn met(&self, eye: Vector, way: Vector, pixel: f64, metal: [f64; 2]) -> Option<(f64, f64)> {
         let [ux, uz] = self.along;
         let (ex, ez) = (eye[0] - self.start[0], eye[2] - self.start[1]);
         let (off, fall) = (ux * ez - uz * ex, ux * way[2] - uz * way[0]);
@@ -140,7 +155,8 @@ impl Part {
         }
         if self.ends[1] {
             let pitch = width / (TINES as f64 - 1.0 + TINE);
-            covered *= (TINE + (y - y_leaving).abs() / pitch).min(1.0);
+            let tine = metal[0] + (metal[1] - metal[0]) * (s / self.length).clamp(0.0, 1.0);
+            covered *= (tine + (y - y_leaving).abs() / pitch).min(1.0);
         }
         // Through a side or an end of the strip it is met later.
         let later = |outside: f64, way: f64| if outside > 0.0 { (outside / way.abs().max(1e-9)).min(1.0) } else { 0.0 };

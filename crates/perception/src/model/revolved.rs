@@ -1,6 +1,7 @@
 //! Walls of even thickness, turned about an axis: a polyline of (radius, height) is the middle of the wall.
 
 use super::Round;
+use super::form::{BELLY, Form, LIFT};
 
 /// A point of the half plane: distance from the axis and height above the table, in metres.
 pub(super) type Point = [f64; 2];
@@ -8,25 +9,43 @@ pub(super) type Point = [f64; 2];
 /// How thick the walls are, in metres.
 const WALL: f64 = 0.004;
 
-/// The middle of the wall from the axis to the rim, as parts of what is left of radius and height beside the wall itself.
-fn shape(kind: Round) -> &'static [Point] {
+/// How wide the rim around a can's lid is, in metres.
+const RIM: f64 = 0.003;
+
+/// How high the seam is that stands out from a can's side at its top, in metres.
+const SEAM: f64 = 0.004;
+
+/// What is round: its greatest radius, its height, and its form (see [`super::form`]).
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Turned {
+    pub(super) kind: Round,
+    pub(super) radius: f64,
+    pub(super) height: f64,
+    pub(super) form: Form,
+}
+
+/// The middle of the wall from the axis to the rim, as parts of what is left of radius and height beside the wall itself; and how much
+/// of its form's belly each place moves out.
+fn shape(kind: Round) -> &'static [[f64; 3]] {
     match kind {
         Round::Can => &[],
-        Round::Cup => &[[0.0, 0.0], [0.78, 0.0], [1.0, 1.0]],
-        Round::Bowl => &[[0.0, 0.0], [0.45, 0.0], [0.74, 0.22], [0.91, 0.56], [1.0, 1.0]],
-        Round::Plate => &[[0.0, 0.0], [0.60, 0.0], [0.72, 0.42], [1.0, 1.0]],
+        Round::Cup => &[[0.0, 0.0, 0.0], [0.78, 0.0, 1.0], [1.0, 1.0, 0.0]],
+        Round::Bowl => &[[0.0, 0.0, 0.0], [0.45, 0.0, 0.5], [0.74, 0.22, 1.0], [0.91, 0.56, 0.6], [1.0, 1.0, 0.0]],
+        Round::Plate => &[[0.0, 0.0, 0.0], [0.60, 0.0, 1.0], [0.72, 0.42, 1.0], [1.0, 1.0, 0.0]],
     }
 }
 
 /// The middle of the wall, in metres.
-fn wall(kind: Round, radius: f64, height: f64) -> impl Iterator<Item = Point> + Clone {
+fn wall(of: &Turned) -> impl Iterator<Item = Point> + Clone + use<> {
     let half = WALL / 2.0;
-    shape(kind).iter().map(move |[r, z]| [r * (radius - half), half + z * (height - WALL)])
+    let (across, bottom) = (of.radius - half, half + of.form[LIFT]);
+    let (belly, rise) = (of.form[BELLY], of.height - half - bottom);
+    shape(of.kind).iter().map(move |[r, z, out]| [(r * across + out * belly).min(across), bottom + z * rise])
 }
 
 /// How much the topmost part of the wall leans outwards, in radians from upright; none for what is closed.
-pub(super) fn rim_lean(kind: Round, radius: f64, height: f64) -> Option<f64> {
-    let (below, rim) = pairs(wall(kind, radius, height)).last()?;
+pub(super) fn rim_lean(of: &Turned) -> Option<f64> {
+    let (below, rim) = pairs(wall(of)).last()?;
     Some((rim[0] - below[0]).atan2(rim[1] - below[1]))
 }
 
@@ -35,12 +54,12 @@ const EDGE_ON: f64 = 0.15;
 
 /// Signed distance from the side of the wall that looks to the eye: a point that noise has put behind a wall of 4 mm still
 /// belongs to the side that was seen. `to_eye` is the way from the point to the eye, outwards and up.
-pub(super) fn distance(kind: Round, radius: f64, height: f64, point: Point, to_eye: Point) -> f64 {
-    if kind == Round::Can {
-        return cylinder_distance(radius, height, point);
+pub(super) fn distance(of: &Turned, point: Point, to_eye: Point) -> f64 {
+    if of.kind == Round::Can {
+        return can_distance(of, point, to_eye);
     }
     let half = WALL / 2.0;
-    let nearest = pairs(wall(kind, radius, height))
+    let nearest = pairs(wall(of))
         .map(|(a, b)| (square_from_segment(point, a, b), a, b))
         .min_by(|left, right| left.0.total_cmp(&right.0));
     let Some((square, a, b)) = nearest else { return f64::INFINITY };
@@ -50,40 +69,44 @@ pub(super) fn distance(kind: Round, radius: f64, height: f64, point: Point, to_e
     // All around the rim the wall is seen.
     let along = [b[0] - a[0], b[1] - a[1]];
     let past = (point[0] - b[0]) * along[0] + (point[1] - b[1]) * along[1];
-    let at_rim = b[1] >= height - WALL && past > -half * along[0].hypot(along[1]);
+    let at_rim = b[1] >= of.height - WALL && past > -half * along[0].hypot(along[1]);
     let behind = facing.abs() > EDGE_ON * to_eye[0].hypot(to_eye[1]) && off * facing < 0.0 && !at_rim;
     if behind { -square.sqrt() - half } else { square.sqrt() - half }
 }
 
 /// Signed distance from the wall itself.
-fn from_wall(kind: Round, radius: f64, height: f64, point: Point) -> f64 {
-    let squares = pairs(wall(kind, radius, height)).map(|(a, b)| square_from_segment(point, a, b));
+fn from_wall(of: &Turned, point: Point) -> f64 {
+    let squares = pairs(wall(of)).map(|(a, b)| square_from_segment(point, a, b));
     squares.fold(f64::INFINITY, f64::min).sqrt() - WALL / 2.0
 }
 
 /// Signed distance from the thing filled to its rim.
-pub(super) fn fill_distance(kind: Round, radius: f64, height: f64, point: Point) -> f64 {
-    if kind == Round::Can {
-        return cylinder_distance(radius, height, point);
+pub(super) fn fill_distance(of: &Turned, point: Point) -> f64 {
+    let (radius, height) = (of.radius, of.height);
+    if of.kind == Round::Can {
+        let [r, z] = point;
+        let seam = cylinder_distance(radius, SEAM, [r, z - height + SEAM]);
+        return cylinder_distance(radius + of.form[BELLY], height, point).min(seam);
     }
-    let to_wall = from_wall(kind, radius, height, point);
+    let to_wall = from_wall(of, point);
     let [r, z] = point;
     if z < 0.0 || z > height {
         return to_wall.min(if z > height && r < radius { z - height } else { f64::INFINITY });
     }
     // Within the hollow the wall is crossed outwards: negative is how deep below rim and outer side.
-    let inside = pairs(wall(kind, radius, height))
+    let inside = pairs(wall(of))
         .find(|(a, b)| b[1] > a[1] && (a[1]..=b[1]).contains(&z))
         .is_some_and(|(a, b)| r < a[0] + (b[0] - a[0]) * (z - a[1]) / (b[1] - a[1]));
     if inside { -(to_wall.max(0.0) + WALL).min(height - z) } else { to_wall }
 }
 
 /// The outline of the material: from the axis below, around the rim, back to the axis above. Corners are mitred.
-pub(super) fn outline(kind: Round, radius: f64, height: f64) -> Vec<Point> {
-    if kind == Round::Can {
+pub(super) fn outline(of: &Turned) -> Vec<Point> {
+    let (radius, height) = (of.radius, of.height);
+    if of.kind == Round::Can {
         return vec![[0.0, 0.0], [radius, 0.0], [radius, height], [0.0, height]];
     }
-    let middle: Vec<Point> = wall(kind, radius, height).collect();
+    let middle: Vec<Point> = wall(of).collect();
     let side = |sign: f64| -> Vec<Point> {
         (0..middle.len())
             .map(|i| {
@@ -110,6 +133,21 @@ pub(super) fn outline(kind: Round, radius: f64, height: f64) -> Vec<Point> {
 fn normal(a: Point, b: Point) -> Point {
     let length = (b[0] - a[0]).hypot(b[1] - a[1]);
     [(b[1] - a[1]) / length, (a[0] - b[0]) / length]
+}
+
+/// Signed distance from the lid or the near side of a can, for a point that noise has moved along its ray: the far side is not seen, so what is
+/// behind it comes from the lid, and what is in front of the near edge comes from the one of both that its ray meets.
+fn can_distance(of: &Turned, [r, z]: Point, to_eye: Point) -> f64 {
+    let lid = if r < of.radius - RIM { of.height + of.form[LIFT] } else { of.height };
+    let above = z - lid;
+    // Where the ray comes through the lid.
+    let through = r - to_eye[0] * above / to_eye[1].max(1e-9);
+    let hidden = above < 0.0 && to_eye[0] < -EDGE_ON * to_eye[0].hypot(to_eye[1]);
+    if (hidden || above > 0.0) && through < of.radius {
+        return above;
+    }
+    let radius = if z < of.height - SEAM { of.radius + of.form[BELLY] } else { of.radius };
+    if above > 0.0 && to_eye[0] > 0.0 { r - radius } else { cylinder_distance(radius, lid, [r, z]) }
 }
 
 fn cylinder_distance(radius: f64, height: f64, [r, z]: Point) -> f64 {

@@ -1,5 +1,6 @@
 //! Models as parry shapes, for the ray caster.
 
+use super::form::FORMS;
 use super::{Model, fork, revolved};
 use parry3d::math::Vector;
 use parry3d::shape::SharedShape;
@@ -16,7 +17,10 @@ impl Model {
                 let [x, y, z] = size.map(|edge| edge as f32 / 2.0);
                 SharedShape::cuboid(x, y, z)
             }
-            Model::Round { kind, radius, height } => turned(&revolved::outline(kind, radius, height), height / 2.0),
+            Model::Round { kind, radius, height } => {
+                let of = revolved::Turned { kind, radius, height, form: [0.0; FORMS] };
+                turned(&revolved::outline(&of), height / 2.0)
+            }
             Model::Fork { length } => strip(length),
         }
     }
