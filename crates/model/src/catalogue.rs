@@ -1,5 +1,11 @@
 //! What a system offers to tasks: its providers of actions and its resources. Read from the system's config, so that a
-//! task can be checked before anything is started.
+//! task can be checked before anything is started. Where a system runs, what its workers say of
+//! themselves ([`WorkerDescription`]) extends it, or is compared with it.
+
+mod description;
+mod mismatch;
+
+pub use description::{DescriptionError, WorkerDescription};
 
 use crate::resource::{Quantity, ResourceClass};
 use crate::value::Type;
@@ -62,10 +68,11 @@ pub struct Provider {
     #[serde(default)]
     pub joints: Option<u32>,
     /// By action name, the part after the slash.
+    #[serde(default)]
     pub actions: BTreeMap<String, ActionSignature>,
 }
 
-/// The ports of an action.
+/// The ports of an action, and what else a task has to know of it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ActionSignature {
@@ -81,6 +88,47 @@ pub struct ActionSignature {
     /// Outcomes besides `success`, `aborted` and `preempted`.
     #[serde(default)]
     pub outcomes: Vec<String>,
+    /// What it does, for people.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub description: String,
+    /// What optional inputs are where they are not given, as people write it. For people: the provider fills them in.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub defaults: BTreeMap<String, String>,
+    /// What a state that performs it may say of itself.
+    #[serde(default, skip_serializing_if = "Annotations::is_empty")]
+    pub annotations: Annotations,
+}
+
+/// What a state that performs an action may say of itself, as task files have it. For people, who copy it; nothing follows from it by itself.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Annotations {
+    /// It reads its projection and changes nothing.
+    pub computes: bool,
+    /// Patterns of the facts that it reads.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub reads: Vec<String>,
+    /// Patterns of the facts that it senses.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub senses: Vec<String>,
+    /// What has to be true.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub requires: Vec<String>,
+    /// What is true afterwards.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub effects: Vec<String>,
+}
+
+impl Annotations {
+    /// Whether it says nothing.
+    pub fn is_empty(&self) -> bool {
+        *self == Annotations::default()
+    }
+
+    /// The lists, by the key of a task file.
+    pub fn lists(&self) -> [(&'static str, &Vec<String>); 4] {
+        [("reads", &self.reads), ("senses", &self.senses), ("requires", &self.requires), ("effects", &self.effects)]
+    }
 }
 
 /// A kind of resource that the system can have.

@@ -1,16 +1,13 @@
 //! A worker in one file: which object is nearest to a pose, in the world that the goal works on.
 
-use ratn_model::fact::{FactPattern, Term};
-use ratn_model::pose::Pose;
-use ratn_model::value::Value;
-use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome};
-use ratn_worker::worker::{Worker, WorkerOptions};
+use ratn_worker::prelude::*;
 use std::error::Error;
+use std::process::ExitCode;
 
 /// `inspector/nearest`
 struct Nearest;
 
-#[tonic::async_trait]
+#[async_trait]
 impl Action for Nearest {
     fn name(&self) -> &str {
         "nearest"
@@ -20,11 +17,17 @@ impl Action for Nearest {
         "The object nearest to a pose."
     }
 
+    /// Goals are checked against it, and whoever asks is told.
+    fn signature(&self) -> Option<Signature> {
+        let ports =
+            Signature::new().input("from", Type::Pose).with_default("within_m", Type::Float, Value::Float(10.0));
+        let ports = ports.output("object", Type::String).output("distance_m", Type::Float);
+        Some(ports.outcome("nothing_near").computes().reads("at(?)"))
+    }
+
     async fn execute(&self, goal: GoalContext) -> ActionResult {
-        // A missing or ill-typed input ends the goal `aborted` with a message that names it.
-        let from = goal.input_pose("from")?;
-        let within_m = goal.optional_float("within_m")?.unwrap_or(f64::INFINITY);
-        // The projection where the goal has one, else the root world. `?` on any error aborts with it.
+        let (from, within_m) = (goal.input_pose("from")?, goal.input_float("within_m")?);
+        // The projection where the goal has one, else the root world. `?` on any error ends the goal `aborted` with it.
         let every_place = FactPattern { predicate: "at".to_owned(), arguments: vec![None] };
         let facts = goal.unless_cancelled(goal.facts(&[every_place])).await??;
         goal.progress(format!("{} objects", facts.len()));
@@ -39,7 +42,7 @@ impl Action for Nearest {
                 best = Some((object, distance_m));
             }
         }
-        let (object, distance_m) = best.ok_or_else(|| ActionFailure::aborted("there is no object so near"))?;
+        let Some((object, distance_m)) = best else { return Ok(GoalOutcome::named("nothing_near")) };
         Ok(GoalOutcome::success()
             .with_output("object", Value::String(object.to_owned()))
             .with_output("distance_m", Value::Float(distance_m)))
@@ -51,24 +54,6 @@ fn nearer(pose: &Pose, from: &Pose, best: Option<(&str, f64)>, within_m: f64) ->
     (distance_m <= within_m && best.is_none_or(|(_, least)| distance_m < least)).then_some(distance_m)
 }
 
-#[tokio::main]
-async fn main() -> Result<(), Box<dyn Error>> {
-    Worker::new(options()?).action(Nearest).run().await?;
-    Ok(())
-}
-
-/// What the template of the process manager passes.
-fn options() -> Result<WorkerOptions, Box<dyn Error>> {
-    let mut options = WorkerOptions { exit_with_parent: true, ..WorkerOptions::default() };
-    let mut arguments = std::env::args().skip(1);
-    while let Some(name) = arguments.next() {
-        let value = arguments.next().ok_or_else(|| format!("{name} needs a value"))?;
-        match name.as_str() {
-            "--id" => options.id = value,
-            "--listen" => options.listen = value.parse()?,
-            "--endpoint-file" => options.endpoint_file = Some(value.into()),
-            _ => return Err(format!("there is no option {name}").into()),
-        }
-    }
-    Ok(options)
+fn main() -> Result<ExitCode, Box<dyn Error>> {
+    Ok(Worker::from_args()?.provides("inspector", "Inspector").action(Nearest).start())
 }

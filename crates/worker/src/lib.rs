@@ -16,7 +16,9 @@
 //!   `cancelled`, `progress("…")`, `world(&patterns)`, `call("Camera", "capture", inputs)`.
 //! - [`action::ActionServer`]: fencing, idempotent goals, one at a time where asked, cancel, bounded results.
 //! - [`lease_watch::LeaseWatch`]: who holds this provider's resources, by the resource manager's word; goals end with their lease.
-//! - [`worker::Worker`]: all of it in one builder, for `ratn worker …`.
+//! - [`worker::Worker`]: all of it in one builder; [`worker::Worker::from_args`] for a process of its own. [`prelude`] has what it needs,
+//!   [`testing::perform`] performs a goal in a test.
+//! - [`action::Signature`]: what an action says of its ports, outcomes and annotations.
 //! - [`safety::Safety`]: emergency stop and hold, for drivers of what moves; [`safety::SafetyClient`] asks for them.
 //!
 //! # Asking others
@@ -32,6 +34,7 @@
 pub mod access;
 pub mod action;
 pub mod adoption;
+pub mod arguments;
 pub mod audit;
 pub mod boot_clock;
 pub mod client;
@@ -43,6 +46,7 @@ pub mod lease_watch;
 pub mod multiplex;
 pub mod panic;
 pub mod pooled;
+pub mod prelude;
 pub mod protocol;
 pub mod provider;
 pub mod robot_clock;
@@ -51,6 +55,7 @@ pub mod safety;
 pub mod server;
 pub mod session;
 pub mod shutdown;
+pub mod testing;
 pub mod tls;
 pub mod token_bucket;
 pub mod trace;

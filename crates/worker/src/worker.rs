@@ -7,7 +7,8 @@
 
 use crate::access::{AccessError, LiveAccess, RoleGate};
 use crate::action::{Action, ActionServer, ActionServerBuilder};
-use crate::client::{CallError, Channels};
+use crate::arguments::{ArgumentError, Arguments};
+use crate::client::{CallError, Channels, chain};
 use crate::endpoint::Endpoint;
 use crate::lease_watch::{LeaseWatch, RESOURCE_MANAGER_VARIABLE};
 use crate::panic::exit_on_panic;
@@ -20,11 +21,13 @@ use crate::session::{DEFAULT_TTL, Session};
 use crate::shutdown;
 use crate::tls::{ClientTls, TlsError};
 use crate::vitals::Vitals;
+use ratn_model::catalogue::DescriptionError;
 use ratn_model::resource::ResourceClass;
 use ratn_proto::types::Resource;
 use std::collections::BTreeSet;
-use std::io;
+use std::io::{self, Write};
 use std::path::PathBuf;
+use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
@@ -142,6 +145,9 @@ pub enum WorkerError {
     /// What the process manager has told it is nonsense.
     #[error("the environment of the worker is not that of a pooled one")]
     Pooled(#[from] PooledError),
+    /// What it says of itself is beyond the bounds of that.
+    #[error("the worker's description")]
+    Description(#[from] DescriptionError),
     /// The resource manager does not want it.
     #[error("the worker's resource is refused")]
     Resource(#[from] CallError),
@@ -184,6 +190,26 @@ impl Worker {
         let shutdown = CancellationToken::new();
         let (resources, leases) = (BTreeSet::new(), Leases::Confirmed);
         Worker { options, actions, safety: None, standstill: None, resources, leases, shutdown }
+    }
+
+    /// One that is told all it has to know by the arguments of this process, as the process manager's template passes them
+    /// ([`crate::arguments`]).
+    ///
+    /// # Errors
+    /// [`ArgumentError`] names the argument.
+    pub fn from_args() -> Result<Worker, ArgumentError> {
+        Arguments::of_process()?.worker()
+    }
+
+    /// What tasks call it, `inspector` of `inspector/nearest`, and the kind of resource that it is. It says so, with what its actions say of
+    /// their ports, when it is asked.
+    #[must_use]
+    pub fn provides(mut self, provider: &str, kind: &str) -> Worker {
+        self.actions = self.actions.provides(provider, kind);
+        if self.options.kind.is_empty() {
+            kind.clone_into(&mut self.options.kind);
+        }
+        self
     }
 
     /// With an action. One that names a resource of its own needs leases of that.
@@ -233,6 +259,20 @@ impl Worker {
         self
     }
 
+    /// [`Worker::run`] on a runtime of its own: all that `main` has to do. What went wrong is written to standard error.
+    pub fn start(self) -> ExitCode {
+        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build();
+        let ended = runtime.map_err(|source| WorkerError::System { what: "start its runtime".to_owned(), source });
+        match ended.and_then(|runtime| runtime.block_on(self.run())) {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => {
+                // The process manager keeps what is written there in the worker's log.
+                let _ = writeln!(io::stderr(), "{}", chain(&error));
+                ExitCode::FAILURE
+            }
+        }
+    }
+
     /// Serves until a signal, the parent's end or the shutdown token says otherwise. Goals under way are told to stop. A panic of the SDK itself
     /// ends the process ([`crate::panic`]); a panic of an action aborts its goal.
     ///
@@ -240,6 +280,7 @@ impl Worker {
     /// [`WorkerError`].
     pub async fn run(self) -> Result<(), WorkerError> {
         let Worker { options, mut actions, safety, standstill, mut resources, leases: asked, shutdown } = self;
+        actions.description().check()?;
         let has_resource = !options.id.is_empty() || !resources.is_empty();
         match asked {
             _ if safety.is_some() && !has_resource => return Err(WorkerError::MovesWithoutLease),

@@ -172,7 +172,7 @@ async fn a_wrong_input_and_a_panic_end_the_goal_aborted_with_the_reason() {
     let provider = provider(None).await;
     let inputs = [("x".to_owned(), Value::String("many".to_owned()))].into();
     let outcome = run(&provider, Goal { inputs, ..goal("a", "double", 1) }).await.unwrap();
-    assert_eq!(outcome, GoalOutcome::aborted("input `x` is a string: expected a number"));
+    assert_eq!(outcome, GoalOutcome::aborted("input `x` of `double` is a string: expected a number"));
     let outcome = run(&provider, goal("b", "panic", 1)).await.unwrap();
     assert_eq!(outcome, GoalOutcome::aborted("the action panicked: on purpose"));
 }

@@ -4,6 +4,7 @@
 //! not finite, a pose that is none, a trajectory that runs backwards, names without bound, nesting without end.
 
 mod action;
+mod describe;
 mod fact;
 mod process;
 mod resource;
@@ -19,6 +20,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use crate::v1;
+pub use describe::MAX_DESCRIPTION_BYTES;
 pub use scene::digest;
 
 /// Lists and maps nest at most this deep.

@@ -1,16 +1,15 @@
 //! What an action gets: its goal, and what it may do with it.
 
+use super::ActionFailure;
 use super::goal::GoalEntry;
-use super::{ActionFailure, InputError, Port};
 use crate::client::{ActionClient, CallError, Channels, WorldClient, retry_unanswered};
 use crate::endpoint::{Endpoint, EndpointError};
 use crate::safety::{Safety, SafetyState};
 use ratn_model::fact::{Change, FactPattern};
 use ratn_model::id::ProjectionId;
-use ratn_model::pose::Pose;
 use ratn_model::program::{PREEMPTED, STOPPED};
 use ratn_model::resource::Lease;
-use ratn_model::value::{Trajectory, Value};
+use ratn_model::value::Value;
 use ratn_proto::convert::wire_ports;
 use ratn_proto::types::{FactRecord, Goal, GoalOutcome};
 use ratn_proto::v1;
@@ -152,67 +151,6 @@ impl GoalContext {
             entry,
             calls: AtomicU32::new(0),
         }
-    }
-
-    /// The input `name`, there or not: `goal.port("region").field("pose").pose()?`.
-    pub fn port(&self, name: &str) -> Port<'_> {
-        Port::new(name, self.inputs.get(name))
-    }
-
-    /// An input that must be joint positions.
-    ///
-    /// # Errors
-    /// [`InputError`].
-    pub fn input_joints(&self, name: &str) -> Result<&[f64], InputError> {
-        self.port(name).joints()
-    }
-
-    /// An input that must be a pose.
-    ///
-    /// # Errors
-    /// [`InputError`].
-    pub fn input_pose(&self, name: &str) -> Result<Pose, InputError> {
-        self.port(name).pose()
-    }
-
-    /// An input that must be a trajectory.
-    ///
-    /// # Errors
-    /// [`InputError`].
-    pub fn input_trajectory(&self, name: &str) -> Result<&Trajectory, InputError> {
-        self.port(name).trajectory()
-    }
-
-    /// An input that must be text.
-    ///
-    /// # Errors
-    /// [`InputError`].
-    pub fn input_string(&self, name: &str) -> Result<&str, InputError> {
-        self.port(name).string()
-    }
-
-    /// An input that must be a number.
-    ///
-    /// # Errors
-    /// [`InputError`].
-    pub fn input_float(&self, name: &str) -> Result<f64, InputError> {
-        self.port(name).float()
-    }
-
-    /// An input that is a number if it is there.
-    ///
-    /// # Errors
-    /// [`InputError`].
-    pub fn optional_float(&self, name: &str) -> Result<Option<f64>, InputError> {
-        self.port(name).optional().map(|port| port.float()).transpose()
-    }
-
-    /// An input that is a whole number if it is there.
-    ///
-    /// # Errors
-    /// [`InputError`].
-    pub fn optional_int(&self, name: &str) -> Result<Option<i64>, InputError> {
-        self.port(name).optional().map(|port| port.int()).transpose()
     }
 
     /// Says how far it is, to whoever listens and to the event log. Never blocks.

@@ -15,12 +15,14 @@ mod authority;
 mod context;
 mod fence;
 mod goal;
+mod inputs;
 mod memory;
 mod port;
 mod run;
 mod scene;
 mod server;
 mod service;
+mod signature;
 mod stream;
 
 pub(crate) use admission::TOO_MANY_WAITING;
@@ -31,6 +33,7 @@ pub use ratn_proto::types::{Goal, GoalOutcome};
 pub use run::STOP_GRACE;
 pub use scene::SceneCache;
 pub use server::{ActionServer, ActionServerBuilder};
+pub use signature::{Signature, SignatureError};
 
 use crate::client::chain;
 use std::error::Error;
@@ -45,6 +48,11 @@ pub trait Action: Send + Sync + 'static {
     /// What it does, for people.
     fn description(&self) -> &str {
         ""
+    }
+
+    /// Its ports, outcomes and annotations; without them nobody is told, and the catalogue has to say them.
+    fn signature(&self) -> Option<Signature> {
+        None
     }
 
     /// The resource whose lease a goal needs, where it is another than the server's own.

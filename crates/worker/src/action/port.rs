@@ -6,6 +6,8 @@ use ratn_model::value::{Trajectory, Value};
 /// An input, or a part of one: there or not, of the right type or not.
 #[derive(Debug, Clone)]
 pub struct Port<'a> {
+    /// Whose input; may be empty.
+    action: &'a str,
     path: String,
     value: Option<&'a Value>,
 }
@@ -14,16 +16,20 @@ pub struct Port<'a> {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InputError {
     /// It is not there.
-    #[error("input `{port}` is missing: expected {expected}")]
+    #[error("input `{port}`{} is missing: expected {expected}", of(action))]
     Missing {
+        /// The action; empty where it is not an action's.
+        action: String,
         /// Its path, `region.size`.
         port: String,
         /// What it should be.
         expected: &'static str,
     },
     /// It is something else.
-    #[error("input `{port}` is {found}: expected {expected}")]
+    #[error("input `{port}`{} is {found}: expected {expected}", of(action))]
     WrongType {
+        /// The action; empty where it is not an action's.
+        action: String,
         /// Its path.
         port: String,
         /// What it should be.
@@ -36,7 +42,12 @@ pub enum InputError {
 impl<'a> Port<'a> {
     /// The input `name`; a null counts as none.
     pub fn new(name: &str, value: Option<&'a Value>) -> Port<'a> {
-        Port { path: name.to_owned(), value: value.filter(|v| **v != Value::Null) }
+        Port::of("", name, value)
+    }
+
+    /// The same, of an action that errors shall name.
+    pub fn of(action: &'a str, name: &str, value: Option<&'a Value>) -> Port<'a> {
+        Port { action, path: name.to_owned(), value: value.filter(|v| **v != Value::Null) }
     }
 
     /// This input if it is there.
@@ -46,7 +57,7 @@ impl<'a> Port<'a> {
 
     /// A field of it.
     pub fn field(&self, name: &str) -> Port<'a> {
-        Port::new(&format!("{}.{name}", self.path), self.value.and_then(|v| v.field(name)))
+        Port::of(self.action, &format!("{}.{name}", self.path), self.value.and_then(|v| v.field(name)))
     }
 
     /// Its value, whatever it is.
@@ -127,7 +138,7 @@ impl<'a> Port<'a> {
     /// [`InputError`].
     pub fn list(&self) -> Result<Vec<Port<'a>>, InputError> {
         let values = self.read("a list", |v| if let Value::List(values) = v { Some(values) } else { None })?;
-        let element = |(i, v)| Port { path: format!("{}[{i}]", self.path), value: Some(v) };
+        let element = |(i, v)| Port { action: self.action, path: format!("{}[{i}]", self.path), value: Some(v) };
         Ok(values.iter().enumerate().map(element).collect())
     }
 
@@ -144,10 +155,15 @@ impl<'a> Port<'a> {
     }
 
     fn read<T>(&self, expected: &'static str, take: impl FnOnce(&'a Value) -> Option<T>) -> Result<T, InputError> {
-        let port = || self.path.clone();
-        let value = self.value.ok_or_else(|| InputError::Missing { port: port(), expected })?;
-        take(value).ok_or_else(|| InputError::WrongType { port: port(), expected, found: summary(value) })
+        let (action, port) = (|| self.action.to_owned(), || self.path.clone());
+        let value = self.value.ok_or_else(|| InputError::Missing { action: action(), port: port(), expected })?;
+        let wrong = || InputError::WrongType { action: action(), port: port(), expected, found: summary(value) };
+        take(value).ok_or_else(wrong)
     }
+}
+
+fn of(action: &str) -> String {
+    if action.is_empty() { String::new() } else { format!(" of `{action}`") }
 }
 
 fn summary(value: &Value) -> String {

@@ -37,7 +37,7 @@ pub(super) async fn run(
             SafetyState::Stopped { reason } => Err(ActionFailure::emergency_stop(&reason)),
             // It may have been told to stop since it was admitted.
             _ => match context.checkpoint() {
-                Ok(()) => action.execute(context).await,
+                Ok(()) => perform(&*action, context).await,
                 Err(stopped) => Err(stopped),
             },
         }
@@ -102,6 +102,16 @@ pub(super) async fn run(
         server.state().end(&entry, server.limits.results_kept);
     }
     entry.returned.cancel();
+}
+
+/// Performs a goal that is as the action says, and sees that what comes of it is.
+async fn perform(action: &dyn Action, mut context: GoalContext) -> ActionResult {
+    let Some(signature) = action.signature() else { return action.execute(context).await };
+    let name = context.action.clone();
+    signature.complete(&name, &mut context.inputs)?;
+    let outcome = action.execute(context).await?;
+    signature.check(&name, &outcome)?;
+    Ok(outcome)
 }
 
 /// An outcome whose outputs fit into a message; a failure that says what does not, otherwise.

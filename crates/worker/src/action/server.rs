@@ -14,6 +14,7 @@ use crate::panic::exit_on_panic;
 use crate::safety::Safety;
 use crate::tls::ClientTls;
 use crate::trace;
+use ratn_model::catalogue::{ActionSignature, WorkerDescription};
 use ratn_proto::types::Goal;
 use std::collections::BTreeMap;
 use std::fmt;
@@ -39,6 +40,8 @@ pub struct ActionServer {
 /// What an [`ActionServer`] shall be.
 pub struct ActionServerBuilder {
     resource: String,
+    provider: String,
+    kind: String,
     actions: BTreeMap<String, Arc<dyn Action>>,
     one_at_a_time: bool,
     results_kept: Option<usize>,
@@ -50,6 +53,8 @@ pub struct ActionServerBuilder {
 
 pub(super) struct Inner {
     pub(super) resource: String,
+    pub(super) provider: String,
+    pub(super) kind: String,
     pub(super) actions: BTreeMap<String, Arc<dyn Action>>,
     pub(super) limits: Limits,
     pub(super) channels: Channels,
@@ -70,6 +75,23 @@ impl ActionServerBuilder {
     pub fn action(mut self, action: impl Action) -> ActionServerBuilder {
         self.actions.insert(action.name().to_owned(), Arc::new(action));
         self
+    }
+
+    /// What tasks call it, `inspector` of `inspector/nearest`, and the kind of resource that it is: it says so when it is asked.
+    #[must_use]
+    pub fn provides(mut self, provider: &str, kind: &str) -> ActionServerBuilder {
+        (self.provider, self.kind) = (provider.to_owned(), kind.to_owned());
+        self
+    }
+
+    /// What it will say of itself.
+    pub fn description(&self) -> WorkerDescription {
+        let said = |action: &Arc<dyn Action>| {
+            let signature = action.signature()?.said().clone();
+            Some(ActionSignature { description: action.description().to_owned(), ..signature })
+        };
+        let actions = self.actions.iter().map(|(name, action)| (name.clone(), said(action))).collect();
+        WorkerDescription { provider: self.provider.clone(), kind: self.kind.clone(), actions }
     }
 
     /// A resource performs one goal at a time: a further one is refused, unless the one before was told to stop: then
@@ -136,6 +158,8 @@ impl ActionServerBuilder {
         }
         let inner = Arc::new(Inner {
             resource: self.resource,
+            provider: self.provider,
+            kind: self.kind,
             actions: self.actions,
             limits: Limits {
                 one_at_a_time: self.one_at_a_time,
@@ -162,6 +186,8 @@ impl ActionServer {
     pub fn builder(resource: impl Into<String>) -> ActionServerBuilder {
         ActionServerBuilder {
             resource: resource.into(),
+            provider: String::new(),
+            kind: String::new(),
             actions: BTreeMap::new(),
             one_at_a_time: false,
             results_kept: None,

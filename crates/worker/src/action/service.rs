@@ -83,10 +83,13 @@ impl ActionService for ActionServer {
             name: action.name().to_owned(),
             description: action.description().to_owned(),
             cancel_when_abandoned: action.cancel_when_abandoned(),
+            signature: action.signature().map(|signature| signature.said().clone().into()),
         };
         Ok(Response::new(v1::DescribeResponse {
             resource_id: self.inner.resource.clone(),
             actions: self.inner.actions.values().map(description).collect(),
+            provider: self.inner.provider.clone(),
+            kind: self.inner.kind.clone(),
         }))
     }
 }

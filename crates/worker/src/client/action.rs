@@ -1,18 +1,21 @@
 //! The client of action services: workers, and the modules of the robot.
 
 use super::retry::{PAUSE, TRIES};
-use super::{CallError, Channels};
+use super::{CallError, Channels, chain};
 use crate::endpoint::Endpoint;
 use crate::trace::Traced;
+use ratn_model::catalogue::WorkerDescription;
 use ratn_model::value::Value;
 use ratn_proto::MAX_MESSAGE_BYTES;
-use ratn_proto::convert::{Malformed, ports};
+use ratn_proto::convert::{MAX_DESCRIPTION_BYTES, Malformed, ports};
 use ratn_proto::types::{Goal, GoalOutcome};
 use ratn_proto::v1;
 use ratn_proto::v1::action_service_client::ActionServiceClient;
 use ratn_proto::v1::perform_request::Kind as Asked;
 use ratn_proto::v1::perform_response::Kind as Heard;
 use std::collections::BTreeMap;
+use std::time::Duration;
+use tonic::Code;
 
 /// Gives goals to providers.
 #[derive(Debug, Clone)]
@@ -47,6 +50,17 @@ pub struct ActionInfo {
     pub description: String,
     /// A goal ends when nobody listens to it any more.
     pub cancel_when_abandoned: bool,
+}
+
+/// A worker that does not describe itself so that it is believed.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DescribeError {
+    /// It says nothing: it cannot, or is not reached.
+    #[error("it does not describe itself: {0}")]
+    Unanswered(String),
+    /// What it says is beyond the bounds.
+    #[error("its description is refused: {0}")]
+    Refused(String),
 }
 
 impl ActionClient {
@@ -149,6 +163,23 @@ impl ActionClient {
             cancel_when_abandoned: a.cancel_when_abandoned,
         };
         Ok(ProviderInfo { resource: answer.resource_id, actions: answer.actions.into_iter().map(info).collect() })
+    }
+
+    /// What a worker says of itself, within the bounds of that, and not longer than this.
+    ///
+    /// # Errors
+    /// [`DescribeError`].
+    pub async fn description(&self, endpoint: &Endpoint, within: Duration) -> Result<WorkerDescription, DescribeError> {
+        let channel = self.channels.get(endpoint).map_err(|error| DescribeError::Unanswered(chain(&error)))?;
+        let mut client = ActionServiceClient::new(channel).max_decoding_message_size(MAX_DESCRIPTION_BYTES);
+        let answer = tokio::time::timeout(within, client.describe(v1::DescribeRequest {})).await;
+        let late = |_| DescribeError::Unanswered(format!("no answer within {:.1} s", within.as_secs_f64()));
+        let answer = answer.map_err(late)?.map_err(|status| match status.code() {
+            // The decoder says so.
+            Code::OutOfRange => DescribeError::Refused(format!("it has more than {MAX_DESCRIPTION_BYTES} bytes")),
+            _ => DescribeError::Unanswered(chain(&CallError::from_status(endpoint, &status))),
+        })?;
+        WorkerDescription::try_from(answer.into_inner()).map_err(|error| DescribeError::Refused(error.to_string()))
     }
 
     fn client(&self, endpoint: &Endpoint) -> Result<ActionServiceClient<Traced>, CallError> {

@@ -1,0 +1,185 @@
+//! What a worker says of itself: its provider's name, the kind of resource that it is, and its actions with their ports. Somebody else's
+//! words: it is believed only within these bounds.
+
+use super::{ActionSignature, Catalogue, Provider, ResourceOffer};
+use crate::resource::{Quantity, ResourceClass};
+use crate::value::Type;
+use std::collections::BTreeMap;
+
+/// Actions of one worker.
+const ACTIONS: usize = 128;
+/// Inputs, outputs, outcomes and annotations of one action, together.
+const PORTS: usize = 128;
+/// Bytes of a name.
+const NAME_BYTES: usize = 64;
+/// Bytes of a type, a default, an annotation.
+const TEXT_BYTES: usize = 512;
+/// Bytes of a description for people.
+const DESCRIPTION_BYTES: usize = 2_048;
+
+/// See the module.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct WorkerDescription {
+    /// The name that tasks use, `inspector` of `inspector/nearest`; empty where it does not say.
+    pub provider: String,
+    /// The kind of resource that it is; empty where it does not say.
+    pub kind: String,
+    /// By name; without a signature where it does not say its ports.
+    pub actions: BTreeMap<String, Option<ActionSignature>>,
+}
+
+/// A description that is not believed.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DescriptionError {
+    /// More than anybody needs.
+    #[error("it says {count} {what}{of}: at most {most} are taken")]
+    TooMany {
+        /// Of what.
+        what: &'static str,
+        /// Of which action; may be empty.
+        of: String,
+        /// How many.
+        count: usize,
+        /// How many are taken.
+        most: usize,
+    },
+    /// A name that no task could write.
+    #[error(
+        "its {what} `{name}`{of} is no name: 1 to {NAME_BYTES} ASCII letters, digits, `_` and `-`, the first one a letter"
+    )]
+    Name {
+        /// Of what.
+        what: &'static str,
+        /// Of which action; may be empty.
+        of: String,
+        /// As it says it, cut.
+        name: String,
+    },
+    /// A text that nobody would read.
+    #[error("its {what}{of} is too long, or not one line of text: at most {most} bytes without control characters")]
+    Text {
+        /// Of what.
+        what: &'static str,
+        /// Of which action; may be empty.
+        of: String,
+        /// How many are taken.
+        most: usize,
+    },
+    /// The same port twice, or a default of a port that is not optional.
+    #[error("action `{action}` says port `{port}` twice, or a default of it that is required")]
+    Port {
+        /// Of which action.
+        action: String,
+        /// Which.
+        port: String,
+    },
+    /// A type that the grammar does not know.
+    #[error("action `{action}`: port `{port}`: {why}")]
+    Type {
+        /// Of which action.
+        action: String,
+        /// Which.
+        port: String,
+        /// What is wrong.
+        why: String,
+    },
+    /// The message is none.
+    #[error("it cannot be read: {why}")]
+    Malformed {
+        /// Why.
+        why: String,
+    },
+}
+
+impl WorkerDescription {
+    /// Refuses what is beyond the bounds, by name.
+    ///
+    /// # Errors
+    /// [`DescriptionError`] of the first thing that is.
+    pub fn check(&self) -> Result<(), DescriptionError> {
+        bound("actions", "", self.actions.len(), ACTIONS)?;
+        for (what, said) in [("provider", &self.provider), ("kind", &self.kind)] {
+            if !said.is_empty() {
+                name(what, "", said)?;
+            }
+        }
+        for (action, signature) in &self.actions {
+            name("action", "", action)?;
+            signature.as_ref().map_or(Ok(()), |signature| check(action, signature))?;
+        }
+        Ok(())
+    }
+
+    /// What it describes well enough for a task to use.
+    pub fn signatures(&self) -> impl Iterator<Item = (&String, &ActionSignature)> {
+        self.actions.iter().filter_map(|(name, signature)| Some((name, signature.as_ref()?)))
+    }
+}
+
+impl Catalogue {
+    /// Extends it by what a worker of `kind`, of which there can be `count`, says of itself. What is in the catalogue already stays as it is.
+    pub fn extend_by(&mut self, kind: &str, count: Quantity, worker: &WorkerDescription) {
+        if worker.provider.is_empty() || worker.signatures().next().is_none() {
+            return;
+        }
+        let provider = self.providers.entry(worker.provider.clone()).or_insert_with(|| Provider {
+            resource: kind.to_owned(),
+            joints: None,
+            actions: BTreeMap::new(),
+        });
+        if provider.resource != kind {
+            return;
+        }
+        for (name, signature) in worker.signatures() {
+            provider.actions.entry(name.clone()).or_insert_with(|| signature.clone());
+        }
+        let offer = || ResourceOffer::new(ResourceClass::Process, count);
+        self.resources.entry(kind.to_owned()).or_insert_with(offer);
+    }
+}
+
+fn check(action: &str, signature: &ActionSignature) -> Result<(), DescriptionError> {
+    let of = format!(" of action `{action}`");
+    let ActionSignature { inputs, optional, outputs, outcomes, description, defaults, annotations } = signature;
+    let said: usize = annotations.lists().iter().map(|(_, list)| list.len()).sum();
+    let ports = inputs.len() + optional.len() + outputs.len() + outcomes.len() + defaults.len() + said;
+    bound("ports, outcomes and annotations", &of, ports, PORTS)?;
+    text("description", &of, description, DESCRIPTION_BYTES)?;
+    for (port, of_type) in inputs.iter().chain(optional).chain(outputs) {
+        name("port", &of, port)?;
+        if *of_type != Type::Any {
+            text("type", &of, &of_type.to_string(), TEXT_BYTES)?;
+        }
+    }
+    let twice = inputs.keys().find(|port| optional.contains_key(*port));
+    if let Some(port) = twice.or_else(|| defaults.keys().find(|port| !optional.contains_key(*port))) {
+        return Err(DescriptionError::Port { action: action.to_owned(), port: shown(port) });
+    }
+    outcomes.iter().try_for_each(|outcome| name("outcome", &of, outcome))?;
+    defaults.values().try_for_each(|default| text("default", &of, default, TEXT_BYTES))?;
+    let mut lists = annotations.lists().into_iter();
+    lists.try_for_each(|(key, list)| list.iter().try_for_each(|said| text(key, &of, said, TEXT_BYTES)))
+}
+
+fn bound(what: &'static str, of: &str, count: usize, most: usize) -> Result<(), DescriptionError> {
+    if count <= most { Ok(()) } else { Err(DescriptionError::TooMany { what, of: of.to_owned(), count, most }) }
+}
+
+fn name(what: &'static str, of: &str, said: &str) -> Result<(), DescriptionError> {
+    let good = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    let begins = said.chars().next().is_some_and(|c| c.is_ascii_alphabetic());
+    if begins && said.len() <= NAME_BYTES && said.chars().all(good) {
+        return Ok(());
+    }
+    Err(DescriptionError::Name { what, of: of.to_owned(), name: shown(said) })
+}
+
+fn text(what: &'static str, of: &str, said: &str, most: usize) -> Result<(), DescriptionError> {
+    let good = said.len() <= most && !said.contains(char::is_control);
+    if good { Ok(()) } else { Err(DescriptionError::Text { what, of: of.to_owned(), most }) }
+}
+
+/// What somebody else wrote, as much as a message has room for.
+fn shown(said: &str) -> String {
+    said.chars().take(NAME_BYTES).map(|c| if c.is_control() { '?' } else { c }).collect()
+}

@@ -1,0 +1,87 @@
+//! What a worker says of itself.
+
+use crate::v1;
+use ratn_model::catalogue::{ActionSignature, Annotations, DescriptionError, WorkerDescription};
+use std::collections::BTreeMap;
+
+/// Bytes of a description on the wire.
+pub const MAX_DESCRIPTION_BYTES: usize = 65_536;
+
+impl From<ActionSignature> for v1::ActionSignature {
+    fn from(signature: ActionSignature) -> v1::ActionSignature {
+        let ActionSignature { inputs, optional, outputs, outcomes, defaults, annotations, .. } = signature;
+        let port = |optional: bool, defaults: &BTreeMap<String, String>, (name, of_type): (String, _)| {
+            let default_value = defaults.get(&name).cloned().unwrap_or_default();
+            v1::PortDescription { name, r#type: String::from(of_type), optional, default_value }
+        };
+        let none = BTreeMap::new();
+        let required = inputs.into_iter().map(|given| port(false, &none, given));
+        let inputs = required.chain(optional.into_iter().map(|given| port(true, &defaults, given))).collect();
+        let outputs = outputs.into_iter().map(|given| port(false, &none, given)).collect();
+        let annotations = (!annotations.is_empty()).then_some(v1::ActionAnnotations {
+            computes: annotations.computes,
+            reads: annotations.reads,
+            senses: annotations.senses,
+            requires: annotations.requires,
+            effects: annotations.effects,
+        });
+        v1::ActionSignature { inputs, outputs, outcomes, annotations }
+    }
+}
+
+impl TryFrom<v1::DescribeResponse> for WorkerDescription {
+    type Error = DescriptionError;
+
+    /// Only what is within the bounds.
+    fn try_from(said: v1::DescribeResponse) -> Result<WorkerDescription, DescriptionError> {
+        let mut actions = BTreeMap::new();
+        for action in said.actions {
+            let signature = match action.signature {
+                Some(signature) => Some(read(&action.name, action.description, signature)?),
+                None => None,
+            };
+            actions.insert(action.name, signature);
+        }
+        let description = WorkerDescription { provider: said.provider, kind: said.kind, actions };
+        description.check().map(|()| description)
+    }
+}
+
+fn read(action: &str, description: String, said: v1::ActionSignature) -> Result<ActionSignature, DescriptionError> {
+    let mut signature = ActionSignature { outcomes: said.outcomes, description, ..ActionSignature::default() };
+    for port in said.inputs {
+        let of_type = of_type(action, &port)?;
+        if !port.default_value.is_empty() {
+            signature.defaults.insert(port.name.clone(), port.default_value);
+        }
+        let ports = if port.optional { &mut signature.optional } else { &mut signature.inputs };
+        once(action, ports.insert(port.name.clone(), of_type), port.name)?;
+    }
+    for port in said.outputs {
+        let of_type = of_type(action, &port)?;
+        once(action, signature.outputs.insert(port.name.clone(), of_type), port.name)?;
+    }
+    if let Some(said) = said.annotations {
+        let v1::ActionAnnotations { computes, reads, senses, requires, effects } = said;
+        signature.annotations = Annotations { computes, reads, senses, requires, effects };
+    }
+    Ok(signature)
+}
+
+fn of_type(action: &str, port: &v1::PortDescription) -> Result<ratn_model::value::Type, DescriptionError> {
+    port.r#type.parse().map_err(|_| DescriptionError::Type {
+        action: shown(action),
+        port: shown(&port.name),
+        why: format!("`{}` is no type", shown(&port.r#type)),
+    })
+}
+
+fn once<T>(action: &str, before: Option<T>, port: String) -> Result<(), DescriptionError> {
+    let twice = || DescriptionError::Port { action: shown(action), port: shown(&port) };
+    before.map_or(Ok(()), |_| Err(twice()))
+}
+
+/// What somebody else wrote, as much as a message has room for.
+fn shown(said: &str) -> String {
+    said.chars().take(64).map(|c| if c.is_control() { '?' } else { c }).collect()
+}

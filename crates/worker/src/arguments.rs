@@ -1,0 +1,187 @@
+//! The arguments of a worker process, as a template of the process manager passes them: `--id {id} --endpoint-file {endpoint_file}` and
+//! what else of the table below, and options of the worker's own.
+//!
+//! | | |
+//! |---|---|
+//! | `--id` | the id of its resource |
+//! | `--endpoint-file` | where it writes its endpoint |
+//! | `--listen` | where it listens, `127.0.0.1:0` unless said |
+//! | `--kind`, `--host` | of the resource, where it offers that itself |
+//! | `--resource-manager` | it offers its resource there itself: not for a worker of a process manager |
+//! | `--config` | the system's config, with the roles of callers |
+//! | `--exit-with-parent` | it ends when its standard input does; so does every worker of a process manager, said or not |
+//! | `--insecure` | it may listen beyond loopback without TLS |
+
+use crate::endpoint::EndpointError;
+use crate::pooled::PROVIDER_SESSION_VARIABLE;
+use crate::server::Exposure;
+use crate::tls;
+use crate::worker::{Worker, WorkerOptions};
+use std::collections::BTreeMap;
+use std::str::FromStr;
+
+/// Options that stand without a value.
+const FLAGS: [&str; 2] = ["--exit-with-parent", "--insecure"];
+/// The others of every worker.
+const OPTIONS: [&str; 7] =
+    ["--id", "--endpoint-file", "--listen", "--kind", "--host", "--resource-manager", "--config"];
+
+/// What a worker process was started with. Options of one's own are taken out before [`Arguments::worker`].
+#[derive(Debug, Clone)]
+pub struct Arguments {
+    given: BTreeMap<String, String>,
+    pooled: bool,
+    known: Vec<String>,
+}
+
+/// Arguments that a worker cannot be started with.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ArgumentError {
+    /// An option without its value.
+    #[error("{option} needs a value")]
+    NoValue {
+        /// Which.
+        option: String,
+    },
+    /// An option was given twice.
+    #[error("{option} is given twice")]
+    Twice {
+        /// Which.
+        option: String,
+    },
+    /// A value that is none.
+    #[error("{option} is `{value}`: {why}")]
+    Value {
+        /// Which.
+        option: String,
+        /// As it was given.
+        value: String,
+        /// What is wrong with it.
+        why: String,
+    },
+    /// Nothing that a worker takes.
+    #[error("there is no option `{option}`; there are {known}")]
+    Unknown {
+        /// As it was given.
+        option: String,
+        /// Those that there are.
+        known: String,
+    },
+    /// Not text.
+    #[error("an argument is not UTF-8: {shown}")]
+    NoText {
+        /// As well as it can be shown.
+        shown: String,
+    },
+}
+
+impl Arguments {
+    /// Those of this process.
+    ///
+    /// # Errors
+    /// [`ArgumentError`].
+    pub fn of_process() -> Result<Arguments, ArgumentError> {
+        let text = |argument: std::ffi::OsString| {
+            argument.into_string().map_err(|odd| ArgumentError::NoText { shown: odd.to_string_lossy().into_owned() })
+        };
+        let arguments = std::env::args_os().skip(1).map(text).collect::<Result<Vec<_>, _>>()?;
+        let pooled = std::env::var_os(PROVIDER_SESSION_VARIABLE).is_some_and(|session| !session.is_empty());
+        Arguments::of(arguments, pooled)
+    }
+
+    /// These; a `pooled` worker ends with its process manager.
+    ///
+    /// # Errors
+    /// [`ArgumentError`].
+    pub fn of(arguments: Vec<String>, pooled: bool) -> Result<Arguments, ArgumentError> {
+        let mut given = BTreeMap::new();
+        let mut arguments = arguments.into_iter();
+        while let Some(argument) = arguments.next() {
+            let (option, value) = match argument.split_once('=') {
+                Some((option, value)) if option.starts_with("--") => (option.to_owned(), Some(value.to_owned())),
+                _ => (argument, None),
+            };
+            let value = match value {
+                Some(value) => value,
+                None if FLAGS.contains(&option.as_str()) => String::new(),
+                // What begins like an option is told as one that is not known, not as a lack of its value.
+                None if !option.starts_with("--") => return Err(unknown(&option, &[])),
+                None => arguments.next().ok_or_else(|| ArgumentError::NoValue { option: option.clone() })?,
+            };
+            if given.insert(option.clone(), value).is_some() {
+                return Err(ArgumentError::Twice { option });
+            }
+        }
+        Ok(Arguments { given, pooled, known: Vec::new() })
+    }
+
+    /// An option of the worker's own, `--speed`: what the template passes, or nothing.
+    ///
+    /// # Errors
+    /// [`ArgumentError::Value`] where it does not read.
+    pub fn take<T: FromStr>(&mut self, option: &str) -> Result<Option<T>, ArgumentError>
+    where
+        T::Err: std::fmt::Display,
+    {
+        self.known.push(option.to_owned());
+        let Some(value) = self.given.remove(option) else { return Ok(None) };
+        let wrong = |why: T::Err| ArgumentError::Value {
+            option: option.to_owned(),
+            value: value.clone(),
+            why: why.to_string(),
+        };
+        value.parse().map(Some).map_err(wrong)
+    }
+
+    /// The worker that they describe, without actions.
+    ///
+    /// # Errors
+    /// [`ArgumentError`], also where something is left that nobody has taken.
+    pub fn worker(self) -> Result<Worker, ArgumentError> {
+        Ok(Worker::new(self.options()?))
+    }
+
+    /// What [`Arguments::worker`] makes a worker of.
+    ///
+    /// # Errors
+    /// As that.
+    pub fn options(mut self) -> Result<WorkerOptions, ArgumentError> {
+        let own = std::mem::take(&mut self.known);
+        let defaults = WorkerOptions::default();
+        let endpoint = |error: EndpointError| crate::client::chain(&error);
+        let mut parsed = |option: &str| match self.given.remove(option) {
+            None => Ok(None),
+            Some(value) => match value.parse() {
+                Ok(parsed) => Ok(Some(parsed)),
+                Err(error) => Err(ArgumentError::Value { option: option.to_owned(), value, why: endpoint(error) }),
+            },
+        };
+        let (listen, resource_manager) = (parsed("--listen")?, parsed("--resource-manager")?);
+        let mut text = |option: &str| self.given.remove(option);
+        let options = WorkerOptions {
+            id: text("--id").unwrap_or_default(),
+            kind: text("--kind").unwrap_or_default(),
+            host: text("--host").unwrap_or_default(),
+            endpoint_file: text("--endpoint-file").map(Into::into),
+            access: text("--config").map(Into::into),
+            listen: listen.unwrap_or(defaults.listen),
+            resource_manager,
+            exit_with_parent: text("--exit-with-parent").is_some() || self.pooled,
+            exposure: Exposure {
+                tls: tls::server_from_environment().map(Into::into),
+                insecure: text("--insecure").is_some(),
+                ..Exposure::default()
+            },
+            tls: None,
+        };
+        match self.given.into_keys().next() {
+            Some(option) => Err(unknown(&option, &own)),
+            None => Ok(options),
+        }
+    }
+}
+
+fn unknown(option: &str, own: &[String]) -> ArgumentError {
+    let known: Vec<&str> = OPTIONS.iter().chain(&FLAGS).copied().chain(own.iter().map(String::as_str)).collect();
+    ArgumentError::Unknown { option: option.to_owned(), known: known.join(", ") }
+}

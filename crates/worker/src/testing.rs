@@ -1,0 +1,51 @@
+//! For the tests of a worker: an action performs one goal over a real socket, without a system around it.
+
+use crate::action::{Action, ActionServer, Goal, GoalOutcome};
+use crate::client::{ActionClient, Channels, chain};
+use crate::endpoint::Endpoint;
+use crate::server::{Exposure, Services, Serving, bind_as};
+use crate::tls::ClientTls;
+use ratn_model::value::Value;
+use std::collections::BTreeMap;
+use tokio_util::sync::CancellationToken;
+
+/// What comes of a goal with these inputs: `perform(Nearest, [("from", Value::Pose(pose))])`. There is no world pool, and no lease.
+/// Not to be called where a runtime runs already: [`performed`] is.
+///
+/// # Errors
+/// In words: the goal was refused, or the action crashed.
+pub fn perform<const N: usize>(action: impl Action, inputs: [(&str, Value); N]) -> Result<GoalOutcome, String> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    runtime.map_err(|error| error.to_string())?.block_on(performed(action, inputs))
+}
+
+/// As [`perform`], where a runtime runs.
+///
+/// # Errors
+/// As [`perform`].
+pub async fn performed<const N: usize>(action: impl Action, inputs: [(&str, Value); N]) -> Result<GoalOutcome, String> {
+    let name = action.name().to_owned();
+    let server = ActionServer::builder("").action(action);
+    server.description().check().map_err(|error| chain(&error))?;
+    let bound = bind_as(&Endpoint::loopback(), &Exposure::default()).await.map_err(|error| chain(&error))?;
+    let (endpoint, shutdown) = (bound.endpoint().clone(), CancellationToken::new());
+    let services = Services::new().with(server.build().into_service());
+    let serving = tokio::spawn(bound.serve_as(services, Serving::default(), shutdown.clone()));
+    let goal = Goal {
+        id: "test/1/1".to_owned(),
+        action: name,
+        inputs: inputs.into_iter().map(|(port, value)| (port.to_owned(), value)).collect::<BTreeMap<_, _>>(),
+        seed: 1,
+        lease: None,
+        session: String::new(),
+        projection: None,
+        world_pool: String::new(),
+        deadline_ms: 0,
+        grace_ms: 0,
+    };
+    let client = ActionClient::new(Channels::new(&ClientTls::none()));
+    let outcome = client.execute(&endpoint, goal, |_, _| {}).await.map_err(|error| chain(&error));
+    shutdown.cancel();
+    let _ = serving.await;
+    outcome
+}
