@@ -415,6 +415,10 @@ impl Planning<'_> {
                     failed = failed.or(Some(error));
                     continue;
                 }
+                Err(PlanError::TimeUp) if best.is_some() => {
+                    best = best.map(|plan| Plan { time_up: true, ..plan });
+                    break;
+                }
                 Err(error) => return Err(error),
             };
             let length_rad = length(&depart) + followed.length_rad();

@@ -11,7 +11,8 @@ use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::arm;
 use ratn_motion::line::through;
-use ratn_motion::plan::{Goal, Plan, PlanError, Request};
+use ratn_motion::pace::{Control, Progress};
+use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
 use ratn_motion::straight::Straight;
 use ratn_motion::timing::{Section, timed};
 use ratn_motion::trajectory::{ArmTrajectory, Curve};
@@ -134,6 +135,22 @@ fn a_plan_goes_through_way_points_between_its_departure_and_its_approach() {
         lasted = duration_s;
         assert_eq!(cell.plan(&request).unwrap(), plan);
     }
+}
+
+#[test]
+fn when_time_is_up_after_the_first_straight_way_that_way_is_the_answer() {
+    let (cell, tool) = at_home();
+    let straight = Some(WayPoints { through: vec![by(&tool, 0.05, 0.05, 0.05)], blend_m: 0.02 });
+    let request = Request { straight, ..request(cell.state(), vec![Goal::Pose(by(&tool, 0.0, 0.10, 0.0))]) };
+    let mut found = false;
+    let hasty = plan(&cell.robot, &cell.scene, &request, &mut |progress| {
+        found |= matches!(progress, Progress::FirstPath { .. });
+        if found { Control::TimeUp } else { Control::Continue }
+    });
+    let hasty = hasty.unwrap();
+    assert!(hasty.time_up && hasty.end_pose.distance(&cell.plan(&request).unwrap().end_pose) < 1e-6);
+    let never = plan(&cell.robot, &cell.scene, &request, &mut |_| Control::TimeUp);
+    assert_eq!(never, Err(PlanError::TimeUp));
 }
 
 #[test]
