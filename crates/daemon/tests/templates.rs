@@ -147,7 +147,9 @@ async fn one_that_never_says_that_it_is_ready_is_killed_with_that_as_the_reason(
         Template { start_timeout_s: 0.3, crash_limit: 1, ..shell("echo not quite; exec cat", line("ready")) };
     let processes = system.process_manager(vec![template]).await;
     let failure = failure(&system, &processes).await;
-    let words = "1 crashes in a row; shell-1@compute: not ready within 0.3 s; its last words: not quite";
+    let words = "1 crashes in a row; shell-1@compute: not ready within 0.3 s: no line of its standard output has `ready` in it; \
+                 it was started as `/bin/sh -c echo not quite; exec cat`, and `ratn logs shell-1@compute` shows what it wrote; \
+                 its last words: not quite";
     assert_eq!(failure, words);
     processes.end().await;
 }

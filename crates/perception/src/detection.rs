@@ -73,8 +73,6 @@ pub enum DetectionError {
 const MIN_EXPLAINED: f64 = 0.7;
 /// How badly it may explain what was measured, see `Fit::score`.
 const MAX_SCORE: f64 = 0.6;
-/// A place that is less certain than this is none: a standard deviation in metres.
-const MOST_UNCERTAIN: f64 = 0.010;
 /// How far apart the middles of two parts of one thing are at the most, in metres.
 const MAX_APART: f64 = 0.12;
 /// How far around a known object is looked for it, in metres.
@@ -244,10 +242,9 @@ fn explanation(view: &View<'_>, cluster: usize, classes: &[ObjectClass]) -> Opti
         let common = common(&fit, &evidence);
         (fit, covariance, common)
     };
-    // Also what is not a number is too uncertain.
-    let certain =
-        (0..2).all(|i| covariance.pose[i][i] < MOST_UNCERTAIN.powi(2)) && covariance.height < MOST_UNCERTAIN.powi(2);
-    if !certain {
+    // What the image hardly says stays in, with a covariance that says so; a fit that came out as no number at all is none.
+    let is_fitted = (0..2).all(|i| covariance.pose[i][i].is_finite()) && covariance.height.is_finite();
+    if !is_fitted {
         return None;
     }
     let object = detection(view, &fit, &covariance, common, confidence);
