@@ -418,6 +418,18 @@ fn a_place_whose_object_the_camera_missed_is_not_filled_again() {
 }
 
 #[test]
+fn a_place_that_was_used_in_an_earlier_round_stays_used_though_the_camera_misses_it() {
+    // Of three bowls the second is grasped in vain: the third picture, of the table, comes after another round. The first one is missed there.
+    let mishaps = Mishaps { grasps: vec![2], missed: vec![(3, 0)], ..Mishaps::default() };
+    for mode in MODES {
+        let (run, room) = set_table(mode, [2, 0], &[bowl(0), bowl(1), bowl(2)], &mishaps);
+        assert_eq!(run.outcome, "success", "{mode:?}: {}", run.reason);
+        let (a, b, c) = (&room.things[0].pose, &room.things[1].pose, &room.things[2].pose);
+        assert!([a.distance(b), b.distance(c), c.distance(a)].iter().all(|away| *away > 0.1), "{mode:?}: {room:#?}");
+    }
+}
+
+#[test]
 fn what_stands_beside_its_place_is_set_anew_and_does_not_block_the_others() {
     let mishaps = Mishaps { let_go: BTreeMap::from([(1, Pose::at(0.04, 0.0, 0.0))]), ..Mishaps::default() };
     sets([2, 0], &[bowl(0), bowl(1)], &mishaps, 4);
