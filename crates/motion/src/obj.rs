@@ -41,18 +41,27 @@ pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<[[f64; 3]; 3]>, MeshError> {
 
 /// A line with those that it goes on with: after a backslash at its end.
 fn continued<'t>(line: &'t str, lines: &mut impl Iterator<Item = (usize, &'t str)>) -> Result<Cow<'t, str>, String> {
-    let mut whole = Cow::Borrowed(line);
-    while let Some(before) = whole.strip_suffix('\\') {
+    // A comment ends with its line.
+    if !line.ends_with('\\') || line.contains('#') {
+        return Ok(Cow::Borrowed(line));
+    }
+    let mut whole = line.to_owned();
+    while whole.ends_with('\\') {
+        whole.pop();
         let Some((_, next)) = lines.next() else {
             return Err("the line goes on after its `\\`, but the file ends: it was cut off".to_owned());
         };
-        let is_apart = before.ends_with(char::is_whitespace) || next.starts_with(char::is_whitespace);
-        if !is_apart && !before.is_empty() && !next.is_empty() {
+        let is_apart = whole.ends_with(char::is_whitespace) || next.starts_with(char::is_whitespace);
+        if !is_apart && !whole.is_empty() && !next.is_empty() {
             return Err("whether a number goes on after the `\\` cannot be told: put a blank before it".to_owned());
         }
-        whole = Cow::Owned(format!("{before} {next}"));
+        whole.push(' ');
+        whole.push_str(next);
+        if next.contains('#') {
+            break;
+        }
     }
-    Ok(whole)
+    Ok(Cow::Owned(whole))
 }
 
 /// The vertex that a corner `7`, `7/1` or `7//2` names; negative numbers count from the last vertex so far.

@@ -288,7 +288,12 @@ pub fn plan(
     if let Some(constraint) = planning.constraint.as_ref().filter(|c| !c.holds(&state(&start))) {
         return Err(PlanError::NotKept { place: "at the start", reason: constraint.breach(&state(&start)) });
     }
+    // An arm may stand so close to something, where it was stopped; it does not go there.
+    let roomy = || Checker::new(robot, scene, &here, TIGHT_PADDING_M).reaching_into(&request.reaches_into);
     if let Some(way) = &request.straight {
+        if planning.checker.padding() < TIGHT_PADDING_M {
+            planning.checker = roomy();
+        }
         return planning.straight(request, way, depart, &mut pace);
     }
     let departure_rad = length(&depart);
@@ -296,8 +301,7 @@ pub fn plan(
     let door = planning.door(&start).ok_or_else(|| planning.no_room(&start))?;
     let way_out = if door == state(&start) { 0.0 } else { distance(&start, &joints(robot, &door)) };
     if planning.checker.padding() < TIGHT_PADDING_M {
-        // An arm may stand so close to something, where it was stopped; it does not go there.
-        planning.checker = Checker::new(robot, scene, &here, TIGHT_PADDING_M).reaching_into(&request.reaches_into);
+        planning.checker = roomy();
     }
     planning.leaving = leaving(robot, scene, request, planning.checker.padding());
     let before = departure_rad + way_out;

@@ -102,6 +102,11 @@ impl Arguments {
                 _ => (argument, None),
             };
             let value = match value {
+                // `--insecure=false` must not read as `--insecure`.
+                Some(value) if FLAGS.contains(&option.as_str()) => {
+                    let why = "it stands without a value: leave it out, or give it alone".to_owned();
+                    return Err(ArgumentError::Value { option, value, why });
+                }
                 Some(value) => value,
                 None if FLAGS.contains(&option.as_str()) => String::new(),
                 // What begins like an option is told as one that is not known, not as a lack of its value.

@@ -31,6 +31,10 @@ mod arguments {
         };
         assert_eq!(refused("--id"), "--id needs a value");
         assert_eq!(refused("--id a --id b"), "--id is given twice");
+        assert_eq!(
+            refused("--id a --insecure=false"),
+            "--insecure is `false`: it stands without a value: leave it out, or give it alone"
+        );
         assert_eq!(refused("--speed fast"), "--speed is `fast`: invalid float literal");
         assert!(refused("--listen nowhere").starts_with("--listen is `nowhere`: "));
         let unknown = refused("--sped 3");
