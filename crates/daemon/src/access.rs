@@ -1,4 +1,4 @@
-//! Who may do what: as in every server ([`ratn_worker::access`]), and what a daemon's config and its resource pool make of it.
+//! Access control: roles as in every server ([`ratn_worker::access`]), with what a daemon's config and its resource pool add.
 
 pub use ratn_worker::access::*;
 

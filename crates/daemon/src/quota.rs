@@ -1,4 +1,4 @@
-//! What one caller may have of a daemon at the same time, so that one stops nobody else.
+//! Quotas: how much of a daemon one caller may use at the same time, so that no caller can block the others.
 //!
 //! ```text
 //!   call ──admit(caller, path)──▶ Permit, held until the answer has been sent

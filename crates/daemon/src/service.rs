@@ -1,4 +1,4 @@
-//! What surrounds every daemon, whatever it serves: who may connect and do what, logs, metrics, the drain.
+//! What every daemon has around its own service: access control, logs, metrics, the drain.
 //!
 //! ```text
 //!   [service] of the config ──▶ ServiceConfig ──serving(role)──▶ ratn_worker::server::Serving (exposure, gate, drain)

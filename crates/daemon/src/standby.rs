@@ -4,9 +4,9 @@
 //!   log in files: open the state ──▶ bind ──▶ serve
 //!   etcd:         bind ──▶ open the state ──▶ serve
 //!                   │          ▲ the leader is gone
-//!                   └─ held ───┴── standing by: health NOT_SERVING, every call refused with who leads
+//!                   └─ held ───┴── standing by: health NOT_SERVING, every call refused, with the address of the leader
 //! ```
-//! Who stands by is ready for a service manager. Clients that know several addresses go to the one that is SERVING.
+//! A standby counts as ready for a service manager. Clients that know several addresses go to the one that is SERVING.
 
 use crate::access::{Caller, RoleGate};
 use crate::config::{Engine, StorageConfig};

@@ -1,4 +1,4 @@
-//! Where the expressions of a state stand: one walk over all of them. Whoever asks what a state reads, needs, uses or is typed
+//! Where the expressions of a state stand: one walk over all of them. Code that asks what a state reads, needs, uses or is typed
 //! as asks this walk and chooses by [`Slot`]; nobody else takes a state apart for its expressions.
 //!
 //! The walk visits whole expressions; their parts are visited by [`Expr::visit`]. It comes in the order of [`Slot`]'s variants.

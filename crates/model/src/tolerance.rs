@@ -2,7 +2,7 @@
 //!
 //! A [`Tolerance`] is complete. A task and its ontology say parts of one ([`Deviation`]), for all facts or for those of a
 //! predicate; [`Tolerances::of`] puts them together, the nearest first: the task for the predicate, the ontology for the
-//! predicate, the task for all, whoever runs it.
+//! predicate, the task for all, in every run.
 
 use crate::value::Value;
 use serde::{Deserialize, Serialize};

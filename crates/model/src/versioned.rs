@@ -1,7 +1,7 @@
 //! Values as bytes that are kept: the version of their form first, then [postcard](https://docs.rs/postcard).
 //!
 //! For what is written into a log or a snapshot and read by later versions of the program. What changes in a form otherwise than by
-//! new variants of an enum at its end takes a new number, and whoever reads goes on reading the older ones ([`version`]).
+//! new variants of an enum at its end takes a new number, and readers still read the older ones ([`version`]).
 
 use serde::{Deserialize, Serialize};
 

@@ -1,4 +1,4 @@
-//! What changes of resources mean for those who wait.
+//! Changes of resources, and which waiting requests they may help.
 //!
 //! Each group of a family knows how much exists for it and what of that is free. A change of a resource concerns every group that
 //! the resource fits, and a family may have thousands of groups. So a change is only noted; turns settle what was noted: a few

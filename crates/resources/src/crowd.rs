@@ -1,4 +1,4 @@
-//! Who has units of a resource, as views show it: in parts that views share.
+//! The holders of a resource, as views show them: in parts that views share.
 //!
 //! Every event of a lease carries views of its resources. With a copy of all holders in each, the end of thousands of leases of one
 //! resource would cost their square in time and memory. A resource with many holders therefore keeps them in parts; a change makes

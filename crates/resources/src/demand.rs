@@ -1,4 +1,4 @@
-//! Demand: what waiters want beyond all that exists, for those who could provide it; and why they do not.
+//! Demand: resources that requests wait for and that do not exist yet, for the providers that could create them; and why a provider does not.
 //!
 //! Demand is of now: it goes when its waiters do, or when what they want is there. It is not written down, nor is what providers
 //! say of it; both are said again after a restart.

@@ -1,4 +1,4 @@
-//! What a waiter waits for, and whom.
+//! Explanations: which resources a waiting request lacks, and which leases and requests stand before it.
 
 use crate::assignment::{Assignment, Available};
 use crate::id::{SessionId, WaiterId};

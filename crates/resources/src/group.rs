@@ -1,5 +1,5 @@
-//! Who waits for what: waiters whose requirements select the same resources form a group, and groups whose resources may
-//! overlap (of one kind) a family. A change of a resource touches the groups that it fits and nobody else (`changed.rs`).
+//! Groups of waiting requests: those whose requirements select the same resources form a group, and groups whose resources may
+//! overlap (of one kind) a family. A change of a resource touches only the groups that it fits (`changed.rs`).
 
 use crate::id::Slot;
 use crate::pool::Pool;

@@ -1,4 +1,4 @@
-//! The last events, for who watches from a revision that is not the newest.
+//! The last events, for watches that begin at an earlier revision.
 
 use crate::event::WatchEvent;
 use ratn_model::id::Revision;

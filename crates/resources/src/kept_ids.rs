@@ -1,15 +1,15 @@
 //! Ids of sessions that have ended. Each is kept for a while for the caller that opened its session, so that nobody else opens a session of
-//! that id while its owner is away: the owner would be refused from then on.
+//! that id before its owner returns: the owner would be refused from then on.
 //!
 //! Bounded by number and by age, and for each caller by number. A caller's own oldest ids are given up first; where all callers together
 //! have too many, those of the caller with the most. So nobody's sessions make the manager give up the ids of a caller with fewer.
-//! Where nobody knows who opened a session, its id is kept for nobody.
+//! If the opener of a session is unknown, its id is not kept.
 //!
 //! An id is kept by the record that ends its session, and given up by the one that opens the next: nothing else is written down. After a
 //! restart the time begins anew, and a replay may keep more ids than there were: those that had been given up for their age, or under narrower
 //! bounds, are kept again, within the bounds of now.
 //!
-//! Whoever may open sessions can reserve ids of its choice by opening and ending sessions of them. Ids of the project's own parts are fresh, and
+//! Every caller that may open sessions can reserve ids of its choice by opening and ending sessions of them. Ids of the project's own parts are fresh, and
 //! nobody guesses them. `keep_session_ids_for_ms = 0` keeps none, also of those that are there.
 
 use crate::id::SessionId;

@@ -1,4 +1,4 @@
-//! Which kinds are subclasses of which: who asks for a `Gripper` may get a `VacuumGripper`.
+//! Subclasses of kinds: a request for a `Gripper` may be granted a `VacuumGripper`.
 //!
 //! ```text
 //!   Tool ◀── Gripper ◀── VacuumGripper        one family: what fits a request for one kind may fit one for another

@@ -19,7 +19,7 @@
 //! nothing is counted beside them. Grants are made in
 //! strict order of priority, then arrival: a waiter that cannot be served yet reserves every free unit it can use, so a
 //! later one never takes a unit that it waits for, and waiters for other kinds pass. It deliberately knows no socket,
-//! no clock, no file and no process; who starts what a waiter lacks is the providers' business.
+//! no clock, no file and no process. Starting missing workers is the task of the providers.
 //!
 //! Waiters that select the same form a group (`group.rs`); a change of a resource touches the groups that it fits, and what became free
 //! goes to the first who lacks it (`schedule.rs`). `cargo bench -p ratn-resources`, medians on a busy machine with two

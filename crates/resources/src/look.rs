@@ -1,4 +1,4 @@
-//! Looks that may be long, in parts: whoever looks at much does it in several turns, and others have theirs in between.
+//! Long reads, in parts: a request that reads much does so in several turns, and other requests have theirs in between.
 //!
 //! A part is bounded in what it looks at, not in what it finds. Of what changes between two parts, the new or the old may be seen.
 

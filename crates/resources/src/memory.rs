@@ -1,8 +1,8 @@
-//! The answers given, by who asked and request id: the same id of the same caller twice is performed once.
+//! Remembered answers, by caller and request id: a request that the same caller repeats under the same id is performed once.
 //!
 //! Bounded by number and by age, and for each caller by number and bytes. A caller's own oldest answers are forgotten first; where all
 //! callers together have too many, those of the caller with the most. So nobody's requests make the manager forget the answers of a caller
-//! with fewer. An answer is durable together with its effect; who is still in the queue is not.
+//! with fewer. An answer is durable together with its effect; waiting requests are not.
 
 use crate::error::PoolError;
 use crate::fingerprint::Fingerprint;

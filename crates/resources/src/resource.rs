@@ -1,4 +1,4 @@
-//! A resource: its description, who has how much of it, and therefore what is free.
+//! A resource: its description, how much each lease holds, and therefore what is free.
 
 use crate::crowd::Holders;
 use crate::id::{SessionId, Slot};

@@ -1,4 +1,4 @@
-//! Who in the queue can be served now.
+//! Scheduling: which waiting requests can be served now.
 //!
 //! Waiters are served in order. One that cannot be yet, but could be if the holders let go, reserves every free unit that it
 //! would take: nobody behind it gets those, so it is not overtaken for what it waits for more often than

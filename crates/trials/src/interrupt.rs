@@ -1,4 +1,4 @@
-//! Runs that somebody ends, or that run out of time, or in which the world changes at any moment.
+//! Runs that are aborted or reach their deadline at any moment, or in which the world changes at any moment.
 //!
 //! What is compared:
 //!

@@ -16,7 +16,7 @@
 //! | the same where nothing looks at the world ([`Features::IMPRECISE`]) | the outcome, every result of HSM mode, and that all its PIAs start |
 //!
 //! Every run is replayed from its log, and the executive's invariants hold after each of its events. CDTN mode's is made once more, and
-//! after each moment everything that waits is looked at again: nobody could have gone on who was not woken.
+//! after each moment everything that waits is looked at again: no instance could have gone on that was not woken.
 //!
 //! | | |
 //! |---|---|

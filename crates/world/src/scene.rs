@@ -8,7 +8,7 @@
 //!
 //! - [`Scene::of`]: all of it, from a world
 //! - [`live::LiveScene`]: kept up to date with the changes of a world, each costing what it moves
-//! - [`delta::SceneDelta`]: what one scene differs by from another, for whoever has the other
+//! - [`delta::SceneDelta`]: how one scene differs from another, for a reader that has the other
 
 pub mod delta;
 pub mod live;

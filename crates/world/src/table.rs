@@ -5,7 +5,7 @@
 //! shifts (Knuth, volume 3, 6.4, algorithm R), at most five eighths full.
 //!
 //! The table is in shards, by the first bits of the hash: a shard that grows too large is divided, and nothing but it is touched
-//! (extendible hashing: Fagin, Nievergelt, Pippenger, Strong, ACM TODS 1979). Who alone has a shard writes into it. Who shares it writes
+//! (extendible hashing: Fagin, Nievergelt, Pippenger, Strong, ACM TODS 1979). The only owner of a shard writes into it. An owner that shares it writes
 //! beside it, into a persistent hash map of the changes since; when those are an eighth of the shard, the two become a shard of its
 //! own. So a write costs a constant amount, on average, and at most a shard; a clone always costs nothing.
 

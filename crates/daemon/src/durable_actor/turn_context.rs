@@ -1,4 +1,4 @@
-//! What a core has at hand during a turn: the time, whom to answer, who watches, and whether anything may change.
+//! What a core can use during a turn: the time, the callers to answer, the watches, and whether changes are allowed.
 
 use super::Core;
 use super::clock::Clock;

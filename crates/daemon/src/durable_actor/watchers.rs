@@ -1,4 +1,4 @@
-//! Who watches: everything as it is, then every update; one that does not keep up is cut off rather than waited for.
+//! Watches: each gets everything as it is, then every update. A watch that does not keep up is closed; the actor never waits for it.
 
 use crate::details::{retry_later, status};
 use std::fmt;

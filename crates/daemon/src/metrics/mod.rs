@@ -1,6 +1,6 @@
 //! What a daemon counts and measures, for Prometheus: in the text form of OpenMetrics, at `/metrics` of a listener of its own.
 //!
-//! Made once for each daemon and handed to whoever has something to count; whether they are shown is another matter ([`listen`]). Labels take few values: methods of this system, gRPC codes, reasons of refusals; never what a client sent.
+//! Made once for each daemon and given to every part that counts something. Serving them is separate ([`listen`]). Labels take few values: methods of this system, gRPC codes, reasons of refusals; never what a client sent.
 
 mod listener;
 

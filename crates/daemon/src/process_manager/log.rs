@@ -1,4 +1,4 @@
-//! The output of a worker: into a bounded file, with its end kept at hand for whoever asks why it died. Of the workers that
+//! The output of a worker: into a bounded file, with its end kept in memory, to answer why the worker died. Of the workers that
 //! have ended, the logs of the last ones are kept.
 
 use super::log_file::previous;

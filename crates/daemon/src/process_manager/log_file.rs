@@ -1,4 +1,4 @@
-//! A worker's log as somebody reads it: what was kept of before, what there is, and what is written from then on, also when the file is
+//! Reading a worker's log: the older file that was kept, the current one, and what is written from then on, also when the file is
 //! begun anew or cut to nothing.
 
 use ratn_worker::runtime_directory::RuntimeDirectory;

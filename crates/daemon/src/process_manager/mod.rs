@@ -6,7 +6,7 @@
 //!                                          │ ▲ pools/ (what there should be)                  │ exit, health
 //!                  resource manager ◀──link┘ └─────────────────────────────────────────────────┘
 //! ```
-//! What the workers do, and who uses them, it does not know.
+//! It does not know what the workers do or which tasks use them.
 
 mod account;
 mod actor;

@@ -1,4 +1,4 @@
-//! The resource manager: owns every resource of a system, and says who has what.
+//! The resource manager: owns every resource of a system and grants leases of them.
 //!
 //! ```text
 //!   gRPC call ──▶ service/ ──message──▶ actor (Pool of ratn-resources, a clock) ──answer, event──▶ service/
@@ -6,7 +6,7 @@
 //!   durable_actor ──records──▶ journal.rs (ratn-storage) ──durable──▶ outbox ──▶ what tells of them leaves
 //! ```
 //! After a restart everything that was acknowledged is as it was: resources, leases with their tokens, what was consumed,
-//! answers by request id; sessions and leases with a time of their own have it once more. Who was in the queue asks again.
+//! answers by request id; sessions and leases with a time of their own have it once more. Waiting requests have to be made again.
 
 mod actor;
 mod config;

@@ -1,4 +1,4 @@
-//! The answers given, by who asked and request id: the same id of the same caller twice is performed once.
+//! Remembered answers, by caller and request id: a request that the same caller repeats under the same id is performed once.
 //!
 //! Bounded in all and for each caller. A caller's own oldest answers are forgotten first; where all callers together have too many, those of
 //! the caller with the most.

@@ -1,6 +1,6 @@
 //! What happens to an action that does not end at once as it should: tries and their pauses, timeouts, workers that die.
 //!
-//! A cancelled or crashed goal changes nothing: nobody knows how far it came.
+//! A cancelled or crashed goal changes nothing, because it is not known how far it came.
 
 use super::node::GoalEnd;
 use super::{Current, DEFAULT_ATTEMPTS, Interpreter, Phase};

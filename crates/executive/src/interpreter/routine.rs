@@ -1,5 +1,5 @@
 //! A routine of HSM mode: it asks for all that it contains at its entry, as one PIA if any of it is one, and holds it to its end,
-//! so that nobody comes in between. Routines and preemptive concurrencies inside of it are part of it.
+//! so that no other node gets them in between. Routines and preemptive concurrencies inside of it are part of it.
 //!
 //! A routine of the window has its lease from there; it is the one that everything in its interpreter is in.
 

@@ -1,7 +1,7 @@
 //! One simulation of the rest of the window under the executive's dispatch.
 //!
-//! An instance asks for its resources as soon as what it waits for has ended. The resource manager serves who asks by priority;
-//! whoever cannot be served reserves what is free of what it needs. Endings are handled one at a time: first those that
+//! An instance asks for its resources as soon as what it waits for has ended. The resource manager serves requests by priority;
+//! a request that cannot be served reserves what is free of what it needs. Endings are handled one at a time: first those that
 //! became ready ask, then what has ended gives back what it held. Nothing is allocated while it runs.
 
 use super::network::{Network, Place};

@@ -5,11 +5,11 @@
 //!
 //! | owner | of what |
 //! |---|---|
-//! | [`graph`] | the instances: what follows what, lines, branches, who is a head |
+//! | [`graph`] | the instances: their order, lines, branches, the heads of lines |
 //! | [`growth`] | cursors, where the window grows |
-//! | [`memory`] | what the world is at a place, who has looked, what cannot change any more |
-//! | [`waits`] | who waits for whom, the queue, timers |
-//! | [`dispatch`] | who is under way, priorities, who gives way |
+//! | [`memory`] | the world as it is at a place of the program, its readers, what cannot change any more |
+//! | [`waits`] | which instance waits for which other one, the queue, timers |
+//! | [`dispatch`] | running instances, priorities, which speculative holder gives way |
 //! | [`results`] | the result cache |
 //!
 //! | what happens | |

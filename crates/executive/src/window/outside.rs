@@ -1,4 +1,4 @@
-//! The world changes from outside: a fact expired, or somebody else wrote one.
+//! Changes of the world from outside the run: a fact expired, or another client wrote one.
 //!
 //! What is real stands, and so does a motion under way, as it would in HSM mode. Of the rest, whatever was made of a fact that is
 //! otherwise now is made again, settled or not; and a decision that would be another one now is made again where it stands: what

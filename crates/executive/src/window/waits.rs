@@ -1,4 +1,4 @@
-//! Who waits for whom, and until when: the queue of instances to be looked at, who is woken by whom, and timers.
+//! Waits: which instance waits for which other one, the queue of instances to be examined again, and timers.
 //!
 //! An instance that cannot go on waits for exactly one other (the first thing found missing) and is looked at again when that
 //! one goes on: the work per event is proportional to what it touches, not to the window.

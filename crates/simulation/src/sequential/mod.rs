@@ -1,7 +1,7 @@
 //! What keeps a task sequential: it is simulated as written and as a dataflow network with the durations that are known, and again
 //! with states annotated that say too little.
 //!
-//! Nobody knows here what the actions will answer: they succeed, with assumed outputs of the declared types. So a figure
+//! What the actions will answer is not known here: they succeed, with assumed outputs of the declared types. So a figure
 //! is what an annotation is worth if it is true, not a promise.
 
 mod annotate;

@@ -1,6 +1,6 @@
 //! Reads a log: the snapshot that counts, and the frames behind it up to the head.
 //!
-//! Who stands by reads along ([`Known`]), so that who takes the place reads only what was written last. Records up to the head never
+//! A standby reads along ([`Known`]), so that a new leader only has to read what was written last. Records up to the head never
 //! change; whether they are still the same ones is seen by when the last of them was written. Where a snapshot has taken their place,
 //! everything is read anew.
 

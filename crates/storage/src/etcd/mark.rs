@@ -2,7 +2,7 @@
 //! the one that there was. Nothing else depends on the file. Without it, only the number of etcd's cluster tells, and what this process has
 //! seen itself.
 //!
-//! Whoever accepts an older state begins a generation of the log, and so does a copy of one. A later generation takes the place of what was seen of an earlier one, so
+//! Accepting an older state begins a generation of the log, and so does a copy of one. A later generation takes the place of what was seen of an earlier one, so
 //! it is accepted once, by one host, for all.
 
 use super::term::Seen;

@@ -1,7 +1,7 @@
 //! One writer: an advisory lock on a file that is never removed.
 //!
 //! A lock can be got past (the file is removed by hand, a copy of the directory is put in its place). The writer notices: before
-//! it acknowledges anything it looks whether the name still leads to the file that it holds. Whoever took the place later did so
+//! it acknowledges anything it looks whether the name still leads to the file that it holds. A process that took the place later did so
 //! before reading the log, so what was acknowledged before is read by them. The same look compares the segment that is written: one that
 //! was removed, or replaced by a copy, takes records that nobody will read.
 

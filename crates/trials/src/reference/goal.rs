@@ -1,7 +1,7 @@
 //! One action: its tries, what it answers, and what its end changes.
 //!
 //! What ends without an answer (a goal that had no time left, a worker that died too often, a precondition that does not hold) ends
-//! `aborted` and changes nothing, not even by the effects of `aborted`: nobody knows how far it came.
+//! `aborted` and changes nothing, not even by the effects of `aborted`: it is not known how far it came.
 
 use super::evaluate::{Place, Read};
 use super::walk::assign;

@@ -2,7 +2,7 @@
 //!
 //! A fact about an individual moves that individual, and whatever stands on it. The objects are a persistent map, so that a clone is a
 //! version that costs nothing and two versions are compared by what they do not share. The digest is the sum of those of the
-//! objects, so it follows as cheaply; it tells scenes apart, and is no defence against who makes two scenes alike on purpose.
+//! objects, so it follows as cheaply; it tells scenes apart, and is no defence against a caller that makes two scenes alike on purpose.
 
 use super::{BASE, Placement, Scene, SceneError, SceneObject, Shape, base, object};
 use crate::digest::{Digest, Digester};

@@ -1,4 +1,4 @@
-//! What those who wait demand of one host.
+//! Demand: how many workers the waiting requests need from one host.
 
 use crate::process_manager::config::Labels;
 use ratn_model::resource::ResourceClass;

@@ -1,4 +1,4 @@
-//! What is missing, for those who can provide it.
+//! Demand: which resources are missing, reported to the providers that can supply them.
 
 use super::super::providers::Provisions;
 use super::super::status::of_error;

@@ -1,4 +1,4 @@
-//! What leaves when its records are on the disk: grants to whoever still waits, events to everybody who watches.
+//! Replies that are sent after their records have been synced: grants to requests that still wait, events to all watches.
 
 use super::{ResourceCore, ResourceTurn};
 use crate::resource_manager::status;

@@ -1,4 +1,4 @@
-//! Who only looks: the sessions there are, and why an acquire waits. Each turn a part of it: the call asks for the next part.
+//! Requests that only read: the open sessions, and why an acquire waits. Each turn answers a part, and the call asks for the next.
 
 use super::{ResourceCore, ResourceTurn};
 use crate::details::status as status_with;

@@ -1,6 +1,6 @@
-//! The pool as the core of an actor: what is asked of it, what time ends, and who is told.
+//! The resource pool as the core of an actor: requests, deadlines, and replies to callers.
 //!
-//! A grant that nobody takes any more (the call was dropped in the same moment) is released at once. Pings of sessions come first: a
+//! A grant whose call was dropped at the same moment is released at once. Pings of sessions come first: a
 //! session does not expire because there is much to do.
 
 mod calls;

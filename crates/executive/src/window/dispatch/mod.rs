@@ -1,4 +1,4 @@
-//! Dispatch: who is served first, and who gives way.
+//! Dispatch: which instance gets resources first, and which speculative holder gives way.
 //!
 //! What is certain comes before what is speculative, then the longest remaining path (`estimate`), then program order. A look-ahead
 //! may have advised something better. A speculative node counts as much as its path is likely; it leaves the last room for

@@ -1,6 +1,6 @@
 //! Forecasts: what an instance changes of the world, predicted before it has ended, as it came out after; each effect by itself.
 //!
-//! A forecast is made when somebody looks, and kept. What it is made of is registered, so that it is made again when that
+//! A forecast is made for its first reader, and kept. What it is made of is registered, so that it is made again when that
 //! changes, and its readers are told of the difference. An `increase` is worked out to the value that it leaves: then it hides
 //! older writers as a `set` does, and a chain of counters costs one step per writer.
 

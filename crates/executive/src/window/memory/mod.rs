@@ -4,7 +4,7 @@
 //! lookup walks the chain of older writers of a predicate, youngest first, as far as it must (`walk`, `view`). What a writer
 //! changes, predicted or measured, is worked out once and kept (`forecast`), as a memo of incremental computation is.
 //!
-//! Whoever looks is registered with every writer that was *visited*, also where that one had nothing to write: absence is read,
+//! A reader is registered with every writer that was *visited*, also where that one had nothing to write: absence is read,
 //! too. When what a writer changes comes out otherwise, beyond the tolerances of the facts, its users are told
 //! (`difference`); where it comes out the same, nobody is.
 //!

@@ -1,4 +1,4 @@
-//! The chain of older writers: from an environment, youngest first, as far as somebody wants to go.
+//! The chain of older writers: from an environment, youngest first, as far as the reader needs.
 
 use super::view::View;
 use crate::plan::{Chain, EVERYTHING, Plan};
