@@ -39,29 +39,29 @@ pub(crate) enum Command {
     Up(UpArguments),
     /// Run a task on a running system, or on one started for it
     Run(RunArguments),
-    /// Pause a run that is under way, let it go on, let it do one step, or end it
+    /// Pause a run, let it go on, let it do one step, or end it
     Control(ControlArguments),
-    /// Show what runs, by the names of its states, who holds what, and who waits for what
+    /// Show which states run, which resources are held, and what waits for what
     Status(StatusArguments),
     /// Show the worker processes of all hosts
     Ps(HostArguments),
-    /// Print what a worker writes, on whichever host it is
+    /// Print the output of a worker on any host
     Logs(LogsArguments),
     /// Start and end workers of a host's pools, and change how many there are
     Pool(PoolArguments),
     /// Replace workers, each once its successor is ready
     Restart(RestartArguments),
-    /// Let a host take no new work: each of its workers ends once nobody holds it
+    /// Let a host take no new work: each of its workers ends when no lease holds it
     Drain(DrainArguments),
-    /// Emergency stop: whatever moves stops, and nothing begins until it is cleared
+    /// Emergency stop: everything that moves stops, and nothing begins until the stop is cleared
     Stop(StopArguments),
-    /// Pause whatever moves, and whatever would begin to
+    /// Pause everything that moves, and let nothing new move
     Hold(HoldArguments),
     /// End a hold: motions go on where they paused
     GoOn(GoOnArguments),
     /// Say what is missing on this machine or in this config, and what to do about it
     Doctor(DoctorArguments),
-    /// Lay a new table in the simulated cell of a running system, and forget every fact
+    /// Lay a new table in the simulated cell of a running system, and remove every fact
     Reset(ResetArguments),
     /// Check a task file without starting anything
     Check(CheckArguments),
@@ -75,21 +75,21 @@ pub(crate) enum Command {
     Plan(PlanArguments),
     /// Look at the resources of a running system and change them
     Resource(ResourceArguments),
-    /// Look at the world model of a running system, back in time too, and load facts into it
+    /// Look at the world model of a running system, now or at an earlier revision, and load facts into it
     World(WorldArguments),
-    /// Copy what a daemon keeps on the disk, put a copy back, or look at it
+    /// Back up, restore, copy or show the state that a daemon keeps on the disk
     State(StateArguments),
     /// Make the authority of a system and certificates for its hosts
     Certs(CertsArguments),
-    /// Own the resources: who has what, and who waits (host compute)
+    /// Run the resource manager, which grants resources to tasks (host compute)
     ResourceManager(KeptRoleArguments),
-    /// Hold the root world model and its projections (host compute)
+    /// Run the world pool, which keeps the world model and its projections (host compute)
     WorldPool(KeptRoleArguments),
-    /// Spawn and watch this host's worker processes
+    /// Run the process manager, which starts and watches this host's workers
     ProcessManager(RoleArguments),
-    /// Be the simulated cell: robot, table, boxes, sensors, controllers (host sim)
+    /// Run the simulated cell: robot, table, boxes, sensors, controllers (host sim)
     Cell(CellArguments),
-    /// Be a worker process; the process manager starts these
+    /// Run a bundled worker; the process manager starts these
     Worker(WorkerArguments),
 }
 

@@ -21,6 +21,15 @@ mod task_control;
 use clap::Parser;
 use std::process::ExitCode;
 
+/// Whether these words, the name of the program first, are a command line that `ratn` takes; otherwise what it says to them. Nothing is
+/// done: the test of the documentation asks about every command that is printed there.
+///
+/// # Errors
+/// The message that a user would see, also for `--help` and `--version`.
+pub fn would_take(words: &[String]) -> Result<(), String> {
+    arguments::Arguments::try_parse_from(words).map(drop).map_err(|refusal| refusal.to_string())
+}
+
 /// Runs the command line of this process.
 pub fn main() -> ExitCode {
     let arguments = match arguments::Arguments::try_parse() {

@@ -63,7 +63,7 @@ pub(crate) enum StateCommand {
         /// Where the copy goes: a folder that is empty or not there yet
         target: PathBuf,
     },
-    /// Make a state of a copy; end the daemon first whose state it takes the place of
+    /// Restore a state from a copy; end the daemon of that state first
     Restore {
         /// What `backup` made
         backup: PathBuf,

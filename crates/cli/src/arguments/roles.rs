@@ -30,7 +30,7 @@ pub(crate) struct RoleArguments {
     /// Show metrics for Prometheus at this address, `127.0.0.1:9464`; the config's unless given
     #[arg(long, value_name = "ADDRESS")]
     pub(crate) metrics: Option<SocketAddr>,
-    /// End when standard input ends: whoever started this is gone
+    /// End when standard input ends, because the process that started this one is gone
     #[arg(long)]
     pub(crate) exit_with_parent: bool,
 }
@@ -108,7 +108,7 @@ pub(crate) struct WorkerArguments {
     /// Offer the resource to this resource manager by itself; not for workers of a process manager
     #[arg(long, value_name = "ADDRESS")]
     pub(crate) resource_manager: Option<Endpoint>,
-    /// End when standard input ends: whoever started this is gone
+    /// End when standard input ends, because the process that started this one is gone
     #[arg(long)]
     pub(crate) exit_with_parent: bool,
     /// Serve addresses beyond loopback also without TLS: the network itself is trusted

@@ -42,7 +42,7 @@ pub(crate) struct CheckArguments {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct RunArguments {
-    /// The task file; with --resume the one that the log names unless given
+    /// The task file; with --resume it may be left out, because the log names it
     #[arg(value_name = "TASK", required_unless_present = "resume")]
     pub(crate) task: Option<PathBuf>,
     /// Go on with the run of this event log, whose task control was killed, on the system that it was on
@@ -63,7 +63,7 @@ pub(crate) struct RunArguments {
     /// Write a Gantt chart; `.svg` or `.html`
     #[arg(long, value_name = "FILE", value_parser = chart)]
     pub(crate) gantt: Option<PathBuf>,
-    /// What every random choice is derived from
+    /// Every random choice is derived from this number
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub(crate) seed: u64,
     /// The system's config, TOML; without it the built-in default
@@ -85,7 +85,7 @@ pub(crate) struct RunArguments {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ControlArguments {
-    /// What the run shall do
+    /// What to tell the run
     #[arg(value_enum)]
     pub(crate) word: Word,
     /// Where the endpoint files of the run's system are
@@ -140,7 +140,7 @@ pub(crate) struct SimulateArguments {
     /// Orders to look at whenever much of what is to be done has changed; 0 for plain dispatch
     #[arg(long, value_name = "N", default_value_t = ratn_simulation::jobshop::DEFAULT_ORDERS)]
     pub(crate) orders: usize,
-    /// What every random choice is derived from
+    /// Every random choice is derived from this number
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub(crate) seed: u64,
     /// Print one JSON document on standard output

@@ -57,11 +57,11 @@ pub(crate) enum Asked {
 /// What a run can be told.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Word {
-    /// No further PIA begins; what runs goes on
+    /// No further PIA begins; states that run go on
     Pause,
     /// PIAs may begin again
     Resume,
-    /// One PIA begins, then it is a pause again
+    /// One PIA begins, then the run pauses again
     Step,
     /// The run ends: motions stop and hold, everything is given back
     Abort,

@@ -39,9 +39,9 @@ pub(crate) struct HostArguments {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct LogsArguments {
-    /// A worker's id, as `ps` shows it: `path-planner-1@compute`; or a template: then every line says whose it is
+    /// A worker's id, as `ps` shows it: `path-planner-1@compute`; or a template: then every line names its worker
     name: String,
-    /// Go on with what is written from now on: of a worker until it ends, of a template also of the workers to come
+    /// Follow the output: of a worker until it ends, of a template also of workers that start later
     #[arg(short, long)]
     follow: bool,
     #[command(flatten)]
@@ -58,7 +58,7 @@ pub(crate) struct PoolArguments {
 
 #[derive(Debug, Clone, Subcommand)]
 enum PoolCommand {
-    /// Start more workers of a template, which then are kept; also where it has failed
+    /// Start more workers of a template and keep them; also where the template has failed
     Start {
         /// The template's name
         template: String,
@@ -66,7 +66,7 @@ enum PoolCommand {
         #[arg(default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
         count: u32,
     },
-    /// End workers, each once nobody holds it; a template never keeps less than its minimum
+    /// End workers, each when no lease holds it; a template keeps at least its minimum
     Stop {
         /// Their ids
         #[arg(required = true)]

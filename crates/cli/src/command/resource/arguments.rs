@@ -31,7 +31,7 @@ pub(super) enum ResourceCommand {
     Create(CreateArguments),
     /// Use capacity up for as long as this command runs
     Consume(HoldArguments),
-    /// Remove resources: whoever holds them loses them
+    /// Remove resources; their holders lose them
     Delete {
         /// Their ids
         #[arg(value_name = "ID", required_unless_present = "kind", conflicts_with = "kind")]
@@ -42,20 +42,20 @@ pub(super) enum ResourceCommand {
     },
     /// Wait for resources and hold them for as long as this command runs
     Block(HoldArguments),
-    /// End a lease, whoever holds it
+    /// End a lease of any holder
     Release {
         /// Its number, as `list` shows it
         #[arg(value_name = "LEASE")]
         lease: u64,
     },
-    /// Say whether resources are there, blocked or not; exit code 1 when not
+    /// Say whether such resources exist, free or not; exit code 1 when not
     Exists(Selector),
-    /// Show the resources and who has them
+    /// Show the resources and who holds them
     List {
         /// Only of these kinds
         #[arg(value_name = "KIND")]
         kinds: Vec<String>,
-        /// Only those that are like this, `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`; may be repeated
+        /// Only those that meet this condition, `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`; may be repeated
         #[arg(long = "where", value_name = "CONDITION")]
         conditions: Vec<Condition>,
     },
@@ -65,13 +65,13 @@ pub(super) enum ResourceCommand {
         #[arg(value_name = "ID")]
         id: String,
     },
-    /// Say what waits for resources, and what is in its way
+    /// Show the requests that wait, and what each waits for
     Explain {
         /// The request id of one; the first hundred of the queue unless given
         #[arg(value_name = "REQUEST", default_value = "")]
         request: String,
     },
-    /// Show who is there: sessions, what they hold and provide
+    /// Show the open sessions, what they hold and provide
     Sessions,
     /// Show the resources, then every change
     Watch {
@@ -118,7 +118,7 @@ pub(super) struct Selector {
     /// Their kind
     #[arg(value_name = "KIND")]
     pub(super) kind: String,
-    /// How many, or of what is divisible how much: `0.5`
+    /// How many units; of divisible resources also a part: `0.5`
     #[arg(long, value_name = "N", default_value = "1", value_parser = amount)]
     pub(super) count: Quantity,
     /// Their class
@@ -127,7 +127,7 @@ pub(super) struct Selector {
     /// An attribute that they have, `reach=1.2`; may be repeated
     #[arg(long = "attribute", value_name = "NAME=VALUE", value_parser = attribute)]
     pub(super) attributes: Vec<(String, Value)>,
-    /// What they must be like besides, `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`; may be repeated
+    /// A condition that they must meet, `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`; may be repeated
     #[arg(long = "where", value_name = "CONDITION")]
     pub(super) conditions: Vec<Condition>,
 }

@@ -91,7 +91,7 @@ pub(super) enum WorldCommand {
         /// What `dump` wrote; Turtle where its name ends in `.ttl`
         #[arg(value_name = "FILE")]
         file: PathBuf,
-        /// All other facts are gone
+        /// Remove all other facts
         #[arg(long)]
         replace: bool,
     },
