@@ -1,4 +1,4 @@
-//! What SIGHUP changes without a restart, and what it does not.
+//! Reloading the config at SIGHUP: which settings change without a restart, and which do not.
 
 /// Keys of a config that a running daemon takes over, with all below them.
 const LIVE: [&str; 6] = [

@@ -1,4 +1,4 @@
-//! What the service manager of the machine (systemd) hears and says: `sd_notify(3)` and SIGHUP. Without one nothing is sent, and
+//! The interface to the machine's service manager (systemd): `sd_notify(3)` and SIGHUP. Without one nothing is sent, and
 //! SIGHUP means the same.
 //!
 //! ```text

@@ -1,4 +1,4 @@
-//! How the stream of a watch ends.
+//! The end of a watch's stream.
 
 use crate::details::ending;
 use futures::stream::BoxStream;

@@ -1,4 +1,4 @@
-//! What every part of the executive works with while it handles one event.
+//! The context of one event: shared by all parts of the executive while it is handled.
 
 use crate::plan::Plan;
 use crate::protocol::{Command, Note};

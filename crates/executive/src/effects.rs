@@ -1,4 +1,4 @@
-//! What a finished node changed: its declared effects with what was measured put in.
+//! The effects of a finished node: as declared, with measured values in place of predicted ones.
 
 use crate::plan::NodeNature;
 use ratn_model::expression::{EffectExpr, EvaluateError, Scope};

@@ -1,4 +1,4 @@
-//! What goes into and comes out of the executive. Both are the event log, line by line.
+//! Events into the executive and commands out of it. Together they are the event log, line by line.
 
 use ratn_model::fact::{Change, FactKey, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision, StateId};

@@ -1,4 +1,4 @@
-//! Which resources serve which requirement: a maximum assignment, so that a request that can be served is.
+//! Assigns resources to requirements: a maximum assignment, so that every request that can be served is.
 //!
 //! Requirements take greedily, each from the resources that it fits, in the order in which those are given away. Where that falls
 //! short and several requirements fit the same resources (`PathPlanner` beside `PathPlanner{host: a}`), amounts are moved by a

@@ -1,4 +1,4 @@
-//! What each caller has in the pool: how many sessions it opened, what those provide and hold, how many of their acquires wait, and for
+//! Use of the pool by each caller: how many sessions it opened, what those provide and hold, how many of their acquires wait, and for
 //! how many selectors. Counted beside the sessions, which say whose they are; kept nowhere. Whether one may have more: [`Share`].
 
 use crate::error::{ALL, ALL_BUT_OPERATORS, PoolError};

@@ -1,4 +1,4 @@
-//! What comes out of the pool besides direct answers: answers to waiters, and the events that watchers see.
+//! Outputs of the pool besides direct answers: answers to waiting requests, and the events for watches.
 
 use crate::id::{SessionId, WaiterId};
 use crate::resource::ResourceView;

@@ -1,4 +1,4 @@
-//! What time does to the pool: sessions expire, waiters reach their deadline, leases their end,
+//! Expiry: sessions expire, waiters reach their deadline, leases their end,
 //! and providers the bound within which they confirm standstill.
 //!
 //! Waiters whose session or deadline has passed leave before anything is granted, however late the pool was called. What else is

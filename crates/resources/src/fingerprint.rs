@@ -1,4 +1,4 @@
-//! What makes two requests of one id the same one: a hash of what is asked.
+//! Fingerprints of requests: two requests of one id are the same if the hash of their contents is.
 //!
 //! It is kept over a restart and over an upgrade, so it must not depend on how records are written. It is of the names of what is asked
 //! and their values, in the order of the names, and what is not said (`None`) is left out: a field that is added, and is left out where

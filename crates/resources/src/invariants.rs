@@ -1,4 +1,4 @@
-//! What always holds between two calls; checked after every step of simulated runs and property tests.
+//! Invariants that hold between two calls; checked after every step of simulated runs and property tests.
 
 use crate::caller::Callers;
 use crate::expiry::Timer;

@@ -1,4 +1,4 @@
-//! How fast tokens may grow: no faster than a clock's microseconds, so that the time is above all that was ever handed out.
+//! The pace at which tokens grow: no faster than a clock's microseconds, so that the time is above all that was ever handed out.
 //!
 //! ```text
 //!   started at floor t ──▶ last token ≤ t + AHEAD + microseconds since ──▶ state lost, started anew at floor t' > all of them

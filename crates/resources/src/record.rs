@@ -1,4 +1,4 @@
-//! What changes in a pool, as it is written down: every durable change is one of these records, applied by
+//! Records of changes: every durable change is one of these records, applied by
 //! `apply.rs`, both when it happens and when it is read back.
 //!
 //! Records are physical (which slot, which amount, which token), never "what was asked": nothing is decided again when they

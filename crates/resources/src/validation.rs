@@ -1,4 +1,4 @@
-//! What every request is checked for before it is looked at: names, amounts, numbers of things.
+//! Validation of every request before it is handled: names, amounts, numbers of things.
 
 use crate::assignment::selects_the_same;
 use crate::error::{PoolError, malformed};

@@ -1,4 +1,4 @@
-//! How far a log is durable, for those who hold answers back until it is.
+//! The durable position of a log, for code that holds answers back until it is reached.
 
 use crate::error::{CompactionFailure, Fault};
 use crate::store::Position;

@@ -1,4 +1,4 @@
-//! What can go wrong, one type per operation. Messages say what, where, and what to do.
+//! Errors, one type per operation. Messages say what, where, and what to do.
 
 use crate::store::Position;
 use std::io;

@@ -1,4 +1,4 @@
-//! What a writer shares with the thread that writes and with a compaction: the records that wait, and how far everybody is.
+//! State that a writer shares with the writing thread and a compaction: the records that wait, and the position of each.
 //!
 //! ```text
 //!   append ──▶ batch ──take──▶ the thread that writes ──▶ progress.durable ──▶ whoever holds answers back

@@ -1,4 +1,4 @@
-//! What a durable log promises, wherever it is kept: append, read, compact, and one guarded writer.
+//! The trait of a durable log, wherever it is kept: append, read, compact, and one guarded writer.
 //!
 //! Nothing here speaks of files: a log may as well be kept by a service of another host.
 

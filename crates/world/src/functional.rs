@@ -1,4 +1,4 @@
-//! What a world together with changes must not be: two facts of a functional predicate about one subject.
+//! Functional predicates: changes are refused that would give a subject two facts of one.
 
 use crate::world::World;
 use ratn_model::fact::{Change, FactKey};

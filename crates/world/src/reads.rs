@@ -1,4 +1,4 @@
-//! What live projections have read, and which of them a commit contradicts.
+//! Facts that live projections have read, and which projections a commit contradicts.
 //!
 //! A projection shows a base with predicted effects, and what reads it depends on what it showed: on single facts, on the facts
 //! that match a pattern (that none did, too), or on everything. When the root changes, a projection is contradicted where it

@@ -1,4 +1,4 @@
-//! How messages get to the actor. What is urgent goes past all of them.
+//! The inbox of the actor. Urgent messages overtake all others.
 
 use super::Core;
 use crate::details::ending;

@@ -1,4 +1,4 @@
-//! What a daemon's state is kept in over a restart: a log of its entries, and from time to time a snapshot in their place.
+//! The journal keeps a daemon's state over a restart: a log of entries, and from time to time a snapshot in their place.
 //!
 //! ```text
 //!   state ──entries──▶ log ──durable──▶ outbox: what depended on them leaves

@@ -1,4 +1,4 @@
-//! What an actor has to say, held back until what it tells of is on the disk. In order: nothing overtakes.
+//! The outbox: replies are held back until their records are on the disk, and are sent in order.
 //!
 //! An answer waits for the last entry written before it was made, also when it changed nothing itself: it may tell of what others
 //! changed.

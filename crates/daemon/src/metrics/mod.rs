@@ -1,4 +1,4 @@
-//! What a daemon counts and measures, for Prometheus: in the text form of OpenMetrics, at `/metrics` of a listener of its own.
+//! Metrics of a daemon for Prometheus: in the text form of OpenMetrics, at `/metrics` of a listener of its own.
 //!
 //! Made once for each daemon and given to every part that counts something. Serving them is separate ([`listen`]). Labels take few values: methods of this system, gRPC codes, reasons of refusals; never what a client sent.
 

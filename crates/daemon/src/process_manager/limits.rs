@@ -1,4 +1,4 @@
-//! What a worker may use of the machine: kept by a group of cgroup v2 of its own where the config names a directory for them, else by
+//! Limits of a worker (memory, processors, processes, files): enforced by a group of cgroup v2 of its own where the config names a directory for them, else by
 //! groups of cgroup v1, one for each controller that it names a directory for, else by the limits of its process (`setrlimit(2)`), as far as these go. What is in force is said, never assumed.
 //!
 //! They are set right after the process is started: nothing may run in the child before its program does.

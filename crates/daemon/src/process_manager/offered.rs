@@ -1,4 +1,4 @@
-//! What a process manager offers to the resource manager: its host with what the machine has, and every worker that is ready.
+//! Resources that a process manager offers to the resource manager: its host with what the machine has, and every worker that is ready.
 
 use super::HOST_KIND;
 use super::config::{Labels, ProcessManagerConfig};

@@ -1,4 +1,4 @@
-//! How many files may be open at once (`RLIMIT_NOFILE`). A process manager has a dozen for each worker, so it takes all that it may have:
+//! The limit of open files (`RLIMIT_NOFILE`). A process manager needs a dozen for each worker, so it raises its limit as far as it may:
 //! its soft limit becomes the hard one. Its workers get back what it was started with, where their template says nothing else: a
 //! program that looks at every number up to its limit, or waits with `select(2)`, is not to find another world under it.
 

@@ -1,4 +1,4 @@
-//! Which templates wait for which: no worker of one is started before a worker of each in its `after` is ready.
+//! The start order of templates: no worker of one is started before a worker of each in its `after` is ready.
 
 use super::template::Template;
 use crate::config::{ConfigError, rule};

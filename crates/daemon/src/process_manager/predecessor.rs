@@ -1,4 +1,4 @@
-//! What becomes of the workers that a process manager left behind that was killed: adopted or ended, each as its template says, before
+//! Workers that a killed process manager left behind: they are adopted or ended, each as its template says, before
 //! any other is started.
 //!
 //! ```text

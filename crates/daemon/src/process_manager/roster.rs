@@ -1,4 +1,4 @@
-//! Which workers there are, in a file of the runtime directory, so that a process manager that is started after one that was killed
+//! The list of workers in a file of the runtime directory, so that a process manager that is started after one that was killed
 //! knows whom that one left behind, and what may still move though its worker is gone. Lines are appended as workers come and go; a lock
 //! keeps a second process manager away.
 

@@ -1,4 +1,4 @@
-//! What workers use of the machine: resident memory, and processor time between two listings.
+//! Resource usage of workers: resident memory, and processor time between two listings.
 
 use ratn_proto::types::PoolStatus;
 use sysinfo::{Pid, ProcessRefreshKind, ProcessesToUpdate, System};

@@ -1,4 +1,4 @@
-//! Which provider meets which demand: each unit that is missing is asked of one, so that two hosts do not both start a worker for it.
+//! Distributes demand to providers: each missing unit is asked of one, so that two hosts do not both start a worker for it.
 //!
 //! ```text
 //!   asked of the first that has room ──▶ there in time ──▶ met

@@ -1,4 +1,4 @@
-//! Which resources a watch is about: a provider hears of its own, and not of everybody's.
+//! Filters of watches by resource: a provider watches its own resources only.
 
 use ratn_resources::ResourceView;
 use std::collections::BTreeSet;

@@ -1,4 +1,4 @@
-//! What watchers are told, as the pool has it. The wire's messages are made of it where they are sent: the holders of a resource that
+//! Messages to watches, in the types of the pool. The wire's messages are made of it where they are sent: the holders of a resource that
 //! thousands of leases hold are in every event of it, and the actor has no time for that.
 
 use super::watch_filter::WatchFilter;

@@ -1,4 +1,4 @@
-//! What makes two requests the same one: a hash of what goes over the wire.
+//! Fingerprints of requests: two requests are the same if the hash of their messages is.
 //!
 //! It is kept over a restart and over an upgrade, so it must not depend on how this program writes its types down. The wire form does
 //! not: fields have numbers, a field with its default value is not there, and maps are in the order of their keys. A field that

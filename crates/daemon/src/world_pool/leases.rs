@@ -1,4 +1,4 @@
-//! Which leases live, as the resource manager's watch tells: what projections live as long as.
+//! Leases that live, as the resource manager's watch reports them. A projection lives as long as its lease.
 
 use crate::link::Manager;
 use ratn_model::id::LeaseId;

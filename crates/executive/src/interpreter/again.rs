@@ -1,4 +1,4 @@
-//! What happens to an action that does not end at once as it should: tries and their pauses, timeouts, workers that die.
+//! Repeated tries of an action: retries and their pauses, timeouts, workers that die.
 //!
 //! A cancelled or crashed goal changes nothing, because it is not known how far it came.
 

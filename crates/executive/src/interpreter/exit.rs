@@ -1,4 +1,4 @@
-//! What composite states do when they are left: outputs, assignments, effects, resource operations.
+//! Leaving a composite state: outputs, assignments, effects, resource operations.
 
 use super::{Interpreter, Target};
 use crate::binding::{self, Outputs};

@@ -1,4 +1,4 @@
-//! What a look-ahead plans: the tasks that have not ended, what they wait for and what they occupy.
+//! The scheduling problem of a look-ahead: the nodes that have not ended, what they wait for and what they occupy.
 
 use ratn_model::id::InstanceId;
 use ratn_model::resource::Quantity;

@@ -1,4 +1,4 @@
-//! What follows from a program alone, per state, before anything runs. The plan is made once per run, and both modes look at it.
+//! The static plan: what follows from the program alone, for each state, before anything runs. It is made once per run and used by both modes.
 //!
 //! | file | what it finds out |
 //! |---|---|

@@ -1,4 +1,4 @@
-//! What a node does to the environment.
+//! The nature of a node: whether it computes, senses or acts on the environment.
 
 use super::Subject;
 use super::resources::operated;

@@ -1,4 +1,4 @@
-//! How a state may end: where each outcome leads, which of them are computed ahead, and what each of them changes.
+//! Outcomes of a state: where each leads, which of them are computed ahead, and what each of them changes.
 
 use super::nature::NodeNature;
 use super::{Names, Predicate, Subject, index};

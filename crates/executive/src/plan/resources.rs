@@ -1,4 +1,4 @@
-//! What a state asks of the resource manager when it starts, and what it does to resources when it ends.
+//! Resources of a state: what it acquires when it starts, and what it creates, deletes or consumes when it ends.
 
 use super::{Names, Predicate, Subject, is_action};
 use ratn_model::program::{Program, ResourceExpr, State};

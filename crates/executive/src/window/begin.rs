@@ -1,4 +1,4 @@
-//! How a node begins: its resources, its projection, its goal.
+//! Beginning a node: its resources, its projection, its goal.
 
 use super::Window;
 use super::graph::instance::{Ended, Instance, Status};

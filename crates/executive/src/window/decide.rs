@@ -1,4 +1,4 @@
-//! What the window decides by itself, without a worker: conditions, lists of loops, deciders, what composite states do at
+//! Decisions of the window without a worker: conditions, lists of loops, deciders, what composite states do at
 //! their ends, the end of the task.
 
 use super::graph::instance::{Ended, Instance, Role};

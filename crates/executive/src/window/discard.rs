@@ -1,4 +1,4 @@
-//! What is discarded: the arms that are not taken, and everything behind an outcome that was not computed ahead.
+//! Discarding instances: the branches that are not taken, and everything behind an outcome that was not computed ahead.
 
 use super::Window;
 use super::graph::Pruned;

@@ -1,4 +1,4 @@
-//! How a node's attempt ends: with a result, without an answer, too late; and what is tried again.
+//! The end of a node's attempt: with a result, without an answer, too late; and what is tried again.
 
 use super::Window;
 use super::graph::instance::{Changed, Ended, Held, Instance, Status};

@@ -1,4 +1,4 @@
-//! What a node still waits for before it may ask for its resources: the first thing found missing.
+//! Readiness of a node: the first thing that is missing before it may ask for its resources.
 
 use super::Window;
 use super::graph::instance::{Instance, Role};

@@ -1,4 +1,4 @@
-//! What happens to a run beside what its providers do: what a user asks for, messages that come late or twice, answers that
+//! Circumstances of a simulated run besides its providers: what a user asks for, messages that come late or twice, answers that
 //! cross their cancellation.
 //!
 //! Which messages go wrong follows from a seed and from what they are about (path and attempt), never from the time: the same

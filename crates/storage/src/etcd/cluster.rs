@@ -1,4 +1,4 @@
-//! Which cluster of etcd counts, where the configured members are not all of one: one of them was made anew and empty, as a cluster of its
+//! Choosing the cluster of etcd where the configured members are not all of one: one of them was made anew and empty, as a cluster of its
 //! own, or an address leads to another etcd.
 //!
 //! A client is of one cluster for good. Where several answer when it begins, the one that has the log counts. A log is only begun where

@@ -1,4 +1,4 @@
-//! Where what stands in etcd, and how a transaction of it is written.
+//! The keys in etcd, and how a transaction of them is written.
 //!
 //! ```text
 //!   PREFIX/meta                       which log this is, and of which format

@@ -1,4 +1,4 @@
-//! What this host has seen of a log at the most, in a file of its own: by that an older state of etcd is recognised which was put in place of
+//! The newest position of a log that this host has seen, in a file of its own: by that an older state of etcd is recognised which was put in place of
 //! the one that there was. Nothing else depends on the file. Without it, only the number of etcd's cluster tells, and what this process has
 //! seen itself.
 //!

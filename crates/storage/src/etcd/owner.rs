@@ -1,4 +1,4 @@
-//! Whether the owner of a writer takes its turns. A process whose core hangs must not keep the place, whatever its other threads do.
+//! Watches whether the owner of a writer takes its turns. A process whose core hangs must not keep the place, whatever its other threads do.
 //! Pure: what the owner has counted and when it was looked at in, a verdict out.
 //!
 //! Between two looks only so much counts: who was suspended with everything else, or waited for a slow etcd with this thread, has not hung.

@@ -1,4 +1,4 @@
-//! How long who has the place has said nothing, as far as somebody looked who wants it. Pure: looks and their times in, a verdict out.
+//! How long the leader has been silent, as seen by a standby. Pure: observations and their times in, a verdict out.
 //!
 //! Silence counts only while etcd answers: what counts of a pause between two looks is bounded, and with a longer one it begins anew. That is
 //! for the sake of a holder that could not speak either. Whether the place may be taken is decided by the transaction that takes it: it

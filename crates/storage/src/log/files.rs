@@ -1,4 +1,4 @@
-//! What the log does to files, as few operations as possible: the tests put disks behind it that fail.
+//! The file operations of the log, as few as possible, so that tests can replace the disk by one that fails.
 
 use std::fmt;
 use std::fs::{self, File, OpenOptions};

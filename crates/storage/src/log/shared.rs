@@ -1,4 +1,4 @@
-//! What the writer, the syncer and a compaction of a log in files share: the records that wait, and which segments there are.
+//! State shared by the writer, the syncer and a compaction of a log in files: the records that wait, and the segments.
 
 use super::directory;
 use super::format::FRAME_HEADER;

@@ -1,4 +1,4 @@
-//! What a scene differs by from another: a planner that has one of a thousand objects is sent the two that moved.
+//! Differences between two scenes: a planner that has a scene of a thousand objects is sent the two that moved.
 //!
 //! A delta names the digest of the scene that it starts from and of the one it leads to. Applied to another it is refused, and what
 //! comes out is compared with what it should be; a reader without the base asks for [`SceneDelta::whole`]. [`Scenes`] keeps the last few

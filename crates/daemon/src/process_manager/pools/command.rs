@@ -1,4 +1,4 @@
-//! What the pools hear, what they answer with, and what they refuse.
+//! Events, commands and refusals of the pools.
 
 use crate::process_manager::machine::Sample;
 use ratn_proto::types::{Demand, WorkerStatus};

@@ -1,4 +1,4 @@
-//! Which workers there should be, and what to do about it: a pure state machine.
+//! The worker pools as a pure state machine: which workers there should be, and which to start or end.
 //!
 //! ```text
 //!   Event ─▶ Pools (of which pool, of which worker) ─▶ Pool ─┬─ Worker    one worker's life;  Liveness  when it is asked

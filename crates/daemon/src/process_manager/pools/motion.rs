@@ -1,4 +1,4 @@
-//! What workers that are gone moved, and may still move: no process does anything for it any more, so only time ends it.
+//! Devices that may still move although their worker's process has ended. No process can confirm that they stand still, so only time decides.
 
 use ratn_model::time::Timestamp;
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! What follows a crash: another worker at once after a first one, later after each further one, and none any more after
+//! Restarts after a crash: another worker at once after a first one, later after each further one, and none any more after
 //! [`Template::crash_limit`] in a row: then the pool has failed, until somebody asks for it.
 //!
 //! Pauses are shorter than they say by up to a quarter, differently on every host and each time (but the same in every run), so that

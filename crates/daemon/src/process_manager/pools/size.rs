@@ -1,4 +1,4 @@
-//! How many workers a pool shall have.
+//! The desired size of a pool.
 //!
 //! ```text
 //!   wanted = max(asked for (at least `min`), held) + spares,   or what is demanded where that is more;   `max` at the most

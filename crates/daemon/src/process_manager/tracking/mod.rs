@@ -1,4 +1,4 @@
-//! Which processes belong to which worker, also those that it sent away into sessions of their own: so that all of a worker ends with it, and
+//! Tracks which processes belong to which worker, including those in sessions of their own, so that all of a worker ends with it, and
 //! a successor of a process manager that was killed ends what nobody else knows.
 //!
 //! ```text

@@ -1,4 +1,4 @@
-//! What the service asks of the actor, and how it gets there.
+//! Messages from the service to the actor.
 
 use super::super::providers::Provisions;
 use super::super::watch_filter::WatchFilter;

@@ -1,4 +1,4 @@
-//! What a watch begins with: everything as it is, or what happened after a position that is known.
+//! The beginning of a watch: everything as it is, or all events after a known position.
 
 use super::{ResourceCore, ResourceTurn};
 use crate::resource_manager::status;

@@ -1,4 +1,4 @@
-//! What the audit log says of a request to the pool.
+//! Audit log entries of requests to the pool.
 
 use crate::audit::{self, Mutation};
 use ratn_resources::{AcquireRequest, Request};

@@ -1,4 +1,4 @@
-//! How a call asks the actor: a change is written to the audit log, and a refusal is counted by its reason.
+//! Calls to the actor: a change is written to the audit log, and a refusal is counted by its reason.
 
 use super::mutation;
 use crate::access::{Caller, speaker};

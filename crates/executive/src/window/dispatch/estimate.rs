@@ -1,4 +1,4 @@
-//! How long nodes take, and the longest path that remains: a node's own duration plus the longest of what waits for it: the
+//! Estimated durations of nodes, and the longest remaining path: a node's own duration plus the longest of what waits for it: the
 //! readers of its outputs, and the next PIA in program order, which may not begin before every older instance has ended.
 
 use super::{DEFAULT_DURATION_S, Dispatch};

@@ -1,4 +1,4 @@
-//! What is still to be done, as a scheduling problem for a look-ahead: of an undecided decision the likelier way on.
+//! The remaining work as a scheduling problem for a look-ahead: of an undecided decision the likelier way on.
 
 use super::{DEFAULT_DURATION_S, Dispatch, blocks};
 use crate::lookahead::{Problem, Task};

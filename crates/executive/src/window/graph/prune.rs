@@ -1,4 +1,4 @@
-//! What is lost when a path is left: the instances behind it, their branches, their lines.
+//! Pruning a path that is left: the instances behind it, their branches, their lines.
 
 use super::Graph;
 use super::instance::{LineId, Role, SegmentId};

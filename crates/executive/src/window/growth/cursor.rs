@@ -1,4 +1,4 @@
-//! Where the window grows: one cursor per open end of a path. It holds the environment of the next instance.
+//! Cursors, the places where the window grows: one per open end of a path. It holds the environment of the next instance.
 
 use super::environment::Environment;
 use crate::plan::Outcome;

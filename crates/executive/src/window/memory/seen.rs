@@ -1,4 +1,4 @@
-//! What a result was made of: which facts were looked at, and a digest of what they were.
+//! The facts that a result was made of, and a digest of their values.
 
 use super::digests::hash;
 use super::overlay::Overlay;

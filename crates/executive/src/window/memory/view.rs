@@ -1,4 +1,4 @@
-//! What an instance sees: its variables, the ports of older instances, and the world at its place in the program.
+//! The view of an instance: its variables, the ports of older instances, and the world at its place in the program.
 //!
 //! Where something is not known yet, the view names the instance to wait for.
 

@@ -1,4 +1,4 @@
-//! What is on the disk after some of the steps, and a loss of power.
+//! The contents of the disk after some of the steps and a loss of power.
 
 use super::{Node, PIECE, Step};
 use std::collections::BTreeMap;
