@@ -141,7 +141,7 @@ fn a_log_takes_the_place_of_nothing() -> anyhow::Result<()> {
 #[test]
 fn what_cannot_be_resumed_is_refused() -> anyhow::Result<()> {
     let place = Place::new()?;
-    let fixture = repository("crates/cli/src/report/fixtures/two_boxes.jsonl");
+    let fixture = repository("crates/report/src/fixtures/two_boxes.jsonl");
     let (fixture, task) = (fixture.to_str().context("a path")?, repository("examples/fetch_boxes.yaml"));
     let task = task.to_str().context("a path")?;
     for (arguments, reason) in [

@@ -19,7 +19,7 @@ pub(crate) use roles::{CellArguments, KeptRoleArguments, RoleArguments, WorkerAr
 pub(crate) use systems::{Budget, DemoArguments, GoodsArguments, ResetArguments, SystemArguments, UpArguments};
 pub(crate) use tasks::{
     CheckArguments, ControlArguments, ModeArgument, PlanArguments, ReportArguments, RunArguments, SimulateArguments,
-    StatusArguments, TablesArguments,
+    StatusArguments, TablesArguments, WordArgument,
 };
 
 /// Runs robot tasks, written as sequential state machines, as fast as their real dependencies allow.

@@ -1,5 +1,7 @@
 //! How a command ends when it does not succeed.
 
+use ratn_task_control::NotStarted;
+use ratn_task_control::learn::LearnError;
 use std::fmt;
 use std::process::ExitCode;
 
@@ -48,14 +50,13 @@ impl fmt::Display for Failure {
     }
 }
 
-/// An error that came before anything was started.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub(crate) struct NotStarted(pub(crate) String);
-
 impl<E: Into<anyhow::Error>> From<E> for Failure {
     fn from(error: E) -> Self {
         let error = error.into();
-        if error.is::<NotStarted>() { Failure::Refused(format!("ratn: {error:#}")) } else { Failure::Failed(error) }
+        if error.is::<NotStarted>() || error.is::<LearnError>() {
+            Failure::Refused(format!("ratn: {error:#}"))
+        } else {
+            Failure::Failed(error)
+        }
     }
 }

@@ -1,12 +1,11 @@
 //! The command of the user, as a library so that tests run the same code.
 //!
-//! [`main`] reads the command line and runs one of the commands in `command/`. Task control (`task_control/`) is the shell
-//! around `ratn-executive`; `system/` starts and finds the other processes; `report/` reads event logs.
+//! [`main`] reads the command line and runs one of the commands in `command/`; `system/` starts and finds the other processes. What
+//! runs a task is in `ratn-task-control`, what is made of event logs in `ratn-report`: both are libraries that print nothing.
 //! Results go to stdout, everything else to stderr. Exit code 0 is success, 1 a failure, 2 something refused before anything
 //! was started: a task file, a config or a command line; 4 a task's own outcome.
 
 mod arguments;
-mod background_runtime;
 mod colour;
 mod columns;
 mod command;
@@ -14,9 +13,7 @@ mod failure;
 mod input;
 mod interrupt;
 mod output;
-mod report;
 mod system;
-mod task_control;
 
 use clap::Parser;
 use std::process::ExitCode;

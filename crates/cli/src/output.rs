@@ -6,6 +6,7 @@
 use crate::failure::Failure;
 use nix::errno::Errno;
 use nix::unistd::{AccessFlags, access};
+use ratn_task_control::Messages;
 use std::fmt::Display;
 use std::io::{self, ErrorKind, Write};
 use std::path::Path;
@@ -13,6 +14,11 @@ use std::path::Path;
 /// Writes one line to standard error, if somebody is there to read it.
 pub(crate) fn progress(line: impl Display) {
     let _ = io::stderr().write_all(format!("{line}\n").as_bytes());
+}
+
+/// [`progress`], for task control.
+pub(crate) fn messages() -> Messages {
+    Messages::to(|line| progress(format_args!("{line}")))
 }
 
 /// Writes a result and the end of its last line to standard output.

@@ -13,6 +13,8 @@ use std::time::Duration;
 
 /// The attribute of a resource that says where its action service is.
 pub const ENDPOINT_ATTRIBUTE: &str = "endpoint";
+/// The kind of the resource that a host is: by its endpoint the host's process manager is found.
+pub const HOST_KIND: &str = "Host";
 
 /// The attribute by which a provider asks for time to stop what moves when a lease of its resource has ended, in milliseconds.
 pub const STANDSTILL_ATTRIBUTE: &str = "standstill_ms";

@@ -1,9 +1,8 @@
 //! What is said of tasks: how they are checked, run, steered, reported and simulated, and of planning problems.
 
 use super::values::{at_least_one, chart, makespan, padding, setting, speed};
-use crate::task_control::checkpoint::EVERY_EVENTS;
-use crate::task_control::control::Word;
 use clap::{Args, ValueEnum};
+use ratn_task_control::checkpoint::EVERY_EVENTS;
 use std::path::PathBuf;
 
 /// How tasks are executed, on the command line.
@@ -83,11 +82,24 @@ pub(crate) struct RunArguments {
     pub(crate) json: bool,
 }
 
+/// What a run can be told, on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum WordArgument {
+    /// No further PIA begins; states that run go on
+    Pause,
+    /// PIAs may begin again
+    Resume,
+    /// One PIA begins, then the run pauses again
+    Step,
+    /// The run ends: motions stop and hold, everything is given back
+    Abort,
+}
+
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ControlArguments {
     /// What to tell the run
     #[arg(value_enum)]
-    pub(crate) word: Word,
+    pub(crate) word: WordArgument,
     /// Where the endpoint files of the run's system are
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,

@@ -4,7 +4,6 @@ use super::tables::improvement;
 use crate::arguments::CheckArguments;
 use crate::failure::Failure;
 use crate::system::config::SystemConfig;
-use crate::task_control::learn;
 use crate::{input, output};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
@@ -13,6 +12,7 @@ use ratn_model::parameters::ParameterError;
 use ratn_model::program::Program;
 use ratn_model::resource::Quantity;
 use ratn_simulation::sequential::{Assumptions, Gain, Link, Sequential, sequential};
+use ratn_task_control::learn;
 use serde::Serialize;
 use std::path::Path;
 
@@ -86,7 +86,7 @@ fn simulate(
             return Err(Failure::Refused(format!("{file}: error[invalid-parameter]: {error}")));
         }
     };
-    let learned = learn::from_files(&arguments.learn, &program.name)?;
+    let learned = learn::from_files(&arguments.learn, &program.name, &output::messages())?;
     let assumptions = Assumptions {
         parameters,
         elements: usize::from(arguments.elements),
@@ -157,7 +157,7 @@ pub(crate) fn load(path: &Path, catalogue: &Catalogue) -> Result<Program, Failur
 }
 
 /// Loads a task file's text; `file` is its name in messages.
-pub(crate) fn load_text(text: &str, file: &str, catalogue: &Catalogue) -> Result<Program, Failure> {
+fn load_text(text: &str, file: &str, catalogue: &Catalogue) -> Result<Program, Failure> {
     load_from(&input::Libraries, text, file, catalogue)
 }
 

@@ -1,18 +1,30 @@
 //! `ratn control pause|resume|step|abort`
 
 use super::blocking_on;
-use crate::arguments::ControlArguments;
+use crate::arguments::{ControlArguments, WordArgument};
 use crate::failure::Failure;
 use crate::output;
 use crate::system::public_directory;
-use crate::task_control::control::{self, RunStatus, Word};
 use anyhow::Context;
+use ratn_task_control::control::{self, RunStatus, Word};
+
+impl From<WordArgument> for Word {
+    fn from(word: WordArgument) -> Word {
+        match word {
+            WordArgument::Pause => Word::Pause,
+            WordArgument::Resume => Word::Resume,
+            WordArgument::Step => Word::Step,
+            WordArgument::Abort => Word::Abort,
+        }
+    }
+}
 
 /// Tells the run of a system.
 pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
-        let told = control::tell(&directory, arguments.word).await;
+        let word = Word::from(arguments.word);
+        let told = control::tell(&directory, word).await;
         let place = directory.display();
         match told {
             Err(error) if control::is_nobody(&error) => {
@@ -22,7 +34,7 @@ pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
                 told.with_context(|| format!("the run in {place} does not take that"))?;
                 // One that has ended meanwhile says nothing any more.
                 let run = control::status(&directory).await.ok().flatten();
-                Ok(output::result(said(arguments.word, run.as_ref()))?)
+                Ok(output::result(said(word, run.as_ref()))?)
             }
         }
     })
@@ -47,8 +59,8 @@ fn said(word: Word, run: Option<&RunStatus>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::task_control::progress::UnderWay;
     use ratn_executive::protocol::Mode;
+    use ratn_task_control::progress::UnderWay;
 
     #[test]
     fn what_was_done_is_said_with_what_goes_on() {

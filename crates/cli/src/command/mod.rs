@@ -22,9 +22,6 @@ mod tables;
 mod up;
 pub(crate) mod world;
 
-#[cfg(test)]
-pub(crate) use check::load_text;
-
 use crate::arguments::Command;
 use crate::failure::Failure;
 use anyhow::Context;

@@ -3,11 +3,11 @@
 use crate::arguments::ReportArguments;
 use crate::failure::Failure;
 use crate::output;
-use crate::report::gantt;
-use crate::report::statistics::Statistics;
-use crate::report::timeline::Timeline;
-use crate::task_control::log;
 use anyhow::Context;
+use ratn_event_log as log;
+use ratn_report::gantt;
+use ratn_report::statistics::Statistics;
+use ratn_report::timeline::Timeline;
 
 /// Prints statistics of an event log, and draws it.
 pub(crate) fn run(arguments: &ReportArguments) -> Result<(), Failure> {

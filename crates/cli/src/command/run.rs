@@ -7,17 +7,18 @@ use crate::arguments::{ModeArgument, RunArguments, SystemArguments};
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
 use crate::output;
-use crate::report::gantt;
-use crate::report::statistics::Statistics;
-use crate::report::timeline::Timeline;
 use crate::system::config::SystemConfig;
 use crate::system::{System, public_directory};
-use crate::task_control::shell::{self, Ended, Run};
-use crate::task_control::{learn, log};
 use anyhow::{Context, anyhow, bail};
+use ratn_event_log as log;
 use ratn_executive::protocol::Mode;
 use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS};
 use ratn_model::value::Value;
+use ratn_report::gantt;
+use ratn_report::statistics::Statistics;
+use ratn_report::timeline::Timeline;
+use ratn_task_control::learn;
+use ratn_task_control::shell::{self, Ended, Run};
 use ratn_worker::tls::ClientTls;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -82,7 +83,7 @@ async fn begin(
     if let Some(chart) = &arguments.gantt {
         output::check_writable(chart)?;
     }
-    let learned = learn::from_files(&arguments.learn, &program.name)?;
+    let learned = learn::from_files(&arguments.learn, &program.name, &output::messages())?;
     let log = arguments.log.clone().map_or_else(|| log_file(&program.name), Ok)?;
 
     let system = match found {

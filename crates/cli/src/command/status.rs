@@ -9,14 +9,14 @@ use crate::colour::Colours;
 use crate::columns::aligned;
 use crate::failure::Failure;
 use crate::output;
-use crate::report::statistics::mode_name;
 use crate::system::public_directory;
-use crate::task_control::control::{self, RunStatus};
 use anyhow::Context;
 use ratn_daemon::resource_manager;
 use ratn_model::program::WORLD_MODEL;
 use ratn_model::resource::Quantity;
 use ratn_proto::types::{Resource, WaitingAcquire};
+use ratn_report::statistics::mode_name;
+use ratn_task_control::control::{self, RunStatus};
 use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
@@ -169,9 +169,9 @@ fn section(lines: &mut Vec<String>, head: &str, mut rows: Vec<[String; 2]>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::task_control::progress::UnderWay;
     use insta::assert_snapshot;
     use ratn_executive::protocol::Mode;
+    use ratn_task_control::progress::UnderWay;
 
     #[test]
     fn what_runs_is_told_by_the_names_of_states_and_who_holds_what() {

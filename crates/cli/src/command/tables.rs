@@ -3,10 +3,10 @@
 use crate::arguments::TablesArguments;
 use crate::failure::Failure;
 use crate::output;
-use crate::report::gantt;
-use crate::report::timeline::Timeline;
 use anyhow::Context;
 use ratn_executive::protocol::Mode;
+use ratn_report::gantt;
+use ratn_report::timeline::Timeline;
 use ratn_simulation::tables::{self, Row, Scenario};
 use std::path::Path;
 

@@ -3,9 +3,8 @@
 pub(crate) mod config;
 mod launch;
 
-use crate::failure::{Failure, NotStarted};
-use crate::task_control::Endpoints;
-use crate::task_control::shell::Place;
+use crate::failure::Failure;
+use crate::output;
 use anyhow::Context;
 use config::SystemConfig;
 use launch::Processes;
@@ -14,6 +13,9 @@ use ratn_daemon::config::{Durability, state_directory};
 use ratn_model::resource::Quantity;
 use ratn_proto::v1::cell_service_client::CellServiceClient;
 use ratn_proto::v1::{GetGroundTruthRequest, UnintendedContact};
+use ratn_task_control::Endpoints;
+use ratn_task_control::NotStarted;
+use ratn_task_control::shell::Place;
 use ratn_worker::client::{Channels, ResourceClient, WorldClient};
 use ratn_worker::endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -136,6 +138,7 @@ impl System {
             directory: self.directory.path().to_owned(),
             catalogue: Arc::new(self.config.catalogue.clone()),
             speed: self.config.speed,
+            messages: output::messages(),
         }
     }
 

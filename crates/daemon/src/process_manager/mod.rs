@@ -73,8 +73,7 @@ const TAKE_PATIENCE: Duration = Duration::from_millis(500);
 /// States of the demand that the actor was not told of yet.
 const DEMANDS: usize = 16;
 
-/// The kind of the resource that a host is: by its endpoint the host's process manager is found.
-pub const HOST_KIND: &str = "Host";
+pub use ratn_proto::types::HOST_KIND;
 
 /// Serves until `shutdown` is cancelled, and returns once every worker is gone.
 ///

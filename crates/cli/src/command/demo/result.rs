@@ -3,12 +3,12 @@
 use crate::arguments::DemoArguments;
 use crate::command::tables::improvement;
 use crate::failure::Failure;
-use crate::report::statistics::{self, Statistics, mode_name};
-use crate::report::timeline::Timeline;
 use ratn_cell::config::Setting;
 use ratn_executive::protocol::Mode;
 use ratn_model::program::SUCCESS;
 use ratn_proto::v1::UnintendedContact;
+use ratn_report::statistics::{self, Statistics, mode_name};
+use ratn_report::timeline::Timeline;
 use serde_json::{Value, json};
 use std::fmt;
 use std::path::PathBuf;

@@ -8,9 +8,9 @@ use crate::interrupt::Interrupt;
 use crate::output;
 use crate::system::System;
 use crate::system::config::SystemConfig;
-use crate::task_control::history::History;
-use crate::task_control::log::LogWriter;
-use crate::task_control::shell::{self, Resumption};
+use ratn_event_log::LogWriter;
+use ratn_task_control::history::History;
+use ratn_task_control::shell::{self, Resumption};
 use ratn_worker::tls::ClientTls;
 use std::path::Path;
 
@@ -32,7 +32,7 @@ pub(super) async fn run(
     // From here on nobody else goes on with it.
     let log = |error| refused(&format_args!("{:#}", anyhow::Error::from(error)));
     let writer = LogWriter::go_on(file).map_err(log)?;
-    let history = History::of(&writer).map_err(log)?;
+    let history = History::of(&writer, output::messages()).map_err(log)?;
     let task = task.map(Path::to_owned).or_else(|| history.task());
     let task = task.ok_or_else(|| refused(&"it does not name its task file: say `ratn run --resume LOG TASK`"))?;
     let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;

@@ -1,0 +1,399 @@
+//! The event log: one JSON object per line, every event that the executive was given and every command that it gave.
+//!
+//! It is the single source of Gantt charts, statistics, replay and resume, so each line is on its way to the file before the
+//! commands of its event are performed, and on the disk where they cannot be undone. Its writer holds a lock on it: nobody else
+//! writes it meanwhile. Reading says which line is wrong and why; a torn last line (the writer was killed) is left out and named.
+
+use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
+use ratn_model::time::Timestamp;
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{BufRead, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+
+/// A longer line is not written by any task; whoever wrote it is not `ratn`.
+const MAX_LINE_BYTES: usize = 16 << 20;
+/// A run whose log grows beyond this is ended rather than filling the disk.
+const MAX_LOG_BYTES: u64 = 4 << 30;
+
+/// Why an event log cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum LogError {
+    /// The operating system refuses it.
+    #[error("cannot {what} the event log {}", path.display())]
+    Io {
+        /// What was tried.
+        what: &'static str,
+        /// The log.
+        path: PathBuf,
+        /// Why it failed.
+        source: std::io::Error,
+    },
+    /// A new log would replace a file that has something in it.
+    #[error("{} is there already, nothing is written over it", path.display())]
+    There {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Another process writes it.
+    #[error("the event log {} is being written by a run that is under way", path.display())]
+    UnderWay {
+        /// The log.
+        path: PathBuf,
+    },
+    /// It has reached its bound.
+    #[error("the event log {} would grow beyond {MAX_LOG_BYTES} bytes; the run ends here", path.display())]
+    TooLong {
+        /// The log.
+        path: PathBuf,
+    },
+    /// A line does not read.
+    #[error("{}:{line}: not a line of an event log: {reason}", path.display())]
+    Foreign {
+        /// The file.
+        path: PathBuf,
+        /// The line's number, from 1.
+        line: usize,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// It has no whole line.
+    #[error("{} has no whole line: an event log begins with the event `started`", path.display())]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
+}
+
+/// Writes an event log.
+#[derive(Debug)]
+pub struct LogWriter {
+    path: PathBuf,
+    file: BufWriter<File>,
+    /// How many bytes and lines are written.
+    written: u64,
+    lines: usize,
+    /// It is on a disk, so that it can be made safe there.
+    on_disk: bool,
+    /// What was behind the last whole line is away.
+    is_cut: bool,
+}
+
+impl LogWriter {
+    /// Creates the file; one with something in it stays as it is.
+    pub fn create(path: &Path) -> Result<Self, LogError> {
+        let mut writer = LogWriter::open(path, OpenOptions::new().write(true).create(true).truncate(false), "create")?;
+        let length = writer.file.get_ref().metadata().map_err(|source| writer.io(source))?.len();
+        if writer.on_disk && length > 0 {
+            return Err(LogError::There { path: path.to_owned() });
+        }
+        writer.is_cut = true;
+        if writer.on_disk {
+            // The file's name has to be safe, too.
+            let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+            File::open(folder).and_then(|folder| folder.sync_all()).map_err(|source| writer.io(source))?;
+        }
+        Ok(writer)
+    }
+
+    /// For a log that is gone on with: from here on nobody else is its writer. [`LogWriter::go_on_behind`] says where.
+    pub fn go_on(path: &Path) -> Result<Self, LogError> {
+        let mut writer = LogWriter::open(path, OpenOptions::new().append(true), "go on with")?;
+        writer.written = writer.file.get_ref().metadata().map_err(|source| writer.io(source))?.len();
+        Ok(writer)
+    }
+
+    /// Goes on behind the whole lines of what was read. A torn line is cut off before the first line is written.
+    pub fn go_on_behind(&mut self, log: &Log) {
+        (self.written, self.lines) = (log.whole, log.before + log.lines.len());
+    }
+
+    /// Where the log is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Whether it is a file, which can be read again.
+    pub fn is_on_disk(&self) -> bool {
+        self.on_disk
+    }
+
+    /// How many bytes it has.
+    pub fn written(&self) -> u64 {
+        self.written
+    }
+
+    /// How many lines it has.
+    pub fn lines(&self) -> usize {
+        self.lines
+    }
+
+    fn open(path: &Path, options: &OpenOptions, what: &'static str) -> Result<Self, LogError> {
+        let io = |source| LogError::Io { what, path: path.to_owned(), source };
+        let file = options.open(path).map_err(io)?;
+        let on_disk = file.metadata().map_err(io)?.is_file();
+        if on_disk {
+            file.try_lock().map_err(|error| match error {
+                TryLockError::WouldBlock => LogError::UnderWay { path: path.to_owned() },
+                TryLockError::Error(source) => io(source),
+            })?;
+        }
+        Ok(LogWriter {
+            path: path.to_owned(),
+            file: BufWriter::new(file),
+            written: 0,
+            lines: 0,
+            on_disk,
+            is_cut: false,
+        })
+    }
+
+    fn cut(&mut self) -> Result<(), LogError> {
+        if self.on_disk && !self.is_cut {
+            self.file.get_ref().set_len(self.written).map_err(|source| self.io(source))?;
+        }
+        self.is_cut = true;
+        Ok(())
+    }
+
+    /// Writes what happened and what was decided then, and hands it to the operating system.
+    pub fn append(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Result<(), LogError> {
+        self.write(&LogLine { at, entry: LogEntry::Event(event.clone()) })?;
+        self.append_commands(at, commands)
+    }
+
+    /// Writes what was decided on the last event.
+    pub fn append_commands(&mut self, at: Timestamp, commands: &[Command]) -> Result<(), LogError> {
+        for command in commands {
+            self.write(&LogLine { at, entry: LogEntry::Command(command.clone()) })?;
+        }
+        self.file.flush().map_err(|source| self.io(source))
+    }
+
+    /// Returns once everything written so far outlives a loss of power.
+    pub fn make_durable(&mut self) -> Result<(), LogError> {
+        if self.on_disk {
+            self.file.get_ref().sync_data().map_err(|source| self.io(source))?;
+        }
+        Ok(())
+    }
+
+    fn write(&mut self, line: &LogLine) -> Result<(), LogError> {
+        let mut text = serde_json::to_vec(line).map_err(|source| self.io(source.into()))?;
+        text.push(b'\n');
+        self.cut()?;
+        self.written += text.len() as u64;
+        self.lines += 1;
+        if self.written > MAX_LOG_BYTES {
+            return Err(LogError::TooLong { path: self.path.clone() });
+        }
+        self.file.write_all(&text).map_err(|source| self.io(source))
+    }
+
+    fn io(&self, source: std::io::Error) -> LogError {
+        LogError::Io { what: "write", path: self.path.clone(), source }
+    }
+}
+
+/// What an event log says.
+#[derive(Debug)]
+pub struct Log {
+    /// The whole lines that were read.
+    pub lines: Vec<LogLine>,
+    /// How many lines are before these and were not read.
+    pub before: usize,
+    /// The number of its last line if that is torn, which is not among the others.
+    pub torn: Option<usize>,
+    /// How many bytes the whole lines have, those that were not read among them.
+    pub whole: u64,
+}
+
+/// Reads a whole event log.
+///
+/// # Errors
+/// [`LogError`] names the line.
+pub fn read(path: &Path) -> Result<Log, LogError> {
+    let log = read_from(path, 0, 0, usize::MAX)?;
+    if log.lines.is_empty() {
+        return Err(LogError::Empty { path: path.to_owned() });
+    }
+    Ok(log)
+}
+
+/// Reads what is behind so many bytes, which are so many lines.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_behind(path: &Path, bytes: u64, lines: usize) -> Result<Log, LogError> {
+    read_from(path, bytes, lines, usize::MAX)
+}
+
+/// Reads the first line.
+///
+/// # Errors
+/// As [`read`].
+pub fn first(path: &Path) -> Result<LogLine, LogError> {
+    read_from(path, 0, 0, 1)?.lines.pop().ok_or_else(|| LogError::Empty { path: path.to_owned() })
+}
+
+fn read_from(path: &Path, bytes: u64, before: usize, at_most: usize) -> Result<Log, LogError> {
+    let io = |source| LogError::Io { what: "read", path: path.to_owned(), source };
+    let mut file = File::open(path).map_err(io)?;
+    if bytes > 0 {
+        file.seek(SeekFrom::Start(bytes)).map_err(io)?;
+    }
+    let mut reader = BufReader::new(file);
+    let mut lines = Vec::new();
+    let (mut torn, mut whole) = (None, bytes);
+    let mut text = Vec::new();
+    while lines.len() < at_most {
+        text.clear();
+        let limit = MAX_LINE_BYTES as u64 + 1;
+        let length = reader.by_ref().take(limit).read_until(b'\n', &mut text).map_err(io)?;
+        if length == 0 {
+            break;
+        }
+        let line = before + lines.len() + 1;
+        let foreign = |reason: String| LogError::Foreign { path: path.to_owned(), line, reason };
+        if text.last() != Some(&b'\n') {
+            if length as u64 == limit {
+                return Err(foreign(format!("longer than {MAX_LINE_BYTES} bytes")));
+            }
+            torn = Some(line);
+            break;
+        }
+        let parsed: LogLine = serde_json::from_slice(&text).map_err(|error| foreign(explain(&text, &error)))?;
+        if line == 1 && !matches!(parsed.entry, LogEntry::Event(Event::Started { .. })) {
+            return Err(foreign("an event log begins with the event `started`".into()));
+        }
+        lines.push(parsed);
+        whole += length as u64;
+    }
+    Ok(Log { lines, before, torn, whole })
+}
+
+/// The path of a state, of the path of one of its visits: `place_all[2]/plan_transfer` → `place_all/plan_transfer`
+pub fn without_visits(path: &str) -> String {
+    let mut depth = 0_usize;
+    let mut number = false;
+    path.chars()
+        .filter(|c| {
+            depth += usize::from(*c == '[');
+            number = *c == '#' || (number && c.is_ascii_digit());
+            let keep = depth == 0 && !number;
+            depth -= usize::from(*c == ']' && depth > 0);
+            keep
+        })
+        .collect()
+}
+
+/// serde's message for an untagged enum says nothing; this one says what the line claims to be.
+fn explain(text: &[u8], error: &serde_json::Error) -> String {
+    let Ok(value) = serde_json::from_slice::<serde_json::Value>(text) else {
+        return format!("not JSON: {error}");
+    };
+    if value.get("at").is_none() {
+        return "it has no time `at`".into();
+    }
+    let known = ["event", "command"].iter().find_map(|key| Some((*key, value.get(key)?)));
+    match known {
+        Some(("event", _)) => said(serde_json::from_value::<Event>(value.clone()).err(), "event"),
+        Some((_, _)) => said(serde_json::from_value::<Command>(value.clone()).err(), "command"),
+        None => "it has neither `event` nor `command`".into(),
+    }
+}
+
+fn said(error: Option<serde_json::Error>, what: &str) -> String {
+    error.map_or_else(|| format!("not a {what} of this version"), |error| format!("not a known {what}: {error}"))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use ratn_executive::protocol::{Mode, Note};
+    use ratn_model::id::{InstanceId, Revision};
+
+    fn started() -> Event {
+        Event::Started {
+            task: "t".into(),
+            digest: "d".into(),
+            mode: Mode::Cdtn,
+            parameters: Default::default(),
+            seed: 7,
+            world: vec![],
+            revision: Revision(3),
+            capacity: Default::default(),
+            learned: Default::default(),
+            origin: Default::default(),
+        }
+    }
+
+    fn refusal(text: &str) -> String {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), text).unwrap();
+        read(file.path()).unwrap_err().to_string().replace(&file.path().display().to_string(), "LOG")
+    }
+
+    #[test]
+    fn a_log_reads_back_as_written() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let mut log = LogWriter::create(file.path()).unwrap();
+        let command = Command::Note(Note::Retired { instance: InstanceId(1) });
+        // It has a time of its own.
+        let wake = Command::Wake { at: Timestamp(7) };
+        log.append(Timestamp(0), &started(), &[command.clone(), wake.clone()]).unwrap();
+        let Log { lines, torn, .. } = read(file.path()).unwrap();
+        assert_eq!((lines.len(), torn), (3, None));
+        assert_eq!(lines[2], LogLine { at: Timestamp(0), entry: LogEntry::Command(wake) });
+        assert_eq!(lines[0], LogLine { at: Timestamp(0), entry: LogEntry::Event(started()) });
+        assert_eq!(lines[1], LogLine { at: Timestamp(0), entry: LogEntry::Command(command) });
+    }
+
+    #[test]
+    fn a_log_has_one_writer() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let mut writer = LogWriter::create(file.path()).unwrap();
+        writer.append(Timestamp(0), &started(), &[]).unwrap();
+        assert!(matches!(LogWriter::create(file.path()), Err(LogError::UnderWay { .. })));
+        assert!(matches!(LogWriter::go_on(file.path()), Err(LogError::UnderWay { .. })));
+        assert_eq!(read(file.path()).unwrap().lines.len(), 1);
+    }
+
+    #[test]
+    fn nothing_is_written_over_a_file_with_something_in_it() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), "mine").unwrap();
+        assert!(matches!(LogWriter::create(file.path()), Err(LogError::There { .. })));
+        assert_eq!(std::fs::read_to_string(file.path()).unwrap(), "mine");
+    }
+
+    #[test]
+    fn a_torn_last_line_is_left_out() {
+        let first = serde_json::to_string(&LogLine { at: Timestamp(0), entry: LogEntry::Event(started()) }).unwrap();
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), format!("{first}\n{{\"at\":1,")).unwrap();
+        let log = read(file.path()).unwrap();
+        assert_eq!((log.lines.len(), log.torn), (1, Some(2)));
+        // Who goes on with it writes over the torn line.
+        let mut writer = LogWriter::go_on(file.path()).unwrap();
+        writer.go_on_behind(&log);
+        writer.append(Timestamp(2), &Event::Resumed, &[]).unwrap();
+        writer.make_durable().unwrap();
+        let log = read(file.path()).unwrap();
+        assert_eq!((log.lines.len(), log.torn), (2, None));
+        assert!(refusal(&first).contains("has no whole line"));
+    }
+
+    #[test]
+    fn a_foreign_line_is_named() {
+        let first = serde_json::to_string(&LogLine { at: Timestamp(0), entry: LogEntry::Event(started()) }).unwrap();
+        assert!(refusal(&format!("{first}\n{{\"at\":1,\n{first}\n")).starts_with("LOG:2: not a line of an event log"));
+        assert!(refusal(&format!("{first}\nhello\n")).starts_with("LOG:2: not a line of an event log: not JSON"));
+        let strange = format!("{first}\n{{\"at\":1,\"event\":\"rained\"}}\n");
+        assert!(refusal(&strange).starts_with("LOG:2: not a line of an event log: not a known event: unknown variant"));
+        assert!(refusal("").contains("has no whole line"));
+        assert!(
+            refusal("{\"at\":1,\"command\":\"note\",\"note\":\"retired\",\"instance\":1}\n").contains("begins with")
+        );
+    }
+}

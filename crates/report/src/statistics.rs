@@ -1,0 +1,380 @@
+//! Where the time of a run went.
+//!
+//! Every moment of a run counts once in [`Shares`]: to motion if anything moves, else to detection, else to other work, else to planning
+//! that everything waits for, else to idleness; they add up to the makespan.
+
+use super::timeline::{Activity, Ending, Job, Span, Timeline};
+use ratn_event_log::without_visits;
+use ratn_executive::protocol::Mode;
+use ratn_model::value::Value;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::fmt::{self, Write as _};
+
+/// What a log says in numbers. Times are in the robot's seconds.
+#[derive(Debug, Clone, Serialize)]
+pub struct Statistics {
+    /// The task.
+    pub task: String,
+    /// How it was executed.
+    pub mode: Mode,
+    /// `None` when the log ends before the run does.
+    pub outcome: Option<String>,
+    /// Why it ended so; empty for a success.
+    pub reason: String,
+    /// From the start of the run to its end.
+    pub makespan_s: f64,
+    /// Where the time went.
+    pub time: Shares,
+    /// All jobs' durations added up.
+    pub work_s: f64,
+    /// How long at least two jobs ran at once.
+    pub overlap_s: f64,
+    /// How long no PIA was to begin, because the user paused the run.
+    pub paused_s: f64,
+    /// How many single steps the user asked for.
+    pub steps: usize,
+    /// How long task control was gone; what ran then went on or was stopped by its provider.
+    pub away_s: f64,
+    /// PIAs that began beside an older one whose exceptions are imprecise.
+    pub imprecise: Vec<ImpreciseOverlap>,
+    /// What became of the visits of states.
+    pub instances: Instances,
+    /// Work on projected worlds.
+    pub ahead_of_time: AheadOfTime,
+    /// How busy each resource was.
+    pub resources: Vec<Busy>,
+    /// By state, in the order of their first visits.
+    pub states: Vec<StateTime>,
+    /// The paths that were planned.
+    pub plans: Vec<Plan>,
+}
+
+/// The makespan, divided.
+#[derive(Debug, Clone, Copy, Default, Serialize)]
+pub struct Shares {
+    /// Something moved.
+    pub motion_s: f64,
+    /// Something was looked at, and nothing moved.
+    pub detection_s: f64,
+    /// What neither moves the robot nor looks nor computes.
+    #[serde(skip_serializing_if = "is_nothing")]
+    pub other_s: f64,
+    /// Only planning went on, and everything else waited for that.
+    pub planning_waited_for_s: f64,
+    /// Nothing went on.
+    pub idle_s: f64,
+}
+
+fn is_nothing(seconds: &f64) -> bool {
+    *seconds == 0.0
+}
+
+/// How many instances there were.
+#[derive(Debug, Clone, Copy, Default, Serialize)]
+pub struct Instances {
+    /// All of them.
+    pub expanded: usize,
+    /// Those that have become real.
+    pub retired: usize,
+    /// Those that were discarded.
+    pub squashed: usize,
+    /// Attempts that ended without an answer.
+    pub crashed_attempts: usize,
+    /// How often a result did not count because something came out otherwise.
+    pub invalidated: usize,
+    /// How many took the result of an equal one.
+    pub reused: usize,
+}
+
+/// A PIA that began while another one with imprecise exceptions ran.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ImpreciseOverlap {
+    /// What ran, and might have failed.
+    pub older: String,
+    /// What began, and would have stood.
+    pub younger: String,
+}
+
+/// Computing and detecting jobs that began before an instance that was expanded earlier had finished.
+#[derive(Debug, Clone, Copy, Default, Serialize)]
+pub struct AheadOfTime {
+    /// Jobs whose results were used.
+    pub used: usize,
+    /// Jobs whose results were discarded.
+    pub squashed: usize,
+}
+
+/// How much of the run a resource was in use.
+#[derive(Debug, Clone, Serialize)]
+pub struct Busy {
+    /// Its id.
+    pub resource: String,
+    /// How long a job held it.
+    pub busy_s: f64,
+    /// The same as a part of the makespan.
+    pub share: f64,
+}
+
+/// What the visits of one state took together.
+#[derive(Debug, Clone, Serialize)]
+pub struct StateTime {
+    /// Its path without visit numbers.
+    pub state: String,
+    /// How many of its jobs have run.
+    pub runs: usize,
+    /// Of all of them together.
+    pub total_s: f64,
+    /// Of the longest.
+    pub longest_s: f64,
+    /// Waiting for resources to be granted.
+    pub waited_s: f64,
+}
+
+/// What a planner did with its time.
+#[derive(Debug, Clone, Serialize)]
+pub struct Plan {
+    /// The instance's path.
+    pub instance: String,
+    /// The planner.
+    pub resource: String,
+    /// When the first path was found, after the planner began.
+    pub first_path_s: f64,
+    /// The length of the first path in joint space.
+    pub first_length_rad: f64,
+    /// The length of the path that was given.
+    pub length_rad: f64,
+    /// How long the planner worked.
+    pub planning_s: f64,
+    /// By how much the rest of the budget shortened the first path, in percent.
+    pub shortened_percent: f64,
+}
+
+impl Statistics {
+    /// Reads them off a timeline.
+    pub fn of(run: &Timeline) -> Statistics {
+        let jobs: Vec<&Job> = run.jobs().map(|(_, job)| job).collect();
+        let (time, overlap_s) = divide(run.end_s, &jobs);
+        Statistics {
+            task: run.task.clone(),
+            mode: run.mode,
+            outcome: run.outcome.clone(),
+            reason: run.reason.clone(),
+            makespan_s: run.end_s,
+            time,
+            // The sum of nothing would be -0.
+            work_s: jobs.iter().map(|job| job.to_s - job.from_s).fold(0.0, |all, one| all + one),
+            overlap_s,
+            paused_s: run.pauses.iter().map(Span::length_s).fold(0.0, |all, one| all + one),
+            steps: run.steps,
+            away_s: run.absences.iter().map(Span::length_s).fold(0.0, |all, one| all + one),
+            imprecise: run
+                .beside
+                .iter()
+                .map(|(older, younger)| ImpreciseOverlap { older: older.clone(), younger: younger.clone() })
+                .collect(),
+            instances: Instances {
+                expanded: run.instances.len(),
+                retired: run.instances.iter().filter(|i| i.retired).count(),
+                squashed: run.instances.iter().filter(|i| i.squashed).count(),
+                invalidated: run.instances.iter().map(|i| i.invalidations.len()).sum(),
+                reused: run.instances.iter().filter(|i| i.reused).count(),
+                crashed_attempts: jobs.iter().filter(|job| matches!(job.ending, Ending::Crashed(_))).count(),
+            },
+            ahead_of_time: ahead_of_time(run),
+            resources: busy(run),
+            states: states(run),
+            plans: run.jobs().filter_map(|(instance, job)| plan(&instance.path, job)).collect(),
+        }
+    }
+}
+
+/// Sweeps over the ends of all jobs; between two of them nothing changes.
+fn divide(end_s: f64, jobs: &[&Job]) -> (Shares, f64) {
+    let mut edges: Vec<f64> = jobs.iter().flat_map(|job| [job.from_s, job.to_s]).chain([0.0, end_s]).collect();
+    edges.sort_by(f64::total_cmp);
+    edges.dedup();
+    let (mut shares, mut overlap_s) = (Shares::default(), 0.0);
+    for pair in edges.windows(2) {
+        let (from, length) = (pair[0], pair[1] - pair[0]);
+        let running = || jobs.iter().filter(|job| job.from_s <= from && job.to_s > from);
+        *match running().map(|job| job.activity).min() {
+            Some(Activity::Motion) => &mut shares.motion_s,
+            Some(Activity::Detection) => &mut shares.detection_s,
+            Some(Activity::Other) => &mut shares.other_s,
+            Some(Activity::Planning) => &mut shares.planning_waited_for_s,
+            None => &mut shares.idle_s,
+        } += length;
+        if running().count() > 1 {
+            overlap_s += length;
+        }
+    }
+    (shares, overlap_s)
+}
+
+fn ahead_of_time(run: &Timeline) -> AheadOfTime {
+    let mut count = AheadOfTime::default();
+    for instance in &run.instances {
+        let ahead = || {
+            instance
+                .jobs
+                .iter()
+                .filter(|job| job.ahead_of_time && matches!(job.activity, Activity::Detection | Activity::Planning))
+        };
+        if ahead().next().is_some() {
+            let used_elsewhere = ahead().any(|job| job.used_elsewhere);
+            count.used += usize::from(instance.retired || used_elsewhere);
+            count.squashed += usize::from(instance.squashed && !used_elsewhere);
+        }
+    }
+    count
+}
+
+fn busy(run: &Timeline) -> Vec<Busy> {
+    let mut of: BTreeMap<&str, f64> = BTreeMap::new();
+    for (_, job) in run.jobs() {
+        for resource in &job.resources {
+            *of.entry(resource).or_default() += job.to_s - job.from_s;
+        }
+    }
+    let share = |busy_s: f64| if run.end_s > 0.0 { busy_s / run.end_s } else { 0.0 };
+    of.into_iter().map(|(id, busy_s)| Busy { resource: id.to_owned(), busy_s, share: share(busy_s) }).collect()
+}
+
+fn states(run: &Timeline) -> Vec<StateTime> {
+    let mut order: Vec<StateTime> = Vec::new();
+    for instance in run.instances.iter().filter(|i| !i.jobs.is_empty()) {
+        let state = without_visits(&instance.path);
+        let at = order.iter().position(|s| s.state == state).unwrap_or_else(|| {
+            order.push(StateTime { state, runs: 0, total_s: 0.0, longest_s: 0.0, waited_s: 0.0 });
+            order.len() - 1
+        });
+        let entry = &mut order[at];
+        for job in &instance.jobs {
+            entry.runs += 1;
+            entry.total_s += job.to_s - job.from_s;
+            entry.longest_s = entry.longest_s.max(job.to_s - job.from_s);
+        }
+        entry.waited_s += instance.waits.iter().map(|wait| wait.to_s - wait.from_s).sum::<f64>();
+    }
+    order
+}
+
+fn plan(path: &str, job: &Job) -> Option<Plan> {
+    let number = |name: &str| job.outputs.get(name).and_then(Value::as_number);
+    let (first_length_rad, length_rad) = (number("first_length_rad")?, number("length_rad")?);
+    Some(Plan {
+        instance: path.to_owned(),
+        resource: job.resources.first().cloned().unwrap_or_default(),
+        first_path_s: number("first_path_s")?,
+        first_length_rad,
+        length_rad,
+        planning_s: number("planning_s")?,
+        shortened_percent: if first_length_rad > 0.0 { 100.0 * (1.0 - length_rad / first_length_rad) } else { 0.0 },
+    })
+}
+
+/// The mode's name as people write it.
+pub fn mode_name(mode: Mode) -> &'static str {
+    match mode {
+        Mode::Hsm => "HSM",
+        Mode::Cdtn => "CDTN",
+    }
+}
+
+impl fmt::Display for Statistics {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let outcome = self.outcome.as_deref().unwrap_or("unfinished");
+        writeln!(f, "{} in {} mode: {outcome} after {:.1} s", self.task, mode_name(self.mode), self.makespan_s)?;
+        if !self.reason.is_empty() {
+            writeln!(f, "  because {}", self.reason)?;
+        }
+        let percent = |seconds: f64| if self.makespan_s > 0.0 { 100.0 * seconds / self.makespan_s } else { 0.0 };
+        writeln!(f, "\nwhere the time went            s      %")?;
+        for (what, seconds) in [
+            ("motion", self.time.motion_s),
+            ("detection", self.time.detection_s),
+            ("other work", self.time.other_s),
+            ("planning waited for", self.time.planning_waited_for_s),
+            ("idle", self.time.idle_s),
+        ]
+        .into_iter()
+        .filter(|(what, seconds)| *what != "other work" || *seconds > 0.0)
+        {
+            writeln!(f, "  {what:<22} {seconds:>7.1} {:>6.1}", percent(seconds))?;
+        }
+        writeln!(
+            f,
+            "  {:.1} s of work in {:.1} s, at least two things at once for {:.1} s",
+            self.work_s, self.makespan_s, self.overlap_s
+        )?;
+        writeln!(
+            f,
+            "  {} instances expanded, {} retired, {} squashed; begun ahead of time: {} used, {} squashed; {} crashed attempts",
+            self.instances.expanded,
+            self.instances.retired,
+            self.instances.squashed,
+            self.ahead_of_time.used,
+            self.ahead_of_time.squashed,
+            self.instances.crashed_attempts
+        )?;
+        self.incidents(f)?;
+        let width = self.resources.iter().map(|r| r.resource.chars().count()).max().unwrap_or(0).max(22);
+        writeln!(f, "\n{:<w$} busy s      %", "resource", w = width + 2)?;
+        for r in &self.resources {
+            writeln!(f, "  {:<width$} {:>7.1} {:>6.1}", r.resource, r.busy_s, 100.0 * r.share)?;
+        }
+        let width = self.states.iter().map(|s| s.state.chars().count()).max().unwrap_or(0).max(22);
+        writeln!(f, "\n{:<w$} runs  total s longest s  waited s", "state", w = width + 2)?;
+        for s in &self.states {
+            writeln!(
+                f,
+                "  {:<width$} {:>4} {:>8.1} {:>9.1} {:>9.1}",
+                s.state, s.runs, s.total_s, s.longest_s, s.waited_s
+            )?;
+        }
+        f.write_str(&plan_table(&self.plans))
+    }
+}
+
+impl Statistics {
+    /// What does not happen in most runs.
+    fn incidents(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Instances { invalidated, reused, .. } = self.instances;
+        if invalidated > 0 || reused > 0 {
+            writeln!(f, "  results invalidated and computed again: {invalidated}; taken from an equal one: {reused}")?;
+        }
+        if self.paused_s > 0.0 || self.steps > 0 {
+            writeln!(f, "  paused for {:.1} s; single steps: {}", self.paused_s, self.steps)?;
+        }
+        if self.away_s > 0.0 {
+            writeln!(f, "  task control was gone for {:.1} s", self.away_s)?;
+        }
+        if let Some(ImpreciseOverlap { older, younger }) = self.imprecise.first() {
+            let all = self.imprecise.len();
+            writeln!(
+                f,
+                "  exceptions were imprecise: {younger} began beside {older}, which might have failed ({all} in all)"
+            )?;
+        }
+        Ok(())
+    }
+}
+
+/// What the planners did with their time; empty without plans.
+pub fn plan_table(plans: &[Plan]) -> String {
+    let mut text = String::new();
+    if plans.is_empty() {
+        return text;
+    }
+    let width = plans.iter().map(|p| p.instance.chars().count()).max().unwrap_or(0).max(22);
+    let _ = writeln!(text, "\n{:<w$} first path s  planned s  first rad  final rad  shortened", "plan", w = width + 2);
+    for p in plans {
+        let _ = writeln!(
+            text,
+            "  {:<width$} {:>12.3} {:>10.1} {:>10.2} {:>10.2} {:>9.1}%",
+            p.instance, p.first_path_s, p.planning_s, p.first_length_rad, p.length_rad, p.shortened_percent
+        );
+    }
+    text
+}

@@ -1,0 +1,284 @@
+//! A run's ear: a Unix socket in the runtime directory of its system, over which `ratn control` pauses it, lets it go on, lets
+//! one PIA begin, or ends it, and `ratn status` asks what it is doing. One word per line; each is answered by one line.
+
+use super::progress::UnderWay;
+use crate::messages::Messages;
+use ratn_executive::protocol::{Event, Mode};
+use serde::{Deserialize, Serialize};
+use std::io::{Error, ErrorKind};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::net::{UnixListener, UnixStream};
+use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::{CancellationToken, DropGuard};
+
+/// In a system's runtime directory: where its run listens.
+const SOCKET: &str = "run.control";
+/// Words that the run has not been told yet.
+const MAX_PENDING: usize = 16;
+/// Longer lines are no words of control.
+const MAX_LINE_BYTES: u64 = 64;
+/// A run that does not answer for so long does not listen.
+const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
+const DONE: &str = "ok";
+/// The word that asks what the run is doing.
+const STATUS: &str = "status";
+/// No run has so much to say of itself.
+const MAX_STATUS_BYTES: u64 = 4 << 20;
+
+/// What a run is doing.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunStatus {
+    /// Its id.
+    pub run: String,
+    /// Its task's name.
+    pub task: String,
+    /// How it is executed.
+    pub mode: Mode,
+    /// The event log.
+    pub log: PathBuf,
+    /// The robot's seconds since it began.
+    pub at_s: f64,
+    /// Whether the user has paused it.
+    pub paused: bool,
+    /// How many states have ended for good.
+    pub ended: u64,
+    /// The states that are under way, those that began first first.
+    pub under_way: Vec<UnderWay>,
+}
+
+/// What somebody wants of a run.
+#[derive(Debug)]
+pub(crate) enum Asked {
+    /// It shall do something.
+    Told(Box<Event>),
+    /// It shall say what it is doing.
+    Status(oneshot::Sender<RunStatus>),
+}
+
+/// What a run can be told.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Word {
+    /// No further PIA begins; states that run go on.
+    Pause,
+    /// PIAs may begin again.
+    Resume,
+    /// One PIA begins, then the run pauses again.
+    Step,
+    /// The run ends: motions stop and hold, everything is given back.
+    Abort,
+}
+
+impl Word {
+    const ALL: [Word; 4] = [Word::Pause, Word::Resume, Word::Step, Word::Abort];
+
+    fn text(self) -> &'static str {
+        match self {
+            Word::Pause => "pause",
+            Word::Resume => "resume",
+            Word::Step => "step",
+            Word::Abort => "abort",
+        }
+    }
+
+    fn event(self) -> Event {
+        match self {
+            Word::Pause => Event::PauseRequested,
+            Word::Resume => Event::ResumeRequested,
+            Word::Step => Event::StepRequested,
+            Word::Abort => Event::AbortRequested { reason: "the user asked for it".into() },
+        }
+    }
+}
+
+/// Listens until dropped.
+#[derive(Debug)]
+pub(crate) struct Control {
+    words: mpsc::Receiver<Asked>,
+    path: PathBuf,
+    _end: DropGuard,
+}
+
+impl Control {
+    /// Listens in `directory`. A socket that is there already is one of a run that was killed: a system has one run at a time.
+    ///
+    /// # Errors
+    /// Where the socket cannot be made, for example because its path is too long for one.
+    pub(crate) fn listen(directory: &Path) -> std::io::Result<Control> {
+        let path = directory.join(SOCKET);
+        match std::fs::remove_file(&path) {
+            Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+            _ => {}
+        }
+        let listener = UnixListener::bind(&path)?;
+        let (tell, words) = mpsc::channel(MAX_PENDING);
+        let end = CancellationToken::new();
+        tokio::spawn(end.clone().run_until_cancelled_owned(accept(listener, tell)));
+        Ok(Control { words, path, _end: end.drop_guard() })
+    }
+
+    /// As [`Control::listen`]; a run goes on without it where it cannot be.
+    pub(crate) fn listen_if_possible(directory: &Path, messages: &Messages) -> Option<Control> {
+        let listening = Control::listen(directory);
+        if let Err(error) = &listening {
+            let place = directory.join(SOCKET);
+            messages.say(format_args!("`ratn control` cannot reach this run: {}: {error}", place.display()));
+        }
+        listening.ok()
+    }
+
+    /// What the run is asked next.
+    pub(crate) async fn asked(&mut self) -> Asked {
+        match self.words.recv().await {
+            Some(event) => event,
+            None => std::future::pending().await,
+        }
+    }
+}
+
+impl Drop for Control {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+async fn accept(listener: UnixListener, tell: mpsc::Sender<Asked>) {
+    loop {
+        // One after the other: whoever is slow is given up after a while.
+        if let Ok((stream, _)) = listener.accept().await {
+            let _ = tokio::time::timeout(ANSWER_DEADLINE, hear(stream, &tell)).await;
+        }
+    }
+}
+
+async fn hear(mut stream: UnixStream, tell: &mpsc::Sender<Asked>) -> std::io::Result<()> {
+    let (reader, mut writer) = stream.split();
+    let mut line = String::new();
+    BufReader::new(reader.take(MAX_LINE_BYTES)).read_line(&mut line).await?;
+    const BEHIND: &str = "the run is too far behind";
+    let word = Word::ALL.into_iter().find(|word| word.text() == line.trim());
+    let answer = match word {
+        Some(word) if tell.try_send(Asked::Told(Box::new(word.event()))).is_ok() => DONE.to_owned(),
+        Some(_) => BEHIND.to_owned(),
+        None if line.trim() == STATUS => {
+            let (say, said) = oneshot::channel();
+            match tell.try_send(Asked::Status(say)) {
+                Ok(()) => said.await.map_err(Error::other).and_then(|status| Ok(serde_json::to_string(&status)?))?,
+                Err(_) => BEHIND.to_owned(),
+            }
+        }
+        None => "expected pause, resume, step, abort or status".to_owned(),
+    };
+    writer.write_all(format!("{answer}\n").as_bytes()).await
+}
+
+/// Tells the run of the system in `directory`.
+///
+/// # Errors
+/// Where no run listens, or it does not take the word.
+pub async fn tell(directory: &Path, word: Word) -> std::io::Result<()> {
+    match ask(directory, word.text(), MAX_LINE_BYTES).await?.as_str() {
+        DONE => Ok(()),
+        other => Err(Error::other(other.to_owned())),
+    }
+}
+
+/// What the run of the system in `directory` is doing; `None` where none is under way.
+///
+/// # Errors
+/// Where it does not say.
+pub async fn status(directory: &Path) -> std::io::Result<Option<RunStatus>> {
+    match ask(directory, STATUS, MAX_STATUS_BYTES).await {
+        Ok(answer) => serde_json::from_str(&answer).map(Some).map_err(|_| Error::other(answer)),
+        Err(error) if is_nobody(&error) => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+/// Whether an error says that no run listens.
+pub fn is_nobody(error: &Error) -> bool {
+    matches!(error.kind(), ErrorKind::NotFound | ErrorKind::ConnectionRefused)
+}
+
+/// Says a word and hears the line that answers it.
+async fn ask(directory: &Path, word: &str, most: u64) -> std::io::Result<String> {
+    let asking = async {
+        let mut stream = UnixStream::connect(directory.join(SOCKET)).await?;
+        stream.write_all(format!("{word}\n").as_bytes()).await?;
+        let mut answer = String::new();
+        BufReader::new(stream.take(most)).read_line(&mut answer).await?;
+        match answer.trim() {
+            "" => Err(Error::new(ErrorKind::UnexpectedEof, "it has just ended")),
+            answer => Ok(answer.to_owned()),
+        }
+    };
+    tokio::time::timeout(ANSWER_DEADLINE, asking).await.unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn words_arrive_as_events_in_order() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        // One of a run that was killed.
+        std::fs::write(place.path().join(SOCKET), "")?;
+        let mut control = Control::listen(place.path())?;
+        for word in [Word::Pause, Word::Step] {
+            tell(place.path(), word).await?;
+        }
+        for expected in [Event::PauseRequested, Event::StepRequested] {
+            assert!(matches!(control.asked().await, Asked::Told(event) if *event == expected));
+        }
+        drop(control);
+        assert!(tell(place.path(), Word::Resume).await.is_err());
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn a_run_says_what_it_is_doing_and_where_none_listens_there_is_none() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        assert_eq!(status(place.path()).await?, None);
+        let mut control = Control::listen(place.path())?;
+        let doing = RunStatus {
+            run: "run-1".to_owned(),
+            task: "sort".to_owned(),
+            mode: Mode::Cdtn,
+            log: PathBuf::from("log.jsonl"),
+            at_s: 3.5,
+            paused: true,
+            ended: 2,
+            under_way: vec![UnderWay { path: "place[2]/plan".to_owned(), for_s: 1.5 }],
+        };
+        let said = doing.clone();
+        let answering = tokio::spawn(async move {
+            if let Asked::Status(say) = control.asked().await {
+                let _ = say.send(said);
+            }
+        });
+        assert_eq!(status(place.path()).await?, Some(doing));
+        answering.await?;
+        // The socket of a run that was killed.
+        std::fs::write(place.path().join(SOCKET), "")?;
+        assert_eq!(status(place.path()).await?, None);
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn what_is_no_word_is_answered_and_not_told() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        let mut control = Control::listen(place.path())?;
+        for nonsense in ["fly\n".to_owned(), "x".repeat(1000)] {
+            let mut stream = UnixStream::connect(place.path().join(SOCKET)).await?;
+            let _ = stream.write_all(nonsense.as_bytes()).await;
+            let mut answer = String::new();
+            let _ = stream.read_to_string(&mut answer).await;
+            assert!(control.words.try_recv().is_err());
+        }
+        tell(place.path(), Word::Abort).await?;
+        assert!(matches!(control.asked().await, Asked::Told(event) if matches!(*event, Event::AbortRequested { .. })));
+        Ok(())
+    }
+}

@@ -1,0 +1,392 @@
+//! One goal, from giving it to a provider (or finding it there again) to the event of its end.
+
+use super::Answer;
+use crate::record::said;
+use ratn_executive::protocol::Event;
+use ratn_model::fact::FactKey;
+use ratn_model::id::{InstanceId, LeaseId};
+use ratn_model::measurement::Measurement;
+use ratn_model::program::{ABORTED, PREEMPTED};
+use ratn_model::value::Value;
+use ratn_proto::types::{Goal, GoalOutcome, HOST_KIND};
+use ratn_worker::client::retry_unanswered;
+use ratn_worker::client::{ActionClient, CallError, Channels, ProcessClient, ResourceClient};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::session::DEFAULT_TTL;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+/// A provider that was told to stop and does not is left alone after this long.
+const CANCEL_DEADLINE: Duration = Duration::from_secs(2);
+/// How long a goal goes on without task control, so that a run that is resumed finds it under way: as long as its lease would
+/// live.
+pub(super) const GRACE_MS: u64 = DEFAULT_TTL.as_millis() as u64;
+/// How long the resource of a provider that is gone may still be there: its process manager withdraws it at once, and where that one is
+/// gone too it ends with its session.
+const WITHDRAWAL_DEADLINE: Duration = Duration::from_secs(DEFAULT_TTL.as_secs() + 1);
+/// How often that is looked at.
+const WITHDRAWAL_POLL: Duration = Duration::from_millis(100);
+/// Who does not say within this time how a provider ended is not waited for.
+const END_DEADLINE: Duration = Duration::from_secs(1);
+/// How much longer than its time a session may be seen.
+const SESSION_SLACK: Duration = Duration::from_millis(500);
+/// The executive ends a goal that takes too long. The provider does so this much later, where nobody tells it to.
+const DEADLINE_SLACK: Duration = Duration::from_millis(500);
+
+/// Whether a goal is new to its provider.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Given {
+    /// It is given now.
+    Now,
+    /// Task control gave it before it was killed, or was about to: it is not given again.
+    Before,
+}
+
+/// A goal's way.
+pub(super) struct Performing {
+    pub(super) instance: InstanceId,
+    pub(super) attempt: u32,
+    pub(super) endpoint: Result<Endpoint, String>,
+    /// The provider's id: what measures, where it names nothing itself.
+    pub(super) source: String,
+    pub(super) timeout_s: Option<f64>,
+    pub(super) speed: f64,
+    pub(super) actions: ActionClient,
+    pub(super) resources: ResourceClient,
+    pub(super) channels: Channels,
+    pub(super) events: mpsc::Sender<Answer>,
+    pub(super) stop: CancellationToken,
+    pub(super) goal: Goal,
+}
+
+/// The deadline that the provider is told, in wall time; 0 for none.
+pub(super) fn deadline_ms(timeout_s: Option<f64>, speed: f64) -> u64 {
+    let Some(timeout_s) = timeout_s else { return 0 };
+    // A float to an integer saturates.
+    (timeout_s / speed * 1e3).ceil() as u64 + DEADLINE_SLACK.as_millis() as u64
+}
+
+impl Performing {
+    /// Until its end; the event goes to the shell, unless the goal was told to stop.
+    pub(super) async fn perform(self, given: Given) {
+        let event = match &self.endpoint {
+            Ok(endpoint) => self.execute(endpoint, given).await,
+            Err(reason) => Some(self.aborted(reason.clone())),
+        };
+        if let Some(event) = event
+            && !self.stop.is_cancelled()
+        {
+            let _ = self.events.send(event.into()).await;
+        }
+    }
+
+    /// `None` when it was told to stop.
+    async fn execute(&self, endpoint: &Endpoint, given: Given) -> Option<Event> {
+        let begun = Instant::now();
+        let mut ending = std::pin::pin!(self.ending(endpoint, given));
+        let event = tokio::select! {
+            event = &mut ending => event,
+            () = self.stop.cancelled() => {
+                let stopping = async {
+                    let _ = self.actions.cancel(endpoint, &self.goal.id).await;
+                    let _ = ending.await;
+                };
+                let _ = tokio::time::timeout(CANCEL_DEADLINE, stopping).await;
+                return None;
+            }
+        };
+        Some(self.in_time(event, begun))
+    }
+
+    async fn ending(&self, endpoint: &Endpoint, given: Given) -> Event {
+        if given == Given::Now {
+            return self.given(endpoint).await;
+        }
+        match self.actions.attach(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
+            Ok(fate) if fate.orphaned => {
+                self.crashed(format!("it was stopped while task control was gone: {}", fate.outcome.reason))
+            }
+            Ok(fate) => self.finished(fate.outcome),
+            // Task control was killed when it had written down that it gives the goal, and before it did.
+            Err(error) if error.code() == Some(tonic::Code::NotFound) && self.would_be_known(endpoint).await => {
+                self.given(endpoint).await
+            }
+            Err(error) if error.code() == Some(tonic::Code::NotFound) => {
+                self.crashed(format!("nobody knows what became of it while task control was gone: {}", said(&error)))
+            }
+            Err(error) => self.lost(endpoint, &error).await,
+        }
+    }
+
+    async fn given(&self, endpoint: &Endpoint) -> Event {
+        match self.actions.execute(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
+            Ok(outcome) => self.finished(outcome),
+            // What was wrong with the goal is wrong with it the next time, too.
+            Err(error) if error.code() == Some(tonic::Code::InvalidArgument) => self.aborted(said(&error)),
+            // Only the connection may have broken; the goal is still there then.
+            Err(error @ CallError::Broken { .. }) => self.attached(endpoint, &error).await,
+            Err(error) => self.lost(endpoint, &error).await,
+        }
+    }
+
+    /// Whether a provider that does not know the goal was never given it. It could also be another process since, or have forgotten
+    /// it; but then the session that the resource is bound to would not live on, and under the goal's lease nobody else gives it any.
+    async fn would_be_known(&self, endpoint: &Endpoint) -> bool {
+        let Some((lease, provider)) = self.provider(endpoint) else { return false };
+        let owner = async || {
+            let resource = retry_unanswered(|| self.resources.get(&provider)).await.ok()?;
+            let held = resource.holdings.iter().any(|holding| holding.lease == lease);
+            held.then_some(resource.session)
+        };
+        let lives = async {
+            let owned_by = owner().await?;
+            let sessions = retry_unanswered(|| self.resources.sessions()).await.ok()?;
+            let ttl_ms = sessions.iter().find(|session| session.id == owned_by)?.ttl_ms;
+            tokio::time::sleep(Duration::from_millis(ttl_ms) + SESSION_SLACK).await;
+            Some(owner().await? == owned_by)
+        };
+        tokio::select! {
+            lives = lives => lives == Some(true),
+            () = self.stop.cancelled() => false,
+        }
+    }
+
+    /// The lease under which the goal is given, and the id of the resource that performs it.
+    fn provider(&self, endpoint: &Endpoint) -> Option<(LeaseId, String)> {
+        let (lease, there) = (self.goal.lease.as_ref()?, endpoint.to_string());
+        let resource = lease.resources.iter().find(|resource| resource.endpoint == there)?;
+        Some((lease.id, resource.id.clone()))
+    }
+
+    async fn attached(&self, endpoint: &Endpoint, broken: &CallError) -> Event {
+        match self.actions.attach(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
+            Ok(fate) if !fate.orphaned => self.finished(fate.outcome),
+            _ => self.lost(endpoint, broken).await,
+        }
+    }
+
+    async fn lost(&self, endpoint: &Endpoint, error: &CallError) -> Event {
+        self.withdrawn(endpoint, error).await;
+        let reason = match (self.provider(endpoint), error) {
+            (Some((_, provider)), CallError::Broken { reason, .. }) => match self.end_of(&provider).await {
+                Some(end) => format!("{provider}: {end}"),
+                None => format!("{provider} does not answer: {reason}"),
+            },
+            _ => said(error),
+        };
+        self.crashed(reason)
+    }
+
+    /// How the process of a provider ended, as the process manager of its host says; `None` where none knows.
+    async fn end_of(&self, provider: &str) -> Option<String> {
+        let host = provider.rsplit_once('@')?.1;
+        let asking = async {
+            let hosts = self.resources.list(&[HOST_KIND]).await.ok()?;
+            let manager = hosts.iter().find(|one| one.host == host)?.endpoint().parse().ok()?;
+            let pools = ProcessClient::new(&self.channels, &manager).ok()?.pools().await.ok()?.pools;
+            let end = pools.iter().find_map(|pool| pool.last_exit.strip_prefix(&format!("{provider}: ")));
+            // What it wrote at last is in `ratn logs`.
+            Some(end?.split("; its last words").next()?.to_owned())
+        };
+        tokio::time::timeout(END_DEADLINE, asking).await.ok().flatten()
+    }
+
+    /// Who tries again at once would be given the same provider again, and nothing would come of any of its attempts: it is over when
+    /// nobody can be given that one any more. Its lease is not given back before.
+    async fn withdrawn(&self, endpoint: &Endpoint, error: &CallError) {
+        if let Some((_, provider)) = self.provider(endpoint)
+            && error.is_crash()
+        {
+            let there = endpoint.to_string();
+            let withdrawn = async {
+                // A manager that does not answer may still have it when it is back.
+                while match self.resources.get(&provider).await {
+                    Ok(resource) => resource.endpoint() == there,
+                    Err(error) => error.is_crash(),
+                } {
+                    tokio::time::sleep(WITHDRAWAL_POLL).await;
+                }
+            };
+            tokio::select! {
+                _ = tokio::time::timeout(WITHDRAWAL_DEADLINE, withdrawn) => {}
+                () = self.stop.cancelled() => {}
+            }
+        }
+    }
+
+    /// What the provider ended at its deadline has failed, whatever the provider calls that.
+    fn in_time(&self, event: Event, begun: Instant) -> Event {
+        match (event, self.timeout_s) {
+            (Event::Finished { outcome, .. }, Some(timeout_s))
+                if outcome == PREEMPTED && begun.elapsed().as_secs_f64() * self.speed >= timeout_s =>
+            {
+                self.aborted(format!("took longer than {timeout_s} s"))
+            }
+            (event, _) => event,
+        }
+    }
+
+    fn progressed(&self, message: String) {
+        let (instance, attempt) = (self.instance, self.attempt);
+        // Progress is for people: when events pile up, it is what can be missed.
+        let _ = self.events.try_send(Event::Progressed { instance, attempt, message }.into());
+    }
+
+    fn finished(&self, done: GoalOutcome) -> Event {
+        let said: BTreeMap<FactKey, Measurement> = done.evidence.into_iter().collect();
+        let by = |fact: &FactKey| {
+            let mut measured = said.get(fact).cloned().unwrap_or_default();
+            if measured.source.is_empty() {
+                measured.source.clone_from(&self.source);
+            }
+            (fact.clone(), measured)
+        };
+        Event::Finished {
+            evidence: done.measured.iter().map(|(fact, _)| by(fact)).collect(),
+            instance: self.instance,
+            attempt: self.attempt,
+            outcome: done.outcome,
+            outputs: done.outputs,
+            measured: done.measured,
+            reason: done.reason,
+        }
+    }
+
+    fn aborted(&self, reason: String) -> Event {
+        let outputs: BTreeMap<String, Value> = BTreeMap::new();
+        self.finished(GoalOutcome { outputs, reason, ..GoalOutcome::named(ABORTED) })
+    }
+
+    fn crashed(&self, reason: String) -> Event {
+        Event::Crashed { instance: self.instance, attempt: self.attempt, reason }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
+    use ratn_worker::server::{Services, bind};
+    use ratn_worker::tls::ClientTls;
+    use tokio_util::sync::DropGuard;
+
+    /// `work`: is done at once. `hang`: never, unless it is told to stop.
+    struct Named(&'static str);
+
+    #[tonic::async_trait]
+    impl Action for Named {
+        fn name(&self) -> &str {
+            self.0
+        }
+
+        async fn execute(&self, goal: GoalContext) -> ActionResult {
+            if self.0 == "hang" {
+                goal.cancelled.cancelled().await;
+                return Err(goal.stopped());
+            }
+            Ok(GoalOutcome::success())
+        }
+    }
+
+    struct Bench {
+        endpoint: Endpoint,
+        server: ActionServer,
+        resources: ResourceClient,
+        events: mpsc::Sender<Answer>,
+        answers: mpsc::Receiver<Answer>,
+        _place: tempfile::TempDir,
+        _shutdown: DropGuard,
+    }
+
+    impl Bench {
+        async fn new() -> anyhow::Result<Bench> {
+            let place = tempfile::tempdir()?;
+            let server = ActionServer::builder("").action(Named("work")).action(Named("hang")).build();
+            let bound = bind(&Endpoint::Unix(place.path().join("provider.sock"))).await?;
+            let (endpoint, shutdown) = (bound.endpoint().clone(), CancellationToken::new());
+            tokio::spawn(bound.serve(Services::new().with(server.clone().into_service()), shutdown.clone()));
+            let (events, answers) = mpsc::channel(8);
+            let resources = ResourceClient::new(&Channels::new(&ClientTls::none()), &endpoint, "")?;
+            Ok(Bench { endpoint, server, resources, events, answers, _place: place, _shutdown: shutdown.drop_guard() })
+        }
+
+        fn performing(&self, action: &str, timeout_s: Option<f64>, grace_ms: u64) -> Performing {
+            Performing {
+                instance: InstanceId(1),
+                attempt: 1,
+                endpoint: Ok(self.endpoint.clone()),
+                source: "worker-1".to_owned(),
+                timeout_s,
+                speed: 10.0,
+                actions: ActionClient::new(Channels::new(&ClientTls::none())),
+                channels: Channels::new(&ClientTls::none()),
+                resources: self.resources.clone(),
+                events: self.events.clone(),
+                stop: CancellationToken::new(),
+                goal: Goal {
+                    id: format!("run/1/{action}"),
+                    action: action.to_owned(),
+                    deadline_ms: deadline_ms(timeout_s, 10.0),
+                    grace_ms,
+                    ..Goal::default()
+                },
+            }
+        }
+
+        async fn event(&mut self) -> Option<Event> {
+            match self.answers.recv().await? {
+                Answer::Event { event, .. } => Some(*event),
+                Answer::World(_) => None,
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn a_worker_that_hangs_ends_at_the_goals_timeout() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        bench.performing("hang", Some(0.5), GRACE_MS).perform(Given::Now).await;
+        let event = bench.event().await;
+        assert!(
+            matches!(&event, Some(Event::Finished { outcome, reason, .. })
+                if outcome == ABORTED && reason == "took longer than 0.5 s"),
+            "{event:?}"
+        );
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn a_goal_of_before_is_found_and_not_given_again() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        // Nobody has given it: what became of it is not known, and it is not begun.
+        bench.performing("work", None, 0).perform(Given::Before).await;
+        let event = bench.event().await;
+        assert!(
+            matches!(&event, Some(Event::Crashed { reason, .. }) if reason.contains("not known here")),
+            "{event:?}"
+        );
+        // It has ended since.
+        bench.performing("work", None, 0).perform(Given::Now).await;
+        bench.event().await;
+        bench.performing("work", None, 0).perform(Given::Before).await;
+        let event = bench.event().await;
+        assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == "success"), "{event:?}");
+        // Nobody listened to it.
+        let left = tokio::spawn(bench.performing("hang", None, 0).perform(Given::Now));
+        while bench.server.running() == 0 {
+            tokio::task::yield_now().await;
+        }
+        left.abort();
+        while bench.server.running() > 0 {
+            tokio::task::yield_now().await;
+        }
+        bench.performing("hang", None, 0).perform(Given::Before).await;
+        let event = bench.event().await;
+        assert!(
+            matches!(&event, Some(Event::Crashed { reason, .. }) if reason.contains("nobody listened")),
+            "{event:?}"
+        );
+        Ok(())
+    }
+}

@@ -1,0 +1,573 @@
+//! Performs the executive's commands: asks the resource manager, gives goals to providers, hands what needs an order to
+//! [`super::record`]. Never waits: every answer comes back as an event.
+
+mod goal;
+mod handover;
+mod resume;
+#[cfg(test)]
+mod tests;
+mod watch;
+
+pub(super) use resume::{check_world, remembers};
+
+use super::ledger::{Confirmed, acquire_request};
+use super::outside::Outside;
+use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Record, Recorded, Recorder, said};
+use super::shell::Place;
+use crate::NotStarted;
+use crate::background_runtime::BackgroundRuntime;
+use crate::messages::Messages;
+use anyhow::{Context, bail};
+use futures::FutureExt;
+use goal::{Given, Performing};
+use handover::{Handover, Leases};
+use ratn_executive::protocol::{Command, Event, Goal, Note};
+use ratn_model::catalogue::Catalogue;
+use ratn_model::condition::Condition;
+use ratn_model::fact::FactKey;
+use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
+use ratn_model::resource::{LeasedResource, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
+use ratn_proto::types::{self, ENDPOINT_ATTRIBUTE, Resource, WorldChange};
+use ratn_worker::client::{AcquireOptions, ActionClient, CallError, Channels, ResourceClient, WorldClient};
+use ratn_worker::client::{retry_unanswered, retry_until_answered};
+use ratn_worker::session::{DEFAULT_TTL, Session};
+use ratn_worker::trace::{self, TraceContext};
+use ratn_world::world::World;
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, PoisonError};
+use std::time::{Duration, Instant};
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::{JoinHandle, JoinSet};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
+
+/// A resource manager that does not open a session within this time is not there.
+const SESSION_DEADLINE: Duration = Duration::from_secs(5);
+/// A task that waits this long for its resources has waited in vain.
+const ACQUIRE_DEADLINE: Duration = Duration::from_secs(3600);
+/// What waits longer than this while nothing is done is said, and
+const LONG_WHILE_IDLE: Duration = Duration::from_secs(4);
+/// what waits longer than this in any case.
+const LONG: Duration = Duration::from_secs(30);
+/// The resource that the one run of a system is.
+const RUN: &str = "run";
+/// At the end of a run, for everything that is still being given back.
+const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
+
+/// A holder's name has so many characters at the most, half of it the task's: the resource manager takes 128 unless told otherwise.
+const MAX_HOLDER: usize = 120;
+
+/// Who holds a lease, for people: the task and the state, of a longer path its end.
+fn holder(task: &str, path: &str) -> String {
+    let task: String = task.chars().take(MAX_HOLDER / 2).collect();
+    let room = MAX_HOLDER - task.chars().count() - ": …".chars().count();
+    match path.chars().count() {
+        length if length <= room => format!("{task}: {path}"),
+        length => format!("{task}: …{}", path.chars().skip(length - room).collect::<String>()),
+    }
+}
+
+/// What is on its way to the executive.
+#[derive(Debug)]
+pub(super) enum Answer {
+    /// An event.
+    Event {
+        event: Box<Event>,
+        /// Of an acquire: whether it was withdrawn meanwhile.
+        withdrawn: Option<CancellationToken>,
+    },
+    /// A revision of the root: the run's own, or another's.
+    World(WorldChange),
+}
+
+impl From<Event> for Answer {
+    fn from(event: Event) -> Answer {
+        Answer::Event { event: Box::new(event), withdrawn: None }
+    }
+}
+
+/// One run's hands.
+pub(super) struct Performer {
+    run: String,
+    task: String,
+    /// The robot's seconds per second.
+    speed: f64,
+    catalogue: Arc<Catalogue>,
+    messages: Messages,
+    resources: ResourceClient,
+    actions: ActionClient,
+    channels: Channels,
+    world: WorldClient,
+    session: Session,
+    /// Where the session is kept alive, whatever this thread does.
+    _background: BackgroundRuntime,
+    events: mpsc::Sender<Answer>,
+    records: mpsc::Sender<Record>,
+    outside: Outside,
+    /// Hears of the root's revisions.
+    following: Option<AbortOnDropHandle<()>>,
+    cancelled: Cancelled,
+    recorded: Recorded,
+    asking: BTreeMap<InstanceId, Asking>,
+    leases: Leases,
+    /// What the instances of the window are called, for whoever asks who holds something.
+    paths: BTreeMap<InstanceId, String>,
+    /// Of the commands that are performed now.
+    handover: Option<Handover>,
+    jobs: BTreeMap<InstanceId, Job>,
+    giving_back: JoinSet<()>,
+    acquires: u64,
+    operations: u64,
+    /// How often task control has come back to this run.
+    resumptions: u32,
+    /// Of the run.
+    trace: TraceContext,
+}
+
+/// An acquire under way.
+struct Asking {
+    request: String,
+    requirements: Vec<Requirement>,
+    since: Instant,
+    withdrawn: CancellationToken,
+}
+
+struct Job {
+    attempt: u32,
+    /// What it works under; a routine's serves several jobs.
+    lease: Option<LeaseId>,
+    stop: CancellationToken,
+    ended: JoinHandle<()>,
+}
+
+impl Performer {
+    /// Opens the run's session and begins to listen to commands. The session has the run's id, so that whoever resumes the run
+    /// goes on with it.
+    pub(super) async fn connect(
+        place: &Place,
+        run: &str,
+        task: &str,
+        events: mpsc::Sender<Answer>,
+    ) -> anyhow::Result<Performer> {
+        let channels = Channels::new(&place.tls);
+        let run = run.to_owned();
+        let manager = &place.endpoints.resource_manager;
+        let background = BackgroundRuntime::start("session").context("cannot keep a session alive")?;
+        // Over a connection of its own.
+        let open = || Session::open_as(&Channels::new(&place.tls), manager, run.clone(), "task-control", DEFAULT_TTL);
+        let session = background.enter(open);
+        session.alive(SESSION_DEADLINE).await?;
+        let resources = ResourceClient::new(&channels, manager, session.id())?;
+        only_run(&resources, task).await?;
+        let world = WorldClient::new(&channels, &place.endpoints.world_pool)?;
+        let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
+        let (cancelled, recorded) = (Cancelled::default(), Recorded::default());
+        let recorder = Recorder {
+            run: run.clone(),
+            world: world.clone(),
+            resources: resources.clone(),
+            cancelled: cancelled.clone(),
+            done: recorded.clone(),
+            events: events.clone(),
+            root: Revision::default(),
+        };
+        let trace = TraceContext::fresh();
+        tracing::debug!(run, trace = %trace.trace_id(), "calls of this run are of one trace");
+        tokio::spawn(trace::within(trace.child(), recorder.work(work)));
+        Ok(Performer {
+            run,
+            task: task.to_owned(),
+            speed: place.speed,
+            catalogue: place.catalogue.clone(),
+            messages: place.messages.clone(),
+            resources,
+            actions: ActionClient::new(channels.clone()),
+            channels,
+            world,
+            session,
+            _background: background,
+            events,
+            records,
+            outside: Outside::default(),
+            following: None,
+            cancelled,
+            recorded,
+            asking: BTreeMap::new(),
+            leases: Leases::default(),
+            paths: BTreeMap::new(),
+            handover: None,
+            jobs: BTreeMap::new(),
+            giving_back: JoinSet::new(),
+            acquires: 0,
+            operations: 0,
+            resumptions: 0,
+            trace,
+        })
+    }
+
+    /// The root world as it is now; of every revision after it [`Performer::accept`] will hear.
+    pub(super) async fn root(&mut self) -> anyhow::Result<(Revision, Vec<(FactKey, Value)>)> {
+        let (revision, facts) = retry_unanswered(|| self.world.root()).await?;
+        self.follow(revision)?;
+        Ok((revision, facts.into_iter().map(|fact| (fact.key, fact.value)).collect()))
+    }
+
+    /// Hears of every revision of the root after this one.
+    fn follow(&mut self, after: Revision) -> anyhow::Result<()> {
+        self.record(Record::Known(after))?;
+        let following = watch::follow(self.world.clone(), after, self.events.clone());
+        self.following = Some(AbortOnDropHandle::new(tokio::spawn(following)));
+        Ok(())
+    }
+
+    /// How far what was decided is done.
+    pub(super) fn confirmed(&self) -> Confirmed {
+        *self.recorded.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn confirm(&self, confirmed: Confirmed) {
+        *self.recorded.lock().unwrap_or_else(PoisonError::into_inner) = confirmed;
+    }
+
+    /// Resolves when the session with the resource manager, and with it every lease, is gone. A manager that is not heard is waited for,
+    /// also with a motion under way: its provider has it stand still meanwhile, and one that was suspended still knows what the run holds.
+    pub(super) async fn lost(&self) {
+        self.session.gone().await;
+    }
+
+    /// What the executive made of an event is performed next, all of it.
+    pub(super) fn prepare(&mut self, event: &Event, commands: &[Command]) {
+        for command in commands {
+            match command {
+                Command::Note(Note::Expanded { instance, path, .. }) => {
+                    self.paths.insert(*instance, path.clone());
+                }
+                Command::Note(Note::Retired { instance } | Note::Squashed { instance }) => {
+                    self.paths.remove(instance);
+                }
+                _ => {}
+            }
+        }
+        let waiting = self.asking.values().map(|asking| asking.requirements.as_slice());
+        self.handover = self.leases.handover(event, commands, waiting, Instant::now());
+    }
+
+    /// What instances are called that were expanded before this performer was there.
+    pub(super) fn know(&mut self, paths: &BTreeMap<InstanceId, String>) {
+        self.paths.extend(paths.iter().map(|(instance, path)| (*instance, path.clone())));
+    }
+
+    /// The id of the run.
+    pub(super) fn run(&self) -> &str {
+        &self.run
+    }
+
+    /// Begins to perform a command.
+    pub(super) fn perform(&mut self, command: Command) -> anyhow::Result<()> {
+        while self.giving_back.try_join_next().is_some() {}
+        match command {
+            // Waking is the shell's: it has the clock.
+            Command::Note(_) | Command::End { .. } | Command::Wake { .. } => {}
+            Command::Acquire { instance, requirements, priority } => {
+                self.acquires += 1;
+                self.acquire(instance, self.acquires, requirements, priority);
+            }
+            Command::Withdraw { instance } => {
+                if let Some(asking) = self.asking.remove(&instance) {
+                    asking.withdrawn.cancel();
+                }
+            }
+            Command::Project { instance, attempt, base, changes, writers, reads, lease } => {
+                self.record(Record::Project { instance, attempt, base, changes, writers, reads, lease })?;
+            }
+            Command::Start { instance, attempt, goal } => self.start(instance, attempt, *goal, Given::Now),
+            Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
+                Some(job) if job.attempt == attempt => job.stop.cancel(),
+                _ => {
+                    self.cancelled.lock().unwrap_or_else(PoisonError::into_inner).insert((instance, attempt));
+                }
+            },
+            Command::Release { instance, lease, projection } => {
+                let goes_back = |id: &LeaseId| self.handover.as_ref().is_none_or(|handover| handover.lease.id != *id);
+                let lease = lease.filter(goes_back);
+                self.release(instance, lease, projection);
+            }
+            Command::Commit { instance, writer, changes, evidence, revision } => {
+                let decided = Decided { instance, writer, changes, evidence, revision };
+                self.outside.decided(&self.run, &decided);
+                self.record(Record::Commit(decided))?;
+            }
+            Command::Operate { instance, operations } => {
+                self.operations += 1;
+                self.record(Record::Operate { instance, number: self.operations, operations })?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Waits until what was decided is recorded and given back, and ends the session.
+    ///
+    /// # Errors
+    /// When something that was decided is not recorded: the world pool or the resource manager know less than what happened.
+    pub(super) async fn close(mut self) -> anyhow::Result<()> {
+        let recording = async {
+            let (done, recorded) = oneshot::channel();
+            self.records.send(Record::Flush(done)).await.map_err(|_| "the recorder is gone".to_owned())?;
+            recorded.await.unwrap_or_else(|_| Err("the recorder is gone".to_owned()))
+        };
+        let recorded = tokio::time::timeout(CLOSE_DEADLINE, recording).await;
+        let giving_back = async { while self.giving_back.join_next().await.is_some() {} };
+        if tokio::time::timeout(CLOSE_DEADLINE, giving_back).await.is_err() {
+            tracing::warn!("what was left at the end of the run was not given back in time");
+        }
+        self.session.close().await;
+        match recorded {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(reason)) => bail!("what the run did is not all recorded: {reason}"),
+            Err(_) => bail!("what the run did is not all recorded: the world pool has not answered in time"),
+        }
+    }
+
+    fn record(&self, record: Record) -> anyhow::Result<()> {
+        if self.records.try_send(record).is_err() {
+            bail!("the world pool is more than {MAX_PENDING_RECORDS} requests behind, or gone");
+        }
+        Ok(())
+    }
+
+    fn acquire(&mut self, instance: InstanceId, number: u64, requirements: Vec<Requirement>, priority: i64) {
+        let withdrawn = CancellationToken::new();
+        let request = acquire_request(&self.run, instance, number, self.resumptions);
+        let asked = Asking {
+            request: request.clone(),
+            requirements: requirements.clone(),
+            since: Instant::now(),
+            withdrawn: withdrawn.clone(),
+        };
+        self.asking.insert(instance, asked);
+        let handed = self.handover.as_ref().filter(|handover| handover.to == instance).map(|one| one.lease.clone());
+        let options = AcquireOptions {
+            request,
+            priority,
+            deadline: ACQUIRE_DEADLINE,
+            holder: holder(&self.task, self.paths.get(&instance).map_or(&instance.to_string(), |path| path)),
+        };
+        let requirements: Vec<Requirement> = requirements.into_iter().map(|one| self.of_performers(one)).collect();
+        let (resources, events) = (self.resources.clone(), self.events.clone());
+        let mut asking = Box::pin(trace::within(self.trace.child(), async move {
+            let unheard = AtomicBool::new(false);
+            let ask = || async {
+                let answer = resources.acquire(requirements.clone(), options.clone()).await;
+                unheard.fetch_or(answer.as_ref().is_err_and(CallError::is_crash), Ordering::Relaxed);
+                answer
+            };
+            let answer = match handed {
+                Some(lease) => Ok(lease),
+                None => tokio::select! {
+                    // A manager that does not answer is waited for until the run gives its session up ([`Performer::lost`]).
+                    answer = retry_until_answered(ask) => answer,
+                    () = withdrawn.cancelled() => {
+                        // The call is dropped; what was granted meanwhile goes back.
+                        let _ = retry_unanswered(|| resources.withdraw(&options.request)).await;
+                        return;
+                    }
+                },
+            };
+            if answer.is_err() && unheard.into_inner() {
+                // An answer that was lost before the refusal may have been a grant.
+                let _ = retry_unanswered(|| resources.withdraw(&options.request)).await;
+            }
+            let event = match answer {
+                Ok(lease) => Event::Granted { instance, lease },
+                Err(error) => Event::Refused { instance, reason: said(&error) },
+            };
+            let _ = events.send(Answer::Event { event: Box::new(event), withdrawn: Some(withdrawn) }).await;
+        }));
+        // The request leaves here and now: tasks would be run, and requests arrive, in any order.
+        if asking.as_mut().now_or_never().is_none() {
+            tokio::spawn(asking);
+        }
+    }
+
+    /// Who waits for resources longest, if that is longer than somebody who watches the run takes for granted.
+    pub(super) fn waits(&self) -> Option<InstanceId> {
+        let idle = self.jobs.values().all(|job| job.ended.is_finished());
+        let bound = if idle { LONG_WHILE_IDLE } else { LONG };
+        let (instance, longest) = self.asking.iter().min_by_key(|(_, asking)| asking.since)?;
+        (longest.since.elapsed() >= bound).then_some(*instance)
+    }
+
+    /// Says what is in the way of an instance that waits, in the resource manager's words.
+    pub(super) fn say_why(&self, at: Timestamp, instance: InstanceId, path: String) {
+        let Some(Asking { request, since, .. }) = self.asking.get(&instance) else { return };
+        let (resources, request, waited_s) = (self.resources.clone(), request.clone(), since.elapsed().as_secs());
+        let messages = self.messages.clone();
+        tokio::spawn(async move {
+            // One that has its answer by now does not wait any more.
+            let Ok(waiting) = resources.explain(&request).await else { return };
+            let obstacles: Vec<String> = waiting.into_iter().flat_map(|one| one.obstacles).collect();
+            let why = if obstacles.is_empty() { "its turn".to_owned() } else { obstacles.join("; ") };
+            let at = at.seconds();
+            messages.say(format_args!("{at:>8.1} s  waits  {path}  for {waited_s} s: {why}"));
+        });
+    }
+
+    /// The event of an answer; `None` when what it answers was withdrawn or cancelled: what crossed with that goes back.
+    ///
+    /// # Errors
+    /// Where nothing can be recorded any more.
+    pub(super) fn accept(&mut self, answer: Answer, mirror: &World) -> anyhow::Result<Option<Event>> {
+        let (event, withdrawn) = match answer {
+            Answer::Event { event, withdrawn } => (*event, withdrawn.is_some_and(|token| token.is_cancelled())),
+            Answer::World(change) => {
+                self.record(Record::Known(change.revision))?;
+                return Ok(self.outside.told(change, mirror));
+            }
+        };
+        Ok(match event {
+            Event::Granted { instance, lease } if withdrawn => {
+                self.give_back(instance, Vec::new(), Some(lease.id), None);
+                None
+            }
+            _ if withdrawn => None,
+            Event::Projected { instance, attempt, projection } if self.was_cancelled(instance, attempt) => {
+                self.give_back(instance, Vec::new(), None, Some(projection));
+                None
+            }
+            Event::Crashed { instance, attempt, .. } if self.was_cancelled(instance, attempt) => None,
+            event => {
+                if let Event::Granted { instance, .. } | Event::Refused { instance, .. } = &event {
+                    let asked = self.asking.remove(instance);
+                    if let (Event::Granted { lease, .. }, Some(asked)) = (&event, asked) {
+                        self.leases.granted(lease, asked.requirements, Instant::now());
+                    }
+                }
+                Some(event)
+            }
+        })
+    }
+
+    fn was_cancelled(&self, instance: InstanceId, attempt: u32) -> bool {
+        self.cancelled.lock().unwrap_or_else(PoisonError::into_inner).remove(&(instance, attempt))
+    }
+
+    /// Gives a goal to its provider, or waits for one that was given before.
+    fn start(&mut self, instance: InstanceId, attempt: u32, goal: Goal, given: Given) {
+        let stop = CancellationToken::new();
+        let lease = goal.lease.as_ref().map(|lease| lease.id);
+        let provider = self.provider_of(&goal);
+        let (source, endpoint) = match provider {
+            Ok(resource) => (
+                resource.id.clone(),
+                resource.endpoint.parse().map_err(|error| format!("{} has no usable endpoint: {error}", resource.id)),
+            ),
+            Err(reason) => (String::new(), Err(reason)),
+        };
+        let performing = Performing {
+            instance,
+            attempt,
+            endpoint,
+            source,
+            timeout_s: goal.timeout_s,
+            speed: self.speed,
+            actions: self.actions.clone(),
+            resources: self.resources.clone(),
+            channels: self.channels.clone(),
+            events: self.events.clone(),
+            stop: stop.clone(),
+            goal: types::Goal {
+                id: format!("{}/{instance}/{attempt}", self.run),
+                action: goal.action.to_string(),
+                inputs: goal.inputs,
+                seed: goal.seed,
+                lease: goal.lease,
+                session: self.run.clone(),
+                projection: goal.projection,
+                world_pool: self.world.endpoint().to_string(),
+                deadline_ms: goal::deadline_ms(goal.timeout_s, self.speed),
+                grace_ms: goal::GRACE_MS,
+            },
+        };
+        let ended = tokio::spawn(trace::within(self.trace.child(), performing.perform(given)));
+        self.jobs.insert(instance, Job { attempt, lease, stop, ended });
+    }
+
+    /// What performs goals says where it is: a resource of that kind that does not is nobody's to give a goal to, whoever made it.
+    fn of_performers(&self, mut requirement: Requirement) -> Requirement {
+        let performs = self.catalogue.providers.values().any(|provider| provider.resource == requirement.kind);
+        if performs && requirement.operation == ResourceOperation::Block {
+            requirement.conditions.push(Condition::has(ENDPOINT_ATTRIBUTE));
+        }
+        requirement
+    }
+
+    /// The provider of a goal: the leased resource of its kind.
+    fn provider_of<'a>(&self, goal: &'a Goal) -> Result<&'a LeasedResource, String> {
+        let Some(provider) = self.catalogue.providers.get(&*goal.provider) else {
+            return Err(format!("the system's catalogue has no provider `{}`", goal.provider));
+        };
+        let leased = goal.lease.as_ref().and_then(|lease| lease.resource(&provider.resource));
+        leased.ok_or_else(|| {
+            format!(
+                "`{}` is done by a {}, and none is leased: add `block: {}` to the state's resources",
+                goal.provider, provider.resource, provider.resource
+            )
+        })
+    }
+
+    fn release(&mut self, instance: InstanceId, lease: Option<LeaseId>, projection: Option<ProjectionId>) {
+        let over = |id: InstanceId, job: &Job| id == instance || (lease.is_some() && job.lease == lease);
+        let (ended, going_on) = std::mem::take(&mut self.jobs).into_iter().partition(|(id, job)| over(*id, job));
+        self.jobs = going_on;
+        self.give_back(instance, Vec::from_iter(BTreeMap::into_values(ended)), lease, projection);
+    }
+
+    fn give_back(
+        &mut self,
+        instance: InstanceId,
+        jobs: Vec<Job>,
+        lease: Option<LeaseId>,
+        projection: Option<ProjectionId>,
+    ) {
+        if let Some(lease) = lease {
+            self.leases.given_back(lease);
+        }
+        let (resources, world) = (self.resources.clone(), self.world.clone());
+        self.giving_back.spawn(async move {
+            // Whoever gets the resources next finds them idle.
+            for job in jobs {
+                let _ = job.ended.await;
+            }
+            if let Some(projection) = projection
+                && let Err(error) = retry_unanswered(|| world.release(projection)).await
+            {
+                tracing::warn!(%instance, "a projection was not given back: {}", said(&error));
+            }
+            if let Some(lease) = lease
+                && let Err(error) = retry_unanswered(|| resources.release(lease)).await
+            {
+                tracing::warn!(%instance, "a lease was not given back: {}", said(&error));
+            }
+        });
+    }
+}
+
+/// Two runs would each change the world under the other's projections: a system has one at a time. The resource that says so
+/// goes with the run's session.
+///
+/// # Errors
+/// Where another run is under way, or the resource manager cannot be asked.
+pub async fn only_run(resources: &ResourceClient, task: &str) -> anyhow::Result<()> {
+    let claim = Resource::new(RUN, ResourceClass::Task, "Run").with_attribute("task", Value::String(task.to_owned()));
+    match retry_unanswered(|| resources.create(claim.clone())).await {
+        Ok(_) => Ok(()),
+        Err(error) if error.code() == Some(tonic::Code::AlreadyExists) => {
+            let message = "another run is under way on this system: wait for its end, or use a system of your own";
+            Err(NotStarted(message.to_owned()).into())
+        }
+        Err(error) => bail!("cannot begin the run: {}", said(&error)),
+    }
+}

@@ -1,0 +1,174 @@
+//! Coming back to a run whose task control was killed: what it had asked for is asked for again, and nothing twice.
+//!
+//! Leases live on with the run's session, if that still lives; what nobody knows to have goes back. Goals are looked for where
+//! they were given. Commits and operations are repeated under their ids. If the session has ended meanwhile, leases are gone
+//! with it (their goals end as the providers say), and what the run had created and used up is made so again.
+
+use super::Performer;
+use super::goal::Given;
+use crate::ledger::{Confirmed, Ledger};
+use crate::outside;
+use crate::record::{Record, commit_next, operate_once, said};
+use crate::shell::Place;
+use anyhow::bail;
+use ratn_executive::protocol::Event;
+use ratn_model::fact::FactKey;
+use ratn_model::id::{InstanceId, LeaseId, Revision};
+use ratn_proto::types::{Resource, WorldUpdate};
+use ratn_worker::client::retry_unanswered;
+use ratn_worker::client::{Channels, WorldClient};
+use ratn_world::world::World;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Refuses a world that is not the run's. Changes nothing.
+pub(crate) async fn check_world(place: &Place, ledger: &Ledger) -> anyhow::Result<()> {
+    let world = WorldClient::new(&Channels::new(&place.tls), &place.endpoints.world_pool)?;
+    let (root, _) = retry_unanswered(|| world.root()).await?;
+    if root < ledger.first_revision {
+        bail!(
+            "the world pool's root is at {root}, and the run began at {}: the world pool has lost its \
+               state, or has another's, and what the run knew is gone; run the task again",
+            ledger.first_revision
+        );
+    }
+    Ok(())
+}
+
+/// Whether the world pool needs no commit that the ledger has forgotten. Where it does, the run has to be resumed from its whole log.
+pub(crate) async fn remembers(place: &Place, ledger: &Ledger) -> anyhow::Result<bool> {
+    if ledger.forgotten == 0 {
+        return Ok(true);
+    }
+    let world = WorldClient::new(&Channels::new(&place.tls), &place.endpoints.world_pool)?;
+    let (root, _) = retry_unanswered(|| world.root()).await?;
+    Ok(youngest_there(&world, ledger, root).await?.0.is_some())
+}
+
+/// How many of the ledger's commits the pool has: they were made in order, so those up to the youngest that it tells of. `None`
+/// where it tells of none; with the oldest revision that it can tell of.
+async fn youngest_there(
+    world: &WorldClient,
+    ledger: &Ledger,
+    root: Revision,
+) -> anyhow::Result<(Option<usize>, Revision)> {
+    // Any fact says how far back the pool can tell.
+    let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
+    let (_, oldest) = retry_unanswered(|| world.history(any.clone())).await?;
+    let after = oldest.max(ledger.first_revision);
+    let run = &ledger.origin.run;
+    let ids: BTreeMap<String, usize> =
+        ledger.commits.iter().enumerate().map(|(place, decided)| (decided.id(run), place + 1)).collect();
+    let mut watch = retry_unanswered(|| world.watch(Some(after), &[])).await?;
+    let (mut told, mut there) = (after, None);
+    while told < root {
+        let Some(WorldUpdate::Changed(change)) = watch.next().await? else {
+            bail!("the world pool does not tell of its revisions up to {root}");
+        };
+        told = change.revision;
+        there = ids.get(&change.commit).copied().or(there);
+    }
+    Ok((there, oldest))
+}
+
+impl Performer {
+    /// Takes up everything that is open, in the order in which it was decided; what has changed from outside meanwhile.
+    ///
+    /// # Errors
+    /// Where the run cannot go on.
+    pub(crate) async fn take_up(&mut self, ledger: Ledger, mirror: &World) -> anyhow::Result<Option<Event>> {
+        (self.acquires, self.operations, self.resumptions) = (ledger.acquires, ledger.operations, ledger.resumptions);
+        let changed = self.commit_again(&ledger, mirror).await?;
+        let commit = ledger.commits.last().map(|decided| decided.revision).unwrap_or_default();
+        self.confirm(Confirmed { commit, ..Confirmed::default() });
+        if self.session.state().borrow().found {
+            for (number, instance, operations) in &ledger.operated {
+                let (number, instance, operations) = (*number, *instance, operations.clone());
+                self.record(Record::Operate { instance, number, operations })?;
+            }
+            self.sweep(&ledger).await?;
+        } else {
+            self.make_anew(&ledger).await?;
+            self.confirm(Confirmed { commit, operation: ledger.operations });
+        }
+        // What crossed with the end of task control goes back; a waiting one has left the queue with its connection.
+        for request in &ledger.withdrawn {
+            let _ = retry_unanswered(|| self.resources.withdraw(request)).await;
+        }
+        for (instance, asked) in ledger.projecting {
+            let attempt = asked.attempt;
+            let (base, changes, writers) = (asked.base, asked.changes, asked.writers);
+            let (reads, lease) = (asked.reads, asked.lease);
+            self.record(Record::Project { instance, attempt, base, changes, writers, reads, lease })?;
+        }
+        for (instance, (attempt, goal)) in ledger.goals {
+            self.start(instance, attempt, goal, Given::Before);
+        }
+        let mut waiting: Vec<_> = ledger.waiting.into_iter().collect();
+        waiting.sort_by_key(|(instance, asked)| (Reverse(asked.priority), *instance));
+        for (instance, asked) in waiting {
+            self.acquire(instance, asked.number, asked.requirements, asked.priority);
+        }
+        Ok(changed)
+    }
+
+    /// Makes every commit that the world pool does not have, and compares the two worlds: what is otherwise in the pool was changed
+    /// from outside.
+    async fn commit_again(&mut self, ledger: &Ledger, mirror: &World) -> anyhow::Result<Option<Event>> {
+        let (mut root, _) = retry_unanswered(|| self.world.root()).await?;
+        let there = self.commits_there(ledger, root).await?;
+        for decided in &ledger.commits[there..] {
+            let commit = decided.clone().commit(&self.run);
+            match commit_next(&self.world, root, commit).await {
+                Ok(revision) => root = revision,
+                Err(error) => bail!("the world pool does not take what the run had decided: {}", said(&error)),
+            }
+        }
+        let (revision, facts) = self.root().await?;
+        let pool = World::from_facts(facts, revision);
+        let facts = outside::differences(&pool, mirror);
+        Ok((!facts.is_empty()).then_some(Event::WorldChanged { revision, facts }))
+    }
+
+    async fn commits_there(&self, ledger: &Ledger, root: Revision) -> anyhow::Result<usize> {
+        match youngest_there(&self.world, ledger, root).await? {
+            (None, _) if ledger.forgotten > 0 => {
+                bail!("the world pool has lost commits of the run since it was asked for them; resume the run again")
+            }
+            (None, oldest) if oldest > ledger.first_revision && !ledger.commits.is_empty() => bail!(
+                "the world pool keeps no revision of this run any more (the oldest is {oldest}): what it has of the run's commits \
+                   is not known; run the task again"
+            ),
+            (there, _) => Ok(there.unwrap_or(0)),
+        }
+    }
+
+    /// Gives back what the session holds and the run does not know of: grants that nobody heard of.
+    async fn sweep(&mut self, ledger: &Ledger) -> anyhow::Result<()> {
+        for lease in self.living_leases().await?.difference(&ledger.held) {
+            self.give_back(InstanceId(0), Vec::new(), Some(*lease), None);
+        }
+        Ok(())
+    }
+
+    async fn living_leases(&self) -> anyhow::Result<BTreeSet<LeaseId>> {
+        let resources = retry_unanswered(|| self.resources.list(&[])).await?;
+        let own = |resource: Resource| {
+            let holdings = resource.holdings.into_iter().filter(|holding| holding.session == self.run);
+            holdings.map(|holding| holding.lease).collect::<Vec<_>>()
+        };
+        Ok(resources.into_iter().flat_map(own).collect())
+    }
+
+    /// The old session is gone with what it had made and used up.
+    async fn make_anew(&self, ledger: &Ledger) -> anyhow::Result<()> {
+        let created = ledger.created();
+        for (index, operation) in created.iter().chain(ledger.used_up()).enumerate() {
+            let request = format!("{}/again-{}.{index}", self.run, self.resumptions);
+            if let Err(error) = operate_once(&self.resources, &request, operation).await {
+                bail!("`{operation}` was so before and cannot be made so again: {}", said(&error));
+            }
+        }
+        Ok(())
+    }
+}

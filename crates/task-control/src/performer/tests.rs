@@ -1,0 +1,375 @@
+//! A performer with a real resource manager and world pool.
+
+use super::*;
+use crate::Endpoints;
+use crate::ledger::Ledger;
+use anyhow::Context;
+use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
+use ratn_daemon::world_pool::{self, WorldPoolConfig};
+use ratn_executive::protocol::Origin;
+use ratn_model::fact::{Change, Footprint};
+use ratn_model::program::SUCCESS;
+use ratn_model::resource::ResourceOperation;
+use ratn_model::time::Timestamp;
+use ratn_worker::client::fresh_id;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::tls::ClientTls;
+use ratn_world::world::World;
+use tokio_util::sync::DropGuard;
+
+async fn connect(endpoints: &Endpoints, task: &str, events: mpsc::Sender<Answer>) -> anyhow::Result<Performer> {
+    connect_as(endpoints, &fresh_id("run"), task, events).await
+}
+
+async fn connect_as(
+    endpoints: &Endpoints,
+    run: &str,
+    task: &str,
+    events: mpsc::Sender<Answer>,
+) -> anyhow::Result<Performer> {
+    Performer::connect(&place_of(endpoints), run, task, events).await
+}
+
+fn place_of(endpoints: &Endpoints) -> Place {
+    Place {
+        endpoints: endpoints.clone(),
+        tls: ClientTls::none(),
+        directory: std::path::PathBuf::new(),
+        catalogue: Arc::default(),
+        speed: 1.0,
+        messages: Messages::nowhere(),
+    }
+}
+
+fn arm() -> Vec<Requirement> {
+    vec![Requirement::new(ResourceOperation::Block, "Arm")]
+}
+
+/// A performer with a resource manager, a world pool and one arm.
+struct Bench {
+    performer: Performer,
+    answers: mpsc::Receiver<Answer>,
+    endpoints: Endpoints,
+    /// Whoever offers the arm.
+    _robot: Session,
+    _place: tempfile::TempDir,
+    _shutdown: DropGuard,
+}
+
+impl Bench {
+    async fn new() -> anyhow::Result<Bench> {
+        let place = tempfile::tempdir()?;
+        let directory = RuntimeDirectory::create(place.path())?;
+        let shutdown = CancellationToken::new();
+        tokio::spawn(resource_manager::run(ResourceManagerConfig::default(), directory.clone(), shutdown.clone()));
+        tokio::spawn(world_pool::run(WorldPoolConfig::default(), directory.clone(), shutdown.clone()));
+        let endpoints = Endpoints {
+            resource_manager: directory.wait_for(resource_manager::ROLE, SESSION_DEADLINE).await?,
+            world_pool: directory.wait_for(world_pool::ROLE, SESSION_DEADLINE).await?,
+        };
+        let (events, answers) = mpsc::channel(8);
+        let performer = connect(&endpoints, "task", events).await?;
+        let channels = Channels::new(&ClientTls::none());
+        let robot = Session::open(&channels, &endpoints.resource_manager, "robot", DEFAULT_TTL);
+        robot.alive(SESSION_DEADLINE).await?;
+        let offering = ResourceClient::new(&channels, &endpoints.resource_manager, robot.id())?;
+        offering.create(Resource::new("arm", ResourceClass::Module, "Arm")).await?;
+        Ok(Bench { performer, answers, endpoints, _robot: robot, _place: place, _shutdown: shutdown.drop_guard() })
+    }
+
+    fn ask(&mut self, instance: InstanceId) -> anyhow::Result<()> {
+        self.performer.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })
+    }
+
+    /// What the executive makes of the end of `ended`: `next` wants what that had.
+    fn goes_on(&mut self, ended: InstanceId, lease: LeaseId, next: InstanceId) -> anyhow::Result<()> {
+        let event = Event::Finished {
+            instance: ended,
+            attempt: 1,
+            outcome: SUCCESS.to_owned(),
+            outputs: BTreeMap::new(),
+            measured: Vec::new(),
+            evidence: Vec::new(),
+            reason: String::new(),
+        };
+        let commands = [
+            Command::Acquire { instance: next, requirements: arm(), priority: 0 },
+            Command::Release { instance: ended, lease: Some(lease), projection: None },
+        ];
+        self.performer.prepare(&event, &commands);
+        commands.into_iter().try_for_each(|command| self.performer.perform(command))
+    }
+
+    /// The next event that the executive is given.
+    async fn event(&mut self) -> Option<Event> {
+        loop {
+            let answer = self.answers.recv().await?;
+            if let Some(event) = self.performer.accept(answer, &World::default()).ok()? {
+                return Some(event);
+            }
+        }
+    }
+
+    /// Task control is killed and comes back; `lives` says whether its session still does.
+    async fn comes_back(mut self, lives: bool) -> anyhow::Result<Bench> {
+        let run = self.performer.run.clone();
+        let (events, answers) = mpsc::channel(8);
+        self.answers = answers;
+        if lives {
+            // Nobody says farewell.
+            std::mem::forget(self.performer);
+        } else {
+            // Its farewell is what the end of its time would be.
+            self.performer.session.close().await;
+        }
+        self.performer = connect_as(&self.endpoints, &run, "task", events).await?;
+        Ok(self)
+    }
+
+    /// How many units of a kind there are.
+    async fn units(&self, kind: &str) -> anyhow::Result<u32> {
+        let resources = self.performer.resources.list(&[kind]).await?;
+        Ok(resources.iter().map(|resource| resource.capacity.units()).sum())
+    }
+
+    async fn granted(&mut self, to: InstanceId) -> anyhow::Result<LeaseId> {
+        match self.event().await {
+            Some(Event::Granted { instance, lease }) if instance == to => Ok(lease.id),
+            other => bail!("the arm was to be granted to {to}: {other:?}"),
+        }
+    }
+}
+
+#[tokio::test]
+async fn an_acquire_of_the_event_that_gave_a_lease_back_can_be_withdrawn() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (instance, other) = (InstanceId(1), InstanceId(2));
+    bench.ask(instance)?;
+    let lease = Some(bench.granted(instance).await?);
+    // Its worker died: it asks again, then gives back. Then its branch is not taken.
+    bench.ask(instance)?;
+    bench.performer.perform(Command::Release { instance, lease, projection: None })?;
+    bench.performer.perform(Command::Withdraw { instance })?;
+    bench.ask(other)?;
+    bench.granted(other).await?;
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn the_next_node_takes_a_lease_over_until_others_get_their_turn() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let [first, second, third, fourth] = [1, 2, 3, 4].map(InstanceId);
+    bench.ask(first)?;
+    let lease = bench.granted(first).await?;
+    bench.goes_on(first, lease, second)?;
+    assert_eq!(bench.granted(second).await?, lease);
+    // Longer than a turn.
+    tokio::time::sleep(Duration::from_millis(150)).await;
+    bench.goes_on(second, lease, third)?;
+    let other = bench.granted(third).await?;
+    assert_ne!(other, lease);
+
+    // One that is not wanted any more when it is taken over goes back.
+    bench.goes_on(third, other, fourth)?;
+    bench.performer.perform(Command::Withdraw { instance: fourth })?;
+    let handed = bench.answers.recv().await;
+    assert_eq!(bench.performer.accept(handed.context("no answer")?, &World::default())?, None);
+    bench.ask(first)?;
+    bench.granted(first).await?;
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn a_second_run_is_refused_before_anything_is_started() -> anyhow::Result<()> {
+    let bench = Bench::new().await?;
+    let (events, _) = mpsc::channel(1);
+    let second = connect(&bench.endpoints, "second", events).await;
+    assert!(second.is_err_and(|error| error.to_string().contains("another run is under way")));
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_run_whose_effects_are_not_all_recorded_does_not_end_well() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    // Nothing can be added to it.
+    let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
+    let mut changes = done();
+    changes.push(Change::Increase { fact, by: 1.0 });
+    bench.performer.perform(Command::Commit {
+        instance: InstanceId(1),
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes,
+        revision: Revision(99),
+    })?;
+    let ended = bench.performer.close().await;
+    assert!(ended.is_err_and(|error| error.to_string().contains("not all recorded")));
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_projection_that_crosses_its_cancel_goes_back() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (instance, reads) = (InstanceId(1), Footprint::Everything);
+    bench.ask(instance)?;
+    bench.granted(instance).await?;
+    let project = |attempt| Command::Project {
+        instance,
+        attempt,
+        base: Revision(0),
+        changes: Vec::new(),
+        writers: Vec::new(),
+        reads: reads.clone(),
+        lease: None,
+    };
+    bench.performer.perform(project(1))?;
+    let made = bench.answers.recv().await;
+    bench.performer.perform(Command::Cancel { instance, attempt: 1 })?;
+    assert_eq!(bench.performer.accept(made.context("no answer")?, &World::default())?, None);
+    assert!(bench.performer.cancelled.lock().is_ok_and(|cancelled| cancelled.is_empty()));
+    bench.performer.perform(project(2))?;
+    assert!(matches!(bench.event().await, Some(Event::Projected { attempt: 2, .. })));
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn a_grant_that_crosses_its_withdrawal_goes_back() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let instance = InstanceId(1);
+    bench.ask(instance)?;
+    let granted = bench.answers.recv().await;
+    bench.performer.perform(Command::Withdraw { instance })?;
+    assert_eq!(bench.performer.accept(granted.context("no answer")?, &World::default())?, None);
+
+    // Nobody holds the arm: the same instance gets it when it asks again.
+    bench.ask(instance)?;
+    bench.granted(instance).await?;
+    bench.performer.close().await
+}
+
+fn create(kind: &str, count: u32) -> Requirement {
+    Requirement { operation: ResourceOperation::Create, kind: kind.to_owned(), count: count.into(), ..arm().remove(0) }
+}
+
+fn done() -> Vec<Change> {
+    let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
+    vec![Change::Set { fact, value: Value::Bool(true) }]
+}
+
+/// What a run had commanded before it was killed, as its log has it.
+fn ledger(run: &str, commands: &[Command]) -> Ledger {
+    let mut ledger = Ledger { origin: Origin { run: run.to_owned(), ..Origin::default() }, ..Ledger::default() };
+    commands.iter().for_each(|command| ledger.command(command));
+    ledger.event(Timestamp(0), &Event::Resumed);
+    ledger
+}
+
+#[tokio::test]
+async fn who_comes_back_to_a_living_session_does_nothing_twice() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let run = bench.performer.run.clone();
+    let operate = Command::Operate { instance: InstanceId(1), operations: vec![create("Box", 2)] };
+    let commit = Command::Commit {
+        instance: InstanceId(1),
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(1),
+    };
+    bench.performer.perform(commit.clone())?;
+    bench.performer.perform(operate.clone())?;
+    // A grant that was on its way when task control was killed.
+    bench.ask(InstanceId(2))?;
+    bench.granted(InstanceId(2)).await?;
+    let waiting = Command::Acquire { instance: InstanceId(2), requirements: arm(), priority: 0 };
+
+    let mut bench = bench.comes_back(true).await?;
+    let mut mirror = World::default();
+    mirror.apply(&done())?;
+    let ledger = ledger(&run, &[commit, operate, waiting]);
+    bench.performer.take_up(ledger, &mirror).await?;
+    // It is asked for anew, and what nobody knew to have is free for it.
+    bench.granted(InstanceId(2)).await?;
+    assert_eq!(bench.units("Box").await?, 2);
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn who_comes_back_too_late_makes_anew_what_went_with_the_session() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let run = bench.performer.run.clone();
+    let operate = Command::Operate { instance: InstanceId(1), operations: vec![create("Box", 2)] };
+    bench.performer.perform(operate.clone())?;
+    while bench.units("Box").await? == 0 {}
+    let mut bench = bench.comes_back(false).await?;
+    assert_eq!(bench.units("Box").await?, 0);
+    bench.performer.take_up(ledger(&run, &[operate]), &World::default()).await?;
+    assert_eq!(bench.units("Box").await?, 2);
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another_world_is_refused() -> anyhow::Result<()>
+{
+    let mut bench = Bench::new().await?;
+    let run = bench.performer.run.clone();
+    let commit = Command::Commit {
+        instance: InstanceId(1),
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(1),
+    };
+    let open = ledger(&run, &[commit]);
+    let mut mirror = World::default();
+    mirror.apply(&done())?;
+    check_world(&place_of(&bench.endpoints), &open).await?;
+    assert_eq!(bench.performer.take_up(open.clone(), &mirror).await?, None);
+    let (revision, facts) = bench.performer.root().await?;
+    assert_eq!((revision, facts.len()), (Revision(1), 1));
+
+    // Somebody else changes it, and nothing is committed twice.
+    let fact = FactKey { predicate: "other".to_owned(), arguments: Vec::new() };
+    let changes = vec![Change::Set { fact: fact.clone(), value: Value::Int(1) }];
+    bench.performer.world.commit("other/1/2", changes, None).await?;
+    check_world(&place_of(&bench.endpoints), &open).await?;
+    let changed = bench.performer.take_up(open.clone(), &mirror).await?;
+    let facts = vec![(fact, Some(Value::Int(1)))];
+    assert_eq!(changed, Some(Event::WorldChanged { revision: Revision(2), facts }));
+    // A pool that began anew.
+    let later = Ledger { first_revision: Revision(9), ..open };
+    let refused = check_world(&place_of(&bench.endpoints), &later).await;
+    assert!(refused.is_err_and(|error| error.to_string().contains("lost its state")));
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let run = bench.performer.run.clone();
+    let commit = |number: u64| Command::Commit {
+        instance: InstanceId(number),
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(number),
+    };
+    let whole = ledger(&run, &[commit(1), commit(2)]);
+    // A checkpoint without the first commit, and a pool that has lost both.
+    let mut short = ledger(&run, &[commit(2)]);
+    short.forgotten = 1;
+    assert!(remembers(&place_of(&bench.endpoints), &whole).await?);
+    assert!(!remembers(&place_of(&bench.endpoints), &short).await?);
+    let mut mirror = World::default();
+    mirror.apply(&done())?;
+    let refused = bench.performer.take_up(short.clone(), &mirror).await;
+    assert!(refused.is_err_and(|error| error.to_string().contains("resume the run again")));
+    assert_eq!(bench.performer.root().await?.0, Revision(0));
+    // With the whole log it has both, and the checkpoint is enough from then on.
+    assert_eq!(bench.performer.take_up(whole, &mirror).await?, None);
+    assert_eq!(bench.performer.confirmed().commit, Revision(2));
+    assert!(remembers(&place_of(&bench.endpoints), &short).await?);
+    assert_eq!(bench.performer.take_up(short, &mirror).await?, None);
+    assert_eq!(bench.performer.root().await?.0, Revision(2));
+    bench.performer.close().await
+}

@@ -1,0 +1,233 @@
+//! What a run is doing, one line per node that starts or ends, for whoever reads them.
+
+use ratn_executive::protocol::{Command, Event, Note};
+use ratn_model::id::InstanceId;
+use ratn_model::program::{SUCCESS, WORLD_MODEL};
+use ratn_model::time::Timestamp;
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, VecDeque};
+
+/// Of one change from outside so many facts are said.
+const MOST_FACTS: usize = 5;
+/// The paths of so many instances that have left the window are known, so that they do not grow with the run.
+const MOST_GONE: usize = 1024;
+
+/// Follows events and commands, and words them for people.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Progress {
+    /// Of the instances that are in the window, and of those that have left it last.
+    paths: BTreeMap<InstanceId, String>,
+    /// Those that have left it, the oldest first.
+    gone: VecDeque<InstanceId>,
+    started: BTreeMap<InstanceId, Timestamp>,
+    /// How many states have ended for good.
+    retired: u64,
+    /// Whether no PIA is to begin.
+    paused: bool,
+    #[serde(skip)]
+    quiet: bool,
+}
+
+/// A state that is under way.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct UnderWay {
+    /// Its path with visits.
+    pub path: String,
+    /// Since when, in the robot's seconds.
+    pub for_s: f64,
+}
+
+impl Progress {
+    /// One that words what happens, or keeps silent.
+    pub(crate) fn new(quiet: bool) -> Progress {
+        Progress { quiet, ..Progress::default() }
+    }
+
+    /// Knows of one step of a run that goes on, and says nothing of it again.
+    pub(crate) fn catch_up<'a>(
+        &mut self,
+        at: Timestamp,
+        event: &Event,
+        commands: impl Iterator<Item = &'a Command> + Clone,
+    ) {
+        if let Event::Finished { instance, .. } = event {
+            self.started.remove(instance);
+        }
+        self.hear(event);
+        for command in commands.clone() {
+            match command {
+                Command::Note(Note::Expanded { instance, path, .. }) => {
+                    self.paths.insert(*instance, path.clone());
+                }
+                Command::Note(Note::Invalidated { instance, .. }) => drop(self.started.remove(instance)),
+                Command::Start { instance, .. } => drop(self.started.insert(*instance, at)),
+                _ => {}
+            }
+        }
+        self.forget(commands);
+    }
+
+    /// Whether PIAs may begin after an event.
+    fn hear(&mut self, event: &Event) {
+        match event {
+            Event::PauseRequested | Event::StepRequested => self.paused = true,
+            Event::ResumeRequested => self.paused = false,
+            _ => {}
+        }
+    }
+
+    /// Whether the user has paused the run.
+    pub(crate) fn is_paused(&self) -> bool {
+        self.paused
+    }
+
+    /// How many states have ended for good.
+    pub(crate) fn retired(&self) -> u64 {
+        self.retired
+    }
+
+    /// The states that are under way, those that began first first.
+    pub(crate) fn under_way(&self, now: Timestamp) -> Vec<UnderWay> {
+        let mut all: Vec<(Timestamp, InstanceId)> = self.started.iter().map(|(id, at)| (*at, *id)).collect();
+        all.sort_unstable();
+        all.into_iter().map(|(at, id)| UnderWay { path: self.path(id), for_s: now.since(at).as_secs_f64() }).collect()
+    }
+
+    /// The paths of the instances that are known.
+    pub(crate) fn paths(&self) -> &BTreeMap<InstanceId, String> {
+        &self.paths
+    }
+
+    /// Of an instance that has left the window only a failure to make it real can still be told.
+    fn forget<'a>(&mut self, commands: impl Iterator<Item = &'a Command>) {
+        for command in commands {
+            if let Command::Note(Note::Retired { instance } | Note::Squashed { instance }) = command {
+                self.started.remove(instance);
+                self.retired += u64::from(matches!(command, Command::Note(Note::Retired { .. })));
+                self.gone.push_back(*instance);
+                if self.gone.len() > MOST_GONE
+                    && let Some(oldest) = self.gone.pop_front()
+                {
+                    self.paths.remove(&oldest);
+                }
+            }
+        }
+    }
+
+    /// What there is to say of one step, a line each.
+    pub(crate) fn follow(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Vec<String> {
+        let mut lines = Vec::new();
+        if self.quiet {
+            self.catch_up(at, event, commands.iter());
+            return lines;
+        }
+        self.hear(event);
+        match event {
+            Event::Finished { instance, outcome, reason, .. } => {
+                let path = self.path(*instance);
+                let took = self.started.remove(instance).map_or(0.0, |s| at.since(s).as_secs_f64());
+                if outcome == SUCCESS {
+                    say(&mut lines, at, &format!("done   {path}  {took:.1} s"));
+                } else {
+                    say(&mut lines, at, &format!("{outcome} {path}  {took:.1} s: {reason}"));
+                }
+            }
+            Event::Crashed { instance, reason, .. } => {
+                let path = self.path(*instance);
+                say(&mut lines, at, &format!("crash  {path}: {reason}"));
+            }
+            Event::Refused { instance, reason } => {
+                say(&mut lines, at, &format!("refuse {}: {reason}", self.path(*instance)))
+            }
+            Event::RetirementFailed { instance, reason } => {
+                say(&mut lines, at, &format!("failed to make {} real: {reason}", self.path(*instance)));
+            }
+            Event::AbortRequested { reason } => say(&mut lines, at, &format!("abort: {reason}")),
+            Event::WorldChanged { facts, .. } => {
+                for (fact, value) in facts.iter().take(MOST_FACTS) {
+                    match value {
+                        Some(value) => say(&mut lines, at, &format!("world  {fact} = {value}, from outside")),
+                        None => say(&mut lines, at, &format!("world  {fact} is gone, from outside")),
+                    }
+                }
+                if facts.len() > MOST_FACTS {
+                    say(&mut lines, at, &format!("world  and {} more facts", facts.len() - MOST_FACTS));
+                }
+            }
+            Event::Resumed => say(&mut lines, at, "task control goes on"),
+            Event::PauseRequested => say(&mut lines, at, "pause"),
+            Event::ResumeRequested => say(&mut lines, at, "resume"),
+            Event::StepRequested => say(&mut lines, at, "step"),
+            Event::Started { .. }
+            | Event::Granted { .. }
+            | Event::Projected { .. }
+            | Event::Progressed { .. }
+            | Event::Woken
+            | Event::Advised { .. } => {}
+        }
+        for command in commands {
+            match command {
+                Command::Note(Note::Expanded { instance, path, .. }) => {
+                    self.paths.insert(*instance, path.clone());
+                }
+                // What ended without its provider: a `requires` that does not hold, a timeout.
+                Command::Note(Note::Finished { instance, outcome })
+                    if **outcome != *SUCCESS && !told(event, *instance) =>
+                {
+                    let path = self.path(*instance);
+                    let took = self.started.remove(instance).map_or(0.0, |s| at.since(s).as_secs_f64());
+                    say(&mut lines, at, &format!("{outcome} {path}  {took:.1} s, not by its provider"));
+                }
+                Command::Note(Note::Decided { path, decision, .. }) => {
+                    say(&mut lines, at, &format!("decide {path}: {decision}"))
+                }
+                Command::Note(Note::Invalidated { instance, reason }) => {
+                    self.started.remove(instance);
+                    say(&mut lines, at, &format!("again  {}: {reason}", self.path(*instance)));
+                }
+                Command::Note(Note::Reused { instance }) => {
+                    say(&mut lines, at, &format!("reuse  {}", self.path(*instance)))
+                }
+                Command::Note(Note::Squashed { instance }) if self.started.remove(instance).is_some() => {
+                    say(&mut lines, at, &format!("squash {}", self.path(*instance)));
+                }
+                Command::Start { instance, attempt, goal } => {
+                    self.started.insert(*instance, at);
+                    let with: Vec<&str> = goal
+                        .lease
+                        .iter()
+                        .flat_map(|lease| &lease.resources)
+                        .filter(|r| r.kind != WORLD_MODEL)
+                        .map(|r| r.id.as_str())
+                        .collect();
+                    let again = if *attempt > 1 { format!(", attempt {attempt}") } else { String::new() };
+                    say(&mut lines, at, &format!("start  {}  ({}{again})", self.path(*instance), with.join(", ")));
+                }
+                _ => {}
+            }
+        }
+        self.forget(commands.iter());
+        lines
+    }
+
+    /// What is known of an instance that waits for resources; `None` where nothing is said.
+    pub(crate) fn waits(&self, instance: InstanceId) -> Option<String> {
+        (!self.quiet).then(|| self.path(instance))
+    }
+
+    fn path(&self, instance: InstanceId) -> String {
+        self.paths.get(&instance).cloned().unwrap_or_else(|| instance.to_string())
+    }
+}
+
+/// Whether what an event says of an instance is printed already.
+fn told(event: &Event, instance: InstanceId) -> bool {
+    match event {
+        Event::Finished { instance: of, .. } | Event::Refused { instance: of, .. } => *of == instance,
+        _ => false,
+    }
+}
+
+fn say(lines: &mut Vec<String>, at: Timestamp, what: &str) {
+    lines.push(format!("{:>8.1} s  {what}", at.seconds()));
+}

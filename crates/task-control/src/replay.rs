@@ -1,0 +1,446 @@
+//! A run's log, replayed through a new executive: the same events give the same commands, so it then stands where the one that
+//! was killed stood. With a checkpoint only the lines behind it are replayed. A log that says otherwise is of another program and
+//! is refused. Pure.
+
+use super::checkpoint::{Checkpoint, ReplayedState};
+use super::ledger::Ledger;
+use ratn_executive::executive::Executive;
+use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Note};
+use ratn_model::id::{InstanceId, StateId};
+use ratn_model::program::Program;
+use ratn_model::time::Timestamp;
+use ratn_model::tolerance::Tolerance;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// The version of this program, as logs name it.
+pub(super) const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// Why a run cannot be resumed from its log.
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum ReplayError {
+    /// Its first line has no run id.
+    #[error("the log names no run: it was written by an earlier version; run the task again")]
+    NoRun,
+    /// Another version wrote it.
+    #[error("the log was written by ratn {theirs}, and this is {VERSION}: resume it with that version")]
+    Version {
+        /// That version.
+        theirs: String,
+    },
+    /// It is of another task.
+    #[error("the log is of the task `{theirs}`, not of `{ours}`")]
+    Task {
+        /// The name in the log.
+        theirs: String,
+        /// The name in the task file.
+        ours: String,
+    },
+    /// The task file is not the one that the run began with.
+    #[error(
+        "the task file has changed since the run began: put the old one back, or run the new one from its beginning"
+    )]
+    Digest,
+    /// Nothing is left to do.
+    #[error("the run has ended with {outcome}: there is nothing to resume")]
+    Ended {
+        /// The outcome of the run.
+        outcome: String,
+    },
+    /// A command in it is not what this program gives.
+    #[error(
+        "line {line}: the log says {theirs}, and this program would have said {ours}: it was written by another program, for \
+         another catalogue, or has been edited"
+    )]
+    Otherwise {
+        /// The number of the line, from 1.
+        line: usize,
+        /// What the log says.
+        theirs: String,
+        /// What this program gives.
+        ours: String,
+    },
+    /// The state in the checkpoint does not read.
+    #[error("the executive's state cannot be restored: {reason}")]
+    Restore {
+        /// Why.
+        reason: String,
+    },
+}
+
+/// Where a run stands.
+pub(super) struct Replayed {
+    pub(super) executive: Executive,
+    pub(super) standing: ReplayedState,
+    /// Commands of the last event that are not in the log: its writer was killed among them, and has performed none of them.
+    /// They are to be performed.
+    pub(super) missing: Vec<Command>,
+    /// How many events were replayed.
+    pub(super) events: u64,
+}
+
+/// Whether a log that begins like this is of the program and of this version, and of a run that can be resumed.
+///
+/// # Errors
+/// [`ReplayError`].
+pub(super) fn check(program: &Program, first: &LogLine) -> Result<(), ReplayError> {
+    let LogEntry::Event(Event::Started { task, digest, origin, .. }) = &first.entry else { return Ok(()) };
+    if origin.run.is_empty() {
+        return Err(ReplayError::NoRun);
+    }
+    if origin.version != VERSION {
+        return Err(ReplayError::Version { theirs: origin.version.clone() });
+    }
+    if *task != program.name {
+        return Err(ReplayError::Task { theirs: task.clone(), ours: program.name.clone() });
+    }
+    if *digest != program.digest {
+        return Err(ReplayError::Digest);
+    }
+    Ok(())
+}
+
+/// Replays a whole log.
+///
+/// # Errors
+/// [`ReplayError`]; lines count from 1.
+pub(super) fn replay(program: &Arc<Program>, lines: &[LogLine]) -> Result<Replayed, ReplayError> {
+    if let Some(first) = lines.first() {
+        check(program, first)?;
+    }
+    let executive = Executive::new(program.clone(), Tolerance::ROBOT);
+    go_on(executive, ReplayedState::default(), 0, lines)
+}
+
+/// Replays the lines of a log that are behind a checkpoint of it.
+///
+/// # Errors
+/// [`ReplayError`]; lines count from 1, from the beginning of the log.
+pub(super) fn replay_behind(
+    program: &Arc<Program>,
+    checkpoint: Checkpoint,
+    lines: &[LogLine],
+) -> Result<Replayed, ReplayError> {
+    let Checkpoint { place, standing, executive, .. } = checkpoint;
+    let executive = Executive::restore(program.clone(), Tolerance::ROBOT, &executive)
+        .map_err(|error| ReplayError::Restore { reason: error.to_string() })?;
+    go_on(executive, standing, place.lines, lines)
+}
+
+/// Hands the events of lines to an executive and compares what it says; `before` lines are before them.
+fn go_on(
+    mut executive: Executive,
+    mut standing: ReplayedState,
+    before: usize,
+    lines: &[LogLine],
+) -> Result<Replayed, ReplayError> {
+    let ReplayedState { ledger, states, progress } = &mut standing;
+    let mut missing = Vec::new();
+    let (mut next, mut events) = (0, 0);
+    while let Some(LogLine { at, entry }) = lines.get(next) {
+        let event = match entry {
+            LogEntry::Event(event) => event,
+            // Every command behind an event was compared with it.
+            LogEntry::Command(command) => return Err(otherwise(before + next + 1, Some(command), None)),
+        };
+        next += 1;
+        events += 1;
+        ledger.event(*at, event);
+        missing = executive.handle(*at, event.clone());
+        let logged = lines[next..].iter().map_while(|line| match &line.entry {
+            LogEntry::Command(command) => Some(command),
+            LogEntry::Event(_) => None,
+        });
+        let logged: Vec<&Command> = logged.collect();
+        let last = next + logged.len() == lines.len();
+        for (index, theirs) in logged.iter().enumerate() {
+            let ours = missing.get(index);
+            if ours.is_none_or(|ours| !same(ours, theirs)) {
+                return Err(otherwise(before + next + index + 1, Some(theirs), ours));
+            }
+        }
+        if !last && logged.len() < missing.len() {
+            return Err(otherwise(before + next + logged.len() + 1, None, missing.get(logged.len())));
+        }
+        missing.iter().for_each(|command| follow(states, command));
+        if let Some(Command::End { outcome, .. }) = logged.last() {
+            return Err(ReplayError::Ended { outcome: outcome.clone() });
+        }
+        logged.iter().for_each(|command| ledger.command(command));
+        progress.catch_up(*at, event, missing.iter());
+        missing.drain(..logged.len());
+        // Nothing of these was performed, so they are no open items; what they commit is in the executive's world already.
+        let commits = missing.iter().filter(|command| matches!(command, Command::Commit { .. }));
+        commits.for_each(|command| ledger.command(command));
+        next += logged.len();
+    }
+    Ok(Replayed { executive, standing, missing, events })
+}
+
+/// Keeps in mind which state an instance is of, as long as it matters.
+pub(super) fn follow(states: &mut BTreeMap<InstanceId, StateId>, command: &Command) {
+    match command {
+        Command::Note(Note::Expanded { instance, state, .. }) => {
+            states.insert(*instance, *state);
+        }
+        Command::Note(Note::Retired { instance } | Note::Squashed { instance }) => {
+            states.remove(instance);
+        }
+        _ => {}
+    }
+}
+
+/// As the log has them: what is not a number equals itself there.
+fn same(ours: &Command, theirs: &Command) -> bool {
+    ours == theirs || text(Some(ours)) == text(Some(theirs))
+}
+
+fn otherwise(line: usize, theirs: Option<&Command>, ours: Option<&Command>) -> ReplayError {
+    ReplayError::Otherwise { line, theirs: short(text(theirs)), ours: short(text(ours)) }
+}
+
+fn text(command: Option<&Command>) -> String {
+    command.map_or("nothing".into(), |command| serde_json::to_string(command).unwrap_or_default())
+}
+
+/// Enough of it to see what it is.
+fn short(text: String) -> String {
+    const ENOUGH: usize = 160;
+    if text.chars().count() <= ENOUGH { text } else { text.chars().take(ENOUGH).chain(['…']).collect() }
+}
+
+/// Whether something of these commands must not leave before the event that led to them is safe: what cannot be undone.
+pub(super) fn must_be_durable(program: &Program, states: &BTreeMap<InstanceId, StateId>, commands: &[Command]) -> bool {
+    use ratn_model::program::Nature;
+    commands.iter().any(|command| match command {
+        Command::Commit { .. } | Command::Operate { .. } => true,
+        Command::Start { instance, .. } => states
+            .get(instance)
+            .is_none_or(|state| matches!(program.state(*state).annotations.nature, Nature::Irreversible)),
+        _ => false,
+    })
+}
+
+/// The time of a run that goes on: the wall's, as if task control had been there, and never behind the log.
+pub(super) fn now(ledger: &Ledger, unix_ms: u64, speed: f64) -> Timestamp {
+    let since = unix_ms.saturating_sub(ledger.origin.began_unix_ms);
+    Timestamp::from_seconds(since as f64 / 1e3 * speed).max(ledger.last)
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::super::checkpoint::Place;
+    use super::*;
+    use crate::task_for_tests::{self, FETCH_BOXES};
+    use ratn_executive::protocol::{Mode, Origin};
+    use ratn_model::catalogue::Catalogue;
+    use ratn_simulation::run::Setup;
+    use ratn_simulation::timed::TimedProviders;
+    use std::time::Duration;
+
+    fn program(text: &str) -> Arc<Program> {
+        Arc::new(task_for_tests::program(text))
+    }
+
+    pub(crate) fn fetch_boxes() -> Arc<Program> {
+        program(FETCH_BOXES)
+    }
+
+    /// A whole run in virtual time, as task control would have logged it.
+    pub(crate) fn log(program: &Arc<Program>, mode: Mode) -> Vec<LogLine> {
+        let resources = Catalogue::standard().resources;
+        let setup = Setup {
+            program: program.clone(),
+            mode,
+            parameters: program.bind_parameters(&[("boxes".into(), "2".into())]).unwrap(),
+            seed: 3,
+            resources: resources.into_iter().collect(),
+            world: Vec::new(),
+            tolerance: Tolerance::ROBOT,
+            latency: Duration::from_millis(50),
+        };
+        let mut lines = ratn_simulation::run::run(setup, &mut TimedProviders { boxes: 2 }).unwrap().log;
+        let LogEntry::Event(Event::Started { origin, .. }) = &mut lines[0].entry else { panic!("no start") };
+        *origin = Origin { run: "run-1".into(), version: VERSION.into(), ..Origin::default() };
+        lines
+    }
+
+    #[test]
+    fn a_run_that_is_cut_anywhere_goes_on_where_it_was() {
+        let program = fetch_boxes();
+        for mode in [Mode::Hsm, Mode::Cdtn] {
+            let lines = log(&program, mode);
+            // The last line is the end.
+            for length in 1..lines.len() {
+                let Replayed { mut executive, missing, standing, .. } = replay(&program, &lines[..length]).unwrap();
+                assert_eq!(standing.ledger.last, lines[length - 1].at);
+                // What was not written is what would have been, and so is what follows.
+                let mut commands = missing.into_iter();
+                for line in &lines[length..] {
+                    match &line.entry {
+                        LogEntry::Command(command) => assert_eq!(commands.next().as_ref(), Some(command)),
+                        LogEntry::Event(event) => {
+                            commands = executive.handle(line.at, event.clone()).into_iter();
+                        }
+                    }
+                }
+                assert!(executive.has_ended());
+            }
+            let ended = ReplayError::Ended { outcome: "success".into() };
+            assert_eq!(replay(&program, &lines).err(), Some(ended));
+        }
+    }
+
+    /// A checkpoint behind so many whole events of a log, as a run that is under way makes it.
+    fn checkpoint(program: &Arc<Program>, lines: &[LogLine]) -> Checkpoint {
+        let Replayed { executive, standing, missing, .. } = replay(program, lines).unwrap();
+        assert_eq!(missing, []);
+        let log = tempfile::NamedTempFile::new().unwrap();
+        let place = Place::of(log.as_file(), 0, lines.len()).unwrap();
+        Checkpoint { digest: program.digest.clone(), place, standing, executive: executive.checkpoint() }
+    }
+
+    #[test]
+    fn with_a_checkpoint_behind_any_event_a_cut_run_stands_where_it_stands_without() {
+        let program = fetch_boxes();
+        for mode in [Mode::Hsm, Mode::Cdtn] {
+            let lines = log(&program, mode);
+            let mut newest = None;
+            for cut in 1..lines.len() {
+                let whole = replay(&program, &lines[..cut]).unwrap();
+                // Between two events: every command of the last one is there.
+                if matches!(lines[cut].entry, LogEntry::Event(_)) {
+                    newest = Some(checkpoint(&program, &lines[..cut]).encode().unwrap());
+                }
+                let Some(newest) = &newest else { continue };
+                let checkpoint = Checkpoint::decode(newest).unwrap();
+                let before = checkpoint.place.lines;
+                let behind = replay_behind(&program, checkpoint, &lines[before..cut]).unwrap();
+                assert_eq!(behind.standing, whole.standing, "cut at {cut}, checkpoint at {before}");
+                assert_eq!(behind.missing, whole.missing);
+                assert!(behind.events <= 1);
+                // And it goes on alike.
+                let (mut one, mut other) = (whole.executive, behind.executive);
+                for LogLine { at, entry } in &lines[cut..] {
+                    if let LogEntry::Event(event) = entry {
+                        assert_eq!(one.handle(*at, event.clone()), other.handle(*at, event.clone()));
+                    }
+                }
+                assert!(one.has_ended() && other.has_ended());
+            }
+        }
+    }
+
+    #[test]
+    fn the_rest_of_a_log_goes_with_a_checkpoint_behind_any_event_of_it() {
+        let program = fetch_boxes();
+        let lines = log(&program, Mode::Cdtn);
+        let cut = lines.len() - 1;
+        let whole = replay(&program, &lines[..cut]).unwrap();
+        for place in (1..cut).filter(|place| matches!(lines[*place].entry, LogEntry::Event(_))) {
+            let behind = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place..cut]).unwrap();
+            assert_eq!((&behind.standing, &behind.missing), (&whole.standing, &whole.missing));
+            // The end is found, too; and a line that does not follow is refused with its number in the whole log.
+            let ended = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place..]).err();
+            assert_eq!(ended, Some(ReplayError::Ended { outcome: "success".into() }));
+            let refused = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place - 1..]).err();
+            if matches!(lines[place - 1].entry, LogEntry::Command(_)) {
+                assert!(
+                    matches!(refused, Some(ReplayError::Otherwise { line, .. }) if line == place + 1),
+                    "{refused:?}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn whatever_is_answered_after_the_cut_is_open_at_the_cut_and_nothing_else_is() {
+        let program = fetch_boxes();
+        let lines = log(&program, Mode::Cdtn);
+        let mut checked = 0;
+        for cut in (1..lines.len()).filter(|cut| matches!(lines[*cut].entry, LogEntry::Event(_))) {
+            let ledger = replay(&program, &lines[..cut]).unwrap().standing.ledger;
+            let (mut goals, mut projecting, mut waiting) = (ledger.goals, ledger.projecting, ledger.waiting);
+            // What is asked for after the cut is answered after the cut, too, and was not open.
+            let mut asked: Vec<InstanceId> = Vec::new();
+            for line in &lines[cut..] {
+                match &line.entry {
+                    LogEntry::Command(
+                        Command::Start { instance, .. }
+                        | Command::Project { instance, .. }
+                        | Command::Acquire { instance, .. },
+                    ) => asked.push(*instance),
+                    LogEntry::Event(Event::Finished { instance, attempt, .. }) if !asked.contains(instance) => {
+                        assert_eq!(goals.remove(instance).map(|goal| goal.0), Some(*attempt));
+                    }
+                    LogEntry::Event(Event::Projected { instance, .. }) if !asked.contains(instance) => {
+                        assert!(projecting.remove(instance).is_some());
+                    }
+                    LogEntry::Event(Event::Granted { instance, .. }) if !asked.contains(instance) => {
+                        assert!(waiting.remove(instance).is_some());
+                    }
+                    _ => continue,
+                }
+                checked += 1;
+            }
+            assert!(goals.is_empty() && projecting.is_empty() && waiting.is_empty(), "cut at {cut}");
+        }
+        assert!(checked > 100);
+    }
+
+    #[test]
+    fn a_log_that_says_otherwise_is_refused_with_its_line() {
+        let program = fetch_boxes();
+        let mut lines = log(&program, Mode::Cdtn);
+        let is_start = |line: &LogLine| matches!(line.entry, LogEntry::Command(Command::Start { .. }));
+        let at = lines.iter().position(is_start).unwrap();
+        lines[at].entry = LogEntry::Command(Command::Wake { at: Timestamp(1) });
+        let refused = replay(&program, &lines).err().unwrap();
+        assert!(matches!(refused, ReplayError::Otherwise { line, .. } if line == at + 1), "{refused}");
+        // A command that is missing in the middle.
+        let mut lines = log(&program, Mode::Cdtn);
+        lines.remove(at);
+        assert!(matches!(replay(&program, &lines).err().unwrap(), ReplayError::Otherwise { .. }));
+    }
+
+    #[test]
+    fn a_log_of_something_else_is_refused_for_what_it_is() {
+        let program = fetch_boxes();
+        let lines = log(&program, Mode::Hsm);
+        let changed = |change: fn(&mut Origin, &mut String)| {
+            let mut lines = lines.clone();
+            if let LogEntry::Event(Event::Started { origin, task, .. }) = &mut lines[0].entry {
+                change(origin, task);
+            }
+            replay(&program, &lines).err().unwrap().to_string()
+        };
+        assert!(changed(|origin, _| origin.run.clear()).contains("names no run"));
+        assert!(changed(|origin, _| origin.version = "0.0.1".into()).contains("written by ratn 0.0.1"));
+        assert!(changed(|_, task| *task = "other".into()).contains("of the task `other`, not of `fetch_boxes`"));
+        let edited = FETCH_BOXES.replace("duration: 7.7", "duration: 7.8");
+        assert_eq!(replay(&self::program(&edited), &lines).err(), Some(ReplayError::Digest));
+    }
+
+    #[test]
+    fn what_cannot_be_undone_must_be_durable_before() {
+        let program = fetch_boxes();
+        let lines = log(&program, Mode::Cdtn);
+        let (mut states, mut durable, mut starts) = (BTreeMap::new(), 0, 0);
+        for line in &lines {
+            let LogEntry::Command(command) = &line.entry else { continue };
+            follow(&mut states, command);
+            let must_be = must_be_durable(&program, &states, std::slice::from_ref(command));
+            match command {
+                Command::Start { goal, .. } => {
+                    let moves = ["arm", "gripper", "pan_tilt"].contains(&&*goal.provider);
+                    assert_eq!(must_be, moves, "{command:?}");
+                    (durable, starts) = (durable + usize::from(must_be), starts + 1);
+                }
+                Command::Commit { .. } | Command::Operate { .. } => assert!(must_be),
+                _ => assert!(!must_be),
+            }
+        }
+        assert!(durable > 0 && durable < starts);
+    }
+}

@@ -1,0 +1,428 @@
+//! The one loop of task control: receive an event, log it, hand it to the executive, log its commands, perform them.
+//!
+//! Nothing is decided here. Whatever a command leads to comes back as an event through one bounded queue, so the event log is
+//! the whole story of the run, and a run whose task control was killed goes on from it ([`resume`]).
+
+mod resume;
+
+pub use resume::{Resumption, resume};
+
+use super::Endpoints;
+use super::advisor::{self, Advisor};
+use super::checkpoint::Checkpointer;
+use super::control::{Asked, Control, RunStatus};
+use super::ledger::Ledger;
+use super::messages::Messages;
+use super::performer::{self, Performer};
+use super::progress::Progress;
+use super::replay::{self, VERSION};
+use crate::interrupt::Interrupt;
+use anyhow::{Context, bail};
+use ratn_event_log::LogWriter;
+use ratn_executive::executive::Executive;
+use ratn_executive::lookahead::Lookout;
+use ratn_executive::protocol::{Command, Event, Learned, Mode, Natures, Origin};
+use ratn_model::catalogue::Catalogue;
+use ratn_model::id::{InstanceId, StateId};
+use ratn_model::program::{Exceptions, Nature, Program, SUCCESS, State, StateKind};
+use ratn_model::time::Timestamp;
+use ratn_model::tolerance::Tolerance;
+use ratn_model::value::Value;
+use ratn_worker::client::fresh_id;
+use ratn_worker::robot_clock::RobotClock;
+use ratn_worker::tls::ClientTls;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use tokio::sync::mpsc;
+
+/// Answers that the executive has not been given yet.
+pub(super) const MAX_PENDING_EVENTS: usize = 1024;
+
+/// How often a run says what it waits for, at the most.
+const LOOK: Duration = Duration::from_secs(5);
+
+/// A task to be run once.
+#[derive(Debug, Clone)]
+pub struct Run {
+    /// The task, loaded and checked.
+    pub program: Arc<Program>,
+    /// The task file, as an absolute path; empty where there is none.
+    pub file: String,
+    /// Its parameters, bound.
+    pub parameters: BTreeMap<String, Value>,
+    /// How it is executed.
+    pub mode: Mode,
+    /// What its random choices are derived from.
+    pub seed: u64,
+    /// What earlier runs have taught.
+    pub learned: Learned,
+    /// Where the event log goes.
+    pub log: PathBuf,
+    /// Whether the nodes that start and end are not told to [`Place::messages`].
+    pub quiet: bool,
+    /// A checkpoint after so many events; 0 is none.
+    pub checkpoint_every: u64,
+}
+
+/// The system that a run is on.
+#[derive(Debug, Clone)]
+pub struct Place {
+    /// Where its daemons are.
+    pub endpoints: Endpoints,
+    /// What the run trusts and shows there.
+    pub tls: ClientTls,
+    /// Where its endpoint files are.
+    pub directory: PathBuf,
+    /// What there is on it.
+    pub catalogue: Arc<Catalogue>,
+    /// The robot's seconds per second of wall time.
+    pub speed: f64,
+    /// Where what people read of the run goes.
+    pub messages: Messages,
+}
+
+/// How a run ended.
+#[derive(Debug, Clone)]
+pub struct Ended {
+    /// The outcome of the task.
+    pub outcome: String,
+    /// What the task gave.
+    pub outputs: BTreeMap<String, Value>,
+    /// Why it ended so; empty for a success.
+    pub reason: String,
+    /// The robot's seconds from the first event to the last.
+    pub makespan_s: f64,
+}
+
+/// Runs a task on a running system.
+///
+/// # Errors
+/// When the system cannot be reached, the log cannot be written, or the user insists. A task that ends badly is no error: its
+/// outcome says so.
+pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
+    let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
+    let id = fresh_id("run");
+    let performer = Performer::connect(place, &id, &run.program.name, events).await.context("cannot begin the run")?;
+    // A run that is refused leaves no log.
+    let log = LogWriter::create(&run.log)?;
+    let checkpointer = Checkpointer::start(&log, &run.program.digest, run.checkpoint_every, Ledger::default(), 0);
+    let shell = Shell {
+        executive: Executive::new(run.program.clone(), Tolerance::ROBOT),
+        states: BTreeMap::new(),
+        mode: run.mode,
+        timers: BTreeSet::new(),
+        progress: Progress::new(run.quiet),
+        messages: place.messages.clone(),
+        program: run.program.clone(),
+        log,
+        checkpointer,
+        clock: RobotClock::start(place.speed),
+        control: Control::listen_if_possible(&place.directory, &place.messages),
+        advisor: advisor_of(run.mode, run.seed),
+        lookout: Lookout::default(),
+        ask_at: None,
+        look_at: Instant::now() + LOOK,
+        performer,
+        answers,
+    };
+    let began_unix_ms = unix_ms();
+    let begin = async |shell: &mut Shell| {
+        let (revision, world) = shell.performer.root().await.context("cannot read the root world")?;
+        shell.clock = RobotClock::start(place.speed);
+        let begun = Event::Started {
+            task: run.program.name.clone(),
+            digest: run.program.digest.clone(),
+            mode: run.mode,
+            parameters: run.parameters,
+            seed: run.seed,
+            world,
+            revision,
+            capacity: place.catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
+            learned: run.learned,
+            origin: Origin {
+                run: id,
+                version: VERSION.to_owned(),
+                file: run.file,
+                began_unix_ms,
+                imprecise: imprecise(&run.program),
+                natures: Box::new(natures(&run.program, &place.catalogue)),
+            },
+        };
+        shell.step(begun)
+    };
+    shell.run_to_its_end(begin, interrupt).await
+}
+
+/// A run under way.
+struct Shell {
+    program: Arc<Program>,
+    executive: Executive,
+    /// Which states the instances are of.
+    states: BTreeMap<InstanceId, StateId>,
+    mode: Mode,
+    /// When the executive wants to be woken.
+    timers: BTreeSet<Timestamp>,
+    log: LogWriter,
+    /// None where there shall be no checkpoints, or can be none.
+    checkpointer: Option<Checkpointer>,
+    progress: Progress,
+    messages: Messages,
+    clock: RobotClock,
+    control: Option<Control>,
+    /// None in HSM mode, which has one order only.
+    advisor: Option<Advisor>,
+    /// Whether enough has changed since the advisor was asked.
+    lookout: Lookout,
+    /// When it may be asked again.
+    ask_at: Option<Instant>,
+    /// When what waits is looked at again.
+    look_at: Instant,
+    performer: Performer,
+    answers: mpsc::Receiver<performer::Answer>,
+}
+
+impl Shell {
+    /// Begins and goes on until the run has ended; then everything is recorded and given back, whatever happened.
+    async fn run_to_its_end(
+        mut self,
+        begin: impl AsyncFnOnce(&mut Shell) -> anyhow::Result<Option<Ended>>,
+        interrupt: &Interrupt,
+    ) -> anyhow::Result<Ended> {
+        let ended = self.until_ended(begin, interrupt).await;
+        let closed = self.performer.close().await;
+        match (ended, closed) {
+            // A success of which not everything is known afterwards is none.
+            (Ok(ended), Err(error)) if ended.outcome == SUCCESS => Err(error),
+            // The reason is in the outcome already, or matters less.
+            (ended, _) => ended,
+        }
+    }
+
+    async fn until_ended(
+        &mut self,
+        begin: impl AsyncFnOnce(&mut Shell) -> anyhow::Result<Option<Ended>>,
+        interrupt: &Interrupt,
+    ) -> anyhow::Result<Ended> {
+        let mut ended = begin(self).await?;
+        let mut asked_to_abort = false;
+        loop {
+            if let Some(ended) = ended {
+                self.checkpointer.take().into_iter().for_each(Checkpointer::end);
+                return Ok(ended);
+            }
+            let event = self.next(interrupt, &mut asked_to_abort).await?;
+            ended = self.step(event)?;
+        }
+    }
+
+    /// Hands an event to the executive, and what it commands to whoever does it.
+    fn step(&mut self, event: Event) -> anyhow::Result<Option<Ended>> {
+        let (now, commands) = self.decide(&event)?;
+        self.performer.prepare(&event, &commands);
+        self.perform(now, commands)
+    }
+
+    /// What the executive makes of an event, written down.
+    fn decide(&mut self, event: &Event) -> anyhow::Result<(Timestamp, Vec<Command>)> {
+        let now = self.clock.now();
+        if *event == Event::Woken {
+            self.timers.retain(|at| *at > now);
+        }
+        let commands = self.executive.handle(now, event.clone());
+        commands.iter().for_each(|command| replay::follow(&mut self.states, command));
+        self.log.append(now, event, &commands)?;
+        if replay::must_be_durable(&self.program, &self.states, &commands) {
+            self.log.make_durable()?;
+        }
+        if let Some(checkpointer) = &mut self.checkpointer {
+            checkpointer.follow(now, event, &commands);
+        }
+        for line in self.progress.follow(now, event, &commands) {
+            self.messages.say(line);
+        }
+        self.lookout.observe(&commands);
+        if self.lookout.is_due() {
+            self.ask_at.get_or_insert_with(|| Instant::now() + advisor::PAUSE);
+        }
+        Ok((now, commands))
+    }
+
+    fn perform(
+        &mut self,
+        now: Timestamp,
+        commands: impl IntoIterator<Item = Command>,
+    ) -> anyhow::Result<Option<Ended>> {
+        for command in commands {
+            match command {
+                Command::Wake { at } => drop(self.timers.insert(at)),
+                Command::End { .. } => return Ok(ended(command, now)),
+                command => self.performer.perform(command)?,
+            }
+        }
+        Ok(None)
+    }
+
+    /// What is still to be done may be done in a better order, while something runs.
+    fn ask_for_advice(&mut self) {
+        self.ask_at = None;
+        let outlook = self.executive.outlook(self.clock.now());
+        if let Some(advisor) = &self.advisor
+            && advisor::is_worth_asking(&outlook)
+        {
+            self.lookout.looks(outlook.tasks.len());
+            advisor.ask(outlook);
+        }
+    }
+
+    /// What the run is doing, for whoever asks.
+    fn status(&self) -> RunStatus {
+        let now = self.clock.now();
+        RunStatus {
+            run: self.performer.run().to_owned(),
+            task: self.program.name.clone(),
+            mode: self.mode,
+            log: std::path::absolute(self.log.path()).unwrap_or_else(|_| self.log.path().to_owned()),
+            at_s: now.seconds(),
+            paused: self.progress.is_paused(),
+            ended: self.progress.retired(),
+            under_way: self.progress.under_way(now),
+        }
+    }
+
+    /// Whoever resumes this run begins here. Between two events all that was logged has been performed.
+    fn make_checkpoint(&mut self) {
+        if let Some(checkpointer) = &mut self.checkpointer {
+            let confirmed = self.performer.confirmed();
+            checkpointer.make(&self.log, &self.executive, &self.states, &self.progress, confirmed);
+        }
+    }
+
+    /// The next event that the executive has to know of.
+    async fn next(&mut self, interrupt: &Interrupt, asked_to_abort: &mut bool) -> anyhow::Result<Event> {
+        loop {
+            let timer = self.timers.first().copied();
+            let due = async {
+                match timer {
+                    Some(at) => tokio::time::sleep(self.clock.until(at)).await,
+                    None => std::future::pending().await,
+                }
+            };
+            let ask_at = self.ask_at.filter(|_| self.advisor.is_some());
+            let to_ask = async {
+                match ask_at {
+                    Some(at) => tokio::time::sleep_until(at.into()).await,
+                    None => std::future::pending().await,
+                }
+            };
+            let checkpoint_at = self.checkpointer.as_mut().and_then(|checkpointer| checkpointer.due(&self.log));
+            let to_keep = async {
+                match checkpoint_at {
+                    Some(at) => tokio::time::sleep_until(at.into()).await,
+                    None => std::future::pending().await,
+                }
+            };
+            let advised = async {
+                match &mut self.advisor {
+                    Some(advisor) => advisor.told().await,
+                    None => std::future::pending().await,
+                }
+            };
+            let told = async {
+                match &mut self.control {
+                    Some(control) => control.asked().await,
+                    None => std::future::pending().await,
+                }
+            };
+            let answer = tokio::select! {
+                answer = self.answers.recv() => answer.context("nothing can answer any more")?,
+                () = due => return Ok(Event::Woken),
+                asked = told => match asked {
+                    Asked::Told(event) => return Ok(*event),
+                    Asked::Status(say) => {
+                        // Whoever asked may have gone.
+                        let _ = say.send(self.status());
+                        continue;
+                    }
+                },
+                event = advised => return Ok(event),
+                () = to_ask => {
+                    self.ask_for_advice();
+                    continue;
+                }
+                () = to_keep => {
+                    self.make_checkpoint();
+                    continue;
+                }
+                () = tokio::time::sleep_until(self.look_at.into()) => {
+                    self.look_at = Instant::now() + LOOK;
+                    if let Some(instance) = self.performer.waits() && let Some(path) = self.progress.waits(instance) {
+                        self.performer.say_why(self.clock.now(), instance, path);
+                    }
+                    continue;
+                }
+                () = interrupt.asked_times(1), if !*asked_to_abort => {
+                    *asked_to_abort = true;
+                    return Ok(Event::AbortRequested { reason: "the user asked for it".into() });
+                }
+                () = self.performer.lost(), if !*asked_to_abort => {
+                    *asked_to_abort = true;
+                    let reason = "the session with the resource manager, and every lease, is lost".into();
+                    return Ok(Event::AbortRequested { reason });
+                }
+                () = interrupt.asked_times(2) => bail!("interrupted twice: the run was left where it was"),
+            };
+            if let Some(event) = self.performer.accept(answer, self.executive.root())? {
+                return Ok(event);
+            }
+        }
+    }
+}
+
+fn ended(command: Command, now: Timestamp) -> Option<Ended> {
+    match command {
+        Command::End { outcome, outputs, reason } => {
+            Some(Ended { outcome, outputs, reason, makespan_s: now.seconds() })
+        }
+        _ => None,
+    }
+}
+
+/// Whoever looks for a better order, where there is more than one. A run goes on without.
+fn advisor_of(mode: Mode, seed: u64) -> Option<Advisor> {
+    match mode {
+        Mode::Hsm => None,
+        Mode::Cdtn => Advisor::start(seed).inspect_err(|error| tracing::warn!(%error, "nobody looks ahead")).ok(),
+    }
+}
+
+/// What the actions of a program are, by path, and which kinds of resources move the robot.
+fn natures(program: &Program, catalogue: &Catalogue) -> Natures {
+    let is_action = |state: &&State| matches!(state.kind, StateKind::Action { .. });
+    let actions = |is_meant: fn(&Nature) -> bool| {
+        let meant = program.states.iter().filter(is_action).filter(|state| is_meant(&state.annotations.nature));
+        meant.map(|state| state.path.clone()).collect()
+    };
+    Natures {
+        computes: actions(|nature| *nature == Nature::Computes),
+        senses: actions(|nature| matches!(nature, Nature::Senses(_))),
+        actuating: catalogue.resources.iter().filter(|r| r.1.actuates).map(|r| r.0.clone()).collect(),
+    }
+}
+
+/// Where the program lets younger PIAs run beside one that might still fail.
+fn imprecise(program: &Program) -> Vec<String> {
+    let is_pia = |state: &&State| {
+        matches!(state.kind, StateKind::Action { .. }) && state.annotations.nature == Nature::Irreversible
+    };
+    let lets = |state: &&State| state.annotations.exceptions.unwrap_or(program.exceptions) == Exceptions::Imprecise;
+    program.states.iter().filter(is_pia).filter(lets).map(|state| state.path.clone()).collect()
+}
+
+fn unix_ms() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,131 @@
+//! Going on with a run from its event log: the executive is brought to where it was, what was open is taken up, and the loop goes
+//! on as ever.
+
+use super::{Ended, LOOK, Place, Shell, advisor_of, unix_ms};
+use crate::checkpoint::{Checkpointer, ReplayedState};
+use crate::control::Control;
+use crate::history::{History, HistoryError};
+use crate::interrupt::Interrupt;
+use crate::performer::{self, Performer};
+use crate::replay::{self, Replayed};
+use crate::shell::MAX_PENDING_EVENTS;
+use anyhow::Context;
+use ratn_event_log::{Log, LogWriter};
+use ratn_executive::lookahead::Lookout;
+use ratn_executive::protocol::{Command, Event};
+use ratn_model::program::Program;
+use ratn_worker::robot_clock::RobotClock;
+use std::sync::Arc;
+use std::time::Instant;
+use tokio::sync::mpsc;
+
+/// A run to go on with, as its log has it.
+pub struct Resumption {
+    program: Arc<Program>,
+    history: History,
+    replayed: Replayed,
+    log: LogWriter,
+    checkpoint_every: u64,
+}
+
+impl Resumption {
+    /// Replays what the log says. Touches nothing of the run.
+    ///
+    /// # Errors
+    /// Where the log is not of this program and this version, or the run has ended.
+    pub fn new(
+        program: Program,
+        history: History,
+        log: LogWriter,
+        checkpoint_every: u64,
+    ) -> Result<Resumption, HistoryError> {
+        let program = Arc::new(program);
+        let replayed = history.replay(&program)?;
+        Ok(Resumption::of(program, history, replayed, log, checkpoint_every))
+    }
+
+    /// The same from the whole log, where its checkpoint does not know enough.
+    fn whole(self) -> Result<Resumption, HistoryError> {
+        let Resumption { program, history, log, checkpoint_every, .. } = self;
+        let replayed = history.replay_whole(&program)?;
+        Ok(Resumption::of(program, history, replayed, log, checkpoint_every))
+    }
+
+    fn of(
+        program: Arc<Program>,
+        history: History,
+        (replayed, read): (Replayed, Log),
+        mut log: LogWriter,
+        checkpoint_every: u64,
+    ) -> Resumption {
+        if let Some(line) = read.torn {
+            history
+                .messages()
+                .say(format_args!("{}:{line}: the last line is torn and is cut off", log.path().display()));
+        }
+        log.go_on_behind(&read);
+        Resumption { program, history, replayed, log, checkpoint_every }
+    }
+}
+
+/// Goes on with a run whose task control was killed, on the system that it was on.
+///
+/// # Errors
+/// As [`run`]; and where the run cannot go on: its log is of another program, its world is not there any more, another run is
+/// under way.
+pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
+    let ledger = &resumption.replayed.standing.ledger;
+    performer::check_world(place, ledger).await?;
+    if !performer::remembers(place, ledger).await? {
+        resumption.history.say(&"the world pool has lost commits that are older");
+        resumption = resumption.whole()?;
+    }
+    let Resumption { program, history, replayed, log, checkpoint_every } = resumption;
+    let Replayed { executive, standing, missing, events: replayed } = replayed;
+    let ReplayedState { mut ledger, states, progress } = standing;
+    let (mode, seed) = history.mode_and_seed();
+    // It knows of what is missing before that is written: nothing is kept until it is.
+    let mut kept = ledger.clone();
+    let others = missing.iter().filter(|command| !matches!(command, Command::Commit { .. }));
+    others.for_each(|command| kept.command(command));
+    let checkpointer = Checkpointer::start(&log, &program.digest, checkpoint_every, kept, replayed);
+    let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
+    let performer = Performer::connect(place, &ledger.origin.run, &program.name, events).await;
+    let shell = Shell {
+        executive,
+        states,
+        mode,
+        timers: std::mem::take(&mut ledger.wakes),
+        progress,
+        messages: place.messages.clone(),
+        program,
+        log,
+        checkpointer,
+        clock: RobotClock::going_on(replay::now(&ledger, unix_ms(), place.speed), place.speed),
+        control: Control::listen_if_possible(&place.directory, &place.messages),
+        advisor: advisor_of(mode, seed),
+        lookout: Lookout::default(),
+        ask_at: None,
+        look_at: Instant::now() + LOOK,
+        performer: performer.context("cannot go on with the run")?,
+        answers,
+    };
+    let begin = async |shell: &mut Shell| {
+        let mirror = shell.executive.root().clone();
+        shell.log.append_commands(ledger.last, &missing)?;
+        // Request ids of now on have the number of this resumption: it is in the log before they are used.
+        let (now, commands) = shell.decide(&Event::Resumed)?;
+        shell.log.make_durable()?;
+        ledger.event(now, &Event::Resumed);
+        shell.performer.know(shell.progress.paths());
+        let changed = shell.performer.take_up(ledger, &mirror).await?;
+        // Commits are there by now.
+        let missing = missing.into_iter().filter(|command| !matches!(command, Command::Commit { .. }));
+        let ended = shell.perform(now, missing.chain(commands))?;
+        match changed {
+            Some(changed) if ended.is_none() => shell.step(changed),
+            _ => Ok(ended),
+        }
+    };
+    shell.run_to_its_end(begin, interrupt).await
+}

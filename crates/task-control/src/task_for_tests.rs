@@ -1,0 +1,14 @@
+//! An example task, checked against the standard catalogue, for tests.
+
+use ratn_model::catalogue::Catalogue;
+use ratn_model::program::Program;
+
+pub(crate) const FETCH_BOXES: &str = include_str!("../../../examples/fetch_boxes.yaml");
+
+/// The task of this text, which must be good.
+pub(crate) fn program(text: &str) -> Program {
+    match ratn_model::load::load(text, "fetch_boxes.yaml", &Catalogue::standard()) {
+        Ok(loaded) => loaded.program,
+        Err(findings) => panic!("{findings:?}"),
+    }
+}
