@@ -51,8 +51,9 @@ pub struct Space {
     compiled: Compiled,
     scratch: Scratch,
     isa: Isa,
-    /// Per rigid part, then per group.
-    arms: Vec<Arm>,
+    spans: Spans,
+    /// Per rigid part, then per group: how far it turns in half a step, and how much larger its spheres are taken to be.
+    turned: Vec<f32>,
     inflate: Vec<f32>,
     lower: State,
     upper: State,
@@ -64,15 +65,15 @@ pub struct Space {
     swept: bool,
 }
 
-/// How spheres move with each joint.
+/// How spheres move with each joint: of each joint a list over the rigid parts, then the groups, so that many are added up at once.
 #[derive(Debug, Clone)]
-struct Arm {
-    /// How far a point of them moves at most for one radian (or metre).
-    levers: State,
+struct Spans {
     /// How far they turn for one radian; zero for joints that slide.
-    turns: State,
-    /// How far they slide for one metre; zero for joints that turn.
-    slides: State,
+    turns: Vec<Vec<f32>>,
+    /// How far a point of them moves at most for one radian; for one metre of a joint that slides, twice that.
+    ways: Vec<Vec<f32>>,
+    /// Of each rigid part and group, the radius of its bounding sphere.
+    radii: Vec<f32>,
 }
 
 impl Space {
@@ -122,7 +123,7 @@ impl Space {
         compiled.obstacles = compiled_obstacles;
         blocked |= add_clouds(&mut compiled, mechanism, &surroundings, &shells, &links, isa);
         compiled.pairs = pairs(mechanism, &compiled, &links);
-        let arms = spheres(&compiled).map(|(frame, coarse)| arm(&compiled, frame, coarse)).collect();
+        let spans = spans(&compiled);
         let (mut lower, mut upper) = ([0.0; MAX_JOINTS], [0.0; MAX_JOINTS]);
         for (j, joint) in mechanism.joints.iter().enumerate() {
             (lower[j], upper[j]) = (joint.lower as f32, joint.upper as f32);
@@ -132,9 +133,22 @@ impl Space {
             *fine = fineness as f32;
         }
         let scratch = Scratch::new(&compiled);
-        let inflate = vec![0.0; compiled.rigids.len() + compiled.groups.len()];
+        let (turned, inflate) = (vec![0.0; spans.radii.len()], vec![0.0; spans.radii.len()]);
         let branches = branches::branches(&parents(&compiled));
-        Space { compiled, scratch, isa, arms, inflate, lower, upper, fineness, branches, blocked, swept: false }
+        Space {
+            compiled,
+            scratch,
+            isa,
+            spans,
+            turned,
+            inflate,
+            lower,
+            upper,
+            fineness,
+            branches,
+            blocked,
+            swept: false,
+        }
     }
 
     /// How many joints there are.
@@ -249,15 +263,24 @@ impl Space {
     fn touching_grown(&mut self, start: &State, delta: &State) -> u32 {
         // Each posture stands for the step that it is in the middle of: nothing is further than half a step from one.
         let step = 0.5 / self.isa.width() as f32;
-        let joints = self.compiled.joints;
-        for ((inflate, arm), (_, coarse)) in self.inflate.iter_mut().zip(&self.arms).zip(spheres(&self.compiled)) {
-            let along = |levers: &State| (0..joints).map(|j| levers[j] * delta[j].abs()).sum::<f32>() * step;
-            let (turned, moved, slid) = (along(&arm.turns), along(&arm.levers), along(&arm.slides));
+        self.turned.fill(0.0);
+        self.inflate.fill(0.0);
+        let Spans { turns, ways, radii } = &self.spans;
+        for (joint, (turns, ways)) in turns.iter().zip(ways).enumerate() {
+            let by = delta[joint].abs() * step;
+            for (turned, turns) in self.turned.iter_mut().zip(turns) {
+                *turned += turns * by;
+            }
+            for (moved, way) in self.inflate.iter_mut().zip(ways) {
+                *moved += way * by;
+            }
+        }
+        for ((inflate, turned), radius) in self.inflate.iter_mut().zip(&self.turned).zip(radii) {
             // The second derivative by two joints that turn is no longer than the lever of the later one. The mean speed of a
             // step differs from that anywhere in it and half a step beyond by what it changes in one step at most.
-            let bend = 2.0 * turned * (moved + slid);
+            let bend = 2.0 * turned * *inflate;
             // Points beside the centre of the bounding sphere turn about it.
-            *inflate = bend + turned * coarse[3];
+            *inflate = bend + turned * radius;
         }
         let start: State = std::array::from_fn(|j| start[j] - delta[j] * step);
         let edge = Edge { compiled: &self.compiled, start: &start, delta, batches: 1, inflate: &self.inflate };
@@ -266,21 +289,32 @@ impl Space {
 }
 
 /// `to - from`
+#[inline]
 pub fn difference(to: &State, from: &State) -> State {
     std::array::from_fn(|j| to[j] - from[j])
 }
 
 /// The Euclidean length.
+#[inline]
 pub fn length(delta: &State) -> f32 {
-    delta.iter().map(|d| d * d).sum::<f32>().sqrt()
+    // Four sums side by side.
+    let mut sums = [0.0_f32; 4];
+    for four in delta.chunks_exact(4) {
+        for (sum, d) in sums.iter_mut().zip(four) {
+            *sum += d * d;
+        }
+    }
+    ((sums[0] + sums[1]) + (sums[2] + sums[3])).sqrt()
 }
 
 /// The Euclidean distance.
+#[inline]
 pub fn distance(a: &State, b: &State) -> f32 {
     length(&difference(a, b))
 }
 
 /// The posture a fraction of the way from one to another.
+#[inline]
 pub fn between(a: &State, b: &State, fraction: f32) -> State {
     std::array::from_fn(|j| a[j] + (b[j] - a[j]) * fraction)
 }
@@ -512,24 +546,27 @@ fn parents(compiled: &Compiled) -> Vec<Option<usize>> {
     (0..compiled.joints).map(parent).collect()
 }
 
-fn arm(compiled: &Compiled, mut frame: usize, coarse: &[f32; 4]) -> Arm {
-    let mut arm = Arm { levers: [0.0; MAX_JOINTS], turns: [0.0; MAX_JOINTS], slides: [0.0; MAX_JOINTS] };
-    let mut reach = norm(coarse) + coarse[3];
-    while frame != 0 {
-        let here = &compiled.frames[frame - 1];
-        // A joint may move several links of a chain.
-        let factor = here.factor.abs();
-        if here.slides {
-            arm.levers[here.joint] += factor;
-            arm.slides[here.joint] += factor;
-        } else {
-            arm.levers[here.joint] += reach * factor;
-            arm.turns[here.joint] += factor;
+fn spans(compiled: &Compiled) -> Spans {
+    let radii: Vec<f32> = spheres(compiled).map(|(_, coarse)| coarse[3]).collect();
+    let none = || vec![vec![0.0; radii.len()]; compiled.joints];
+    let (mut turns, mut ways) = (none(), none());
+    for (part, (mut frame, coarse)) in spheres(compiled).enumerate() {
+        let mut reach = norm(coarse) + coarse[3];
+        while frame != 0 {
+            let here = &compiled.frames[frame - 1];
+            // A joint may move several links of a chain.
+            let factor = here.factor.abs();
+            if here.slides {
+                ways[here.joint][part] += 2.0 * factor;
+            } else {
+                ways[here.joint][part] += reach * factor;
+                turns[here.joint][part] += factor;
+            }
+            reach += here.origin[9].hypot(here.origin[10]).hypot(here.origin[11]) + here.travel;
+            frame = here.parent;
         }
-        reach += here.origin[9].hypot(here.origin[10]).hypot(here.origin[11]) + here.travel;
-        frame = here.parent;
     }
-    arm
+    Spans { turns, ways, radii }
 }
 
 fn norm(sphere: &[f32; 4]) -> f32 {
