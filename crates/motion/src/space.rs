@@ -24,6 +24,9 @@ pub type State = [f32; MAX_JOINTS];
 /// Grown by this, the spheres hide the rounding of `f32`, in metres.
 const ROUNDING_M: f64 = 2e-5;
 
+/// Bounding spheres are larger by this, in metres: what a sphere meets in single precision, its bounding sphere meets, too.
+const COARSE_ROUNDING_M: f32 = 1e-5;
+
 /// How much finer each level of a swept check is than the one before, and how many levels there are.
 const FINER: usize = 4;
 const LEVELS: usize = 3;
@@ -615,5 +618,5 @@ fn enclose(spheres: &[[f32; 4]]) -> [f32; 4] {
         return spheres[0];
     }
     let [x, y, z] = best.1;
-    [x, y, z, best.0 * (1.0 + 1e-6)]
+    [x, y, z, best.0 + COARSE_ROUNDING_M]
 }

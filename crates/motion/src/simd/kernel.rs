@@ -264,7 +264,7 @@ fn sin_cos<V: Lanes>(x: V) -> (V, V) {
     }
     let s = s.mul(h);
     let mut c = V::splat(2.319_438_7e-5);
-    for t in [-1.385_592_7e-3, 4.166_399e-2, -0.499_999_32, 1.0] {
+    for t in [-1.385_592_7e-3, 4.166_399e-2, -0.499_999_3, 1.0] {
         c = c.mul_add(h2, V::splat(t));
     }
     let twice = s.add(s);
