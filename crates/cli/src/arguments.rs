@@ -6,7 +6,9 @@ mod systems;
 mod tasks;
 mod values;
 
+use crate::command::actions::ActionsArguments;
 use crate::command::doctor::DoctorArguments;
+use crate::command::new::NewArguments;
 use crate::command::pool::{DrainArguments, HostArguments, LogsArguments, PoolArguments, RestartArguments};
 use crate::command::resource::ResourceArguments;
 use crate::command::world::WorldArguments;
@@ -65,6 +67,10 @@ pub(crate) enum Command {
     Reset(ResetArguments),
     /// Check a task file without starting anything
     Check(CheckArguments),
+    /// List the actions that tasks can use, with their ports, and where each comes from
+    Actions(ActionsArguments),
+    /// Begin a worker or a task of your own
+    New(NewArguments),
     /// Say where the time of a run went, from its event log
     Report(ReportArguments),
     /// Replay the paper's tables in virtual time

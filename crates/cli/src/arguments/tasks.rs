@@ -22,6 +22,12 @@ pub(crate) struct CheckArguments {
     /// The system to check it against; without it the built-in default
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
+    /// A catalogue that extends the config's, and overrides it where both say something; may be repeated
+    #[arg(long, value_name = "FILE")]
+    pub(crate) catalogue: Vec<PathBuf>,
+    /// Check against the system that runs there, too: what its workers say of themselves extends the catalogue, or is compared with it
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
     /// Only check: leave out the simulation that says what keeps the task sequential
     #[arg(long)]
     pub(crate) no_simulation: bool,

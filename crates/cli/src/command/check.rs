@@ -1,9 +1,11 @@
 //! `ratn check TASK`, and what `ratn run` does first.
 
+use super::blocking_here;
 use super::tables::improvement;
 use crate::arguments::CheckArguments;
 use crate::failure::Failure;
 use crate::system::config::SystemConfig;
+use crate::system::{System, catalogue, public_directory};
 use crate::{input, output};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
@@ -13,6 +15,7 @@ use ratn_model::program::Program;
 use ratn_model::resource::Quantity;
 use ratn_simulation::sequential::{Assumptions, Gain, Link, Sequential, sequential};
 use ratn_task_control::learn;
+use ratn_worker::tls::ClientTls;
 use serde::Serialize;
 use std::path::Path;
 
@@ -25,6 +28,8 @@ struct Checked<'a> {
     /// The task's name; of a task that is refused, none.
     task: Option<&'a str>,
     findings: &'a [Diagnostic],
+    /// Where workers of the running system and its catalogue say something else, and what nobody offers.
+    workers: &'a [String],
     /// What keeps it sequential, unless it was left out or cannot be said.
     sequential: Option<&'a Sequential>,
     /// Why it cannot be said.
@@ -32,21 +37,24 @@ struct Checked<'a> {
 }
 
 /// Says what is wrong with a task file, and what keeps the task sequential.
-pub(crate) fn run(arguments: &CheckArguments) -> Result<(), Failure> {
-    let config = SystemConfig::load(arguments.config.as_deref())?;
+pub(crate) fn run(arguments: &CheckArguments, tls: &ClientTls) -> Result<(), Failure> {
+    let (config, system) = against(arguments, tls)?;
     let file = arguments.task.display().to_string();
     let text = read(&arguments.task)?;
     let loaded = match ratn_model::load::load_with(&text, &file, &config.catalogue, &input::Libraries) {
         Ok(loaded) => loaded,
         Err(findings) => {
             if arguments.json {
-                let checked = Checked { task: None, findings: &findings, sequential: None, obstacle: None };
+                let checked =
+                    Checked { task: None, findings: &findings, workers: &[], sequential: None, obstacle: None };
                 output::result(serde_json::to_string_pretty(&checked)?)?;
             }
             return Err(refused(&findings));
         }
     };
     let (program, findings) = (loaded.program, loaded.warnings);
+    let workers =
+        system.map(|system| [system.offered.lacking(&program), system.mismatches].concat()).unwrap_or_default();
     let simulated = if arguments.no_simulation { None } else { Some(simulate(&program, &config, arguments)?) };
     if arguments.json {
         let (sequential, obstacle) = match &simulated {
@@ -54,10 +62,12 @@ pub(crate) fn run(arguments: &CheckArguments) -> Result<(), Failure> {
             Some(Err(obstacle)) => (None, Some(obstacle.as_str())),
             None => (None, None),
         };
-        let checked = Checked { task: Some(&program.name), findings: &findings, sequential, obstacle };
+        let checked =
+            Checked { task: Some(&program.name), findings: &findings, workers: &workers, sequential, obstacle };
         return output::result(serde_json::to_string_pretty(&checked)?).map_err(Failure::from);
     }
     findings.iter().for_each(output::progress);
+    workers.iter().for_each(|what| output::progress(format_args!("warning: {what}")));
     // State 0 is the task itself.
     let states = program.states.len().saturating_sub(1);
     let plural = if states == 1 { "state" } else { "states" };
@@ -70,6 +80,32 @@ pub(crate) fn run(arguments: &CheckArguments) -> Result<(), Failure> {
             Ok(())
         }
     }
+}
+
+/// The config with the catalogue that a task is checked against, and the running system, where one is named.
+fn against(arguments: &CheckArguments, tls: &ClientTls) -> Result<(SystemConfig, Option<System>), Failure> {
+    let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
+    let tls = &given.as_ref().map_or_else(|| Ok(tls.clone()), |config| config.client_tls(tls))?;
+    let mut system = None;
+    if let Some(named) = arguments.runtime_dir.as_deref() {
+        let directory = public_directory(Some(named))?;
+        blocking_here(async {
+            system = Box::pin(System::find(&directory, given.clone(), tls)).await?;
+            Ok(())
+        })?;
+        if system.is_none() {
+            return Err(Failure::Refused(format!("ratn: no system runs in {}", directory.display())));
+        }
+    }
+    let mut config = match (&system, given) {
+        (Some(system), _) => system.config.clone(),
+        (None, given) => given.map_or_else(|| SystemConfig::load(None), Ok)?,
+    };
+    for file in &arguments.catalogue {
+        let said = catalogue::read(file).map_err(|error| Failure::Refused(format!("ratn: {error:#}")))?;
+        catalogue::extend(&mut config.catalogue, said);
+    }
+    Ok((config, system))
 }
 
 /// What keeps the task sequential, or why that cannot be said.

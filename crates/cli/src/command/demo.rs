@@ -52,6 +52,7 @@ impl Files for BuiltIn {
 /// Runs the task in every way and compares.
 pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Failure> {
     let config = SystemConfig::load(arguments.config.as_deref())?;
+    let tls = &config.client_tls(tls)?;
     let (file, text) = match arguments.scenario {
         Setting::Boxes if arguments.faults.fault.is_empty() => FETCH,
         Setting::Boxes => RECOVERING,

@@ -1,11 +1,13 @@
 //! One file per command of the user; `roles.rs` holds the daemons and workers.
 
+pub(crate) mod actions;
 mod certs;
 mod check;
 mod control;
 mod demo;
 pub(crate) mod doctor;
 mod leader;
+pub(crate) mod new;
 mod plan;
 pub(crate) mod pool;
 mod reload;
@@ -52,7 +54,9 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::GoOn(arguments) => safety::go_on(&arguments, tls),
         Command::Doctor(arguments) => doctor::run(&arguments, tls),
         Command::Reset(arguments) => reset::run(&arguments, tls),
-        Command::Check(arguments) => check::run(&arguments),
+        Command::Check(arguments) => check::run(&arguments, tls),
+        Command::Actions(arguments) => actions::run(&arguments, tls),
+        Command::New(arguments) => new::run(&arguments),
         Command::Resource(arguments) => resource::run(&arguments, tls),
         Command::World(arguments) => world::run(&arguments, tls),
         Command::State(arguments) => state::run(&arguments),

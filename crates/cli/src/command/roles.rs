@@ -85,6 +85,7 @@ pub(super) fn process_manager(arguments: &RoleArguments, tls: &ClientTls) -> Res
     daemon(arguments, tls, process_manager::ROLE, async |system, host| {
         let mut config = system.process_manager_config();
         config.owns_process = true;
+        config.catalogue = Some(Arc::new(system.catalogue));
         config.worker_environment = system.service.for_workers(arguments.config.as_deref());
         config.listen = host.listen.unwrap_or(config.listen);
         process_manager::run_as(config, host.directory, host.serving, host.tls, host.shutdown).await

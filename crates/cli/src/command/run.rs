@@ -55,6 +55,7 @@ async fn begin(
     interrupt: &Interrupt,
 ) -> Result<(), Failure> {
     let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
+    let tls = &given.as_ref().map_or_else(|| Ok(tls.clone()), |config| config.client_tls(tls))?;
     let found = System::find(directory, given.clone(), tls).await?;
     if found.is_none() && arguments.runtime_dir.is_some() {
         let place = directory.display();
@@ -69,6 +70,9 @@ async fn begin(
     config.apply(&SystemArguments { speed: arguments.speed, ..SystemArguments::default() });
 
     // Everything that can be refused is refused before anything is started.
+    if let Some(system) = &found {
+        system.mismatches.iter().for_each(|what| output::progress(format_args!("warning: {what}")));
+    }
     let program = check::load(task, &config.catalogue)?;
     let parameters = program
         .bind_parameters(&arguments.set)
@@ -101,6 +105,7 @@ async fn begin(
             system
         }
     };
+    system.offered.lacking(&program).iter().for_each(|what| output::progress(format_args!("warning: {what}")));
     let run = Run {
         program: Arc::new(program),
         file: std::path::absolute(task)?.display().to_string(),

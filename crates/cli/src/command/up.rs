@@ -15,6 +15,7 @@ pub(crate) fn run(arguments: &UpArguments, tls: &ClientTls) -> Result<(), Failur
     let mut config = SystemConfig::load(arguments.config.as_deref())?;
     config.apply(&arguments.system);
     startable(&config)?;
+    let tls = &config.client_tls(tls)?;
     blocking(async {
         let interrupt = Interrupt::listen()?;
         let directory = public_directory(arguments.runtime_dir.as_deref())?;

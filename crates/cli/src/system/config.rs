@@ -1,5 +1,6 @@
 //! The config of a whole system: one TOML file, of which every role takes its own section.
 
+use super::catalogue;
 use crate::arguments::SystemArguments;
 use crate::failure::Failure;
 use crate::input;
@@ -12,6 +13,7 @@ use ratn_daemon::service::ServiceConfig;
 use ratn_daemon::world_pool::WorldPoolConfig;
 use ratn_model::catalogue::Catalogue;
 use ratn_model::resource::{Quantity, ResourceClass};
+use ratn_worker::tls::ClientTls;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -39,6 +41,8 @@ pub(crate) struct SystemConfig {
     pub(crate) world_pool: WorldPoolConfig,
     pub(crate) process_manager: ProcessManagerConfig,
     pub(crate) cell: CellConfig,
+    /// What the catalogue is made of: `built-in`, and files, found from the folder of this one. What `catalogue` says then comes on top.
+    pub(crate) catalogues: Vec<String>,
     /// What tasks are checked against.
     pub(crate) catalogue: Catalogue,
 }
@@ -52,6 +56,7 @@ impl Default for SystemConfig {
             world_pool: WorldPoolConfig::default(),
             process_manager: ProcessManagerConfig::default(),
             cell: CellConfig::default(),
+            catalogues: Vec::new(),
             catalogue: Catalogue::standard(),
         }
     }
@@ -78,6 +83,7 @@ impl SystemConfig {
         let mut config: SystemConfig =
             toml::from_str(text).map_err(|error| anyhow::anyhow!("{name}: {}", error.to_string().trim_end()))?;
         config.check().with_context(|| name.to_owned())?;
+        config.compose(Path::new(name).parent().unwrap_or(Path::new(""))).with_context(|| name.to_owned())?;
         config.settle();
         Ok(config)
     }
@@ -98,6 +104,25 @@ impl SystemConfig {
         self.cell.check().context("[cell]")
     }
 
+    /// Makes the catalogue of what it is made of. Workers of the built-in one that no template of this config starts are not there.
+    fn compose(&mut self, folder: &Path) -> anyhow::Result<()> {
+        if self.catalogues.is_empty() {
+            return Ok(());
+        }
+        let names = std::mem::take(&mut self.catalogues);
+        let (mut composed, built_in) = catalogue::compose(&names, folder).context("`catalogues`")?;
+        let own = std::mem::take(&mut self.catalogue);
+        // Left out of the file, it is the built-in one.
+        if own != Catalogue::standard() {
+            catalogue::extend(&mut composed, own);
+        }
+        let starts = |kind: &String| self.process_manager.templates.iter().any(|template| template.kind == *kind);
+        let is_absent = |kind: &String| built_in.contains(kind) && !starts(kind);
+        composed.resources.retain(|kind, offer| offer.class != ResourceClass::Process || !is_absent(kind));
+        self.catalogue = composed;
+        Ok(())
+    }
+
     /// What follows from the rest: one speed for all, and as many workers in the catalogue as the templates can provide.
     /// A kind that no template provides is in a catalogue of one's own for another host's sake; not in the built-in one.
     fn settle(&mut self) {
@@ -111,6 +136,14 @@ impl SystemConfig {
             }
             provided > 0 || offer.class != ResourceClass::Process || !built_in
         });
+    }
+
+    /// What a client of this system trusts and shows: what the environment says, else as `[service.tls]` does.
+    pub(crate) fn client_tls(&self, from_environment: &ClientTls) -> Result<ClientTls, Failure> {
+        let read = self.service.client_tls(from_environment).context("[service.tls]");
+        read.map_err(|error| {
+            Failure::Refused(format!("ratn: {error:#}; $RATN_TLS_CA names another authority to trust"))
+        })
     }
 
     /// With what the command line says.
@@ -204,6 +237,26 @@ mod tests {
         assert!(without.catalogue.resources.contains_key("Arm"));
         let elsewhere = "[catalogue.resources]\nPathPlanner = { class = \"process\", count = 3 }";
         assert_eq!(SystemConfig::parse(elsewhere, "x.toml").unwrap().catalogue.resources[PATH_PLANNER].count, 3);
+    }
+
+    #[test]
+    fn a_catalogue_is_made_of_the_built_in_one_files_and_its_own_section() {
+        let folder = tempfile::tempdir().unwrap();
+        let of_file = "[resources.Inspector]\nclass = \"process\"\ncount = 3\n";
+        std::fs::write(folder.path().join("inspector.toml"), of_file).unwrap();
+        let text = "catalogues = [\"built-in\", \"inspector.toml\"]\n[catalogue.providers.inspector]\nresource = \"Inspector\"\n\
+            [process-manager]\ntemplate = []\n";
+        let file = folder.path().join("system.toml");
+        std::fs::write(&file, text).unwrap();
+        let config = SystemConfig::read(&file).unwrap();
+        let catalogue = &config.catalogue;
+        assert_eq!(catalogue.resources["Inspector"].count, 3);
+        assert!(catalogue.providers.contains_key("inspector") && catalogue.providers.contains_key("arm"));
+        assert!(catalogue.resources.contains_key("Arm") && !catalogue.resources.contains_key(PATH_PLANNER));
+        // Whoever reads what was written needs no other file.
+        assert_eq!(SystemConfig::parse(&config.to_toml().unwrap(), "elsewhere.toml").unwrap(), config);
+        let refused = format!("{:#}", SystemConfig::parse("catalogues = [\"no.toml\"]", "x.toml").unwrap_err());
+        assert!(refused.starts_with("x.toml: `catalogues`: cannot read the catalogue no.toml"), "{refused}");
     }
 
     #[test]

@@ -1,7 +1,9 @@
 //! A whole system on this machine: its config, its processes, its endpoint files.
 
+pub(crate) mod catalogue;
 pub(crate) mod config;
 mod launch;
+pub(crate) mod workers;
 
 use crate::failure::Failure;
 use crate::output;
@@ -24,6 +26,7 @@ use std::collections::BTreeMap;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use workers::Offered;
 
 /// The environment variable that says where endpoint files are.
 const DIRECTORY_VARIABLE: &str = "RATN_RUNTIME_DIR";
@@ -52,6 +55,10 @@ const ROLES: [&str; 4] = ["resource-manager", "world-pool", CELL, "process-manag
 pub(crate) struct System {
     pub(crate) config: SystemConfig,
     pub(crate) endpoints: Endpoints,
+    /// What there is in one that was found running.
+    pub(crate) offered: Offered,
+    /// Where its catalogue and its workers say something else.
+    pub(crate) mismatches: Vec<String>,
     /// What its clients trust and show.
     tls: ClientTls,
     directory: RuntimeDirectory,
@@ -102,7 +109,11 @@ impl System {
         let mut processes = Processes::start(&ROLES, &file, directory.path())?;
         match ready(&mut processes, &directory, &config, tls).await {
             Ok(endpoints) => {
-                Ok(System { config, endpoints, tls: tls.clone(), directory, processes, _private: private })
+                let offered = Box::pin(Offered::known(tls, &endpoints.resource_manager)).await;
+                let mismatches = offered.mismatches(&config.catalogue);
+                offered.extend(&mut config.catalogue);
+                let tls = tls.clone();
+                Ok(System { config, endpoints, offered, mismatches, tls, directory, processes, _private: private })
             }
             Err(error) => {
                 processes.stop().await;
@@ -111,18 +122,24 @@ impl System {
         }
     }
 
-    /// The one that runs in `directory`, if one does. Without a config of your own it is the one that it was started with.
+    /// The one that runs in `directory`, if one does. Without a config of your own it is the one that it was started with. Its workers
+    /// extend its catalogue by what they say of themselves.
     pub(crate) async fn find(
         directory: &Path,
         config: Option<SystemConfig>,
         tls: &ClientTls,
     ) -> anyhow::Result<Option<System>> {
         let Some(endpoints) = running(directory, tls).await? else { return Ok(None) };
-        let config = config_of(directory, config)?;
+        let mut config = config_of(directory, config)?;
         let directory = RuntimeDirectory::at(directory);
+        let offered = Box::pin(Offered::known(tls, &endpoints.resource_manager)).await;
+        let mismatches = offered.mismatches(&config.catalogue);
+        offered.extend(&mut config.catalogue);
         Ok(Some(System {
             config,
             endpoints,
+            offered,
+            mismatches,
             tls: tls.clone(),
             directory,
             processes: Processes::default(),

@@ -6,11 +6,13 @@ use super::order;
 use super::template::Template;
 use super::tracking::Tracking;
 use crate::config::{Check, ConfigError, rule};
+use ratn_model::catalogue::Catalogue;
 use ratn_model::value::Value;
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
+use std::sync::Arc;
 
 /// Names that labels cannot have.
 const TAKEN: [&str; 9] =
@@ -79,6 +81,9 @@ pub struct ProcessManagerConfig {
     /// Not of the file: of who starts the process manager.
     #[serde(skip)]
     pub worker_environment: BTreeMap<&'static str, PathBuf>,
+    /// What workers that describe themselves are compared with. Not of this section of the file: of who starts the process manager.
+    #[serde(skip)]
+    pub catalogue: Option<Arc<Catalogue>>,
     /// The pools.
     #[serde(rename = "template")]
     pub templates: Vec<Template>,
@@ -99,6 +104,7 @@ impl Default for ProcessManagerConfig {
             machine: MachineConfig::default(),
             max_log_bytes: 16 * 1024 * 1024,
             worker_environment: BTreeMap::new(),
+            catalogue: None,
             templates: Vec::new(),
         }
     }

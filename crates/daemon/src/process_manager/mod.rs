@@ -10,6 +10,7 @@
 
 mod account;
 mod actor;
+mod comparison;
 mod config;
 mod drained;
 mod environment;

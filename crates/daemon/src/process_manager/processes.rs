@@ -1,6 +1,7 @@
 //! The processes of the workers: begins them from their templates, signals them, waits until they serve, and clears up behind them.
 
 use super::account::{self, Account};
+use super::comparison::Comparison;
 use super::config::ProcessManagerConfig;
 use super::environment;
 use super::limits::Groups;
@@ -15,6 +16,7 @@ use super::template::Template;
 use super::tracking::{Children, Tracker};
 use crate::resource_manager;
 use nix::sys::signal::Signal;
+use ratn_model::catalogue::Catalogue;
 use ratn_panic_point::panic_point;
 use ratn_worker::adoption;
 use ratn_worker::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
@@ -26,6 +28,7 @@ use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::io;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
@@ -74,6 +77,8 @@ pub(super) struct Processes {
     told: ManagerContact,
     /// Variables in the environment of every worker.
     worker_environment: BTreeMap<&'static str, PathBuf>,
+    /// What workers are compared with, where that is known.
+    catalogue: Option<Arc<Catalogue>>,
     max_log_bytes: u64,
     /// The directories in which cgroups are made.
     groups: Groups,
@@ -144,6 +149,7 @@ impl Processes {
             tls,
             told,
             worker_environment: config.worker_environment.clone(),
+            catalogue: config.catalogue.clone(),
             max_log_bytes: config.max_log_bytes,
             groups: Groups { v2: config.cgroup.clone(), v1: config.cgroup_v1.clone(), tracking: tracker.groups() },
             directory,
@@ -245,10 +251,16 @@ impl Processes {
         let (ask, questions) = mpsc::channel(1);
         let within = template.start_timeout();
         let (known, is_known) = oneshot::channel();
+        let describes_itself = matches!(readiness_check, ReadinessCheck::Health(_));
+        let comparison = self.catalogue.clone().filter(|_| describes_itself).map(|catalogue| Comparison {
+            catalogue,
+            kind: template.kind.clone(),
+            tls: self.tls.clone(),
+        });
         let attended = attend(
             directory.clone(),
             id.to_owned(),
-            (readiness_check, within),
+            (readiness_check, within, comparison),
             is_known,
             questions,
             self.senders.clone(),
@@ -383,21 +395,26 @@ fn notify_socket(directory: &RuntimeDirectory, id: &str) -> PathBuf {
 async fn attend(
     directory: RuntimeDirectory,
     id: String,
-    (readiness_check, within): (ReadinessCheck, Duration),
+    (readiness_check, within, comparison): (ReadinessCheck, Duration, Option<Comparison>),
     known: oneshot::Receiver<()>,
     questions: mpsc::Receiver<Duration>,
     senders: EventSenders,
 ) {
-    let health_check = match readiness_check.ready(&directory, &id, within).await {
+    let (endpoint, health_check) = match readiness_check.ready(&directory, &id, within).await {
         Ok((endpoint, health_check)) => {
             // Its sender goes when it is known.
             let _ = known.await;
-            drop(senders.serving.send((id.clone(), endpoint)).await);
-            health_check
+            drop(senders.serving.send((id.clone(), endpoint.clone())).await);
+            (endpoint, health_check)
         }
         Err(reason) => return tracing::debug!(id, reason, "a worker is not ready"),
     };
-    answer(health_check, id, questions, senders.health).await;
+    let compare = async {
+        if let Some(comparison) = comparison {
+            comparison.tell(&id, &endpoint).await;
+        }
+    };
+    tokio::join!(compare, answer(health_check, id.clone(), questions, senders.health));
 }
 
 /// Answers each health check of a worker.
@@ -430,7 +447,7 @@ mod tests {
         let (known, is_known) = oneshot::channel();
         let seen = Arc::new(Notify::new());
         seen.notify_one();
-        let readiness_check = (ReadinessCheck::Line(seen), Duration::from_secs(10));
+        let readiness_check = (ReadinessCheck::Line(seen), Duration::from_secs(10), None);
         let senders = EventSenders { serving, health: mpsc::channel(1).0 };
         let attended = attend(directory, "w-1@here".to_owned(), readiness_check, is_known, mpsc::channel(1).1, senders);
         let attended = tokio::spawn(attended);

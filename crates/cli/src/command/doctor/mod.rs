@@ -95,6 +95,8 @@ pub(super) fn run(arguments: &DoctorArguments, client_tls: &ClientTls) -> Result
             SystemConfig::load(None)?
         }
     };
+    // Files that cannot be read are told of as the certificates are looked at.
+    let client_tls = &config.service.client_tls(client_tls).unwrap_or_else(|_| client_tls.clone());
     machine::check(&mut findings, &config, &directory);
     tls::check(&mut findings, &config);
     templates::check(&mut findings, &config.process_manager);

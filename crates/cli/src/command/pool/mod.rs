@@ -7,6 +7,7 @@ mod show;
 use super::{blocking_on, leader};
 use crate::failure::Failure;
 use crate::output;
+use crate::system::{System, public_directory};
 use anyhow::Context;
 use clap::{Args, Subcommand};
 use hosts::Answered;
@@ -132,14 +133,17 @@ pub(super) fn ps(arguments: &HostArguments, tls: &ClientTls) -> Result<(), Failu
             return Err(Failure::Refused(format!("ratn: there is no host `{host}`; `ratn ps` shows all")));
         }
         let pools: Vec<&HostPools> = answered.iter().filter_map(|one| one.pools.as_ref().ok()).collect();
+        let mismatches = mismatches(arguments, tls).await;
         if arguments.json {
             let mut document = show::in_json(&answered);
+            document["mismatches"] = json!(mismatches);
             if !managers.is_empty() {
                 document["resource_managers"] = leader::in_json(&managers);
             }
             output::result(document)?;
         } else {
             output::result(show::table(&pools))?;
+            mismatches.iter().try_for_each(output::result)?;
             if !managers.is_empty() {
                 output::result(leader::line(resource_manager::ROLE, &managers))?;
             }
@@ -147,6 +151,18 @@ pub(super) fn ps(arguments: &HostArguments, tls: &ClientTls) -> Result<(), Failu
         let problems: Vec<String> = answered.iter().filter_map(Answered::problem).collect();
         if problems.is_empty() { Ok(()) } else { Err(anyhow::anyhow!(problems.join("\nratn: ")).into()) }
     })
+}
+
+/// Where workers say something else than the catalogue of the system in the runtime directory; nothing where none is known.
+async fn mismatches(arguments: &HostArguments, tls: &ClientTls) -> Vec<String> {
+    let elsewhere = arguments.manager.is_some() || arguments.resource_manager.is_some();
+    let Some(directory) = public_directory(arguments.runtime_dir.as_deref()).ok().filter(|_| !elsewhere) else {
+        return Vec::new();
+    };
+    match Box::pin(System::find(&directory, None, tls)).await {
+        Ok(Some(system)) => system.mismatches,
+        Ok(None) | Err(_) => Vec::new(),
+    }
 }
 
 /// Prints what workers wrote.

@@ -36,6 +36,7 @@ pub(super) async fn run(
     let task = task.map(Path::to_owned).or_else(|| history.task());
     let task = task.ok_or_else(|| refused(&"it does not name its task file: say `ratn run --resume LOG TASK`"))?;
     let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
+    let tls = &given.as_ref().map_or_else(|| Ok(tls.clone()), |config| config.client_tls(tls))?;
     let Some(mut system) = System::find(directory, given, tls).await? else {
         let place = directory.display();
         return Err(refused(&format_args!(

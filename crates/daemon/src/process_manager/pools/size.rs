@@ -147,6 +147,9 @@ mod tests {
         let size = Size::new(2, 5, 1);
         let wanted = (0..=5).map(|held| size.wanted(held));
         assert_eq!(wanted.collect::<Vec<_>>(), [3, 3, 3, 4, 5, 5]);
+        let growing = Size::new(0, 3, 1);
+        let wanted = (0..=3).map(|held| growing.wanted(held));
+        assert_eq!(wanted.collect::<Vec<_>>(), [1, 2, 3, 3], "one more while all are held");
     }
 
     #[test]

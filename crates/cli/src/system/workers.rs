@@ -1,0 +1,186 @@
+//! What the workers of a running system say of themselves. It extends the catalogue that tasks are checked against; where the catalogue
+//! says something else, that is told.
+
+use ratn_daemon::process_manager::HOST_KIND;
+use ratn_model::catalogue::{Catalogue, WorkerDescription};
+use ratn_model::program::Program;
+use ratn_model::resource::{Quantity, ResourceClass, ResourceOperation};
+use ratn_proto::types::Resource;
+use ratn_worker::client::{ActionClient, CallError, Channels, DescribeError, ProcessClient, ResourceClient};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::tls::ClientTls;
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+
+/// A worker that has not described itself by then does not.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// All of a system that has not answered by then is not known.
+const PATIENCE_OF_ALL: Duration = Duration::from_secs(5);
+/// Workers that are asked, the first by their ids.
+const MOST_ASKED: usize = 128;
+
+/// What there is in a running system.
+#[derive(Debug, Default)]
+pub(crate) struct Offered {
+    /// The workers that were asked.
+    pub(crate) workers: Vec<Described>,
+    /// How much there is of each kind of resource.
+    pub(crate) kinds: BTreeMap<String, Quantity>,
+    /// Kinds of which a process manager can start workers.
+    pub(crate) startable: BTreeSet<String>,
+}
+
+/// A worker with what it says of itself.
+#[derive(Debug)]
+pub(crate) struct Described {
+    pub(crate) id: String,
+    pub(crate) kind: String,
+    pub(crate) description: Result<WorkerDescription, DescribeError>,
+}
+
+impl Offered {
+    /// What is there as far as it answers. What is not known so is seen when it is used.
+    pub(crate) async fn known(tls: &ClientTls, resource_manager: &Endpoint) -> Offered {
+        let channels = Channels::new(tls);
+        let asked = tokio::time::timeout(PATIENCE_OF_ALL, Offered::ask(&channels, resource_manager));
+        asked.await.ok().and_then(Result::ok).unwrap_or_default()
+    }
+
+    /// Asks the resource manager, the process managers and the workers.
+    async fn ask(channels: &Channels, resource_manager: &Endpoint) -> Result<Offered, CallError> {
+        let resources = ResourceClient::new(channels, resource_manager, "")?.list(&[]).await?;
+        let mut kinds = BTreeMap::<String, Quantity>::new();
+        for resource in &resources {
+            *kinds.entry(resource.kind.clone()).or_default() += resource.capacity;
+        }
+        let is_worker = |one: &&Resource| one.class == ResourceClass::Process && one.kind != HOST_KIND;
+        let asked = resources.iter().filter(is_worker).take(MOST_ASKED).filter_map(|one| {
+            let endpoint: Endpoint = one.endpoint().parse().ok()?;
+            Some(async move {
+                let description = ActionClient::new(channels.clone()).description(&endpoint, PATIENCE).await;
+                Described { id: one.id.clone(), kind: one.kind.clone(), description }
+            })
+        });
+        let hosts = resources.iter().filter(|one| one.kind == HOST_KIND).filter_map(|host| {
+            let client = ProcessClient::new(channels, &host.endpoint().parse().ok()?).ok()?;
+            Some(async move { tokio::time::timeout(PATIENCE, client.pools()).await })
+        });
+        let (workers, hosts) = tokio::join!(futures::future::join_all(asked), futures::future::join_all(hosts));
+        let pools = hosts.into_iter().filter_map(|answer| answer.ok()?.ok()).flat_map(|host| host.pools);
+        let startable = pools.filter(|pool| pool.max > 0).map(|pool| pool.kind).collect();
+        Ok(Offered { workers, kinds, startable })
+    }
+
+    /// Where workers and the catalogue say something else, and descriptions that are not believed, each in a sentence with whose it is.
+    pub(crate) fn mismatches(&self, catalogue: &Catalogue) -> Vec<String> {
+        let of = |worker: &Described| -> Vec<String> {
+            match &worker.description {
+                Ok(said) => said.mismatches(catalogue, &worker.kind),
+                Err(refused @ DescribeError::Refused(_)) => vec![refused.to_string()],
+                // A worker need not describe itself.
+                Err(DescribeError::Unanswered(_)) => Vec::new(),
+            }
+        };
+        let told = |worker: &Described| -> Vec<String> {
+            of(worker).into_iter().map(|what| format!("{}: {what}", worker.id)).collect()
+        };
+        self.workers.iter().flat_map(told).collect()
+    }
+
+    /// Adds what workers say and the catalogue does not have.
+    pub(crate) fn extend(&self, catalogue: &mut Catalogue) {
+        for Described { kind, description, .. } in &self.workers {
+            if let Ok(said) = description {
+                catalogue.extend_by(kind, self.kinds.get(kind).copied().unwrap_or(Quantity::ONE), said);
+            }
+        }
+    }
+
+    /// Which resources of a task nobody offers, and what to do: it would wait for them.
+    pub(crate) fn lacking(&self, program: &Program) -> Vec<String> {
+        let asks = |operation| matches!(operation, ResourceOperation::Block | ResourceOperation::Consume);
+        let all =
+            || program.states.iter().flat_map(|state| state.annotations.resources.iter().map(move |r| (state, r)));
+        let created: BTreeSet<&str> = all()
+            .filter(|(_, resource)| resource.operation == ResourceOperation::Create)
+            .map(|(_, resource)| resource.kind.as_str())
+            .collect();
+        let mut lacking = BTreeMap::<&str, &str>::new();
+        for (state, resource) in all().filter(|(_, resource)| asks(resource.operation)) {
+            let kind = resource.kind.as_str();
+            let is_there = self.kinds.contains_key(kind) || self.startable.contains(kind) || created.contains(kind);
+            if !is_there {
+                lacking.entry(kind).or_insert(&state.path);
+            }
+        }
+        // A system that was not asked lacks nothing that is known.
+        if self.kinds.is_empty() {
+            return Vec::new();
+        }
+        let sentence = |(kind, path): (&str, &str)| {
+            format!(
+                "nobody offers a `{kind}`, which `{path}` asks for: the run will wait there. Start a worker with `--kind {kind}`, or add a \
+                 [[process-manager.template]] with kind = \"{kind}\" to the system's config and start the system anew; \
+                 `ratn resource list` and `ratn ps` show what there is"
+            )
+        };
+        lacking.into_iter().map(sentence).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use ratn_model::value::Type;
+
+    const TASK: &str = "task: read\nstates:\n  - make: { action: gripper/release, resources: [Gripper, { create: Token, class: task }] }\n  \
+        - read: { action: pan_tilt/look_at, in: { target: \"pose(1, 0, 0)\" }, resources: [PanTilt, { consume: Token }, { block: Detector }] }\n";
+
+    fn program() -> Program {
+        ratn_model::load::load(TASK, "task.yaml", &Catalogue::standard()).unwrap().program
+    }
+
+    #[test]
+    fn what_nobody_offers_is_told_with_the_state_and_what_a_pool_can_start_is_there() {
+        let kinds = ["Gripper", "PanTilt"].map(|kind| (kind.to_owned(), Quantity::ONE)).into();
+        let mut offered = Offered { kinds, ..Offered::default() };
+        let told = offered.lacking(&program());
+        assert_eq!(told.len(), 1, "{told:?}");
+        assert!(
+            told[0].contains("`Detector`") && told[0].contains("`read`") && told[0].contains("--kind Detector"),
+            "{told:?}"
+        );
+        offered.startable.insert("Detector".to_owned());
+        assert_eq!(offered.lacking(&program()), Vec::<String>::new());
+    }
+
+    #[test]
+    fn a_worker_that_is_known_by_its_own_words_alone_extends_the_catalogue_and_another_one_is_compared() {
+        let signature = |port: &str| ratn_model::catalogue::ActionSignature {
+            inputs: [(port.to_owned(), Type::Pose)].into(),
+            ..Default::default()
+        };
+        let described = |id: &str, kind: &str, provider: &str, action: &str| Described {
+            id: id.to_owned(),
+            kind: kind.to_owned(),
+            description: Ok(WorkerDescription {
+                provider: provider.to_owned(),
+                kind: kind.to_owned(),
+                actions: [(action.to_owned(), Some(signature("from")))].into(),
+            }),
+        };
+        let workers = vec![
+            described("nearest-1@compute", "Inspector", "inspector", "nearest"),
+            described("planner-1@compute", "PathPlanner", "path_planner", "plan"),
+        ];
+        let offered = Offered { workers, ..Offered::default() };
+        let mut catalogue = Catalogue::standard();
+        let told = offered.mismatches(&catalogue);
+        assert!(told.iter().all(|line| line.starts_with("planner-1@compute: ")), "{told:?}");
+        assert!(told.iter().any(|line| line.contains("`path_planner/plan`: the catalogue has an input")), "{told:?}");
+        offered.extend(&mut catalogue);
+        assert!(catalogue.action("inspector", "nearest").is_some());
+        assert_eq!(catalogue.action("path_planner", "plan"), Catalogue::standard().action("path_planner", "plan"));
+    }
+}

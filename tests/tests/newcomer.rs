@@ -1,0 +1,110 @@
+//! What somebody meets who begins: a task and a worker of their own, and a worker that is otherwise than the catalogue says.
+
+mod support;
+
+use anyhow::{Context, ensure};
+use std::path::Path;
+use std::process::Command;
+use support::{Place, repository, texts, wait_for};
+
+/// A detector is offered as a planner, and nobody offers what the catalogue has as a label reader.
+const SYSTEM: &str = r#"
+speed = 20.0
+catalogues = ["built-in"]
+[catalogue.resources.LabelReader]
+class = "process"
+count = 1
+[process-manager]
+host = "compute"
+[[process-manager.template]]
+name = "mistaken"
+kind = "PathPlanner"
+args = ["worker", "detector", "--id", "{id}", "--kind", "{kind}", "--endpoint-file", "{endpoint_file}", "--exit-with-parent"]
+min = 1
+"#;
+const TASK: &str =
+    "task: read\nstates:\n  - read: { action: gripper/release, resources: [Gripper, { block: LabelReader }] }\n";
+const MISMATCH: &str = "the catalogue has `path_planner/plan`, and the worker performs ";
+const LACKING: &str = "nobody offers a `LabelReader`, which `read` asks for";
+
+fn text(path: &Path) -> anyhow::Result<&str> {
+    path.to_str().context("a path")
+}
+
+#[test]
+fn a_worker_that_the_catalogue_does_not_know_so_is_told_at_its_start_and_what_nobody_offers_before_it_is_waited_for()
+-> anyhow::Result<()> {
+    let place = Place::new()?;
+    let (config, task) = (place.path().join("system.toml"), place.path().join("task.yaml"));
+    std::fs::write(&config, SYSTEM)?;
+    std::fs::write(&task, TASK)?;
+    let directory = place.path().join("run");
+    let mut up = place.start_as("up", &["up", "--config", text(&config)?, "--runtime-dir", text(&directory)?])?;
+    wait_for("the system", || Ok(up.said().contains("is ready").then_some(()))).with_context(|| up.said())?;
+
+    let log = directory.join("process-manager.log");
+    wait_for("the mismatch in the log", || Ok(std::fs::read_to_string(&log)?.contains(MISMATCH).then_some(())))?;
+    let (out, err) = texts(&place.ratn(&["ps"]).output()?);
+    ensure!(out.contains(&format!("mistaken-1@compute: {MISMATCH}")), "{out}{err}");
+    let checked = place.ratn(&["check", text(&task)?, "--runtime-dir", text(&directory)?]).output()?;
+    let (out, err) = texts(&checked);
+    ensure!(err.contains(MISMATCH) && err.contains(LACKING), "{out}{err}");
+
+    let mut run = place.start_as("run", &["run", text(&task)?, "--runtime-dir", text(&directory)?])?;
+    wait_for("what nobody offers", || Ok(run.said().contains(LACKING).then_some(()))).with_context(|| run.said())?;
+    run.signal(nix::sys::signal::Signal::SIGINT)?;
+    run.finish()?;
+    up.signal(nix::sys::signal::Signal::SIGINT)?;
+    up.finish()?;
+    Ok(())
+}
+
+#[test]
+fn a_new_task_is_good_and_nothing_is_overwritten() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let ratn = |arguments: &[&str]| place.ratn(arguments).current_dir(place.path()).output();
+    let made = ratn(&["new", "task", "first-steps"])?;
+    ensure!(made.status.success(), "{:?}", texts(&made));
+    let checked = ratn(&["check", "first-steps.yaml"])?;
+    ensure!(checked.status.success() && !texts(&checked).1.contains("warning"), "{:?}", texts(&checked));
+    for again in [["new", "task", "first-steps"], ["new", "worker", "../up"]] {
+        let refused = ratn(&again)?;
+        ensure!(refused.status.code() == Some(2), "{:?}", texts(&refused));
+    }
+
+    let (one, err) = texts(&ratn(&["actions", "pan_tilt/look_at"])?);
+    ensure!(one.starts_with("pan_tilt/look_at (built in; a state that uses it blocks PanTilt)"), "{one}{err}");
+    ensure!(one.contains("in        target: pose") && one.contains("out       pan: float, tilt: float"), "{one}");
+    let unknown = ratn(&["actions", "arms"])?;
+    ensure!(unknown.status.code() == Some(2) && texts(&unknown).1.contains("arm/follow"), "{:?}", texts(&unknown));
+    Ok(())
+}
+
+#[test]
+#[ignore = "builds a crate: scripts/check-newcomer"]
+fn a_new_worker_builds_passes_its_test_and_does_its_task() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let sdk = repository("crates/worker");
+    let made = place.ratn(&["new", "worker", "pose-meter", "--sdk", text(&sdk)?]).current_dir(place.path()).output()?;
+    ensure!(made.status.success(), "{:?}", texts(&made));
+    let here = place.path().join("pose-meter");
+    // The versions that are there already.
+    std::fs::copy(repository("Cargo.lock"), here.join("Cargo.lock"))?;
+    let target = std::env::var_os("CARGO_TARGET_DIR").context("scripts/check-newcomer says CARGO_TARGET_DIR")?;
+    for verb in ["test", "build"] {
+        let built = Command::new("cargo").args([verb, "--offline"]).current_dir(&here).output()?;
+        ensure!(built.status.success(), "cargo {verb}: {:?}", texts(&built));
+    }
+    std::fs::create_dir_all(here.join("target/debug"))?;
+    std::fs::copy(Path::new(&target).join("debug/pose-meter"), here.join("target/debug/pose-meter"))?;
+    for (arguments, said) in [
+        (["check", "task.yaml", "--config", "system.toml"], "is good"),
+        (["run", "task.yaml", "--config", "system.toml"], "distance_m = 5"),
+    ] {
+        let done = place.ratn(&arguments).current_dir(&here).output()?;
+        let (out, err) = texts(&done);
+        ensure!(done.status.success() && format!("{out}{err}").contains(said), "{arguments:?}: {out}{err}");
+        ensure!(!err.contains("warning"), "{err}");
+    }
+    Ok(())
+}
