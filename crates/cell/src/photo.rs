@@ -2,7 +2,7 @@
 
 use crate::config::CellConfig;
 use crate::core::cell::Cell;
-use anyhow::ensure;
+use anyhow::{Context as _, ensure};
 use ratn_model::pose::Pose;
 use ratn_motion::robot::Configuration;
 use ratn_perception::camera::{Camera, Intrinsics};
@@ -27,7 +27,8 @@ pub fn photo(config: CellConfig, from: Option<[f64; 3]>, towards: [f64; 3]) -> a
         None => {
             let (pan, tilt) = cell.robot().look_at(&Pose::IDENTITY, towards);
             let looking = Configuration { pan, tilt, ..cell.configuration() };
-            Camera { intrinsics: OPTICS, pose: cell.robot().camera_pose(&looking) }
+            let pose = cell.robot().camera_pose(&looking).context("the robot has no camera: say from where")?;
+            Camera { intrinsics: OPTICS, pose }
         }
     };
     Ok(cell.scenery().photograph(cell.robot(), &camera).to_png()?)

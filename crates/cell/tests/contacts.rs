@@ -10,6 +10,7 @@ use ratn_cell::core::protocol::{Ending, Event, Request};
 use ratn_cell::core::recording::Line;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::plan::Goal;
 use ratn_motion::robot::{Configuration, Robot};
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -17,8 +18,8 @@ use std::f64::consts::{FRAC_PI_2, PI};
 mod bench;
 use bench::{Bench, grasp};
 
-fn at(x: f64, arm: [f64; 7]) -> Configuration {
-    Configuration { base: [x, 0.0, 0.0], arm, finger: 0.055, ..Configuration::ZERO }
+fn at(x: f64, arm: JointVector) -> Configuration {
+    Configuration { base: [x, 0.0, 0.0], arm, finger: 0.055, ..Robot::aimm().at_zero() }
 }
 
 /// What touches once a robot has come there.
@@ -52,7 +53,7 @@ fn a_base_that_stands_in_a_wall_is_as_deep_in_it_as_it_is() {
 #[test]
 fn an_arm_that_is_folded_into_its_own_base_touches_it() {
     // Stretched out backwards and down into the deck: joint 1 turns it there, joint 2 bends it by 115°.
-    let found = touches(at(0.0, [FRAC_PI_2, -2.0, 0.0, 0.0, 0.0, 0.0, 0.0]), &[]);
+    let found = touches(at(0.0, JointVector::of([FRAC_PI_2, -2.0, 0.0, 0.0, 0.0, 0.0, 0.0])), &[]);
     let of_robot = |touch: &&Touch| touch.things.iter().all(|thing| matches!(thing, Thing::Link(_)));
     assert!(found.iter().find(of_robot).is_some_and(|touch| touch.depth_m > TOLERANCE_M), "{found:?}");
 }

@@ -99,7 +99,7 @@ fn a_trajectory_through_the_table_is_followed_and_judged() {
 #[test]
 fn a_trajectory_that_is_too_fast_or_starts_elsewhere_or_meets_the_robot_itself_is_refused_with_the_reason() {
     let mut bench = Bench::new(1, 7);
-    let into_itself = Request::MoveTo { joints: [0.0, -2.0, 0.0, 2.6, 0.0, 0.0, 0.0], speed: 0.3 };
+    let into_itself = Request::MoveTo { joints: [0.0, -2.0, 0.0, 2.6, 0.0, 0.0, 0.0].into(), speed: 0.3 };
     let refused = bench.perform(into_itself);
     assert!(matches!(&refused, Ending::Aborted(reason) if reason.contains("the trajectory is refused")), "{refused:?}");
     let from_home = bench.plan(&bench.cell.scene(), vec![Goal::Joints(aimm::OBSERVATION)], 0.0, 0.0);

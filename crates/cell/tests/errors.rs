@@ -72,7 +72,7 @@ fn the_camera_is_not_quite_where_it_is_said_to_be() {
     bench.done(Request::LookAt { target: aimm::TABLE_CENTRE });
     let Product::Captured { camera, exposures } = bench.done(Request::Capture { frames: 2 }) else { panic!() };
     let scenery = &exposures[0].scenery;
-    assert_eq!(camera.pose, bench.cell.robot().camera_pose(&bench.cell.measured()));
+    assert_eq!(camera.pose, bench.cell.robot().camera_pose(&bench.cell.measured()).unwrap());
     assert_eq!(scenery.measured, bench.cell.measured(), "the robot is told where it has itself");
     // As seen from the base: where that stands is another matter.
     let told = bench.cell.believed_base_pose().inverse().compose(&camera.pose);

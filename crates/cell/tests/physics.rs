@@ -5,6 +5,7 @@
 use ratn_cell::core::environment::{Environment, FLOOR, Furniture, Kind, Model, STEP, Support};
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{Configuration, Robot};
 use std::f64::consts::FRAC_PI_2;
 use std::time::Instant;
@@ -17,7 +18,7 @@ fn table() -> Furniture {
 }
 
 fn stowed() -> Configuration {
-    Configuration { arm: aimm::STOWED, finger: 0.055, ..Configuration::ZERO }
+    Configuration { arm: aimm::STOWED, finger: 0.055, ..Robot::aimm().at_zero() }
 }
 
 fn world(objects: &[(Model, Pose)]) -> (Robot, Environment) {
@@ -116,9 +117,9 @@ fn a_cup_put_into_a_bowl_stands_on_the_bowls_bottom() {
 fn an_arm_that_sweeps_over_the_table_pushes_what_stands_in_its_way() {
     let robot = Robot::aimm();
     let configuration = |s: f64| Configuration {
-        arm: std::array::from_fn(|i| aimm::HOME[i] + if i == 0 { 0.5 * s } else { 0.0 }),
+        arm: JointVector::from_fn(7, |i| aimm::HOME[i] + if i == 0 { 0.5 * s } else { 0.0 }),
         finger: 0.055,
-        ..Configuration::ZERO
+        ..Robot::aimm().at_zero()
     };
     let tool = robot.tool_pose(&configuration(0.5));
     let at = Pose::at(tool.position[0], tool.position[1], aimm::TABLE_HEIGHT_M + 0.05);

@@ -10,7 +10,7 @@ use ratn_model::resource::{Lease, LeasedResource, Requirement, ResourceOperation
 use ratn_model::value::Value;
 use ratn_motion::aimm;
 use ratn_motion::collision::distance;
-use ratn_motion::robot::Joints;
+use ratn_motion::joint_vector::JointVector;
 use ratn_proto::types::{Goal, GoalOutcome, ResourceEventKind, ResourceUpdate};
 use ratn_proto::v1;
 use ratn_proto::v1::cell_service_client::CellServiceClient;
@@ -99,8 +99,8 @@ impl System {
         client.get_ground_truth(v1::GetGroundTruthRequest {}).await.unwrap().into_inner()
     }
 
-    async fn arm(&self) -> Joints {
-        self.truth().await.arm.unwrap().positions.try_into().unwrap()
+    async fn arm(&self) -> JointVector {
+        JointVector::read(&self.truth().await.arm.unwrap().positions).unwrap()
     }
 
     /// Returns once the arm is on its way.

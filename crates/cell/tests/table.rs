@@ -285,7 +285,7 @@ fn cups_and_plates_are_pushed_by_what_sweeps_over_the_table() {
         let robot = Robot::aimm();
         // The base drives against it on the floor.
         let at =
-            |x: f64| Configuration { base: [x, 0.0, 0.0], arm: aimm::STOWED, finger: 0.055, ..Configuration::ZERO };
+            |x: f64| Configuration { base: [x, 0.0, 0.0], arm: aimm::STOWED, finger: 0.055, ..Robot::aimm().at_zero() };
         let stands = Pose::at(0.75, 0.0, object.size[2] / 2.0);
         let mut environment = Environment::new(&robot, &at(0.0), &[], &[(model, stands)]);
         (0..500).for_each(|step| environment.step(&robot, &at(0.001 * f64::from(step))));

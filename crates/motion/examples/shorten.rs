@@ -16,11 +16,11 @@ use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_motion::connect::{Budget, connect};
 use ratn_motion::geometry::Geometry;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
 use ratn_motion::pace::Control;
 use ratn_motion::problems::Problems;
 use ratn_motion::refine::{End, Measure, Refinement, Shares};
-use ratn_motion::robot::Joint;
 use ratn_motion::simplify::{path_length, simplify};
 use ratn_motion::space::{Isa, Obstacle, Space, State};
 use ratn_motion::timing::rough::Rough;
@@ -258,7 +258,8 @@ fn durations(mechanisms: &[(String, Mechanism)], tasks: &[Task]) {
         let Ok(route) = connect(&mut space, &task.start, &[task.goal], BUDGET, &mut go_on) else { continue };
         let Ok(path) = simplify(&mut space, &route.path, BUDGET, &mut go_on) else { continue };
         space.set_swept(true);
-        let path: Vec<[f64; 7]> = path.iter().map(|s| std::array::from_fn(|j| f64::from(s[j]))).collect();
+        let posture = |s: &State| JointVector::from_fn(mechanism.joints.len(), |j| f64::from(s[j]));
+        let path: Vec<JointVector> = path.iter().map(posture).collect();
         let begin = Instant::now();
         let curve = timed(&mechanism.joints, &[Section::Blended(path)], 1.0, &mut |a, b| {
             space.is_free_motion(&state(a), &state(b))
@@ -295,10 +296,9 @@ fn quicken(mechanisms: &[(String, Mechanism)], tasks: &[Task], speed: f64) {
                     // What others made it wait is not its own.
                     spent += (begin.elapsed().as_secs_f64() * 1e3).min(2.0);
                 }
-                let path: Vec<[f64; MAX_JOINTS]> = refinement.path().iter().map(|s| s.map(f64::from)).collect();
-                let joints: Vec<Joint> =
-                    (0..MAX_JOINTS).map(|j| mechanism.joints[j.min(mechanism.joints.len() - 1)].clone()).collect();
-                let curve = timed(&joints, &[Section::Blended(path)], speed, &mut |a, b| {
+                let posture = |s: &State| JointVector::from_fn(mechanism.joints.len(), |j| f64::from(s[j]));
+                let path: Vec<JointVector> = refinement.path().iter().map(posture).collect();
+                let curve = timed(&mechanism.joints, &[Section::Blended(path)], speed, &mut |a, b| {
                     space.is_free_motion(&state(a), &state(b))
                 });
                 curve.duration_s()

@@ -4,6 +4,7 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::Joint;
 use ratn_motion::timing::{Section, timed};
 use serde_json::json;
@@ -25,10 +26,10 @@ fn limits<const N: usize>(random: &mut ChaCha8Rng) -> Vec<Joint> {
 
 fn case<const N: usize>(kind: &str, joints: &[Joint], path: &[[f64; N]]) {
     let begin = Instant::now();
-    let curve = timed(joints, &[Section::Blended(path.to_vec())], 1.0, &mut |_, _| true);
+    let path = path.iter().map(|q| JointVector::of(*q)).collect();
+    let curve = timed(joints, &[Section::Blended(path)], 1.0, &mut |_, _| true);
     let made_in_us = begin.elapsed().as_micros();
-    let knots: Vec<_> =
-        curve.knots().iter().map(|k| json!([k.time_s, k.positions.as_slice(), k.velocities.as_slice()])).collect();
+    let knots: Vec<_> = curve.knots().iter().map(|k| json!([k.time_s, k.positions, k.velocities])).collect();
     let of = |limit: fn(&Joint) -> f64| joints.iter().map(limit).collect::<Vec<_>>();
     let jerks: Vec<_> = joints.iter().map(|j| if j.jerk.is_finite() { json!(j.jerk) } else { json!(null) }).collect();
     let line = json!({

@@ -5,7 +5,7 @@
 //! right; the mast stands at x = -0.68, and the camera hangs at (-0.49, 0, 1.88) looking ahead. The tests of this file show that
 //! every place below can be reached from above, with a straight approach of [`APPROACH_M`].
 
-use crate::robot::Joints;
+use crate::joint_vector::JointVector;
 use ratn_model::pose::Pose;
 use std::f64::consts::{FRAC_PI_2, PI};
 
@@ -46,13 +46,13 @@ pub const GRIPPER_OPENING_M: f64 = 0.11;
 pub const SLOT_COUNT: usize = 9;
 
 /// Arm at rest in front of the base, tool downwards above the table.
-pub const HOME: Joints = [-FRAC_PI_2, -0.35, 0.0, 1.40, 0.0, -1.391_592_653_589_793, 0.0];
+pub const HOME: JointVector = JointVector::of([-FRAC_PI_2, -0.35, 0.0, 1.40, 0.0, -1.391_592_653_589_793, 0.0]);
 
 /// Arm above the deck, out of the camera's view of the table.
-pub const OBSERVATION: Joints = [0.9, -1.2, 0.0, 0.9, 0.0, -0.6, 0.0];
+pub const OBSERVATION: JointVector = JointVector::of([0.9, -1.2, 0.0, 0.9, 0.0, -0.6, 0.0]);
 
 /// Arm folded within the base's outline, for driving; the camera sees the whole deck.
-pub const STOWED: Joints = [FRAC_PI_2, 0.3, 0.0, 2.05, 0.0, -0.8, 0.0];
+pub const STOWED: JointVector = JointVector::of([FRAC_PI_2, 0.3, 0.0, 2.05, 0.0, -0.8, 0.0]);
 
 /// The places `slot_1`..`slot_9` on the deck, seen from the base: on the deck's surface, x along a box's longer edge, which
 /// lies across the base. Three rows behind the arm, nearest first, each from right to left.
@@ -106,9 +106,8 @@ mod tests {
         let mut random = ChaCha8Rng::seed_from_u64(1);
         let mut reasons = Vec::new();
         for grasp in grasp_poses(pose, size) {
-            for posture in reach.solutions(&Target::at(grasp), &arm::positions(&HOME), 12, 40, &mut random) {
-                let solution = std::array::from_fn(|j| posture[j]);
-                match line(&reach, &solution, [0.0, 0.0, APPROACH_M]) {
+            for posture in reach.solutions(&Target::at(grasp), &HOME, 12, 40, &mut random) {
+                match line(&reach, &posture, [0.0, 0.0, APPROACH_M]) {
                     Err(error) => reasons.push(error.to_string()),
                     Ok(postures) => {
                         let contact = Contact::Gripper(crate::collision::CONTACT_TOLERANCE_M);
@@ -170,18 +169,18 @@ mod tests {
         let scene = Scene { base: Pose::IDENTITY, objects: objects.chain([table()]).collect() };
         let mut checker = Checker::new(&robot, &scene, &arm::assumed(&robot, &scene), PADDING_M);
         for (name, posture) in [("HOME", HOME), ("OBSERVATION", OBSERVATION), ("STOWED", STOWED)] {
-            let tool = arm::reach(&robot).pose(&arm::positions(&posture));
+            let tool = arm::reach(&robot).pose(&posture);
             assert_eq!(robot.clamp(&posture), posture, "{name} is within limits");
             assert_eq!(checker.collision(&posture, Contact::None), None, "{name}, tool at {:?}", tool.position);
         }
     }
 
     /// Which points of a patch of floor, or up to a box's height above it, the robot hides from the camera looking at `target`.
-    fn hidden(arm: Joints, target: [f64; 3], [x_low, x_high]: [f64; 2], [y_low, y_high]: [f64; 2]) -> Vec<String> {
+    fn hidden(arm: JointVector, target: [f64; 3], [x_low, x_high]: [f64; 2], [y_low, y_high]: [f64; 2]) -> Vec<String> {
         let robot = Robot::aimm();
         let (pan, tilt) = robot.look_at(&Pose::IDENTITY, target);
-        let configuration = Configuration { arm, pan, tilt, finger: GRIPPER_OPENING_M / 2.0, ..Configuration::ZERO };
-        let eye = robot.camera_pose(&configuration).position;
+        let configuration = Configuration { arm, pan, tilt, finger: GRIPPER_OPENING_M / 2.0, ..robot.at_zero() };
+        let eye = robot.camera_pose(&configuration).unwrap().position;
         // The base carries the deck: looking at it, its surface is no obstacle.
         let body = robot.link("base").unwrap();
         let shapes: Vec<_> = robot.shapes(&configuration).into_iter().filter(|(link, ..)| *link != body).collect();

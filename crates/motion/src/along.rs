@@ -3,9 +3,8 @@
 //! At the middle of a piece of the curve it is said how far the tool may move and turn from there. If no joint strays so far within the piece
 //! that the tool could (`levers`), the piece holds; else its halves are looked at.
 
+use crate::joint_vector::JointVector;
 use crate::levers::Levers;
-use crate::mechanism::MAX_JOINTS;
-use crate::reach::Positions;
 use crate::trajectory::Curve;
 
 /// What is broken by less may go unseen, in metres and radians.
@@ -13,19 +12,14 @@ const RESOLUTION: f64 = 1e-5;
 
 /// The first moment, in seconds, at which something does not hold. `room` says of a posture how far the tool may move (metres) and turn
 /// (radians) from there; less than nothing where it does not hold.
-pub(crate) fn first_breach<const N: usize>(
-    curve: &Curve<N>,
+pub(crate) fn first_breach(
+    curve: &Curve,
     levers: &Levers,
-    room: &mut dyn FnMut(&Positions) -> [f64; 2],
+    room: &mut dyn FnMut(&JointVector) -> [f64; 2],
 ) -> Option<f64> {
-    let padded = |joints: [f64; N]| {
-        let mut positions = [0.0; MAX_JOINTS];
-        positions[..N].copy_from_slice(&joints);
-        positions
-    };
     let knots = curve.knots();
     if let [only] = knots {
-        return room(&padded(only.positions)).iter().any(|left| *left < -RESOLUTION).then_some(only.time_s);
+        return room(&only.positions).iter().any(|left| *left < -RESOLUTION).then_some(only.time_s);
     }
     for (i, pair) in knots.windows(2).enumerate() {
         let cubics = curve.cubics(i);
@@ -34,12 +28,12 @@ pub(crate) fn first_breach<const N: usize>(
         while let Some([from, to]) = pieces.pop() {
             let middle = (from + to) / 2.0;
             let posture = cubics.map(|cubic| cubic.position_at(middle));
-            let strays = padded(std::array::from_fn(|j| {
+            let strays = JointVector::from_fn(posture.len(), |j| {
                 let [least, greatest] = cubics[j].range(from, to);
                 (posture[j] - least).max(greatest - posture[j])
-            }));
+            });
             let moves = [levers.moves_m(&strays), levers.turns_rad(&strays)];
-            let left = room(&padded(posture));
+            let left = room(&posture);
             if left.iter().any(|left| *left < -RESOLUTION) {
                 return Some(pair[0].time_s + middle);
             }

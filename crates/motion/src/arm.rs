@@ -5,10 +5,11 @@
 //! at most [`OVERHANG_M`] and hold them with at least [`CLEARANCE_M`] to spare. So what the exact check with a padding of `OVERHANG_M`
 //! finds clear of obstacles the spheres do too, and what the spheres find free is free by the exact check with `CLEARANCE_M`.
 
+use crate::joint_vector::JointVector;
 use crate::line::{self, LineError};
-use crate::mechanism::{MAX_JOINTS, Mechanism};
-use crate::reach::{Positions, Reach};
-use crate::robot::{Body, Configuration, Geometry, Joints, Link, Robot};
+use crate::mechanism::Mechanism;
+use crate::reach::Reach;
+use crate::robot::{Body, Configuration, Geometry, Link, Robot};
 use crate::space::{Obstacle, Space, State};
 use crate::spheres::cover_within;
 use ratn_model::pose::Pose;
@@ -30,7 +31,7 @@ pub fn space(mechanism: &Mechanism, obstacles: &[Obstacle]) -> Space {
 /// The arm and what is around it, in the frame of the base; everything but arm and base is as in `here`, the base where the scene has it.
 pub fn in_scene(robot: &Robot, scene: &Scene, here: &Configuration) -> (Mechanism, Vec<Obstacle>) {
     let mut arm = robot.arm(&Configuration { base: [0.0; 3], ..*here });
-    let resting = arm.poses(&[0.0; 7]);
+    let resting = arm.poses(&JointVector::zeros(arm.joints.len()));
     let mut obstacles = Vec::new();
     for (index, link) in arm.links.iter_mut().enumerate() {
         if robot.arm_links.contains(&index) {
@@ -67,24 +68,24 @@ pub fn in_scene(robot: &Robot, scene: &Scene, here: &Configuration) -> (Mechanis
 
 /// The tool of the arm in the frame of the base.
 pub fn reach(robot: &Robot) -> Reach {
-    Reach::new(&robot.arm(&Configuration::ZERO), robot.tool, Pose::IDENTITY)
+    Reach::new(&robot.arm(&robot.at_zero()), robot.tool, Pose::IDENTITY)
 }
 
 /// What a scene alone leaves to be assumed of the robot: the base stands where the scene has it, the fingers are around what is held, else
 /// open, the head looks straight ahead, and the arm is at zero.
 pub fn assumed(robot: &Robot, scene: &Scene) -> Configuration {
-    Configuration { finger: finger_around_held(robot, scene), ..Configuration::ZERO.with_base(&scene.base) }
+    Configuration { finger: finger_around_held(robot, scene), ..robot.at_zero().with_base(&scene.base) }
 }
 
 /// The base's place and heading on the floor.
 pub fn on_floor(base: &Pose) -> Pose {
-    let [x, y, yaw] = Configuration::ZERO.with_base(base).base;
+    let [x, y, yaw] = crate::robot::on_floor(base);
     Pose::from_rpy([x, y, 0.0], 0.0, 0.0, yaw)
 }
 
 /// Where the fingers are around what is held, else open: each this far from the middle, in metres.
 fn finger_around_held(robot: &Robot, scene: &Scene) -> f64 {
-    let open = robot.finger().upper;
+    let open = robot.open_finger_m();
     let widths = scene.objects.iter().filter_map(|object| match (&object.placement, &object.shape) {
         (Placement::Gripper(pose), Shape::Box { size }) => {
             let axis = pose.inverse().rotate([0.0, 1.0, 0.0]);
@@ -98,7 +99,7 @@ fn finger_around_held(robot: &Robot, scene: &Scene) -> f64 {
 
 /// Whether a link is the hand or hangs on it.
 fn is_gripper(robot: &Robot, link: usize) -> bool {
-    let hand = robot.link("hand");
+    let hand = robot.hand();
     hand.is_some() && (Some(link) == hand || robot.model.links[link].parent == hand)
 }
 
@@ -114,30 +115,13 @@ fn cover(link: &mut Link) {
 ///
 /// # Errors
 /// [`LineError`] where limits or a singular posture end the line early.
-pub fn line(reach: &Reach, start: &Joints, offset: [f64; 3]) -> Result<Vec<Joints>, LineError> {
-    let start = positions(start);
-    let tool = reach.pose(&start);
+pub fn line(reach: &Reach, start: &JointVector, offset: [f64; 3]) -> Result<Vec<JointVector>, LineError> {
+    let tool = reach.pose(start);
     let to = Pose { position: std::array::from_fn(|i| tool.position[i] + offset[i]), ..tool };
-    Ok(line::line(reach, &start, &to)?.iter().map(|posture| std::array::from_fn(|j| posture[j])).collect())
-}
-
-/// A posture for the vector checks.
-pub fn state(arm: &Joints) -> State {
-    let mut state = [0.0; MAX_JOINTS];
-    for (to, from) in state.iter_mut().zip(arm) {
-        *to = *from as f32;
-    }
-    state
-}
-
-/// A posture as [`Reach`] wants it.
-pub fn positions(arm: &Joints) -> Positions {
-    let mut positions = [0.0; MAX_JOINTS];
-    positions[..7].copy_from_slice(arm);
-    positions
+    line::line(reach, start, &to)
 }
 
 /// A posture of the vector checks, within the arm's limits.
-pub fn joints(robot: &Robot, state: &State) -> Joints {
-    robot.clamp(&std::array::from_fn(|j| f64::from(state[j])))
+pub fn joints(robot: &Robot, state: &State) -> JointVector {
+    robot.clamp(&JointVector::from_fn(robot.arm_joints().len(), |j| f64::from(state[j])))
 }

@@ -7,15 +7,16 @@
 use crate::aimm;
 use crate::collision::length;
 use crate::connect::{Budget, ConnectError};
-use crate::drive::{Vehicle, drive_in, state, wrapped};
+use crate::drive::{Vehicle, drive_in, wrapped};
 use crate::exact::{Exact, Touch};
 use crate::geometry::Geometry;
+use crate::joint_vector::JointVector;
 use crate::pace::Control;
 use crate::request::{MIN_SPEED, Outside, outside_of_limits};
 use crate::robot::{Configuration, Joint, Robot, to_f32};
-use crate::space::{Obstacle, Space};
+use crate::space::{Obstacle, Space, state};
 use crate::timing::{Section, timed};
-use crate::trajectory::{BaseTrajectory, Curve, TrajectoryError};
+use crate::trajectory::{Curve, TrajectoryError};
 use crate::validate::{Violation, check_limits, check_rest};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -90,6 +91,12 @@ pub enum DriveError {
         /// What it should be.
         expected: String,
     },
+    /// It has no base that drives.
+    #[error("{robot} has no base that drives: its description has no `[base]`")]
+    NoBase {
+        /// Its name.
+        robot: String,
+    },
     /// It touches something where it stands.
     #[error("the robot cannot drive off: there is less than {:.0} mm between it and something else{}", PADDING_M * 1e3, touching(.touch.as_ref()))]
     Start {
@@ -145,8 +152,8 @@ pub enum DriveViolation {
 
 /// What stands on the robot's deck: objects whose middle is above it and whose lowest point is at its height.
 pub fn riding(robot: &Robot, scene: &Scene) -> Vec<String> {
-    let standing = Configuration::ZERO.with_base(&scene.base);
-    let Some(base) = robot.link("base") else { return Vec::new() };
+    let standing = robot.at_zero().with_base(&scene.base);
+    let Some(base) = robot.body() else { return Vec::new() };
     let frame = robot.poses(&standing)[base];
     let stands = |pose: &Pose, geometry: &Geometry| {
         robot.model.links[base].bodies.iter().any(|deck| {
@@ -173,6 +180,9 @@ pub fn plan_drive(
     request: &DriveRequest,
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<DrivePlan, DriveError> {
+    if robot.base_joints().is_empty() {
+        return Err(DriveError::NoBase { robot: robot.name().to_owned() });
+    }
     request.check(robot)?;
     let here = request.start.with_base(&scene.base);
     let riding = riding(robot, scene);
@@ -197,10 +207,12 @@ pub fn plan_drive(
         other => DriveError::NoPath(other),
     })?;
     let joints = limits(robot);
-    let mut free = |from: &[f64; 3], to: &[f64; 3]| space.is_free_motion(&state(*from), &state(*to));
-    let trajectory = timed(&joints, &[Section::Blended(path.clone())], request.speed, &mut free);
-    let [x, y, heading] = trajectory.end();
-    Ok(DrivePlan { trajectory: trajectory.named(&joints), end: [x, y, wrapped(heading)], length: length(&path) })
+    let path: Vec<JointVector> = path.into_iter().map(JointVector::of).collect();
+    let length = length(&path);
+    let mut free = |from: &JointVector, to: &JointVector| space.is_free_motion(&state(from), &state(to));
+    let trajectory = timed(&joints, &[Section::Blended(path)], request.speed, &mut free);
+    let end = trajectory.end();
+    Ok(DrivePlan { trajectory: trajectory.named(&joints), end: [end[0], end[1], wrapped(end[2])], length })
 }
 
 /// Checks a trajectory for a base that stands where the scene says, with the arm as in `configuration` and `riding` on its deck.
@@ -214,9 +226,9 @@ pub fn check_drive(
     configuration: &Configuration,
     riding: &[String],
     trajectory: &Trajectory,
-) -> Result<BaseTrajectory, DriveViolation> {
+) -> Result<Curve, DriveViolation> {
     let joints = limits(robot);
-    let trajectory: BaseTrajectory = Curve::of(&joints, trajectory)?;
+    let trajectory: Curve = Curve::of(&joints, trajectory)?;
     let (here, first) = (configuration.base, trajectory.knots()[0].positions);
     let metres = (here[0] - first[0]).hypot(here[1] - first[1]);
     let radians = wrapped(here[2] - first[2]).abs();
@@ -236,14 +248,14 @@ pub fn check_drive(
 fn check_way(
     [vehicle, roomy]: [&Vehicle; 2],
     obstacles: &[Obstacle],
-    trajectory: &BaseTrajectory,
+    trajectory: &Curve,
 ) -> Result<(), DriveViolation> {
     let (mechanism, padded) = (vehicle.mechanism(), roomy.mechanism());
     let mut space = Space::new(&padded, obstacles);
     let exact = Exact::new(&mechanism, obstacles);
     let reach = vehicle.bodies.iter().map(|b| b.pose.position[0].hypot(b.pose.position[1]) + b.geometry.radius());
     let reach = reach.fold(0.0, f64::max);
-    let look = |time_s: f64, place: &[f64; 3]| match exact.touch(place) {
+    let look = |time_s: f64, place: &[f64]| match exact.touch(place) {
         None => Ok(()),
         Some(touch) => Err(DriveViolation::Touch { time_s, touch }),
     };
@@ -256,12 +268,12 @@ fn check_way(
         while let Some([from, to]) = pieces.pop() {
             let middle = (from + to) / 2.0;
             let place = cubics.map(|cubic| cubic.position_at(middle));
-            let [x, y, heading] = std::array::from_fn(|j| {
+            let [x, y, heading] = std::array::from_fn(|j: usize| {
                 let [least, greatest] = cubics[j].range(from, to);
                 (place[j] - least).max(greatest - place[j])
             });
             let moves_m = x.hypot(y) + reach * heading;
-            if moves_m <= roomy.padding_m && space.is_free(&state(place)) {
+            if moves_m <= roomy.padding_m && space.is_free(&state(&place)) {
                 continue;
             }
             if moves_m <= roomy.padding_m {

@@ -7,7 +7,8 @@
 //! allows, no point is further than the padding from its place in the nearer one: where both are free, the way between is.
 
 use crate::frame::compose;
-use crate::robot::{Body, Configuration, Geometry, Joints, Robot, to_f32};
+use crate::joint_vector::JointVector;
+use crate::robot::{Body, Configuration, Geometry, Robot, to_f32};
 use parry3d::math::{Pose as Pose32, Vector};
 use parry3d::query;
 use parry3d::shape::SharedShape;
@@ -37,7 +38,7 @@ pub struct Checker<'a> {
     /// Pairs of moving shapes that can meet.
     pairs: Vec<(usize, usize)>,
     /// How far a point can be from the axis of each arm joint, in metres.
-    reach: Joints,
+    reach: JointVector,
     poses: Vec<Pose>,
     placed: Vec<Pose32>,
     centres: Vec<Vector>,
@@ -121,7 +122,7 @@ impl<'a> Checker<'a> {
             obstacles: Vec::new(),
             moving: Vec::new(),
             pairs: Vec::new(),
-            reach: [0.0; 7],
+            reach: JointVector::zeros(robot.arm_joints().len()),
             poses,
             placed: Vec::new(),
             centres: Vec::new(),
@@ -142,7 +143,7 @@ impl<'a> Checker<'a> {
     }
 
     fn add_robot(&mut self) {
-        let hand = self.robot.link("hand");
+        let hand = self.robot.hand();
         for (i, link) in self.robot.model.links.iter().enumerate() {
             for body in &link.bodies {
                 if self.robot.arm_links.contains(&i) {
@@ -226,7 +227,7 @@ impl<'a> Checker<'a> {
 
     fn find_reach(&mut self) {
         let mut beyond = 0.0;
-        for joint in (0..7).rev() {
+        for joint in (0..self.reach.len()).rev() {
             let link = self.robot.arm_joint_links[joint];
             let mut reach: f64 = beyond;
             for moving in self.moving.iter().filter(|m| self.nearest_joint(m.link) == joint) {
@@ -263,19 +264,19 @@ impl<'a> Checker<'a> {
 
     /// Into how many equal steps the straight line between two postures must be cut so that no point of the robot moves
     /// further than twice the padding in one.
-    pub fn steps(&self, from: &Joints, to: &Joints) -> usize {
+    pub fn steps(&self, from: &JointVector, to: &JointVector) -> usize {
         let moved: f64 = (0..7).map(|j| (to[j] - from[j]).abs() * self.reach[j]).sum();
         let step = if self.padding > 0.0 { 2.0 * self.padding } else { UNPADDED_STEP_M };
         ((moved / step).ceil() as usize).max(1)
     }
 
     /// Whether a posture touches nothing.
-    pub fn is_free(&mut self, arm: &Joints, contact: Contact) -> bool {
+    pub fn is_free(&mut self, arm: &JointVector, contact: Contact) -> bool {
         self.hit(arm, contact).is_none()
     }
 
     /// What a posture touches first, if anything.
-    pub fn collision(&mut self, arm: &Joints, contact: Contact) -> Option<Collision> {
+    pub fn collision(&mut self, arm: &JointVector, contact: Contact) -> Option<Collision> {
         let (i, other) = self.hit(arm, contact)?;
         let depth = self.depth(i, other).unwrap_or(-self.padding);
         let other = match other {
@@ -286,13 +287,13 @@ impl<'a> Checker<'a> {
     }
 
     /// How far any point of the robot moves at the most when the joints turn by so much, in metres.
-    pub(crate) fn moves_m(&self, turns: &Joints) -> f64 {
+    pub(crate) fn moves_m(&self, turns: &JointVector) -> f64 {
         (0..7).map(|j| turns[j].abs() * self.reach[j]).sum()
     }
 
     /// How far a posture is from touching what it may not, in metres, or `up_to` where that is less; or what it touches. For a checker
     /// without padding.
-    pub(crate) fn room(&mut self, arm: &Joints, contact: Contact, up_to: f64) -> Result<f64, Collision> {
+    pub(crate) fn room(&mut self, arm: &JointVector, contact: Contact, up_to: f64) -> Result<f64, Collision> {
         if let Some(collision) = self.collision(arm, contact) {
             return Err(collision);
         }
@@ -337,7 +338,7 @@ impl<'a> Checker<'a> {
     }
 
     /// Whether the straight motion from one posture to another touches nothing; `from` itself is not checked.
-    pub fn edge_is_free(&mut self, from: &Joints, to: &Joints, contact: Contact) -> bool {
+    pub fn edge_is_free(&mut self, from: &JointVector, to: &JointVector, contact: Contact) -> bool {
         if !self.is_free(to, contact) {
             return false;
         }
@@ -356,12 +357,12 @@ impl<'a> Checker<'a> {
     }
 
     /// The first collision of the straight motion from one posture to another, both included.
-    pub fn edge_collision(&mut self, from: &Joints, to: &Joints, contact: Contact) -> Option<Collision> {
+    pub fn edge_collision(&mut self, from: &JointVector, to: &JointVector, contact: Contact) -> Option<Collision> {
         let steps = self.steps(from, to);
         (0..=steps).find_map(|i| self.collision(&between(from, to, i as f64 / steps as f64), contact))
     }
 
-    fn hit(&mut self, arm: &Joints, contact: Contact) -> Option<(usize, Other)> {
+    fn hit(&mut self, arm: &JointVector, contact: Contact) -> Option<(usize, Other)> {
         self.configuration.arm = *arm;
         self.robot.update_arm(&self.configuration, &mut self.poses);
         for (i, moving) in self.moving.iter().enumerate() {
@@ -424,17 +425,17 @@ enum Other {
 }
 
 /// The posture a fraction of the way from one to another.
-pub fn between<const N: usize>(from: &[f64; N], to: &[f64; N], fraction: f64) -> [f64; N] {
-    std::array::from_fn(|j| from[j] + (to[j] - from[j]) * fraction)
+pub fn between(from: &JointVector, to: &JointVector, fraction: f64) -> JointVector {
+    JointVector::from_fn(from.len(), |j| from[j] + (to[j] - from[j]) * fraction)
 }
 
 /// The Euclidean distance of two postures, in radians.
-pub fn distance<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
-    (0..N).map(|j| (a[j] - b[j]).powi(2)).sum::<f64>().sqrt()
+pub fn distance(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
 }
 
 /// The length of a path, in radians.
-pub fn length<const N: usize>(path: &[[f64; N]]) -> f64 {
+pub fn length(path: &[JointVector]) -> f64 {
     path.windows(2).map(|pair| distance(&pair[0], &pair[1])).sum()
 }
 

@@ -7,6 +7,7 @@
 
 use crate::branches::{together, with};
 use crate::ellipsoid;
+use crate::joint_vector::JointVector;
 use crate::pace::Control;
 use crate::reach::{Reach, Target};
 use crate::sobol::Sobol;
@@ -240,13 +241,13 @@ pub fn connect_to_targets(
     budget: Budget,
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<Route, ConnectError> {
-    let near = start.map(f64::from);
+    let near = JointVector::from_fn(reach.joints(), |j| f64::from(start[j]));
     let mut random = ChaCha8Rng::seed_from_u64(budget.seed);
     let mut goals: Vec<(usize, State)> = Vec::new();
     for (index, target) in targets.iter().enumerate() {
         go_on(control, 0)?;
         let solutions = reach.solutions(target, &near, POSTURES, ATTEMPTS, &mut random);
-        let states = solutions.into_iter().map(|q| (index, q.map(|q| q as f32)));
+        let states = solutions.into_iter().map(|q| (index, crate::space::state(&q)));
         goals.extend(states.filter(|(_, state)| space.is_within(state) && space.is_free(state)));
     }
     let states: Vec<State> = goals.iter().map(|(_, state)| *state).collect();

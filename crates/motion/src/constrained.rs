@@ -6,9 +6,10 @@
 //! the tolerance, which leaves the other half for what is between them: tolerances below [`LEAST_TOLERANCE`] ask for too much.
 
 use crate::connect::{Budget, ConnectError, Route};
+use crate::joint_vector::JointVector;
 use crate::levers::Levers;
 use crate::pace::Control;
-use crate::reach::{Positions, Reach, Target};
+use crate::reach::{Reach, Target};
 use crate::simplify::path_length;
 use crate::sobol::Sobol;
 use crate::space::{Space, State, between, distance};
@@ -62,13 +63,17 @@ impl Constraint {
         Constraint { reach, asked: target, target: kept, inner }
     }
 
+    fn positions(&self, state: &State) -> JointVector {
+        JointVector::from_fn(self.reach.joints(), |j| f64::from(state[j]))
+    }
+
     /// Whether a posture keeps it.
     pub fn holds(&self, state: &State) -> bool {
-        self.target.is_met_by(&self.reach.pose(&positions(state)))
+        self.target.is_met_by(&self.reach.pose(&self.positions(state)))
     }
 
     /// How far the frame may move, in metres, and turn, in radians, from a posture; less than nothing where it does not keep what is asked.
-    pub(crate) fn room(&self, positions: &Positions) -> [f64; 2] {
+    pub(crate) fn room(&self, positions: &JointVector) -> [f64; 2] {
         self.asked.room(&self.reach.pose(positions))
     }
 
@@ -78,7 +83,7 @@ impl Constraint {
 
     /// What a posture that does not keep it breaks.
     pub(crate) fn breach(&self, state: &State) -> String {
-        let [left_m, left_rad] = self.room(&positions(state));
+        let [left_m, left_rad] = self.room(&self.positions(state));
         match left_m < left_rad {
             true => format!("the tool is {:.3} m outside the box", (-left_m).max(0.0)),
             false => format!("the tool is {:.3} rad off the direction that it keeps", self.tilt_rad(state)),
@@ -88,14 +93,14 @@ impl Constraint {
     /// How far the frame's z axis is off that of the target, in radians.
     pub fn tilt_rad(&self, state: &State) -> f64 {
         let up = [0.0, 0.0, 1.0];
-        let (have, want) = (self.reach.pose(&positions(state)).rotate(up), self.target.pose.rotate(up));
+        let (have, want) = (self.reach.pose(&self.positions(state)).rotate(up), self.target.pose.rotate(up));
         (0..3).map(|i| have[i] * want[i]).sum::<f64>().clamp(-1.0, 1.0).acos()
     }
 
     /// Whether all postures of a straight motion keep it: those that are looked at are so close that what lies between them differs from the
     /// line between their frames by less than half of what is kept back.
     pub fn holds_along(&self, from: &State, to: &State) -> bool {
-        let by: Positions = std::array::from_fn(|j| f64::from((from[j] - to[j]).abs()));
+        let by = JointVector::from_fn(self.reach.joints(), |j| f64::from((from[j] - to[j]).abs()));
         let bends = [self.levers().bend_m(&by), self.levers().turns_rad(&by).powi(2) / 8.0];
         let close = bends.map(|bend| (bend / (RESERVE / 2.0)).sqrt()).into_iter().fold(0.0, f64::max);
         let steps = f64::from(distance(from, to) * Space::RESOLUTION).max(close).ceil().max(1.0) as usize;
@@ -104,11 +109,11 @@ impl Constraint {
 
     /// The posture itself where it keeps it with room to spare, else one near it that does.
     pub(crate) fn project(&self, state: &State) -> Option<State> {
-        let positions = positions(state);
+        let positions = self.positions(state);
         if self.inner.is_met_by(&self.reach.pose(&positions)) {
             return Some(*state);
         }
-        self.reach.descend(&self.inner, &positions).map(|p| p.map(|q| q as f32))
+        self.reach.descend(&self.inner, &positions).map(|p| crate::space::state(&p))
     }
 }
 
@@ -116,10 +121,6 @@ impl Constraint {
 fn free_or(tolerance: [f64; 3], less: impl Fn([f64; 3]) -> [f64; 3]) -> [f64; 3] {
     let reduced = less(tolerance);
     std::array::from_fn(|i| if tolerance[i] < std::f64::consts::PI { reduced[i] } else { tolerance[i] })
-}
-
-fn positions(state: &State) -> Positions {
-    state.map(f64::from)
 }
 
 /// Searches a path from `start` to one of `goals` that keeps the constraint. `control` gets the iterations so far.

@@ -3,7 +3,7 @@
 use crate::trajectory::Knot;
 
 /// One joint from one knot to the next: q + v t + a t² / 2 + j t³ / 6.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct Cubic {
     /// Seconds from knot to knot.
     pub(crate) lasts_s: f64,
@@ -18,17 +18,15 @@ pub(crate) struct Cubic {
 }
 
 impl Cubic {
-    /// It stands at zero, for no time.
-    pub(crate) const STILL: Cubic = Cubic { lasts_s: 0.0, position: 0.0, velocity: 0.0, acceleration: 0.0, jerk: 0.0 };
-
     /// Joint `j` between two knots.
-    pub(crate) fn between<const N: usize>(a: &Knot<N>, b: &Knot<N>, j: usize) -> Cubic {
+    pub(crate) fn between<P: AsRef<[f64]>>(a: &Knot<P>, b: &Knot<P>, j: usize) -> Cubic {
         let h = b.time_s - a.time_s;
-        let mean = (b.positions[j] - a.positions[j]) / h;
-        let (v0, v1) = (a.velocities[j], b.velocities[j]);
+        let [p0, p1] = [a, b].map(|knot| knot.positions.as_ref()[j]);
+        let [v0, v1] = [a, b].map(|knot| knot.velocities.as_ref()[j]);
+        let mean = (p1 - p0) / h;
         Cubic {
             lasts_s: h,
-            position: a.positions[j],
+            position: p0,
             velocity: v0,
             acceleration: (6.0 * mean - 4.0 * v0 - 2.0 * v1) / h,
             jerk: 6.0 * (v0 + v1 - 2.0 * mean) / (h * h),

@@ -6,12 +6,12 @@
 
 use crate::connect::{Budget, ConnectError, connect};
 use crate::geometry::Body;
-use crate::mechanism::{MAX_JOINTS, Mechanism};
+use crate::mechanism::Mechanism;
 use crate::pace::Control;
 use crate::pairs::Checks;
 use crate::robot::{Configuration, Drive, Geometry, Joint, Link, Robot};
 use crate::simplify::simplify;
-use crate::space::{Obstacle, Space, State};
+use crate::space::{Obstacle, Space, State, state};
 use crate::spheres::cover_within;
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene};
@@ -117,9 +117,9 @@ pub(crate) fn drive_in(
     budget: Budget,
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<(Vec<[f64; 3]>, usize), ConnectError> {
-    let offer = |goal: &[f64; 3]| [-TAU, 0.0, TAU].map(|turn| state([goal[0], goal[1], wrapped(goal[2]) + turn]));
+    let offer = |goal: &[f64; 3]| [-TAU, 0.0, TAU].map(|turn| state(&[goal[0], goal[1], wrapped(goal[2]) + turn]));
     let ends: Vec<State> = goals.iter().flat_map(offer).collect();
-    let from = state([start[0], start[1], wrapped(start[2])]);
+    let from = state(&[start[0], start[1], wrapped(start[2])]);
     let route = match connect(space, &from, &ends, budget, control) {
         Err(ConnectError::Goal { .. }) => return Err(ConnectError::Goal { goals: goals.len() }),
         other => other?,
@@ -127,15 +127,6 @@ pub(crate) fn drive_in(
     let path = simplify(space, &route.path, budget, control)?;
     let places = path.iter().map(|s| [f64::from(s[0]), f64::from(s[1]), f64::from(s[2])]).collect();
     Ok((places, route.goal / 3))
-}
-
-/// A place for the vector checks.
-pub(crate) fn state(place: [f64; 3]) -> State {
-    let mut state = [0.0; MAX_JOINTS];
-    for (to, from) in state.iter_mut().zip(place) {
-        *to = from as f32;
-    }
-    state
 }
 
 /// A heading within half a turn of zero.

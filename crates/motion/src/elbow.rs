@@ -7,7 +7,7 @@
 //! Redundancy Resolution*, IEEE T-RO 24(5), 2008). A pose that can be reached at all is found this way, however small the arc.
 
 use crate::frame::{cross, rotate};
-use crate::reach::Positions;
+use crate::joint_vector::JointVector;
 use crate::robot::Joint;
 use crate::spherical::{Spherical, about, dot};
 use ratn_model::pose::Pose;
@@ -45,13 +45,14 @@ impl Arc {
 /// All arcs of the turns that reach a pose within the limits, which are in the order of the positions.
 pub(crate) fn arcs(arm: &Spherical, target: &Pose, limits: &[Joint]) -> Vec<Arc> {
     let mut arcs = Vec::new();
+    let others = JointVector::zeros(limits.len());
     for bend in arm.bends_for(target) {
         let within = |turn: f64| {
             // Joints that are none of the arm's are wherever they are.
-            let is_within = |posture: &Positions| {
+            let is_within = |posture: &JointVector| {
                 arm.joints.iter().all(|i| (limits[*i].lower..=limits[*i].upper).contains(&posture[*i]))
             };
-            arm.solve(target, bend, turn).iter().any(is_within)
+            arm.solve(target, bend, turn, &others).iter().any(is_within)
         };
         let cuts = cuts(arm, target, bend, limits);
         for (i, from) in cuts.iter().enumerate() {

@@ -7,7 +7,8 @@ use crate::along::first_breach;
 use crate::collision::between;
 use crate::constrained::{Constraint, LEAST_TOLERANCE};
 use crate::frame::norm;
-use crate::mechanism::{MAX_JOINTS, Mechanism};
+use crate::joint_vector::JointVector;
+use crate::mechanism::Mechanism;
 use crate::plan::PlanError;
 use crate::reach::{Reach, Target};
 use crate::robot_model::Joint;
@@ -111,16 +112,16 @@ impl Keep {
 
 /// The trajectory along sections that keeps a constraint all along, as quick as can be; none where even the straight motions from posture
 /// to posture do not keep it. For the rest as [`timed_while`].
-pub fn timed_keeping<const N: usize>(
+pub fn timed_keeping(
     joints: &[Joint],
-    sections: &[Section<N>],
+    sections: &[Section],
     speed: f64,
     constraint: &Constraint,
-    is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
+    is_free: &mut dyn FnMut(&JointVector, &JointVector) -> bool,
     goes_on: &mut dyn FnMut() -> bool,
-) -> Option<Curve<N>> {
-    let keeps = |curve: &Curve<N>| {
-        let room = &mut |positions: &[f64; MAX_JOINTS]| constraint.room(positions);
+) -> Option<Curve> {
+    let keeps = |curve: &Curve| {
+        let room = &mut |positions: &JointVector| constraint.room(positions);
         first_breach(curve, constraint.levers(), room).is_none()
     };
     let curve = timed_while(joints, sections, speed, is_free, goes_on);
@@ -128,11 +129,11 @@ pub fn timed_keeping<const N: usize>(
         return Some(curve);
     }
     // Along the postures themselves, then with a stop at each of them.
-    let closely = |section: &Section<N>| match section {
+    let closely = |section: &Section| match section {
         Section::Blended(path) => Section::AsGiven(divided(path)),
         given => given.clone(),
     };
-    let closer: Vec<Section<N>> = sections.iter().map(closely).collect();
+    let closer: Vec<Section> = sections.iter().map(closely).collect();
     let curve = timed_while(joints, &closer, speed, is_free, goes_on);
     if keeps(&curve) {
         return Some(curve);
@@ -141,7 +142,7 @@ pub fn timed_keeping<const N: usize>(
     keeps(&curve).then_some(curve)
 }
 
-fn divided<const N: usize>(path: &[[f64; N]]) -> Vec<[f64; N]> {
+fn divided(path: &[JointVector]) -> Vec<JointVector> {
     let parts =
         path.windows(2).flat_map(|pair| (0..DIVIDED).map(|i| between(&pair[0], &pair[1], i as f64 / DIVIDED as f64)));
     parts.chain(path.last().copied()).collect()

@@ -3,8 +3,7 @@
 //! The end of a chain is no further from a joint's axis than its lever: the sum of all offsets that follow, and of all that can slide.
 //! These bounds hold in every posture. They say what cannot happen between two postures that were looked at.
 
-use crate::mechanism::MAX_JOINTS;
-use crate::reach::Positions;
+use crate::joint_vector::JointVector;
 use crate::robot_model::{Drive, Joint};
 use ratn_model::pose::Pose;
 
@@ -37,17 +36,17 @@ impl Levers {
     }
 
     /// How far the end moves at the most where no joint moves by more than so much, in metres.
-    pub(crate) fn moves_m(&self, by: &Positions) -> f64 {
+    pub(crate) fn moves_m(&self, by: &JointVector) -> f64 {
         self.0.iter().map(|lever| lever.amount(by) * lever.length_m).sum()
     }
 
     /// How far it turns at the most, in radians.
-    pub(crate) fn turns_rad(&self, by: &Positions) -> f64 {
+    pub(crate) fn turns_rad(&self, by: &JointVector) -> f64 {
         self.0.iter().filter(|lever| !lever.drive.slides).map(|lever| lever.amount(by)).sum()
     }
 
     /// How much the end's velocity changes at the most, where joints of these speeds move by so much, in metres per second.
-    pub(crate) fn swing_m(&self, by: &Positions, speeds: &Positions) -> f64 {
+    pub(crate) fn swing_m(&self, by: &JointVector, speeds: &JointVector) -> f64 {
         // As below, for two different amounts.
         let (mut turned, mut turning, mut sum) = (0.0, 0.0, 0.0);
         for lever in &self.0 {
@@ -62,7 +61,7 @@ impl Levers {
 
     /// How far the end is at the most from the straight line between its two places, where the joints go straight from one posture to
     /// another that differs by so much, in metres: an eighth of the greatest second derivative.
-    pub(crate) fn bend_m(&self, by: &Positions) -> f64 {
+    pub(crate) fn bend_m(&self, by: &JointVector) -> f64 {
         // ∂²p / ∂i ∂j with i before j is the axis of i times ∂p / ∂j, and nothing where i slides.
         let (mut before, mut second) = (0.0, 0.0);
         for lever in &self.0 {
@@ -76,7 +75,7 @@ impl Levers {
 }
 
 impl Lever {
-    fn amount(&self, by: &[f64; MAX_JOINTS]) -> f64 {
+    fn amount(&self, by: &JointVector) -> f64 {
         (self.drive.factor * by[self.drive.joint]).abs()
     }
 }

@@ -6,8 +6,9 @@
 //! an error, which says how far the arm gets and which joint ends the line. Any robot.
 
 use crate::frame::{compose, difference, norm};
+use crate::joint_vector::JointVector;
 use crate::pace::{Control, Stop};
-use crate::reach::{Positions, Reach, Target, rotation_vector};
+use crate::reach::{Reach, Target, rotation_vector};
 use crate::robot_model::Joint;
 use ratn_model::pose::Pose;
 use std::fmt;
@@ -80,7 +81,7 @@ impl fmt::Display for Cause {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Traced {
     /// The first is where it starts.
-    pub postures: Vec<Positions>,
+    pub postures: Vec<JointVector>,
     /// How far the tool has come at each of them, in metres.
     pub along_m: Vec<f64>,
     /// Which pose each of them leads to, by its index.
@@ -92,7 +93,7 @@ pub struct Traced {
 }
 
 impl Traced {
-    fn beginning(lines: &Lines, start: &Positions) -> Traced {
+    fn beginning(lines: &Lines, start: &JointVector) -> Traced {
         let wanted_m = lines.pieces.iter().map(|piece| piece.length_m).sum();
         Traced { postures: vec![*start], along_m: vec![0.0], towards: vec![0], wanted_m, ended: None }
     }
@@ -103,7 +104,7 @@ impl Traced {
 ///
 /// # Errors
 /// [`LineError`] where limits or a singular posture end the line early.
-pub fn line(reach: &Reach, start: &Positions, to: &Pose) -> Result<Vec<Positions>, LineError> {
+pub fn line(reach: &Reach, start: &JointVector, to: &Pose) -> Result<Vec<JointVector>, LineError> {
     let Traced { postures, along_m, wanted_m, ended, .. } = through(reach, start, &[*to], 0.0);
     match ended {
         None => Ok(postures),
@@ -113,7 +114,7 @@ pub fn line(reach: &Reach, start: &Positions, to: &Pose) -> Result<Vec<Positions
 
 /// Postures along straight lines from where the frame of `reach` is in the posture `start` through poses (in the frame of the root), as far as
 /// the arm gets. At each pose but the last the tool may leave the lines as far as `blend_m` from it.
-pub fn through(reach: &Reach, start: &Positions, to: &[Pose], blend_m: f64) -> Traced {
+pub fn through(reach: &Reach, start: &JointVector, to: &[Pose], blend_m: f64) -> Traced {
     let lines = Lines::new(reach.pose(start), to, blend_m);
     let traced = trace(reach, &lines, start, &mut || Control::Continue);
     // It is never told to stop.
@@ -127,7 +128,7 @@ pub fn through(reach: &Reach, start: &Positions, to: &[Pose], blend_m: f64) -> T
 pub(crate) fn trace(
     reach: &Reach,
     lines: &Lines,
-    start: &Positions,
+    start: &JointVector,
     control: &mut dyn FnMut() -> Control,
 ) -> Result<Traced, Stop> {
     let mut traced = Traced::beginning(lines, start);
@@ -162,14 +163,14 @@ pub(crate) fn trace(
 }
 
 /// From one posture to the next on a line.
-fn step(reach: &Reach, here: &Positions, to: &Pose) -> Result<Positions, Cause> {
+fn step(reach: &Reach, here: &JointVector, to: &Pose) -> Result<JointVector, Cause> {
     let joints = reach.limits();
     let Some(next) = reach.descend(&Target::at(*to), here) else {
         let held = |(joint, q): &(&Joint, &f64)| (joint.upper - **q).min(**q - joint.lower) < AT_LIMIT;
         let limit = joints.iter().zip(here).find(held).map(|(joint, _)| joint.name.clone());
         return Err(limit.map_or(Cause::OutOfReach, |joint| Cause::Limit { joint }));
     };
-    let by: Positions = std::array::from_fn(|j| (next[j] - here[j]).abs());
+    let by = JointVector::from_fn(joints.len(), |j| (next[j] - here[j]).abs());
     let most = (0..joints.len()).max_by(|a, b| by[*a].total_cmp(&by[*b])).unwrap_or(0);
     if by[most] > MAX_JUMP || reach.levers().bend_m(&by) > STRAY_M {
         return Err(Cause::Flip { joint: joints.get(most).map(|joint| joint.name.clone()).unwrap_or_default() });

@@ -11,23 +11,24 @@
 //! tool is to stay upright, the free path keeps it so (`constrained`), and the straight parts do anyway. Where the tool is to go in
 //! straight lines, they take the place of the free path (`way_points`).
 
-use crate::arm::{self, joints, positions, state};
+use crate::arm::{self, joints};
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M, distance, length};
 use crate::connect::{Budget, ConnectError, connect};
 use crate::constrained::{self, Constraint};
+use crate::joint_vector::JointVector;
 use crate::keep::{KeptAxis, timed_keeping};
 use crate::line::LineError;
 use crate::pace::{Control, Pace, Progress, Stop};
-use crate::reach::{Positions, Postures, Reach, Target, is_new};
+use crate::reach::{Postures, Reach, Target, is_new};
 use crate::refine::{End, Measure, Refinement};
 pub use crate::request::{Goal, MAX_GOALS, MIN_SPEED, Request};
-use crate::robot::{Configuration, Geometry, Joints, Robot};
+use crate::robot::{Configuration, Geometry, Robot};
 use crate::simplify::{path_length, shortened};
-use crate::space::{Space, State};
+use crate::space::{Space, State, state};
 use crate::straight::Straight;
 use crate::timing::rough::Rough;
 use crate::timing::{Section, timed_while};
-use crate::trajectory::ArmTrajectory;
+use crate::trajectory::Curve;
 use crate::way_points::{Follower, WayPoints};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -81,7 +82,7 @@ pub struct Plan {
     /// Timed.
     pub trajectory: Trajectory,
     /// Where it ends.
-    pub end: Joints,
+    pub end: JointVector,
     /// The tool frame there, in the world frame.
     pub end_pose: Pose,
     /// Length of the first path in joint space, straight parts included.
@@ -179,8 +180,8 @@ struct Candidate {
     /// Where the free path ends.
     door: State,
     /// From there to the goal: the way in where the approach begins with little room, and the approach; at least one posture.
-    way_in: Option<Joints>,
-    approach: Vec<Joints>,
+    way_in: Option<JointVector>,
+    approach: Vec<JointVector>,
     /// Length of both.
     length_rad: f64,
     /// How long both take, roughly.
@@ -210,7 +211,7 @@ struct Improved {
 /// A way, and the whole motion along it.
 struct Motion {
     way: Way,
-    curve: ArmTrajectory,
+    curve: Curve,
 }
 
 /// The tools and the knowledge of one planning.
@@ -226,7 +227,7 @@ struct Planning<'a> {
     constraint: Option<Constraint>,
     rough: Rough,
     /// The straight part at the start.
-    depart: Vec<Joints>,
+    depart: Vec<JointVector>,
     random: ChaCha8Rng,
     goals: Vec<Goal>,
     approach: Straight,
@@ -277,7 +278,7 @@ pub fn plan(
     }
     let depart = depart?;
     let start = depart[depart.len() - 1];
-    let tool = planning.reach.pose(&positions(&start));
+    let tool = planning.reach.pose(&start);
     let mut keep = request.keep;
     if let Some(tolerance_rad) = request.upright_rad {
         let up = [0.0, 0.0, 1.0];
@@ -331,7 +332,7 @@ pub fn plan(
     let chosen = &planning.candidates[way.candidate];
     let length_rad = before + f64::from(path_length(&way.path)) + chosen.length_rad;
     let end = chosen.approach[chosen.approach.len() - 1];
-    let trajectory = curve.to_model(robot);
+    let trajectory = curve.named(robot.arm_joints());
     let end_pose = robot.tool_pose(&Configuration { arm: end, ..here });
     let (iterations, time_up) = (pace.iterations, improved.is_err());
     Ok(Plan { trajectory, end, end_pose, first_length_rad, length_rad, first_duration_s, iterations, time_up })
@@ -356,7 +357,7 @@ impl From<Stop> for PlanError {
 
 impl Planning<'_> {
     /// The straight part at the start; its end is free.
-    fn depart(&mut self, request: &Request) -> Result<Vec<Joints>, PlanError> {
+    fn depart(&mut self, request: &Request) -> Result<Vec<JointVector>, PlanError> {
         let start = request.start.arm;
         if !request.depart.is_some() {
             return match self.checker.collision(&start, Contact::None) {
@@ -380,8 +381,8 @@ impl Planning<'_> {
     }
 
     /// Postures along a straight part (`sense` 1) or against its direction (-1), from the first of them.
-    fn line(&self, from: &Joints, part: &Straight, sense: f64) -> Result<Vec<Joints>, LineError> {
-        let tool = self.reach.pose(&positions(from));
+    fn line(&self, from: &JointVector, part: &Straight, sense: f64) -> Result<Vec<JointVector>, LineError> {
+        let tool = self.reach.pose(from);
         // A request that names an object which is not there has been refused.
         let way = part.way(self.scene, &self.base, &tool).unwrap_or_default();
         arm::line(&self.reach, from, way.map(|c| sense * c))
@@ -392,7 +393,7 @@ impl Planning<'_> {
         mut self,
         request: &Request,
         way: &WayPoints,
-        depart: Vec<Joints>,
+        depart: Vec<JointVector>,
         pace: &mut Pace<'_>,
     ) -> Result<Plan, PlanError> {
         let robot = self.robot;
@@ -437,10 +438,10 @@ impl Planning<'_> {
             }
             if best.as_ref().is_none_or(|best| curve.duration_s() < best.trajectory.duration_s()) {
                 best = Some(Plan {
-                    trajectory: curve.to_model(robot),
+                    trajectory: curve.named(robot.arm_joints()),
                     first_duration_s: curve.duration_s(),
                     end,
-                    end_pose: self.base.compose(&self.reach.pose(&positions(&end))),
+                    end_pose: self.base.compose(&self.reach.pose(&end)),
                     first_length_rad: length_rad,
                     length_rad,
                     iterations: 0,
@@ -452,7 +453,7 @@ impl Planning<'_> {
     }
 
     /// Fills the list of candidates: those that keep away from what they need not touch, or else those that press the least.
-    fn find_candidates(&mut self, near: &Joints, pace: &mut Pace<'_>) -> Result<(), PlanError> {
+    fn find_candidates(&mut self, near: &JointVector, pace: &mut Pace<'_>) -> Result<(), PlanError> {
         let mut reasons: Vec<String> = Vec::new();
         for (wanted, attempts) in SOLUTIONS {
             let mut postures = Vec::new();
@@ -497,12 +498,12 @@ impl Planning<'_> {
     fn postures(
         &mut self,
         pose: &Pose,
-        near: &Joints,
+        near: &JointVector,
         wanted: usize,
         attempts: usize,
         pace: &mut Pace<'_>,
-    ) -> Result<Vec<Joints>, Stop> {
-        let (postures, near) = (self.goal(pose), positions(near));
+    ) -> Result<Vec<JointVector>, Stop> {
+        let (postures, near) = (self.goal(pose), *near);
         let mut found = Vec::new();
         for attempt in 0..attempts {
             pace.poll()?;
@@ -516,7 +517,7 @@ impl Planning<'_> {
                 break;
             }
         }
-        Ok(found.iter().map(arm_of).collect())
+        Ok(found.iter().copied().collect())
     }
 
     /// All postures at a pose in the world frame.
@@ -525,7 +526,7 @@ impl Planning<'_> {
     }
 
     /// The goal posture with its approach, or why it is none.
-    fn candidate(&mut self, goal: &Joints) -> Result<Candidate, String> {
+    fn candidate(&mut self, goal: &JointVector) -> Result<Candidate, String> {
         let mut approach = vec![*goal];
         if self.approach.is_some() {
             let back = self.line(goal, &self.approach, -1.0);
@@ -548,9 +549,9 @@ impl Planning<'_> {
     }
 
     /// What the tool keeps is kept along postures, or what is broken.
-    fn kept_along(&self, postures: &[Joints]) -> Result<(), String> {
+    fn kept_along(&self, postures: &[JointVector]) -> Result<(), String> {
         let Some(constraint) = &self.constraint else { return Ok(()) };
-        let breaks = |pair: &&[Joints]| !constraint.holds_along(&state(&pair[0]), &state(&pair[1]));
+        let breaks = |pair: &&[JointVector]| !constraint.holds_along(&state(&pair[0]), &state(&pair[1]));
         match postures.windows(2).find(breaks) {
             Some(pair) => Err(constraint.breach(&state(&pair[1]))),
             None => Ok(()),
@@ -563,10 +564,10 @@ impl Planning<'_> {
         request: &Request,
         sections: &[Section],
         goes_on: &mut dyn FnMut() -> bool,
-    ) -> Result<ArmTrajectory, PlanError> {
+    ) -> Result<Curve, PlanError> {
         let joints = request.joints(self.robot);
         let (space, constraint) = (&mut self.space, &self.constraint);
-        let mut is_free = |from: &Joints, to: &Joints| {
+        let mut is_free = |from: &JointVector, to: &JointVector| {
             let (from, to) = (state(from), state(to));
             constraint.as_ref().is_none_or(|c| c.holds_along(&from, &to)) && space.is_free_motion(&from, &to)
         };
@@ -582,7 +583,7 @@ impl Planning<'_> {
         Ok(request.tool_speed.keep(&self.reach, curve))
     }
 
-    fn with_door(&mut self, approach: Vec<Joints>) -> Result<Candidate, String> {
+    fn with_door(&mut self, approach: Vec<JointVector>) -> Result<Candidate, String> {
         let entry = approach[0];
         let door = self.door(&entry).ok_or_else(|| "there is too little room before the goal".to_owned())?;
         if let Some(constraint) = self.constraint.as_ref().filter(|c| !c.holds(&door)) {
@@ -592,12 +593,13 @@ impl Planning<'_> {
         let way_in = (door != state(&entry)).then(|| joints(self.robot, &door));
         let length_rad = length(&approach) + way_in.map_or(0.0, |way_in| distance(&way_in, &entry));
         let way_in_s = way_in.map_or(0.0, |way_in| self.rough.duration_s(&[state(&way_in), state(&entry)]));
-        let lasts_s = way_in_s + self.rough.duration_s(&approach.iter().map(state).collect::<Vec<_>>());
+        let lasts_s =
+            way_in_s + self.rough.duration_s(&approach.iter().map(|posture| state(posture)).collect::<Vec<_>>());
         Ok(Candidate { door, way_in, approach, length_rad, lasts_s })
     }
 
     /// The posture itself where the vector checks find room for it, else one close by that can be reached from it.
-    fn door(&mut self, posture: &Joints) -> Option<State> {
+    fn door(&mut self, posture: &JointVector) -> Option<State> {
         let here = state(posture);
         if self.space.is_within(&here) && self.space.is_free(&here) {
             return Some(here);
@@ -617,7 +619,7 @@ impl Planning<'_> {
     /// From the door at the start to that of a candidate.
     fn first_path(
         &mut self,
-        start: &Joints,
+        start: &JointVector,
         door: &State,
         seed: u64,
         pace: &mut Pace<'_>,
@@ -766,8 +768,8 @@ impl Planning<'_> {
         let along = self.random.random_range(0.0..=1.0) * path_length(refinement.path());
         let near = joints(self.robot, &refinement.point(along).0);
         let seed = near.map(|q| q + self.random.random_range(-0.5..0.5));
-        let postures = self.reach.nearest(&self.goal(&pose), &positions(&seed));
-        let Some(posture) = postures.first().map(arm_of) else { return };
+        let postures = self.reach.nearest(&self.goal(&pose), &seed);
+        let Some(posture) = postures.first().copied() else { return };
         // The posture itself is no end of the path, but where the end is cannot be much nearer.
         if !refinement.is_promising(&End { state: state(&posture), rest: 0.0, rest_s: 0.0 }) {
             return;
@@ -780,8 +782,8 @@ impl Planning<'_> {
     }
 
     /// The free path with its ways out and in, from the end of the departure to the beginning of the approach.
-    fn whole(&self, start: &Joints, path: &[State], candidate: &Candidate) -> Vec<Joints> {
-        let mut whole: Vec<Joints> = path.iter().map(|s| joints(self.robot, s)).collect();
+    fn whole(&self, start: &JointVector, path: &[State], candidate: &Candidate) -> Vec<JointVector> {
+        let mut whole: Vec<JointVector> = path.iter().map(|s| joints(self.robot, s)).collect();
         if path[0] == state(start) {
             whole[0] = *start;
         } else {
@@ -789,13 +791,13 @@ impl Planning<'_> {
         }
         let entry = candidate.approach[0];
         match candidate.way_in {
-            None if whole.len() > 1 => *whole.last_mut().unwrap_or(&mut [0.0; 7]) = entry,
+            None if whole.len() > 1 => whole.last_mut().into_iter().for_each(|last| *last = entry),
             _ => whole.push(entry),
         }
         whole
     }
 
-    fn no_room(&mut self, posture: &Joints) -> PlanError {
+    fn no_room(&mut self, posture: &JointVector) -> PlanError {
         let collision = self.checker.collision(posture, Contact::None);
         let reason = collision.map_or_else(|| "there is too little room to move".to_owned(), |c| c.to_string());
         PlanError::NoRoom { reason }
@@ -803,7 +805,11 @@ impl Planning<'_> {
 }
 
 /// What a straight part touches first that it may not.
-pub(crate) fn straight_collision(checker: &mut Checker<'_>, postures: &[Joints], press_m: f64) -> Option<Collision> {
+pub(crate) fn straight_collision(
+    checker: &mut Checker<'_>,
+    postures: &[JointVector],
+    press_m: f64,
+) -> Option<Collision> {
     let contact = Contact::Gripper(press_m);
     let first = checker.collision(&postures[0], contact);
     first.or_else(|| postures.windows(2).find_map(|w| checker.edge_collision(&w[0], &w[1], contact)))
@@ -819,7 +825,7 @@ fn presses_m(robot: &Robot) -> Vec<f64> {
 
 /// Half of a finger's thickness along the direction in which it closes; 0 for a robot without fingers made of boxes.
 fn half_finger_m(robot: &Robot) -> f64 {
-    let halves = robot.link("finger_left").into_iter().flat_map(|link| &robot.model.links[link].bodies);
+    let halves = robot.finger_link().into_iter().flat_map(|link| &robot.model.links[link].bodies);
     let thickness = halves.filter_map(|body| match body.geometry {
         Geometry::Box { half } => Some(half[1]),
         _ => None,
@@ -836,12 +842,8 @@ fn leaving<'a>(robot: &'a Robot, scene: &Scene, request: &Request, padding: f64)
     }
     let left = scene.objects.iter().filter(|object| !is_held(object)).cloned().collect();
     let scene = Scene { objects: left, ..scene.clone() };
-    let opened = Configuration { finger: robot.finger().upper, ..request.start };
+    let opened = Configuration { finger: robot.open_finger_m(), ..request.start };
     Some(Checker::new(robot, &scene, &opened, padding).reaching_into(&request.reaches_into))
-}
-
-fn arm_of(positions: &Positions) -> Joints {
-    std::array::from_fn(|j| positions[j])
 }
 
 /// How many different reasons an error names.

@@ -8,6 +8,7 @@
 
 use crate::elbow::{self, Arc};
 use crate::frame::{compose, cross, difference, norm, rotate};
+use crate::joint_vector::JointVector;
 use crate::levers::Levers;
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 use crate::robot_model::{Drive, Joint};
@@ -15,9 +16,6 @@ use crate::spherical::Spherical;
 use rand::{Rng, RngExt};
 use ratn_model::pose::Pose;
 use std::f64::consts::PI;
-
-/// Positions in the order of the joints; unused ones are zero.
-pub type Positions = [f64; MAX_JOINTS];
 
 /// Iterations of one descent.
 const MAX_ITERATIONS: usize = 80;
@@ -36,6 +34,9 @@ const ARCS_TRIED: usize = 4;
 
 /// Two postures closer than this are the same one, in radians.
 const SAME: f64 = 0.05;
+
+/// One row of a Jacobian; a column per joint.
+type Row = [f64; MAX_JOINTS];
 
 /// Where a link is wanted.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -206,7 +207,7 @@ impl Reach {
     }
 
     /// The frame in the frame of the root.
-    pub fn pose(&self, positions: &Positions) -> Pose {
+    pub fn pose(&self, positions: &JointVector) -> Pose {
         let place = |pose: &Pose, (origin, drive): &(Pose, Drive)| {
             compose(&compose(pose, origin), &drive.moved(positions[drive.joint]))
         };
@@ -214,7 +215,7 @@ impl Reach {
     }
 
     /// How fast the frame moves, in metres per second, and turns, in radians per second, where the joints have these velocities.
-    pub(crate) fn speeds(&self, positions: &Positions, velocities: &Positions) -> [f64; 2] {
+    pub(crate) fn speeds(&self, positions: &JointVector, velocities: &JointVector) -> [f64; 2] {
         let (axes, tip) = self.axes(positions);
         let rows = jacobian(&axes, &tip, &[Pose::IDENTITY; 2], [true; 6]);
         let along = |row: usize| (0..self.joints.len()).map(|j| rows[row][j] * velocities[j]).sum::<f64>();
@@ -222,7 +223,7 @@ impl Reach {
     }
 
     /// Positions held within the limits.
-    pub fn clamp(&self, positions: &Positions) -> Positions {
+    pub fn clamp(&self, positions: &JointVector) -> JointVector {
         let mut clamped = *positions;
         for (q, joint) in clamped.iter_mut().zip(&self.joints) {
             *q = q.clamp(joint.lower, joint.upper);
@@ -231,16 +232,12 @@ impl Reach {
     }
 
     /// Random positions within the limits.
-    pub fn random(&self, random: &mut impl Rng) -> Positions {
-        let mut positions = [0.0; MAX_JOINTS];
-        for (q, joint) in positions.iter_mut().zip(&self.joints) {
-            *q = random.random_range(joint.lower..joint.upper);
-        }
-        positions
+    pub fn random(&self, random: &mut impl Rng) -> JointVector {
+        JointVector::from_fn(self.joints.len(), |j| random.random_range(self.joints[j].lower..self.joints[j].upper))
     }
 
     /// Descends from `seed` to positions within the limits that meet the target.
-    pub fn descend(&self, target: &Target, seed: &Positions) -> Option<Positions> {
+    pub fn descend(&self, target: &Target, seed: &JointVector) -> Option<JointVector> {
         let mut positions = self.clamp(seed);
         for _ in 0..MAX_ITERATIONS {
             let (axes, tip) = self.axes(&positions);
@@ -274,12 +271,12 @@ impl Reach {
     pub fn solutions(
         &self,
         target: &Target,
-        near: &Positions,
+        near: &JointVector,
         wanted: usize,
         attempts: usize,
         random: &mut impl Rng,
-    ) -> Vec<Positions> {
-        let mut found: Vec<Positions> = Vec::new();
+    ) -> Vec<JointVector> {
+        let mut found: Vec<JointVector> = Vec::new();
         let postures = self.postures(target);
         for attempt in 0..attempts {
             for posture in self.attempt(&postures, near, attempt, random) {
@@ -298,15 +295,15 @@ impl Reach {
     pub fn attempt(
         &self,
         postures: &Postures,
-        near: &Positions,
+        near: &JointVector,
         attempt: usize,
         random: &mut impl Rng,
-    ) -> Vec<Positions> {
+    ) -> Vec<JointVector> {
         if attempt == 0 { self.nearest(postures, near) } else { self.anywhere(postures, near, random) }
     }
 
     /// Postures close to `near`, the nearest first. Joints that do not move the link stay where they are there.
-    pub fn nearest(&self, postures: &Postures, near: &Positions) -> Vec<Positions> {
+    pub fn nearest(&self, postures: &Postures, near: &JointVector) -> Vec<JointVector> {
         let (Some(arm), Some(arcs)) = (&self.spherical, &postures.arcs) else {
             return self.descend(&postures.target, near).into_iter().collect();
         };
@@ -324,7 +321,7 @@ impl Reach {
 
     /// Postures anywhere, the nearest to `near` first. Joints that do not move the link stay where they are there half of the time: elsewhere
     /// they may be in nobody's way.
-    pub fn anywhere(&self, postures: &Postures, near: &Positions, random: &mut impl Rng) -> Vec<Positions> {
+    pub fn anywhere(&self, postures: &Postures, near: &JointVector, random: &mut impl Rng) -> Vec<JointVector> {
         let stays = self.others.is_empty() || random.random_bool(0.5);
         let others = if stays { *near } else { self.random(random) };
         let Some(arcs) = &postures.arcs else {
@@ -345,19 +342,16 @@ impl Reach {
     }
 
     /// The postures within the limits with the elbow at this bend and turn, in closed form, and the other joints as in `others`.
-    fn solve(&self, postures: &Postures, bend: f64, turn: f64, others: &Positions) -> Vec<Positions> {
+    fn solve(&self, postures: &Postures, bend: f64, turn: f64, others: &JointVector) -> Vec<JointVector> {
         let target = &postures.target;
         let Some(arm) = &self.spherical else { return Vec::new() };
         // At the end of an arc a joint is at its limit, but for rounding.
-        let clamped = arm.solve(&target.pose, bend, turn).into_iter().map(|mut posture| {
-            self.others.iter().for_each(|joint| posture[*joint] = others[*joint]);
-            self.clamp(&posture)
-        });
+        let clamped = arm.solve(&target.pose, bend, turn, others).into_iter().map(|posture| self.clamp(&posture));
         clamped.filter(|posture| target.is_met_by(&self.pose(posture))).collect()
     }
 
     /// Each joint's axis and a point on it, in the root's frame; and the frame.
-    fn axes(&self, positions: &Positions) -> (Vec<Axis>, Pose) {
+    fn axes(&self, positions: &JointVector) -> (Vec<Axis>, Pose) {
         let mut axes = Vec::with_capacity(self.chain.len());
         let mut pose = Pose::IDENTITY;
         for (origin, drive) in &self.chain {
@@ -371,7 +365,7 @@ impl Reach {
 
 /// Rows: the velocity of the tip and its angular velocity per joint, as seen from frames turned by `views`; those that are not minded
 /// are zero.
-fn jacobian(axes: &[Axis], tip: &Pose, views: &[Pose; 2], minded: [bool; 6]) -> [Positions; 6] {
+fn jacobian(axes: &[Axis], tip: &Pose, views: &[Pose; 2], minded: [bool; 6]) -> [Row; 6] {
     let mut rows = [[0.0; MAX_JOINTS]; 6];
     for Axis { direction, point, drive } in axes {
         let (linear, angular) = match drive.slides {
@@ -388,17 +382,17 @@ fn jacobian(axes: &[Axis], tip: &Pose, views: &[Pose; 2], minded: [bool; 6]) -> 
 }
 
 /// Whether a posture is none of these.
-pub(crate) fn is_new(found: &[Positions], posture: &Positions) -> bool {
+pub(crate) fn is_new(found: &[JointVector], posture: &JointVector) -> bool {
     found.iter().all(|other| distance(other, posture) > SAME)
 }
 
-fn sorted(mut postures: Vec<Positions>, near: &Positions) -> Vec<Positions> {
+fn sorted(mut postures: Vec<JointVector>, near: &JointVector) -> Vec<JointVector> {
     postures.sort_by(|a, b| distance(a, near).total_cmp(&distance(b, near)));
     postures
 }
 
 /// The Euclidean distance.
-pub fn distance(a: &Positions, b: &Positions) -> f64 {
+pub fn distance(a: &JointVector, b: &JointVector) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
 }
 
@@ -428,7 +422,7 @@ fn between_directions(from: [f64; 3], to: [f64; 3]) -> [f64; 3] {
 }
 
 /// Jᵀ (J Jᵀ + λ I)⁻¹ e; `None` where the system is singular.
-fn damped_step(jacobian: &[Positions; 6], error: &[f64; 6], damping: f64, joints: usize) -> Option<Positions> {
+fn damped_step(jacobian: &[Row; 6], error: &[f64; 6], damping: f64, joints: usize) -> Option<Row> {
     let mut system = [[0.0; 7]; 6];
     for row in 0..6 {
         for column in 0..6 {

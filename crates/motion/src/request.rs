@@ -1,9 +1,10 @@
 //! What the planner is asked for.
 
 use crate::constrained::LEAST_TOLERANCE;
+use crate::joint_vector::JointVector;
 use crate::keep::Keep;
 use crate::plan::PlanError;
-use crate::robot::{Configuration, Joint, Joints, Robot};
+use crate::robot::{Configuration, Joint, Robot};
 use crate::straight::Straight;
 use crate::tool_speed::ToolSpeed;
 use crate::way_points::WayPoints;
@@ -40,7 +41,7 @@ pub struct Request {
     /// Fraction of the joints' velocity and acceleration limits.
     pub speed: f64,
     /// Fractions of the joints' limits of velocity (beside `speed`), acceleration (beside `speed`) and jerk, joint by joint.
-    pub scales: [Joints; 3],
+    pub scales: [JointVector; 3],
     /// How fast the tool may be.
     pub tool_speed: ToolSpeed,
     /// The same seed, scene and iterations give the same plan.
@@ -53,7 +54,7 @@ pub struct Request {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Goal {
     /// A posture.
-    Joints(Joints),
+    Joints(JointVector),
     /// The tool frame in the world frame.
     Pose(Pose),
 }
@@ -71,7 +72,7 @@ impl Request {
             keep: Keep::default(),
             reaches_into: Vec::new(),
             speed: 1.0,
-            scales: [[1.0; 7]; 3],
+            scales: [JointVector::all(start.arm.len(), 1.0); 3],
             tool_speed: ToolSpeed::default(),
             seed: 0,
             improvement_iterations: 0,
@@ -97,6 +98,17 @@ impl Request {
         };
         if !(MIN_SPEED..=1.0).contains(&self.speed) {
             return malformed("speed", self.speed.to_string(), &format!("a fraction from {MIN_SPEED} to 1"));
+        }
+        let joints = robot.arm_joints().len();
+        let expected = || format!("{joints}, one for each joint of the arm of {}", robot.name());
+        let asked = self.goals.iter().filter_map(|goal| match goal {
+            Goal::Joints(joints) => Some(("the number of a goal's positions", joints)),
+            Goal::Pose(_) => None,
+        });
+        let scales = self.scales.iter().map(|scales| ("the number of a scale's values", scales));
+        let start = std::iter::once(("the number of the start's positions", &self.start.arm));
+        if let Some((what, vector)) = start.chain(asked).chain(scales).find(|(_, vector)| vector.len() != joints) {
+            return malformed(what, vector.len().to_string(), &expected());
         }
         self.depart.check("depart", scene)?;
         self.approach.check("approach", scene)?;
@@ -156,7 +168,7 @@ pub(crate) struct Outside {
 /// The first joint of arm, head and fingers that is beyond its limits.
 pub(crate) fn outside_of_limits(robot: &Robot, at: &Configuration) -> Option<Outside> {
     let head = || outside(&[at.pan, at.tilt], robot.head_joints(), "rad");
-    let fingers = || outside(&[at.finger], std::slice::from_ref(robot.finger()), "m");
+    let fingers = || outside(&[at.finger], robot.finger().map_or(&[], std::slice::from_ref), "m");
     outside(&at.arm, robot.arm_joints(), "rad").or_else(head).or_else(fingers)
 }
 

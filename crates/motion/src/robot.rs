@@ -1,75 +1,64 @@
-//! Our mobile manipulator: the indices by which its parts are known in the one model of a robot, and its state by names.
+//! A robot with its parts: an arm, and where it has them a gripper, a base, a head and a camera.
 //!
-//! Positions are `f64` throughout; only shapes and the poses handed to parry3d are `f32`. A [`Configuration`] names the 13
-//! degrees of freedom. Planning moves the seven arm joints; the others are where a configuration has them.
+//! Which joints and links those are is data ([`RobotDescription`]); the robots that we ship are read the same way. Positions are `f64`
+//! throughout; only shapes and the poses handed to parry3d are `f32`. A [`Configuration`] says by parts where all of them are.
+//! Planning moves the arm; the others are where a configuration has them, joints of no part at zero or at the limit next to it.
 
+use crate::description::RobotDescription;
 pub use crate::geometry::{Body, Geometry};
-use crate::mechanism::{Mechanism, MechanismError};
+use crate::joint_vector::JointVector;
+use crate::mechanism::{MAX_JOINTS, Mechanism, MechanismError};
+use crate::mesh::MeshError;
 pub use crate::robot_model::{Drive, Joint, Link, RobotModel};
+use crate::robot_state::RobotState;
 pub use crate::urdf::RobotError;
 pub use crate::urdf_faults::UrdfFault;
 use parry3d::math::{Pose as Pose32, Rotation, Vector};
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
-use std::ops::Range;
 
-/// Positions of the seven arm joints, in radians.
-pub type Joints = [f64; 7];
-
-/// How many degrees of freedom the robot has.
-pub const DEGREES_OF_FREEDOM: usize = 13;
-
-/// The URDF's joints in the order of the degrees of freedom.
-const JOINT_NAMES: [&str; DEGREES_OF_FREEDOM] = [
-    "base_x",
-    "base_y",
-    "base_yaw",
-    "arm_joint_1",
-    "arm_joint_2",
-    "arm_joint_3",
-    "arm_joint_4",
-    "arm_joint_5",
-    "arm_joint_6",
-    "arm_joint_7",
-    "pan",
-    "tilt",
-    "finger",
-];
-
-/// The arm's joints, those of the head and that of the fingers among the degrees of freedom.
-const ARM: Range<usize> = 3..10;
-const PAN: usize = 10;
-const TILT: usize = 11;
-const FINGER: usize = 12;
-
-/// The robot that we ship.
-const AIMM_URDF: &str = include_str!("../robots/aimm.urdf");
-const AIMM_SRDF: &str = include_str!("../robots/aimm.srdf");
-
-/// A robot with this arm, base, head and gripper.
+/// A robot with an arm.
 #[derive(Debug, Clone)]
 pub struct Robot {
-    /// Its joints are in the order of the degrees of freedom; its first link is the world.
+    /// All links and joints.
     pub model: RobotModel,
-    /// Link indices: the tool frame, the camera's optical frame, the frame the arm is mounted at.
+    /// The tool frame, by the index of its link.
     pub tool: usize,
-    /// The camera's optical frame: z forward, x right, y down.
-    pub camera: usize,
-    /// The fixed foot of the arm.
-    pub arm_foot: usize,
     /// The links that an arm joint moves, parents before children.
     pub arm_links: Vec<usize>,
     /// For each arm joint the link that it moves.
-    pub arm_joint_links: [usize; 7],
+    pub arm_joint_links: Vec<usize>,
+    description: RobotDescription,
+    arm: Part,
+    base: Option<Part>,
+    head: Option<Part>,
+    finger: Option<Part>,
+    /// The camera's optical frame: z forward, x right, y down.
+    camera: Option<usize>,
+    /// The link that carries the fingers, and a finger.
+    gripper: Option<[usize; 2]>,
+    /// The base's body.
+    body: Option<usize>,
+    postures: Vec<(String, JointVector)>,
+    /// Where all joints are before a configuration says otherwise.
+    neutral: Vec<f64>,
 }
 
-/// Positions of all degrees of freedom.
+/// Joints of a robot that belong together.
+#[derive(Debug, Clone)]
+struct Part {
+    /// Among the model's joints.
+    indices: Vec<usize>,
+    joints: Vec<Joint>,
+}
+
+/// Where the parts of a robot are. What it does not have does not count.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Configuration {
     /// x and y in metres, yaw in radians, in the world frame.
     pub base: [f64; 3],
     /// Arm joints.
-    pub arm: Joints,
+    pub arm: JointVector,
     /// Radians, positive to the left.
     pub pan: f64,
     /// Radians, positive downwards.
@@ -78,80 +67,233 @@ pub struct Configuration {
     pub finger: f64,
 }
 
-impl Configuration {
-    /// A robot at the world's origin with everything else at zero.
-    pub const ZERO: Configuration = Configuration { base: [0.0; 3], arm: [0.0; 7], pan: 0.0, tilt: 0.0, finger: 0.0 };
+/// Why a description and a URDF make no robot.
+#[derive(Debug, thiserror::Error)]
+pub enum RobotFault {
+    /// URDF, SRDF or a mesh is not right, or a name is not in them.
+    #[error(transparent)]
+    Model(#[from] MechanismError),
+    /// The arm has no joints, or too many.
+    #[error("`arm.joints` has {count} joints: expected 1 to {MAX_JOINTS}")]
+    ArmJoints {
+        /// How many.
+        count: usize,
+    },
+    /// A joint of the arm that does not move the tool.
+    #[error("the joint `{joint}` of the arm does not move its tool, the link `{tool}`")]
+    Beside {
+        /// The joint.
+        joint: String,
+        /// The tool.
+        tool: String,
+    },
+    /// A posture that the arm cannot take.
+    #[error("the posture `{posture}` {reason}")]
+    Posture {
+        /// Its name.
+        posture: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
 
+/// The robots that we ship: name, description, URDF and SRDF.
+const BUILT_IN: [(&str, &str, &str, &str); 1] = [(
+    "aimm",
+    include_str!("../robots/aimm.toml"),
+    include_str!("../robots/aimm.urdf"),
+    include_str!("../robots/aimm.srdf"),
+)];
+
+impl Configuration {
     /// The base taken from a pose on the floor: its x, y and yaw.
     pub fn with_base(self, base: &Pose) -> Configuration {
-        let heading = base.rotate([1.0, 0.0, 0.0]);
-        Configuration { base: [base.position[0], base.position[1], heading[1].atan2(heading[0])], ..self }
+        Configuration { base: on_floor(base), ..self }
     }
 
-    /// The positions in the order of the degrees of freedom.
-    pub fn positions(&self) -> [f64; DEGREES_OF_FREEDOM] {
-        let mut positions = [0.0; DEGREES_OF_FREEDOM];
-        positions[..ARM.start].copy_from_slice(&self.base);
-        positions[ARM].copy_from_slice(&self.arm);
-        (positions[PAN], positions[TILT], positions[FINGER]) = (self.pan, self.tilt, self.finger);
-        positions
+    /// All positions: of the base, the arm, pan, tilt and finger.
+    pub fn values(&self) -> Vec<f64> {
+        [&self.base[..], &self.arm[..], &[self.pan, self.tilt, self.finger]].concat()
     }
 }
 
 impl Robot {
     /// The robot of the paper: omnidirectional base, KUKA LWR 4+, pan-tilt unit, two-finger gripper.
     pub fn aimm() -> Robot {
-        #[expect(clippy::expect_used, reason = "the description is compiled in and read by every test")]
-        Robot::read(AIMM_URDF, AIMM_SRDF).expect("the built-in robot description is valid")
+        #[expect(clippy::expect_used, reason = "it is compiled in and read by every test")]
+        Robot::built_in("aimm").expect("it is built in")
     }
 
-    /// Reads a robot with the joint and link names of our URDF; its SRDF says which links are not checked against each other.
+    /// The names of the robots that we ship.
+    pub fn built_in_names() -> impl Iterator<Item = &'static str> {
+        BUILT_IN.into_iter().map(|(name, ..)| name)
+    }
+
+    /// The robot of this name that we ship.
+    pub fn built_in(name: &str) -> Option<Robot> {
+        let (_, description, urdf, srdf) = BUILT_IN.into_iter().find(|(known, ..)| *known == name)?;
+        let read = RobotDescription::read(description).and_then(|description| {
+            let no_meshes = &mut |_: &str| Err(MeshError::Read { reason: "there are none".to_owned() });
+            Robot::of(description, urdf, Some(srdf), no_meshes).map_err(|error| error.to_string())
+        });
+        match read {
+            Ok(robot) => Some(robot),
+            Err(error) => unreachable!("the built-in robot {name}: {error}"),
+        }
+    }
+
+    /// Holds a description against the URDF and SRDF that it names; `load` gives what is in a mesh file that the URDF names.
     ///
     /// # Errors
-    /// [`MechanismError`] names the link or joint.
-    pub fn read(urdf: &str, srdf: &str) -> Result<Robot, MechanismError> {
-        let model = RobotModel::read(urdf, Some(srdf))?.in_order(&JOINT_NAMES)?;
-        let find =
-            |name: &str| model.link(name).ok_or_else(|| RobotError::Missing { what: "link", name: name.to_owned() });
-        let (tool, camera, arm_foot) = (find("tool")?, find("camera")?, find("arm_0")?);
-        let mut arm_joint_links = [0; 7];
-        let mut on_arm = vec![false; model.links.len()];
-        for (i, link) in model.links.iter().enumerate() {
-            on_arm[i] = link.parent.is_some_and(|p| on_arm[p]);
-            if let Some(Drive { joint, .. }) = link.drive
-                && ARM.contains(&joint)
-            {
-                on_arm[i] = true;
-                arm_joint_links[joint - ARM.start] = i;
-            }
+    /// [`RobotFault`] names the link, joint or posture that does not fit.
+    pub fn of(
+        description: RobotDescription,
+        urdf: &str,
+        srdf: Option<&str>,
+        load: &mut dyn FnMut(&str) -> Result<Vec<u8>, MeshError>,
+    ) -> Result<Robot, RobotFault> {
+        let model = RobotModel::read_with_meshes(urdf, srdf, load)?;
+        let link = |name: &str| {
+            let missing = || RobotError::Missing { what: "link", name: name.to_owned() };
+            model.link(name).ok_or_else(missing).map_err(MechanismError::Robot)
+        };
+        let RobotDescription { arm, gripper, base, head, camera, postures, .. } = &description;
+        if !(1..=MAX_JOINTS).contains(&arm.joints.len()) {
+            return Err(RobotFault::ArmJoints { count: arm.joints.len() });
         }
-        let arm_links = (0..model.links.len()).filter(|i| on_arm[*i]).collect();
-        Ok(Robot { model, tool, camera, arm_foot, arm_links, arm_joint_links })
+        let part = |names: &[String]| Part::of(&model, names);
+        let tool = link(&arm.tool)?;
+        let arm_part = part(&arm.joints)?;
+        let base_part = base.as_ref().map(|base| part(&base.joints)).transpose()?;
+        let head_part = head.as_ref().map(|head| part(&head.joints)).transpose()?;
+        let finger = gripper.as_ref().map(|gripper| part(std::slice::from_ref(&gripper.joint))).transpose()?;
+        let camera = camera.as_ref().map(|camera| link(&camera.link)).transpose()?;
+        let body = base.as_ref().map(|base| link(&base.body)).transpose()?;
+        let gripper = match gripper {
+            Some(gripper) => Some([link(&gripper.hand)?, link(&gripper.finger)?]),
+            None => None,
+        };
+        let arm_joint_links = arm_part.links_to(&model, tool)?;
+        let arm_links = arm_part.moved_links(&model);
+        let posture = |(name, values): (&String, &Vec<f64>)| Ok((name.clone(), arm_part.posture(name, values)?));
+        let postures = postures.iter().map(posture).collect::<Result<Vec<_>, RobotFault>>()?;
+        let neutral = RobotState::neutral(&model).positions().to_vec();
+        Ok(Robot {
+            model,
+            tool,
+            arm_links,
+            arm_joint_links,
+            arm: arm_part,
+            base: base_part,
+            head: head_part,
+            finger,
+            camera,
+            gripper,
+            body,
+            postures,
+            neutral,
+            description,
+        })
+    }
+
+    /// What messages call it.
+    pub fn name(&self) -> &str {
+        &self.description.name
+    }
+
+    /// Everything at zero, or at the limit next to it, at the world's origin.
+    pub fn at_zero(&self) -> Configuration {
+        let at = |part: &Option<Part>, j: usize| part.as_ref().map_or(0.0, |part| self.neutral[part.indices[j]]);
+        Configuration {
+            base: [0.0; 3],
+            arm: JointVector::from_fn(self.arm.indices.len(), |j| self.neutral[self.arm.indices[j]]),
+            pan: at(&self.head, 0),
+            tilt: at(&self.head, 1),
+            finger: at(&self.finger, 0),
+        }
+    }
+
+    /// From what [`Configuration::values`] gives; none for another number of them.
+    pub fn configuration(&self, values: &[f64]) -> Option<Configuration> {
+        let arm = self.arm.joints.len();
+        if values.len() != arm + 6 {
+            return None;
+        }
+        let (arm, rest) = values[3..].split_at(arm);
+        let arm = JointVector::read(arm).ok()?;
+        let base = [values[0], values[1], values[2]];
+        Some(Configuration { base, arm, pan: rest[0], tilt: rest[1], finger: rest[2] })
+    }
+
+    /// A posture of the description by its name.
+    pub fn posture(&self, name: &str) -> Option<JointVector> {
+        self.postures.iter().find(|(known, _)| known == name).map(|(_, posture)| *posture)
+    }
+
+    /// The postures of the description with their names.
+    pub fn postures(&self) -> &[(String, JointVector)] {
+        &self.postures
+    }
+
+    /// Positions of the model's joints.
+    fn positions(&self, configuration: &Configuration) -> Vec<f64> {
+        let mut positions = self.neutral.clone();
+        let Configuration { base, arm, pan, tilt, finger } = configuration;
+        let mut put = |part: Option<&Part>, values: &[f64]| {
+            for (index, value) in part.into_iter().flat_map(|part| &part.indices).zip(values) {
+                positions[*index] = *value;
+            }
+        };
+        put(self.base.as_ref(), base);
+        put(Some(&self.arm), arm);
+        put(self.head.as_ref(), &[*pan, *tilt]);
+        put(self.finger.as_ref(), &[*finger]);
+        positions
     }
 
     /// What is planned for where the arm alone moves, and everything else is as in a configuration.
     pub(crate) fn arm(&self, configuration: &Configuration) -> Mechanism {
-        self.model.restricted(&ARM.collect::<Vec<usize>>(), &configuration.positions())
+        self.model.restricted(&self.arm.indices, &self.positions(configuration))
     }
 
-    /// The limits of the seven arm joints.
+    /// The limits of the arm's joints.
     pub fn arm_joints(&self) -> &[Joint] {
-        &self.model.joints[ARM]
+        &self.arm.joints
     }
 
-    /// The limits of the base's x, y and heading.
+    /// The limits of the base's x, y and heading; none of a robot that stands.
     pub fn base_joints(&self) -> &[Joint] {
-        &self.model.joints[..ARM.start]
+        self.base.as_ref().map_or(&[], |base| &base.joints)
     }
 
-    /// The finger joint: its upper limit is half of the greatest opening.
-    pub fn finger(&self) -> &Joint {
-        &self.model.joints[FINGER]
+    /// The finger's joint: its upper limit is half of the greatest opening. None of a robot without a gripper.
+    pub fn finger(&self) -> Option<&Joint> {
+        self.finger.as_ref().map(|finger| &finger.joints[0])
     }
 
-    /// The limits of the head's pan and tilt.
+    /// Half of the widest that the fingers open, in metres; 0 without a gripper.
+    pub fn open_finger_m(&self) -> f64 {
+        self.finger().map_or(0.0, |finger| finger.upper)
+    }
+
+    /// The limits of pan and tilt; none of a robot without a head.
     pub fn head_joints(&self) -> &[Joint] {
-        &self.model.joints[PAN..=TILT]
+        self.head.as_ref().map_or(&[], |head| &head.joints)
+    }
+
+    /// The link that carries the fingers.
+    pub fn hand(&self) -> Option<usize> {
+        self.gripper.map(|[hand, _]| hand)
+    }
+
+    /// A finger.
+    pub fn finger_link(&self) -> Option<usize> {
+        self.gripper.map(|[_, finger]| finger)
+    }
+
+    /// The body of the base, on top of which things ride along.
+    pub fn body(&self) -> Option<usize> {
+        self.body
     }
 
     /// The index of a link.
@@ -159,14 +301,14 @@ impl Robot {
         self.model.link(name)
     }
 
-    /// The pose of every link in the world frame.
+    /// Poses of all links in the world frame.
     pub fn poses(&self, configuration: &Configuration) -> Vec<Pose> {
-        self.model.poses(&configuration.positions())
+        self.model.poses(&self.positions(configuration))
     }
 
-    /// Recomputes in place the poses of the links that hang on the arm.
-    pub fn update_arm(&self, configuration: &Configuration, poses: &mut [Pose]) {
-        self.model.update(&self.arm_links, &configuration.positions(), poses);
+    /// Recomputes in place what the arm moves; the rest of the configuration is as when the poses were computed.
+    pub(crate) fn update_arm(&self, configuration: &Configuration, poses: &mut [Pose]) {
+        self.model.update(&self.arm_links, &self.positions(configuration), poses);
     }
 
     /// The pose of one link in the world frame.
@@ -179,22 +321,23 @@ impl Robot {
         self.pose(configuration, self.tool)
     }
 
-    /// The camera's optical frame in the world frame.
-    pub fn camera_pose(&self, configuration: &Configuration) -> Pose {
-        self.pose(configuration, self.camera)
+    /// The camera's optical frame in the world frame; none of a robot without a camera.
+    pub fn camera_pose(&self, configuration: &Configuration) -> Option<Pose> {
+        self.camera.map(|camera| self.pose(configuration, camera))
     }
 
     /// Pan and tilt that point the camera at a point of the world, held within their limits.
     pub fn look_at(&self, base: &Pose, target: [f64; 3]) -> (f64, f64) {
-        let mut looking = Configuration::ZERO.with_base(base);
+        let mut looking = self.at_zero().with_base(base);
+        let [pan, tilt] = self.head_joints() else { return (looking.pan, looking.tilt) };
         // The optical centre sits off the tilt axis: a few rounds make up for it.
         for _ in 0..8 {
-            let camera = self.camera_pose(&looking);
+            let Some(camera) = self.camera_pose(&looking) else { break };
             let seen = camera.inverse().transform(target);
             let pan_step = -(seen[0]).atan2((seen[2].powi(2) + seen[1].powi(2)).sqrt());
             let tilt_step = seen[1].atan2(seen[2]);
-            looking.pan = (looking.pan + pan_step).clamp(self.head_joints()[0].lower, self.head_joints()[0].upper);
-            looking.tilt = (looking.tilt + tilt_step).clamp(self.head_joints()[1].lower, self.head_joints()[1].upper);
+            looking.pan = (looking.pan + pan_step).clamp(pan.lower, pan.upper);
+            looking.tilt = (looking.tilt + tilt_step).clamp(tilt.lower, tilt.upper);
         }
         (looking.pan, looking.tilt)
     }
@@ -207,13 +350,65 @@ impl Robot {
     }
 
     /// The joints held within their limits.
-    pub fn clamp(&self, arm: &Joints) -> Joints {
+    pub fn clamp(&self, arm: &JointVector) -> JointVector {
         let mut clamped = *arm;
         for (q, joint) in clamped.iter_mut().zip(self.arm_joints()) {
             *q = q.clamp(joint.lower, joint.upper);
         }
         clamped
     }
+}
+
+impl Part {
+    fn of(model: &RobotModel, names: &[String]) -> Result<Part, MechanismError> {
+        if let Some(joint) = names.iter().enumerate().find_map(|(i, name)| names[..i].contains(name).then_some(name)) {
+            return Err(MechanismError::Twice { joint: joint.clone() });
+        }
+        let indices = names.iter().map(|name| model.plannable(name)).collect::<Result<Vec<_>, _>>()?;
+        let joints = indices.iter().map(|index| model.joints[*index].clone()).collect();
+        Ok(Part { indices, joints })
+    }
+
+    /// The links that its joints move, parents before children.
+    fn moved_links(&self, model: &RobotModel) -> Vec<usize> {
+        let mut moved = vec![false; model.links.len()];
+        for (i, link) in model.links.iter().enumerate() {
+            let by_joint = link.drive.is_some_and(|drive| self.indices.contains(&drive.joint));
+            moved[i] = by_joint || link.parent.is_some_and(|parent| moved[parent]);
+        }
+        (0..moved.len()).filter(|i| moved[*i]).collect()
+    }
+
+    /// For each joint the link on the way to the tool that it moves.
+    fn links_to(&self, model: &RobotModel, tool: usize) -> Result<Vec<usize>, RobotFault> {
+        let way: Vec<usize> = std::iter::successors(Some(tool), |index| model.links[*index].parent).collect();
+        let moved = |(index, joint): (&usize, &Joint)| {
+            let is_moved = |link: &&usize| model.links[**link].drive.is_some_and(|drive| drive.joint == *index);
+            let beside = || RobotFault::Beside { joint: joint.name.clone(), tool: model.links[tool].name.clone() };
+            way.iter().rfind(is_moved).copied().ok_or_else(beside)
+        };
+        self.indices.iter().zip(&self.joints).map(moved).collect()
+    }
+
+    fn posture(&self, name: &str, values: &[f64]) -> Result<JointVector, RobotFault> {
+        let wrong = |reason: String| RobotFault::Posture { posture: name.to_owned(), reason };
+        if values.len() != self.joints.len() {
+            return Err(wrong(format!("has {} positions: the arm has {} joints", values.len(), self.joints.len())));
+        }
+        let beyond = |(q, joint): &(&f64, &Joint)| !(joint.lower..=joint.upper).contains(*q);
+        match values.iter().zip(&self.joints).find(beyond) {
+            None => JointVector::read(values).map_err(|error| wrong(error.to_string())),
+            Some((q, Joint { name, lower, upper, .. })) => {
+                Err(wrong(format!("has {name} at {q}: its limits are {lower} to {upper}")))
+            }
+        }
+    }
+}
+
+/// x, y and yaw of a pose on the floor.
+pub fn on_floor(base: &Pose) -> [f64; 3] {
+    let heading = base.rotate([1.0, 0.0, 0.0]);
+    [base.position[0], base.position[1], heading[1].atan2(heading[0])]
 }
 
 /// A pose for parry3d.

@@ -17,7 +17,7 @@ use crate::robot_state::RobotState;
 use crate::spheres::Sphere;
 use crate::urdf::{self, Description, Loader, RobotError};
 use ratn_model::pose::Pose;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 /// How far apart the limits of a joint that is planned for may be, in radians (metres for one that slides).
 const WIDEST: f64 = 1e4;
@@ -204,26 +204,6 @@ impl RobotModel {
         a == b || self.checks.excepted.contains(&(a.min(b), a.max(b)))
     }
 
-    /// The joints in another order, which names each of them once.
-    ///
-    /// # Errors
-    /// [`RobotError::Missing`] names a joint that the robot does not have, [`RobotError::Unsupported`] one that it has beside those.
-    pub(crate) fn in_order(mut self, names: &[&str]) -> Result<RobotModel, RobotError> {
-        let missing = |name: &str| RobotError::Missing { what: "joint", name: name.to_owned() };
-        let order = names.iter().map(|name| self.joint(name).ok_or_else(|| missing(name)));
-        let order = order.collect::<Result<Vec<usize>, _>>()?;
-        if let Some((_, other)) = self.joints.iter().enumerate().find(|(joint, _)| !order.contains(joint)) {
-            let reason = "its name is none of the robot's degrees of freedom";
-            return Err(RobotError::Unsupported { what: "joint", name: other.name.clone(), reason });
-        }
-        let places: BTreeMap<usize, usize> = order.iter().enumerate().map(|(place, joint)| (*joint, place)).collect();
-        for drive in self.links.iter_mut().filter_map(|link| link.drive.as_mut()) {
-            drive.joint = places[&drive.joint];
-        }
-        self.joints = order.iter().map(|joint| self.joints[*joint].clone()).collect();
-        Ok(self)
-    }
-
     /// What is planned for: `joints`, in this order, without any all of them; the others stay where `state` has them.
     ///
     /// # Errors
@@ -269,7 +249,7 @@ impl RobotModel {
     }
 
     /// The index of a joint that can be planned for.
-    fn plannable(&self, name: &str) -> Result<usize, RobotError> {
+    pub(crate) fn plannable(&self, name: &str) -> Result<usize, RobotError> {
         let unsupported = |reason| RobotError::Unsupported { what: "joint", name: name.to_owned(), reason };
         if self.mimics.contains(name) {
             return Err(unsupported("it follows another joint and cannot be planned for"));

@@ -21,6 +21,15 @@ use std::sync::Arc;
 /// Positions in the order of the joints; unused ones are zero.
 pub type State = [f32; MAX_JOINTS];
 
+/// A posture for the vector checks.
+pub fn state(positions: &[f64]) -> State {
+    let mut state = [0.0; MAX_JOINTS];
+    for (to, from) in state.iter_mut().zip(positions) {
+        *to = *from as f32;
+    }
+    state
+}
+
 /// Grown by this, the spheres hide the rounding of `f32`, in metres.
 const ROUNDING_M: f64 = 2e-5;
 

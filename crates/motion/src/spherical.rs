@@ -5,7 +5,7 @@
 //! Manipulation*, 3.3).
 
 use crate::frame::{compose, cross, difference, norm, rotate};
-use crate::reach::Positions;
+use crate::joint_vector::JointVector;
 use crate::robot_model::Drive;
 use ratn_model::pose::Pose;
 use std::f64::consts::{PI, TAU};
@@ -57,7 +57,7 @@ impl Spherical {
     }
 
     /// How far the elbow of a posture is turned about the line from shoulder to wrist, as [`Spherical::solve`] counts it.
-    pub(crate) fn turn(&self, positions: &Positions) -> f64 {
+    pub(crate) fn turn(&self, positions: &JointVector) -> f64 {
         let q: [f64; 7] = std::array::from_fn(|i| positions[self.joints[i]]);
         let shoulder = self.three(0, [q[0], q[1], q[2]]);
         let reach = difference(self.bent(q[3]), self.shoulder);
@@ -74,15 +74,16 @@ impl Spherical {
         self.bends(norm(difference(motion.transform(self.wrist), self.shoulder)))
     }
 
-    /// All postures, limits aside, that bring the frame to a pose with the elbow at one of its bends and at this turn.
-    pub(crate) fn solve(&self, target: &Pose, bend: f64, turn: f64) -> Vec<Positions> {
+    /// All postures, limits aside, that bring the frame to a pose with the elbow at one of its bends and at this turn. Joints that are
+    /// none of the arm's are as in `others`.
+    pub(crate) fn solve(&self, target: &Pose, bend: f64, turn: f64, others: &JointVector) -> Vec<JointVector> {
         let motion = self.motion(target);
         let mut solutions = Vec::new();
         for first in self.turns(0, &self.turned_shoulder(&motion, bend, turn)) {
             // The turns themselves, not what they should be, so that errors do not add up.
             let wrist = self.turned_wrist(&motion, bend, &self.three(0, first));
             for last in self.turns(4, &wrist) {
-                let mut positions = [0.0; crate::mechanism::MAX_JOINTS];
+                let mut positions = *others;
                 let all = first.into_iter().chain([bend]).chain(last);
                 for (joint, value) in self.joints.iter().zip(all) {
                     positions[*joint] = wrapped(value);

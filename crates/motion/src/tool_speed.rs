@@ -5,9 +5,9 @@
 //! close as a thousandth. Where a limit is exceeded the whole motion is slowed by one factor, so that its fastest moment keeps the limit:
 //! whatever else held goes on to hold, and nothing but the time changes. Any robot.
 
-use crate::mechanism::MAX_JOINTS;
+use crate::joint_vector::JointVector;
 use crate::plan::PlanError;
-use crate::reach::{Positions, Reach};
+use crate::reach::Reach;
 use crate::trajectory::{Curve, Knot};
 
 /// How close the bound is, as a share.
@@ -40,7 +40,7 @@ impl ToolSpeed {
     }
 
     /// The curve, slowed where the frame of `reach` would be too fast on it.
-    pub fn keep<const N: usize>(&self, reach: &Reach, curve: Curve<N>) -> Curve<N> {
+    pub fn keep(&self, reach: &Reach, curve: Curve) -> Curve {
         let limits = [self.m_per_s, self.rad_per_s].map(|limit| limit.unwrap_or(f64::INFINITY));
         if limits == [f64::INFINITY; 2] {
             return curve;
@@ -52,8 +52,8 @@ impl ToolSpeed {
 }
 
 /// The same motion in so many times the time.
-fn slowed<const N: usize>(curve: &Curve<N>, factor: f64) -> Curve<N> {
-    let slow = |knot: &Knot<N>| Knot {
+fn slowed(curve: &Curve, factor: f64) -> Curve {
+    let slow = |knot: &Knot| Knot {
         time_s: knot.time_s * factor,
         positions: knot.positions,
         velocities: knot.velocities.map(|v| v / factor),
@@ -62,12 +62,7 @@ fn slowed<const N: usize>(curve: &Curve<N>, factor: f64) -> Curve<N> {
 }
 
 /// Bounds of the tool's greatest speed and turning on the curve: at most [`CLOSE`] above what they are, or no more than `limits`.
-fn greatest<const N: usize>(reach: &Reach, curve: &Curve<N>, limits: [f64; 2]) -> [f64; 2] {
-    let padded = |joints: [f64; N]| {
-        let mut positions: Positions = [0.0; MAX_JOINTS];
-        positions[..N].copy_from_slice(&joints);
-        positions
-    };
+fn greatest(reach: &Reach, curve: &Curve, limits: [f64; 2]) -> [f64; 2] {
     let mut enough = limits;
     let mut bounds = [0.0_f64; 2];
     for (i, pair) in curve.knots().windows(2).enumerate() {
@@ -75,10 +70,10 @@ fn greatest<const N: usize>(reach: &Reach, curve: &Curve<N>, limits: [f64; 2]) -
         let mut pieces = vec![[0.0, pair[1].time_s - pair[0].time_s]];
         while let Some([from, to]) = pieces.pop() {
             let (middle, half) = ((from + to) / 2.0, (to - from) / 2.0);
-            let velocities = padded(cubics.map(|cubic| cubic.velocity_at(middle)));
-            let speeds = reach.speeds(&padded(cubics.map(|cubic| cubic.position_at(middle))), &velocities);
-            let faster = padded(cubics.map(|c| half * c.acceleration_at(from).abs().max(c.acceleration_at(to).abs())));
-            let fastest: Positions = std::array::from_fn(|j| velocities[j].abs() + faster[j]);
+            let velocities = cubics.map(|cubic| cubic.velocity_at(middle));
+            let speeds = reach.speeds(&cubics.map(|cubic| cubic.position_at(middle)), &velocities);
+            let faster = cubics.map(|c| half * c.acceleration_at(from).abs().max(c.acceleration_at(to).abs()));
+            let fastest = JointVector::from_fn(velocities.len(), |j| velocities[j].abs() + faster[j]);
             let further = fastest.map(|v| half * v);
             let levers = reach.levers();
             let above = [

@@ -1,33 +1,28 @@
 //! A trajectory of the arm, or of the base, as a curve: cubic Hermite interpolation between its points.
 
 use crate::cubic::Cubic;
+use crate::joint_vector::{JointVector, PerJoint};
 use crate::robot::{Joint, Robot};
 use ratn_model::value::{Trajectory, TrajectoryPoint};
 
 /// The most points that a trajectory may have.
 pub const MAX_POINTS: usize = 100_000;
 
-/// A well-formed trajectory of `N` joints.
+/// A well-formed trajectory of an arm's joints, or of a base (x, y and heading); at least one knot, all of the same joints.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Curve<const N: usize> {
-    knots: Vec<Knot<N>>,
+pub struct Curve {
+    knots: Vec<Knot>,
 }
-
-/// Of the seven arm joints.
-pub type ArmTrajectory = Curve<7>;
-
-/// Of the base: x, y and heading.
-pub type BaseTrajectory = Curve<3>;
 
 /// Where the joints are, and how fast, at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Knot<const N: usize = 7> {
+pub struct Knot<P = JointVector> {
     /// Seconds since the start.
     pub time_s: f64,
     /// Radians, or metres where a joint slides.
-    pub positions: [f64; N],
+    pub positions: P,
     /// The same per second.
-    pub velocities: [f64; N],
+    pub velocities: P,
 }
 
 /// A trajectory that is not one of these joints.
@@ -57,32 +52,25 @@ pub enum TrajectoryError {
     },
 }
 
-impl ArmTrajectory {
-    /// Reads a trajectory of the task model.
+impl Curve {
+    /// From knots of the same joints, at least one, whose times grow from 0.
+    pub(crate) fn new(knots: Vec<Knot>) -> Curve {
+        Curve { knots }
+    }
+
+    /// Reads a trajectory of a robot's arm.
     ///
     /// # Errors
     /// [`TrajectoryError`] where it is not one of this arm, or its times do not grow strictly from 0.
-    pub fn read(robot: &Robot, trajectory: &Trajectory) -> Result<ArmTrajectory, TrajectoryError> {
+    pub fn of_arm(robot: &Robot, trajectory: &Trajectory) -> Result<Curve, TrajectoryError> {
         Curve::of(robot.arm_joints(), trajectory)
-    }
-
-    /// As a trajectory of the task model.
-    pub fn to_model(&self, robot: &Robot) -> Trajectory {
-        self.named(robot.arm_joints())
-    }
-}
-
-impl<const N: usize> Curve<N> {
-    /// From knots whose times grow from 0.
-    pub(crate) fn new(knots: Vec<Knot<N>>) -> Curve<N> {
-        Curve { knots }
     }
 
     /// Reads a trajectory of these joints.
     ///
     /// # Errors
     /// [`TrajectoryError`] where it is one of others, or its times do not grow strictly from 0.
-    pub fn of(joints: &[Joint], trajectory: &Trajectory) -> Result<Curve<N>, TrajectoryError> {
+    pub fn of(joints: &[Joint], trajectory: &Trajectory) -> Result<Curve, TrajectoryError> {
         let names: Vec<&str> = joints.iter().map(|j| j.name.as_str()).collect();
         if trajectory.joints != names {
             let joints = trajectory.joints.join(", ");
@@ -91,13 +79,15 @@ impl<const N: usize> Curve<N> {
         if trajectory.points.is_empty() || trajectory.points.len() > MAX_POINTS {
             return Err(TrajectoryError::Points { points: trajectory.points.len() });
         }
-        let mut knots: Vec<Knot<N>> = Vec::with_capacity(trajectory.points.len());
+        let mut knots: Vec<Knot> = Vec::with_capacity(trajectory.points.len());
         for (index, point) in trajectory.points.iter().enumerate() {
             let wrong = |reason: String| TrajectoryError::Point { index, reason };
-            let numbers = |values: &[f64], what: &str| -> Result<[f64; N], TrajectoryError> {
-                let joints: [f64; N] =
-                    values.try_into().map_err(|_| wrong(format!("{} {what}, expected {N}", values.len())))?;
-                if joints.iter().all(|v| v.is_finite()) { Ok(joints) } else { Err(wrong(format!("{what} not finite"))) }
+            let numbers = |values: &[f64], what: &str| -> Result<JointVector, TrajectoryError> {
+                if values.len() != joints.len() {
+                    return Err(wrong(format!("{} {what}, expected {}", values.len(), joints.len())));
+                }
+                let read = JointVector::read(values).map_err(|error| wrong(error.to_string()))?;
+                if read.iter().all(|v| v.is_finite()) { Ok(read) } else { Err(wrong(format!("{what} not finite"))) }
             };
             let after = knots.last().map_or(0.0, |k| k.time_s);
             let grows = if index == 0 { point.time_s == 0.0 } else { point.time_s > after && point.time_s.is_finite() };
@@ -112,7 +102,7 @@ impl<const N: usize> Curve<N> {
 
     /// As a trajectory of the task model, with the joints' names.
     pub fn named(&self, joints: &[Joint]) -> Trajectory {
-        let point = |knot: &Knot<N>| TrajectoryPoint {
+        let point = |knot: &Knot| TrajectoryPoint {
             time_s: knot.time_s,
             positions: knot.positions.to_vec(),
             velocities: knot.velocities.to_vec(),
@@ -124,7 +114,7 @@ impl<const N: usize> Curve<N> {
     }
 
     /// The points.
-    pub fn knots(&self) -> &[Knot<N>] {
+    pub fn knots(&self) -> &[Knot] {
         &self.knots
     }
 
@@ -134,37 +124,37 @@ impl<const N: usize> Curve<N> {
     }
 
     /// Where the trajectory ends.
-    pub fn end(&self) -> [f64; N] {
-        self.knots.last().map_or([0.0; N], |k| k.positions)
+    pub fn end(&self) -> JointVector {
+        self.knots[self.knots.len() - 1].positions
     }
 
     /// Where the joints are at a moment; before the start and after the end it stands.
-    pub fn sample(&self, time_s: f64) -> Knot<N> {
+    pub fn sample(&self, time_s: f64) -> Knot {
         let next = self.knots.partition_point(|k| k.time_s <= time_s);
         if next == 0 || next == self.knots.len() {
             let knot = if next == 0 { &self.knots[0] } else { &self.knots[next - 1] };
-            return Knot { time_s, positions: knot.positions, velocities: [0.0; N] };
+            return Knot { time_s, positions: knot.positions, velocities: JointVector::zeros(knot.positions.len()) };
         }
         hermite(&self.knots[next - 1], &self.knots[next], time_s)
     }
 
     /// What each joint does from knot `i` to the next.
-    pub(crate) fn cubics(&self, i: usize) -> [Cubic; N] {
-        std::array::from_fn(|j| Cubic::between(&self.knots[i], &self.knots[i + 1], j))
+    pub(crate) fn cubics(&self, i: usize) -> PerJoint<Cubic> {
+        PerJoint::from_fn(self.knots[i].positions.len(), |j| Cubic::between(&self.knots[i], &self.knots[i + 1], j))
     }
 }
 
-fn hermite<const N: usize>(a: &Knot<N>, b: &Knot<N>, time_s: f64) -> Knot<N> {
+fn hermite(a: &Knot, b: &Knot, time_s: f64) -> Knot {
     let h = b.time_s - a.time_s;
     let t = (time_s - a.time_s) / h;
     let (t2, t3) = (t * t, t * t * t);
-    let positions = std::array::from_fn(|j| {
+    let positions = JointVector::from_fn(a.positions.len(), |j| {
         (2.0 * t3 - 3.0 * t2 + 1.0) * a.positions[j]
             + (t3 - 2.0 * t2 + t) * h * a.velocities[j]
             + (3.0 * t2 - 2.0 * t3) * b.positions[j]
             + (t3 - t2) * h * b.velocities[j]
     });
-    let velocities = std::array::from_fn(|j| {
+    let velocities = JointVector::from_fn(a.positions.len(), |j| {
         6.0 * (t2 - t) / h * (a.positions[j] - b.positions[j])
             + (3.0 * t2 - 4.0 * t + 1.0) * a.velocities[j]
             + (3.0 * t2 - 2.0 * t) * b.velocities[j]

@@ -2,12 +2,12 @@
 
 use crate::connect::{Budget, ConnectError, Route, connect};
 use crate::exact::{Exact, Touch};
-use crate::mechanism::{MAX_JOINTS, Mechanism};
+use crate::mechanism::Mechanism;
 use crate::pace::Control;
 use crate::problems::Problem;
 use crate::robot::Joint;
 use crate::simplify::{path_length, simplify};
-use crate::space::{Isa, Space, State};
+use crate::space::{Isa, Space, State, state};
 
 /// Postures per radian that the exact check looks at: four times those of the search.
 const EXACT_PER_RADIAN: f64 = 4.0 * Space::RESOLUTION as f64;
@@ -126,12 +126,4 @@ fn found(mechanism: &Mechanism, problem: &Problem, route: &Route, path: &[State]
         clamped: Vec::new(),
         touch,
     }
-}
-
-fn state(positions: &[f64]) -> State {
-    let mut state = [0.0; MAX_JOINTS];
-    for (to, from) in state.iter_mut().zip(positions) {
-        *to = *from as f32;
-    }
-    state
 }

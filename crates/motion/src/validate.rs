@@ -2,8 +2,9 @@
 
 use crate::collision::{Checker, Collision, Contact};
 use crate::cubic::Cubic;
-use crate::robot::{Configuration, Joint, Joints, Robot};
-use crate::trajectory::{ArmTrajectory, Curve, Knot, TrajectoryError};
+use crate::joint_vector::{JointVector, PerJoint};
+use crate::robot::{Configuration, Joint, Robot};
+use crate::trajectory::{Curve, Knot, TrajectoryError};
 use ratn_model::value::Trajectory;
 use ratn_world::scene::Scene;
 
@@ -92,8 +93,8 @@ pub fn validate_trajectory(
     here: &Configuration,
     trajectory: &Trajectory,
     contact: Contact,
-) -> Result<ArmTrajectory, Violation> {
-    let trajectory = ArmTrajectory::read(robot, trajectory)?;
+) -> Result<Curve, Violation> {
+    let trajectory = Curve::of_arm(robot, trajectory)?;
     check_start(robot, &here.arm, &trajectory)?;
     check_rest(robot.arm_joints(), &trajectory)?;
     check_limits(robot.arm_joints(), &trajectory)?;
@@ -102,7 +103,7 @@ pub fn validate_trajectory(
     Ok(trajectory)
 }
 
-fn check_start(robot: &Robot, start: &Joints, trajectory: &ArmTrajectory) -> Result<(), Violation> {
+fn check_start(robot: &Robot, start: &JointVector, trajectory: &Curve) -> Result<(), Violation> {
     let knots = trajectory.knots();
     for (j, joint) in robot.arm_joints().iter().enumerate() {
         let planned = knots[0].positions[j];
@@ -115,9 +116,9 @@ fn check_start(robot: &Robot, start: &Joints, trajectory: &ArmTrajectory) -> Res
 }
 
 /// It starts and ends at rest.
-pub(crate) fn check_rest<const N: usize>(joints: &[Joint], trajectory: &Curve<N>) -> Result<(), Violation> {
+pub(crate) fn check_rest(joints: &[Joint], trajectory: &Curve) -> Result<(), Violation> {
     let knots = trajectory.knots();
-    let moves = |knot: &Knot<N>| (0..N).find(|j| knot.velocities[*j].abs() > 1e-3);
+    let moves = |knot: &Knot| (0..joints.len()).find(|j| knot.velocities[*j].abs() > 1e-3);
     match [&knots[0], &knots[knots.len() - 1]].into_iter().find_map(|knot| moves(knot).map(|j| (knot, j))) {
         None => Ok(()),
         Some((knot, j)) => {
@@ -129,18 +130,18 @@ pub(crate) fn check_rest<const N: usize>(joints: &[Joint], trajectory: &Curve<N>
 
 /// Positions, velocities, accelerations and jerks are within the limits, between the knots too: the extremes of the cubics, in closed
 /// form. Where the acceleration steps from one cubic to the next, or from rest, the jerk has no bound.
-pub(crate) fn check_limits<const N: usize>(joints: &[Joint], trajectory: &Curve<N>) -> Result<(), Violation> {
+pub(crate) fn check_limits(joints: &[Joint], trajectory: &Curve) -> Result<(), Violation> {
     let knots = trajectory.knots();
     let exceeded = |j: usize, what, value: f64, limit: f64, time_s| {
         let joint = joints[j].name.clone();
         Err(Violation::Limit { joint, what, value, limit, time_s })
     };
-    let mut before = [0.0; N];
+    let mut before = JointVector::zeros(joints.len());
     for i in 0..knots.len() {
         let is_last = i + 1 == knots.len();
         let lasts_s = if is_last { 0.0 } else { knots[i + 1].time_s - knots[i].time_s };
-        let still = |j: usize| Cubic { position: knots[i].positions[j], ..Cubic::STILL };
-        let cubics = if is_last { std::array::from_fn(still) } else { trajectory.cubics(i) };
+        let still = |j: usize| Cubic { position: knots[i].positions[j], ..Cubic::default() };
+        let cubics = if is_last { PerJoint::from_fn(joints.len(), still) } else { trajectory.cubics(i) };
         let time_s = knots[i].time_s;
         for (j, (joint, cubic)) in joints.iter().zip(&cubics).enumerate() {
             let [least, greatest] = cubic.range(0.0, lasts_s);
@@ -172,7 +173,7 @@ pub(crate) fn check_limits<const N: usize>(joints: &[Joint], trajectory: &Curve<
 
 /// Looks at the middle of a piece of the curve: where there is more room than anything moves from there within the piece, the piece is
 /// free; else its halves are looked at, until they are so short that nothing moves by more than [`RESOLUTION_M`].
-fn check_collisions(checker: &mut Checker<'_>, trajectory: &ArmTrajectory, contact: Contact) -> Result<(), Violation> {
+fn check_collisions(checker: &mut Checker<'_>, trajectory: &Curve, contact: Contact) -> Result<(), Violation> {
     let knots = trajectory.knots();
     let collides = |time_s| move |collision| Violation::Collision { time_s, collision };
     checker.room(&knots[0].positions, contact, 0.0).map_err(collides(0.0))?;
@@ -183,7 +184,7 @@ fn check_collisions(checker: &mut Checker<'_>, trajectory: &ArmTrajectory, conta
         while let Some([from, to]) = pieces.pop() {
             let middle = (from + to) / 2.0;
             let posture = cubics.map(|cubic| cubic.position_at(middle));
-            let strays = std::array::from_fn(|j| {
+            let strays = JointVector::from_fn(posture.len(), |j| {
                 let [least, greatest] = cubics[j].range(from, to);
                 (posture[j] - least).max(greatest - posture[j])
             });

@@ -7,14 +7,14 @@
 //! The arm follows from posture to posture (`line`). Between the departure and the approach nothing touches anything. Where the way bends
 //! sharply the arm stops, unless the corners may be rounded. Of several goals the first is taken that the tool gets to.
 
-use crate::arm::{positions, state};
 use crate::collision::{Checker, Contact, length};
 use crate::constrained::Constraint;
+use crate::joint_vector::JointVector;
 use crate::line::{Lines, Traced, trace};
 use crate::pace::{Pace, Stop};
 use crate::plan::{Goal, PlanError, Request, straight_collision};
-use crate::reach::{Positions, Reach};
-use crate::robot::Joints;
+use crate::reach::Reach;
+use crate::space::state;
 use ratn_model::pose::Pose;
 use ratn_world::scene::Scene;
 
@@ -79,9 +79,9 @@ pub(crate) struct Follower<'p, 'a> {
 /// A way that was followed to its end.
 pub(crate) struct Followed {
     /// From the end of the departure to the beginning of the approach.
-    pub(crate) lines: Vec<Joints>,
+    pub(crate) lines: Vec<JointVector>,
     /// To the goal; at least one posture.
-    pub(crate) approach: Vec<Joints>,
+    pub(crate) approach: Vec<JointVector>,
 }
 
 impl Followed {
@@ -95,7 +95,7 @@ impl Follower<'_, '_> {
     /// From a posture to the first goal that the tool gets to in straight lines.
     pub(crate) fn follow(
         &mut self,
-        start: &Joints,
+        start: &JointVector,
         request: &Request,
         way: &WayPoints,
         pace: &mut Pace<'_>,
@@ -114,7 +114,7 @@ impl Follower<'_, '_> {
 
     fn to(
         &mut self,
-        start: &Joints,
+        start: &JointVector,
         goal: &Pose,
         request: &Request,
         way: &WayPoints,
@@ -124,7 +124,6 @@ impl Follower<'_, '_> {
         let entry = Pose { position: std::array::from_fn(|i| goal.position[i] - offset[i]), ..*goal };
         let mut poses: Vec<Pose> = way.through.iter().map(|pose| self.base.inverse().compose(pose)).collect();
         poses.push(entry);
-        let start = positions(start);
         let lines = Lines::new(self.reach.pose(&start), &poses, way.blend_m);
         let traced = trace(self.reach, &lines, &start, &mut || pace.answer())?;
         if let Some(reason) = self.obstacle(&traced, pace)? {
@@ -133,13 +132,13 @@ impl Follower<'_, '_> {
         if let Some(cause) = &traced.ended {
             return Ok(Err(said(&traced, way, (traced.postures.len() - 1, cause.to_string()))));
         }
-        let lines: Vec<Joints> = traced.postures.iter().map(joints).collect();
+        let lines: Vec<JointVector> = traced.postures.clone();
         let last = traced.postures[traced.postures.len() - 1];
         if !request.approach.is_some() {
-            return Ok(Ok(Followed { approach: vec![joints(&last)], lines }));
+            return Ok(Ok(Followed { approach: vec![last], lines }));
         }
         let traced = trace(self.reach, &Lines::new(entry, &[*goal], 0.0), &last, &mut || pace.answer())?;
-        let approach: Vec<Joints> = traced.postures.iter().map(joints).collect();
+        let approach: Vec<JointVector> = traced.postures.clone();
         let reason = match &traced.ended {
             Some(cause) => Some(cause.to_string()),
             None => self.pressed(&approach).or_else(|| self.broken(&approach)),
@@ -154,7 +153,7 @@ impl Follower<'_, '_> {
     fn obstacle(&mut self, traced: &Traced, pace: &mut Pace<'_>) -> Result<Option<(usize, String)>, Stop> {
         for (i, pair) in traced.postures.windows(2).enumerate() {
             pace.poll()?;
-            let [from, to] = [joints(&pair[0]), joints(&pair[1])];
+            let [from, to] = [pair[0], pair[1]];
             if let Some(collision) = self.checker.edge_collision(&from, &to, Contact::None) {
                 return Ok(Some((i, collision.to_string())));
             }
@@ -167,14 +166,14 @@ impl Follower<'_, '_> {
     }
 
     /// What the tool does not keep on an approach.
-    fn broken(&self, approach: &[Joints]) -> Option<String> {
+    fn broken(&self, approach: &[JointVector]) -> Option<String> {
         let constraint = self.constraint?;
-        let breaks = |pair: &&[Joints]| !constraint.holds_along(&state(&pair[0]), &state(&pair[1]));
+        let breaks = |pair: &&[JointVector]| !constraint.holds_along(&state(&pair[0]), &state(&pair[1]));
         approach.windows(2).find(breaks).map(|pair| constraint.breach(&state(&pair[1])))
     }
 
     /// What is in the way of an approach that presses as little as it can.
-    fn pressed(&mut self, approach: &[Joints]) -> Option<String> {
+    fn pressed(&mut self, approach: &[JointVector]) -> Option<String> {
         let mut reason = None;
         for press_m in &self.presses_m {
             let closed = straight_collision(self.checker, approach, *press_m).map(|c| c.to_string());
@@ -197,8 +196,4 @@ fn said(traced: &Traced, way: &WayPoints, (last, reason): (usize, String)) -> St
         false => "the goal".to_owned(),
     };
     format!("the tool can go straight for {reached_m:.3} m of {wanted_m:.3} m, on the way to {whither}: {reason}")
-}
-
-fn joints(positions: &Positions) -> Joints {
-    std::array::from_fn(|j| positions[j])
 }

@@ -14,16 +14,16 @@ use ratn_model::pose::Pose;
 use ratn_motion::arm;
 use ratn_motion::connect::Budget;
 use ratn_motion::constrained;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::keep::{Keep, KeptAxis, Region, timed_keeping};
-use ratn_motion::mechanism::MAX_JOINTS;
 use ratn_motion::pace::Control;
 use ratn_motion::plan::{Goal, Plan, PlanError, Request};
-use ratn_motion::reach::{Positions, Reach};
-use ratn_motion::space::Space;
+use ratn_motion::reach::Reach;
+use ratn_motion::space::{Space, State, state};
 use ratn_motion::straight::{Frame, Straight};
 use ratn_motion::timing::{Section, timed};
 use ratn_motion::tool_speed::ToolSpeed;
-use ratn_motion::trajectory::{ArmTrajectory, Curve, Knot};
+use ratn_motion::trajectory::{Curve, Knot};
 use ratn_motion::way_points::WayPoints;
 use robots::Arm;
 use std::f64::consts::PI;
@@ -32,8 +32,8 @@ use std::f64::consts::PI;
 const ROUNDING: f64 = 2e-5;
 
 /// A hundred moments between any two knots.
-fn moments<const N: usize>(curve: &Curve<N>) -> Vec<f64> {
-    let between = |pair: &[Knot<N>]| {
+fn moments(curve: &Curve) -> Vec<f64> {
+    let between = |pair: &[Knot]| {
         let (from, h) = (pair[0].time_s, pair[1].time_s - pair[0].time_s);
         (0..100).map(move |i| from + h * f64::from(i) / 100.0)
     };
@@ -62,19 +62,13 @@ fn beyond(keep: &Keep, tool: &Pose) -> (f64, f64) {
     (off, outside)
 }
 
-fn padded<const N: usize>(home: &Positions, joints: &[f64; N]) -> Positions {
-    let mut positions = *home;
-    positions[..N].copy_from_slice(joints);
-    positions
-}
-
 /// Paths of any arm between random postures that keep something keep it between all samples of the timed motion.
-fn check_any<const N: usize>(arm: &Arm, seed: u64) {
+fn check_any(arm: &Arm, seed: u64) {
     let (mechanism, tool) = (&arm.mechanism, &arm.tool);
     let from = tool.pose(&arm.home);
     let link = mechanism.links.len() - 1;
     // What the constraint sees is the last link, not the tool at its end.
-    let link_pose = |positions: &Positions| mechanism.poses(&positions[..N])[link];
+    let link_pose = |positions: &JointVector| mechanism.poses(positions)[link];
     let held = link_pose(&arm.home);
     let axis = [0.3, -0.2, 1.0];
     let keep = Keep {
@@ -86,7 +80,6 @@ fn check_any<const N: usize>(arm: &Arm, seed: u64) {
     };
     let constraint = keep.constraint(mechanism, link, &Pose::IDENTITY, &held).unwrap();
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let state = |positions: &Positions| positions.map(|q| q as f32);
     let mut space = Space::new(mechanism, &[]);
     let (mut kept, mut tried) = (0, 0);
     while tried < 40 && kept < 4 {
@@ -105,14 +98,13 @@ fn check_any<const N: usize>(arm: &Arm, seed: u64) {
                 Control::Continue
             });
         let Ok(route) = route else { continue };
-        let path: Vec<[f64; N]> = route.path.iter().map(|s| std::array::from_fn(|j| f64::from(s[j]))).collect();
-        let mut is_free = |a: &[f64; N], b: &[f64; N]| {
-            constraint.holds_along(&state(&padded(&[0.0; MAX_JOINTS], a)), &state(&padded(&[0.0; MAX_JOINTS], b)))
-        };
+        let posture = |s: &State| JointVector::from_fn(mechanism.joints.len(), |j| f64::from(s[j]));
+        let path: Vec<JointVector> = route.path.iter().map(posture).collect();
+        let mut is_free = |a: &JointVector, b: &JointVector| constraint.holds_along(&state(a), &state(b));
         let sections = [Section::Blended(path)];
         let curve = timed_keeping(&mechanism.joints, &sections, 1.0, &constraint, &mut is_free, &mut || true).unwrap();
         for t in moments(&curve) {
-            let (off, outside) = beyond(&keep, &link_pose(&padded(&arm.home, &curve.sample(t).positions)));
+            let (off, outside) = beyond(&keep, &link_pose(&curve.sample(t).positions));
             assert!(off < ROUNDING && outside < ROUNDING, "{}: {off} rad, {outside} m beyond", mechanism.name);
         }
         kept += 1;
@@ -122,15 +114,15 @@ fn check_any<const N: usize>(arm: &Arm, seed: u64) {
 
 #[test]
 fn any_arm_keeps_a_direction_and_a_box_between_all_samples() {
-    check_any::<7>(&robots::seven(), 1);
-    check_any::<6>(&robots::six(), 2);
-    check_any::<7>(&robots::lifted(), 3);
+    check_any(&robots::seven(), 1);
+    check_any(&robots::six(), 2);
+    check_any(&robots::lifted(), 3);
 }
 
 fn tools(cell: &Cell, plan: &Plan) -> Vec<Pose> {
-    let curve = ArmTrajectory::read(&cell.robot, &plan.trajectory).unwrap();
+    let curve = Curve::of_arm(&cell.robot, &plan.trajectory).unwrap();
     let (reach, base) = (arm::reach(&cell.robot), arm::on_floor(&cell.scene.base));
-    let tool = |t: f64| base.compose(&reach.pose(&arm::positions(&curve.sample(t).positions)));
+    let tool = |t: f64| base.compose(&reach.pose(&curve.sample(t).positions));
     moments(&curve).into_iter().map(tool).collect()
 }
 
@@ -235,8 +227,8 @@ fn what_is_to_be_kept_and_makes_no_sense_is_refused() {
 }
 
 /// The greatest speed and turning of a frame on a curve, by differences.
-fn fastest<const N: usize>(reach: &Reach, curve: &Curve<N>) -> (f64, f64) {
-    let tool = |t: f64| reach.pose(&padded(&[0.0; MAX_JOINTS], &curve.sample(t).positions));
+fn fastest(reach: &Reach, curve: &Curve) -> (f64, f64) {
+    let tool = |t: f64| reach.pose(&curve.sample(t).positions);
     let (mut speed, mut turning) = (0.0_f64, 0.0_f64);
     for t in moments(curve) {
         let (from, to) = ((t - 1e-4).max(0.0), (t + 1e-4).min(curve.duration_s()));
@@ -249,11 +241,10 @@ fn fastest<const N: usize>(reach: &Reach, curve: &Curve<N>) -> (f64, f64) {
     (speed, turning)
 }
 
-fn check_speed<const N: usize>(arm: &Arm, seed: u64) {
+fn check_speed(arm: &Arm, seed: u64) {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let joints = |positions: Positions| -> [f64; N] { std::array::from_fn(|j| positions[j]) };
     for _ in 0..4 {
-        let path = vec![joints(arm.home), joints(arm.tool.random(&mut random)), joints(arm.tool.random(&mut random))];
+        let path = vec![arm.home, arm.tool.random(&mut random), arm.tool.random(&mut random)];
         let curve = timed(&arm.mechanism.joints, &[Section::Blended(path)], 1.0, &mut |_, _| true);
         let (speed, turning) = fastest(&arm.tool, &curve);
         for (m, rad) in [(Some(0.5), None), (None, Some(0.7)), (Some(0.25), Some(2.0)), (Some(99.0), Some(99.0))] {
@@ -275,9 +266,9 @@ fn check_speed<const N: usize>(arm: &Arm, seed: u64) {
 
 #[test]
 fn the_tool_of_any_arm_is_never_faster_than_its_limit_and_just_as_fast() {
-    check_speed::<7>(&robots::seven(), 1);
-    check_speed::<6>(&robots::six(), 2);
-    check_speed::<7>(&robots::lifted(), 3);
+    check_speed(&robots::seven(), 1);
+    check_speed(&robots::six(), 2);
+    check_speed(&robots::lifted(), 3);
 }
 
 #[test]
@@ -285,14 +276,14 @@ fn limits_of_one_motion_hold_for_each_joint_and_for_the_tool() {
     let (cell, tool) = at_table();
     let goals = vec![Goal::Pose(by(&tool, -0.1, 0.3, 0.1))];
     let free = Request { speed: 1.0, ..request(cell.state(), goals) };
-    let mut scales = [[1.0; 7], [0.5; 7], [0.25; 7]];
+    let mut scales = [1.0, 0.5, 0.25].map(|scale| JointVector::all(7, scale));
     scales[0][1] = 0.1;
     let limited = Request { scales, ..free.clone() };
     let tool_speed = ToolSpeed { m_per_s: Some(0.1), rad_per_s: Some(0.2) };
     let slow = Request { tool_speed, ..free.clone() };
     let lasts_s = |request: &Request| cell.plan(request).unwrap().trajectory.duration_s();
     assert!(lasts_s(&limited) > lasts_s(&free) && lasts_s(&slow) > lasts_s(&free));
-    let curve = ArmTrajectory::read(&cell.robot, &cell.plan(&limited).unwrap().trajectory).unwrap();
+    let curve = Curve::of_arm(&cell.robot, &cell.plan(&limited).unwrap().trajectory).unwrap();
     for pair in curve.knots().windows(2) {
         let h = pair[1].time_s - pair[0].time_s;
         for (j, joint) in cell.robot.arm_joints().iter().enumerate() {
@@ -309,12 +300,12 @@ fn limits_of_one_motion_hold_for_each_joint_and_for_the_tool() {
             }
         }
     }
-    let curve = ArmTrajectory::read(&cell.robot, &cell.plan(&slow).unwrap().trajectory).unwrap();
+    let curve = Curve::of_arm(&cell.robot, &cell.plan(&slow).unwrap().trajectory).unwrap();
     let (speed, turning) = fastest(&arm::reach(&cell.robot), &curve);
     assert!(speed <= 0.1 * (1.0 + 1e-6) && turning <= 0.2 * (1.0 + 1e-6), "{speed} m/s, {turning} rad/s");
     for (request, expected) in [
         (
-            Request { scales: [[0.0; 7], [1.0; 7], [1.0; 7]], ..free.clone() },
+            Request { scales: [0.0, 1.0, 1.0].map(|scale| JointVector::all(7, scale)), ..free.clone() },
             "velocity_scale is 0: expected fractions from 0.01 to 1",
         ),
         (

@@ -10,11 +10,12 @@ use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::arm;
 use ratn_motion::collision::{CONTACT_TOLERANCE_M, Checker, Contact};
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::pace::{Control, Progress};
 use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
-use ratn_motion::robot::{Configuration, Joint, Joints, Robot};
+use ratn_motion::robot::{Configuration, Joint, Robot};
 use ratn_motion::straight::Straight;
-use ratn_motion::trajectory::ArmTrajectory;
+use ratn_motion::trajectory::Curve;
 use ratn_motion::validate::{Violation, validate_trajectory};
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::{FRAC_PI_4, PI};
@@ -160,7 +161,7 @@ fn what_is_let_go_is_put_so_that_the_open_fingers_press_nobody() {
         };
         let mut scene = cell.scene.clone();
         scene.objects.retain(|object| object.name != "can");
-        let opened = Configuration { finger: cell.robot.finger().upper, ..cell.state() };
+        let opened = Configuration { finger: cell.robot.open_finger_m(), ..cell.state() };
         let mut open = Checker::new(&cell.robot, &scene, &opened, 0.0);
         let mut presses = |plan: &Plan| open.collision(&plan.end, Contact::Gripper(0.0)).is_some();
         assert!(!presses(&to(&goals).unwrap()), "{i}");
@@ -174,7 +175,7 @@ fn what_is_let_go_is_put_so_that_the_open_fingers_press_nobody() {
 #[test]
 fn an_arm_that_was_stopped_a_millimetre_beside_something_leaves_it() {
     let mut cell = Cell::with_boxes(0, 1);
-    let configuration = Configuration { arm: cell.arm, ..Configuration::ZERO };
+    let configuration = Configuration { arm: cell.arm, ..cell.robot.at_zero() };
     // The hand is 0.15 m wide along y, and its middle 0.085 m behind the tool's.
     let beside = |room_m: f64| Pose::at(0.0, 0.075 + room_m + 0.025, -0.085);
     let tool = cell.robot.tool_pose(&configuration);
@@ -217,7 +218,7 @@ fn more_iterations_never_make_the_motion_slower() {
 }
 
 /// The least time in which any motion gets the joints from one posture to another: that of the slowest of them, alone.
-fn least_s(cell: &Cell, from: &Joints, to: &Joints, speed: f64) -> f64 {
+fn least_s(cell: &Cell, from: &JointVector, to: &JointVector, speed: f64) -> f64 {
     let alone = |(j, joint): (usize, &Joint)| {
         let (way, v, a, jerk) =
             ((to[j] - from[j]).abs(), joint.velocity * speed, joint.acceleration * speed, joint.jerk);
@@ -279,13 +280,13 @@ fn straight_parts_are_left_and_entered_on_the_way_without_a_stop_and_touching_no
     let (mut passed, mut stops) = (0, 0);
     motions(42, 6, |cell, request, plan| {
         assert_valid(cell, plan, request.speed);
-        let trajectory = ArmTrajectory::read(&cell.robot, &plan.trajectory).unwrap();
+        let trajectory = Curve::of_arm(&cell.robot, &plan.trajectory).unwrap();
         let mut exact = Checker::new(&cell.robot, &cell.scene, &cell.state(), 0.0);
-        let tool = |arm: &Joints| cell.robot.tool_pose(&Configuration { arm: *arm, ..cell.state() }).position;
+        let tool = |arm: &JointVector| cell.robot.tool_pose(&Configuration { arm: *arm, ..cell.state() }).position;
         let (first, last) = (tool(&cell.arm), tool(&plan.end));
         let lasts = trajectory.duration_s();
         let steps = (lasts * 500.0) as u32;
-        let poses: Vec<(Joints, [f64; 3])> = (0..=steps)
+        let poses: Vec<(JointVector, [f64; 3])> = (0..=steps)
             .map(|i| trajectory.sample(lasts * f64::from(i) / f64::from(steps)).positions)
             .map(|arm| (arm, tool(&arm)))
             .collect();
@@ -297,8 +298,8 @@ fn straight_parts_are_left_and_entered_on_the_way_without_a_stop_and_touching_no
             assert!(up >= half || off < 1e-3, "{off:.4} m off the line {up:.3} m above its end");
             up >= half
         };
-        let begins = |(_, at): &(Joints, [f64; 3])| !request.depart.is_some() || straight(at, &first);
-        let goes_on = |(_, at): &(Joints, [f64; 3])| !request.approach.is_some() || straight(at, &last);
+        let begins = |(_, at): &(JointVector, [f64; 3])| !request.depart.is_some() || straight(at, &first);
+        let goes_on = |(_, at): &(JointVector, [f64; 3])| !request.approach.is_some() || straight(at, &last);
         let from = poses.iter().position(begins).unwrap();
         let to = poses.iter().rposition(goes_on).unwrap();
         for (arm, at) in &poses[from..=to] {
@@ -389,12 +390,12 @@ fn a_box_is_carried_upright_where_the_way_leads_round_something() {
         let request = Request { upright_rad: Some(tolerance), ..cell.transfer("box_1", 4) };
         let plan = cell.plan(&request).unwrap_or_else(|e| panic!("{seed}: {e}"));
         assert_valid(&cell, &plan, 0.3);
-        let trajectory = ArmTrajectory::read(&cell.robot, &plan.trajectory).unwrap();
+        let trajectory = Curve::of_arm(&cell.robot, &plan.trajectory).unwrap();
         let reach = ratn_motion::arm::reach(&cell.robot);
         let steps = (trajectory.duration_s() * 100.0) as usize;
         for i in 0..=steps {
             let arm = trajectory.sample(f64::from(i as u32) / 100.0).positions;
-            let tool = reach.pose(&ratn_motion::arm::positions(&arm));
+            let tool = reach.pose(&arm);
             let tilt = (-tool.rotate([0.0, 0.0, 1.0])[2]).clamp(-1.0, 1.0).acos();
             assert!(tilt <= tolerance + 5e-3, "{tilt:.3} rad off upright");
         }
@@ -445,7 +446,7 @@ fn a_pose_out_of_reach_is_refused_as_such() {
 #[test]
 fn a_start_inside_the_table_is_refused() {
     let mut cell = Cell::with_boxes(0, 0);
-    cell.arm = [-1.5, -1.7, 0.0, 0.3, 0.0, 0.0, 0.0];
+    cell.arm = [-1.5, -1.7, 0.0, 0.3, 0.0, 0.0, 0.0].into();
     let error = cell.plan(&request(cell.state(), vec![Goal::Joints(aimm::HOME)])).unwrap_err().to_string();
     assert!(error.starts_with("at the start ") && error.contains("inside table"), "{error}");
 }
@@ -454,7 +455,7 @@ fn a_start_inside_the_table_is_refused() {
 fn a_trajectory_that_meets_something_or_starts_elsewhere_is_refused() {
     let cell = Cell::with_boxes(1, 6);
     let plan = cell.plan(&cell.approach("box_1")).unwrap();
-    let check = |scene, arm: &Joints| {
+    let check = |scene, arm: &JointVector| {
         let here = Configuration { arm: *arm, ..cell.state() };
         validate_trajectory(&cell.robot, scene, &here, &plan.trajectory, Contact::None)
     };
@@ -498,7 +499,7 @@ proptest! {
         let mut request = cell.approach("box_3");
         request.speed = speed;
         let plan = cell.plan(&request).unwrap();
-        let trajectory = ArmTrajectory::read(&Robot::aimm(), &plan.trajectory).unwrap();
+        let trajectory = Curve::of_arm(&Robot::aimm(), &plan.trajectory).unwrap();
         let at = |t: f64| trajectory.sample(t).velocities;
         for pair in trajectory.knots().windows(2) {
             let (t, h) = (pair[0].time_s, (pair[1].time_s - pair[0].time_s) / 8.0);
@@ -518,7 +519,7 @@ proptest! {
         let mut request = cell.approach("box_2");
         request.speed = speed;
         let plan = cell.plan(&request).unwrap();
-        let trajectory = ArmTrajectory::read(&Robot::aimm(), &plan.trajectory).unwrap();
+        let trajectory = Curve::of_arm(&Robot::aimm(), &plan.trajectory).unwrap();
         let knots = trajectory.knots();
         let mean = |i: usize, j: usize| {
             (knots[i + 1].velocities[j] - knots[i].velocities[j]) / (knots[i + 1].time_s - knots[i].time_s)

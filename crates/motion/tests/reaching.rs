@@ -10,13 +10,14 @@ use ratn_motion::connect::{Budget, ConnectError, connect_to_targets};
 use ratn_motion::constrained::{self, Constraint};
 use ratn_motion::exact::Exact;
 use ratn_motion::geometry::Geometry;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
 use ratn_motion::pace::Control;
-use ratn_motion::reach::{Positions, Reach, Target, distance};
+use ratn_motion::reach::{Reach, Target, distance};
 use ratn_motion::robot_model::RobotModel;
 use ratn_motion::robot_state::RobotState;
 use ratn_motion::simplify::path_length;
-use ratn_motion::space::{Obstacle, Space, State, between};
+use ratn_motion::space::{Obstacle, Space, between, state};
 use std::f64::consts::PI;
 use std::sync::LazyLock;
 
@@ -38,10 +39,6 @@ fn arm(joints: std::ops::RangeInclusive<usize>) -> Mechanism {
 
 fn tool(mechanism: &Mechanism) -> Reach {
     Reach::new(mechanism, mechanism.link("tool").unwrap(), Pose::IDENTITY)
-}
-
-fn state(positions: &Positions) -> State {
-    positions.map(|q| q as f32)
 }
 
 proptest! {
@@ -92,7 +89,7 @@ proptest! {
             };
         }
         let target = Target::at(reach.pose(&posture));
-        let solutions = reach.solutions(&target, &[0.0; MAX_JOINTS], 1, 20, &mut random);
+        let solutions = reach.solutions(&target, &JointVector::zeros(reach.joints()), 1, 20, &mut random);
         prop_assert!(!solutions.is_empty(), "{posture:?}: {:?}", reach.postures(&target));
     }
 
@@ -101,7 +98,7 @@ proptest! {
         let reach = tool(&arm(2..=7));
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let target = Target::at(reach.pose(&reach.random(&mut random)));
-        let solutions = reach.solutions(&target, &[0.0; MAX_JOINTS], 2, 60, &mut random);
+        let solutions = reach.solutions(&target, &JointVector::zeros(reach.joints()), 2, 60, &mut random);
         prop_assert!(!solutions.is_empty());
         prop_assert!(solutions.iter().all(|s| target.is_met_by(&reach.pose(s)) && reach.clamp(s) == *s));
     }
@@ -112,7 +109,7 @@ proptest! {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let pose = reach.pose(&reach.random(&mut random));
         let target = Target { pose, tolerance_m: [0.02, 0.0, 0.05], tolerance_rad: [0.1, 0.1, PI], bounds: None };
-        for posture in reach.solutions(&target, &[0.0; MAX_JOINTS], 3, 30, &mut random) {
+        for posture in reach.solutions(&target, &JointVector::zeros(reach.joints()), 3, 30, &mut random) {
             let off = pose.inverse().compose(&reach.pose(&posture));
             let [x, y, z] = off.position;
             prop_assert!(x.abs() <= 0.02 + 1e-6 && y.abs() < 1e-6 && z.abs() <= 0.05 + 1e-6, "{off:?}");
@@ -123,7 +120,7 @@ proptest! {
 }
 
 /// Boxes about the arm, none of them where it stands at `keep`.
-fn clutter(random: &mut impl Rng, mechanism: &Mechanism, keep: &[Positions]) -> Vec<Obstacle> {
+fn clutter(random: &mut impl Rng, mechanism: &Mechanism, keep: &[JointVector]) -> Vec<Obstacle> {
     let mut obstacles: Vec<Obstacle> = Vec::new();
     while obstacles.len() < 8 {
         let mut range = |low: f64, high: f64| random.random_range(low..high);
@@ -166,7 +163,8 @@ fn the_nearest_of_many_grasps_that_can_be_reached_is_taken() {
         };
         reached += 1;
         assert_eq!(route.goal, 1);
-        let end = route.path[route.path.len() - 1].map(f64::from);
+        let end = route.path[route.path.len() - 1];
+        let end = JointVector::from_fn(reach.joints(), |j| f64::from(end[j]));
         assert!(reach.pose(&end).distance(&targets[1].pose) < 1e-5);
         let none = connect_to_targets(&mut space, &reach, &state(&start), &[far], budget, &mut go_on);
         assert_eq!(none, Err(ConnectError::Goal { goals: 1 }));

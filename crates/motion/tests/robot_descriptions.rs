@@ -7,8 +7,9 @@ use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_motion::exact::Exact;
 use ratn_motion::geometry::Geometry;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
-use ratn_motion::reach::{Positions, Reach, Target};
+use ratn_motion::reach::{Reach, Target};
 use ratn_motion::robot_model::RobotModel;
 use ratn_motion::robot_state::{RobotState, StateError};
 use ratn_motion::space::{Obstacle, Space, State};
@@ -194,7 +195,7 @@ fn joints_beside_the_chain_stay_where_they_are_in_closed_form() {
         let near = reach.nearest(&postures, &posture);
         let closest = near.first().unwrap();
         assert!(ratn_motion::reach::distance(closest, &posture) < 1e-3, "{closest:?} instead of {posture:?}");
-        let stayed = |found: &Positions| found[..2] == posture[..2];
+        let stayed = |found: &JointVector| found[..2] == posture[..2];
         assert!(near.iter().all(stayed));
         for _ in 0..8 {
             for found in reach.anywhere(&postures, &posture, &mut random) {

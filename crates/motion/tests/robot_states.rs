@@ -8,8 +8,10 @@ use common::{Cell, request};
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::collision::Contact;
+use ratn_motion::description::RobotDescription;
 use ratn_motion::exact::Exact;
 use ratn_motion::geometry::Geometry;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::mechanism::Mechanism;
 use ratn_motion::plan::{Goal, PlanError, Request};
 use ratn_motion::reach::{Reach, Target};
@@ -86,8 +88,7 @@ fn mimics_multiply_and_add_along_their_chain_in_every_check() {
         let q = -1.5 + 0.15 * f64::from(i);
         let [x, y] = tip(&turns(q));
         assert!(is_close(ball(&mechanism, &[q]), [x, y]));
-        let mut positions = [0.0; 16];
-        positions[0] = q;
+        let mut positions = JointVector::of([q]);
         let pose = reach.pose(&positions);
         assert!(is_close([pose.position[0], pose.position[1]], [x, y]));
         // The vector kernel and the exact check see a post where the ball is, and none 0.12 m beside it.
@@ -185,7 +186,9 @@ fn with_a_lamp() -> Robot {
     let camera = r#"<origin xyz="0.02 0 0"/><geometry><box size="0.06 0.14 0.06"/></geometry>"#;
     assert!(urdf.contains(camera));
     let lamp = r#"<origin xyz="0.02 -0.5 -0.35"/><geometry><box size="0.06 1.1 0.06"/></geometry>"#;
-    Robot::read(&urdf.replace(camera, lamp), include_str!("../robots/aimm.srdf")).unwrap()
+    let description = RobotDescription::read(include_str!("../robots/aimm.toml")).unwrap();
+    let srdf = Some(include_str!("../robots/aimm.srdf"));
+    Robot::of(description, &urdf.replace(camera, lamp), srdf, &mut |_| unreachable!("it has no meshes")).unwrap()
 }
 
 #[test]
@@ -193,7 +196,7 @@ fn a_head_that_is_turned_into_the_way_of_the_arm_is_in_its_way() {
     let mut cell = Cell::with_boxes(0, 1);
     cell.robot = with_a_lamp();
     // Nearly stretched upwards, in front of the mast.
-    let raised = [-1.57, -0.1, 0.0, 0.1, 0.0, 0.0, 0.0];
+    let raised = JointVector::of([-1.57, -0.1, 0.0, 0.1, 0.0, 0.0, 0.0]);
     let ahead = cell.state();
     let turned = Configuration { pan: std::f64::consts::FRAC_PI_2, ..ahead };
     let to = |start: Configuration, goal| Request { ..request(start, vec![Goal::Joints(goal)]) };

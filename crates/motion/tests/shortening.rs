@@ -11,6 +11,7 @@ use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_motion::exact::Exact;
 use ratn_motion::geometry::Geometry;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::mechanism::Mechanism;
 use ratn_motion::pace::Control;
 use ratn_motion::refine::{End, Measure, Refinement, Shares};
@@ -215,12 +216,12 @@ fn a_smooth_way_is_taken_where_it_is_quicker_and_only_what_is_free() {
     };
     let joints = [joint("x"), joint("y")];
     // The side in the middle is short: blends at its ends are narrow.
-    let path = [[0.0, 0.0], [1.0, 0.0], [1.1, 0.1], [1.1, 1.1]];
-    let curve = |is_free: &mut dyn FnMut(&[f64; 2], &[f64; 2]) -> bool| {
+    let path = [[0.0, 0.0], [1.0, 0.0], [1.1, 0.1], [1.1, 1.1]].map(JointVector::of);
+    let curve = |is_free: &mut dyn FnMut(&JointVector, &JointVector) -> bool| {
         timed(&joints, &[Section::Blended(path.to_vec())], 1.0, is_free)
     };
-    let off = |at: &[f64; 2]| {
-        let from_side = |pair: &[[f64; 2]]| {
+    let off = |at: &JointVector| {
+        let from_side = |pair: &[JointVector]| {
             let side = [pair[1][0] - pair[0][0], pair[1][1] - pair[0][1]];
             let off = [at[0] - pair[0][0], at[1] - pair[0][1]];
             let along = (off[0] * side[0] + off[1] * side[1]) / (side[0] * side[0] + side[1] * side[1]);

@@ -19,7 +19,7 @@ use ratn_motion::plan::{Goal, Plan, PlanError, Request};
 use ratn_motion::robot::Joint;
 use ratn_motion::straight::{Frame, Straight};
 use ratn_motion::timing::{Section, timed};
-use ratn_motion::trajectory::ArmTrajectory;
+use ratn_motion::trajectory::Curve;
 use ratn_world::scene::{Placement, SceneObject, Shape};
 use robots::Arm;
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4};
@@ -37,7 +37,7 @@ fn off(point: [f64; 3], through: [f64; 3], direction: [f64; 3]) -> f64 {
 }
 
 /// Along lines of random directions and turns the tool is where it should be, a hundred times between any two knots of the timed motion.
-fn check_timed<const N: usize>(arm: &Arm, seed: u64) {
+fn check_timed(arm: &Arm, seed: u64) {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let joints: &[Joint] = &arm.mechanism.joints;
     let (mut followed, mut refused) = (0, 0);
@@ -53,16 +53,13 @@ fn check_timed<const N: usize>(arm: &Arm, seed: u64) {
         followed += 1;
         let end = arm.tool.pose(postures.last().unwrap());
         assert!(end.distance(&to) < 1e-5 && end.angle(&to) < 1e-4);
-        let path: Vec<[f64; N]> = postures.iter().map(|p| std::array::from_fn(|j| p[j])).collect();
-        let curve = timed(joints, &[Section::AsGiven(path)], 1.0, &mut |_, _| true);
+        let curve = timed(joints, &[Section::AsGiven(postures)], 1.0, &mut |_, _| true);
         let way: [f64; 3] = std::array::from_fn(|i| to.position[i] - from.position[i]);
         let (whole, turn) = (from.distance(&to), from.angle(&to));
         for pair in curve.knots().windows(2) {
             for i in 0..100 {
                 let t = pair[0].time_s + (pair[1].time_s - pair[0].time_s) * f64::from(i) / 100.0;
-                let mut positions = arm.home;
-                positions[..N].copy_from_slice(&curve.sample(t).positions);
-                let tool = arm.tool.pose(&positions);
+                let tool = arm.tool.pose(&curve.sample(t).positions);
                 assert!(off(tool.position, from.position, way) < STRAIGHT_M, "{}", arm.mechanism.name);
                 // It has turned by as much as it has gone.
                 let share = tool.distance(&from) / whole;
@@ -75,9 +72,9 @@ fn check_timed<const N: usize>(arm: &Arm, seed: u64) {
 
 #[test]
 fn the_tool_of_any_arm_goes_straight_between_all_samples() {
-    check_timed::<7>(&robots::seven(), 1);
-    check_timed::<6>(&robots::six(), 2);
-    check_timed::<7>(&robots::lifted(), 3);
+    check_timed(&robots::seven(), 1);
+    check_timed(&robots::six(), 2);
+    check_timed(&robots::lifted(), 3);
 }
 
 #[test]
@@ -111,9 +108,9 @@ fn a_line_that_cannot_be_followed_says_how_far_and_which_joint_ends_it() {
 /// How far the tool is from the straight line, in metres and radians, at the end of a motion (from its beginning where `sense` is -1) for
 /// half of `part`, a hundred times between any two knots; and where it goes, in the world.
 fn strays(cell: &Cell, plan: &Plan, at_end: bool, length_m: f64) -> (f64, f64, [f64; 3]) {
-    let trajectory = ArmTrajectory::read(&cell.robot, &plan.trajectory).unwrap();
+    let trajectory = Curve::of_arm(&cell.robot, &plan.trajectory).unwrap();
     let (reach, base) = (arm::reach(&cell.robot), arm::on_floor(&cell.scene.base));
-    let tool = |t: f64| base.compose(&reach.pose(&arm::positions(&trajectory.sample(t).positions)));
+    let tool = |t: f64| base.compose(&reach.pose(&trajectory.sample(t).positions));
     let rest = tool(if at_end { trajectory.duration_s() } else { 0.0 });
     let mut times = Vec::new();
     for pair in trajectory.knots().windows(2) {
@@ -148,7 +145,7 @@ fn turned_cell() -> (Cell, Pose) {
         shape: Shape::Box { size: [0.1, 0.2, 0.3] },
         placement: Placement::World(Pose::from_rpy([0.0, 1.5, 0.5], 0.0, 0.0, FRAC_PI_4)),
     });
-    let home = arm::reach(&cell.robot).pose(&arm::positions(&aimm::HOME));
+    let home = arm::reach(&cell.robot).pose(&aimm::HOME);
     let goal = cell.scene.base.compose(&home).compose(&Pose::from_rpy([0.03, 0.02, 0.0], 0.1, -0.6, 0.2));
     (cell, goal)
 }

@@ -4,8 +4,10 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use ratn_motion::collision::{between, distance};
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::Joint;
-use ratn_motion::space::State;
+use ratn_motion::space::{State, state};
 use ratn_motion::timing::rough::Rough;
 use ratn_motion::timing::{Section, timed};
 use ratn_motion::trajectory::{Curve, Knot};
@@ -14,26 +16,26 @@ fn joint(velocity: f64, acceleration: f64, jerk: f64) -> Joint {
     Joint { name: "joint".to_owned(), lower: -9.0, upper: 9.0, velocity, acceleration, jerk }
 }
 
-fn free<const N: usize>(joints: &[Joint], path: &[[f64; N]], speed: f64) -> Curve<N> {
+fn free(joints: &[Joint], path: &[JointVector], speed: f64) -> Curve {
     timed(joints, &[Section::Blended(path.to_vec())], speed, &mut |_, _| true)
 }
 
-fn distance<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
-    (0..N).map(|j| (a[j] - b[j]).powi(2)).sum::<f64>().sqrt()
+fn vectors<const N: usize>(path: impl IntoIterator<Item = [f64; N]>) -> Vec<JointVector> {
+    path.into_iter().map(JointVector::of).collect()
 }
 
 /// How far a posture is from the nearest motion of a path.
-fn off<const N: usize>(path: &[[f64; N]], posture: &[f64; N]) -> f64 {
-    let from_side = |pair: &[[f64; N]]| {
-        let dot = |a: &[f64; N], b: &[f64; N]| (0..N).map(|j| (a[j] - pair[0][j]) * (b[j] - pair[0][j])).sum::<f64>();
+fn off(path: &[JointVector], posture: &JointVector) -> f64 {
+    let from_side = |pair: &[JointVector]| {
+        let dot = |a: &[f64], b: &[f64]| (0..a.len()).map(|j| (a[j] - pair[0][j]) * (b[j] - pair[0][j])).sum::<f64>();
         let along = (dot(posture, &pair[1]) / dot(&pair[1], &pair[1])).clamp(0.0, 1.0);
-        distance(posture, &std::array::from_fn(|j| pair[0][j] + (pair[1][j] - pair[0][j]) * along))
+        distance(posture, &between(&pair[0], &pair[1], along))
     };
     path.windows(2).map(from_side).fold(f64::INFINITY, f64::min)
 }
 
 /// Acceleration at the beginning and jerk of a joint's cubic between two knots.
-fn cubic<const N: usize>(a: &Knot<N>, b: &Knot<N>, j: usize) -> (f64, f64) {
+fn cubic(a: &Knot, b: &Knot, j: usize) -> (f64, f64) {
     let h = b.time_s - a.time_s;
     let mean = (b.positions[j] - a.positions[j]) / h;
     let (v0, v1) = (a.velocities[j], b.velocities[j]);
@@ -42,9 +44,10 @@ fn cubic<const N: usize>(a: &Knot<N>, b: &Knot<N>, j: usize) -> (f64, f64) {
 
 /// From rest to rest, velocity, acceleration and jerk within limits a hundred times between any two knots, and acceleration
 /// without a step.
-fn assert_within<const N: usize>(joints: &[Joint], curve: &Curve<N>, speed: f64) {
+fn assert_within(joints: &[Joint], curve: &Curve, speed: f64) {
     let knots = curve.knots();
-    let mut before = [0.0; N];
+    let still = JointVector::zeros(joints.len());
+    let mut before = still;
     for pair in knots.windows(2) {
         let h = pair[1].time_s - pair[0].time_s;
         for (j, joint) in joints.iter().enumerate() {
@@ -65,7 +68,7 @@ fn assert_within<const N: usize>(joints: &[Joint], curve: &Curve<N>, speed: f64)
     for (j, joint) in joints.iter().enumerate() {
         assert!(before[j].abs() <= 0.005 * joint.acceleration * speed, "ends with {}", before[j]);
     }
-    assert_eq!((knots[0].velocities, knots[knots.len() - 1].velocities), ([0.0; N], [0.0; N]));
+    assert_eq!((knots[0].velocities, knots[knots.len() - 1].velocities), (still, still));
 }
 
 #[test]
@@ -73,13 +76,13 @@ fn a_corner_is_never_slower_than_stopping_at_it_however_little_room_there_is() {
     let joints = [joint(2.0, 4.0, 80.0), joint(2.0, 4.0, 80.0)];
     for degrees in [10.0_f64, 60.0, 120.0, 150.0, 170.0, 179.0, 180.0] {
         let angle = degrees.to_radians();
-        let path = [[0.0, 0.0], [1.0, 0.0], [1.0 + angle.cos(), angle.sin()]];
+        let path = vectors([[0.0, 0.0], [1.0, 0.0], [1.0 + angle.cos(), angle.sin()]]);
         // Each side is too short for the full velocity: 1 = v (v / 4 + 4 / 80). Along a diagonal it is faster.
         let stops = timed(&joints, &[Section::Blended(path.to_vec())], 1.0, &mut |_, _| false);
         assert!(stops.duration_s() <= 2.1025, "{}", stops.duration_s());
         let mut last = stops.duration_s();
         for room in [0.001, 0.01, 0.05, 9.0] {
-            let mut is_free = |from: &[f64; 2], to: &[f64; 2]| off(&path, from).max(off(&path, to)) < room;
+            let mut is_free = |from: &JointVector, to: &JointVector| off(&path, from).max(off(&path, to)) < room;
             let curve = timed(&joints, &[Section::Blended(path.to_vec())], 1.0, &mut is_free);
             assert_within(&joints, &curve, 1.0);
             assert!(
@@ -110,22 +113,22 @@ fn a_straight_motion_takes_the_time_of_the_double_s() {
         let joints = [joint(v, a, j), joint(2.0 * v, 2.0 * a, 2.0 * j)];
         // The other joint goes half as far; nothing changes along a diagonal on which it has twice the limits and goes twice as far.
         for to in [[way, way / 2.0], [-way, 2.0 * way]] {
-            let curve = free(&joints, &[[0.0, 0.0], to], 1.0);
+            let curve = free(&joints, &vectors([[0.0, 0.0], to]), 1.0);
             assert!((curve.duration_s() / expected - 1.0).abs() < 1e-3, "{} of {expected}", curve.duration_s());
             assert_within(&joints, &curve, 1.0);
-            assert!(curve.knots().iter().all(|k| off(&[[0.0, 0.0], to], &k.positions) < 1e-9));
+            assert!(curve.knots().iter().all(|k| off(&vectors([[0.0, 0.0], to]), &k.positions) < 1e-9));
         }
     }
 }
 
-fn random_path<const N: usize>(random: &mut ChaCha8Rng, postures: usize) -> (Vec<Joint>, Vec<[f64; N]>) {
+fn random_path<const N: usize>(random: &mut ChaCha8Rng, postures: usize) -> (Vec<Joint>, Vec<JointVector>) {
     let joints = (0..N).map(|_| {
         let acceleration = random.random_range(0.5..15.0);
         let lasts = random.random_range(0.02..0.4);
         joint(random.random_range(0.3..4.0), acceleration, acceleration / lasts)
     });
     let joints = joints.collect();
-    (joints, (0..postures).map(|_| std::array::from_fn(|_| random.random_range(-2.0..2.0))).collect())
+    (joints, (0..postures).map(|_| JointVector::from_fn(N, |_| random.random_range(-2.0..2.0))).collect())
 }
 
 fn check_random<const N: usize>(seeds: std::ops::Range<u64>) {
@@ -178,17 +181,18 @@ fn with_greater_limits_nothing_takes_longer() {
 #[test]
 fn postures_along_a_curve_are_followed_as_they_are_and_kinks_are_stopped_at() {
     let joints = [joint(1.0, 3.0, 40.0), joint(1.0, 3.0, 40.0)];
-    let arc: Vec<[f64; 2]> = (0..=60).map(|i| f64::from(i) * 0.02).map(|a| [a.sin(), 1.0 - a.cos()]).collect();
+    let arc = vectors((0..=60).map(|i| f64::from(i) * 0.02).map(|a| [a.sin(), 1.0 - a.cos()]));
     let curve = timed(&joints, &[Section::AsGiven(arc.clone())], 1.0, &mut |_, _| false);
     assert_within(&joints, &curve, 1.0);
     let steps = 500;
     for i in 0..=steps {
-        let [x, y] = curve.sample(curve.duration_s() * f64::from(i) / f64::from(steps)).positions;
+        let at = curve.sample(curve.duration_s() * f64::from(i) / f64::from(steps)).positions;
+        let (x, y) = (at[0], at[1]);
         assert!((x.hypot(1.0 - y) - 1.0).abs() < 2e-4, "{x} {y}");
     }
     // A straight motion of this length takes 1.6 s.
     assert!((1.3..1.6).contains(&curve.duration_s()), "{}", curve.duration_s());
-    let kinked = [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]];
+    let kinked = vectors([[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]]);
     let curve = timed(&joints, &[Section::AsGiven(kinked.to_vec())], 1.0, &mut |_, _| true);
     assert_within(&joints, &curve, 1.0);
     assert!(curve.knots().iter().any(|k| k.positions == kinked[1] && k.velocities == [0.0; 2]));
@@ -198,8 +202,8 @@ fn postures_along_a_curve_are_followed_as_they_are_and_kinks_are_stopped_at() {
 fn a_dense_path_with_kinks_is_rounded_and_not_stopped_at_each_of_them() {
     let joints = [joint(1.0, 3.0, 40.0), joint(1.0, 3.0, 40.0)];
     // As a search on a constraint leaves them: steps to and fro.
-    let path: Vec<[f64; 2]> = (0..=40).map(|i| [f64::from(i) * 0.06, if i % 2 == 0 { 0.0 } else { 0.02 }]).collect();
-    let mut is_free = |from: &[f64; 2], to: &[f64; 2]| off(&path, from).max(off(&path, to)) < 0.03;
+    let path = vectors((0..=40).map(|i| [f64::from(i) * 0.06, if i % 2 == 0 { 0.0 } else { 0.02 }]));
+    let mut is_free = |from: &JointVector, to: &JointVector| off(&path, from).max(off(&path, to)) < 0.03;
     let curve = timed(&joints, &[Section::Blended(path.clone())], 1.0, &mut is_free);
     assert_within(&joints, &curve, 1.0);
     let stops = timed(&joints, &[Section::Blended(path.clone())], 1.0, &mut |_, _| false);
@@ -213,7 +217,7 @@ fn a_dense_path_with_kinks_is_rounded_and_not_stopped_at_each_of_them() {
 #[test]
 fn a_path_that_is_no_way_at_all_and_repeated_postures_are_no_trouble() {
     let joints = [joint(1.0, 3.0, 40.0), joint(1.0, 3.0, 40.0)];
-    let here = [0.3, 0.4];
+    let here = JointVector::of([0.3, 0.4]);
     for part in [
         Section::Blended(vec![here]),
         Section::AsGiven(vec![here]),
@@ -223,7 +227,7 @@ fn a_path_that_is_no_way_at_all_and_repeated_postures_are_no_trouble() {
         let curve = timed(&joints, &[part], 1.0, &mut |_, _| true);
         assert_eq!((curve.duration_s(), curve.end()), (0.0, here));
     }
-    let there = [1.3, 0.4];
+    let there = JointVector::of([1.3, 0.4]);
     let curve = free(&joints, &[here, here, there, there], 1.0);
     assert!((curve.duration_s() - free(&joints, &[here, there], 1.0).duration_s()).abs() < 1e-9);
     let parts =
@@ -234,22 +238,22 @@ fn a_path_that_is_no_way_at_all_and_repeated_postures_are_no_trouble() {
 }
 
 /// Postures along a straight line, as those of a straight motion of the tool.
-fn dense<const N: usize>(from: &[f64; N], to: &[f64; N]) -> Vec<[f64; N]> {
-    (0..=40).map(|i| std::array::from_fn(|j| from[j] + (to[j] - from[j]) * f64::from(i) / 40.0)).collect()
+fn dense(from: &JointVector, to: &JointVector) -> Vec<JointVector> {
+    (0..=40).map(|i| JointVector::from_fn(from.len(), |j| from[j] + (to[j] - from[j]) * f64::from(i) / 40.0)).collect()
 }
 
 #[test]
 fn a_seam_is_passed_without_a_stop_where_that_is_free_and_within_the_share_that_is_given_for_it() {
     let joints = [joint(1.0, 3.0, 40.0), joint(1.0, 3.0, 40.0)];
-    let (up, over, down) = ([0.0, 0.4], [1.0, 0.4], [1.0, 0.0]);
+    let [start, up, over, down] = [[0.0, 0.0], [0.0, 0.4], [1.0, 0.4], [1.0, 0.0]].map(JointVector::of);
     let sections = |share: f64| {
         [
-            Section::Loose(dense(&[0.0, 0.0], &up), [0.0, share]),
+            Section::Loose(dense(&start, &up), [0.0, share]),
             Section::Blended(vec![up, over]),
             Section::Loose(dense(&over, &down), [share, 0.0]),
         ]
     };
-    let corners = [[0.0, 0.0], up, over, down];
+    let corners = [start, up, over, down];
     // Stopping twice: 0.4 = v (v / 3 + 3 / 40), and 1 / 1 + 1 / 3 + 3 / 40 for the way between them.
     let peak = 3.0 * ((0.075_f64.powi(2) + 4.0 * 0.4 / 3.0).sqrt() - 0.075) / 2.0;
     let by_hand = 2.0 * 2.0 * (peak / 3.0 + 0.075) + 1.0 + 1.0 / 3.0 + 0.075;
@@ -274,7 +278,7 @@ fn a_seam_is_passed_without_a_stop_where_that_is_free_and_within_the_share_that_
         }
         // Where there is room on one side only, one stop stays; where there is none, both do.
         let mut on_the_left =
-            |a: &[f64; 2], b: &[f64; 2]| off(&corners, a).max(off(&corners, b)) < 1e-6 || a[0].max(b[0]) < 0.5;
+            |a: &JointVector, b: &JointVector| off(&corners, a).max(off(&corners, b)) < 1e-6 || a[0].max(b[0]) < 0.5;
         let left = timed(&joints, &sections(share), 1.0, &mut on_the_left);
         assert_within(&joints, &left, 1.0);
         assert!(left.duration_s() < stops.duration_s() - 0.01 && left.duration_s() > curve.duration_s() + 0.01);
@@ -317,8 +321,7 @@ fn the_rough_duration_of_a_path_is_about_the_exact_one() {
         let postures = random.random_range(2..7);
         let (joints, path) = random_path::<7>(&mut random, postures);
         let speed = random.random_range(0.1..=1.0);
-        let state = |q: &[f64; 7]| -> State { std::array::from_fn(|j| q.get(j).map_or(0.0, |q| *q as f32)) };
-        let states: Vec<State> = path.iter().map(state).collect();
+        let states: Vec<State> = path.iter().map(|q| state(q)).collect();
         let mut rough = Rough::new(&joints, speed);
         let about = rough.duration_s(&states);
         ratios.push(about / free(&joints, &path, speed).duration_s());

@@ -10,7 +10,7 @@ use ratn_model::value::{Trajectory, TrajectoryPoint};
 use ratn_motion::aimm;
 use ratn_motion::base::{DriveViolation, check_drive};
 use ratn_motion::collision::Contact;
-use ratn_motion::robot::{Configuration, Joint};
+use ratn_motion::robot::{Configuration, Joint, Robot};
 use ratn_motion::validate::{Violation, validate_trajectory};
 use ratn_world::scene::{Placement, SceneObject, Shape};
 
@@ -97,7 +97,7 @@ fn a_base_that_drives_out_and_back_between_two_knots_meets_what_stands_there() {
     let trajectory = moving(&joints, &[0.0; 3], 1, &phases);
     let middle = trajectory.points[3].positions[1];
     assert!((trajectory.points[4].positions[1] - middle).abs() < 1e-12);
-    let configuration = Configuration { arm: aimm::STOWED, ..Configuration::ZERO };
+    let configuration = Configuration { arm: aimm::STOWED, ..Robot::aimm().at_zero() };
     // The base is 0.6 m wide; in the middle it goes 0.6² / 1.4 m beyond the knots.
     for (beyond, touches) in [(0.05, true), (0.25, true), (0.28, false)] {
         cell.scene.objects.clear();

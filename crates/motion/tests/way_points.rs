@@ -15,7 +15,7 @@ use ratn_motion::pace::{Control, Progress};
 use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
 use ratn_motion::straight::Straight;
 use ratn_motion::timing::{Section, timed};
-use ratn_motion::trajectory::{ArmTrajectory, Curve};
+use ratn_motion::trajectory::Curve;
 use ratn_motion::way_points::WayPoints;
 use ratn_world::scene::{Placement, SceneObject, Shape};
 use robots::Arm;
@@ -24,8 +24,8 @@ use robots::Arm;
 const STRAIGHT_M: f64 = 1e-3;
 
 /// A hundred moments between any two knots.
-fn moments<const N: usize>(curve: &Curve<N>) -> Vec<f64> {
-    let between = |pair: &[ratn_motion::trajectory::Knot<N>]| {
+fn moments(curve: &Curve) -> Vec<f64> {
+    let between = |pair: &[ratn_motion::trajectory::Knot]| {
         let (from, h) = (pair[0].time_s, pair[1].time_s - pair[0].time_s);
         (0..100).map(move |i| from + h * f64::from(i) / 100.0)
     };
@@ -63,7 +63,7 @@ fn assert_along(places: &[[f64; 3]], corners: &[[f64; 3]], blend_m: f64) {
     }
 }
 
-fn check_any<const N: usize>(arm: &Arm) {
+fn check_any(arm: &Arm) {
     let from = arm.tool.pose(&arm.home);
     let there = |x: f64, y: f64, z: f64, turn: f64| from.compose(&Pose::from_rpy([x, y, z], turn, 0.0, -turn));
     let poses = [there(0.08, 0.0, 0.0, 0.1), there(0.08, 0.08, 0.0, 0.2), there(0.0, 0.08, 0.05, 0.0)];
@@ -71,13 +71,8 @@ fn check_any<const N: usize>(arm: &Arm) {
     for blend_m in [0.0, 0.01, 0.03] {
         let traced = through(&arm.tool, &arm.home, &poses, blend_m);
         assert_eq!(traced.ended, None, "{}", arm.mechanism.name);
-        let path: Vec<[f64; N]> = traced.postures.iter().map(|p| std::array::from_fn(|j| p[j])).collect();
-        let curve = timed(&arm.mechanism.joints, &[Section::AsGiven(path)], 1.0, &mut |_, _| true);
-        let tool = |t: f64| {
-            let mut positions = arm.home;
-            positions[..N].copy_from_slice(&curve.sample(t).positions);
-            arm.tool.pose(&positions)
-        };
+        let curve = timed(&arm.mechanism.joints, &[Section::AsGiven(traced.postures)], 1.0, &mut |_, _| true);
+        let tool = |t: f64| arm.tool.pose(&curve.sample(t).positions);
         let places: Vec<[f64; 3]> = moments(&curve).into_iter().map(|t| tool(t).position).collect();
         assert_along(&places, &corners, blend_m);
         let end = tool(curve.duration_s());
@@ -87,15 +82,15 @@ fn check_any<const N: usize>(arm: &Arm) {
 
 #[test]
 fn any_arm_passes_its_way_points_and_rounds_corners_only_where_it_may() {
-    check_any::<7>(&robots::seven());
-    check_any::<6>(&robots::six());
-    check_any::<7>(&robots::lifted());
+    check_any(&robots::seven());
+    check_any(&robots::six());
+    check_any(&robots::lifted());
 }
 
 fn places(cell: &Cell, plan: &Plan) -> Vec<[f64; 3]> {
-    let curve = ArmTrajectory::read(&cell.robot, &plan.trajectory).unwrap();
+    let curve = Curve::of_arm(&cell.robot, &plan.trajectory).unwrap();
     let (reach, base) = (arm::reach(&cell.robot), arm::on_floor(&cell.scene.base));
-    let tool = |t: f64| base.compose(&reach.pose(&arm::positions(&curve.sample(t).positions)));
+    let tool = |t: f64| base.compose(&reach.pose(&curve.sample(t).positions));
     moments(&curve).into_iter().map(|t| tool(t).position).collect()
 }
 

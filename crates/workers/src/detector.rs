@@ -183,7 +183,12 @@ impl Eyes {
             cy: output("cy").float()?,
         };
         let image = DepthImage::from_bytes(intrinsics.width, intrinsics.height, output("image").bytes()?)?;
-        let postures = output("robot").list()?.iter().take(MAX_POSTURES).map(posture).collect::<Result<Vec<_>, _>>()?;
+        let postures = output("robot")
+            .list()?
+            .iter()
+            .take(MAX_POSTURES)
+            .map(|port| posture(&self.robot, port))
+            .collect::<Result<Vec<_>, _>>()?;
         let body = body::balls(&self.robot, &postures);
         let calibration = calibration(output("camera_covariance").optional())?;
         Ok(Seen { image, camera: Camera { intrinsics, pose: output("camera").pose()? }, body, calibration })
@@ -214,10 +219,12 @@ fn surface(goal: &GoalContext) -> Result<Option<Surface>, ActionFailure> {
     Ok(Some(Surface { height_m, sigma_m: SURFACE_SIGMA_M, sigma_rad: SURFACE_SIGMA_RAD }))
 }
 
-fn posture(port: &Port) -> Result<Configuration, ActionFailure> {
+fn posture(robot: &Robot, port: &Port) -> Result<Configuration, ActionFailure> {
     let degrees = port.list()?.iter().map(|degree| degree.float()).collect::<Result<Vec<_>, _>>()?;
-    body::configuration(&degrees)
-        .ok_or_else(|| ActionFailure::aborted(format!("the camera says {} joints of a robot of 13", degrees.len())))
+    robot.configuration(&degrees).ok_or_else(|| {
+        let (found, expected) = (degrees.len(), robot.at_zero().values().len());
+        ActionFailure::aborted(format!("the camera says {found} positions of a robot of {expected} ({})", robot.name()))
+    })
 }
 
 /// What the goal looks for: all that there is, unless it says so.

@@ -68,7 +68,7 @@ impl Action for PlanAction {
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let begin = Instant::now();
-        let (asked, budget_s) = goal::asked(&goal)?;
+        let (asked, budget_s) = goal::asked(&goal, &self.robot)?;
         // Whatever the task declared that this plan depends on, and no more.
         let scene = goal.unless_cancelled(goal.scene(&self.scenes)).await??;
         let request = asked.in_scene(&self.robot, &scene);

@@ -215,7 +215,10 @@ fn numbers(values: &[f64]) -> Value {
 #[tokio::test]
 async fn a_straight_way_through_way_points_is_all_or_an_error_that_says_how_far() {
     let system = system().await;
-    let tool = Robot::aimm().tool_pose(&Configuration { arm: aimm::HOME, ..Configuration::ZERO });
+    let tool = {
+        let robot = Robot::aimm();
+        robot.tool_pose(&Configuration { arm: aimm::HOME, ..robot.at_zero() })
+    };
     let by = |x: f64, y: f64, z: f64| {
         let [a, b, c] = tool.position;
         Value::Pose(Pose { position: [a + x, b + y, c + z], ..tool })

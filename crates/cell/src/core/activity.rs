@@ -5,7 +5,7 @@ use super::motion::Tracking;
 use super::picture::Exposure;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
-use ratn_motion::robot::Joints;
+use ratn_motion::joint_vector::JointVector;
 use ratn_perception::camera::Camera;
 use serde::{Deserialize, Serialize};
 use std::time::Duration;
@@ -89,13 +89,16 @@ impl Activity {
     /// Where the base is, if it moves the base: x, y and heading.
     pub(crate) fn base(&self, now: Timestamp) -> Option<[f64; 3]> {
         match &self.kind {
-            Kind::Follow(Way::Base(motion)) => Some(motion.at(self.elapsed_s(now))),
+            Kind::Follow(Way::Base(motion)) => {
+                let at = motion.at(self.elapsed_s(now));
+                Some([at[0], at[1], at[2]])
+            }
             _ => None,
         }
     }
 
     /// Where the arm is, if it moves the arm.
-    pub(crate) fn arm(&self, now: Timestamp) -> Option<Joints> {
+    pub(crate) fn arm(&self, now: Timestamp) -> Option<JointVector> {
         match &self.kind {
             Kind::Follow(Way::Arm(motion)) => Some(motion.at(self.elapsed_s(now))),
             _ => None,

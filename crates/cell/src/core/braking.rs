@@ -17,6 +17,7 @@ use super::motion::{Motion, Tracking};
 use super::protocol::{Ending, Ticket};
 use ratn_model::time::Timestamp;
 use ratn_motion::drive::wrapped;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{Configuration, Joint, Robot};
 use std::time::Duration;
 
@@ -53,9 +54,9 @@ pub(super) struct Braking {
 #[derive(Debug, Clone)]
 pub(super) enum Way {
     /// With its arm.
-    Arm(Motion<7>),
+    Arm(Motion),
     /// With its base.
-    Base(Motion<3>),
+    Base(Motion),
 }
 
 /// How time goes on for what moves, from a moment on.
@@ -159,8 +160,8 @@ impl Braking {
         match &self.way {
             Way::Arm(motion) => configuration.arm = motion.at(at_s),
             Way::Base(motion) => {
-                let [x, y, heading] = motion.at(at_s);
-                configuration.base = [x, y, wrapped(heading)];
+                let at = motion.at(at_s);
+                configuration.base = [at[0], at[1], wrapped(at[2])];
             }
         }
     }
@@ -194,12 +195,12 @@ impl Pace {
     }
 
     /// From a rate to another, where the motion has come to `from_s` of its time: as fast as joints of these greatest accelerations can.
-    fn change<const N: usize>(
+    fn change(
         since: Timestamp,
         [mut rate, then]: [f64; 2],
-        motion: &Motion<N>,
+        motion: &Motion,
         from_s: f64,
-        limits: &[f64; N],
+        limits: &JointVector,
     ) -> Pace {
         let (dt, brakes) = (STEP.as_secs_f64(), then < rate);
         let mut passed = 0.0;
@@ -270,17 +271,17 @@ impl Pace {
 }
 
 /// The greatest accelerations of joints, `times` as much as motions are planned with.
-fn limits<const N: usize>(joints: &[Joint], times: f64) -> [f64; N] {
-    std::array::from_fn(|j| joints[j].acceleration * times * USED)
+fn limits(joints: &[Joint], times: f64) -> JointVector {
+    JointVector::from_fn(joints.len(), |j| joints[j].acceleration * times * USED)
 }
 
 /// How fast the rate may fall, or rise, in 1/s.
-fn greatest_slope<const N: usize>(
-    velocity: &[f64; N],
-    acceleration: &[f64; N],
+fn greatest_slope(
+    velocity: &JointVector,
+    acceleration: &JointVector,
     rate: f64,
     brakes: bool,
-    limits: &[f64; N],
+    limits: &JointVector,
 ) -> f64 {
     let slope = |j: usize| {
         // What the change of rate adds is along the velocity, or against it.
@@ -289,7 +290,7 @@ fn greatest_slope<const N: usize>(
         let least = if brakes { URGENT * limits[j] } else { 0.0 };
         if v == 0.0 { f64::INFINITY } else { room.max(least) / v.abs() }
     };
-    (0..N).map(slope).fold(f64::INFINITY, f64::min)
+    (0..limits.len()).map(slope).fold(f64::INFINITY, f64::min)
 }
 
 #[cfg(test)]
@@ -302,7 +303,7 @@ mod tests {
 
     /// Each joint goes to and fro at the acceleration that it may have, a third of a swing behind the one before it: one of them always slows
     /// down as hard as it may.
-    fn swings(robot: &Robot, period_s: f64) -> Motion<3> {
+    fn swings(robot: &Robot, period_s: f64) -> Motion {
         let joints = robot.base_joints();
         let (quarter_s, swings) = (period_s / 4.0, 20);
         let velocity = |j: usize, time_s: f64| {
@@ -330,7 +331,7 @@ mod tests {
         let stiff = Controller { of: "base", stiffness: 100.0, most_off: 10.0, slides: 2 };
         Motion::new(
             Curve::of(joints, &trajectory).unwrap(),
-            [0.0; 3],
+            JointVector::zeros(3),
             stiff,
             Some((f64::from(steps) * dt, String::new())),
         )
@@ -344,7 +345,7 @@ mod tests {
         let motion = swings(&robot, 4.0 * fastest);
         // A controller overshoots: what the joints do anyway is more than their limits at some places.
         let steps = (motion.lasts_s() / STEP.as_secs_f64()) as u32;
-        let anyway: Vec<[f64; 3]> =
+        let anyway: Vec<JointVector> =
             (0..steps).map(|i| motion.derivatives(f64::from(i) * STEP.as_secs_f64()).1).collect();
         let most: [f64; 3] =
             std::array::from_fn(|j| anyway.iter().fold(joints[j].acceleration, |most, a| most.max(a[j].abs())));

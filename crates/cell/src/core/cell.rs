@@ -84,8 +84,8 @@ impl Cell {
         )]
         let pads = Pads::of(&robot).expect("the gripper of the built-in robot has two fingers");
         let objects = placement::objects(&robot, config.scene, config.goods(), config.seed)?;
-        let resting = first_posture(&config);
-        let errors = Errors::new(config.errors, config.seed, 0);
+        let resting = first_posture(&robot, &config);
+        let errors = Errors::new(config.errors, robot.arm_joints().len(), config.seed, 0);
         let (environment, ids) = environment(&robot, &errors.truth(&resting), config.scene, &objects);
         let now = Timestamp::default();
         Ok(Cell {
@@ -282,7 +282,7 @@ impl Cell {
         let configuration = self.configuration();
         let tool = self.robot.tool_pose(&configuration);
         let object = |i| (self.environment.model(i).clone(), self.pose_of(i, &tool));
-        let eye = self.errors.eye(&self.robot.camera_pose(&configuration));
+        let eye = self.robot.camera_pose(&configuration).map_or(Pose::IDENTITY, |pose| self.errors.eye(&pose));
         let measured = self.measured();
         Scenery {
             configuration,
@@ -331,8 +331,8 @@ impl Cell {
         let followed = tracking.unwrap_or_default();
         let ending = match activity.kind {
             Kind::Follow(Way::Base(ref motion)) => match motion.end() {
-                Ok([x, y, heading]) => {
-                    self.resting.base = [x, y, wrapped(heading)];
+                Ok(end) => {
+                    self.resting.base = [end[0], end[1], wrapped(end[2])];
                     self.relocalise();
                     Ending::Done(Product::Driven { end: self.believed_base_pose(), tracking: followed })
                 }
@@ -462,10 +462,10 @@ impl Cell {
 
     fn reset(&mut self, seed: u64, goods: Goods, out: &mut Vec<Command>) {
         self.freeze("the cell was reset", out);
-        self.resting = first_posture(&self.config);
+        self.resting = first_posture(&self.robot, &self.config);
         self.seed = seed;
         self.stops = 0;
-        self.errors = Errors::new(self.config.errors, seed, 0);
+        self.errors = Errors::new(self.config.errors, self.robot.arm_joints().len(), seed, 0);
         // The request was checked before it became an event; a table that cannot be laid is an empty one.
         let objects = placement::objects(&self.robot, self.config.scene, goods, seed).unwrap_or_default();
         self.held = None;
@@ -520,6 +520,6 @@ fn standing([x, y, heading]: [f64; 3]) -> Pose {
     Pose::from_rpy([x, y, 0.0], 0.0, 0.0, heading)
 }
 
-fn first_posture(config: &CellConfig) -> Configuration {
-    Configuration { arm: aimm::HOME, finger: config.gripper.opening_m / 2.0, ..Configuration::ZERO }
+fn first_posture(robot: &Robot, config: &CellConfig) -> Configuration {
+    Configuration { arm: aimm::HOME, finger: config.gripper.opening_m / 2.0, ..robot.at_zero() }
 }

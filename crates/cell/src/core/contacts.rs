@@ -421,7 +421,7 @@ mod tests {
         fn new() -> Watched {
             let robot = Robot::aimm();
             let model = Model { kind: Kind::Box, size: [0.1, 0.1, 0.1] };
-            let stands = Configuration { finger: 0.055, ..Configuration::ZERO };
+            let stands = Configuration { finger: 0.055, ..robot.at_zero() };
             let environment = Environment::new(&robot, &stands, &[], &[(model, Pose::at(2.0, 0.0, 0.5))]);
             Watched { robot, environment, contacts: Contacts::default() }
         }

@@ -8,7 +8,8 @@ use crate::config::ErrorsConfig;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
-use ratn_motion::robot::{Configuration, Joints};
+use ratn_motion::joint_vector::{JointVector, PerJoint};
+use ratn_motion::robot::Configuration;
 use std::f64::consts::TAU;
 
 /// What is wrong in one cell, at one stop of its base.
@@ -16,9 +17,9 @@ use std::f64::consts::TAU;
 pub(super) struct Errors {
     config: ErrorsConfig,
     /// What each encoder of the arm reads at its joint's zero, in radians.
-    offsets: Joints,
+    offsets: JointVector,
     /// What it reads too much once a turn: amplitude and phase, in radians.
-    waves: [[f64; 2]; 7],
+    waves: PerJoint<[f64; 2]>,
     /// The true optical frame as seen from where it is said to be.
     camera: Pose,
     /// Where the base truly stands, as seen from where it believes to: x, y and heading.
@@ -30,13 +31,13 @@ const CALIBRATION: u64 = 2;
 const LOCALISATION: u64 = 3;
 
 impl Errors {
-    /// Of a cell with this seed, whose base has come to a stop so many times.
-    pub(super) fn new(config: ErrorsConfig, seed: u64, stops: u64) -> Errors {
+    /// Of a cell with this seed and an arm of so many joints, whose base has come to a stop so many times.
+    pub(super) fn new(config: ErrorsConfig, joints: usize, seed: u64, stops: u64) -> Errors {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         random.set_stream(CALIBRATION);
-        let offsets = std::array::from_fn(|_| config.encoder_rad * normal(&mut random));
-        let waves =
-            std::array::from_fn(|_| [config.encoder_wave_rad * normal(&mut random), random.random_range(0.0..TAU)]);
+        let offsets = JointVector::from_fn(joints, |_| config.encoder_rad * normal(&mut random));
+        let wave = |_| [config.encoder_wave_rad * normal(&mut random), random.random_range(0.0..TAU)];
+        let waves = PerJoint::from_fn(joints, wave);
         let place = std::array::from_fn(|_| config.camera_m * normal(&mut random));
         let [roll, pitch, yaw] = std::array::from_fn(|_| config.camera_rad * normal(&mut random));
         let camera = Pose::from_rpy(place, roll, pitch, yaw);
@@ -59,7 +60,7 @@ impl Errors {
         let [ahead, left, turn] = self.base;
         let (sin, cos) = heading.sin_cos();
         let base = [x + cos * ahead - sin * left, y + sin * ahead + cos * left, heading + turn];
-        let arm = std::array::from_fn(|j| {
+        let arm = JointVector::from_fn(self.offsets.len(), |j| {
             let [amplitude, phase] = self.waves[j];
             measured.arm[j] - self.offsets[j] - amplitude * (measured.arm[j] + phase).sin()
         });
@@ -89,8 +90,13 @@ fn normal(random: &mut ChaCha8Rng) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ratn_motion::robot::Robot;
 
     const SEEDS: u64 = 400;
+
+    fn at_zero() -> Configuration {
+        Robot::aimm().at_zero()
+    }
 
     fn rms(values: impl Iterator<Item = f64>) -> f64 {
         let values: Vec<f64> = values.collect();
@@ -105,15 +111,15 @@ mod tests {
     #[test]
     fn errors_have_the_sizes_that_the_configuration_says() {
         let config = ErrorsConfig::REALISTIC;
-        let all: Vec<Errors> = (0..SEEDS).map(|seed| Errors::new(config, seed, 0)).collect();
-        let here = Configuration { base: [0.3, -0.2, 1.0], ..Configuration::ZERO };
+        let all: Vec<Errors> = (0..SEEDS).map(|seed| Errors::new(config, 7, seed, 0)).collect();
+        let here = Configuration { base: [0.3, -0.2, 1.0], ..at_zero() };
         let truths: Vec<Configuration> = all.iter().map(|errors| errors.truth(&here)).collect();
         assert!(about(rms(truths.iter().map(|t| t.base[2] - 1.0)), config.localisation_rad));
         let off = |t: &Configuration| (t.base[0] - 0.3).hypot(t.base[1] + 0.2) / 2.0_f64.sqrt();
         assert!(about(rms(truths.iter().map(off)), config.localisation_m));
         // A wave has its amplitude's deviation times the root of a half, in the mean over phases.
         let encoder = config.encoder_rad.hypot(config.encoder_wave_rad / 2.0_f64.sqrt());
-        assert!(about(rms(truths.iter().flat_map(|t| t.arm)), encoder));
+        assert!(about(rms(truths.iter().flat_map(|t| t.arm.to_vec())), encoder));
         let eyes: Vec<Pose> = all.iter().map(|errors| errors.eye(&Pose::at(0.0, 0.0, 1.6))).collect();
         assert!(about(
             rms(eyes.iter().map(|eye| eye.distance(&Pose::at(0.0, 0.0, 1.6)) / 3.0_f64.sqrt())),
@@ -124,7 +130,7 @@ mod tests {
 
     #[test]
     fn the_same_seed_has_the_same_errors_and_every_stop_its_own() {
-        let of = |seed, stop| Errors::new(ErrorsConfig::REALISTIC, seed, stop);
+        let of = |seed, stop| Errors::new(ErrorsConfig::REALISTIC, 7, seed, stop);
         assert_eq!(of(3, 0), of(3, 0));
         assert_ne!(of(3, 0).camera, of(4, 0).camera);
         let (first, second) = (of(3, 0), of(3, 1));
@@ -133,16 +139,16 @@ mod tests {
 
     #[test]
     fn what_is_believed_of_where_the_base_truly_stands_is_what_leads_there() {
-        let errors = Errors::new(ErrorsConfig::REALISTIC, 5, 2);
-        let measured = Configuration { base: [1.5, 0.2, 3.0], ..Configuration::ZERO };
+        let errors = Errors::new(ErrorsConfig::REALISTIC, 7, 5, 2);
+        let measured = Configuration { base: [1.5, 0.2, 3.0], ..at_zero() };
         let back = errors.believed(errors.truth(&measured).base);
         assert!((0..3).all(|i| (back[i] - measured.base[i]).abs() < 1e-12), "{back:?}");
     }
 
     #[test]
     fn without_errors_what_is_measured_is_true() {
-        let errors = Errors::new(ErrorsConfig::NONE, 5, 2);
-        let measured = Configuration { base: [1.5, 0.2, 3.0], arm: [0.3; 7], ..Configuration::ZERO };
+        let errors = Errors::new(ErrorsConfig::NONE, 7, 5, 2);
+        let measured = Configuration { base: [1.5, 0.2, 3.0], arm: JointVector::all(7, 0.3), ..at_zero() };
         assert_eq!(errors.truth(&measured), measured);
         assert_eq!((errors.believed(measured.base), errors.eye(&Pose::IDENTITY)), (measured.base, Pose::IDENTITY));
     }

@@ -94,7 +94,7 @@ const PAD_GIVE_M: f64 = 0.002;
 impl Pads {
     /// The pads of a robot's gripper: the inner faces of its fingers.
     pub fn of(robot: &Robot) -> Option<Pads> {
-        let finger = &robot.model.links[robot.link("finger_left")?];
+        let finger = &robot.model.links[robot.finger_link()?];
         let body = finger.bodies.first()?;
         let Geometry::Box { half } = body.geometry else { return None };
         let tool = &robot.model.links[robot.tool];

@@ -7,15 +7,16 @@
 //! starts.
 
 use super::environment::STEP;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::trajectory::Curve;
 use serde::{Deserialize, Serialize};
 
 /// Joints on their way along a trajectory.
 #[derive(Debug, Clone)]
-pub(crate) struct Motion<const N: usize> {
-    trajectory: Curve<N>,
+pub(crate) struct Motion {
+    trajectory: Curve,
     /// Where the joints are, every [`STEP`] from the start.
-    course: Vec<[f64; N]>,
+    course: Vec<JointVector>,
     /// How many of the joints slide; they come first.
     slides: usize,
     /// When it ends before it is done, and why.
@@ -55,18 +56,18 @@ const STANDING: f64 = 1e-3;
 /// How long joints may take to settle, in seconds.
 const MAX_SETTLING_S: f64 = 5.0;
 
-impl<const N: usize> Motion<N> {
+impl Motion {
     /// From where the joints are to the trajectory's end, or until something breaks it off: after so many seconds, for that reason.
     pub(crate) fn new(
-        trajectory: Curve<N>,
-        start: [f64; N],
+        trajectory: Curve,
+        start: JointVector,
         controller: Controller,
         breaks: Option<(f64, String)>,
-    ) -> Motion<N> {
+    ) -> Motion {
         let dt = STEP.as_secs_f64();
         let duration_s = trajectory.duration_s();
         let mut motion = Motion { trajectory, course: vec![start], slides: controller.slides, breaks };
-        let (mut at, mut moving) = (start, [0.0_f64; N]);
+        let (mut at, mut moving) = (start, JointVector::zeros(start.len()));
         loop {
             let time_s = dt * (motion.course.len() - 1) as f64;
             // What is on its way goes on while it brakes.
@@ -93,7 +94,7 @@ impl<const N: usize> Motion<N> {
                 return motion;
             }
             let stiffness = controller.stiffness;
-            for j in 0..N {
+            for j in 0..at.len() {
                 let (off, slow) = (wanted.positions[j] - at[j], wanted.velocities[j] - moving[j]);
                 moving[j] += stiffness * (stiffness * off + 2.0 * slow) * dt;
                 at[j] += moving[j] * dt;
@@ -110,37 +111,37 @@ impl<const N: usize> Motion<N> {
 
     /// Where the joints are after so many seconds: a smooth curve through the course (Catmull and Rom). Beyond its end they go on as fast
     /// as they were.
-    pub(crate) fn at(&self, time_s: f64) -> [f64; N] {
+    pub(crate) fn at(&self, time_s: f64) -> JointVector {
         let steps = (time_s / STEP.as_secs_f64()).max(0.0);
         let (index, t) = (steps as usize, steps.fract());
         let points =
             [self.point(index.saturating_sub(1)), self.point(index), self.point(index + 1), self.point(index + 2)];
         let [p, a, b, q] = points;
-        std::array::from_fn(|j| {
+        JointVector::from_fn(a.len(), |j| {
             let (bend, slope) = (2.0 * p[j] - 5.0 * a[j] + 4.0 * b[j] - q[j], 3.0 * (a[j] - b[j]) + q[j] - p[j]);
             a[j] + 0.5 * t * (b[j] - p[j] + t * (bend + t * slope))
         })
     }
 
     /// How fast the joints are after so many seconds, and how fast that changes, per second and per second squared.
-    pub(crate) fn derivatives(&self, time_s: f64) -> ([f64; N], [f64; N]) {
+    pub(crate) fn derivatives(&self, time_s: f64) -> (JointVector, JointVector) {
         let dt = STEP.as_secs_f64();
         let time_s = time_s.max(dt);
         let [before, at, after] = [-dt, 0.0, dt].map(|off| self.at(time_s + off));
-        let velocity = std::array::from_fn(|j| (after[j] - before[j]) / (2.0 * dt));
-        let acceleration = std::array::from_fn(|j| (after[j] - 2.0 * at[j] + before[j]) / (dt * dt));
+        let velocity = JointVector::from_fn(at.len(), |j| (after[j] - before[j]) / (2.0 * dt));
+        let acceleration = JointVector::from_fn(at.len(), |j| (after[j] - 2.0 * at[j] + before[j]) / (dt * dt));
         (velocity, acceleration)
     }
 
-    fn point(&self, index: usize) -> [f64; N] {
+    fn point(&self, index: usize) -> JointVector {
         let last = self.course.len() - 1;
         let Some(beyond) = index.checked_sub(last).filter(|_| last > 0) else { return self.course[index.min(last)] };
         let (end, before) = (&self.course[last], &self.course[last - 1]);
-        std::array::from_fn(|j| end[j] + (end[j] - before[j]) * beyond as f64)
+        JointVector::from_fn(end.len(), |j| end[j] + (end[j] - before[j]) * beyond as f64)
     }
 
     /// Where they end, at rest; or why they are still on their way then.
-    pub(crate) fn end(&self) -> Result<[f64; N], &str> {
+    pub(crate) fn end(&self) -> Result<JointVector, &str> {
         match &self.breaks {
             Some((_, reason)) => Err(reason),
             None => Ok(self.trajectory.end()),
@@ -150,7 +151,7 @@ impl<const N: usize> Motion<N> {
     /// How well it was followed for so many seconds.
     pub(crate) fn tracking(&self, time_s: f64) -> Tracking {
         let dt = STEP.as_secs_f64();
-        let (mut tracking, turns) = (Tracking::default(), N - self.slides);
+        let (mut tracking, turns) = (Tracking::default(), self.course[0].len() - self.slides);
         let passed = self.course.iter().enumerate().take_while(|(i, _)| *i as f64 * dt <= time_s);
         let mut count = 0.0;
         for (i, at) in passed {
@@ -159,7 +160,8 @@ impl<const N: usize> Motion<N> {
             tracking.most_rad = tracking.most_rad.max(radians);
             tracking.most_m = tracking.most_m.max(metres);
             tracking.rms_m += metres.powi(2);
-            tracking.rms_rad += (self.slides..N).map(|j| (at[j] - wanted[j]).powi(2)).sum::<f64>() / turns as f64;
+            tracking.rms_rad +=
+                (self.slides..at.len()).map(|j| (at[j] - wanted[j]).powi(2)).sum::<f64>() / turns as f64;
             count += 1.0;
         }
         let root = |sum: f64| (sum / f64::max(count, 1.0)).sqrt();
@@ -167,10 +169,10 @@ impl<const N: usize> Motion<N> {
     }
 
     /// How far the joints are from where they should be: the one that is turned too far at the most, and those that slide together.
-    fn off(&self, at: &[f64; N], wanted: &[f64; N]) -> (f64, f64) {
+    fn off(&self, at: &JointVector, wanted: &JointVector) -> (f64, f64) {
         let off = |j: usize| (at[j] - wanted[j]).abs();
         let metres = (0..self.slides).map(|j| off(j).powi(2)).sum::<f64>().sqrt();
-        ((self.slides..N).map(off).fold(0.0, f64::max), metres)
+        ((self.slides..at.len()).map(off).fold(0.0, f64::max), metres)
     }
 }
 
@@ -206,7 +208,7 @@ mod tests {
     const CONTROLLER: Controller = Controller { of: "base", stiffness: 20.0, most_off: 0.05, slides: 2 };
 
     /// Straight along x with an acceleration of 0.5 m/s² for two seconds, and down again.
-    fn straight(robot: &Robot) -> Curve<3> {
+    fn straight(robot: &Robot) -> Curve {
         let point = |time_s: f64, x: f64, v: f64| TrajectoryPoint {
             time_s,
             positions: vec![x, 0.0, 0.0],
@@ -221,30 +223,31 @@ mod tests {
 
     #[test]
     fn the_lag_is_that_of_the_model_and_a_stiffer_controller_lags_less() {
-        let motion = Motion::new(straight(&Robot::aimm()), [0.0; 3], CONTROLLER, None);
+        let motion = Motion::new(straight(&Robot::aimm()), JointVector::zeros(3), CONTROLLER, None);
         // 0.5 / 20² m.
         let tracking = motion.tracking(f64::INFINITY);
         assert!((tracking.most_m - 0.00125).abs() < 2e-4, "{tracking:?}");
         assert!(tracking.rms_m > 0.5 * tracking.most_m && tracking.rms_m < tracking.most_m, "{tracking:?}");
         assert_eq!((tracking.most_rad, tracking.rms_rad), (0.0, 0.0));
         let stiffer = Controller { stiffness: 40.0, ..CONTROLLER };
-        let stiffer = Motion::new(straight(&Robot::aimm()), [0.0; 3], stiffer, None).tracking(f64::INFINITY);
+        let stiffer =
+            Motion::new(straight(&Robot::aimm()), JointVector::zeros(3), stiffer, None).tracking(f64::INFINITY);
         assert!(stiffer.most_m < 0.3 * tracking.most_m, "{stiffer:?}");
     }
 
     #[test]
     fn it_waits_until_the_joints_have_settled_and_then_stands_where_it_should() {
-        let motion = Motion::new(straight(&Robot::aimm()), [0.0; 3], CONTROLLER, None);
+        let motion = Motion::new(straight(&Robot::aimm()), JointVector::zeros(3), CONTROLLER, None);
         let over = motion.lasts_s() - 4.0;
         assert!(over > 0.1 && over < 1.0, "{over} s");
         assert!((motion.at(4.0)[0] - 2.0).abs() > SETTLED && (motion.at(motion.lasts_s())[0] - 2.0).abs() <= SETTLED);
-        assert_eq!(motion.end(), Ok([2.0, 0.0, 0.0]));
+        assert_eq!(motion.end(), Ok(JointVector::of([2.0, 0.0, 0.0])));
     }
 
     #[test]
     fn what_is_too_far_off_breaks_off_there_and_says_how_far() {
         let weak = Controller { stiffness: 3.0, ..CONTROLLER };
-        let motion = Motion::new(straight(&Robot::aimm()), [0.0; 3], weak, None);
+        let motion = Motion::new(straight(&Robot::aimm()), JointVector::zeros(3), weak, None);
         let reason = motion.end();
         assert!(motion.lasts_s() < 3.0 && motion.at(motion.lasts_s())[0] < 2.0);
         assert!(reason.is_err_and(|r| r.contains("m from its trajectory, 0.05 m are allowed")), "{reason:?}");
@@ -253,9 +256,9 @@ mod tests {
 
     #[test]
     fn a_motion_that_starts_beside_its_trajectory_comes_to_it() {
-        let motion = Motion::new(straight(&Robot::aimm()), [0.0, 0.01, 0.01], CONTROLLER, None);
+        let motion = Motion::new(straight(&Robot::aimm()), JointVector::of([0.0, 0.01, 0.01]), CONTROLLER, None);
         let tracking = motion.tracking(f64::INFINITY);
         assert!((tracking.most_rad - 0.01).abs() < 1e-9 && tracking.rms_rad < 0.002, "{tracking:?}");
-        assert_eq!(motion.end(), Ok([2.0, 0.0, 0.0]));
+        assert_eq!(motion.end(), Ok(JointVector::of([2.0, 0.0, 0.0])));
     }
 }

@@ -188,13 +188,12 @@ fn all_graspable(robot: &Robot, setting: Setting, placed: &[Placed]) -> bool {
     });
     let scene = Scene { base: Pose::IDENTITY, objects: parts.chain(fixed(setting)).collect() };
     let mut checker = Checker::new(robot, &scene, &arm::assumed(robot, &scene), PADDING_M);
-    let (reach, home) = (arm::reach(robot), arm::positions(&aimm::HOME));
+    let (reach, home) = (arm::reach(robot), aimm::HOME);
     let mut random = ChaCha8Rng::seed_from_u64(0);
     placed.iter().filter(|object| object.model.slips_off().is_none()).all(|object| {
         grasps(object).iter().any(|grasp| {
             reach.solutions(&Target::at(*grasp), &home, 6, 20, &mut random).iter().any(|posture| {
-                let posture = std::array::from_fn(|j| posture[j]);
-                line(&reach, &posture, [0.0, 0.0, aimm::APPROACH_M]).is_ok_and(|postures| {
+                line(&reach, posture, [0.0, 0.0, aimm::APPROACH_M]).is_ok_and(|postures| {
                     postures.iter().all(|p| checker.is_free(p, Contact::Gripper(CONTACT_TOLERANCE_M)))
                 })
             })

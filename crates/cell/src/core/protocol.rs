@@ -9,7 +9,7 @@ use super::snapshot::Snapshot;
 use crate::config::Goods;
 use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
-use ratn_motion::robot::Joints;
+use ratn_motion::joint_vector::JointVector;
 use ratn_perception::camera::Camera;
 use ratn_worker::safety::SafetyState;
 use serde::{Deserialize, Serialize};
@@ -77,7 +77,7 @@ pub enum Request {
     /// The arm straight to a posture.
     MoveTo {
         /// Where to.
-        joints: Joints,
+        joints: JointVector,
         /// How much of its greatest speed, above 0 and at most 1.
         speed: f64,
     },
@@ -163,7 +163,7 @@ pub enum Product {
     /// The arm is there.
     Moved {
         /// Its posture.
-        end: Joints,
+        end: JointVector,
         /// How well it followed.
         tracking: Tracking,
     },
@@ -187,7 +187,7 @@ pub enum Product {
     /// Where the arm is.
     ArmSensed {
         /// Its posture.
-        joints: Joints,
+        joints: JointVector,
     },
     /// How the fingers are.
     GripperSensed {

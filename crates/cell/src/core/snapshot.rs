@@ -14,7 +14,8 @@ use super::placement::furniture;
 use super::protocol::Command;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
-use ratn_motion::robot::{Configuration, Joints};
+use ratn_motion::joint_vector::JointVector;
+use ratn_motion::robot::Configuration;
 use serde::{Deserialize, Serialize};
 
 /// The form of what is written; another one is refused.
@@ -48,7 +49,7 @@ pub struct Snapshot {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Posture {
     base: [f64; 3],
-    arm: Joints,
+    arm: JointVector,
     pan: f64,
     tilt: f64,
     finger: f64,
@@ -139,7 +140,7 @@ impl Cell {
         let Posture { base, arm, pan, tilt, finger } = snapshot.posture.clone();
         self.resting = Configuration { base, arm, pan, tilt, finger };
         (self.seed, self.stops) = (snapshot.seed, snapshot.stops);
-        self.errors = Errors::new(self.config.errors, self.seed, self.stops);
+        self.errors = Errors::new(self.config.errors, self.robot.arm_joints().len(), self.seed, self.stops);
         self.environment = Environment::restore(
             &self.robot,
             &self.configuration(),

@@ -8,11 +8,14 @@ use super::motion::{Controller, Motion};
 use super::protocol::Request;
 use super::trajectory;
 use ratn_motion::drive::wrapped;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::Configuration;
-use ratn_motion::trajectory::{ArmTrajectory, BaseTrajectory};
+use ratn_motion::trajectory::Curve;
 use ratn_perception::camera::Camera;
 use ratn_perception::noise::MAX_FRAMES;
 
+/// Why there is no picture.
+const NO_CAMERA: &str = "the robot has no camera: its description has no `[camera]`";
 /// How far the camera may look past its target, in radians.
 const MAX_LOOK_ERROR_RAD: f64 = 0.02;
 
@@ -56,6 +59,10 @@ impl Cell {
                 self.no_motion_of(Module::Base, BASE)?;
                 self.no_motion_of(Module::Gripper, HAND)?;
                 self.no_motion_of(Module::PanTilt, HEAD)?;
+                let expected = self.robot.arm_joints().len();
+                if joints.len() != expected {
+                    return Err(format!("input `joints` has {} values: the arm has {expected}", joints.len()));
+                }
                 let line = trajectory::straight(&self.robot, &here.arm, &joints, speed)?;
                 let trajectory = trajectory::check(&self.robot, &here, &line)?;
                 self.following(trajectory)
@@ -95,7 +102,8 @@ impl Cell {
                 if !(1..=MAX_FRAMES).contains(&frames) {
                     return Err(format!("a picture has 1 to {MAX_FRAMES} frames, not {frames}"));
                 }
-                let camera = Camera { intrinsics: self.config.camera.intrinsics, pose: self.robot.camera_pose(&here) };
+                let pose = self.robot.camera_pose(&here).ok_or_else(|| NO_CAMERA.to_owned())?;
+                let camera = Camera { intrinsics: self.config.camera.intrinsics, pose };
                 let period = 1.0 / self.config.camera.frames_per_s;
                 let next = self.motion_time + seconds(period);
                 let kind = Kind::Capture { camera, frames, taken: 0, next, exposures: Vec::new() };
@@ -111,7 +119,7 @@ impl Cell {
     }
 
     /// What the arm does, and for how long.
-    fn following(&mut self, trajectory: ArmTrajectory) -> (Kind, f64) {
+    fn following(&mut self, trajectory: Curve) -> (Kind, f64) {
         let lasts_s = trajectory.duration_s();
         let config = self.config.controllers;
         let controller =
@@ -123,7 +131,7 @@ impl Cell {
     }
 
     /// What the base does, and for how long.
-    fn driving(&mut self, trajectory: BaseTrajectory) -> (Kind, f64) {
+    fn driving(&mut self, trajectory: Curve) -> (Kind, f64) {
         let lasts_s = trajectory.duration_s();
         let config = self.config.controllers;
         let controller =
@@ -131,7 +139,7 @@ impl Cell {
         let breaks = self.drive_breaks_off(lasts_s);
         // A heading is the same after a whole turn: the one that the trajectory begins at.
         let ([x, y, heading], first) = (self.measured().base, trajectory.knots()[0].positions[2]);
-        let start = [x, y, first + wrapped(heading - first)];
+        let start = JointVector::of([x, y, first + wrapped(heading - first)]);
         let motion = Motion::new(trajectory, start, controller, breaks);
         let lasts_s = motion.lasts_s();
         (Kind::Follow(Way::Base(motion)), lasts_s)
@@ -146,7 +154,8 @@ impl Cell {
 
     fn aim(&self, target: [f64; 3]) -> Result<[f64; 2], String> {
         let (pan, tilt) = self.robot.look_at(&self.believed_base_pose(), target);
-        let camera = self.robot.camera_pose(&Configuration { pan, tilt, ..self.measured() });
+        let looking = Configuration { pan, tilt, ..self.measured() };
+        let camera = self.robot.camera_pose(&looking).ok_or_else(|| NO_CAMERA.to_owned())?;
         let seen = camera.inverse().transform(target);
         let off = seen[0].hypot(seen[1]).atan2(seen[2]);
         if off > MAX_LOOK_ERROR_RAD {
@@ -162,7 +171,7 @@ impl Cell {
     /// How long the head takes, with ramps of the greatest acceleration on the joint that takes longest.
     fn turning_s(&self, from: [f64; 2], to: [f64; 2]) -> f64 {
         let time = |joint: usize, way: f64| {
-            let joint = &self.robot.head_joints()[joint];
+            let Some(joint) = self.robot.head_joints().get(joint) else { return 0.0 };
             let (speed, acceleration) = (joint.velocity * self.config.pan_tilt.speed, joint.acceleration);
             let ramp = speed * speed / acceleration;
             if way >= ramp { way / speed + speed / acceleration } else { 2.0 * (way / acceleration).sqrt() }

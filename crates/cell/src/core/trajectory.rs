@@ -6,10 +6,11 @@ use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
 use ratn_motion::base::check_drive;
 use ratn_motion::collision::Contact;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::plan::MIN_SPEED;
-use ratn_motion::robot::{Configuration, Joints, Robot};
+use ratn_motion::robot::{Configuration, Robot};
 use ratn_motion::timing::{Section, parameterise};
-use ratn_motion::trajectory::{ArmTrajectory, BaseTrajectory};
+use ratn_motion::trajectory::Curve;
 use ratn_motion::validate::validate_trajectory;
 use ratn_world::scene::Scene;
 
@@ -20,7 +21,7 @@ const MAX_MOTION_S: f64 = 600.0;
 ///
 /// # Errors
 /// Why it may not be followed.
-pub(crate) fn check(robot: &Robot, here: &Configuration, trajectory: &Trajectory) -> Result<ArmTrajectory, String> {
+pub(crate) fn check(robot: &Robot, here: &Configuration, trajectory: &Trajectory) -> Result<Curve, String> {
     is_short(trajectory)?;
     validate_trajectory(robot, &nothing(), here, trajectory, Contact::None)
         .map_err(|violation| format!("the trajectory is refused: {violation}"))
@@ -30,11 +31,7 @@ pub(crate) fn check(robot: &Robot, here: &Configuration, trajectory: &Trajectory
 ///
 /// # Errors
 /// Why it may not be followed.
-pub(crate) fn check_base(
-    robot: &Robot,
-    here: &Configuration,
-    trajectory: &Trajectory,
-) -> Result<BaseTrajectory, String> {
+pub(crate) fn check_base(robot: &Robot, here: &Configuration, trajectory: &Trajectory) -> Result<Curve, String> {
     is_short(trajectory)?;
     check_drive(robot, &nothing(), here, &[], trajectory)
         .map_err(|violation| format!("the trajectory is refused: {violation}"))
@@ -57,7 +54,7 @@ fn is_short(trajectory: &Trajectory) -> Result<(), String> {
 ///
 /// # Errors
 /// When the speed is none.
-pub(crate) fn straight(robot: &Robot, from: &Joints, to: &Joints, speed: f64) -> Result<Trajectory, String> {
+pub(crate) fn straight(robot: &Robot, from: &JointVector, to: &JointVector, speed: f64) -> Result<Trajectory, String> {
     if !(MIN_SPEED..=1.0).contains(&speed) {
         return Err(format!("a speed of {speed} is none: it is a fraction of the limits, from {MIN_SPEED} to 1"));
     }

@@ -5,6 +5,7 @@ use crate::config::CellConfig;
 use crate::core::protocol::{Ending, Module, Product, Request};
 use ratn_model::fact::{FactKey, Term};
 use ratn_model::value::Value;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::Configuration;
 use ratn_perception::noise::MAX_FRAMES;
 use ratn_worker::action::{Action, ActionFailure, ActionResult, ActionServer, GoalContext, GoalOutcome};
@@ -67,10 +68,10 @@ const ACTIONS: [(Module, &str, &str, Read); 10] = [
         Ok(Request::Follow { trajectory: goal.input_trajectory("trajectory")?.clone() })
     }),
     (Module::Arm, "move_to", "moves the arm on a straight line of joint space", |goal| {
-        let joints = goal.input_joints("joints")?;
-        let wrong = |_| ActionFailure::aborted(format!("input `joints` has {} values: the arm has 7", joints.len()));
+        let joints = JointVector::read(goal.input_joints("joints")?);
+        let joints = joints.map_err(|wrong| ActionFailure::aborted(format!("input `joints` has {wrong}")))?;
         let speed = goal.optional_float("speed")?.unwrap_or(MOVE_TO_SPEED);
-        Ok(Request::MoveTo { joints: joints.try_into().map_err(wrong)?, speed })
+        Ok(Request::MoveTo { joints, speed })
     }),
     (Module::Gripper, "grasp", "closes the fingers around an object", |goal| {
         let expected = goal.port("expected").optional().map(|port| port.pose()).transpose()?;
@@ -91,8 +92,7 @@ const ACTIONS: [(Module, &str, &str, Read); 10] = [
 
 /// All degrees of freedom in their order: base x, y, yaw, the arm, pan, tilt, finger.
 fn configuration_value(at: &Configuration) -> Value {
-    let degrees = at.base.into_iter().chain(at.arm).chain([at.pan, at.tilt, at.finger]);
-    Value::List(degrees.map(Value::Float).collect())
+    Value::List(at.values().into_iter().map(Value::Float).collect())
 }
 
 /// What a drive measures: where the base believes to stand at its stop.

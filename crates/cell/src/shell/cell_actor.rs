@@ -13,7 +13,8 @@ use crate::core::recording::Line;
 use crate::core::snapshot::Snapshot;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
-use ratn_motion::robot::{Joints, Robot};
+use ratn_motion::joint_vector::JointVector;
+use ratn_motion::robot::Robot;
 use ratn_panic_point::panic_point;
 use ratn_perception::camera::{Camera, DepthImage};
 use ratn_perception::noise::Noise;
@@ -42,7 +43,7 @@ const RESTLESS_SLEEP: Duration = Duration::from_millis(5);
 pub(crate) struct State {
     pub(crate) objects: Vec<TrueObject>,
     pub(crate) battery: f64,
-    pub(crate) arm: Joints,
+    pub(crate) arm: JointVector,
     pub(crate) base: Pose,
     pub(crate) now: Timestamp,
     pub(crate) seed: u64,

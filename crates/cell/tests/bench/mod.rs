@@ -10,9 +10,9 @@ use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Trajectory;
 use ratn_motion::aimm;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::pace::Control;
 use ratn_motion::plan::{Goal, Request as PlanRequest, plan};
-use ratn_motion::robot::Joints;
 use ratn_motion::straight::Straight;
 use ratn_world::scene::Scene;
 use std::time::Duration;
@@ -84,7 +84,7 @@ impl Bench {
     }
 
     /// Where the robot has its joints.
-    pub(crate) fn arm(&self) -> Joints {
+    pub(crate) fn arm(&self) -> JointVector {
         self.cell.measured().arm
     }
 

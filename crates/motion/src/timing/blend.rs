@@ -1,9 +1,9 @@
 //! Rounds the corners of a path, each by itself: a quintic Bézier curve per corner, straight at both ends, as wide as the neighbours
 //! and the obstacles leave room for; without room the path is cut there, for the arm to stop.
 
-use super::path::{Path, Segment};
+use super::path::{Path, Segment, between};
 use super::{SAGITTA_RAD, STRAIGHT_RAD};
-use crate::collision::{between, distance};
+use crate::collision::distance;
 
 /// The widest that a corner is cut on each side, and the least, in radians.
 pub(super) const BLEND_RAD: f64 = 0.5;

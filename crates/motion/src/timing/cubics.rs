@@ -6,7 +6,7 @@
 use crate::trajectory::Knot;
 
 /// The knots of the spline; there are at least six.
-pub(crate) fn through<const N: usize>(times: &[f64], positions: &[[f64; N]]) -> Vec<Knot<N>> {
+pub(crate) fn through<const N: usize>(times: &[f64], positions: &[[f64; N]]) -> Vec<Knot<[f64; N]>> {
     let n = times.len() - 1;
     let h: Vec<f64> = times.windows(2).map(|pair| pair[1] - pair[0]).collect();
     let (first, last) = (h[0], h[n - 1]);

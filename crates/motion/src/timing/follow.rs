@@ -58,10 +58,12 @@ const CLOSE: f64 = 1.003;
 impl<const N: usize> Bounds<N> {
     /// The limits of joints; those of velocity and acceleration are multiplied by the speed.
     pub(crate) fn new(joints: &[Joint], speed: f64) -> Bounds<N> {
+        // Those beyond stand still, so any limits do.
+        let joint = |j: usize| joints.get(j).unwrap_or(&joints[0]);
         Bounds {
-            velocities: std::array::from_fn(|j| joints[j].velocity * speed),
-            accelerations: std::array::from_fn(|j| joints[j].acceleration * speed),
-            jerks: std::array::from_fn(|j| joints[j].jerk),
+            velocities: std::array::from_fn(|j| joint(j).velocity * speed),
+            accelerations: std::array::from_fn(|j| joint(j).acceleration * speed),
+            jerks: std::array::from_fn(|j| joint(j).jerk),
         }
     }
 
@@ -88,7 +90,7 @@ pub(crate) fn follow<const N: usize>(
     path: &Path<N>,
     bounds: &Bounds<N>,
     goes_on: &mut dyn FnMut() -> bool,
-) -> Option<Vec<Knot<N>>> {
+) -> Option<Vec<Knot<[f64; N]>>> {
     if path.is_line() {
         return Some(straight(path, bounds));
     }
@@ -112,7 +114,7 @@ pub(crate) fn estimate<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> f6
         + (limits.acceleration / limits.jerk).min((limits.velocity / limits.jerk).sqrt())
 }
 
-fn straight<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> Vec<Knot<N>> {
+fn straight<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> Vec<Knot<[f64; N]>> {
     let line = &path.segments()[0];
     let direction = line.at(0.0).first;
     let instants = double_s(path.length(), bounds.along(&direction));
@@ -153,7 +155,7 @@ impl<const N: usize> Second<N> {
         Second { grid, squares, times }
     }
 
-    fn knots(&self) -> Vec<Knot<N>> {
+    fn knots(&self) -> Vec<Knot<[f64; N]>> {
         let knot = |i: usize| Knot {
             time_s: self.times[i],
             positions: self.grid.points[i].position,
@@ -164,15 +166,15 @@ impl<const N: usize> Second<N> {
 }
 
 /// The knots on a grid so dense that the limits hold between its points as well, but for little.
-fn second_order<const N: usize>(path: &Path<N>, bounds: &Bounds<N>, second: Second<N>) -> Vec<Knot<N>> {
+fn second_order<const N: usize>(path: &Path<N>, bounds: &Bounds<N>, second: Second<N>) -> Vec<Knot<[f64; N]>> {
     let mut knots = second.knots();
-    let excess = |knots: &[Knot<N>]| knots.windows(2).map(|pair| slower(used(pair, bounds))).fold(1.0, f64::max);
+    let excess = |knots: &[Knot<[f64; N]>]| knots.windows(2).map(|pair| slower(used(pair, bounds))).fold(1.0, f64::max);
     for density in DENSER {
         if excess(&knots) < CLOSE {
             break;
         }
         let denser = Second::of(path, bounds, density).knots();
-        let lasts = |knots: &[Knot<N>]| knots[knots.len() - 1].time_s * excess(knots);
+        let lasts = |knots: &[Knot<[f64; N]>]| knots[knots.len() - 1].time_s * excess(knots);
         if lasts(&denser) < lasts(&knots) {
             knots = denser;
         }
@@ -186,7 +188,7 @@ fn third<const N: usize>(
     bounds: &Bounds<N>,
     second: &Second<N>,
     goes_on: &mut dyn FnMut() -> bool,
-) -> Option<Vec<Knot<N>>> {
+) -> Option<Vec<Knot<[f64; N]>>> {
     let mesh = mesh(path, bounds, second);
     let cells = mesh.s.len() - 1;
     let mut limits = Limits {
@@ -194,7 +196,7 @@ fn third<const N: usize>(
         accelerations: vec![bounds.accelerations; cells],
         jerks: vec![bounds.jerks; cells],
     };
-    let mut best: Option<(f64, Vec<Knot<N>>)> = None;
+    let mut best: Option<(f64, Vec<Knot<[f64; N]>>)> = None;
     let mut last = None;
     for _ in 0..ROUNDS {
         let Some(profile) = quickest(&mesh, &limits, last.as_ref(), goes_on) else { break };
@@ -318,7 +320,7 @@ fn lasts(cell: f64, x: [f64; 2], u: [f64; 2]) -> f64 {
 }
 
 /// How much of its limits a cubic uses: by velocity, acceleration and jerk.
-fn used<const N: usize>(pair: &[Knot<N>], bounds: &Bounds<N>) -> [f64; 3] {
+fn used<const N: usize>(pair: &[Knot<[f64; N]>], bounds: &Bounds<N>) -> [f64; 3] {
     let mut used = [0.0_f64; 3];
     for j in 0..N {
         let cubic = Cubic::between(&pair[0], &pair[1], j);
@@ -335,7 +337,7 @@ fn slower([velocity, acceleration, jerk]: [f64; 3]) -> f64 {
 }
 
 /// Draws limits tighter in the cells where the knots break them; gives the factor of time that the knots would need.
-fn tighten<const N: usize>(knots: &[Knot<N>], bounds: &Bounds<N>, limits: &mut Limits<N>) -> f64 {
+fn tighten<const N: usize>(knots: &[Knot<[f64; N]>], bounds: &Bounds<N>, limits: &mut Limits<N>) -> f64 {
     let cells = limits.jerks.len();
     let mut excess = 1.0_f64;
     let mut broken = vec![[1.0_f64; 3]; cells];
@@ -363,7 +365,7 @@ fn tighten<const N: usize>(knots: &[Knot<N>], bounds: &Bounds<N>, limits: &mut L
 }
 
 /// Slower by what its cubics break the limits by, if they do.
-fn slowed<const N: usize>(mut knots: Vec<Knot<N>>, bounds: &Bounds<N>) -> Vec<Knot<N>> {
+fn slowed<const N: usize>(mut knots: Vec<Knot<[f64; N]>>, bounds: &Bounds<N>) -> Vec<Knot<[f64; N]>> {
     let factor = knots.windows(2).map(|pair| slower(used(pair, bounds))).fold(1.0, f64::max);
     if factor > 1.0 {
         for knot in &mut knots {

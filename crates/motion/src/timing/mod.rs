@@ -17,7 +17,9 @@ mod spline;
 mod third_order;
 
 use crate::collision::distance;
-use crate::robot::{Joint, Joints, Robot};
+use crate::joint_vector::JointVector;
+use crate::mechanism::MAX_JOINTS;
+use crate::robot::{Joint, Robot};
 use crate::trajectory::{Curve, Knot};
 use blend::rounded;
 use follow::{Bounds, estimate, follow};
@@ -48,20 +50,32 @@ const LOOSE_SHARE: f64 = 0.5;
 
 /// A section of a path.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Section<const N: usize = 7> {
+pub enum Section<P = JointVector> {
     /// Its corners may be blended where nothing is touched.
-    Blended(Vec<[f64; N]>),
+    Blended(Vec<P>),
     /// Followed as it is given, from rest to rest: postures close to each other, such as those along a straight line of the tool; or two, for a
     /// straight motion of the joints.
-    AsGiven(Vec<[f64; N]>),
+    AsGiven(Vec<P>),
     /// As given but for its ends: shares of its way, at its beginning and at its end, that may be left to pass into a neighbour without a stop,
     /// where nothing is touched.
-    Loose(Vec<[f64; N]>, [f64; 2]),
+    Loose(Vec<P>, [f64; 2]),
 }
 
-impl<const N: usize> Section<N> {
+impl Section {
+    /// With as many joints as an array has; those that are not there are at zero.
+    fn padded<const N: usize>(&self) -> Section<[f64; N]> {
+        let all = |path: &[JointVector]| path.iter().map(JointVector::padded).collect();
+        match self {
+            Section::Blended(path) => Section::Blended(all(path)),
+            Section::AsGiven(path) => Section::AsGiven(all(path)),
+            Section::Loose(path, shares) => Section::Loose(all(path), *shares),
+        }
+    }
+}
+
+impl<P: Copy> Section<P> {
     /// Its postures.
-    pub fn path(&self) -> &[[f64; N]] {
+    pub fn path(&self) -> &[P] {
         let (Section::Blended(path) | Section::AsGiven(path) | Section::Loose(path, _)) = self;
         path
     }
@@ -82,42 +96,75 @@ pub fn parameterise(
     robot: &Robot,
     sections: &[Section],
     speed: f64,
-    is_free: &mut dyn FnMut(&Joints, &Joints) -> bool,
+    is_free: &mut dyn FnMut(&JointVector, &JointVector) -> bool,
 ) -> Trajectory {
-    timed(robot.arm_joints(), sections, speed, is_free).to_model(robot)
+    timed(robot.arm_joints(), sections, speed, is_free).named(robot.arm_joints())
 }
 
 /// As [`parameterise`], for any joints, to the end.
-pub fn timed<const N: usize>(
+pub fn timed(
     joints: &[Joint],
-    sections: &[Section<N>],
+    sections: &[Section],
     speed: f64,
-    is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
-) -> Curve<N> {
+    is_free: &mut dyn FnMut(&JointVector, &JointVector) -> bool,
+) -> Curve {
     timed_while(joints, sections, speed, is_free, &mut || true)
 }
 
 /// As [`timed`]; where `goes_on`, which is asked several times per millisecond, says no, what has not been rounded yet is followed with
 /// a stop at every corner.
-pub fn timed_while<const N: usize>(
+pub fn timed_while(
     joints: &[Joint],
-    sections: &[Section<N>],
+    sections: &[Section],
     speed: f64,
+    is_free: &mut dyn FnMut(&JointVector, &JointVector) -> bool,
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Curve {
+    // What follows computes with arrays of fixed sizes; joints up to the next size stand still at zero.
+    match joints.len() {
+        ..=3 => timed_as::<3>(joints, sections, speed, is_free, goes_on),
+        4..=7 => timed_as::<7>(joints, sections, speed, is_free, goes_on),
+        _ => timed_as::<MAX_JOINTS>(joints, sections, speed, is_free, goes_on),
+    }
+}
+
+fn timed_as<const N: usize>(
+    joints: &[Joint],
+    sections: &[Section],
+    speed: f64,
+    is_free: &mut dyn FnMut(&JointVector, &JointVector) -> bool,
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Curve {
+    let of = |padded: &[f64; N]| JointVector::from_fn(joints.len(), |j| padded[j]);
+    let padded: Vec<Section<[f64; N]>> = sections.iter().map(Section::padded).collect();
+    let is_free = &mut |from: &[f64; N], to: &[f64; N]| is_free(&of(from), &of(to));
+    let knots = knots(&padded, &Bounds::new(joints, speed), is_free, goes_on);
+    let knot = |knot: &Knot<[f64; N]>| Knot {
+        time_s: knot.time_s,
+        positions: of(&knot.positions),
+        velocities: of(&knot.velocities),
+    };
+    Curve::new(knots.iter().map(knot).collect())
+}
+
+/// The knots of the whole motion.
+fn knots<const N: usize>(
+    sections: &[Section<[f64; N]>],
+    bounds: &Bounds<N>,
     is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
     goes_on: &mut dyn FnMut() -> bool,
-) -> Curve<N> {
-    let bounds = Bounds::new(joints, speed);
+) -> Vec<Knot<[f64; N]>> {
     let mut ways = Vec::new();
     for section in sections {
         let path = without_repeats(section.path());
         ways.push(match section {
             _ if path.len() < 2 => Way { pieces: Vec::new(), knots: Vec::new() },
-            Section::Blended(_) => free(&path, &bounds, is_free, goes_on),
-            Section::AsGiven(_) | Section::Loose(..) => straight(&path, &bounds, goes_on),
+            Section::Blended(_) => free(&path, bounds, is_free, goes_on),
+            Section::AsGiven(_) | Section::Loose(..) => straight(&path, bounds, goes_on),
         });
     }
     let stops: f64 = ways.iter().map(|way| lasts_s(&way.knots)).sum();
-    let passing = passing(sections, &ways, &bounds, is_free, goes_on).filter(|knots| lasts_s(knots) < stops);
+    let passing = passing(sections, &ways, bounds, is_free, goes_on).filter(|knots| lasts_s(knots) < stops);
     let start = sections.first().and_then(|section| section.path().first()).copied().unwrap_or([0.0; N]);
     let mut knots = vec![Knot { time_s: 0.0, positions: start, velocities: [0.0; N] }];
     match passing {
@@ -132,11 +179,11 @@ pub fn timed_while<const N: usize>(
     if let Some(section) = sections.last() {
         end_at(&mut knots, section);
     }
-    Curve::new(knots)
+    knots
 }
 
 /// To the last bit.
-fn end_at<const N: usize>(knots: &mut [Knot<N>], section: &Section<N>) {
+fn end_at<const N: usize>(knots: &mut [Knot<[f64; N]>], section: &Section<[f64; N]>) {
     if let (Some(knot), Some(end)) = (knots.last_mut(), section.path().last()) {
         knot.positions = *end;
     }
@@ -145,21 +192,21 @@ fn end_at<const N: usize>(knots: &mut [Knot<N>], section: &Section<N>) {
 /// Smooth pieces from rest to rest, and what they are followed by.
 struct Way<const N: usize> {
     pieces: Vec<Path<N>>,
-    knots: Vec<Knot<N>>,
+    knots: Vec<Knot<[f64; N]>>,
 }
 
 /// Through all sections, without a stop where that is free and quicker by the estimate; none where every seam stays.
 fn passing<const N: usize>(
-    sections: &[Section<N>],
+    sections: &[Section<[f64; N]>],
     ways: &[Way<N>],
     bounds: &Bounds<N>,
     is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
     goes_on: &mut dyn FnMut() -> bool,
-) -> Option<Vec<Knot<N>>> {
+) -> Option<Vec<Knot<[f64; N]>>> {
     if ways.len() < 2 {
         return None;
     }
-    let loose = |(section, way): (&Section<N>, &Way<N>)| -> Vec<Loose<N>> {
+    let loose = |(section, way): (&Section<[f64; N]>, &Way<N>)| -> Vec<Loose<N>> {
         let shares = section.loose();
         let of = |piece: &Path<N>| Loose { path: piece.clone(), ends: shares.map(|share| share * piece.length()) };
         way.pieces.iter().map(of).collect()
@@ -236,7 +283,7 @@ fn without_repeats<const N: usize>(path: &[[f64; N]]) -> Vec<[f64; N]> {
     all
 }
 
-fn lasts_s<const N: usize>(knots: &[Knot<N>]) -> f64 {
+fn lasts_s<const N: usize>(knots: &[Knot<[f64; N]>]) -> f64 {
     knots.last().map_or(0.0, |knot| knot.time_s)
 }
 
@@ -245,7 +292,7 @@ fn followed<const N: usize>(
     pieces: &[Path<N>],
     bounds: &Bounds<N>,
     goes_on: &mut dyn FnMut() -> bool,
-) -> Option<Vec<Knot<N>>> {
+) -> Option<Vec<Knot<[f64; N]>>> {
     let mut knots = Vec::new();
     for piece in pieces {
         append(&mut knots, follow(piece, bounds, goes_on)?);
@@ -254,7 +301,7 @@ fn followed<const N: usize>(
 }
 
 /// Begins where the knots end; what comes first there is left out.
-fn append<const N: usize>(knots: &mut Vec<Knot<N>>, next: Vec<Knot<N>>) {
+fn append<const N: usize>(knots: &mut Vec<Knot<[f64; N]>>, next: Vec<Knot<[f64; N]>>) {
     let begins_s = lasts_s(knots);
     let skipped = usize::from(!knots.is_empty());
     knots.extend(next.into_iter().skip(skipped).map(|knot| Knot { time_s: begins_s + knot.time_s, ..knot }));

@@ -125,6 +125,11 @@ impl<const N: usize> Segment<N> {
     }
 }
 
+/// The point a share of the way from one to another.
+pub(crate) fn between<const N: usize>(from: &[f64; N], to: &[f64; N], share: f64) -> [f64; N] {
+    std::array::from_fn(|j| from[j] + (to[j] - from[j]) * share)
+}
+
 pub(crate) fn norm<const N: usize>(v: &[f64; N]) -> f64 {
     v.iter().map(|x| x * x).sum::<f64>().sqrt()
 }

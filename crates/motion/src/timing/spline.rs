@@ -7,8 +7,8 @@
 
 use super::STRAIGHT_RAD;
 use super::blend::{bend_rad, is_free_along};
-use super::path::{Path, Segment};
-use crate::collision::{between, distance};
+use super::path::{Path, Segment, between};
+use crate::collision::distance;
 use std::collections::BTreeSet;
 
 /// Rounds in which control points are added before the path is cut.

@@ -7,9 +7,10 @@ use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::arm;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::pace::{Control, Progress};
 use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
-use ratn_motion::robot::{Configuration, Joints, Robot};
+use ratn_motion::robot::{Configuration, Robot};
 use ratn_motion::straight::Straight;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::TAU;
@@ -17,7 +18,7 @@ use std::f64::consts::TAU;
 pub struct Cell {
     pub robot: Robot,
     pub scene: Scene,
-    pub arm: Joints,
+    pub arm: JointVector,
     pub improvement_iterations: usize,
 }
 

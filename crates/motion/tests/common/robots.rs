@@ -4,15 +4,16 @@
 #![allow(clippy::unwrap_used, unreachable_pub, dead_code, reason = "shared by several test programs, which may panic")]
 
 use ratn_model::pose::Pose;
-use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
-use ratn_motion::reach::{Positions, Reach};
+use ratn_motion::joint_vector::JointVector;
+use ratn_motion::mechanism::Mechanism;
+use ratn_motion::reach::Reach;
 use std::f64::consts::{FRAC_PI_2, PI};
 
 /// An arm with the frame at its end, and a posture in the middle of what it can do.
 pub struct Arm {
     pub mechanism: Mechanism,
     pub tool: Reach,
-    pub home: Positions,
+    pub home: JointVector,
 }
 
 /// Where a joint sits, its axis, its limits and its speed; what slides has the second axis.
@@ -98,7 +99,5 @@ fn arm(name: &str, parts: &[Part], tool: Pose, home: &[f64]) -> Arm {
     }
     let mechanism = Mechanism::read(&(urdf + "</robot>"), None, &names).unwrap();
     let tool = Reach::new(&mechanism, mechanism.link(&format!("l{}", parts.len())).unwrap(), tool);
-    let mut positions = [0.0; MAX_JOINTS];
-    positions[..home.len()].copy_from_slice(home);
-    Arm { mechanism, tool, home: positions }
+    Arm { mechanism, tool, home: JointVector::read(home).unwrap() }
 }

@@ -3,8 +3,8 @@
 //! `tool_speed_m_s`, `tool_turning_rad_s`.
 
 use ratn_model::value::Value;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::keep::{Keep, KeptAxis, Region};
-use ratn_motion::robot::Joints;
 use ratn_motion::tool_speed::ToolSpeed;
 use ratn_worker::action::{ActionFailure, GoalContext};
 
@@ -29,24 +29,26 @@ pub(super) fn keep(goal: &GoalContext) -> Result<Keep, ActionFailure> {
     Ok(Keep { axis, inside })
 }
 
-/// Fractions of the limits of velocity, acceleration and jerk.
-pub(super) fn scales(goal: &GoalContext) -> Result<[Joints; 3], ActionFailure> {
-    Ok([scale(goal, "velocity_scale")?, scale(goal, "acceleration_scale")?, scale(goal, "jerk_scale")?])
+/// For so many joints: fractions of the limits of velocity, acceleration and jerk.
+pub(super) fn scales(goal: &GoalContext, joints: usize) -> Result<[JointVector; 3], ActionFailure> {
+    let scale = |name| scale(goal, name, joints);
+    Ok([scale("velocity_scale")?, scale("acceleration_scale")?, scale("jerk_scale")?])
 }
 
-fn scale(goal: &GoalContext, name: &str) -> Result<Joints, ActionFailure> {
-    let Some(port) = goal.port(name).optional() else { return Ok([1.0; 7]) };
+fn scale(goal: &GoalContext, name: &str, joints: usize) -> Result<JointVector, ActionFailure> {
+    let Some(port) = goal.port(name).optional() else { return Ok(JointVector::all(joints, 1.0)) };
     if let Some(all) = port.any()?.as_number() {
-        return Ok([all; 7]);
+        return Ok(JointVector::all(joints, all));
     }
     let wrong = |found: String| {
-        ActionFailure::aborted(format!("input `{name}` {found}: expected a number, or one for each of 7 joints"))
+        ActionFailure::aborted(format!("input `{name}` {found}: expected a number, or one for each of {joints} joints"))
     };
     let Value::List(values) = port.any()? else { return Err(wrong(format!("is a {}", port.any()?.type_name()))) };
     let numbers: Option<Vec<f64>> = values.iter().map(Value::as_number).collect();
     let numbers = numbers.ok_or_else(|| wrong("has an element that is no number".to_owned()))?;
     let count = numbers.len();
-    numbers.try_into().map_err(|_| wrong(format!("has {count} numbers")))
+    let vector = JointVector::read(&numbers).ok().filter(|vector| vector.len() == joints);
+    vector.ok_or_else(|| wrong(format!("has {count} numbers")))
 }
 
 /// How fast the tool may be.

@@ -7,7 +7,7 @@ use ratn_model::pose::Pose;
 use ratn_model::value::Value;
 use ratn_motion::base::{DriveError, DriveRequest, plan_drive};
 use ratn_motion::pace::Control;
-use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::robot::Robot;
 use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome, SceneCache};
 use ratn_world::scene::Scene;
 use std::sync::Arc;
@@ -66,7 +66,7 @@ fn request(goal: &GoalContext, robot: &Robot, scene: &Scene) -> Result<DriveRequ
         _ => vec![goal.input_pose("goal")?],
     };
     let start = goal.port("start").optional().map(|port| port.pose()).transpose()?;
-    let here = Said::read(goal, "arm")?.in_scene(robot, scene);
+    let here = Said::read(goal, robot, "arm")?.in_scene(robot, scene);
     Ok(DriveRequest {
         start: here.with_base(&start.unwrap_or(scene.base)),
         goals: goals.iter().map(place).collect(),
@@ -78,7 +78,7 @@ fn request(goal: &GoalContext, robot: &Robot, scene: &Scene) -> Result<DriveRequ
 }
 
 fn place(pose: &Pose) -> [f64; 3] {
-    Configuration::ZERO.with_base(pose).base
+    ratn_motion::robot::on_floor(pose)
 }
 
 fn on_floor([x, y, heading]: [f64; 3]) -> Pose {

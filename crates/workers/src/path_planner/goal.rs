@@ -8,8 +8,9 @@
 use super::bounds;
 use ratn_model::value::Value;
 use ratn_motion::arm::assumed;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::plan::{Goal, Request};
-use ratn_motion::robot::{Configuration, Joints, Robot};
+use ratn_motion::robot::{Configuration, Robot};
 use ratn_motion::straight::{Frame, Straight};
 use ratn_motion::way_points::WayPoints;
 use ratn_worker::action::{ActionFailure, GoalContext};
@@ -21,7 +22,7 @@ const DEFAULT_SPEED: f64 = 0.3;
 /// Where head and fingers are, as far as it is said.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Said {
-    arm: Joints,
+    arm: JointVector,
     pan: Option<f64>,
     tilt: Option<f64>,
     width_m: Option<f64>,
@@ -44,9 +45,9 @@ impl Asked {
 
 impl Said {
     /// From the input ports `pan`, `tilt`, `width_m`, and that of the arm's posture.
-    pub(super) fn read(goal: &GoalContext, arm_port: &str) -> Result<Said, ActionFailure> {
+    pub(super) fn read(goal: &GoalContext, robot: &Robot, arm_port: &str) -> Result<Said, ActionFailure> {
         Ok(Said {
-            arm: joints(arm_port, goal.input_joints(arm_port)?)?,
+            arm: joints(robot, arm_port, goal.input_joints(arm_port)?)?,
             pan: goal.optional_float("pan")?,
             tilt: goal.optional_float("tilt")?,
             width_m: goal.optional_float("width_m")?,
@@ -67,7 +68,7 @@ impl Said {
 }
 
 /// What is asked for, and the budget in the robot's seconds.
-pub(super) fn asked(goal: &GoalContext) -> Result<(Asked, Option<f64>), ActionFailure> {
+pub(super) fn asked(goal: &GoalContext, robot: &Robot) -> Result<(Asked, Option<f64>), ActionFailure> {
     let budget_s = goal.optional_float("budget_s")?;
     if budget_s.is_some_and(|s| !s.is_finite() || s < 0.0) {
         return Err(ActionFailure::aborted(format!(
@@ -80,7 +81,7 @@ pub(super) fn asked(goal: &GoalContext) -> Result<(Asked, Option<f64>), ActionFa
         straight: way_points(goal)?,
         upright_rad: goal.optional_float("upright_rad")?,
         keep: bounds::keep(goal)?,
-        scales: bounds::scales(goal)?,
+        scales: bounds::scales(goal, robot.arm_joints().len())?,
         tool_speed: bounds::tool_speed(goal)?,
         reaches_into: names(goal)?,
         speed: goal.optional_float("speed")?.unwrap_or(DEFAULT_SPEED),
@@ -88,9 +89,9 @@ pub(super) fn asked(goal: &GoalContext) -> Result<(Asked, Option<f64>), ActionFa
         // The clock says when improvement ends.
         improvement_iterations: usize::MAX,
         // The start is known when the scene is.
-        ..Request::new(Configuration::ZERO, goals(goal.port("goal").any()?)?)
+        ..Request::new(robot.at_zero(), goals(robot, goal.port("goal").any()?)?)
     };
-    Ok((Asked { said: Said::read(goal, "start")?, request }, budget_s))
+    Ok((Asked { said: Said::read(goal, robot, "start")?, request }, budget_s))
 }
 
 /// A straight part by the ports `…_m`, `…_direction` and `…_frame`; `usual` is the part where no direction is said.
@@ -134,14 +135,14 @@ fn names(goal: &GoalContext) -> Result<Vec<String>, ActionFailure> {
     port.list()?.iter().map(|name| Ok(name.string()?.to_owned())).collect()
 }
 
-fn goals(value: &Value) -> Result<Vec<Goal>, ActionFailure> {
+fn goals(robot: &Robot, value: &Value) -> Result<Vec<Goal>, ActionFailure> {
     match value {
-        Value::Joints(values) => Ok(vec![Goal::Joints(joints("goal", values)?)]),
+        Value::Joints(values) => Ok(vec![Goal::Joints(joints(robot, "goal", values)?)]),
         Value::Pose(pose) => Ok(vec![Goal::Pose(*pose)]),
         Value::List(alternatives) => {
             let one = |value: &Value| match value {
                 Value::List(_) => Err(not_a_goal(value)),
-                _ => goals(value),
+                _ => goals(robot, value),
             };
             let goals: Result<Vec<Vec<Goal>>, ActionFailure> = alternatives.iter().map(one).collect();
             Ok(goals?.concat())
@@ -155,7 +156,13 @@ fn not_a_goal(value: &Value) -> ActionFailure {
     ActionFailure::aborted(format!("input `goal` has a {found}: expected joints, a pose, or a list of these"))
 }
 
-fn joints(port: &str, values: &[f64]) -> Result<Joints, ActionFailure> {
-    let wrong = |_| ActionFailure::aborted(format!("input `{port}` has {} joints: expected 7", values.len()));
-    values.try_into().map_err(wrong)
+fn joints(robot: &Robot, port: &str, values: &[f64]) -> Result<JointVector, ActionFailure> {
+    let expected = robot.arm_joints().len();
+    let vector = JointVector::read(values).ok().filter(|vector| vector.len() == expected);
+    vector.ok_or_else(|| {
+        let (found, name) = (values.len(), robot.name());
+        ActionFailure::aborted(format!(
+            "input `{port}` has {found} joints: expected {expected}, as many as the arm of {name} has"
+        ))
+    })
 }

@@ -60,7 +60,7 @@ pub(super) struct Joined {
 impl Joined {
     /// Links that hang on each other, and what touches in the home posture.
     pub(super) fn of(robot: &Robot) -> Joined {
-        let home = Configuration { arm: aimm::HOME, finger: robot.finger().upper, ..Configuration::ZERO };
+        let home = Configuration { arm: aimm::HOME, finger: robot.open_finger_m(), ..robot.at_zero() };
         let shapes = robot.shapes(&home);
         let mut joined = Joined::default();
         for (i, (a, pose_a, shape_a)) in shapes.iter().enumerate() {

@@ -1,0 +1,172 @@
+//! A robot as data: which of the joints and links of a URDF are its arm, gripper, base, head and camera (`robot.toml`).
+//!
+//! The built-in robots are read the same way. [`Robot::of`](crate::robot::Robot::of) holds the names against the URDF.
+
+use crate::mesh_files::MeshFiles;
+use crate::robot::{Robot, RobotFault};
+use serde::Deserialize;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// What a `robot.toml` says.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RobotDescription {
+    /// What messages call it.
+    pub name: String,
+    /// The URDF; seen from the folder of the file that names it, as are all paths.
+    pub urdf: PathBuf,
+    /// The SRDF: which links are not checked against each other. Without it, that is found out from how links meet.
+    #[serde(default)]
+    pub srdf: Option<PathBuf>,
+    /// Where `package://NAME/…` leads: folders that hold packages, or are one.
+    #[serde(default)]
+    pub packages: Vec<PathBuf>,
+    /// The arm.
+    pub arm: ArmDescription,
+    /// The gripper. A robot without one grasps nothing.
+    #[serde(default)]
+    pub gripper: Option<GripperDescription>,
+    /// A base that drives. A robot without one stands where its URDF puts it.
+    #[serde(default)]
+    pub base: Option<BaseDescription>,
+    /// A pan-tilt unit that carries the camera. Without it the camera looks where the URDF has it.
+    #[serde(default)]
+    pub head: Option<HeadDescription>,
+    /// The camera.
+    #[serde(default)]
+    pub camera: Option<CameraDescription>,
+    /// Postures of the arm by name, in radians (metres for a joint that slides), in the order of its joints.
+    #[serde(default)]
+    pub postures: BTreeMap<String, Vec<f64>>,
+}
+
+/// An arm.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ArmDescription {
+    /// Its joints, from the foot to the tool.
+    pub joints: Vec<String>,
+    /// The link whose frame is brought to goals: z points the way the gripper reaches, y along which the fingers close.
+    pub tool: String,
+}
+
+/// A gripper of two fingers that close on the middle.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GripperDescription {
+    /// The joint that slides one finger, from 0 where they meet: its position is half of the opening. The other finger's joint mimics it.
+    pub joint: String,
+    /// The link that both fingers hang on.
+    pub hand: String,
+    /// The link of one finger, of which the thickness is taken.
+    pub finger: String,
+}
+
+/// A base that drives on a floor.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BaseDescription {
+    /// Its x, its y and its heading, in this order.
+    pub joints: [String; 3],
+    /// The link of its body: what stands on top of it rides along.
+    pub body: String,
+}
+
+/// A pan-tilt unit.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HeadDescription {
+    /// Pan, positive to the left, and tilt, positive downwards.
+    pub joints: [String; 2],
+}
+
+/// A camera.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraDescription {
+    /// The link that is its optical frame: z forward, x right, y down.
+    pub link: String,
+}
+
+/// Why a file describes no robot.
+#[derive(Debug, thiserror::Error)]
+pub enum DescriptionError {
+    /// A file cannot be read.
+    #[error("{}: cannot be read: {reason}", file.display())]
+    Read {
+        /// The file.
+        file: PathBuf,
+        /// What the system says.
+        reason: String,
+    },
+    /// It is not TOML of this form.
+    #[error("{}: {reason}", file.display())]
+    Form {
+        /// The file.
+        file: PathBuf,
+        /// Line, column and what does not fit.
+        reason: String,
+    },
+    /// Its names do not fit the URDF.
+    #[error("{}: {fault}", file.display())]
+    Fault {
+        /// The file.
+        file: PathBuf,
+        /// What does not fit.
+        fault: Box<RobotFault>,
+    },
+}
+
+/// The most of a file that is read, in bytes.
+const MAX_BYTES: u64 = 16 << 20;
+
+impl RobotDescription {
+    /// Reads the text of a `robot.toml`.
+    ///
+    /// # Errors
+    /// Line, column and what does not fit.
+    pub fn read(text: &str) -> Result<RobotDescription, String> {
+        toml::from_str(text).map_err(|error| error.to_string().trim_end().to_owned())
+    }
+}
+
+impl Robot {
+    /// The built-in robot of this name, or the one that a `robot.toml` describes.
+    ///
+    /// # Errors
+    /// [`DescriptionError`] names the file and what does not fit.
+    pub fn named_or_file(robot: &str) -> Result<Robot, DescriptionError> {
+        match Robot::built_in(robot) {
+            Some(robot) => Ok(robot),
+            None => Robot::from_file(Path::new(robot)),
+        }
+    }
+
+    /// The robot that a `robot.toml` describes, with its URDF, SRDF and meshes.
+    ///
+    /// # Errors
+    /// [`DescriptionError`] names the file and what does not fit.
+    pub fn from_file(file: &Path) -> Result<Robot, DescriptionError> {
+        let text = read_text(file)?;
+        let description =
+            RobotDescription::read(&text).map_err(|reason| DescriptionError::Form { file: file.to_owned(), reason })?;
+        let folder = file.parent().unwrap_or(Path::new("."));
+        let urdf_file = folder.join(&description.urdf);
+        let urdf = read_text(&urdf_file)?;
+        let srdf = description.srdf.as_ref().map(|srdf| read_text(&folder.join(srdf))).transpose()?;
+        let packages = description.packages.iter().map(|package| folder.join(package)).collect();
+        let meshes = MeshFiles { beside: urdf_file.parent().unwrap_or(folder).to_owned(), packages };
+        let fault = |fault| DescriptionError::Fault { file: file.to_owned(), fault: Box::new(fault) };
+        Robot::of(description, &urdf, srdf.as_deref(), &mut |name| meshes.read(name)).map_err(fault)
+    }
+}
+
+fn read_text(file: &Path) -> Result<String, DescriptionError> {
+    let failed = |reason: String| DescriptionError::Read { file: file.to_owned(), reason };
+    let size = std::fs::metadata(file).map_err(|error| failed(error.to_string()))?.len();
+    if size > MAX_BYTES {
+        return Err(failed(format!("it has {size} bytes: at most {MAX_BYTES} are read")));
+    }
+    std::fs::read_to_string(file).map_err(|error| failed(error.to_string()))
+}
