@@ -3,9 +3,11 @@
 //! Numeric: damped least squares on the geometric Jacobian, from a given posture or from random ones. What is within its
 //! tolerance counts as no error, so the same descent serves poses to be reached ([`Target::at`]), poses about an axis, and
 //! constraints that a whole path keeps, such as "upright" ([`Target::upright`]). Arms of seven joints with a spherical shoulder
-//! and wrist are solved in closed form (`spherical`, `elbow`): every pose that they reach is found, and it is certain when one
-//! is out of reach. Deterministic: the randomness comes from the caller.
+//! and wrist (`spherical`, `elbow`) and most of those with six (`closed_form`, `six`) are solved in closed form: every pose that they
+//! reach is found, and it is certain when one is out of reach. What has more joints is solved in closed form for places of one or a few
+//! of its joints, where the others allow it. Deterministic: the randomness comes from the caller.
 
+use crate::closed_form::ClosedForm;
 use crate::elbow::{self, Arc};
 use crate::frame::{compose, cross, difference, norm, rotate};
 use crate::joint_vector::JointVector;
@@ -31,6 +33,16 @@ const EXACT: f64 = 1e-4;
 
 /// Arcs of the elbow's turns that are looked at for the nearest posture.
 const ARCS_TRIED: usize = 4;
+
+/// A joint that is held while the others are solved is tried at so many places of its range on the way from where it is.
+const STEPS: usize = 64;
+
+/// And at so many random ones in an attempt anywhere.
+const DRAWS: usize = 8;
+
+/// Descents of an attempt anywhere, until one arrives. With twenty attempts every one of 10,000 random poses is found, of an arm that is not
+/// solved in closed form.
+const DESCENTS: usize = 2;
 
 /// Two postures closer than this are the same one, in radians.
 const SAME: f64 = 0.05;
@@ -141,6 +153,8 @@ pub struct Reach {
     /// Joints that are planned for and do not move the link.
     others: Vec<usize>,
     spherical: Option<Spherical>,
+    /// Where the chain is not spherical at both ends.
+    closed_form: Option<ClosedForm>,
     levers: Levers,
 }
 
@@ -148,14 +162,30 @@ pub struct Reach {
 #[derive(Debug, Clone)]
 pub struct Postures {
     target: Target,
-    /// The turns of the elbow that keep the limits.
-    arcs: Option<Vec<Arc>>,
+    form: Form,
+}
+
+/// How postures are found.
+#[derive(Debug, Clone)]
+enum Form {
+    /// By descent alone.
+    Numeric,
+    /// By the turns of the elbow that keep the limits.
+    Arcs(Vec<Arc>),
+    /// With some joints of the chain held.
+    Held,
+    /// It is certain that there are none.
+    OutOfReach,
 }
 
 impl Postures {
     /// Whether it is certain that there are none.
     pub fn is_empty(&self) -> bool {
-        self.arcs.as_ref().is_some_and(Vec::is_empty)
+        match &self.form {
+            Form::Arcs(arcs) => arcs.is_empty(),
+            Form::OutOfReach => true,
+            Form::Numeric | Form::Held => false,
+        }
     }
 }
 
@@ -185,10 +215,11 @@ impl Reach {
         let tip = fixed.compose(&frame);
         let spherical = Spherical::of(&chain, &tip);
         let joints = mechanism.joints.clone();
+        let closed_form = if spherical.is_some() { None } else { ClosedForm::of(&chain, &joints) };
         let is_other = |joint: &usize| chain.iter().all(|(_, drive)| drive.joint != *joint);
         let others = (0..joints.len()).filter(is_other).collect();
         let levers = Levers::new(&chain, &tip, &joints);
-        Reach { chain, tip, joints, others, spherical, levers }
+        Reach { chain, tip, joints, others, spherical, closed_form, levers }
     }
 
     /// The joints, in the order of the positions.
@@ -222,7 +253,7 @@ impl Reach {
         [norm([along(0), along(1), along(2)]), norm([along(3), along(4), along(5)])]
     }
 
-    /// Positions held within the limits.
+    /// JointVector held within the limits.
     pub fn clamp(&self, positions: &JointVector) -> JointVector {
         let mut clamped = *positions;
         for (q, joint) in clamped.iter_mut().zip(&self.joints) {
@@ -246,11 +277,15 @@ impl Reach {
             }
             let error = target.error(&tip, INNER);
             let views = [target.bounds.as_ref().unwrap_or(&target.pose), &target.pose].map(Pose::inverse);
-            let rows = jacobian(&axes, &tip, &views, target.minds(&error));
+            let mut rows = jacobian(&axes, &tip, &views, target.minds(&error));
             let (off, turned) = (norm([error[0], error[1], error[2]]), norm([error[3], error[4], error[5]]));
             // Far away a heavily damped step keeps the descent steady; close by it is nearly Newton's.
             let damping = f64::clamp(1e-3 * (off + turned), 1e-9, 1e-3);
-            let step = damped_step(&rows, &error, damping, self.joints.len())?;
+            let mut step = damped_step(&rows, &error, damping, self.joints.len())?;
+            // What a joint at its limit would do the others have to do.
+            while self.stop_at_limits(&positions, &step, &mut rows) {
+                step = damped_step(&rows, &error, damping, self.joints.len())?;
+            }
             let largest = step.iter().fold(0.0_f64, |m, s| m.max(s.abs()));
             let scale = if largest > MAX_STEP { MAX_STEP / largest } else { 1.0 };
             for (q, step) in positions.iter_mut().zip(step) {
@@ -261,10 +296,32 @@ impl Reach {
         None
     }
 
+    /// Takes the joints out of a Jacobian that are at a limit and that a step would move beyond it; whether there were any.
+    fn stop_at_limits(&self, positions: &JointVector, step: &Row, rows: &mut [Row; 6]) -> bool {
+        let mut stopped = false;
+        for (j, joint) in self.joints.iter().enumerate() {
+            let leaves =
+                (step[j] < 0.0 && positions[j] <= joint.lower) || (step[j] > 0.0 && positions[j] >= joint.upper);
+            if leaves && rows.iter().any(|row| row[j] != 0.0) {
+                rows.iter_mut().for_each(|row| row[j] = 0.0);
+                stopped = true;
+            }
+        }
+        stopped
+    }
+
     /// The postures that meet a target, to be taken from by [`Reach::nearest`] and [`Reach::anywhere`].
     pub fn postures(&self, target: &Target) -> Postures {
-        let closed = self.spherical.as_ref().filter(|_| target.is_exact());
-        Postures { target: *target, arcs: closed.map(|arm| elbow::arcs(arm, &target.pose, &self.joints)) }
+        let form = match (&self.spherical, &self.closed_form) {
+            (Some(arm), _) if target.is_exact() => Form::Arcs(elbow::arcs(arm, &target.pose, &self.joints)),
+            (None, Some(form)) if target.is_exact() => {
+                let here = JointVector::zeros(self.joints.len());
+                let solved = form.solve(&self.chain, &self.tip, &self.joints, &target.pose, &here);
+                if solved.is_complete && solved.postures.is_empty() { Form::OutOfReach } else { Form::Held }
+            }
+            _ => Form::Numeric,
+        };
+        Postures { target: *target, form }
     }
 
     /// Up to `wanted` different postures from at most `attempts`, nearest to `near` first.
@@ -304,19 +361,25 @@ impl Reach {
 
     /// Postures close to `near`, the nearest first. Joints that do not move the link stay where they are there.
     pub fn nearest(&self, postures: &Postures, near: &JointVector) -> Vec<JointVector> {
-        let (Some(arm), Some(arcs)) = (&self.spherical, &postures.arcs) else {
-            return self.descend(&postures.target, near).into_iter().collect();
-        };
-        let turn = arm.turn(near);
-        let mut closest: Vec<(f64, f64, f64)> = Vec::new();
-        for arc in arcs {
-            let (turn, away) = arc.nearest(turn);
-            closest.push((away, turn, arc.bend));
+        match (&postures.form, &self.spherical, &self.closed_form) {
+            (Form::Arcs(arcs), Some(arm), _) => {
+                let turn = arm.turn(near);
+                let mut closest: Vec<(f64, f64, f64)> = Vec::new();
+                for arc in arcs {
+                    let (turn, away) = arc.nearest(turn);
+                    closest.push((away, turn, arc.bend));
+                }
+                closest.sort_by(|a, b| a.0.total_cmp(&b.0));
+                let closest = closest.into_iter().take(ARCS_TRIED);
+                sorted(closest.flat_map(|(_, turn, bend)| self.solve(postures, bend, turn, near)).collect(), near)
+            }
+            (Form::Held, _, Some(form)) => {
+                let found = self.nearest_held(form, &postures.target, &self.clamp(near));
+                if found.is_empty() { self.descend(&postures.target, near).into_iter().collect() } else { found }
+            }
+            (Form::OutOfReach, ..) => Vec::new(),
+            _ => self.descend(&postures.target, near).into_iter().collect(),
         }
-        closest.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let found =
-            closest.into_iter().take(ARCS_TRIED).flat_map(|(_, turn, bend)| self.solve(postures, bend, turn, near));
-        sorted(found.collect(), near)
     }
 
     /// Postures anywhere, the nearest to `near` first. Joints that do not move the link stay where they are there half of the time: elsewhere
@@ -324,21 +387,68 @@ impl Reach {
     pub fn anywhere(&self, postures: &Postures, near: &JointVector, random: &mut impl Rng) -> Vec<JointVector> {
         let stays = self.others.is_empty() || random.random_bool(0.5);
         let others = if stays { *near } else { self.random(random) };
-        let Some(arcs) = &postures.arcs else {
+        let mut seed = || {
             let mut seed = self.random(random);
             self.others.iter().for_each(|joint| seed[*joint] = others[*joint]);
-            return self.descend(&postures.target, &seed).into_iter().collect();
+            seed
         };
-        let mut along = random.random_range(0.0..1.0) * arcs.iter().map(|arc| arc.width).sum::<f64>();
-        let chosen = arcs.iter().find(|arc| {
-            let here = along < arc.width;
-            if !here {
-                along -= arc.width;
+        match (&postures.form, &self.closed_form) {
+            (Form::Arcs(arcs), _) => {
+                let mut along = random.random_range(0.0..1.0) * arcs.iter().map(|arc| arc.width).sum::<f64>();
+                let chosen = arcs.iter().find(|arc| {
+                    let here = along < arc.width;
+                    if !here {
+                        along -= arc.width;
+                    }
+                    here
+                });
+                let found = chosen.map(|arc| self.solve(postures, arc.bend, arc.from + along, &others));
+                sorted(found.unwrap_or_default(), near)
             }
-            here
-        });
-        let found = chosen.map(|arc| self.solve(postures, arc.bend, arc.from + along, &others));
-        sorted(found.unwrap_or_default(), near)
+            (Form::Held, Some(form)) => {
+                let draws = if form.held.is_empty() { 1 } else { DRAWS };
+                let found = (0..draws).map(|_| self.solve_held(form, &postures.target, &seed()));
+                match found.into_iter().find(|found| !found.is_empty()) {
+                    Some(found) => sorted(found, near),
+                    None => (0..DESCENTS).find_map(|_| self.descend(&postures.target, &seed())).into_iter().collect(),
+                }
+            }
+            (Form::OutOfReach, _) => Vec::new(),
+            _ => (0..DESCENTS).find_map(|_| self.descend(&postures.target, &seed())).into_iter().collect(),
+        }
+    }
+
+    /// The postures with the held joints where they are closest to `near`, each solved joint in its turn nearest to it.
+    fn nearest_held(&self, form: &ClosedForm, target: &Target, near: &JointVector) -> Vec<JointVector> {
+        let here = self.solve_held(form, target, near);
+        if !here.is_empty() {
+            return here;
+        }
+        for step in 1..=STEPS {
+            let mut found = Vec::new();
+            for joint in &form.held {
+                let Joint { lower, upper, .. } = self.joints[*joint];
+                let by = (upper - lower) * step as f64 / STEPS as f64;
+                for place in [near[*joint] - by, near[*joint] + by] {
+                    if (lower..=upper).contains(&place) {
+                        let mut held = *near;
+                        held[*joint] = place;
+                        found.extend(self.solve_held(form, target, &held));
+                    }
+                }
+            }
+            if !found.is_empty() {
+                return sorted(found, near);
+            }
+        }
+        Vec::new()
+    }
+
+    /// The postures with the held joints as in `others`, the nearest to them first.
+    fn solve_held(&self, form: &ClosedForm, target: &Target, others: &JointVector) -> Vec<JointVector> {
+        let solved = form.solve(&self.chain, &self.tip, &self.joints, &target.pose, others);
+        // Axes that are rounded in the URDF, and limits, leave a little to mend.
+        sorted(solved.postures.iter().filter_map(|posture| self.descend(target, posture)).collect(), others)
     }
 
     /// The postures within the limits with the elbow at this bend and turn, in closed form, and the other joints as in `others`.

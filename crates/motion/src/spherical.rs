@@ -16,7 +16,7 @@ const MEETING: f64 = 1e-9;
 /// Axes this close to one direction turn about the same one, in radians: a tenth of what a pose may be off.
 const IN_LINE: f64 = 1e-7;
 
-type Vector = [f64; 3];
+pub(crate) type Vector = [f64; 3];
 
 /// The geometry of such an arm at zero positions.
 #[derive(Debug, Clone)]
@@ -200,7 +200,7 @@ pub(crate) fn about([x, y, z]: Vector, angle: f64) -> Pose {
 }
 
 /// The angle about an axis from one vector to another.
-fn angle_about(axis: Vector, from: Vector, to: Vector) -> f64 {
+pub(crate) fn angle_about(axis: Vector, from: Vector, to: Vector) -> f64 {
     let across = |v: Vector| -> Vector { std::array::from_fn(|i| v[i] - dot(axis, v) * axis[i]) };
     let (from, to) = (across(from), across(to));
     dot(axis, cross(from, to)).atan2(dot(from, to))

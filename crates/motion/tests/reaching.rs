@@ -94,7 +94,7 @@ proptest! {
     }
 
     #[test]
-    fn poses_of_an_arm_of_six_joints_are_found_by_descent(seed in 0_u64..10_000) {
+    fn poses_of_an_arm_of_six_joints_are_found(seed in 0_u64..10_000) {
         let reach = tool(&arm(2..=7));
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let target = Target::at(reach.pose(&reach.random(&mut random)));

@@ -1,5 +1,5 @@
 //! Arms of other makes than ours, by their kinematics: seven joints with offsets at elbow and wrist, six joints without a spherical wrist,
-//! and the latter on a column that slides.
+//! the latter on a column that slides, and further ones that inverse kinematics treats differently.
 
 #![allow(clippy::unwrap_used, unreachable_pub, dead_code, reason = "shared by several test programs, which may panic")]
 
@@ -79,6 +79,59 @@ pub fn lifted() -> Arm {
 
 pub fn all() -> [Arm; 3] {
     [seven(), six(), lifted()]
+}
+
+/// With limits of two turns either way, as many arms of this make have, and its angles rounded to five digits.
+pub fn six_twice_around() -> Arm {
+    let twice = |part: Part| {
+        let rpy = part.rpy.map(|angle| (angle * 1e5).round() / 1e5);
+        Part { limits: [-2.0 * PI, 2.0 * PI], rpy, ..part }
+    };
+    arm("twice around", &six_parts().map(twice), Pose::at(0.0, 0.0823, 0.0), &SIX_HOME)
+}
+
+/// As industrial arms are: the second and the third axis are parallel, the last three meet.
+fn industrial() -> Arm {
+    let (x, y, z) = ("1 0 0", "0 1 0", "0 0 1");
+    let parts = [
+        turn([0.0, 0.0, 0.4], [0.0; 3], z, [-2.97, 2.97], 2.6),
+        turn([0.18, 0.0, 0.0], [0.0; 3], y, [-1.1, 2.7], 2.6),
+        turn([0.0, 0.0, 0.6], [0.0; 3], y, [-2.2, 2.7], 2.6),
+        turn([0.12, 0.0, 0.12], [0.0; 3], x, [-3.2, 3.2], 5.7),
+        turn([0.5, 0.0, 0.0], [0.0; 3], y, [-2.09, 2.09], 5.7),
+        turn([0.0; 3], [0.0; 3], x, [-6.1, 6.1], 10.0),
+    ];
+    arm("industrial", &parts, Pose::at(0.115, 0.0, 0.0), &[0.0, 0.3, 0.5, 0.0, 0.6, 0.0])
+}
+
+/// As long as the Fetch's: the shoulder is not spherical, the wrist is.
+fn offset_shoulder(wrist: f64) -> [Part; 7] {
+    let (x, y, z) = ("1 0 0", "0 1 0", "0 0 1");
+    [
+        turn([0.12, 0.0, 0.35], [0.0; 3], z, [-1.6056, 1.6056], 1.256),
+        turn([0.117, 0.0, 0.06], [0.0; 3], y, [-1.221, 1.518], 1.454),
+        turn([0.219, 0.0, 0.0], [0.0; 3], x, [-PI, PI], 1.571),
+        turn([0.133, 0.0, 0.0], [0.0; 3], y, [-2.251, 2.251], 1.521),
+        turn([0.197, 0.0, 0.0], [0.0; 3], x, [-PI, PI], 1.571),
+        turn([0.1245, 0.0, wrist], [0.0; 3], y, [-2.16, 2.16], 2.268),
+        turn([0.1385, 0.0, 0.0], [0.0; 3], x, [-PI, PI], 2.268),
+    ]
+}
+
+/// Arms for inverse kinematics, by what is special about each.
+pub fn many() -> impl Iterator<Item = (&'static str, Arm)> {
+    let home = [0.0, 0.5, 0.0, 0.8, 0.0, 0.5, 0.0];
+    let tool = Pose::at(0.166, 0.0, 0.0);
+    [
+        ("like a Panda", seven()),
+        ("like a UR5", six()),
+        ("like a UR5 with limits of two turns and rounded angles", six_twice_around()),
+        ("like a UR5 on a column", lifted()),
+        ("industrial", industrial()),
+        ("like a Fetch", arm("offset shoulder", &offset_shoulder(0.0), tool, &home)),
+        ("with offsets at shoulder and wrist", arm("offset both", &offset_shoulder(0.01), tool, &home)),
+    ]
+    .into_iter()
 }
 
 fn arm(name: &str, parts: &[Part], tool: Pose, home: &[f64]) -> Arm {

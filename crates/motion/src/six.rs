@@ -1,0 +1,287 @@
+//! Six turning joints solved in closed form, where their axes allow it: a spherical wrist behind a shoulder whose first two axes meet or
+//! whose second and third are parallel, or three parallel axes before two that meet. Each is also known from behind: then the
+//! shoulder is the spherical part.
+//!
+//! Products of exponentials, one unknown at a time: what a joint does not change gives the equation of another (Paden and Kahan's
+//! subproblems; Murray, Li, Sastry: *A Mathematical Introduction to Robotic Manipulation*, 3.3; Elias and Wen: *IK-Geo*, 2022, for
+//! which arms fall apart in this way). Limits, and which of the turns of a joint is meant, are the caller's.
+
+use crate::frame::{compose, cross, difference, norm, rotate};
+use crate::spherical::{Vector, about, angle_about, dot};
+use ratn_model::pose::Pose;
+use std::f64::consts::TAU;
+
+/// Axes that pass each other by less than this meet, in metres, and directions that differ by less are one, in radians. Angles in a URDF
+/// are often rounded to five digits; what that does to a solution the caller mends.
+const ROUNDED: f64 = 2e-5;
+
+/// What is below this is zero, but for rounding.
+const EXACT: f64 = 1e-9;
+
+/// An equation with no solution by less than this is one with two equal solutions: what the rounded axes leave.
+const SLACK: f64 = 1e-4;
+
+/// Where an angle is of no influence at all, so many are taken, evenly spread.
+const SPREAD: usize = 16;
+
+/// An axis that is turned about.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Axis {
+    pub(crate) direction: Vector,
+    pub(crate) point: Vector,
+}
+
+/// The ways in which six axes fall apart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Kind {
+    shape: Shape,
+    /// Seen from the tool: the last joint is the first.
+    is_reversed: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Shape {
+    /// The last three axes meet, and the first two.
+    WristAndShoulder,
+    /// The last three axes meet; the second and the third are parallel.
+    WristAndElbow,
+    /// The second to fourth axes are parallel; the last two meet.
+    ThreeParallel,
+}
+
+/// What six joints can be for a motion.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Solutions {
+    /// Angles in no particular turn.
+    pub(crate) all: Vec<[f64; 6]>,
+    /// Whether a joint was of no influence, so that there are more, of which these are some.
+    pub(crate) is_singular: bool,
+}
+
+impl Kind {
+    /// The first of the shapes that six axes have.
+    pub(crate) fn of(axes: &[Axis; 6]) -> Option<Kind> {
+        [false, true].into_iter().find_map(|is_reversed| {
+            let axes = if is_reversed { reversed(axes) } else { *axes };
+            Some(Kind { shape: shape(&axes, ROUNDED)?, is_reversed })
+        })
+    }
+
+    /// Whether the axes have this shape exactly, so that what has no solution cannot be reached.
+    pub(crate) fn is_exact(self, axes: &[Axis; 6]) -> bool {
+        shape(&if self.is_reversed { reversed(axes) } else { *axes }, EXACT) == Some(self.shape)
+    }
+
+    /// The angles that make up a motion of what the last joint carries, counted from where the axes are given.
+    pub(crate) fn solve(self, axes: &[Axis; 6], motion: &Pose) -> Solutions {
+        if !self.is_reversed {
+            return self.shape.solve(axes, motion);
+        }
+        let mut found = self.shape.solve(&reversed(axes), &motion.inverse());
+        found.all.iter_mut().for_each(|angles| angles.reverse());
+        found
+    }
+}
+
+impl Shape {
+    fn solve(self, axes: &[Axis; 6], motion: &Pose) -> Solutions {
+        let mut found = Solutions::default();
+        match self {
+            Shape::WristAndShoulder | Shape::WristAndElbow => solve_wrist(self, axes, motion, &mut found),
+            Shape::ThreeParallel => solve_three_parallel(axes, motion, &mut found),
+        }
+        found
+    }
+}
+
+fn shape(axes: &[Axis; 6], within: f64) -> Option<Shape> {
+    let parallel = |a: usize, b: usize| norm(cross(axes[a].direction, axes[b].direction)) < within;
+    let meet = |a: usize, b: usize| !parallel(a, b) && between(&axes[a], &axes[b]).is_some_and(|(_, gap)| gap < within);
+    let wrist = meet(3, 4)
+        && !parallel(4, 5)
+        && between(&axes[3], &axes[4])
+            .is_some_and(|(point, _)| norm(cross(difference(point, axes[5].point), axes[5].direction)) < within);
+    if wrist && meet(0, 1) {
+        return Some(Shape::WristAndShoulder);
+    }
+    if wrist && parallel(1, 2) && !parallel(0, 1) {
+        return Some(Shape::WristAndElbow);
+    }
+    (parallel(1, 2) && parallel(2, 3) && !parallel(0, 1) && !parallel(3, 4) && meet(4, 5))
+        .then_some(Shape::ThreeParallel)
+}
+
+/// The axes as seen from the last link: the inverse of a product has its factors in reverse, each inverted.
+fn reversed(axes: &[Axis; 6]) -> [Axis; 6] {
+    std::array::from_fn(|i| {
+        let Axis { direction, point } = axes[5 - i];
+        Axis { direction: direction.map(|c| -c), point }
+    })
+}
+
+/// The first three joints bring the wrist to its place, the last three turn it.
+fn solve_wrist(shape: Shape, axes: &[Axis; 6], motion: &Pose, found: &mut Solutions) {
+    let Some((wrist, _)) = between(&axes[3], &axes[4]) else { return };
+    let target = motion.transform(wrist);
+    let mut places: Vec<[f64; 3]> = Vec::new();
+    if shape == Shape::WristAndShoulder {
+        let Some((shoulder, _)) = between(&axes[0], &axes[1]) else { return };
+        let seen = difference(target, shoulder);
+        for third in found.distances(&axes[2], wrist, shoulder, norm(seen)) {
+            let bent = difference(turned(&axes[2], third, wrist), shoulder);
+            let [first, second] = [axes[0].direction, axes[1].direction];
+            for middle in found.angles(wave(second, bent, first), dot(first, seen)) {
+                let outer = angle_about(first, rotate(&about(second, middle), bent), seen);
+                places.push([outer, middle, third]);
+            }
+        }
+    } else {
+        let along = axes[1].direction;
+        let seen = difference(target, axes[0].point);
+        let wanted = dot(along, difference(wrist, axes[0].point));
+        for back in found.angles(wave(axes[0].direction, seen, along), wanted) {
+            let target = turned(&axes[0], back, target);
+            let rest = found.two_parallel(&axes[1], &axes[2], wrist, target);
+            places.extend(rest.into_iter().map(|[b, c]| [-back, b, c]));
+        }
+    }
+    for place in places {
+        let carried = (0..3).fold(Pose::IDENTITY, |pose, i| compose(&pose, &exponential(&axes[i], place[i])));
+        let rest = compose(&carried.inverse(), motion);
+        let ([a, b, c], directions) = (place, [axes[3].direction, axes[4].direction, axes[5].direction]);
+        for [d, e, f] in found.three_turns(directions, &rest) {
+            found.all.push([a, b, c, d, e, f]);
+        }
+    }
+}
+
+fn solve_three_parallel(axes: &[Axis; 6], motion: &Pose, found: &mut Solutions) {
+    let Some((wrist, _)) = between(&axes[4], &axes[5]) else { return };
+    let along = axes[1].direction;
+    let target = motion.transform(wrist);
+    let wanted = dot(along, difference(wrist, axes[0].point));
+    let [fifth, sixth] = [axes[4].direction, axes[5].direction];
+    // Parallel axes may point opposite ways.
+    let [third_sign, fourth_sign] = [2, 3].map(|i: usize| dot(axes[i].direction, along).signum());
+    for back in found.angles(wave(axes[0].direction, difference(target, axes[0].point), along), wanted) {
+        let rest = compose(&exponential(&axes[0], back), motion);
+        let seen = rotate(&rest, sixth);
+        for e in found.angles(wave(fifth, sixth, along), dot(along, seen)) {
+            let tilted = rotate(&about(fifth, e), sixth);
+            let in_line = norm(cross(along, tilted)) < SLACK;
+            // In line with the three the last axis turns as they do, so that any share of it is right.
+            found.is_singular |= in_line;
+            let mut sums = vec![angle_about(along, tilted, seen)];
+            sums.extend(in_line.then(evenly).into_iter().flatten());
+            for sum in sums {
+                let before = compose(&about(along, sum), &about(fifth, e));
+                let f = remaining(sixth, &compose(&before.inverse(), &rest));
+                let hand = compose(&exponential(&axes[4], e), &exponential(&axes[5], f));
+                let elbow = compose(&rest, &hand.inverse()).transform(axes[3].point);
+                for [b, c] in found.two_parallel(&axes[1], &axes[2], axes[3].point, elbow) {
+                    found.all.push([-back, b, c, fourth_sign * (sum - b - third_sign * c), e, f]);
+                }
+            }
+        }
+    }
+}
+
+impl Solutions {
+    /// Angles where `[sine, cosine, constant]` is a value.
+    fn angles(&mut self, [sine, cosine, constant]: [f64; 3], value: f64) -> Vec<f64> {
+        let (size, missing) = (sine.hypot(cosine), value - constant);
+        if missing.abs() > size + SLACK {
+            return Vec::new();
+        }
+        let (middle, half) = (sine.atan2(cosine), (missing / size.max(EXACT)).clamp(-1.0, 1.0).acos());
+        let mut angles = vec![middle + half, middle - half];
+        if size < SLACK {
+            self.is_singular = true;
+            angles.extend(evenly());
+        }
+        angles
+    }
+
+    /// Angles about an axis that bring a point to a distance from another one.
+    fn distances(&mut self, axis: &Axis, point: Vector, from: Vector, distance: f64) -> Vec<f64> {
+        let (arm, offset) = (difference(point, axis.point), difference(axis.point, from));
+        let product = (distance * distance - dot(arm, arm) - dot(offset, offset)) / 2.0;
+        self.angles(wave(axis.direction, arm, offset), product)
+    }
+
+    /// Angles of two parallel axes that bring a point to a target as far along them.
+    fn two_parallel(&mut self, first: &Axis, second: &Axis, point: Vector, target: Vector) -> Vec<[f64; 2]> {
+        let seen = difference(target, first.point);
+        let bends = self.distances(second, point, first.point, norm(seen));
+        let both = |bend: f64| {
+            let bent = difference(turned(second, bend, point), first.point);
+            [angle_about(first.direction, bent, seen), bend]
+        };
+        bends.into_iter().map(both).collect()
+    }
+
+    /// The ways to make a rotation of three turns.
+    fn three_turns(&mut self, [a, b, c]: [Vector; 3], rotation: &Pose) -> Vec<[f64; 3]> {
+        let seen = rotate(rotation, c);
+        let mut ways = Vec::new();
+        for middle in self.angles(wave(b, c, a), dot(a, seen)) {
+            let third = rotate(&about(b, middle), c);
+            let last = |outer: f64| {
+                let before = compose(&about(a, outer), &about(b, middle));
+                remaining(c, &compose(&before.inverse(), rotation))
+            };
+            if norm(cross(a, third)) < EXACT {
+                // Only the two outer turns together count.
+                let (sum, sign) = (last(0.0), dot(a, third).signum());
+                self.is_singular = true;
+                ways.extend(evenly().into_iter().map(|share| [sign * (sum - share), middle, share]));
+            } else {
+                let outer = angle_about(a, third, seen);
+                ways.push([outer, middle, last(outer)]);
+            }
+        }
+        ways
+    }
+}
+
+/// How far a vector that is turned backwards or forwards about a unit vector points along another: coefficients of sine and cosine of the angle, and a constant.
+fn wave(axis: Vector, turned: Vector, along: Vector) -> [f64; 3] {
+    let constant = dot(axis, turned) * dot(axis, along);
+    [dot(along, cross(axis, turned)), dot(along, turned) - constant, constant]
+}
+
+/// The angle of a rotation that is one about this axis.
+fn remaining(axis: Vector, rotation: &Pose) -> f64 {
+    let [x, y, z, w] = rotation.quaternion_xyzw;
+    2.0 * dot(axis, [x, y, z]).atan2(w)
+}
+
+fn evenly() -> Vec<f64> {
+    (0..SPREAD).map(|i| TAU * i as f64 / SPREAD as f64).collect()
+}
+
+/// The motion of a turn about an axis.
+fn exponential(axis: &Axis, angle: f64) -> Pose {
+    let turn = about(axis.direction, angle);
+    Pose { position: difference(axis.point, rotate(&turn, axis.point)), ..turn }
+}
+
+fn turned(axis: &Axis, angle: f64, point: Vector) -> Vector {
+    exponential(axis, angle).transform(point)
+}
+
+/// The middle between the closest points of two axes, and how far these are from each other; nothing for parallel ones.
+fn between(a: &Axis, b: &Axis) -> Option<(Vector, f64)> {
+    let normal = cross(a.direction, b.direction);
+    let square = dot(normal, normal);
+    if square < EXACT {
+        return None;
+    }
+    let way = difference(b.point, a.point);
+    let on_a = dot(cross(way, b.direction), normal) / square;
+    let on_b = dot(cross(way, a.direction), normal) / square;
+    let place =
+        |axis: &Axis, along: f64| -> Vector { std::array::from_fn(|i| axis.point[i] + along * axis.direction[i]) };
+    let (p, q) = (place(a, on_a), place(b, on_b));
+    Some((std::array::from_fn(|i| f64::midpoint(p[i], q[i])), norm(difference(p, q))))
+}
