@@ -17,7 +17,7 @@ const MAX_CHECKS: usize = 1000;
 const LEAST_CUT: f32 = 0.003;
 const LEAST_SAVING: f32 = 0.002;
 
-/// A vertex that is less off the straight motion past it, by what that saves in radians, is none.
+/// A vertex is left out where the straight motion past it is shorter by no more than this, in radians: the path does not bend there.
 const STRAIGHT: f32 = 1e-4;
 
 /// Shares of the shorter side that a corner is cut at.
