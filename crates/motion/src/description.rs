@@ -22,8 +22,11 @@ pub struct RobotDescription {
     /// Where `package://NAME/…` leads: folders that hold packages, or are one.
     #[serde(default)]
     pub packages: Vec<PathBuf>,
-    /// The arm.
+    /// The arm, or the first one.
     pub arm: ArmDescription,
+    /// Further arms: one arm moves at a time, and the others stand.
+    #[serde(default, rename = "other_arm")]
+    pub other_arms: Vec<ArmDescription>,
     /// The gripper. A robot without one grasps nothing.
     #[serde(default)]
     pub gripper: Option<GripperDescription>,
@@ -45,10 +48,23 @@ pub struct RobotDescription {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ArmDescription {
+    /// What goals call it.
+    #[serde(default = "arm")]
+    pub name: String,
     /// Its joints, from the foot to the tool.
     pub joints: Vec<String>,
     /// The link whose frame is brought to goals: z points the way the gripper reaches, y along which the fingers close.
     pub tool: String,
+    /// Its gripper; that of the first arm is the robot's.
+    #[serde(default)]
+    pub gripper: Option<GripperDescription>,
+    /// Its postures, as those of the first arm are the robot's; in the one called `home` it stands unless a goal says where.
+    #[serde(default)]
+    pub postures: BTreeMap<String, Vec<f64>>,
+}
+
+fn arm() -> String {
+    "arm".to_owned()
 }
 
 /// A gripper of two fingers that close on the middle.
@@ -127,7 +143,12 @@ impl RobotDescription {
     /// # Errors
     /// Line, column and what does not fit.
     pub fn read(text: &str) -> Result<RobotDescription, String> {
-        toml::from_str(text).map_err(|error| error.to_string().trim_end().to_owned())
+        let read: RobotDescription = toml::from_str(text).map_err(|error| error.to_string().trim_end().to_owned())?;
+        if read.arm.gripper.is_some() || !read.arm.postures.is_empty() {
+            return Err("the gripper and the postures of the first arm are `[gripper]` and `[postures]` of the robot"
+                .to_owned());
+        }
+        Ok(read)
     }
 }
 

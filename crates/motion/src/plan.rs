@@ -517,7 +517,7 @@ impl Planning<'_> {
                 break;
             }
         }
-        Ok(found.iter().copied().collect())
+        Ok(found.to_vec())
     }
 
     /// All postures at a pose in the world frame.

@@ -4,6 +4,8 @@
 //! throughout; only shapes and the poses handed to parry3d are `f32`. A [`Configuration`] says by parts where all of them are.
 //! Planning moves the arm; the others are where a configuration has them, joints of no part at zero or at the limit next to it.
 
+mod arms;
+
 use crate::description::RobotDescription;
 pub use crate::geometry::{Body, Geometry};
 use crate::joint_vector::JointVector;
@@ -13,6 +15,7 @@ pub use crate::robot_model::{Drive, Joint, Link, RobotModel};
 use crate::robot_state::RobotState;
 pub use crate::urdf::RobotError;
 pub use crate::urdf_faults::UrdfFault;
+use arms::OtherArm;
 use parry3d::math::{Pose as Pose32, Rotation, Vector};
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
@@ -30,6 +33,7 @@ pub struct Robot {
     pub arm_joint_links: Vec<usize>,
     description: RobotDescription,
     arm: Part,
+    other_arms: Vec<OtherArm>,
     base: Option<Part>,
     head: Option<Part>,
     finger: Option<Part>,
@@ -86,6 +90,28 @@ pub enum RobotFault {
         joint: String,
         /// The tool.
         tool: String,
+    },
+    /// Two arms of one name.
+    #[error("two arms are called `{arm}`")]
+    ArmTwice {
+        /// The name.
+        arm: String,
+    },
+    /// A joint that is of two arms.
+    #[error("the joint `{joint}` is of two arms: only one of them can move it, leave it out of the other")]
+    JointOfTwo {
+        /// The joint.
+        joint: String,
+    },
+    /// An arm that is not there.
+    #[error("{robot} has no arm `{arm}` for this: its arms are {arms}")]
+    NoArm {
+        /// The arm.
+        arm: String,
+        /// The robot.
+        robot: String,
+        /// Its arms.
+        arms: String,
     },
     /// A posture that the arm cannot take.
     #[error("the posture `{posture}` {reason}")]
@@ -152,7 +178,14 @@ impl Robot {
         srdf: Option<&str>,
         load: &mut dyn FnMut(&str) -> Result<Vec<u8>, MeshError>,
     ) -> Result<Robot, RobotFault> {
-        let model = RobotModel::read_with_meshes(urdf, srdf, load)?;
+        let robot = Robot::on(description, RobotModel::read_in_primitives(urdf, srdf, load)?)?;
+        // What is wrong with any arm is said at once.
+        robot.other_arms().try_for_each(|arm| robot.with_arm(arm).map(drop))?;
+        Ok(robot)
+    }
+
+    /// Holds a description against a robot without meshes.
+    fn on(description: RobotDescription, model: RobotModel) -> Result<Robot, RobotFault> {
         let link = |name: &str| {
             let missing = || RobotError::Missing { what: "link", name: name.to_owned() };
             model.link(name).ok_or_else(missing).map_err(MechanismError::Robot)
@@ -177,13 +210,15 @@ impl Robot {
         let arm_links = arm_part.moved_links(&model);
         let posture = |(name, values): (&String, &Vec<f64>)| Ok((name.clone(), arm_part.posture(name, values)?));
         let postures = postures.iter().map(posture).collect::<Result<Vec<_>, RobotFault>>()?;
-        let neutral = RobotState::neutral(&model).positions().to_vec();
+        let mut neutral = RobotState::neutral(&model).positions().to_vec();
+        let other_arms = OtherArm::all(&description, &model, &mut neutral)?;
         Ok(Robot {
             model,
             tool,
             arm_links,
             arm_joint_links,
             arm: arm_part,
+            other_arms,
             base: base_part,
             head: head_part,
             finger,

@@ -9,7 +9,7 @@
 mod srdf;
 
 use crate::frame::compose;
-use crate::geometry::Body;
+use crate::geometry::{Body, Geometry};
 use crate::mechanism::{MAX_JOINTS, Mechanism, MechanismError};
 use crate::mesh::{MeshError, Meshed};
 use crate::pairs::{self, Checks};
@@ -159,7 +159,28 @@ impl RobotModel {
         srdf: Option<&str>,
         load: &mut Loader<'_>,
     ) -> Result<RobotModel, MechanismError> {
-        let Description { name, joints, links, mimics } = urdf::read(urdf, load)?;
+        RobotModel::of(urdf::read(urdf, load)?, srdf)
+    }
+
+    /// As [`RobotModel::read_with_meshes`], with spheres in place of each mesh that hold all of it: for whatever knows primitives alone.
+    pub(crate) fn read_in_primitives(
+        urdf: &str,
+        srdf: Option<&str>,
+        load: &mut Loader<'_>,
+    ) -> Result<RobotModel, MechanismError> {
+        let mut description = urdf::read(urdf, load)?;
+        for link in &mut description.links {
+            let spheres = link.meshes.drain(..).flat_map(|mesh| mesh.cover(0.0));
+            link.bodies.extend(spheres.map(|Sphere { centre: [x, y, z], radius }| Body {
+                pose: Pose::at(x, y, z),
+                geometry: Geometry::Sphere { radius },
+            }));
+        }
+        RobotModel::of(description, srdf)
+    }
+
+    fn of(description: Description, srdf: Option<&str>) -> Result<RobotModel, MechanismError> {
+        let Description { name, joints, links, mimics } = description;
         let excepted = srdf.map(|text| srdf::excepted(text, &links)).transpose()?;
         let mut model = RobotModel { name, joints, links, mimics, checks: Checks::default() };
         model.checks = match excepted {

@@ -124,8 +124,8 @@ impl Follower<'_, '_> {
         let entry = Pose { position: std::array::from_fn(|i| goal.position[i] - offset[i]), ..*goal };
         let mut poses: Vec<Pose> = way.through.iter().map(|pose| self.base.inverse().compose(pose)).collect();
         poses.push(entry);
-        let lines = Lines::new(self.reach.pose(&start), &poses, way.blend_m);
-        let traced = trace(self.reach, &lines, &start, &mut || pace.answer())?;
+        let lines = Lines::new(self.reach.pose(start), &poses, way.blend_m);
+        let traced = trace(self.reach, &lines, start, &mut || pace.answer())?;
         if let Some(reason) = self.obstacle(&traced, pace)? {
             return Ok(Err(said(&traced, way, reason)));
         }

@@ -5,6 +5,7 @@
 //! one of ours. Where `budget_s` is given, planning takes exactly that long and gets a quicker motion for it; else the first path is
 //! improved for 50 ms of our time.
 
+mod arms;
 mod bounds;
 mod clock;
 mod drive;
@@ -68,12 +69,13 @@ impl Action for PlanAction {
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let begin = Instant::now();
-        let (asked, budget_s) = goal::asked(&goal, &self.robot)?;
+        let robot = arms::moving(&self.robot, &goal)?;
+        let (asked, budget_s) = goal::asked(&goal, &robot)?;
         // Whatever the task declared that this plan depends on, and no more.
         let scene = goal.unless_cancelled(goal.scene(&self.scenes)).await??;
-        let request = asked.in_scene(&self.robot, &scene);
+        let request = asked.in_scene(&robot, &scene);
 
-        let (robot, goal) = (Arc::clone(&self.robot), Arc::new(goal));
+        let goal = Arc::new(goal);
         let mut clock = Clock::new(begin, self.speed, budget_s, Arc::clone(&goal));
         let planning = tokio::task::spawn_blocking(move || {
             let outcome = plan(&robot, &scene, &request, &mut |progress| clock.control(progress));

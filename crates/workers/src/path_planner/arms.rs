@@ -1,0 +1,31 @@
+//! Which arm of the robot moves, and where the others are: the optional inputs `arm` (its name; unless said, the only or first one) and
+//! `other_arms` (joints by the names of arms; an arm that is left out is in its posture `home`, else at zero).
+
+use ratn_model::value::Value;
+use ratn_motion::robot::{Robot, RobotFault};
+use ratn_worker::action::{ActionFailure, GoalContext};
+use std::sync::Arc;
+
+/// The robot seen from the arm that moves.
+pub(super) fn moving(robot: &Arc<Robot>, goal: &GoalContext) -> Result<Arc<Robot>, ActionFailure> {
+    let arm = goal.port("arm").optional().map(|port| port.string()).transpose()?;
+    let others = goal.port("other_arms").optional();
+    if others.is_none() && arm.is_none_or(|arm| arm == robot.arm_name()) {
+        return Ok(Arc::clone(robot));
+    }
+    let wrong = |port: &str, fault: RobotFault| ActionFailure::aborted(format!("input `{port}`: {fault}"));
+    let mut seen = robot.with_arm(arm.unwrap_or(robot.arm_name())).map_err(|fault| wrong("arm", fault))?;
+    if let Some(others) = others {
+        let Value::Map(postures) = others.any()? else {
+            let found = others.any()?.type_name();
+            return Err(ActionFailure::aborted(format!(
+                "input `other_arms` has a {found}: expected joints by the names of arms"
+            )));
+        };
+        for name in postures.keys() {
+            let joints = others.field(name).joints()?;
+            seen = seen.with_other_arm_at(name, joints).map_err(|fault| wrong("other_arms", fault))?;
+        }
+    }
+    Ok(Arc::new(seen))
+}
