@@ -4,6 +4,7 @@
 
 use crate::mesh_files::MeshFiles;
 use crate::robot::{Robot, RobotFault};
+use crate::workplace::Workplace;
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -42,6 +43,9 @@ pub struct RobotDescription {
     /// Postures of the arm by name, in radians (metres for a joint that slides), in the order of its joints.
     #[serde(default)]
     pub postures: BTreeMap<String, Vec<f64>>,
+    /// The table, the boxes and their places, for a cell.
+    #[serde(default)]
+    pub workplace: Option<Workplace>,
 }
 
 /// An arm.

@@ -15,6 +15,7 @@ pub use crate::robot_model::{Drive, Joint, Link, RobotModel};
 use crate::robot_state::RobotState;
 pub use crate::urdf::RobotError;
 pub use crate::urdf_faults::UrdfFault;
+use crate::workplace::Workplace;
 use arms::OtherArm;
 use parry3d::math::{Pose as Pose32, Rotation, Vector};
 use parry3d::shape::SharedShape;
@@ -121,15 +122,30 @@ pub enum RobotFault {
         /// What is wrong with it.
         reason: String,
     },
+    /// A workplace that is none for this robot.
+    #[error("[workplace]: {reason}")]
+    Workplace {
+        /// What is wrong with it.
+        reason: String,
+    },
 }
 
 /// The robots that we ship: name, description, URDF and SRDF.
-const BUILT_IN: [(&str, &str, &str, &str); 1] = [(
-    "aimm",
-    include_str!("../robots/aimm.toml"),
-    include_str!("../robots/aimm.urdf"),
-    include_str!("../robots/aimm.srdf"),
-)];
+const BUILT_IN: [(&str, &str, &str, &str); 3] = [
+    (
+        "aimm",
+        include_str!("../robots/aimm.toml"),
+        include_str!("../robots/aimm.urdf"),
+        include_str!("../robots/aimm.srdf"),
+    ),
+    (
+        "panda",
+        include_str!("../robots/panda.toml"),
+        include_str!("../robots/panda.urdf"),
+        include_str!("../robots/panda.srdf"),
+    ),
+    ("ur5", include_str!("../robots/ur5.toml"), include_str!("../robots/ur5.urdf"), include_str!("../robots/ur5.srdf")),
+];
 
 impl Configuration {
     /// The base taken from a pose on the floor: its x, y and yaw.
@@ -212,7 +228,7 @@ impl Robot {
         let postures = postures.iter().map(posture).collect::<Result<Vec<_>, RobotFault>>()?;
         let mut neutral = RobotState::neutral(&model).positions().to_vec();
         let other_arms = OtherArm::all(&description, &model, &mut neutral)?;
-        Ok(Robot {
+        let robot = Robot {
             model,
             tool,
             arm_links,
@@ -228,12 +244,21 @@ impl Robot {
             postures,
             neutral,
             description,
-        })
+        };
+        match robot.workplace().and_then(|workplace| workplace.fault(&robot)) {
+            Some(reason) => Err(RobotFault::Workplace { reason }),
+            None => Ok(robot),
+        }
     }
 
     /// What messages call it.
     pub fn name(&self) -> &str {
         &self.description.name
+    }
+
+    /// The table, the boxes and their places in its cell; none of a robot that has no cell.
+    pub fn workplace(&self) -> Option<&Workplace> {
+        self.description.workplace.as_ref()
     }
 
     /// Everything at zero, or at the limit next to it, at the world's origin.

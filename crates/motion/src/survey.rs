@@ -1,0 +1,157 @@
+//! What a robot's description is good for, for people: what it has, how far it reaches, what of it collides, and whether boxes in its
+//! workplace can be taken from above wherever they may stand.
+
+use crate::aimm::{APPROACH_M, grasp_poses};
+use crate::arm::{self, line};
+use crate::collision::{CONTACT_TOLERANCE_M, Checker, Contact, PADDING_M};
+use crate::joint_vector::JointVector;
+use crate::reach::Target;
+use crate::robot::Robot;
+use crate::workplace::{HOME, Surface, Workplace};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use ratn_model::pose::Pose;
+use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+use std::f64::consts::PI;
+
+/// Postures looked at for how far the tool reaches.
+const SAMPLES: usize = 5_000;
+/// Postures tried for one grasp.
+const SOLUTIONS: usize = 12;
+const TRIES: usize = 40;
+
+/// See the module.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Survey {
+    /// What there is to say, a line each.
+    pub lines: Vec<String>,
+    /// What is wrong.
+    pub faults: Vec<String>,
+}
+
+/// Looks at a robot.
+pub fn survey(robot: &Robot) -> Survey {
+    let mut faults = Vec::new();
+    let joints: Vec<&str> = robot.arm_joints().iter().map(|joint| joint.name.as_str()).collect();
+    let tool = &robot.model.links[robot.tool].name;
+    let [below, above, away] = extent(robot);
+    let has = |it: bool| if it { "yes" } else { "no" };
+    let opening = match robot.finger() {
+        Some(_) => format!("opens to {:.0} mm", 2e3 * robot.open_finger_m()),
+        None => "none: it grasps nothing".to_owned(),
+    };
+    let mut lines = vec![
+        format!("robot     {}", robot.name()),
+        format!("arm       {} joints to the link `{tool}`: {}", joints.len(), joints.join(", ")),
+        format!("reach     {away:.2} m from the arm's first joint; the tool's height from {below:.2} to {above:.2} m"),
+        format!("gripper   {opening}"),
+        format!("base      {}", has(!robot.base_joints().is_empty())),
+        format!("head      {}", has(!robot.head_joints().is_empty())),
+        format!("camera    {}", has(robot.camera_pose(&robot.at_zero()).is_some())),
+    ];
+    let scene = scene(robot.workplace(), None);
+    let mut checker = Checker::new(robot, &scene, &arm::assumed(robot, &scene), PADDING_M);
+    for (name, posture) in robot.postures() {
+        let [x, y, z] = arm::reach(robot).pose(posture).position;
+        let touch = checker.collision(posture, Contact::None);
+        let state = touch.as_ref().map_or_else(|| "free".to_owned(), |touch| format!("COLLIDES: {touch}"));
+        lines.push(format!("posture   {name}: {state}; the tool is at ({x:.3}, {y:.3}, {z:.3})"));
+        faults.extend(touch.map(|touch| format!("the posture `{name}` collides: {touch}")));
+    }
+    match robot.workplace() {
+        None => lines.push("workplace none: the simulated cell does not take it".to_owned()),
+        Some(workplace) => {
+            for (what, points) in [("boxes", region(workplace)), ("places", workplace.places.poses())] {
+                let beyond: Vec<String> = points.iter().filter_map(|point| beyond(robot, workplace, point)).collect();
+                let (all, good) = (points.len(), points.len() - beyond.len());
+                lines.push(format!("{what:<10}{good} of {all} points can be served from above"));
+                faults.extend(beyond.into_iter().map(|why| format!("{what}: {why}")));
+            }
+        }
+    }
+    Survey { lines, faults }
+}
+
+/// The tool's least and greatest height, and how far it gets from the arm's first joint.
+fn extent(robot: &Robot) -> [f64; 3] {
+    let reach = arm::reach(robot);
+    let joints = robot.arm_joints();
+    let foot = robot.pose(&robot.at_zero(), robot.arm_joint_links[0]).position;
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let mut extent = [f64::INFINITY, f64::NEG_INFINITY, 0.0];
+    for _ in 0..SAMPLES {
+        // A joint that turns without end has no limits.
+        let drawn = |j: usize| random.random_range(joints[j].lower.max(-PI)..=joints[j].upper.min(PI));
+        let posture = JointVector::from_fn(joints.len(), drawn);
+        let at = reach.pose(&posture).position;
+        let away = (0..3).map(|i| (at[i] - foot[i]).powi(2)).sum::<f64>().sqrt();
+        extent = [extent[0].min(at[2]), extent[1].max(at[2]), extent[2].max(away)];
+    }
+    extent
+}
+
+/// The corners and the middle of the region in which boxes stand.
+fn region(workplace: &Workplace) -> Vec<Pose> {
+    let ([x_low, x_high], [y_low, y_high]) = (workplace.boxes.x, workplace.boxes.y);
+    let middle = ((x_low + x_high) / 2.0, (y_low + y_high) / 2.0);
+    let points = [(x_low, y_low), (x_low, y_high), (x_high, y_low), (x_high, y_high), middle];
+    points.map(|(x, y)| Pose::at(x, y, workplace.table.top_m())).to_vec()
+}
+
+/// The table, and a box on a point of a surface.
+fn scene(workplace: Option<&Workplace>, floor: Option<&Pose>) -> Scene {
+    let Some(workplace) = workplace else { return Scene { base: Pose::IDENTITY, objects: Vec::new() } };
+    let cuboid = |name: &str, pose: Pose, size: [f64; 3]| SceneObject {
+        name: name.to_owned(),
+        shape: Shape::Box { size },
+        placement: Placement::World(pose),
+    };
+    let [x, y, z] = workplace.table.centre;
+    let size = workplace.boxes.greatest;
+    let standing = floor.map(|floor| cuboid("box", floor.compose(&Pose::at(0.0, 0.0, size[2] / 2.0)), size));
+    let table = cuboid("table", Pose::at(x, y, z), workplace.table.size);
+    Scene { base: Pose::IDENTITY, objects: standing.into_iter().chain([table]).collect() }
+}
+
+/// Why a box on this point cannot be taken from above, if so.
+fn beyond(robot: &Robot, workplace: &Workplace, floor: &Pose) -> Option<String> {
+    let scene = scene(Some(workplace), Some(floor));
+    let (reach, home) = (arm::reach(robot), robot.posture(HOME)?);
+    let mut checker = Checker::new(robot, &scene, &arm::assumed(robot, &scene), PADDING_M);
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let size = workplace.boxes.greatest;
+    let mut why = "no posture of the arm gets there".to_owned();
+    for grasp in grasp_poses(&floor.compose(&Pose::at(0.0, 0.0, size[2] / 2.0)), size) {
+        for posture in reach.solutions(&Target::at(grasp), &home, SOLUTIONS, TRIES, &mut random) {
+            match line(&reach, &posture, [0.0, 0.0, APPROACH_M]) {
+                Err(error) => why = error.to_string(),
+                Ok(postures) => {
+                    let contact = Contact::Gripper(CONTACT_TOLERANCE_M);
+                    match postures.iter().find_map(|posture| checker.collision(posture, contact)) {
+                        None => return None,
+                        Some(collision) => why = collision.to_string(),
+                    }
+                }
+            }
+        }
+    }
+    let [x, y, z] = floor.position;
+    let on = if workplace.places.on == Surface::Base { " (seen from the base)" } else { "" };
+    Some(format!("a box at ({x:.2}, {y:.2}, {z:.2}){on} cannot be taken from above: {why}"))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn every_built_in_robot_is_good_and_says_what_it_has() {
+        for name in Robot::built_in_names() {
+            let Survey { lines, faults } = survey(&Robot::built_in(name).unwrap());
+            assert!(faults.is_empty(), "{faults:?}\n{lines:#?}");
+            assert_eq!(lines[0], format!("robot     {name}"));
+            assert!(lines.iter().any(|line| line.starts_with("posture   home: free")), "{lines:#?}");
+        }
+    }
+}

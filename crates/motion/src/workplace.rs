@@ -1,0 +1,136 @@
+//! Where a robot fetches boxes: a table, a region of it on which they stand, and the places that they are brought to.
+//!
+//! It is the `[workplace]` of a `robot.toml` and what a cell is furnished with; planner and detector do not need it.
+//! Metres and radians in the world frame; places on the base are seen from the base.
+
+use crate::robot::Robot;
+use ratn_model::pose::Pose;
+use serde::Deserialize;
+
+/// The most places.
+pub const MAX_PLACES: usize = 9;
+/// How far a place on the table may be above or below the table's top, in metres.
+const LEVEL_M: f64 = 0.001;
+
+/// See the module.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Workplace {
+    /// The table's top.
+    pub table: Slab,
+    /// The boxes on it.
+    pub boxes: Boxes,
+    /// Where they are brought to.
+    pub places: Places,
+}
+
+/// A flat cuboid.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Slab {
+    /// Its centre.
+    pub centre: [f64; 3],
+    /// Its edges.
+    pub size: [f64; 3],
+}
+
+/// Where boxes stand, and how large they are.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Boxes {
+    /// Least and greatest x of their centres.
+    pub x: [f64; 2],
+    /// Least and greatest y.
+    pub y: [f64; 2],
+    /// Least edges: longer horizontal, shorter horizontal, height.
+    pub least: [f64; 3],
+    /// Greatest edges.
+    pub greatest: [f64; 3],
+}
+
+/// Places for a box each.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Places {
+    /// On what.
+    pub on: Surface,
+    /// How a box's longer edge lies there, from the x axis.
+    #[serde(default)]
+    pub yaw: f64,
+    /// Points on that surface.
+    pub at: Vec<[f64; 3]>,
+}
+
+/// What places are on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Surface {
+    /// The table.
+    Table,
+    /// The robot's base, which carries them away.
+    Base,
+}
+
+impl Slab {
+    /// Height of its upper face.
+    pub fn top_m(&self) -> f64 {
+        self.centre[2] + self.size[2] / 2.0
+    }
+
+    fn holds(&self, x: f64, y: f64) -> bool {
+        [x, y].into_iter().zip(self.centre).zip(self.size).all(|((at, centre), size)| (at - centre).abs() <= size / 2.0)
+    }
+}
+
+impl Places {
+    /// As poses: on the surface, x along a box's longer edge.
+    pub fn poses(&self) -> Vec<Pose> {
+        self.at.iter().map(|at| Pose::from_rpy(*at, 0.0, 0.0, self.yaw)).collect()
+    }
+}
+
+impl Workplace {
+    /// What is wrong with it for this robot, if anything.
+    pub(crate) fn fault(&self, robot: &Robot) -> Option<String> {
+        let Workplace { table, boxes, places } = self;
+        let ordered = |[low, high]: [f64; 2]| low.is_finite() && high.is_finite() && low <= high;
+        let positive = |size: &[f64; 3]| size.iter().all(|edge| edge.is_finite() && *edge > 0.0);
+        let corners = [(0, 0), (0, 1), (1, 0), (1, 1)].map(|(i, j)| (boxes.x[i], boxes.y[j]));
+        let opening = 2.0 * robot.open_finger_m();
+        let count = places.at.len();
+        let off = |at: &&[f64; 3]| !(table.holds(at[0], at[1]) && (at[2] - table.top_m()).abs() <= LEVEL_M);
+        if !positive(&table.size) || table.centre.iter().any(|c| !c.is_finite()) {
+            Some("`table` needs a centre and edges above 0".to_owned())
+        } else if !ordered(boxes.x) || !ordered(boxes.y) {
+            Some("`boxes.x` and `boxes.y` are each a least and a greatest value".to_owned())
+        } else if let Some((x, y)) = corners.into_iter().find(|(x, y)| !table.holds(*x, *y)) {
+            Some(format!("`boxes` reaches ({x}, {y}), which is beyond the table"))
+        } else if !positive(&boxes.least)
+            || (0..3).any(|i| boxes.least[i] > boxes.greatest[i] || !boxes.greatest[i].is_finite())
+        {
+            Some(
+                "`boxes.least` has an edge that is not above 0, or greater than the same of `boxes.greatest`"
+                    .to_owned(),
+            )
+        } else if boxes.greatest[1] >= opening {
+            let width = boxes.greatest[1];
+            Some(format!("`boxes.greatest` is {width} m across: the gripper opens to {opening} m"))
+        } else if !(1..=MAX_PLACES).contains(&count)
+            || !places.yaw.is_finite()
+            || places.at.iter().flatten().any(|c| !c.is_finite())
+        {
+            Some(format!("`places.at` has {count} points: 1 to {MAX_PLACES} of three numbers each are needed"))
+        } else if places.on == Surface::Base && robot.base_joints().is_empty() {
+            Some("`places.on` is `base`: this robot has no [base]; use `table`".to_owned())
+        } else if let Some(at) = places.at.iter().find(off).filter(|_| places.on == Surface::Table) {
+            Some(format!("the place {at:?} is not on the table, whose top is at z = {}", table.top_m()))
+        } else if robot.posture(HOME).is_none() {
+            Some(format!("the robot begins in the posture `{HOME}`: add it to [postures]"))
+        } else {
+            None
+        }
+    }
+}
+
+/// The posture that a robot begins in.
+pub const HOME: &str = "home";
