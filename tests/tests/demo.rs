@@ -38,6 +38,24 @@ fn demo_delivers_the_box_in_every_run_and_says_where_the_time_went() -> anyhow::
 }
 
 #[test]
+fn an_arm_behind_a_table_fetches_a_box_as_the_mobile_robot_does() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let out = place.path().join("out");
+    let out = out.to_str().context("a path")?;
+    let robot = ["--robot", "panda", "--planners", "1", "--boxes", "1"];
+    let rest = ["--speed", SPEED, "--budget", "none", "--json", "--out", out];
+    let mut demo = place.start(&[&["demo"][..], &robot, &rest].concat())?;
+    let (code, document, said) = demo.finish()?;
+    ensure!(code == Some(0), "{code:?}\n{said}");
+    let document: Value = serde_json::from_str(&document).with_context(|| document.clone())?;
+    ensure!(document["delivered"] == 1 && document["unintended_contacts"] == 0, "{document}\n{said}");
+    for key in ["hsm_s", "cdtn_1mp_s"] {
+        ensure!(document[key].as_f64().is_some_and(|n| n > 0.0), "{key} in {document}\n{said}");
+    }
+    place.wait_until_empty()
+}
+
+#[test]
 fn nothing_is_left_of_a_demo_that_is_killed() -> anyhow::Result<()> {
     let place = Place::new()?;
     let out = place.path().join("out");

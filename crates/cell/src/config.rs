@@ -18,6 +18,9 @@ pub const MAX_TABLEWARE: usize = 3;
 /// The longest that the resource manager waits for standstill.
 const LONGEST_STANDSTILL: Duration = Duration::from_secs(60);
 
+/// The robot of the paper.
+pub const AIMM: &str = "aimm";
+
 /// What the cell is furnished for: the paper's two experiments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -55,6 +58,8 @@ pub struct CellConfig {
     pub resource_manager: Option<Endpoint>,
     /// The host that the resources say they are on.
     pub host: String,
+    /// Which robot stands there: the name of a built-in one, or the path of a `robot.toml`.
+    pub robot: String,
     /// What stands there: `boxes` on the table, or `table`: tableware on a rack.
     pub scene: Setting,
     /// How many boxes stand on the table, 1 to 9.
@@ -439,6 +444,7 @@ impl Default for CellConfig {
             listen: Endpoint::local(),
             resource_manager: None,
             host: "sim".to_owned(),
+            robot: AIMM.to_owned(),
             scene: Setting::Boxes,
             boxes: 3,
             bowls: 2,

@@ -33,7 +33,7 @@ fn touches(configuration: Configuration, furniture: &[Furniture]) -> Vec<Touch> 
 #[test]
 fn a_robot_in_its_usual_postures_touches_nothing() {
     for arm in [aimm::HOME, aimm::OBSERVATION, aimm::STOWED] {
-        assert_eq!(touches(at(0.0, arm), &furniture(Setting::Boxes)), [], "{arm:?}");
+        assert_eq!(touches(at(0.0, arm), &furniture(&Robot::aimm(), Setting::Boxes)), [], "{arm:?}");
     }
 }
 

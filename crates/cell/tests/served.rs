@@ -60,7 +60,9 @@ async fn system(speed: f64, boxes: usize) -> System {
         resource_manager: Some(manager.clone()),
         ..WorkerOptions::default()
     };
-    tokio::spawn(ratn_workers::detector::worker(options, None).shutdown(end.clone()).run());
+    tokio::spawn(
+        ratn_workers::detector::worker(options, ratn_motion::robot::Robot::aimm(), None).shutdown(end.clone()).run(),
+    );
     let channels = Channels::new(&ClientTls::none());
     let session = Session::open(&channels, &manager, "test", TTL);
     session.alive(DEADLINE).await.unwrap();

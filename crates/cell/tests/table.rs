@@ -92,7 +92,8 @@ fn believed(found: &[(String, Detection, Placement)]) -> Scene {
         };
         SceneObject { name: name.clone(), shape, placement: *placement }
     });
-    let fixed = ratn_cell::core::placement::fixed(Setting::Table);
+    let robot = Robot::aimm();
+    let fixed = ratn_cell::core::placement::fixed(&robot, Setting::Table);
     Scene { base: Pose::IDENTITY, objects: objects.chain(fixed).collect() }
 }
 

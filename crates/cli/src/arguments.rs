@@ -20,8 +20,8 @@ pub(crate) use operating::{
 pub(crate) use roles::{CellArguments, KeptRoleArguments, RoleArguments, WorkerArguments, WorkerKind};
 pub(crate) use systems::{Budget, DemoArguments, GoodsArguments, ResetArguments, SystemArguments, UpArguments};
 pub(crate) use tasks::{
-    CheckArguments, ControlArguments, ModeArgument, PlanArguments, ReportArguments, RunArguments, SimulateArguments,
-    StatusArguments, TablesArguments, WordArgument,
+    CheckArguments, ControlArguments, ModeArgument, PlanArguments, ReportArguments, RobotArguments, RobotCommand,
+    RunArguments, SimulateArguments, StatusArguments, TablesArguments, WordArgument,
 };
 
 /// Runs robot tasks, written as sequential state machines, as fast as their real dependencies allow.
@@ -79,6 +79,8 @@ pub(crate) enum Command {
     Simulate(SimulateArguments),
     /// Solve a file of motion planning problems for a robot, and say how fast and how well
     Plan(PlanArguments),
+    /// Say what a description of a robot is good for: what it has, how far it reaches, what collides
+    Robot(RobotArguments),
     /// Look at the resources of a running system and change them
     Resource(ResourceArguments),
     /// Look at the world model of a running system, now or at an earlier revision, and load facts into it

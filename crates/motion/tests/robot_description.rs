@@ -64,8 +64,14 @@ fn what_does_not_fit_is_refused_by_its_name() {
     assert_eq!(refused(r#""b"]"#, r#""c"]"#), "the robot description has no joint `c`");
     assert_eq!(refused(r#""b"]"#, r#""a"]"#), "the joint `a` is named twice among those to be planned for");
     assert_eq!(refused(r#"tool = "tool""#, r#"tool = "hand""#), "the robot description has no link `hand`");
-    assert_eq!(refused(r#"tool = "tool""#, r#"tool = "upper""#), "the joint `b` of the arm does not move its tool, the link `upper`");
-    assert_eq!(refused(r#""b"]"#, r#""hinge"]"#), "the joint `hinge` of the arm does not move its tool, the link `tool`");
+    assert_eq!(
+        refused(r#"tool = "tool""#, r#"tool = "upper""#),
+        "the joint `b` of the arm does not move its tool, the link `upper`"
+    );
+    assert_eq!(
+        refused(r#""b"]"#, r#""hinge"]"#),
+        "the joint `hinge` of the arm does not move its tool, the link `tool`"
+    );
     assert_eq!(refused("[0.1, -0.2]", "[0.1]"), "the posture `home` has 1 positions: the arm has 2 joints");
     assert_eq!(refused("[0.1, -0.2]", "[0.1, 2.5]"), "the posture `home` has b at 2.5: its limits are -2 to 2");
     let unknown = RobotDescription::read(&TOML.replace("tool =", "tol =")).unwrap_err();

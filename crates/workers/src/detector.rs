@@ -37,13 +37,13 @@ const MAX_POSTURES: usize = 64;
 ///
 /// # Errors
 /// Where it cannot serve.
-pub async fn run(options: WorkerOptions, pictures: Option<PathBuf>) -> anyhow::Result<()> {
-    Ok(worker(options, pictures).run().await?)
+pub async fn run(options: WorkerOptions, robot: Robot, pictures: Option<PathBuf>) -> anyhow::Result<()> {
+    Ok(worker(options, robot, pictures).run().await?)
 }
 
 /// The worker, not running yet.
-pub fn worker(options: WorkerOptions, pictures: Option<PathBuf>) -> Worker {
-    let eyes = Eyes { robot: Arc::new(Robot::aimm()), pictures: Pictures::into(pictures) };
+pub fn worker(options: WorkerOptions, robot: Robot, pictures: Option<PathBuf>) -> Worker {
+    let eyes = Eyes { robot: Arc::new(robot), pictures: Pictures::into(pictures) };
     Worker::new(options).action(Segment(eyes.clone())).action(Locate(eyes))
 }
 

@@ -30,9 +30,9 @@ pub struct PlanAction {
     scenes: Arc<SceneCache>,
 }
 
-/// The worker; `speed` is how many of the robot's seconds pass in one of ours.
-pub fn worker(options: WorkerOptions, speed: f64) -> Worker {
-    let plan = PlanAction::new(speed);
+/// The worker for a robot; `speed` is how many of the robot's seconds pass in one of ours.
+pub fn worker(options: WorkerOptions, robot: Robot, speed: f64) -> Worker {
+    let plan = PlanAction::new(robot, speed);
     let drive = DriveAction::new(&plan.robot, speed, &plan.scenes);
     Worker::new(options).action(plan).action(drive)
 }
@@ -41,14 +41,14 @@ pub fn worker(options: WorkerOptions, speed: f64) -> Worker {
 ///
 /// # Errors
 /// Where it cannot serve.
-pub async fn run(options: WorkerOptions, speed: f64) -> anyhow::Result<()> {
-    Ok(worker(options, speed).run().await?)
+pub async fn run(options: WorkerOptions, robot: Robot, speed: f64) -> anyhow::Result<()> {
+    Ok(worker(options, robot, speed).run().await?)
 }
 
 impl PlanAction {
-    /// For our robot.
-    pub fn new(speed: f64) -> PlanAction {
-        PlanAction { robot: Arc::new(Robot::aimm()), speed, scenes: Arc::default() }
+    /// For a robot.
+    pub fn new(robot: Robot, speed: f64) -> PlanAction {
+        PlanAction { robot: Arc::new(robot), speed, scenes: Arc::default() }
     }
 }
 

@@ -60,7 +60,7 @@ async fn system() -> System {
     let file = temporary.path().join("planner");
     let listen = Endpoint::Unix(temporary.path().join("planner.sock"));
     let options = WorkerOptions { listen, endpoint_file: Some(file.clone()), ..WorkerOptions::default() };
-    tokio::spawn(ratn_workers::path_planner::worker(options, SPEED).without_leases().run());
+    tokio::spawn(ratn_workers::path_planner::worker(options, Robot::aimm(), SPEED).without_leases().run());
     let world_pool = directory.wait_for(world_pool::ROLE, DEADLINE).await.unwrap();
     let planner = wait_for_file(&file, "planner", DEADLINE).await.unwrap();
 

@@ -6,6 +6,7 @@ use super::picture::Exposure;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_motion::joint_vector::JointVector;
+use ratn_motion::robot::Robot;
 use ratn_perception::camera::Camera;
 use serde::{Deserialize, Serialize};
 use std::time::Duration;
@@ -20,7 +21,7 @@ pub struct Ticket(pub u64);
 pub enum Module {
     /// What everything else stands on.
     Base,
-    /// The seven joints.
+    /// Its joints.
     Arm,
     /// The two fingers.
     Gripper,
@@ -53,6 +54,18 @@ pub(crate) enum Kind {
 impl Module {
     /// All of them.
     pub const ALL: [Module; 5] = [Module::Base, Module::Arm, Module::Gripper, Module::PanTilt, Module::Camera];
+
+    /// Those that a robot has.
+    pub fn of(robot: &Robot) -> Vec<Module> {
+        let has = |module: &Module| match module {
+            Module::Base => !robot.base_joints().is_empty(),
+            Module::Arm => true,
+            Module::Gripper => robot.finger().is_some(),
+            Module::PanTilt => !robot.head_joints().is_empty(),
+            Module::Camera => robot.camera_pose(&robot.at_zero()).is_some(),
+        };
+        Module::ALL.into_iter().filter(has).collect()
+    }
 
     /// The kind of the resource that it is.
     pub fn kind(self) -> &'static str {

@@ -26,7 +26,6 @@ use super::tableware;
 use crate::config::{CellConfig, Goods, Setting};
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
-use ratn_motion::aimm;
 use ratn_motion::drive::wrapped;
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_worker::safety::SafetyState;
@@ -75,14 +74,10 @@ impl Cell {
     /// A cell at time 0.
     ///
     /// # Errors
-    /// [`PlacementError`] when no table can be laid.
+    /// [`PlacementError`] when no table can be laid, or the robot is none for a cell.
     pub fn new(config: CellConfig) -> Result<Cell, PlacementError> {
-        let robot = Robot::aimm();
-        #[expect(
-            clippy::expect_used,
-            reason = "the built-in robot has fingers made of boxes, and every test uses them"
-        )]
-        let pads = Pads::of(&robot).expect("the gripper of the built-in robot has two fingers");
+        let robot = Robot::named_or_file(&config.robot)?;
+        let pads = placement::fit(&robot, config.scene)?;
         let objects = placement::objects(&robot, config.scene, config.goods(), config.seed)?;
         let resting = first_posture(&robot, &config);
         let errors = Errors::new(config.errors, robot.arm_joints().len(), config.seed, 0);
@@ -242,6 +237,11 @@ impl Cell {
         active.or(self.braking.get(&module).map(|braking| braking.ticket))
     }
 
+    /// How far each finger is from the middle when the gripper is open, in metres.
+    pub(super) fn open_finger_m(&self) -> f64 {
+        open_finger(&self.robot, &self.config)
+    }
+
     /// The robot.
     pub fn robot(&self) -> &Robot {
         &self.robot
@@ -274,7 +274,10 @@ impl Cell {
                 },
             })
         });
-        Scene { base: self.base_pose(), objects: parts.chain(placement::fixed(self.config.scene)).collect() }
+        Scene {
+            base: self.base_pose(),
+            objects: parts.chain(placement::fixed(&self.robot, self.config.scene)).collect(),
+        }
     }
 
     /// What there is to be seen.
@@ -511,7 +514,7 @@ fn environment(
     objects: &[Placed],
 ) -> (Environment, Vec<String>) {
     let models: Vec<_> = objects.iter().map(|o| (o.model.clone(), o.pose)).collect();
-    let environment = Environment::new(robot, configuration, &placement::furniture(setting), &models);
+    let environment = Environment::new(robot, configuration, &placement::furniture(robot, setting), &models);
     (environment, objects.iter().map(|o| o.id.clone()).collect())
 }
 
@@ -521,5 +524,10 @@ fn standing([x, y, heading]: [f64; 3]) -> Pose {
 }
 
 fn first_posture(robot: &Robot, config: &CellConfig) -> Configuration {
-    Configuration { arm: aimm::HOME, finger: config.gripper.opening_m / 2.0, ..robot.at_zero() }
+    Configuration { arm: placement::home(robot), finger: open_finger(robot, config), ..robot.at_zero() }
+}
+
+/// As the config says, but not wider than the fingers can.
+fn open_finger(robot: &Robot, config: &CellConfig) -> f64 {
+    (config.gripper.opening_m / 2.0).min(robot.open_finger_m())
 }

@@ -4,14 +4,13 @@ use super::activity::{Activity, Kind as Doing, seconds};
 use super::braking::Way;
 use super::cell::Cell;
 use super::faults::{Fault, Kind, When};
-use super::placement::TABLE;
+use super::placement::{self, TABLE};
 use super::protocol::{Command, Ending};
 use super::tableware;
 use crate::config::Setting;
 use rand::RngExt;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
-use ratn_motion::aimm;
 use std::f64::consts::PI;
 
 /// How long the camera stays blind, or the robot lost, in the robot's seconds.
@@ -98,11 +97,18 @@ impl Cell {
     /// Somebody takes an object that is still to be fetched and puts it down elsewhere on what it stands on, where it stands apart.
     fn move_something(&mut self) {
         let (support, height, [[x_low, x_high], [y_low, y_high]]) = match self.config.scene {
-            Setting::Boxes => (TABLE, aimm::TABLE_HEIGHT_M, aimm::BOX_REGION),
+            Setting::Boxes => {
+                let workplace = placement::workplace(&self.robot);
+                (TABLE, workplace.table.top_m(), [workplace.boxes.x, workplace.boxes.y])
+            }
             Setting::Table => (tableware::RACK, tableware::RACK_HEIGHT_M, tableware::RACK_REGION),
         };
         let movable: Vec<usize> = (0..self.ids.len())
-            .filter(|i| self.held.is_none_or(|held| held.object != *i) && self.support_of(*i) == support)
+            .filter(|i| {
+                let on = self.support_of(*i);
+                let held = self.held.is_some_and(|held| held.object == *i);
+                on == support && !held && !self.is_delivered(&self.environment.state(*i).pose, &on)
+            })
             .collect();
         if movable.is_empty() {
             return;

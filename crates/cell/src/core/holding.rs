@@ -5,9 +5,10 @@ use super::environment::{GRAVITY, Grip, Hold, Load, STEP, Slip, Support};
 use super::faults::Kind as Fault;
 use super::grasping::{Grip as GripOf, NotGrasped, felt};
 use super::objects::ON_BASE;
+use super::placement::{self, TABLE};
 use super::protocol::{Command, Ending, Product};
 use ratn_model::pose::Pose;
-use ratn_motion::aimm;
+use ratn_motion::workplace::Surface;
 
 /// What the fingers are closed around.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -202,12 +203,16 @@ impl Cell {
         }
     }
 
-    /// Whether an object stands at one of the places of the load deck, on whichever of its faces: a box has no top.
+    /// Whether an object stands at one of the places that boxes are brought to, on whichever of its faces: a box has no top.
     pub(super) fn is_delivered(&self, pose: &Pose, on: &str) -> bool {
         let upright = |axis: usize| pose.rotate(unit(axis))[2].abs() >= MAX_LEAN_RAD.cos();
-        let seen = self.base_pose().inverse().compose(pose).position;
-        let off = |slot: &Pose| (slot.position[0] - seen[0]).hypot(slot.position[1] - seen[1]);
-        on == ON_BASE && (0..3).any(upright) && aimm::slots().iter().any(|slot| off(slot) <= MAX_OFF_PLACE_M)
+        let places = &placement::workplace(&self.robot).places;
+        let (support, seen) = match places.on {
+            Surface::Base => (ON_BASE, self.base_pose().inverse().compose(pose).position),
+            Surface::Table => (TABLE, pose.position),
+        };
+        let off = |place: &[f64; 3]| (place[0] - seen[0]).hypot(place[1] - seen[1]);
+        on == support && (0..3).any(upright) && places.at.iter().any(|place| off(place) <= MAX_OFF_PLACE_M)
     }
 }
 

@@ -38,7 +38,7 @@ impl Cell {
             let moves = |a: &Activity| matches!(a.kind, Kind::Follow(_));
             self.halt(moves, |_| Ending::Aborted(reason.clone()), 1.0, out);
         }
-        let open = self.config.gripper.opening_m / 2.0 - configuration.finger < OPEN_M;
+        let open = self.open_finger_m() - configuration.finger < OPEN_M;
         // Closed around something, they stand at its faces.
         let solid = open || self.held.is_some();
         self.environment.set_fingers_solid(solid);

@@ -61,7 +61,7 @@ impl Scenery {
     fn in_colours(&self, robot: &Robot) -> Vec<(Body, [u8; 3])> {
         let links = robot.shapes(&self.configuration).into_iter();
         let links = links.map(|(_, pose, shape)| (Body { shape, pose }, ROBOT_COLOUR));
-        let pieces = furniture(self.setting).into_iter().flat_map(|piece| piece.parts);
+        let pieces = furniture(robot, self.setting).into_iter().flat_map(|piece| piece.parts);
         let pieces = pieces.map(|(pose, size)| (Body::new(&Shape::Box { size }, &pose), TABLE_COLOUR));
         let floor = Body::new(&Shape::Box { size: FLOOR_SIZE }, &Pose::at(0.0, 0.0, -FLOOR_SIZE[2] / 2.0));
         let objects = self

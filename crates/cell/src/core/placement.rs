@@ -2,9 +2,10 @@
 //! from above while all others still stand there. The same seed gives the same scene.
 
 use super::environment::{Furniture, Kind, Model};
+use super::grasping::Pads;
 use super::objects::Placed;
 use super::tableware;
-use crate::config::{Goods, Setting};
+use crate::config::{AIMM, Goods, Setting};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::grasp;
@@ -13,19 +14,48 @@ use ratn_motion::aimm;
 use ratn_motion::arm;
 use ratn_motion::arm::line;
 use ratn_motion::collision::{CONTACT_TOLERANCE_M, Checker, Contact, PADDING_M};
+use ratn_motion::description::DescriptionError;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::reach::Target;
 use ratn_motion::robot::Robot;
+use ratn_motion::workplace::{Boxes, HOME, Slab, Workplace};
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::FRAC_PI_2;
 
-/// No scene was found in which the task could be done.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("no feasible scene with {count} objects was found from seed {seed} in {MAX_TABLES} tries; try another seed")]
-pub struct PlacementError {
-    /// How many objects.
-    pub count: usize,
-    /// From which seed.
-    pub seed: u64,
+/// No scene was laid.
+#[derive(Debug, thiserror::Error)]
+pub enum PlacementError {
+    /// None was found in which the task could be done.
+    #[error(
+        "no feasible scene with {count} objects was found from seed {seed} in {MAX_TABLES} tries; try another seed"
+    )]
+    Crowded {
+        /// How many objects.
+        count: usize,
+        /// From which seed.
+        seed: u64,
+    },
+    /// There are fewer places to bring boxes to.
+    #[error("{count} boxes: the [workplace] of `{robot}` has places for {places}")]
+    Places {
+        /// How many boxes.
+        count: usize,
+        /// For how many there are places.
+        places: usize,
+        /// Which robot.
+        robot: String,
+    },
+    /// The robot's description.
+    #[error(transparent)]
+    Robot(#[from] DescriptionError),
+    /// A robot that cannot do what a cell is for.
+    #[error("the robot `{robot}` cannot stand in a cell: {reason}")]
+    Unfit {
+        /// Which robot.
+        robot: String,
+        /// What it lacks, and what next.
+        reason: &'static str,
+    },
 }
 
 /// Tables tried.
@@ -34,8 +64,8 @@ const MAX_TABLES: usize = 3000;
 const MAX_PLACES: usize = 60;
 /// Free space between two boxes, in metres: what the detector needs to tell them apart.
 const GAP_M: f64 = 0.045;
-/// What the fingers need across a box, from its middle, and along it: with room for what the detector gets wrong.
-const FINGER_REACH_M: f64 = aimm::GRIPPER_OPENING_M / 2.0 + 0.034;
+/// What the fingers need across a box beyond half of their opening, and along it: with room for what the detector gets wrong.
+const FINGER_ROOM_M: f64 = 0.034;
 const FINGER_HALF_WIDTH_M: f64 = 0.033;
 /// The table's name.
 pub const TABLE: &str = "table";
@@ -56,29 +86,70 @@ fn dishes(robot: &Robot, goods: Goods, seed: u64) -> Result<Vec<Placed>, Placeme
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut tables = (0..MAX_TABLES).map(|_| tableware::lay(goods, &mut random));
     let feasible = tables.find(|placed| tableware::are_apart(placed) && all_graspable(robot, Setting::Table, placed));
-    feasible.ok_or(PlacementError { count: goods.count(Setting::Table), seed })
+    feasible.ok_or(PlacementError::Crowded { count: goods.count(Setting::Table), seed })
 }
 
 /// Boxes on the table.
 fn boxes(robot: &Robot, count: usize, seed: u64) -> Result<Vec<Placed>, PlacementError> {
+    let workplace = workplace(robot);
+    let places = workplace.places.at.len();
+    if count > places {
+        return Err(PlacementError::Places { count, places, robot: robot.name().to_owned() });
+    }
+    let ground = Ground {
+        boxes: workplace.boxes,
+        height_m: workplace.table.top_m(),
+        finger_reach_m: robot.open_finger_m() + FINGER_ROOM_M,
+    };
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     for table in 0..MAX_TABLES {
         // Long boxes get rarer as the table gets fuller, and the more tries have failed.
         let crowding = (count as f64 / 9.0).powi(2) * 0.6 + 0.4 * table as f64 / MAX_TABLES as f64;
-        let footprints = footprints(&mut random, count, crowding.min(1.0));
+        let footprints = footprints(&mut random, &ground, count, crowding.min(1.0));
         let placed: Option<Vec<Placed>> =
-            footprints.map(|footprints| footprints.iter().enumerate().map(|(i, f)| f.as_box(i)).collect());
+            footprints.map(|footprints| footprints.iter().enumerate().map(|(i, f)| f.as_box(&ground, i)).collect());
         if let Some(placed) = placed
             && all_graspable(robot, Setting::Boxes, &placed)
         {
             return Ok(placed);
         }
     }
-    Err(PlacementError { count, seed })
+    Err(PlacementError::Crowded { count, seed })
+}
+
+/// Where the robot of a cell fetches boxes.
+///
+/// # Panics
+/// A robot without a workplace: [`fit`] refuses it before a cell is made.
+pub fn workplace(robot: &Robot) -> &Workplace {
+    match robot.workplace() {
+        Some(workplace) => workplace,
+        None => unreachable!("the robot `{}` was taken for a cell without a workplace", robot.name()),
+    }
+}
+
+/// The pads of a robot that can stand in a cell of this setting.
+///
+/// # Errors
+/// [`PlacementError::Unfit`] says what it lacks.
+pub fn fit(robot: &Robot, setting: Setting) -> Result<Pads, PlacementError> {
+    let pads = Pads::of(robot);
+    let lacks = if robot.workplace().is_none() {
+        "its robot.toml has no [workplace], so nobody knows where the table and the boxes are: add one (docs/robots.md)"
+    } else if robot.camera_pose(&robot.at_zero()).is_none() {
+        "its robot.toml has no [camera]"
+    } else if setting == Setting::Table && robot.name() != AIMM {
+        "the scene `table` is made for `aimm`; use the scene `boxes`"
+    } else if let Some(pads) = pads {
+        return Ok(pads);
+    } else {
+        "it needs a [gripper] whose finger is a box in the URDF"
+    };
+    Err(PlacementError::Unfit { robot: robot.name().to_owned(), reason: lacks })
 }
 
 /// What never moves, as objects of the scene.
-pub fn fixed(setting: Setting) -> impl Iterator<Item = SceneObject> {
+pub fn fixed(robot: &Robot, setting: Setting) -> impl Iterator<Item = SceneObject> {
     let parts = |piece: Furniture| {
         let name = piece.name;
         piece.parts.into_iter().map(move |(pose, size)| SceneObject {
@@ -87,13 +158,13 @@ pub fn fixed(setting: Setting) -> impl Iterator<Item = SceneObject> {
             placement: Placement::World(pose),
         })
     };
-    furniture(setting).into_iter().flat_map(parts)
+    furniture(robot, setting).into_iter().flat_map(parts)
 }
 
 /// What never moves.
-pub fn furniture(setting: Setting) -> Vec<Furniture> {
-    let [x, y, z] = aimm::TABLE_CENTRE;
-    let table = Furniture { name: TABLE.to_owned(), parts: vec![(Pose::at(x, y, z), aimm::TABLE_SIZE)] };
+pub fn furniture(robot: &Robot, setting: Setting) -> Vec<Furniture> {
+    let Slab { centre: [x, y, z], size } = workplace(robot).table;
+    let table = Furniture { name: TABLE.to_owned(), parts: vec![(Pose::at(x, y, z), size)] };
     match setting {
         Setting::Boxes => vec![table],
         Setting::Table => vec![table, tableware::rack()],
@@ -115,22 +186,32 @@ struct Rectangle {
     half: [f64; 2],
 }
 
-fn footprints(random: &mut ChaCha8Rng, count: usize, crowding: f64) -> Option<Vec<Footprint>> {
+/// Where boxes are put, and with what room.
+#[derive(Debug, Clone, Copy)]
+struct Ground {
+    boxes: Boxes,
+    height_m: f64,
+    /// What the fingers need across a box, from its middle.
+    finger_reach_m: f64,
+}
+
+fn footprints(random: &mut ChaCha8Rng, ground: &Ground, count: usize, crowding: f64) -> Option<Vec<Footprint>> {
+    let Boxes { x, y, least, greatest } = ground.boxes;
     let mut placed: Vec<Footprint> = Vec::with_capacity(count);
     for _ in 0..count {
         let new = (0..MAX_PLACES).find_map(|_| {
-            let [longest, widest, highest] = aimm::BOX_GREATEST;
+            let [longest, widest, highest] = greatest;
             let longest = longest + (widest - longest) * crowding;
-            let width = random.random_range(aimm::BOX_LEAST[1]..=widest);
+            let width = random.random_range(least[1]..=widest);
             let length = random.random_range(width..=longest.max(width));
-            let height = random.random_range(aimm::BOX_LEAST[2]..=highest);
-            let [[x_low, x_high], [y_low, y_high]] = aimm::BOX_REGION;
+            let height = random.random_range(least[2]..=highest);
+            let [[x_low, x_high], [y_low, y_high]] = [x, y];
             let new = Footprint {
                 centre: [random.random_range(x_low..=x_high), random.random_range(y_low..=y_high)],
                 yaw: random.random_range(-FRAC_PI_2..FRAC_PI_2),
                 size: [length, width, height],
             };
-            placed.iter().all(|other| new.clear_of(other) && other.clear_of(&new)).then_some(new)
+            placed.iter().all(|other| new.clear_of(other, ground) && other.clear_of(&new, ground)).then_some(new)
         })?;
         placed.push(new);
     }
@@ -143,20 +224,17 @@ impl Footprint {
     }
 
     /// Whether this box keeps its distance from the other and can be grasped beside it.
-    fn clear_of(&self, other: &Footprint) -> bool {
+    fn clear_of(&self, other: &Footprint, ground: &Ground) -> bool {
         let grown = Rectangle { half: self.base().half.map(|h| h + GAP_M), ..self.base() };
-        let fingers = Rectangle { half: [FINGER_HALF_WIDTH_M, FINGER_REACH_M], ..self.base() };
+        let fingers = Rectangle { half: [FINGER_HALF_WIDTH_M, ground.finger_reach_m], ..self.base() };
         !grown.overlaps(&other.base()) && !fingers.overlaps(&other.base())
     }
 
-    fn pose(&self) -> Pose {
-        let [x, y] = self.centre;
-        Pose::from_rpy([x, y, aimm::TABLE_HEIGHT_M + self.size[2] / 2.0], 0.0, 0.0, self.yaw)
-    }
-
-    fn as_box(&self, index: usize) -> Placed {
+    fn as_box(&self, ground: &Ground, index: usize) -> Placed {
         let model = Model { kind: Kind::Box, size: self.size };
-        Placed { id: format!("slc_{}", index + 1), model, pose: self.pose() }
+        let [x, y] = self.centre;
+        let pose = Pose::from_rpy([x, y, ground.height_m + self.size[2] / 2.0], 0.0, 0.0, self.yaw);
+        Placed { id: format!("slc_{}", index + 1), model, pose }
     }
 }
 
@@ -186,9 +264,9 @@ fn all_graspable(robot: &Robot, setting: Setting, placed: &[Placed]) -> bool {
             placement: Placement::World(object.pose.compose(&part)),
         })
     });
-    let scene = Scene { base: Pose::IDENTITY, objects: parts.chain(fixed(setting)).collect() };
+    let scene = Scene { base: Pose::IDENTITY, objects: parts.chain(fixed(robot, setting)).collect() };
     let mut checker = Checker::new(robot, &scene, &arm::assumed(robot, &scene), PADDING_M);
-    let (reach, home) = (arm::reach(robot), aimm::HOME);
+    let (reach, home) = (arm::reach(robot), home(robot));
     let mut random = ChaCha8Rng::seed_from_u64(0);
     placed.iter().filter(|object| object.model.slips_off().is_none()).all(|object| {
         grasps(object).iter().any(|grasp| {
@@ -199,6 +277,11 @@ fn all_graspable(robot: &Robot, setting: Setting, placed: &[Placed]) -> bool {
             })
         })
     })
+}
+
+/// The posture that a robot begins in.
+pub fn home(robot: &Robot) -> JointVector {
+    robot.posture(HOME).unwrap_or_else(|| robot.at_zero().arm)
 }
 
 /// The ways to take an object from above.

@@ -144,7 +144,7 @@ impl Cell {
         self.environment = Environment::restore(
             &self.robot,
             &self.configuration(),
-            &furniture(self.config.scene),
+            &furniture(&self.robot, self.config.scene),
             &snapshot.environment,
         );
         self.environment.set_time(self.now);

@@ -14,6 +14,10 @@ use ratn_motion::trajectory::Curve;
 use ratn_perception::camera::Camera;
 use ratn_perception::noise::MAX_FRAMES;
 
+/// Why the camera is not turned.
+const NO_HEAD: &str = "the robot has no head that turns: its description has no `[head]`";
+/// Why nothing drives.
+const NO_BASE: &str = "the robot has no base that drives: its description has no `[base]`";
 /// Why there is no picture.
 const NO_CAMERA: &str = "the robot has no camera: its description has no `[camera]`";
 /// How far the camera may look past its target, in radians.
@@ -38,6 +42,7 @@ impl Cell {
         }
         let here = self.measured();
         let (kind, lasts_s) = match request {
+            Request::Drive { .. } if self.robot.base_joints().is_empty() => return Err(NO_BASE.to_owned()),
             Request::Drive { trajectory } => {
                 for other in [Module::Arm, Module::Gripper, Module::PanTilt, Module::Camera] {
                     self.no_motion_of(other, BASE)?;
@@ -81,7 +86,7 @@ impl Cell {
                 self.no_motion_of(Module::Base, BASE)?;
                 self.no_motion_of(Module::Arm, HAND)?;
                 self.let_go();
-                let to = self.config.gripper.opening_m / 2.0;
+                let to = self.open_finger_m();
                 (Kind::Open { from: here.finger, to }, self.config.gripper.open_s)
             }
             Request::SenseBase => (Kind::SenseBase, 0.0),
@@ -153,6 +158,9 @@ impl Cell {
     }
 
     fn aim(&self, target: [f64; 3]) -> Result<[f64; 2], String> {
+        if self.robot.head_joints().is_empty() {
+            return Err(NO_HEAD.to_owned());
+        }
         let (pan, tilt) = self.robot.look_at(&self.believed_base_pose(), target);
         let looking = Configuration { pan, tilt, ..self.measured() };
         let camera = self.robot.camera_pose(&looking).ok_or_else(|| NO_CAMERA.to_owned())?;

@@ -1,4 +1,4 @@
-//! The actions of the five modules: reads a goal's inputs, has the core do it, writes its outputs.
+//! The actions of the modules that the robot has: reads a goal's inputs, has the core do it, writes its outputs.
 
 use super::cell_actor::CellHandle;
 use crate::config::CellConfig;
@@ -29,8 +29,8 @@ pub(crate) fn resource_id(module: Module, host: &str) -> String {
 }
 
 /// The watch of who holds the modules.
-pub(crate) fn leases(config: &CellConfig) -> LeaseWatch {
-    LeaseWatch::of(Module::ALL.map(|module| resource_id(module, &config.host)))
+pub(crate) fn leases(modules: &[Module], config: &CellConfig) -> LeaseWatch {
+    LeaseWatch::of(modules.iter().map(|module| resource_id(*module, &config.host)))
 }
 
 /// The server of all modules. Each takes one goal at a time, under a lease of its own resource.
@@ -42,7 +42,8 @@ pub(crate) fn server(
     leases: &LeaseWatch,
 ) -> ActionServer {
     let mut builder = ActionServer::builder("").one_at_a_time().channels(channels).safety(safety).leases(leases);
-    for (module, name, description, read) in ACTIONS {
+    let modules = handle.modules();
+    for (module, name, description, read) in ACTIONS.into_iter().filter(|(module, ..)| modules.contains(module)) {
         builder = builder.action(ModuleAction {
             name,
             description,

@@ -8,7 +8,7 @@ use crate::core::cell::Cell;
 use crate::core::contacts::Contact;
 use crate::core::faults::{Fault, MAX_FAULTS};
 use crate::core::picture::{Exposure, develop};
-use crate::core::protocol::{Command, Ending, Event, Request, Ticket};
+use crate::core::protocol::{Command, Ending, Event, Module, Request, Ticket};
 use crate::core::recording::Line;
 use crate::core::snapshot::Snapshot;
 use ratn_model::pose::Pose;
@@ -127,6 +127,11 @@ fn handle_of(cell: &Cell) -> (CellHandle, Receiver<QueuedMessage>) {
 }
 
 impl CellHandle {
+    /// What the robot has.
+    pub(crate) fn modules(&self) -> Vec<Module> {
+        Module::of(&self.optics.robot)
+    }
+
     /// Starts a goal.
     pub(crate) fn perform(&self, request: Request) -> Result<Motion, CellActorError> {
         let ticket = Ticket(self.tickets.fetch_add(1, Ordering::Relaxed) + 1);

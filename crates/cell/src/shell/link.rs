@@ -93,7 +93,7 @@ impl Link {
         let patience = Duration::from_millis(self.config.session_ttl_ms);
         let watching = self.leases.follow_session(&self.channels, manager, session, patience)?;
         let offering = async {
-            for module in Module::ALL {
+            for module in self.handle.modules() {
                 let id = resource_id(module, &self.config.host);
                 let mut resource =
                     Resource::new(id, ResourceClass::Module, module.kind()).with_endpoint(&self.endpoint);

@@ -70,7 +70,7 @@ pub async fn run_as(
     let endpoint = bound.endpoint().clone();
     let channels = Channels::new(&tls);
     let safety = safety(&config, &directory, &handle).await?;
-    let leases = actions::leases(&config);
+    let leases = actions::leases(&handle.modules(), &config);
     // A simulated robot ends with its process: this one has not moved yet.
     leases.brought_to_rest();
     let server = actions::server(&handle, &config, channels.clone(), safety.clone(), &leases);

@@ -21,6 +21,9 @@ pub(crate) struct UpArguments {
 /// What differs from a system's config.
 #[derive(Debug, Clone, Default, Args)]
 pub(crate) struct SystemArguments {
+    /// The robot: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml; the config's unless given
+    #[arg(long, value_name = "ROBOT")]
+    pub(crate) robot: Option<String>,
     /// What the cell is furnished for: boxes on a table, or tableware on a rack
     #[arg(long, value_name = "SCENE", value_parser = scene)]
     pub(crate) scene: Option<Setting>,
@@ -93,6 +96,9 @@ pub(crate) enum Budget {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct DemoArguments {
+    /// The robot: the name of a built-in one: aimm, panda or ur5; the config's unless given
+    #[arg(long, value_name = "ROBOT")]
+    pub(crate) robot: Option<String>,
     /// Which of the paper's experiments: boxes are fetched onto the base, or a table is set with tableware from a rack
     #[arg(long, value_name = "SCENARIO", default_value = "boxes", value_parser = scene)]
     pub(crate) scenario: Setting,

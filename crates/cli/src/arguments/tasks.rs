@@ -1,7 +1,7 @@
 //! What is said of tasks: how they are checked, run, steered, reported and simulated, and of planning problems.
 
 use super::values::{at_least_one, chart, makespan, padding, setting, speed};
-use clap::{Args, ValueEnum};
+use clap::{Args, Subcommand, ValueEnum};
 use ratn_task_control::checkpoint::EVERY_EVENTS;
 use std::path::PathBuf;
 
@@ -28,6 +28,9 @@ pub(crate) struct CheckArguments {
     /// Check against the system that runs there, too: what its workers say of themselves extends the catalogue, or is compared with it
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
+    /// The robot: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml; the config's unless given
+    #[arg(long, value_name = "ROBOT")]
+    pub(crate) robot: Option<String>,
     /// Only check: leave out the simulation that says what keeps the task sequential
     #[arg(long)]
     pub(crate) no_simulation: bool,
@@ -74,6 +77,9 @@ pub(crate) struct RunArguments {
     /// The system's config, TOML; without it the built-in default
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
+    /// The robot: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml; the config's unless given
+    #[arg(long, value_name = "ROBOT")]
+    pub(crate) robot: Option<String>,
     /// Where a running system's endpoint files are; without it, a system is started where none runs
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
@@ -198,4 +204,21 @@ pub(crate) struct PlanArguments {
     /// In JSON, also print the paths
     #[arg(long, requires = "json")]
     pub(crate) paths: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct RobotArguments {
+    #[command(subcommand)]
+    pub(crate) command: RobotCommand,
+}
+
+/// What can be done with a robot.
+#[derive(Debug, Clone, Subcommand)]
+pub(crate) enum RobotCommand {
+    /// Read it with its URDF, SRDF and meshes, and look at its postures and its workplace
+    Check {
+        /// The name of a built-in one (aimm, panda, ur5), or the path of a robot.toml
+        #[arg(value_name = "ROBOT")]
+        robot: String,
+    },
 }

@@ -84,7 +84,8 @@ pub(crate) fn run(arguments: &CheckArguments, tls: &ClientTls) -> Result<(), Fai
 
 /// The config with the catalogue that a task is checked against, and the running system, where one is named.
 fn against(arguments: &CheckArguments, tls: &ClientTls) -> Result<(SystemConfig, Option<System>), Failure> {
-    let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
+    let robot = arguments.robot.as_deref();
+    let given = arguments.config.as_deref().map(|file| SystemConfig::load_for(Some(file), robot)).transpose()?;
     let tls = &given.as_ref().map_or_else(|| Ok(tls.clone()), |config| config.client_tls(tls))?;
     let mut system = None;
     if let Some(named) = arguments.runtime_dir.as_deref() {
@@ -99,7 +100,7 @@ fn against(arguments: &CheckArguments, tls: &ClientTls) -> Result<(SystemConfig,
     }
     let mut config = match (&system, given) {
         (Some(system), _) => system.config.clone(),
-        (None, given) => given.map_or_else(|| SystemConfig::load(None), Ok)?,
+        (None, given) => given.map_or_else(|| SystemConfig::load_for(None, robot), Ok)?,
     };
     for file in &arguments.catalogue {
         let said = catalogue::read(file).map_err(|error| Failure::Refused(format!("ratn: {error:#}")))?;

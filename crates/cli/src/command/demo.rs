@@ -13,11 +13,12 @@ use crate::output;
 use crate::system::config::SystemConfig;
 use crate::system::{Judgement, System};
 use anyhow::{Context, anyhow, bail};
-use ratn_cell::config::Setting;
+use ratn_cell::config::{AIMM, Setting};
 use ratn_event_log as log;
 use ratn_executive::protocol::Mode;
 use ratn_model::load::Files;
 use ratn_model::program::{Program, SUCCESS};
+use ratn_motion::robot::Robot;
 use ratn_proto::v1::UnintendedContact;
 use ratn_report::gantt;
 use ratn_report::timeline::Timeline;
@@ -29,6 +30,9 @@ use std::sync::Arc;
 
 /// The tasks are built in, so that the demo works from anywhere: their files' names and texts.
 const FETCH: (&str, &str) = ("fetch_boxes.yaml", include_str!("../../../../examples/fetch_boxes.yaml"));
+/// The same for a robot without base and head, behind a table.
+const FETCH_ON_TABLE: (&str, &str) =
+    ("fetch_boxes_table.yaml", include_str!("../../../../examples/fetch_boxes_table.yaml"));
 /// The one for a cell in which something goes wrong, which uses the other.
 const RECOVERING: (&str, &str) =
     ("fetch_boxes_recovering.yaml", include_str!("../../../../examples/fetch_boxes_recovering.yaml"));
@@ -39,6 +43,11 @@ const LOOK_AND_SET: (&str, &str) =
 
 /// How far a bowl or a cup may have leaned on its way, in radians: as far as the task says, and what the grasp adds.
 const MAX_TILT_RAD: f64 = 0.11;
+
+/// The robots that fetch boxes on a table; their workplaces are the same.
+const ON_TABLE: [&str; 2] = ["panda", "ur5"];
+/// The posture that the task begins to look in, and its parameter for it.
+const OBSERVATION: &str = "observation";
 
 struct BuiltIn;
 
@@ -51,14 +60,15 @@ impl Files for BuiltIn {
 
 /// Runs the task in every way and compares.
 pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Failure> {
-    let config = SystemConfig::load(arguments.config.as_deref())?;
+    let config = SystemConfig::load_for(arguments.config.as_deref(), arguments.robot.as_deref())?;
     let tls = &config.client_tls(tls)?;
     let (file, text) = match arguments.scenario {
+        scenario if config.robot != AIMM => on_table(&config.robot, scenario, arguments)?,
         Setting::Boxes if arguments.faults.fault.is_empty() => FETCH,
         Setting::Boxes => RECOVERING,
         Setting::Table => LOOK_AND_SET,
     };
-    let goods = result::Goods::of(arguments)?;
+    let goods = result::Goods::of(arguments, config.robot == AIMM)?;
     let program = Arc::new(check::load_from(&BuiltIn, text, file, &config.catalogue)?);
     let directory = out_directory(arguments)?;
     let setup = Setup { goods: &goods, arguments, config: &config, program: &program, directory: &directory, tls };
@@ -99,6 +109,33 @@ pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Fail
     }
     outcome?;
     failed.map_or(Ok(()), |failed| Err(anyhow!(failed).into()))
+}
+
+/// The task for a robot that is not the paper's.
+fn on_table(
+    robot: &str,
+    scenario: Setting,
+    arguments: &DemoArguments,
+) -> Result<(&'static str, &'static str), Failure> {
+    let why = if !ON_TABLE.contains(&robot) {
+        let known = ON_TABLE.join(" and ");
+        format!("the demo has tasks for {AIMM}, {known}: run your own with `ratn run TASK --robot {robot}`")
+    } else if scenario != Setting::Boxes {
+        format!("the scenario `table` is made for {AIMM}: use `--scenario boxes`")
+    } else if !arguments.faults.fault.is_empty() {
+        format!("the task that recovers from faults is made for {AIMM}: leave out --fault")
+    } else {
+        return Ok(FETCH_ON_TABLE);
+    };
+    Err(Failure::Refused(format!("ratn: --robot {robot}: {why}")))
+}
+
+/// A robot's posture out of the camera's view, as a parameter of its task.
+fn observation(robot: &str) -> anyhow::Result<String> {
+    let posture = Robot::named_or_file(robot)?.posture(OBSERVATION);
+    let posture = posture.with_context(|| format!("the robot {robot} has no posture `{OBSERVATION}`"))?;
+    let positions: Vec<String> = posture.iter().map(f64::to_string).collect();
+    Ok(format!("joints({})", positions.join(", ")))
 }
 
 /// What of a run is not as it should be, if anything, by the cell's ground truth.
@@ -151,6 +188,7 @@ impl Setup<'_> {
         let Setup { goods, arguments, config, program, directory, tls } = *self;
         let mut config = config.clone();
         config.apply(&SystemArguments {
+            robot: None,
             scene: Some(arguments.scenario),
             goods: GoodsArguments {
                 boxes: Some(arguments.boxes),
@@ -166,6 +204,9 @@ impl Setup<'_> {
         });
         let mut set = goods.parameters();
         set.push(("budget".to_owned(), plan.budget.to_string()));
+        if config.robot != AIMM {
+            set.push((OBSERVATION.to_owned(), observation(&config.robot)?));
+        }
         let log_file = directory.join(format!("{}.jsonl", plan.file_stem()));
         let run = Run {
             program: program.clone(),

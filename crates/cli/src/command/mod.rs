@@ -14,6 +14,7 @@ mod reload;
 mod report;
 mod reset;
 pub(crate) mod resource;
+mod robot;
 mod roles;
 mod run;
 mod safety;
@@ -64,6 +65,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Report(arguments) => report::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Plan(arguments) => plan::run(&arguments),
+        Command::Robot(arguments) => robot::run(&arguments),
         Command::Tables(arguments) => tables::run(&arguments),
         Command::ResourceManager(arguments) => roles::resource_manager(&arguments, tls),
         Command::WorldPool(arguments) => roles::world_pool(&arguments, tls),

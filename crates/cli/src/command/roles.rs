@@ -15,6 +15,7 @@ use ratn_daemon::metrics::Metrics;
 use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_daemon::supervisor::Supervisor;
 use ratn_daemon::{metrics, process_manager, resource_manager, telemetry, world_pool};
+use ratn_motion::robot::Robot;
 use ratn_storage::OpenError;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
@@ -107,14 +108,17 @@ pub(super) fn cell(arguments: &CellArguments, tls: &ClientTls) -> Result<(), Fai
         return replay(file);
     }
     if let Some(file) = &arguments.picture {
-        let mut config = SystemConfig::load(arguments.role.config.as_deref())?.cell;
+        let system = SystemConfig::load_for(arguments.role.config.as_deref(), arguments.robot.as_deref())?;
+        let mut config = system.cell;
         config.scene = arguments.scene.unwrap_or(config.scene);
         let png = ratn_cell::photo(config, arguments.from, arguments.towards)?;
         std::fs::write(file, png).with_context(|| format!("cannot write {}", file.display()))?;
         output::progress(format!("{} shows the cell", file.display()));
         return Ok(());
     }
-    daemon(&arguments.role, tls, ratn_cell::ROLE, async |system, host| {
+    let role = &arguments.role;
+    let system = SystemConfig::load_for(role.config.as_deref(), arguments.robot.as_deref())?;
+    daemon_on(tokio::runtime::Builder::new_multi_thread(), role, system, tls, ratn_cell::ROLE, async |system, host| {
         let mut config = system.cell;
         config.scene = arguments.scene.unwrap_or(config.scene);
         config.faults.extend(&arguments.faults.fault);
@@ -167,11 +171,13 @@ pub(super) fn worker(arguments: &WorkerArguments, tls: &ClientTls) -> Result<(),
         access: arguments.config.clone(),
         tls: Some(tls.clone()),
     };
+    let robot = Robot::named_or_file(&arguments.robot);
+    let robot = robot.map_err(|error| Failure::Refused(format!("ratn: --robot: {error}")))?;
     let speed = arguments.speed;
     let run = async {
         match arguments.worker {
-            WorkerKind::PathPlanner => ratn_workers::path_planner::run(options, speed).await,
-            WorkerKind::Detector => ratn_workers::detector::run(options, arguments.pictures.clone()).await,
+            WorkerKind::PathPlanner => ratn_workers::path_planner::run(options, robot, speed).await,
+            WorkerKind::Detector => ratn_workers::detector::run(options, robot, arguments.pictures.clone()).await,
         }
         .map_err(refused_if_not_started)
     };

@@ -54,7 +54,8 @@ async fn begin(
     tls: &ClientTls,
     interrupt: &Interrupt,
 ) -> Result<(), Failure> {
-    let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
+    let robot = arguments.robot.as_deref();
+    let given = arguments.config.as_deref().map(|file| SystemConfig::load_for(Some(file), robot)).transpose()?;
     let tls = &given.as_ref().map_or_else(|| Ok(tls.clone()), |config| config.client_tls(tls))?;
     let found = System::find(directory, given.clone(), tls).await?;
     if found.is_none() && arguments.runtime_dir.is_some() {
@@ -65,7 +66,7 @@ async fn begin(
     }
     let mut config = match &found {
         Some(system) => system.config.clone(),
-        None => given.map_or_else(|| SystemConfig::load(None), Ok)?,
+        None => given.map_or_else(|| SystemConfig::load_for(None, robot), Ok)?,
     };
     config.apply(&SystemArguments { speed: arguments.speed, ..SystemArguments::default() });
 
@@ -77,6 +78,10 @@ async fn begin(
     let parameters = program
         .bind_parameters(&arguments.set)
         .map_err(|error| Failure::Refused(format!("{}: error[invalid-parameter]: {error}", task.display())))?;
+    if found.is_some() && robot.is_some() {
+        let message = format!("ratn: a system runs in {}: its robot is its own", directory.display());
+        return Err(Failure::Refused(message));
+    }
     if found.is_some() && arguments.speed.is_some() {
         let message = format!("ratn: a system runs in {}: its speed is its own", directory.display());
         return Err(Failure::Refused(message));

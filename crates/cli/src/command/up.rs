@@ -12,7 +12,7 @@ use ratn_worker::tls::ClientTls;
 
 /// Starts it and keeps it running until the user or one of its processes ends it.
 pub(crate) fn run(arguments: &UpArguments, tls: &ClientTls) -> Result<(), Failure> {
-    let mut config = SystemConfig::load(arguments.config.as_deref())?;
+    let mut config = SystemConfig::load_for(arguments.config.as_deref(), arguments.system.robot.as_deref())?;
     config.apply(&arguments.system);
     startable(&config)?;
     let tls = &config.client_tls(tls)?;

@@ -5,14 +5,17 @@ use crate::arguments::SystemArguments;
 use crate::failure::Failure;
 use crate::input;
 use anyhow::Context;
-use ratn_cell::config::CellConfig;
+use ratn_cell::config::{AIMM, CellConfig};
+use ratn_cell::core::protocol::Module;
 use ratn_daemon::config::Check;
-use ratn_daemon::process_manager::ProcessManagerConfig;
+use ratn_daemon::process_manager::{ProcessManagerConfig, Template};
 use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_daemon::service::ServiceConfig;
 use ratn_daemon::world_pool::WorldPoolConfig;
 use ratn_model::catalogue::Catalogue;
 use ratn_model::resource::{Quantity, ResourceClass};
+use ratn_motion::description::DescriptionError;
+use ratn_motion::robot::Robot;
 use ratn_worker::tls::ClientTls;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -25,8 +28,10 @@ const DEFAULT_NAME: &str = "the built-in config";
 const SPEED_PLACEHOLDER: &str = "{speed}";
 /// The kind whose pool `--planners` sizes.
 const PATH_PLANNER: &str = "PathPlanner";
-/// What a cell provides, one of each.
-const CELL_RESOURCES: [&str; 6] = ["Base", "Arm", "Gripper", "PanTilt", "Camera", "Battery"];
+/// In the arguments of a template: the system's robot.
+const ROBOT_PLACEHOLDER: &str = "{robot}";
+/// What a cell provides, one of each, besides the modules of its robot.
+const BATTERY: &str = "Battery";
 const SPEEDS: std::ops::RangeInclusive<f64> = 0.01..=1000.0;
 
 /// All keys are optional.
@@ -35,6 +40,8 @@ const SPEEDS: std::ops::RangeInclusive<f64> = 0.01..=1000.0;
 pub(crate) struct SystemConfig {
     /// Robot's seconds per second, for all roles.
     pub(crate) speed: f64,
+    /// The robot, for all roles: the name of a built-in one, or the path of a `robot.toml`, seen from the folder of the config.
+    pub(crate) robot: String,
     /// What surrounds every daemon.
     pub(crate) service: ServiceConfig,
     pub(crate) resource_manager: ResourceManagerConfig,
@@ -45,12 +52,16 @@ pub(crate) struct SystemConfig {
     pub(crate) catalogues: Vec<String>,
     /// What tasks are checked against.
     pub(crate) catalogue: Catalogue,
+    /// What the robot has.
+    #[serde(skip)]
+    parts: Parts,
 }
 
 impl Default for SystemConfig {
     fn default() -> Self {
         SystemConfig {
             speed: 1.0,
+            robot: AIMM.to_owned(),
             service: ServiceConfig::default(),
             resource_manager: ResourceManagerConfig::default(),
             world_pool: WorldPoolConfig::default(),
@@ -58,6 +69,34 @@ impl Default for SystemConfig {
             cell: CellConfig::default(),
             catalogues: Vec::new(),
             catalogue: Catalogue::standard(),
+            parts: Parts::default(),
+        }
+    }
+}
+
+/// What a robot has of what a cell can have.
+#[derive(Debug, Clone, PartialEq)]
+struct Parts {
+    modules: Vec<Module>,
+    /// Of its arm; as the catalogue says unless given.
+    joints: Option<u32>,
+}
+
+impl Default for Parts {
+    fn default() -> Self {
+        Parts { modules: Module::ALL.to_vec(), joints: None }
+    }
+}
+
+impl Parts {
+    /// What the robot does not have is not offered, and its arm has as many joints as it has.
+    fn fit(&self, catalogue: &mut Catalogue) {
+        let lacks =
+            |kind: &str| Module::ALL.iter().any(|module| module.kind() == kind && !self.modules.contains(module));
+        catalogue.resources.retain(|kind, _| !lacks(kind));
+        catalogue.providers.retain(|_, provider| !lacks(&provider.resource));
+        for provider in catalogue.providers.values_mut().filter(|provider| provider.joints.is_some()) {
+            provider.joints = self.joints.or(provider.joints);
         }
     }
 }
@@ -65,25 +104,45 @@ impl Default for SystemConfig {
 impl SystemConfig {
     /// Reads and checks a config, or the built-in one; a bad one is refused.
     pub(crate) fn load(file: Option<&Path>) -> Result<SystemConfig, Failure> {
+        SystemConfig::load_for(file, None)
+    }
+
+    /// As [`SystemConfig::load`], for the robot that the command line names.
+    pub(crate) fn load_for(file: Option<&Path>, robot: Option<&str>) -> Result<SystemConfig, Failure> {
         let parsed = match file {
-            None => SystemConfig::parse(DEFAULT, DEFAULT_NAME),
-            Some(file) => SystemConfig::read(file),
+            None => SystemConfig::parse(DEFAULT, DEFAULT_NAME, Path::new(""), robot),
+            Some(file) => SystemConfig::read_for(file, robot),
         };
         parsed.map_err(|error| Failure::Refused(format!("ratn: {error:#}")))
     }
 
     /// Reads and checks a config.
     pub(crate) fn read(file: &Path) -> anyhow::Result<SystemConfig> {
-        let name = file.display().to_string();
-        let text = input::read(file).with_context(|| format!("cannot read the config {name}"))?;
-        SystemConfig::parse(&text, &name)
+        SystemConfig::read_for(file, None)
     }
 
-    fn parse(text: &str, name: &str) -> anyhow::Result<SystemConfig> {
+    fn read_for(file: &Path, robot: Option<&str>) -> anyhow::Result<SystemConfig> {
+        let name = file.display().to_string();
+        let text = input::read(file).with_context(|| format!("cannot read the config {name}"))?;
+        SystemConfig::parse(&text, &name, file.parent().unwrap_or(Path::new("")), robot)
+    }
+
+    /// `folder` is where the config is; `robot` is instead of its own.
+    fn parse(text: &str, name: &str, folder: &Path, robot: Option<&str>) -> anyhow::Result<SystemConfig> {
         let mut config: SystemConfig =
             toml::from_str(text).map_err(|error| anyhow::anyhow!("{name}: {}", error.to_string().trim_end()))?;
         config.check().with_context(|| name.to_owned())?;
-        config.compose(Path::new(name).parent().unwrap_or(Path::new(""))).with_context(|| name.to_owned())?;
+        config.compose(folder).with_context(|| name.to_owned())?;
+        config.robot = match robot {
+            Some(robot) => absolute(robot, Path::new(""))?,
+            None => absolute(&config.robot, folder).with_context(|| name.to_owned())?,
+        };
+        let fitted = config.fit_robot();
+        if robot.is_some() {
+            fitted.context("--robot")?
+        } else {
+            fitted.with_context(|| format!("{name}: `robot`"))?
+        }
         config.settle();
         Ok(config)
     }
@@ -96,6 +155,13 @@ impl SystemConfig {
             "`cell.speed` is {} and `speed` is {}: a system has one speed, give it at the top",
             self.cell.speed,
             self.speed
+        );
+        let elsewhere = self.cell.robot != AIMM && self.cell.robot != self.robot;
+        anyhow::ensure!(
+            !elsewhere,
+            "`cell.robot` is `{}` and `robot` is `{}`: a system has one robot, give it at the top",
+            self.cell.robot,
+            self.robot
         );
         self.service.check().context("[service]")?;
         self.resource_manager.check().context("[resource-manager]")?;
@@ -123,11 +189,40 @@ impl SystemConfig {
         Ok(())
     }
 
+    /// What follows from the robot: what it does not have is not offered, and its arm has as many joints as it has.
+    fn fit_robot(&mut self) -> anyhow::Result<()> {
+        self.cell.robot.clone_from(&self.robot);
+        if self.robot == AIMM {
+            return Ok(());
+        }
+        let robot = Robot::named_or_file(&self.robot).map_err(|error| match error {
+            DescriptionError::Read { .. } if !Path::new(&self.robot).exists() => {
+                let known: Vec<&str> = Robot::built_in_names().collect();
+                anyhow::anyhow!("{} is no file, and no built-in robot: those are {}", self.robot, known.join(", "))
+            }
+            error => error.into(),
+        })?;
+        self.parts = Parts { modules: Module::of(&robot), joints: Some(u32::try_from(robot.arm_joints().len())?) };
+        self.parts.fit(&mut self.catalogue);
+        let not_told = |template: &&Template| {
+            let says = |word: &str| template.args.iter().any(|argument| argument == word);
+            template.program.is_none() && says("worker") && !says("--robot")
+        };
+        match self.process_manager.templates.iter().find(not_told) {
+            None => Ok(()),
+            Some(Template { name, .. }) => anyhow::bail!(
+                "the template `{name}` does not say for which robot its worker is: add \"--robot\", \"{ROBOT_PLACEHOLDER}\" to its args"
+            ),
+        }
+    }
+
     /// What follows from the rest: one speed for all, and as many workers in the catalogue as the templates can provide.
     /// A kind that no template provides is in a catalogue of one's own for another host's sake; not in the built-in one.
     fn settle(&mut self) {
         self.cell.speed = self.speed;
-        let built_in = self.catalogue == Catalogue::standard();
+        let mut standard = Catalogue::standard();
+        self.parts.fit(&mut standard);
+        let built_in = self.catalogue == standard;
         let templates = &self.process_manager.templates;
         self.catalogue.resources.retain(|kind, offer| {
             let provided: u32 = templates.iter().filter(|t| t.kind == *kind).map(|t| t.max_workers()).sum();
@@ -178,14 +273,15 @@ impl SystemConfig {
         let mut config = self.process_manager.clone();
         for argument in config.templates.iter_mut().flat_map(|t| &mut t.args) {
             *argument = argument.replace(SPEED_PLACEHOLDER, &self.speed.to_string());
+            *argument = argument.replace(ROBOT_PLACEHOLDER, &self.robot);
         }
         config
     }
 
     /// How much of each kind is there once the system is ready.
     pub(crate) fn promised_resources(&self) -> BTreeMap<String, Quantity> {
-        let one_of = |&kind: &&str| (kind.to_owned(), Quantity::ONE);
-        let mut promised: BTreeMap<String, Quantity> = CELL_RESOURCES.iter().map(one_of).collect();
+        let kinds = self.parts.modules.iter().map(|module| module.kind()).chain([BATTERY]);
+        let mut promised: BTreeMap<String, Quantity> = kinds.map(|kind| (kind.to_owned(), Quantity::ONE)).collect();
         promised.insert(self.world_pool.kind.clone(), self.world_pool.capacity.into());
         for template in &self.process_manager.templates {
             *promised.entry(template.kind.clone()).or_default() += template.min.into();
@@ -199,6 +295,16 @@ impl SystemConfig {
     }
 }
 
+/// A robot as processes elsewhere find it: a built-in one by its name, another by its whole path.
+fn absolute(robot: &str, folder: &Path) -> anyhow::Result<String> {
+    anyhow::ensure!(!robot.is_empty(), "`robot` is empty: name a built-in robot, or the path of a robot.toml");
+    if Robot::built_in_names().any(|name| name == robot) {
+        return Ok(robot.to_owned());
+    }
+    let path = std::path::absolute(folder.join(robot)).with_context(|| format!("`robot` is {robot}"))?;
+    path.to_str().map(str::to_owned).with_context(|| format!("`robot` is {}: it must be UTF-8", path.display()))
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
@@ -207,10 +313,14 @@ mod tests {
     use proptest::collection::vec;
     use proptest::prelude::*;
 
+    fn parse(text: &str, name: &str) -> anyhow::Result<SystemConfig> {
+        SystemConfig::parse(text, name, Path::new(""), None)
+    }
+
     #[test]
     fn the_built_in_config_reads_back_as_written() {
         let config = SystemConfig::load(None).unwrap();
-        assert_eq!(SystemConfig::parse(&config.to_toml().unwrap(), "again").unwrap(), config);
+        assert_eq!(parse(&config.to_toml().unwrap(), "again").unwrap(), config);
         assert_eq!(config.catalogue.resources[PATH_PLANNER].count, 4);
         assert_eq!(config.promised_resources()[PATH_PLANNER], 2);
     }
@@ -232,11 +342,33 @@ mod tests {
 
     #[test]
     fn what_no_template_provides_is_not_offered() {
-        let without = SystemConfig::parse("[process-manager]\ntemplate = []", "x.toml").unwrap();
+        let without = parse("[process-manager]\ntemplate = []", "x.toml").unwrap();
         assert!(!without.catalogue.resources.contains_key(PATH_PLANNER));
         assert!(without.catalogue.resources.contains_key("Arm"));
         let elsewhere = "[catalogue.resources]\nPathPlanner = { class = \"process\", count = 3 }";
-        assert_eq!(SystemConfig::parse(elsewhere, "x.toml").unwrap().catalogue.resources[PATH_PLANNER].count, 3);
+        assert_eq!(parse(elsewhere, "x.toml").unwrap().catalogue.resources[PATH_PLANNER].count, 3);
+    }
+
+    #[test]
+    fn a_robot_without_base_and_head_offers_neither() {
+        let config = parse("robot = \"panda\"", "x.toml").unwrap();
+        for kind in ["Base", "PanTilt"] {
+            assert!(!config.catalogue.resources.contains_key(kind) && !config.promised_resources().contains_key(kind));
+            assert!(config.catalogue.providers.values().all(|provider| provider.resource != kind));
+        }
+        assert!(config.catalogue.resources.contains_key("Gripper"));
+        assert_eq!((config.promised_resources()["Arm"], config.cell.robot.as_str()), (Quantity::ONE, "panda"));
+        assert_eq!(parse(&config.to_toml().unwrap(), "again").unwrap(), config);
+        let six = parse("robot = \"ur5\"", "x.toml").unwrap();
+        assert_eq!(six.catalogue.providers["arm"].joints, Some(6));
+    }
+
+    #[test]
+    fn a_robot_that_nobody_knows_is_refused_with_those_that_are_known() {
+        let refused = format!("{:#}", parse("robot = \"pandaa\"", "x.toml").unwrap_err());
+        assert!(refused.starts_with("x.toml: `robot`") && refused.contains("aimm, panda, ur5"), "{refused}");
+        let two = format!("{:#}", parse("robot = \"ur5\"\ncell.robot = \"panda\"", "x.toml").unwrap_err());
+        assert!(two.contains("a system has one robot"), "{two}");
     }
 
     #[test]
@@ -254,14 +386,14 @@ mod tests {
         assert!(catalogue.providers.contains_key("inspector") && catalogue.providers.contains_key("arm"));
         assert!(catalogue.resources.contains_key("Arm") && !catalogue.resources.contains_key(PATH_PLANNER));
         // Whoever reads what was written needs no other file.
-        assert_eq!(SystemConfig::parse(&config.to_toml().unwrap(), "elsewhere.toml").unwrap(), config);
-        let refused = format!("{:#}", SystemConfig::parse("catalogues = [\"no.toml\"]", "x.toml").unwrap_err());
+        assert_eq!(parse(&config.to_toml().unwrap(), "elsewhere.toml").unwrap(), config);
+        let refused = format!("{:#}", parse("catalogues = [\"no.toml\"]", "x.toml").unwrap_err());
         assert!(refused.starts_with("x.toml: `catalogues`: cannot read the catalogue no.toml"), "{refused}");
     }
 
     #[test]
     fn a_bad_config_is_refused_with_its_place() {
-        let refusal = |text| SystemConfig::parse(text, "x.toml").unwrap_err();
+        let refusal = |text| parse(text, "x.toml").unwrap_err();
         assert!(format!("{:#}", refusal("sped = 2")).starts_with("x.toml: TOML parse error at line 1"));
         assert!(format!("{:#}", refusal("speed = 0")).contains("`speed` is 0: it must be 0.01 to 1000"));
         assert!(format!("{:#}", refusal("[cell]\nboxes = 10")).contains("x.toml: [cell]: `boxes`"));
@@ -316,10 +448,10 @@ mod tests {
             // A list of numbers is named by the list.
             let key = way.iter().rev().find(|step| step.parse::<usize>().is_err()).unwrap();
             // No key is a date; what else may be one, and then it is as the key wants it.
-            let refused = SystemConfig::parse(&replaced(&config, &way, date.clone()), "x.toml").unwrap_err();
+            let refused = parse(&replaced(&config, &way, date.clone()), "x.toml").unwrap_err();
             assert!(format!("{refused:#}").contains(key.as_str()), "{way:?}: {refused:#}");
             for value in &odd {
-                if let Err(refused) = SystemConfig::parse(&replaced(&config, &way, value.clone()), "x.toml") {
+                if let Err(refused) = parse(&replaced(&config, &way, value.clone()), "x.toml") {
                     let said = format!("{refused:#}");
                     assert!(said.starts_with("x.toml") && said.contains(key.as_str()), "{way:?} = {value}: {said}");
                 }
@@ -341,14 +473,14 @@ mod tests {
                 text.splice(from..to, instead.chars());
             }
             let text: String = text.into_iter().collect();
-            if let Err(refused) = SystemConfig::parse(&text, "x.toml") {
+            if let Err(refused) = parse(&text, "x.toml") {
                 prop_assert!(format!("{refused:#}").starts_with("x.toml: "), "{refused:#}");
             }
         }
 
         #[test]
         fn any_text_is_taken_or_refused_with_its_file(text in "\\PC{0,200}") {
-            if let Err(refused) = SystemConfig::parse(&text, "x.toml") {
+            if let Err(refused) = parse(&text, "x.toml") {
                 prop_assert!(format!("{refused:#}").starts_with("x.toml: "), "{refused:#}");
             }
         }

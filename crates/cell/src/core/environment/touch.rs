@@ -12,8 +12,8 @@ use rapier3d::math::{Pose as Pose32, Vector};
 use rapier3d::parry::bounding_volume::{Aabb, BoundingVolume};
 use rapier3d::parry::query::contact;
 use rapier3d::prelude::{Collider, ColliderHandle, RigidBody, RigidBodyHandle};
-use ratn_motion::aimm;
 use ratn_motion::robot::{Configuration, Drive, Geometry, Robot};
+use ratn_motion::workplace::HOME;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
@@ -60,7 +60,11 @@ pub(super) struct Joined {
 impl Joined {
     /// Links that hang on each other, and what touches in the home posture.
     pub(super) fn of(robot: &Robot) -> Joined {
-        let home = Configuration { arm: aimm::HOME, finger: robot.open_finger_m(), ..robot.at_zero() };
+        let home = Configuration {
+            arm: robot.posture(HOME).unwrap_or_else(|| robot.at_zero().arm),
+            finger: robot.open_finger_m(),
+            ..robot.at_zero()
+        };
         let shapes = robot.shapes(&home);
         let mut joined = Joined::default();
         for (i, (a, pose_a, shape_a)) in shapes.iter().enumerate() {

@@ -27,6 +27,8 @@ const PAPER: [(Goods, f64, Option<f64>, f64); 5] = [
 pub(super) enum Goods {
     /// Boxes, onto the base.
     Boxes(u32),
+    /// Boxes, from one side of a table to the other.
+    OnTable(u32),
     /// Tableware, onto a table that plates lie on.
     Dishes { bowls: u32, forks: u32, cups: u32, plates: u32 },
 }
@@ -188,8 +190,9 @@ fn contact_json(contact: &UnintendedContact) -> Value {
 
 impl Goods {
     /// What the command line asks for.
-    pub(super) fn of(arguments: &DemoArguments) -> Result<Goods, Failure> {
+    pub(super) fn of(arguments: &DemoArguments, onto_base: bool) -> Result<Goods, Failure> {
         match *arguments {
+            DemoArguments { scenario: Setting::Boxes, boxes, .. } if !onto_base => Ok(Goods::OnTable(boxes)),
             DemoArguments { scenario: Setting::Boxes, boxes, .. } => Ok(Goods::Boxes(boxes)),
             DemoArguments { bowls: 0, forks: 0, cups: 0, .. } => {
                 Err(Failure::Refused("ratn: no bowls, no forks and no cups: there is nothing to set".to_owned()))
@@ -201,7 +204,7 @@ impl Goods {
     /// How many.
     pub(super) fn count(&self) -> usize {
         match *self {
-            Goods::Boxes(boxes) => boxes as usize,
+            Goods::Boxes(boxes) | Goods::OnTable(boxes) => boxes as usize,
             Goods::Dishes { bowls, forks, cups, plates } => (bowls + forks + cups + plates) as usize,
         }
     }
@@ -210,7 +213,7 @@ impl Goods {
     pub(super) fn parameters(&self) -> Vec<(String, String)> {
         let set = |name: &str, value: u32| (name.to_owned(), value.to_string());
         match *self {
-            Goods::Boxes(boxes) => vec![set("boxes", boxes)],
+            Goods::Boxes(boxes) | Goods::OnTable(boxes) => vec![set("boxes", boxes)],
             Goods::Dishes { bowls, forks, cups, plates } => {
                 vec![set("bowls", bowls), set("forks", forks), set("cups", cups), set("plates", plates)]
             }
@@ -221,20 +224,21 @@ impl Goods {
     pub(super) fn destination(&self) -> &'static str {
         match self {
             Goods::Boxes(_) => "delivered to the base",
+            Goods::OnTable(_) => "brought to their places",
             Goods::Dishes { .. } => "at their places on the table",
         }
     }
 
     fn doing(&self) -> &'static str {
         match self {
-            Goods::Boxes(_) => "Fetching",
+            Goods::Boxes(_) | Goods::OnTable(_) => "Fetching",
             Goods::Dishes { .. } => "Setting",
         }
     }
 
     fn to_json(self) -> Value {
         match self {
-            Goods::Boxes(boxes) => json!({ "scenario": "boxes", "boxes": boxes }),
+            Goods::Boxes(boxes) | Goods::OnTable(boxes) => json!({ "scenario": "boxes", "boxes": boxes }),
             Goods::Dishes { bowls, forks, cups, plates } => {
                 json!({ "scenario": "table", "bowls": bowls, "forks": forks, "cups": cups, "plates": plates })
             }
@@ -249,7 +253,7 @@ impl fmt::Display for Goods {
             _ => format!("{number} {more}"),
         };
         match *self {
-            Goods::Boxes(boxes) => f.write_str(&many(boxes, "box", "boxes")),
+            Goods::Boxes(boxes) | Goods::OnTable(boxes) => f.write_str(&many(boxes, "box", "boxes")),
             Goods::Dishes { bowls, forks, cups, plates } => {
                 let all = [
                     (bowls, "bowl", "bowls"),
