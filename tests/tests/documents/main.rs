@@ -6,7 +6,7 @@
 //! | `console run` | run in a folder of the document's own, which its `file=` blocks are written to; what is shown must be printed, a line `…` standing for any; with `about`, numbers may differ |
 //! | `usage` | lines `ratn COMMAND …`; the help of the command has every `--option` of the line, and the next lines' |
 //! | `yaml` | a whole task, which `check` takes without an error, with `config=` on that system; `yaml fragment` is states of one |
-//! | `toml` | a config; `toml template` is the rest of a `[[process-manager.template]]` |
+//! | `toml` | a config; `toml template` is the rest of a `[[process-manager.template]]`; `toml part-of=FILE` are lines of that file of the repository, in its order |
 //! | `rust example=FILE` | that file of the repository, which the compiler has read |
 //! | `json`, `turtle` | JSON, one or several documents; an ontology |
 //! | `text`, `xml` | not read here; commands of the document may read a `file=` |
@@ -108,6 +108,15 @@ fn examined(fence: &Fence, place: &Place) -> anyhow::Result<()> {
             printed_by(place.ratn(&["check", task, "--config", config]).current_dir(place.path())).map(drop)
         }
         "yaml" => findings(&fence.text, &[]),
+        "toml" if fence.value("part-of").is_some() => {
+            let file = fence.value("part-of").unwrap_or_default();
+            let whole = std::fs::read_to_string(repository(file))?;
+            let mut lines = whole.lines();
+            for line in fence.text.lines().filter(|line| !line.is_empty()) {
+                ensure!(lines.any(|of_file| of_file == line), "{file} has no line `{line}`, or an earlier one only");
+            }
+            Ok(())
+        }
         "toml" => config(fence, place),
         "rust" => {
             let example = fence.value("example").context("no `example=` says which file this is")?;
