@@ -24,6 +24,8 @@ impl RobotDescription {
         std::mem::swap(&mut seen.arm, other);
         (seen.gripper, other.gripper) = (seen.arm.gripper.take(), seen.gripper);
         (seen.postures, other.postures) = (std::mem::take(&mut seen.arm.postures), seen.postures);
+        // A workplace says what the robot's first arm reaches.
+        seen.workplace = None;
         Some(seen)
     }
 }
