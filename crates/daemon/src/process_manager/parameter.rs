@@ -4,8 +4,8 @@ use crate::config::{ConfigError, rule};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// What is filled in everywhere; `speed` is, too, by who starts a whole system.
-const BUILT_IN: [&str; 6] = ["id", "kind", "host", "runtime_dir", "endpoint_file", "speed"];
+/// What is filled in everywhere; `speed` and `robot` are filled in by the command that starts a process manager.
+const BUILT_IN: [&str; 7] = ["id", "kind", "host", "runtime_dir", "endpoint_file", "speed", "robot"];
 /// Bytes of a text.
 const MAX_TEXT_BYTES: usize = 4_096;
 
