@@ -265,7 +265,7 @@ impl<'a> Checker<'a> {
     /// Into how many equal steps the straight line between two postures must be cut so that no point of the robot moves
     /// further than twice the padding in one.
     pub fn steps(&self, from: &JointVector, to: &JointVector) -> usize {
-        let moved: f64 = (0..7).map(|j| (to[j] - from[j]).abs() * self.reach[j]).sum();
+        let moved: f64 = (0..self.reach.len()).map(|j| (to[j] - from[j]).abs() * self.reach[j]).sum();
         let step = if self.padding > 0.0 { 2.0 * self.padding } else { UNPADDED_STEP_M };
         ((moved / step).ceil() as usize).max(1)
     }
@@ -288,7 +288,7 @@ impl<'a> Checker<'a> {
 
     /// How far any point of the robot moves at the most when the joints turn by so much, in metres.
     pub(crate) fn moves_m(&self, turns: &JointVector) -> f64 {
-        (0..7).map(|j| turns[j].abs() * self.reach[j]).sum()
+        (0..self.reach.len()).map(|j| turns[j].abs() * self.reach[j]).sum()
     }
 
     /// How far a posture is from touching what it may not, in metres, or `up_to` where that is less; or what it touches. For a checker

@@ -8,8 +8,11 @@ use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::arm::{self, line};
 use ratn_motion::collision::{CONTACT_TOLERANCE_M, Checker, Contact, PADDING_M};
+use ratn_motion::pace::Control;
+use ratn_motion::plan::{Goal, Request, plan};
 use ratn_motion::reach::Target;
-use ratn_motion::robot::Robot;
+use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::validate::validate_trajectory;
 use ratn_motion::workplace::{HOME, Surface, Workplace};
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::PI;
@@ -164,5 +167,19 @@ fn a_workplace_that_is_none_is_refused_with_what_is_wrong() {
     for (from, to, expected) in wrong {
         let found = fault(from, to);
         assert!(found.starts_with("[workplace]: ") && found.contains(expected), "{from} → {to}: {found}");
+    }
+}
+
+#[test]
+fn every_built_in_robot_goes_from_posture_to_posture_however_many_joints_it_has() {
+    for name in Robot::built_in_names() {
+        let robot = Robot::built_in(name).unwrap();
+        let scene = scene(robot.workplace().unwrap(), &[], [0.1; 3]);
+        let [from, to] = [HOME, "observation"].map(|posture| robot.posture(posture).unwrap());
+        let start = Configuration { arm: from, ..arm::assumed(&robot, &scene) };
+        let request = Request { improvement_iterations: 20, ..Request::new(start, vec![Goal::Joints(to)]) };
+        let plan = plan(&robot, &scene, &request, &mut |_| Control::Continue).unwrap();
+        assert_eq!((plan.end, plan.trajectory.joints.len()), (to, robot.arm_joints().len()), "{name}");
+        validate_trajectory(&robot, &scene, &start, &plan.trajectory, Contact::None).unwrap();
     }
 }
