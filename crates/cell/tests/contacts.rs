@@ -18,8 +18,13 @@ use std::f64::consts::{FRAC_PI_2, PI};
 mod bench;
 use bench::{Bench, grasp};
 
+/// The built-in robot with everything at zero, without reading its description again.
+fn at_zero() -> Configuration {
+    Configuration { base: [0.0; 3], arm: JointVector::zeros(7), pan: 0.0, tilt: 0.0, finger: 0.0 }
+}
+
 fn at(x: f64, arm: JointVector) -> Configuration {
-    Configuration { base: [x, 0.0, 0.0], arm, finger: 0.055, ..Robot::aimm().at_zero() }
+    Configuration { base: [x, 0.0, 0.0], arm, finger: 0.055, ..at_zero() }
 }
 
 /// What touches once a robot has come there.

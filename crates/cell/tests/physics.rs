@@ -12,13 +12,18 @@ use std::time::Instant;
 
 const BOX: Model = Model { kind: Kind::Box, size: [0.12, 0.08, 0.10] };
 
+/// The built-in robot with everything at zero, without reading its description again.
+fn at_zero() -> Configuration {
+    Configuration { base: [0.0; 3], arm: JointVector::zeros(7), pan: 0.0, tilt: 0.0, finger: 0.0 }
+}
+
 fn table() -> Furniture {
     let [x, y, z] = aimm::TABLE_CENTRE;
     Furniture { name: "table".to_owned(), parts: vec![(Pose::at(x, y, z), aimm::TABLE_SIZE)] }
 }
 
 fn stowed() -> Configuration {
-    Configuration { arm: aimm::STOWED, finger: 0.055, ..Robot::aimm().at_zero() }
+    Configuration { arm: aimm::STOWED, finger: 0.055, ..at_zero() }
 }
 
 fn world(objects: &[(Model, Pose)]) -> (Robot, Environment) {
@@ -119,7 +124,7 @@ fn an_arm_that_sweeps_over_the_table_pushes_what_stands_in_its_way() {
     let configuration = |s: f64| Configuration {
         arm: JointVector::from_fn(7, |i| aimm::HOME[i] + if i == 0 { 0.5 * s } else { 0.0 }),
         finger: 0.055,
-        ..Robot::aimm().at_zero()
+        ..at_zero()
     };
     let tool = robot.tool_pose(&configuration(0.5));
     let at = Pose::at(tool.position[0], tool.position[1], aimm::TABLE_HEIGHT_M + 0.05);

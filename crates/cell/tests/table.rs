@@ -11,6 +11,7 @@ use ratn_cell::core::tableware::{RACK_HEIGHT_M, places};
 use ratn_model::grasp;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::pace::Control;
 use ratn_motion::plan::{Goal, Request as PlanRequest, plan};
 use ratn_motion::robot::{Configuration, Robot};
@@ -25,6 +26,11 @@ use bench::Bench;
 
 /// How far a bowl may lean on its way, in radians.
 const UPRIGHT_RAD: f64 = 0.1;
+
+/// The built-in robot with everything at zero, without reading its description again.
+fn at_zero() -> Configuration {
+    Configuration { base: [0.0; 3], arm: JointVector::zeros(7), pan: 0.0, tilt: 0.0, finger: 0.0 }
+}
 
 fn bench(goods: Goods, seed: u64) -> Bench {
     wrong(goods, seed, ErrorsConfig::NONE)
@@ -285,8 +291,7 @@ fn cups_and_plates_are_pushed_by_what_sweeps_over_the_table() {
         let model = Model { kind, size: object.size };
         let robot = Robot::aimm();
         // The base drives against it on the floor.
-        let at =
-            |x: f64| Configuration { base: [x, 0.0, 0.0], arm: aimm::STOWED, finger: 0.055, ..Robot::aimm().at_zero() };
+        let at = |x: f64| Configuration { base: [x, 0.0, 0.0], arm: aimm::STOWED, finger: 0.055, ..at_zero() };
         let stands = Pose::at(0.75, 0.0, object.size[2] / 2.0);
         let mut environment = Environment::new(&robot, &at(0.0), &[], &[(model, stands)]);
         (0..500).for_each(|step| environment.step(&robot, &at(0.001 * f64::from(step))));
