@@ -1,12 +1,12 @@
 //! Checkpoints of a run, beside its event log as `LOG.checkpoint`: a run is resumed from the newest one and the lines behind it,
 //! however long its log is.
 //!
-//! A checkpoint holds all that replaying the log up to a place comes to ([`ReplayedState`]), and says which log and which place in it
-//! ([`Place`]). It only saves time: without one, or with one that does not fit, the whole log is replayed. What the log says is
+//! A checkpoint holds all that replaying the log up to a place comes to (`ReplayedState`), and says which log and which place in it
+//! (`Place`). It only saves time: without one, or with one that does not fit, the whole log is replayed. What the log says is
 //! never changed for it.
 //!
-//! [`file`] is the form of the file and its reading, [`pace`] says when one is due, [`checkpointer`] makes them during a run, and
-//! [`writer`] writes them in a thread of its own.
+//! `file` is the form of the file and its reading, `pace` says when one is due, `checkpointer` makes them during a run, and
+//! `writer` writes them in a thread of its own.
 
 mod checkpointer;
 mod file;
