@@ -71,7 +71,7 @@ impl Resumption {
 /// Goes on with a run whose task control was killed, on the system that it was on.
 ///
 /// # Errors
-/// As `run`; and where the run cannot go on: its log is of another program, its world is not there any more, another run is
+/// As when a run begins; and where the run cannot go on: its log is of another program, its world is not there any more, another run is
 /// under way.
 pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
     let ledger = &resumption.replayed.standing.ledger;
