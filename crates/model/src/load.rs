@@ -307,15 +307,23 @@ fn read_parameters(fields: &mut Fields<'_, '_>, root: &Node) -> Vec<Parameter> {
         let default = default.and_then(|node| constant(fields, node).map(|value| (node.at, value)));
         let ty = declared.flatten().or_else(|| default.as_ref().map(|(_, value)| check::types::of_value(value)));
         let ty = ty.unwrap_or(Type::Any);
-        if let Some((at, value)) = &default
-            && !ty.accepts(value)
-        {
-            let message = format!("the default of `{}` is {}, not {ty}", entry.key, value.type_name());
-            fields.error("type-mismatch", *at, message, "");
+        if let Some((at, value)) = &default {
+            of_type(fields, *at, &entry.key, &ty, value);
         }
         parameters.push(Parameter { name: entry.key.clone(), ty, default: default.map(|(_, value)| value) });
     }
     parameters
+}
+
+/// Complains of a default of another type.
+fn of_type(fields: &mut Fields<'_, '_>, at: crate::program::Location, name: &str, ty: &Type, value: &Value) {
+    if ty.accepts(value) {
+        return;
+    }
+    let items = if let Value::List(items) = value { items.as_slice() } else { &[] };
+    let items: Vec<String> = items.iter().map(ToString::to_string).collect();
+    let help = check::types::called(ty, &items).unwrap_or_default();
+    fields.error("type-mismatch", at, format!("the default of `{name}` is {}, not {ty}", value.type_name()), help);
 }
 
 fn constant(fields: &mut Fields<'_, '_>, node: &Node) -> Option<Value> {

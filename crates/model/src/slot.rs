@@ -215,6 +215,15 @@ impl EffectExpr {
             EffectExpr::ForEach { effects, .. } => effects.iter().flat_map(EffectExpr::written).collect(),
         }
     }
+
+    /// The facts that the effect sets or increases, without those that it deletes.
+    pub(crate) fn made(&self) -> Vec<&FactExpr> {
+        match self {
+            EffectExpr::Set(fact, _) | EffectExpr::Increase(fact, _) => vec![fact],
+            EffectExpr::Delete(_) => Vec::new(),
+            EffectExpr::ForEach { effects, .. } => effects.iter().flat_map(EffectExpr::made).collect(),
+        }
+    }
 }
 
 impl Annotations {

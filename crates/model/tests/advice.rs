@@ -36,6 +36,13 @@ fn operators_of_other_languages_are_translated() {
     says(&condition("'!hand_empty(g)'"), &["`!` is no operator here", "write `not`"]);
     says(&condition("'hand_empty(g) AND on(a, b)'"), &["write `and`, in small letters"]);
     says(&condition("'hand_empty(g) ? 1 : 2'"), &["if(condition, a, b)"]);
+    says(&condition("'len($mode) <> 3'"), &["`<>` is no operator here", "write `!=`"]);
+    says(&condition("'len($mode) === 3'"), &["`===` is no operator here", "write `=`"]);
+    says(&condition("'len($mode) % 2 = 0'"), &["`%` is no operator here", "write `n - m * floor(n / m)`"]);
+    says(&condition("'len($mode) // 2 = 0'"), &["`//` is no operator here", "write `floor(a / b)`"]);
+    says(&condition("'2 ** 3 = 8'"), &["`**` is no operator here", "write `x * x`"]);
+    says(&condition("'len([x for x in [1, 2]]) = 2'"), &["expected `,`, found `for`", "map($x in list, value)"]);
+    says(&condition("'if hand_empty(g) then true else false'"), &["write `if(condition, a, b)`"]);
     assert_eq!(condition("'$mode != \"fast\" and not hand_empty(g)'"), "fine");
     assert_eq!(condition("$mode == \"fast\""), "fine");
 }
@@ -65,6 +72,71 @@ fn true_in_other_words_is_written_as_here() {
         &first("task: t\nstates:\n  - r: { action: gripper/release, pia: no, resources: [Gripper] }\n"),
         &["write `false`"],
     );
+}
+
+#[test]
+fn a_variable_without_its_sign_is_told_as_such() {
+    says(&condition("mode"), &["`condition` is bool; `mode` is string", "the variable `mode` is written `$mode`"]);
+    let task = "task: t\nparameters: { home: { type: joints, default: 'joints(0,0,0,0,0,0,0)' }, n: 1 }\nstates:\n";
+    let tuck = "  - m: { action: arm/move_to, in: { joints: home }, resources: [Arm] }\n";
+    says(&first(&format!("{task}{tuck}")), &["`joints` is joints; `home` is string", "is written `$home`"]);
+    let compares = |text: &str| first(&format!("{task}  - c: {{ condition: '{text}', then: [] }}\n"));
+    says(&compares("n > 0"), &["expected float, found string", "is written `$n`"]);
+    says(&compares("len(n) + n > 0"), &["expected float, found string", "is written `$n`"]);
+    assert!(!compares("other > 0").contains('$'));
+    // An element is a variable, too.
+    says(&condition("'any($x in [1, 2], x > 1)'"), &["is written `$x`"]);
+}
+
+#[test]
+fn a_condition_in_the_words_of_other_languages_is_shown_in_those_of_this_one() {
+    let task = |rest: &str| first(&format!("task: t\nstates:\n{rest}"));
+    says(
+        &task("  - if: hand_empty(g)\n    then: []\n"),
+        &["t:3:5:", "there is no form `if`", "`- condition: …`, with `then: […]` and `else: […]`"],
+    );
+    says(&task("  - c: { if: hand_empty(g), then: [] }\n"), &["no form `if`", "condition"]);
+    says(
+        &task("  - repeat: 3\n    do: []\n"),
+        &["there is no form `repeat`", "`- for: i in range(n)`, with `do: […]`"],
+    );
+    says(&task("  - parallel: []\n    join: all\n"), &["there is no form `parallel`", "concurrency: barrier"]);
+}
+
+#[test]
+fn what_is_no_list_of_facts_is_written_as_one() {
+    let release = |rest: &str| {
+        first(&format!("task: t\nstates:\n  - r: {{ action: gripper/release, resources: [Gripper], {rest} }}\n"))
+    };
+    for nothing in ["none", "nothing", "empty"] {
+        says(&release(&format!("reads: {nothing}")), &["write `[]` for no fact"]);
+    }
+    says(&release("reads: [posture]"), &["a fact has its arguments in parentheses", "`posture(…)`"]);
+    says(&release("effects: ['open = true']"), &["a fact has its arguments in parentheses", "`open(…)`"]);
+    says(&release("effects: ['at(cup) == 1']"), &["write `=`"]);
+    says(&release("duration: 5s"), &["`5s` is no number", "leave the unit out"]);
+    says(&release("timeout: 3 s"), &["a number of seconds", "leave the unit out"]);
+}
+
+#[test]
+fn a_fact_with_a_letter_wrong_is_the_one_that_is_there() {
+    let release = |rest: &str| {
+        first(&format!(
+            "task: t\nworld: [hand_empty(g)]\nstates:\n  - r: {{ action: gripper/release, resources: [Gripper], {rest} }}\n"
+        ))
+    };
+    says(
+        &release("requires: [hand_emtpy(g)], effects: []"),
+        &["error[unestablished-precondition]", "did you mean `hand_empty`?"],
+    );
+    says(&release("requires: [full(g)], effects: []"), &["help: add it to the `world`"]);
+    // A deletion says of no fact that there is one.
+    says(
+        &release("effects: [delete hand_emtpy(g)]"),
+        &["warning[unknown-fact]", "nothing writes `hand_emtpy(g)`, which is deleted", "did you mean `hand_empty`?"],
+    );
+    assert_eq!(release("effects: [delete hand_empty(g)]"), "fine");
+    assert_eq!(release("effects: [delete held(cup)]"), "fine");
 }
 
 #[test]
@@ -126,6 +198,10 @@ fn wrong_indentation_is_told_as_such() {
 fn a_list_where_joints_or_a_pose_is_wanted_is_written_as_one() {
     let tuck = "task: t\nstates:\n  - m: { action: arm/move_to, in: { joints: [0.9, -1.2, 0, 0.9, 0, -0.6, 0] }, resources: [Arm] }\n";
     says(&first(tuck), &["help: write \"joints(0.9, -1.2, 0, 0.9, 0, -0.6, 0)\""]);
+    let home = "task: t\nparameters: { home: { type: joints, default: [0.9, -1.2, 0] }, at: { type: pose, default: [1, 0, 1] } }\nstates: []\n";
+    says(&first(home), &["the default of `home` is list, not joints", "help: write \"joints(0.9, -1.2, 0)\""]);
+    let place = home.replace("joints, default: [0.9, -1.2, 0]", "int, default: 1");
+    says(&first(&place), &["the default of `at` is list, not pose", "help: write \"pose(1, 0, 1)\""]);
     let look =
         "task: t\nstates:\n  - l: { action: pan_tilt/look_at, in: { target: [0.9, -1.2, 0] }, resources: [PanTilt] }\n";
     says(&first(look), &["help: write \"pose(0.9, -1.2, 0)\""]);

@@ -115,7 +115,7 @@ states:
 ";
     assert_snapshot!(check(source), @r#"
     task.yaml:5:21: error[unknown-action] in plan: `path_planner` has no action `plam`. help: did you mean `plan`?
-    task.yaml:5:21: error[provider-not-blocked] in plan: `path_planner` is a `PathPlanner`, and this state blocks none. help: add `resources: [{block: PathPlanner}]`
+    task.yaml:5:21: error[provider-not-blocked] in plan: an action of `path_planner` needs the resource `PathPlanner`, which this state does not block. help: add `resources: [{block: PathPlanner}]`
     task.yaml:5:52: error[unknown-resource] in plan: no template or module of the system provides `PathPlaner`. help: did you mean `PathPlanner`?
     task.yaml:8:13: error[unknown-port] in look: `pan_tilt/look_at` has no input port `goal`. help: there is `target`
     task.yaml:8:22: error[type-mismatch] in look: `target` is pose; `1 + 1` is int

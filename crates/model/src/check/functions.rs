@@ -121,8 +121,12 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
                     (None, None) if matches!(slot, Slot::Requires(_)) => {}
                     // Once each: what nobody writes is null wherever it is read.
                     (None, near) if told.insert(name.to_owned()) => {
-                        let meant = near.map(|near| format!("did you mean `{near}`? ")).unwrap_or_default();
-                        let help = format!("{meant}If the world that the task begins in has it, {declare}");
+                        let help = match near {
+                            Some(near) => {
+                                format!("did you mean `{near}`? If the world that the task begins in has it, {declare}")
+                            }
+                            None => format!("if the world that the task begins in has it, {declare}"),
+                        };
                         findings.warning("unknown-fact", at, &state.path, message, help);
                     }
                     (None, _) => {}
@@ -130,6 +134,34 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
             }
         }
     }
+    deleted(subject, findings);
+}
+
+/// A fact that is deleted, which nothing writes, and which is called almost like one that something does write.
+fn deleted(subject: &Subject<'_>, findings: &mut Findings) {
+    let known = mentioned(subject, true);
+    for state in &subject.program.states {
+        for (outcome, effects) in &state.annotations.effects {
+            for fact in effects.iter().flat_map(EffectExpr::written) {
+                let name = fact.predicate.as_str();
+                if !known.contains(name)
+                    && let Some(near) = nearest(name, &known)
+                {
+                    let whole = named(subject.program, &Expr::Fact(fact.clone()));
+                    let message = format!("nothing writes `{whole}`, which is deleted");
+                    let help = format!("did you mean `{near}`?");
+                    let at = subject.place_of(state, Slot::Effect(outcome));
+                    findings.warning("unknown-fact", at, &state.path, message, help);
+                }
+            }
+        }
+    }
+}
+
+/// The predicate that is meant by a name that nothing in the task writes or declares, where one is called almost so.
+pub(super) fn meant_predicate<'a>(subject: &Subject<'a>, name: &str) -> Option<&'a str> {
+    let known = predicates(subject);
+    if known.contains(name) { None } else { nearest(name, &known) }
 }
 
 /// The predicate that a name is almost the name of.
@@ -162,10 +194,18 @@ fn edits(a: &str, b: &str) -> usize {
 
 /// The predicates that the task says there are: what it writes, reads by declaration, senses, asks for with `?` or holds at the start.
 fn predicates<'a>(subject: &Subject<'a>) -> BTreeSet<&'a str> {
+    mentioned(subject, false)
+}
+
+/// The same; where only `made` count, without those that are only deleted.
+fn mentioned<'a>(subject: &Subject<'a>, made: bool) -> BTreeSet<&'a str> {
     let program = subject.program;
     let mut known = BTreeSet::new();
     known.extend(program.ontology.iter().flat_map(|ontology| ontology.predicates()).map(|(name, _)| name));
-    let written = |effect: &'a EffectExpr| effect.written().into_iter().map(|fact| fact.predicate.as_str());
+    let written = |effect: &'a EffectExpr| {
+        let facts = if made { effect.made() } else { effect.written() };
+        facts.into_iter().map(|fact| fact.predicate.as_str())
+    };
     known.extend(program.initial.iter().flat_map(written));
     for state in &program.states {
         let annotations = &state.annotations;

@@ -2,7 +2,7 @@
 //!
 //! Without a declared `world` the facts at the start are whatever the system holds, so this is a warning then.
 
-use super::{Subject, branches, named};
+use super::{Subject, branches, functions, named};
 use crate::diagnostic::Findings;
 use crate::expression::scope::NothingKnown;
 use crate::expression::{BinaryOperator, EffectExpr, Expr, FactExpr, UnaryOperator};
@@ -57,11 +57,17 @@ fn walk(subject: &Subject<'_>, id: StateId, established: &mut Established, findi
             let required = named(subject.program, required);
             let message = format!("`{required}` is required, and nothing before establishes `{missing}`");
             let rule = "unestablished-precondition";
+            let meant = functions::meant_predicate(subject, &missing.predicate);
+            let help = |otherwise: &str| match meant {
+                Some(meant) => format!("did you mean `{meant}`? Else {otherwise}"),
+                None => otherwise.to_owned(),
+            };
             if subject.declares_world {
-                let help = "add it to the `world` of the task, or to the effects of an older state";
+                let help = help("add it to the `world` of the task, or to the effects of an older state");
                 findings.error(rule, at, &state.path, message, help);
             } else {
-                findings.warning(rule, at, &state.path, message, "say in the task's `world` what holds at the start");
+                let help = help("say in the task's `world` what holds at the start");
+                findings.warning(rule, at, &state.path, message, help);
             }
         }
     }

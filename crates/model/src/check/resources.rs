@@ -170,7 +170,10 @@ fn exists_of_a_composite(subject: &Subject<'_>, state: &State, findings: &mut Fi
 fn provider_blocked(subject: &Subject<'_>, state: &State, provider: &str, findings: &mut Findings) {
     let Some(offered) = subject.catalogue.providers.get(provider) else { return };
     if !blocked(subject, state).contains(offered.resource.as_str()) {
-        let message = format!("`{provider}` is a `{0}`, and this state blocks none", offered.resource);
+        let message = format!(
+            "an action of `{provider}` needs the resource `{0}`, which this state does not block",
+            offered.resource
+        );
         let help = format!("add `resources: [{{block: {}}}]`", offered.resource);
         findings.error("provider-not-blocked", subject.place(state, "action"), &state.path, message, help);
     }

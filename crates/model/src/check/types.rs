@@ -31,7 +31,9 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
                         && !fits(&wanted, &found, expr)
                     {
                         let message = format!("`{}` is {wanted}; `{}` is {found}", what(slot), named(program, expr));
-                        findings.error("type-mismatch", at, &state.path, message, written(&wanted, program, expr));
+                        let help = types.without_sign(&[expr]);
+                        let help = if help.is_empty() { written(&wanted, program, expr) } else { help };
+                        findings.error("type-mismatch", at, &state.path, message, help);
                     } else {
                         constants::check(subject, state, slot, expr, findings);
                     }
@@ -50,15 +52,25 @@ pub(crate) fn truth(text: &str) -> Option<&'static str> {
     }
 }
 
+/// How a list is written where joints or a pose is wanted.
+pub(crate) fn called(wanted: &Type, items: &[String]) -> Option<String> {
+    let function = match wanted {
+        Type::Joints if !items.is_empty() => "joints",
+        Type::Pose if matches!(items.len(), 3 | 6) => "pose",
+        _ => return None,
+    };
+    Some(format!("write \"{function}({})\"", items.join(", ")))
+}
+
 /// How a value of another type is written as one of the wanted type; empty where nothing is known.
 fn written(wanted: &Type, program: &Program, expr: &Expr) -> String {
-    let called = |function: &str, items: &[Expr]| {
+    if let Expr::List(items) = expr {
         let items: Vec<String> = items.iter().map(|item| named(program, item)).collect();
-        format!("write \"{function}({})\"", items.join(", "))
-    };
+        if let Some(call) = called(wanted, &items) {
+            return call;
+        }
+    }
     match (wanted, expr) {
-        (Type::Joints, Expr::List(items)) => called("joints", items),
-        (Type::Pose, Expr::List(items)) if matches!(items.len(), 3 | 6) => called("pose", items),
         (Type::Pose, Expr::List(_) | Expr::Map(_)) => {
             "write \"pose(x, y, z)\" or \"pose(x, y, z, roll, pitch, yaw)\", in metres and radians".to_owned()
         }
@@ -197,7 +209,14 @@ impl Types<'_> {
     fn of(&self, expr: &Expr) -> Found {
         let wrong = |message: String| {
             let message = format!("`{}`: {message}", named(self.program, expr));
-            Err(Wrong { rule: "type-mismatch", message, help: String::new() })
+            let operands: Vec<&Expr> = match expr {
+                Expr::Unary(_, a) | Expr::Field(a, _) => vec![a],
+                Expr::Binary(_, a, b) | Expr::Index(a, b) => vec![a, b],
+                Expr::Each { list, .. } => vec![list],
+                Expr::Call(_, arguments) => arguments.iter().collect(),
+                _ => Vec::new(),
+            };
+            Err(Wrong { rule: "type-mismatch", message, help: self.without_sign(&operands) })
         };
         Ok(match expr {
             Expr::Literal(value) => of_value(value),
@@ -295,6 +314,16 @@ impl Types<'_> {
                 Err(message) => return wrong(message),
             },
         })
+    }
+
+    /// What to write where one of these is the name of a variable without its `$`, which makes it a text; empty where none is.
+    fn without_sign(&self, exprs: &[&Expr]) -> String {
+        let is_variable = |name: &str| self.variables.contains_key(name) || self.elements.contains_key(name);
+        let name = exprs.iter().find_map(|expr| match expr {
+            Expr::Literal(Value::String(text)) if is_variable(text) => Some(text),
+            _ => None,
+        });
+        name.map_or_else(String::new, |name| format!("the variable `{name}` is written `${name}`"))
     }
 
     /// The same, in the body of a comprehension with such an element.

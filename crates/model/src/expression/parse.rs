@@ -137,19 +137,28 @@ fn parse<T>(
         Token::End => Ok(result),
         other => {
             let error = parser.unexpected(&format!("expected an operator or the end, found {}", other.described()));
-            Err(error.with_help(meant(other)))
+            // `if a then b else c` stops behind the word `if`.
+            let behind = parser.next.checked_sub(1).and_then(|before| parser.tokens.get(before));
+            let help = behind.map_or_else(String::new, |(_, before)| meant(before));
+            Err(error.with_help(if matches!(behind, Some((_, Token::Word(_)))) && !help.is_empty() {
+                help
+            } else {
+                meant(other)
+            }))
         }
     }
 }
 
-/// What somebody means by a token where an expression could have ended; empty where nothing is known.
+/// What somebody means by a token where an expression could have ended or gone on; empty where nothing is known.
 fn meant(token: &Token) -> String {
     match token {
         Token::Symbol("?") => "write `if(condition, a, b)`".to_owned(),
+        Token::Symbol("==") => "write `=`".to_owned(),
         Token::Word(word) => match word.to_ascii_lowercase().as_str() {
             lower @ ("and" | "or" | "not" | "in") => format!("write `{lower}`, in small letters"),
             "is" => "write `=`".to_owned(),
             "if" | "then" | "else" => "write `if(condition, a, b)`".to_owned(),
+            "for" => format!("write `{}` or `{}`", Comprehension::Map.usage(), Comprehension::Filter.usage()),
             _ => String::new(),
         },
         _ => String::new(),
@@ -210,7 +219,8 @@ impl Parser<'_> {
         if self.takes(symbol) {
             return Ok(());
         }
-        Err(self.unexpected(&format!("expected `{symbol}`, found {}", self.peek().described())))
+        let error = self.unexpected(&format!("expected `{symbol}`, found {}", self.peek().described()));
+        Err(error.with_help(meant(self.peek())))
     }
 
     fn unexpected(&self, message: &str) -> ParseError {
@@ -554,7 +564,13 @@ impl Parser<'_> {
             let message = format!("`{predicate}` is built in and cannot be a predicate");
             return Err(ParseError::syntax(at, message));
         }
-        self.expects("(")?;
+        self.expects("(").map_err(|error| {
+            let help = match predicate.as_str() {
+                "none" | "nothing" | "empty" => "write `[]` for no fact".to_owned(),
+                _ => format!("a fact has its arguments in parentheses: `{predicate}(…)`"),
+            };
+            error.with_help(help)
+        })?;
         let (mut arguments, mut below) = (Vec::new(), 0);
         while !self.takes(")") {
             if !arguments.is_empty() {
@@ -688,7 +704,7 @@ mod tests {
         check("$bax", "unknown-variable: there is no `bax` at 0");
         check("? = 1", "invalid-expression: `?` stands only for an argument of a fact at 0");
         check("'open", "invalid-expression: this text has no closing quote at 0");
-        check("3rd", "invalid-expression: a name does not begin with a digit, and `3…` is no number at 0");
+        check("3rd", "invalid-expression: a name does not begin with a digit, and `3rd` is no number at 0");
         check("a § b", "invalid-expression: unexpected character `§` at 2");
         check("99999999999999999999", "invalid-expression: 99999999999999999999 is too large for an int at 0");
     }

@@ -25,8 +25,21 @@ pub(crate) enum Token {
 const SYMBOLS: [&str; 22] =
     ["==", "!=", "<=", ">=", "=", "<", ">", "+", "-", "*", "/", "(", ")", "[", "]", "{", "}", ",", ".", ":", "?", "|"];
 
-/// What other languages write for a word of this one.
-const FOREIGN: [(&str, &str); 4] = [("&&", "and"), ("&", "and"), ("||", "or"), ("!", "not")];
+/// What other languages write, and what stands for it in this one. Longer ones first.
+const FOREIGN: [(&str, &str); 10] = [
+    ("===", "="),
+    ("!==", "!="),
+    ("&&", "and"),
+    ("||", "or"),
+    ("<>", "!="),
+    ("**", "x * x"),
+    ("//", "floor(a / b)"),
+    ("&", "and"),
+    ("!", "not"),
+    ("%", "n - m * floor(n / m)"),
+];
+/// Units that people write behind a number.
+const UNITS: [&str; 11] = ["s", "ms", "min", "h", "m", "cm", "mm", "rad", "deg", "kg", "g"];
 
 impl Token {
     /// As it stands in a message.
@@ -126,10 +139,11 @@ fn number(characters: &[char], at: &mut usize) -> Result<Token, ParseError> {
     }
     let text: String = characters[start..*at].iter().collect();
     if characters.get(*at).is_some_and(|c| c.is_alphanumeric() || *c == '_') {
-        return Err(ParseError::syntax(
-            start,
-            format!("a name does not begin with a digit, and `{text}…` is no number"),
-        ));
+        let rest = word(characters, at);
+        let error =
+            ParseError::syntax(start, format!("a name does not begin with a digit, and `{text}{rest}` is no number"));
+        let help = "leave the unit out: numbers are in seconds, metres and radians";
+        return Err(if UNITS.contains(&rest.as_str()) { error.with_help(help) } else { error });
     }
     if whole {
         let int = text.parse().map(Token::Int);

@@ -252,7 +252,10 @@ fn seconds(fields: &mut Fields<'_, '_>, node: &Node, what: &str) -> Option<f64> 
     };
     let seconds = seconds.filter(|s| s.is_finite() && *s >= 0.0);
     if seconds.is_none() {
-        fields.error("type-mismatch", node.at, format!("`{what}` is a number of seconds, not below 0"), "");
+        let is_with_unit =
+            matches!(&node.content, Content::Text(text) if text.starts_with(|c: char| c.is_ascii_digit()));
+        let help = if is_with_unit { "leave the unit out" } else { "" };
+        fields.error("type-mismatch", node.at, format!("`{what}` is a number of seconds, not below 0"), help);
     }
     seconds
 }

@@ -17,6 +17,26 @@ const MAX_DEPTH: usize = 32;
 const FORMS: [&str; 9] =
     ["action", "for", "condition", "states", "while", "do_while", "until", "concurrency", "library"];
 
+/// Keys that say in other languages what a step is, and how it is written here.
+const FOREIGN_FORMS: [(&str, &str); 8] = [
+    ("if", CONDITION),
+    ("when", CONDITION),
+    ("repeat", COUNTED),
+    ("loop", COUNTED),
+    ("foreach", "write `- for: x in list`, with `do: […]`"),
+    ("sequence", "write `- name:`, with `states: […]`"),
+    ("parallel", "write `- name:`, with `concurrency: barrier` and `regions: […]`"),
+    ("call", "write `- name:`, with `action: provider/action` and `in: {…}`"),
+];
+const CONDITION: &str = "write `- condition: …`, with `then: […]` and `else: […]`";
+const COUNTED: &str = "write `- for: i in range(n)`, with `do: […]`";
+
+/// The key of a form that there is in other languages, and how it is written here.
+fn foreign_form(entries: &[Entry]) -> Option<(&Entry, &'static str)> {
+    let here = |entry: &Entry| FOREIGN_FORMS.iter().find(|(other, _)| *other == entry.key).map(|(_, here)| *here);
+    entries.iter().find_map(|entry| Some((entry, here(entry)?)))
+}
+
 /// Every step, by [`StateId`]; the root is the task.
 #[derive(Debug)]
 pub(crate) struct Outline<'a> {
@@ -226,6 +246,9 @@ impl<'a> Builder<'a, '_> {
         }
         let [entry] = entries else {
             let (at, message, help) = match entries {
+                _ if let Some((form, here)) = foreign_form(entries) => {
+                    (form.at, format!("there is no form `{}`", form.key), here.to_owned())
+                }
                 [name, other, ..] if matches!(name.value.content, Content::Map(_)) => (
                     other.at,
                     format!("`{}` stands beside the state `{}`", other.key, name.key),
@@ -277,14 +300,20 @@ impl<'a> Builder<'a, '_> {
         let forms: Vec<&Entry> = body.entries().iter().filter(|e| FORMS.contains(&e.key.as_str())).collect();
         let [form] = forms.as_slice() else {
             let message = match forms.as_slice() {
-                [] => "this is no kind of state".to_owned(),
+                [] => match foreign_form(body.entries()) {
+                    Some((form, _)) => format!("there is no form `{}`", form.key),
+                    None => "this is no kind of state".to_owned(),
+                },
                 [a, b, ..] => format!("a state is `{}` or `{}`, not both", a.key, b.key),
                 [_] => String::new(),
             };
             let is_glued = |e: &&Entry| e.key.split_once(':').is_some_and(|(form, _)| FORMS.contains(&form));
             let help = match body.entries().iter().find(is_glued).and_then(|e| e.key.split_once(':')) {
                 Some((form, value)) => format!("put a blank behind the colon: `{form}: {value}`"),
-                None => format!("give it one of {}", FORMS.join(", ")),
+                None => match foreign_form(body.entries()) {
+                    Some((_, here)) => here.to_owned(),
+                    None => format!("give it one of {}", FORMS.join(", ")),
+                },
             };
             self.findings.error("invalid-state", at, &path, message, help);
             return None;

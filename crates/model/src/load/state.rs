@@ -201,9 +201,8 @@ fn defaults(fields: &mut Fields<'_, '_>, body: &Node) -> std::collections::BTree
             && let Some(value) = super::constant(fields, node)
         {
             let own = fields.view.state.and_then(|id| fields.task.ports[id.0 as usize].types.get(&entry.key));
-            if let Some(ty) = own.filter(|ty| !ty.accepts(&value)) {
-                let message = format!("the default of `{}` is {}, not {ty}", entry.key, value.type_name());
-                fields.error("type-mismatch", node.at, message, "");
+            if let Some(ty) = own {
+                super::of_type(fields, node.at, &entry.key, ty, &value);
             }
             defaults.insert(entry.key.clone(), value);
         }
