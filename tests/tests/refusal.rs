@@ -212,6 +212,11 @@ fn a_daemon_that_may_not_listen_or_has_no_state_of_its_own_is_refused() -> anyho
     for role in ["resource-manager", "process-manager", "cell"] {
         refused(&[role, "--listen", "0.0.0.0:0"], "has no TLS")?;
     }
+    let deep = place.path().join("x".repeat(120));
+    for role in ["resource-manager", "world-pool", "process-manager", "cell"] {
+        refused(&[role, "--runtime-dir", deep.to_str().context("a path")?], "is too deep")?;
+        ensure!(!deep.exists(), "{role} made {}", deep.display());
+    }
     let worker = ["worker", "detector", "--id", "d1", "--resource-manager", "http://127.0.0.1:1"];
     refused(&[worker.as_slice(), &["--listen", "0.0.0.0:0"]].concat(), "has no TLS")?;
     let config = place.path().join("ratn.toml");

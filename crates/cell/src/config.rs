@@ -1,4 +1,4 @@
-//! What a cell is made of, from TOML. Every key has a default; an unknown one is an error.
+//! The configuration of a cell, the section `[cell]` of a config. Every key has a default; an unknown key is an error.
 
 use crate::core::faults::{Fault, MAX_FAULTS};
 use ratn_perception::camera::Intrinsics;
@@ -15,13 +15,13 @@ pub const MAX_BOXES: usize = 9;
 /// The most of each kind of tableware that a cell can have: as many as there are places for it on the table.
 pub const MAX_TABLEWARE: usize = 3;
 
-/// The longest that the resource manager waits for standstill.
+/// The longest time that the resource manager waits for standstill.
 const LONGEST_STANDSTILL: Duration = Duration::from_secs(60);
 
 /// The robot of the paper.
 pub const AIMM: &str = "aimm";
 
-/// What the cell is furnished for: the paper's two experiments.
+/// The scene that the cell begins with: those of the paper's two experiments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Setting {
@@ -32,7 +32,7 @@ pub enum Setting {
     Table,
 }
 
-/// What can be moved of a new scene; each setting looks at its own.
+/// How many objects of each kind a new scene has. Each setting uses its own kinds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Goods {
@@ -52,15 +52,15 @@ pub struct Goods {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CellConfig {
-    /// Where to listen: `local` (a Unix socket in the runtime directory), `127.0.0.1:0` or `unix:/path`.
+    /// The address to listen on: `local` (a Unix socket in the runtime directory), `127.0.0.1:0` or `unix:/path`.
     pub listen: Endpoint,
-    /// Where the resource manager is; without it, where the runtime directory says.
+    /// The endpoint of the resource manager; unless given, the one in the runtime directory.
     pub resource_manager: Option<Endpoint>,
-    /// The host that the resources say they are on.
+    /// The name of the host that the resources are offered with.
     pub host: String,
-    /// Which robot stands there: the name of a built-in one, or the path of a `robot.toml`.
+    /// The robot: the name of a built-in one, or the path of a `robot.toml`.
     pub robot: String,
-    /// What stands there: `boxes` on the table, or `table`: tableware on a rack.
+    /// The scene: `boxes` on a table, or `table`, which is tableware on a rack.
     pub scene: Setting,
     /// How many boxes stand on the table, 1 to 9.
     pub boxes: usize,
@@ -72,26 +72,25 @@ pub struct CellConfig {
     pub cups: usize,
     /// How many plates lie on the table, 0 to 3.
     pub plates: usize,
-    /// What the boxes' sizes and places and the camera's noise are derived from.
+    /// The seed from which the sizes and places of objects and the camera's noise are derived.
     pub seed: u64,
     /// The robot's seconds per second of wall time.
     pub speed: f64,
     /// How long the session with the resource manager outlives the last keep-alive, in milliseconds.
     pub session_ttl_ms: u64,
-    /// When a lease of what moves has ended, the next one is granted when the cell has confirmed that nothing moves any more, and at the
-    /// latest after this, in milliseconds: at least `session_ttl_ms`, for which the cell may not have heard of it. 3 s more than that
-    /// unless given.
+    /// When a lease of a module that moves has ended, the next lease is granted once the cell has confirmed standstill, and after this many
+    /// milliseconds at the latest. At least `session_ttl_ms`, because the cell may not hear of the end for so long; unless given, 3 s more.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub standstill_ms: Option<u64>,
-    /// Where an emergency stop is kept, so that it outlasts the process; a folder that a reboot leaves alone. `state/cell` in the runtime
-    /// directory unless given.
+    /// The folder in which an emergency stop is kept, so that it outlasts the process: choose one that a reboot does not empty. `state/cell`
+    /// in the runtime directory unless given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub state_dir: Option<PathBuf>,
-    /// A new file to write down in what happens, so that `ratn cell --replay` goes through it again.
+    /// The new file that the cell records everything in, for `ratn cell --replay`.
     pub record: Option<PathBuf>,
-    /// What goes wrong: `grasp_slips:2` at the second grasp, `object_moved@12.5` at a time, `sensor_dropout~0.05` by chance.
+    /// The faults to inject: `grasp_slips:2` at the second grasp, `object_moved@12.5` at a time, `sensor_dropout~0.05` by chance.
     pub faults: Vec<Fault>,
-    /// What drives arm and base along their trajectories.
+    /// The controllers that move arm and base along their trajectories.
     pub controllers: ControllersConfig,
     /// The gripper.
     pub gripper: GripperConfig,
@@ -101,21 +100,21 @@ pub struct CellConfig {
     pub camera: CameraConfig,
     /// The battery.
     pub battery: BatteryConfig,
-    /// How wrong the robot is about itself.
+    /// How wrong the robot's model of itself is.
     pub errors: ErrorsConfig,
 }
 
-/// What drives arm and base along their trajectories. The stiffer, the less they lag.
+/// The controllers that move arm and base along their trajectories: critically damped second-order systems. The stiffer, the less they lag.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ControllersConfig {
-    /// Of the arm's joints, in radians per second.
+    /// Stiffness of the arm's joints: the natural frequency in radians per second.
     pub arm_stiffness: f64,
-    /// How far one of them may be from its trajectory, in radians: then the motion is aborted.
+    /// The greatest error of a joint, in radians; beyond it the motion ends `aborted`.
     pub arm_most_off_rad: f64,
-    /// Of the base, in radians per second.
+    /// Stiffness of the base: the natural frequency in radians per second.
     pub base_stiffness: f64,
-    /// How far it may be from its trajectory, in metres and in radians.
+    /// The greatest error of the base, in metres and in radians; beyond it the drive ends `aborted`.
     pub base_most_off: f64,
 }
 
@@ -123,13 +122,13 @@ pub struct ControllersConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GripperConfig {
-    /// How far it opens, in metres; at most what its fingers can.
+    /// The opening between the fingers, in metres; at most what the fingers can.
     pub opening_m: f64,
     /// How long it takes to close, in the robot's seconds.
     pub close_s: f64,
     /// How long it takes to open, in the robot's seconds.
     pub open_s: f64,
-    /// How hard each finger presses, in newtons.
+    /// The force of each finger, in newtons.
     pub force_n: f64,
 }
 
@@ -137,7 +136,7 @@ pub struct GripperConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PanTiltConfig {
-    /// How much of its greatest speed it uses, above 0 and at most 1.
+    /// The fraction of its greatest speed that it uses, above 0 and at most 1.
     pub speed: f64,
     /// How long it takes to come to rest, in the robot's seconds.
     pub settle_s: f64,
@@ -147,30 +146,30 @@ pub struct PanTiltConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CameraConfig {
-    /// Frames per second of the robot.
+    /// Frames per second of the robot's time.
     pub frames_per_s: f64,
-    /// Its optics.
+    /// The intrinsic parameters: focal lengths and principal point in pixels, and the size of the image.
     pub intrinsics: Intrinsics,
     /// Its noise.
     pub noise: Noise,
 }
 
-/// How wrong the robot is about itself: standard deviations of normal distributions, drawn from the seed. docs/cell.md says what real robots
-/// have.
+/// The errors of the robot's model of itself: standard deviations of normal distributions, drawn from the seed. docs/cell.md says which errors
+/// real robots have.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ErrorsConfig {
-    /// Of the zero of each of the arm's encoders, in radians.
+    /// Zero offset of each of the arm's encoders, in radians.
     pub encoder_rad: f64,
-    /// Of the amplitude of what each of them reads too much once a turn, in radians.
+    /// Amplitude of the periodic error, once a turn, of each encoder, in radians.
     pub encoder_wave_rad: f64,
-    /// Of the camera's place on the head along each axis, in metres.
+    /// Position of the camera on the head along each axis, in metres.
     pub camera_m: f64,
-    /// Of its direction about each axis, in radians.
+    /// Orientation of the camera about each axis, in radians.
     pub camera_rad: f64,
-    /// Of where the base believes to stand along each axis, in metres; drawn anew at every stop.
+    /// Localised position of the base along each axis, in metres; drawn anew at every stop.
     pub localisation_m: f64,
-    /// Of its heading, in radians; drawn anew at every stop.
+    /// Localised heading of the base, in radians; drawn anew at every stop.
     pub localisation_rad: f64,
 }
 
@@ -178,13 +177,13 @@ pub struct ErrorsConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct BatteryConfig {
-    /// How full it is at the start, 0 to 1.
+    /// The charge at the start, 0 to 1.
     pub level: f64,
-    /// How much an hour of standing uses up.
+    /// The charge that one hour of standing uses, as a fraction.
     pub idle_per_hour: f64,
-    /// How much more an hour of moving the arm uses up.
+    /// The charge that one hour of moving the arm uses beside that.
     pub motion_per_hour: f64,
-    /// How much more an hour of driving uses up.
+    /// The charge that one hour of driving uses beside that.
     pub driving_per_hour: f64,
 }
 
@@ -207,7 +206,7 @@ impl Setting {
 }
 
 impl ErrorsConfig {
-    /// None at all.
+    /// No errors at all.
     pub const NONE: ErrorsConfig = ErrorsConfig {
         encoder_rad: 0.0,
         encoder_wave_rad: 0.0,
@@ -216,7 +215,7 @@ impl ErrorsConfig {
         localisation_m: 0.0,
         localisation_rad: 0.0,
     };
-    /// Of a robot that is calibrated with care.
+    /// The errors of a robot that is calibrated with care.
     pub const REALISTIC: ErrorsConfig = ErrorsConfig {
         encoder_rad: 2e-4,
         encoder_wave_rad: 2e-4,
@@ -225,7 +224,7 @@ impl ErrorsConfig {
         localisation_m: 0.005,
         localisation_rad: 0.00524,
     };
-    /// Of a robot that is calibrated once and used for long.
+    /// The errors of a robot that was calibrated once and has been used for long.
     pub const ROUGH: ErrorsConfig = ErrorsConfig {
         encoder_rad: 5e-4,
         encoder_wave_rad: 5e-4,
@@ -243,7 +242,7 @@ impl ErrorsConfig {
 }
 
 impl Goods {
-    /// Whether a cell of this setting can have so many.
+    /// Whether a cell of this setting can have these numbers of objects.
     pub fn fit(&self, setting: Setting) -> bool {
         let Goods { boxes, bowls, forks, cups, plates } = *self;
         match setting {
@@ -254,7 +253,7 @@ impl Goods {
         }
     }
 
-    /// How many there are in this setting.
+    /// How many objects this setting has in all.
     pub fn count(&self, setting: Setting) -> usize {
         match setting {
             Setting::Boxes => self.boxes,
@@ -263,7 +262,7 @@ impl Goods {
     }
 }
 
-/// A value that no cell can have.
+/// A value of a cell's configuration that is out of its range.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("`{key}` of the cell is {value}: it must be {rule}")]
 pub struct ConfigError {
@@ -276,14 +275,14 @@ pub struct ConfigError {
 }
 
 impl CellConfig {
-    /// What can be moved at the beginning.
+    /// The objects of the first scene.
     pub fn goods(&self) -> Goods {
         let CellConfig { boxes, bowls, forks, cups, plates, .. } = *self;
         Goods { boxes, bowls, forks, cups, plates }
     }
 
-    /// The bound within which the next lease of what moves is granted. What brakes takes seconds of the robot, which last longer in a
-    /// cell that is slowed down; below a speed of 0.06 longer than a bound may be.
+    /// The time after which the next lease of a module that moves is granted at the latest. Braking takes seconds of the robot, which last
+    /// longer in a cell that is slowed down; below a speed of 0.06 they last longer than this time may be.
     pub fn standstill(&self) -> Duration {
         let ttl = Duration::from_millis(self.session_ttl_ms);
         let braking = (standstill_bound(ttl) - ttl).div_f64(self.speed.clamp(1e-3, 1.0));

@@ -21,6 +21,12 @@ pub(crate) fn messages() -> Messages {
     Messages::to(|line| progress(format_args!("{line}")))
 }
 
+/// `1 fact`, `3 facts`.
+pub(crate) fn counted(count: usize, noun: &str) -> String {
+    let plural = if count == 1 { "" } else { "s" };
+    format!("{count} {noun}{plural}")
+}
+
 /// Writes a result and the end of its last line to standard output.
 ///
 /// # Errors

@@ -1,11 +1,11 @@
-//! The caller's hand on the planner: asked often whether to go on, told when there is a first path.
+//! How the caller controls the planner: a callback is called often, reports progress, and answers whether to go on.
 
 /// What the planner reports when it asks whether to go on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Progress {
     /// Nothing new.
     Working,
-    /// The first path was found; said once.
+    /// The first path was found; reported once.
     FirstPath {
         /// Its length in joint space.
         length_rad: f64,
@@ -63,7 +63,7 @@ impl<'c> Pace<'c> {
         }
     }
 
-    /// What the caller says, for those who ask it themselves.
+    /// Calls the callback directly, for searches that count their own iterations.
     pub(crate) fn answer(&mut self) -> Control {
         (self.control)(Progress::Working)
     }

@@ -36,8 +36,8 @@ use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
 use ratn_world::scene::{Placement, Scene, SceneObject};
 
-/// The padding where the start is too close to something for the usual one, in metres. As much room is on a free path at the least; a
-/// controller that gives up there stops a little beside it, so a start with less is left, too, as long as it touches nothing.
+/// The padding, in metres, where the start is too close to something for the usual padding. A free path keeps at least this distance. A
+/// controller that aborts on such a path stops a little beside it, so planning may also begin at a start with less room that touches nothing.
 const TIGHT_PADDING_M: f64 = 0.002;
 
 /// Postures looked for per goal pose, and attempts spent on it: at first, and once more if there were none.
@@ -66,7 +66,7 @@ const MEASURED_WITHIN_M: f64 = 0.002;
 /// Steps from touching to the deepest that may be pressed: of the ways to a goal those count that press the least.
 const PRESS_STEPS: u32 = 4;
 
-/// A path must have become this much quicker to be worth a word, in seconds.
+/// A path must have become this much quicker to be reported, in seconds.
 const LEAST_REPORT_S: f32 = 1e-3;
 
 /// The motion is timed exactly after so many steps of improvement, and after four times as many, again and again.
@@ -76,16 +76,16 @@ const TIMED_AGAIN: usize = 4;
 /// How much of a straight part a blend may take, at the end that is away from what it leads to or from.
 const BLENDED_SHARE: f64 = 0.5;
 
-/// A motion.
+/// A planned motion.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
-    /// Timed.
+    /// The trajectory: times in seconds, positions in radians, velocities in radians per second.
     pub trajectory: Trajectory,
-    /// Where it ends.
+    /// The posture in which it ends, in radians.
     pub end: JointVector,
     /// The tool frame there, in the world frame.
     pub end_pose: Pose,
-    /// Length of the first path in joint space, straight parts included.
+    /// Length of the first path in joint space (radians, Euclidean), straight parts included.
     pub first_length_rad: f64,
     /// Length of the path that the trajectory follows, before its corners were rounded.
     pub length_rad: f64,
@@ -93,14 +93,14 @@ pub struct Plan {
     pub first_duration_s: f64,
     /// Iterations of search and improvement.
     pub iterations: usize,
-    /// The caller's time was up before all iterations of improvement were done: with more of it the path may differ.
+    /// The caller's time was up before all iterations of improvement were done: with more time the path may be another.
     pub time_up: bool,
 }
 
 /// Why there is no plan.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PlanError {
-    /// The request makes no sense.
+    /// A part of the request is out of range or contradicts the robot.
     #[error("{what} is {value}: expected {expected}")]
     Malformed {
         /// Which part of it.
@@ -138,7 +138,7 @@ pub enum PlanError {
         /// The different reasons.
         reasons: Vec<String>,
     },
-    /// The tool cannot go straight to any of the goals.
+    /// The tool reaches none of the goals in a straight line.
     #[error("no straight way to any of the {goals} goals: {}", reasons.join("; "))]
     NoStraightWay {
         /// How many alternatives there were.
@@ -146,7 +146,7 @@ pub enum PlanError {
         /// How far the tool gets and why no further, of some of them.
         reasons: Vec<String>,
     },
-    /// What the tool is to keep does not hold.
+    /// A constraint on the tool is broken where it has to hold.
     #[error("{place} {reason}")]
     NotKept {
         /// Where.
@@ -169,7 +169,7 @@ pub enum PlanError {
     /// The caller's time was up before there was any path.
     #[error("no path was found in the time given")]
     TimeUp,
-    /// The caller gave up.
+    /// The caller cancelled the planning.
     #[error("planning was cancelled")]
     Cancelled,
 }
@@ -238,10 +238,10 @@ struct Planning<'a> {
     candidates: Vec<Candidate>,
 }
 
-/// Plans a motion of the arm in a scene; `control` is asked at least every millisecond or so whether to go on.
+/// Plans a motion of the arm in a scene. `control` is called about every millisecond and says whether to go on.
 ///
 /// # Errors
-/// [`PlanError`] says what is in the way.
+/// [`PlanError`], which names the shapes in the way, or the part of the request that is wrong.
 pub fn plan(
     robot: &Robot,
     scene: &Scene,

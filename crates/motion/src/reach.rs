@@ -50,10 +50,10 @@ const SAME: f64 = 0.05;
 /// One row of a Jacobian; a column per joint.
 type Row = [f64; MAX_JOINTS];
 
-/// Where a link is wanted.
+/// A pose that a link is to reach, with tolerances.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Target {
-    /// In the frame of the robot's root.
+    /// The pose in the frame of the robot's root.
     pub pose: Pose,
     /// How far the link may be off along the axes of that pose, in metres.
     pub tolerance_m: [f64; 3],
@@ -253,7 +253,7 @@ impl Reach {
         [norm([along(0), along(1), along(2)]), norm([along(3), along(4), along(5)])]
     }
 
-    /// JointVector held within the limits.
+    /// The nearest positions within the limits.
     pub fn clamp(&self, positions: &JointVector) -> JointVector {
         let mut clamped = *positions;
         for (q, joint) in clamped.iter_mut().zip(&self.joints) {
@@ -383,7 +383,7 @@ impl Reach {
     }
 
     /// Postures anywhere, the nearest to `near` first. Joints that do not move the link stay where they are there half of the time: elsewhere
-    /// they may be in nobody's way.
+    /// they may be out of the way of everything.
     pub fn anywhere(&self, postures: &Postures, near: &JointVector, random: &mut impl Rng) -> Vec<JointVector> {
         let stays = self.others.is_empty() || random.random_bool(0.5);
         let others = if stays { *near } else { self.random(random) };

@@ -1,4 +1,4 @@
-//! What the planner is asked for.
+//! A request to the planner.
 
 use crate::constrained::LEAST_TOLERANCE;
 use crate::joint_vector::JointVector;
@@ -18,31 +18,32 @@ pub const MAX_GOALS: usize = 64;
 /// The slowest motion, as a fraction of the limits: a trajectory's points are as many as its time is long.
 pub const MIN_SPEED: f64 = 0.01;
 
-/// What to plan.
+/// A motion that is to be planned.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Request {
-    /// Where the whole robot is. The arm moves from there; head and fingers stay; the base is where the scene has it, whatever is said
-    /// here. What is not known: [`assumed`](crate::arm::assumed).
+    /// The start: the positions of all parts of the robot. The arm moves from there; head and fingers stay as they are. The base is where the
+    /// scene has it, whatever this says. [`assumed`](crate::arm::assumed) fills in parts that are not known.
     pub start: Configuration,
-    /// Alternatives; any one will do.
+    /// The goals, of which the motion may end at any one.
     pub goals: Vec<Goal>,
-    /// Leave in a straight line.
+    /// The straight line of the tool with which the motion begins.
     pub depart: Straight,
-    /// Arrive in a straight line, moving in this direction.
+    /// The straight line of the tool with which the motion ends.
     pub approach: Straight,
     /// Go in straight lines of the tool from the end of the departure to the beginning of the approach, instead of along a free path.
     pub straight: Option<WayPoints>,
-    /// What points up in the tool at the end of the departure points up all along the free path, at most this far off, in radians.
+    /// Keeps the tool upright: the direction that points up in the tool at the end of the departure stays within this angle of up along the
+    /// free path, in radians.
     pub upright_rad: Option<f64>,
-    /// What else the tool keeps, all along.
+    /// Further constraints on the tool, for the whole motion.
     pub keep: Keep,
-    /// Hollow things that the fingers may reach into on the straight parts, by their names in the scene: their shapes there are filled.
+    /// Names, in the scene, of hollow objects that the fingers may reach into on the straight parts, although their shapes are filled.
     pub reaches_into: Vec<String>,
-    /// Fraction of the joints' velocity and acceleration limits.
+    /// Fraction of the joints' velocity and acceleration limits, [`MIN_SPEED`] to 1.
     pub speed: f64,
     /// Fractions of the joints' limits of velocity (beside `speed`), acceleration (beside `speed`) and jerk, joint by joint.
     pub scales: [JointVector; 3],
-    /// How fast the tool may be.
+    /// Limits of the tool's speed.
     pub tool_speed: ToolSpeed,
     /// The same seed, scene and iterations give the same plan.
     pub seed: u64,
@@ -50,17 +51,17 @@ pub struct Request {
     pub improvement_iterations: usize,
 }
 
-/// Where to go.
+/// A goal of a motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Goal {
-    /// A posture.
+    /// A posture: positions of the arm's joints in radians.
     Joints(JointVector),
-    /// The tool frame in the world frame.
+    /// A pose of the tool frame, in the world frame, in metres.
     Pose(Pose),
 }
 
 impl Request {
-    /// The quickest motion to one of the goals, without straight parts and improvement.
+    /// A request for the quickest motion to one of the goals, without straight parts and without improvement.
     pub fn new(start: Configuration, goals: Vec<Goal>) -> Request {
         Request {
             start,

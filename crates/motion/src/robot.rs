@@ -57,25 +57,25 @@ struct Part {
     joints: Vec<Joint>,
 }
 
-/// Where the parts of a robot are. What it does not have does not count.
+/// The positions of a robot's parts. Values of parts that the robot does not have are ignored.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Configuration {
-    /// x and y in metres, yaw in radians, in the world frame.
+    /// The base: x and y in metres, yaw in radians, in the world frame.
     pub base: [f64; 3],
-    /// Arm joints.
+    /// The arm's joints, in radians.
     pub arm: JointVector,
-    /// Radians, positive to the left.
+    /// Pan of the head, in radians, positive to the left.
     pub pan: f64,
-    /// Radians, positive downwards.
+    /// Tilt of the head, in radians, positive downwards.
     pub tilt: f64,
-    /// How far each finger is from the middle, in metres: half of the opening.
+    /// The distance of each finger from the middle, in metres: half of the opening.
     pub finger: f64,
 }
 
 /// Why a description and a URDF make no robot.
 #[derive(Debug, thiserror::Error)]
 pub enum RobotFault {
-    /// URDF, SRDF or a mesh is not right, or a name is not in them.
+    /// URDF, SRDF or a mesh is faulty, or does not have a name that the description uses.
     #[error(transparent)]
     Model(#[from] MechanismError),
     /// The arm has no joints, or too many.
@@ -84,7 +84,7 @@ pub enum RobotFault {
         /// How many.
         count: usize,
     },
-    /// A joint of the arm that does not move the tool.
+    /// A joint of the arm does not move the tool.
     #[error("the joint `{joint}` of the arm does not move its tool, the link `{tool}`")]
     Beside {
         /// The joint.
@@ -92,19 +92,19 @@ pub enum RobotFault {
         /// The tool.
         tool: String,
     },
-    /// Two arms of one name.
+    /// Two arms have one name.
     #[error("two arms are called `{arm}`")]
     ArmTwice {
         /// The name.
         arm: String,
     },
-    /// A joint that is of two arms.
+    /// A joint belongs to two arms.
     #[error("the joint `{joint}` is of two arms: only one of them can move it, leave it out of the other")]
     JointOfTwo {
         /// The joint.
         joint: String,
     },
-    /// An arm that is not there.
+    /// The robot has no arm of this name.
     #[error("{robot} has no arm `{arm}` for this: its arms are {arms}")]
     NoArm {
         /// The arm.
@@ -114,7 +114,7 @@ pub enum RobotFault {
         /// Its arms.
         arms: String,
     },
-    /// A posture that the arm cannot take.
+    /// A named posture is out of the arm's limits.
     #[error("the posture `{posture}` {reason}")]
     Posture {
         /// Its name.
@@ -122,7 +122,7 @@ pub enum RobotFault {
         /// What is wrong with it.
         reason: String,
     },
-    /// A workplace that is none for this robot.
+    /// The workplace does not suit the robot.
     #[error("[workplace]: {reason}")]
     Workplace {
         /// What is wrong with it.
@@ -184,7 +184,8 @@ impl Robot {
         }
     }
 
-    /// Holds a description against the URDF and SRDF that it names; `load` gives what is in a mesh file that the URDF names.
+    /// Reads a robot from a description and the texts of the URDF and SRDF that it names; `load` returns the bytes of a mesh file that the
+    /// URDF names.
     ///
     /// # Errors
     /// [`RobotFault`] names the link, joint or posture that does not fit.
@@ -251,7 +252,7 @@ impl Robot {
         }
     }
 
-    /// What messages call it.
+    /// The robot's name, for messages.
     pub fn name(&self) -> &str {
         &self.description.name
     }
@@ -273,7 +274,7 @@ impl Robot {
         }
     }
 
-    /// From what [`Configuration::values`] gives; none for another number of them.
+    /// The inverse of [`Configuration::values`]; `None` where the number of values is another.
     pub fn configuration(&self, values: &[f64]) -> Option<Configuration> {
         let arm = self.arm.joints.len();
         if values.len() != arm + 6 {
@@ -409,7 +410,7 @@ impl Robot {
         bodies.map(|(i, body)| (i, to_f32(&poses[i].compose(&body.pose)), body.geometry.shape(0.0))).collect()
     }
 
-    /// The joints held within their limits.
+    /// The nearest posture within the joints' limits.
     pub fn clamp(&self, arm: &JointVector) -> JointVector {
         let mut clamped = *arm;
         for (q, joint) in clamped.iter_mut().zip(self.arm_joints()) {

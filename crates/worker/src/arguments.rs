@@ -1,15 +1,15 @@
-//! The arguments of a worker process, as a template of the process manager passes them: `--id {id} --endpoint-file {endpoint_file}` and
-//! what else of the table below, and options of the worker's own.
+//! The arguments of a worker process, as a template of the process manager passes them: `--id {id} --endpoint-file {endpoint_file}`, others of
+//! the table below, and options of the worker's own.
 //!
 //! | | |
 //! |---|---|
 //! | `--id` | the id of its resource |
-//! | `--endpoint-file` | where it writes its endpoint |
-//! | `--listen` | where it listens, `127.0.0.1:0` unless said |
-//! | `--kind`, `--host` | of the resource, where it offers that itself |
-//! | `--resource-manager` | it offers its resource there itself: not for a worker of a process manager |
+//! | `--endpoint-file` | the file into which the worker writes its endpoint |
+//! | `--listen` | the address that it listens on; `127.0.0.1:0` unless given |
+//! | `--kind`, `--host` | kind and host of its resource, where the worker offers that itself |
+//! | `--resource-manager` | the resource manager at which the worker offers its resource itself; not for a pooled worker |
 //! | `--config` | the system's config, with the roles of callers |
-//! | `--exit-with-parent` | it ends when its standard input does; so does every worker of a process manager, said or not |
+//! | `--exit-with-parent` | the worker ends when its standard input is closed; a pooled worker always does |
 //! | `--insecure` | it may listen beyond loopback without TLS |
 
 use crate::endpoint::EndpointError;
@@ -26,7 +26,7 @@ const FLAGS: [&str; 2] = ["--exit-with-parent", "--insecure"];
 const OPTIONS: [&str; 7] =
     ["--id", "--endpoint-file", "--listen", "--kind", "--host", "--resource-manager", "--config"];
 
-/// What a worker process was started with. Options of one's own are taken out before [`Arguments::worker`].
+/// The arguments that a worker process was started with. Take your own options out ([`Arguments::take`]) before [`Arguments::worker`].
 #[derive(Debug, Clone)]
 pub struct Arguments {
     given: BTreeMap<String, String>,
@@ -34,7 +34,7 @@ pub struct Arguments {
     known: Vec<String>,
 }
 
-/// Arguments that a worker cannot be started with.
+/// Why a worker cannot be started with these arguments.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ArgumentError {
     /// An option without its value.
@@ -49,7 +49,7 @@ pub enum ArgumentError {
         /// Which.
         option: String,
     },
-    /// A value that is none.
+    /// The value of an option cannot be read.
     #[error("{option} is `{value}`: {why}")]
     Value {
         /// Which.
@@ -59,24 +59,24 @@ pub enum ArgumentError {
         /// What is wrong with it.
         why: String,
     },
-    /// Nothing that a worker takes.
+    /// The worker has no such option.
     #[error("there is no option `{option}`; there are {known}")]
     Unknown {
         /// As it was given.
         option: String,
-        /// Those that there are.
+        /// The options that it has.
         known: String,
     },
-    /// Not text.
+    /// An argument is not UTF-8.
     #[error("an argument is not UTF-8: {shown}")]
     NoText {
-        /// As well as it can be shown.
+        /// The argument, with its unreadable bytes replaced.
         shown: String,
     },
 }
 
 impl Arguments {
-    /// Those of this process.
+    /// The arguments of this process.
     ///
     /// # Errors
     /// [`ArgumentError`].
@@ -89,7 +89,7 @@ impl Arguments {
         Arguments::of(arguments, pooled)
     }
 
-    /// These; a `pooled` worker ends with its process manager.
+    /// Reads these arguments, without the program's name. A `pooled` worker ends with its process manager, whatever they say.
     ///
     /// # Errors
     /// [`ArgumentError`].
@@ -120,10 +120,10 @@ impl Arguments {
         Ok(Arguments { given, pooled, known: Vec::new() })
     }
 
-    /// An option of the worker's own, `--speed`: what the template passes, or nothing.
+    /// Takes out an option of the worker's own, for example `--speed`: its value, or `None` where it was not given.
     ///
     /// # Errors
-    /// [`ArgumentError::Value`] where it does not read.
+    /// [`ArgumentError::Value`] where the value cannot be read as a `T`.
     pub fn take<T: FromStr>(&mut self, option: &str) -> Result<Option<T>, ArgumentError>
     where
         T::Err: std::fmt::Display,
@@ -138,18 +138,18 @@ impl Arguments {
         value.parse().map(Some).map_err(wrong)
     }
 
-    /// The worker that they describe, without actions.
+    /// A worker with these options, without actions.
     ///
     /// # Errors
-    /// [`ArgumentError`], also where something is left that nobody has taken.
+    /// [`ArgumentError`], also for an argument that nobody has taken.
     pub fn worker(self) -> Result<Worker, ArgumentError> {
         Ok(Worker::new(self.options()?))
     }
 
-    /// What [`Arguments::worker`] makes a worker of.
+    /// The options that [`Arguments::worker`] makes a worker with.
     ///
     /// # Errors
-    /// As that.
+    /// As [`Arguments::worker`].
     pub fn options(mut self) -> Result<WorkerOptions, ArgumentError> {
         let own = std::mem::take(&mut self.known);
         let defaults = WorkerOptions::default();

@@ -1,5 +1,5 @@
-//! Where a server is: a TCP address, with TLS or without, or a Unix socket. Written `http://host:port`, `host:port`,
-//! `https://host:port` or `unix:/path`. Several of them, with commas between, are servers of which one leads.
+//! The address of a server: TCP, with or without TLS, or a Unix socket. It is written `http://host:port`, `host:port`, `https://host:port` or
+//! `unix:/path`. Several addresses, separated by commas, are servers of which one leads and the others stand by.
 
 use crate::leader::LeaderConnector;
 use crate::tls::ClientTls;
@@ -26,7 +26,7 @@ const MAX_SOCKET_PATH_BYTES: usize = 107;
 /// [`Endpoint::local`] as text.
 const LOCAL: &str = "local";
 
-/// Where a server listens, or is to be reached.
+/// The address that a server listens on, or can be reached at.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(into = "String", try_from = "String")]
 pub enum Endpoint {
@@ -39,14 +39,14 @@ pub enum Endpoint {
     },
     /// Over TCP with TLS; both as above.
     Tls {
-        /// What the server's certificate is for.
+        /// The host name, for which the server's certificate is made out.
         host: String,
         /// The port.
         port: u16,
     },
     /// At a path of the file system.
     Unix(PathBuf),
-    /// At whichever of these leads; the others stand by. For connecting only.
+    /// The one of these servers that leads; the others stand by. For connecting only.
     AnyOf(Vec<Endpoint>),
 }
 
@@ -74,7 +74,7 @@ pub struct ConnectError {
 }
 
 impl ConnectError {
-    /// Nobody listens there: the server has ended.
+    /// Whether nothing listens there: the server has ended.
     pub fn nobody_listens(&self) -> bool {
         let absent = [io::ErrorKind::ConnectionRefused, io::ErrorKind::NotFound];
         let causes = std::iter::successors(self.source.source(), |cause: &&(dyn Error + 'static)| (*cause).source());
@@ -93,7 +93,7 @@ impl Endpoint {
         Endpoint::Unix(PathBuf::new())
     }
 
-    /// Each server: itself, where it is one.
+    /// The addresses of the single servers; the endpoint itself where it is one.
     pub fn members(&self) -> &[Endpoint] {
         match self {
             Endpoint::AnyOf(members) => members,
@@ -101,7 +101,7 @@ impl Endpoint {
         }
     }
 
-    /// Whether it is [`Endpoint::local`].
+    /// Whether this is [`Endpoint::local`].
     pub fn is_local(&self) -> bool {
         *self == Endpoint::local()
     }

@@ -1,4 +1,5 @@
-//! The worker SDK: what a process links that takes part in a ratn system. Light: no planner, no store, no clap.
+//! The worker SDK: the library for a process that takes part in a ratn system (a worker, a driver of a robot's module, a client). It is
+//! light: it links no planner, no store and no clap. [`worker::Worker`] is where a worker begins; docs/workers.md shows a whole one.
 //!
 //! # Serving
 //! - [`endpoint::Endpoint`]: `http://host:port`, `https://…`, `host:port` or `unix:/path`; parse, print, [`endpoint::connect`].
@@ -6,8 +7,8 @@
 //!   `wait_for(role, deadline)`.
 //! - [`server`]: `bind(&endpoint) -> Bound` (port 0 and Unix sockets too), `Services::new().with(service)`,
 //!   `bound.serve(services, shutdown_token)`: adds gRPC health and reflection, drains with a hard deadline.
-//! - [`gate::Gate`] sees every call with the [`gate::Identity`] of its caller; [`access::RoleGate`] is the one of every server unless it
-//!   brings its own: who may what is [`access`]. [`tls`] says what is shown and trusted; [`trace`] carries
+//! - [`gate::Gate`] sees every call with the [`gate::Identity`] of its caller. A server uses [`access::RoleGate`] unless it brings a gate
+//!   of its own; [`access`] says which role may call what. [`tls`] says which certificates are shown and trusted; [`trace`] carries
 //!   a W3C trace context from call to call; [`multiplex`] carries many calls over one stream.
 //! - [`shutdown`]: `on_signals(&token)`, `exit_with_parent(&token)`.
 //!
@@ -15,21 +16,21 @@
 //! - [`action::Action`]: the trait; [`action::GoalContext`]: inputs by type (`goal.input_joints("start")?`), `seed`, `lease`,
 //!   `cancelled`, `progress("…")`, `world(&patterns)`, `call("Camera", "capture", inputs)`.
 //! - [`action::ActionServer`]: fencing, idempotent goals, one at a time where asked, cancel, bounded results.
-//! - [`lease_watch::LeaseWatch`]: who holds this provider's resources, by the resource manager's word; goals end with their lease.
-//! - [`worker::Worker`]: all of it in one builder; [`worker::Worker::from_args`] for a process of its own. [`prelude`] has what it needs,
-//!   [`testing::perform`] performs a goal in a test.
-//! - [`action::Signature`]: what an action says of its ports, outcomes and annotations.
-//! - [`safety::Safety`]: emergency stop and hold, for drivers of what moves; [`safety::SafetyClient`] asks for them.
+//! - [`lease_watch::LeaseWatch`]: who holds this provider's resources, as the resource manager says; a goal ends with its lease.
+//! - [`worker::Worker`]: all of this in one builder; [`worker::Worker::from_args`] reads the arguments of a worker process.
+//!   [`prelude`] has the names that a worker needs, [`testing::perform`] performs a goal in a test.
+//! - [`action::Signature`]: the ports, outcomes and annotations of an action.
+//! - [`safety::Safety`]: emergency stop and hold, for drivers of hardware that moves; [`safety::SafetyClient`] asks for them.
 //!
 //! # Asking others
 //! - [`client::Channels`] keeps one channel per endpoint; [`client::ActionClient`], [`client::ResourceClient`],
-//!   [`client::WorldClient`], [`client::ProcessClient`] speak the cores' types; [`client::CallError`] tells a refusal from a
+//!   [`client::WorldClient`], [`client::ProcessClient`] speak the cores' types; [`client::CallError`] distinguishes a refusal from a
 //!   crash; [`client::wait_until_serving`] asks gRPC health.
-//! - [`session::Session`] keeps a session with the resource manager alive and tells when it was lost;
-//!   [`provider::Provider`] offers resources under it, again after the manager came back. What is believed of either ends by
-//!   [`boot_clock::BootClock`], also while the machine is suspended.
+//! - [`session::Session`] keeps a session with the resource manager alive and reports when it was lost;
+//!   [`provider::Provider`] offers resources in that session, and offers them again after the manager came back. Both measure how long
+//!   they may trust the manager with [`boot_clock::BootClock`], which goes on while the machine is suspended.
 //!
-//! What it deliberately does not do: decide anything. No retries of goals, no choice of resources.
+//! The SDK deliberately decides nothing: it does not retry goals and does not choose resources.
 
 pub mod access;
 pub mod action;

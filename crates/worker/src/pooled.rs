@@ -1,12 +1,12 @@
-//! What a worker is told by the process manager that offers it, in its environment: where leases are confirmed, which session offers the
-//! worker's resource, and the bound for its standstill.
+//! The environment variables that a process manager sets for its workers: where leases are confirmed, which session offers the worker's
+//! resource, and within which time the worker has to stand still.
 
 use crate::endpoint::EndpointError;
 use crate::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use std::time::Duration;
 
-/// The environment variable with the id of the session that offers the worker's resource. What another session offers under the
-/// resource's id is not this worker, and its leases are none.
+/// The environment variable with the id of the session that offers the worker's resource. A resource of the same id that another session
+/// offers is not this worker, and leases of it do not count.
 pub const PROVIDER_SESSION_VARIABLE: &str = "RATN_PROVIDER_SESSION";
 
 /// The environment variable with the `standstill_ms` that the worker's resource is offered with.
@@ -21,7 +21,7 @@ pub(crate) struct Pooled {
     pub(crate) standstill: Option<Duration>,
 }
 
-/// The environment of a pooled worker says nonsense.
+/// A variable of a pooled worker's environment cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum PooledError {
     /// What it says of the resource manager is no location.

@@ -1,4 +1,4 @@
-//! What a worker needs: `use ratn_worker::prelude::*`.
+//! The names that a worker needs: `use ratn_worker::prelude::*`.
 
 pub use crate::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome, Signature};
 pub use crate::arguments::{ArgumentError, Arguments};

@@ -109,7 +109,7 @@ enum Presence {
 }
 
 impl Provider {
-    /// A provider of nothing yet, at the resource manager of `session`.
+    /// A provider that offers nothing yet, at the resource manager of `session`.
     ///
     /// # Errors
     /// As [`Channels::get`].
@@ -117,8 +117,8 @@ impl Provider {
         Provider::start_with(channels, endpoint, session, None)
     }
 
-    /// As [`Provider::start`], of resources that `leases` watches: one that the manager has not got, or has not got any more, is offered
-    /// when the driver has said [`LeaseWatch::brought_to_rest`] and no goal runs at it. Its next holder finds it at rest.
+    /// As [`Provider::start`], for resources that `leases` watches. A resource that the manager does not have (any more) is offered once the
+    /// driver has called [`LeaseWatch::brought_to_rest`] and no goal runs at the resource. So its next holder finds it at rest.
     ///
     /// # Errors
     /// As [`Channels::get`].
@@ -155,16 +155,16 @@ impl Provider {
         Ok(Provider { shared, _end: end.drop_guard() })
     }
 
-    /// The client, in the session's name.
+    /// The resource manager's client, in the name of the session.
     pub fn client(&self) -> &ResourceClient {
         &self.shared.client
     }
 
-    /// Offers a resource (its id must not be empty), or updates one offered before. True once it is there; false when the
-    /// manager cannot be asked now, or another session still has one of this id: it will be offered as soon as it can.
+    /// Offers a resource (its id must not be empty), or updates one that was offered before. True once the manager has it. False when the
+    /// manager cannot be reached, or another session still has a resource of this id: it will be offered as soon as possible.
     ///
     /// # Errors
-    /// [`CallError::Refused`] when the manager does not want it; it is not offered again, unless the manager had it before.
+    /// [`CallError::Refused`] when the manager refuses the resource. It is then not offered again, unless the manager had it before.
     pub async fn offer(&self, resource: Resource) -> Result<bool, CallError> {
         self.set_desired(resource.id.clone(), Some(resource)).await
     }
@@ -201,17 +201,17 @@ impl Provider {
         }
     }
 
-    /// Withdraws a resource; who holds a lease of it loses it. True once it is gone; false when the manager cannot be asked
-    /// now: it will be withdrawn as soon as it can.
+    /// Withdraws a resource; whoever holds a lease of it loses it. True once it is gone. False when the manager cannot be reached: the
+    /// resource will be withdrawn as soon as possible.
     ///
     /// # Errors
-    /// [`CallError::Refused`] when the manager does not let it go; that is not asked again.
+    /// [`CallError::Refused`] when the manager refuses; it is not asked again.
     pub async fn withdraw(&self, id: &str) -> Result<bool, CallError> {
         self.set_desired(id.to_owned(), None).await
     }
 
-    /// Withdraws a resource unless somebody holds it. True once it is gone; false when it is held, or the manager cannot be asked
-    /// now: then it stays.
+    /// Withdraws a resource unless somebody holds it. True once it is gone. False, and the resource stays, when it is held or the manager
+    /// cannot be reached.
     pub async fn withdraw_unless_held(&self, id: &str) -> bool {
         let mut desired = self.shared.desired.lock().await;
         let Some(resource) = desired.states.get(id).and_then(|entry| entry.resource.clone()) else { return true };
@@ -245,13 +245,13 @@ impl Provider {
         asked.into_iter().next().map_or(Ok(true), |(_, done)| done)
     }
 
-    /// Why the manager has not got a resource that is offered: another session has one of its id. That session may end, so it is
-    /// offered again all the same.
+    /// Why the manager does not have a resource that is offered: another session has one of its id. That session may end, so the resource
+    /// is offered again.
     pub async fn refusal(&self, id: &str) -> Option<String> {
         self.shared.desired.lock().await.states.get(id).and_then(|entry| entry.taken.clone())
     }
 
-    /// What is offered, by id.
+    /// The resources that are offered, in the order of their ids.
     pub async fn offered(&self) -> Vec<Resource> {
         self.shared.desired.lock().await.states.values().filter_map(|entry| entry.resource.clone()).collect()
     }

@@ -14,12 +14,12 @@ pub struct RobotClock {
 }
 
 impl RobotClock {
-    /// Starts at zero now; `speed` is how many of the robot's seconds pass in one of ours, above 0.
+    /// A clock that is at zero now. `speed`, above 0, is how many of the robot's seconds pass in one second of wall time.
     pub fn start(speed: f64) -> RobotClock {
         RobotClock::going_on(Timestamp(0), speed)
     }
 
-    /// Goes on from `at`, which is now.
+    /// A clock that is at `at` now.
     pub fn going_on(at: Timestamp, speed: f64) -> RobotClock {
         RobotClock { start: Instant::now(), at, speed }
     }

@@ -19,10 +19,10 @@ pub struct RuntimeDirectory {
     path: PathBuf,
 }
 
-/// A role that cannot be found.
+/// Why the endpoint of a role is not found.
 #[derive(Debug, thiserror::Error)]
 pub enum FindError {
-    /// Nobody serves it.
+    /// No process serves the role.
     #[error("no {role} is running: {} is not there; start one with `ratn up` or `ratn {role}`", file.display())]
     NotPublished {
         /// The role.
@@ -30,7 +30,7 @@ pub enum FindError {
         /// The file that it would have.
         file: PathBuf,
     },
-    /// Nobody served it in time.
+    /// No process served the role within the deadline.
     #[error("no {role} was ready within {waited_s:.1} s: {} is not there", file.display())]
     NotInTime {
         /// The role.
@@ -74,7 +74,7 @@ impl RuntimeDirectory {
     /// The directory at `path`, made for this user only if it is not there.
     ///
     /// # Errors
-    /// Where it cannot be made, is no directory, or is one that others may write to: they could stand in for a role.
+    /// The directory cannot be made, is no directory, or can be written by other users, who could then pretend to be a role.
     pub fn create(path: impl Into<PathBuf>) -> io::Result<RuntimeDirectory> {
         let path = path.into();
         fs::DirBuilder::new().recursive(true).mode(0o700).create(&path)?;
@@ -86,7 +86,7 @@ impl RuntimeDirectory {
         Ok(RuntimeDirectory { path: path.canonicalize()? })
     }
 
-    /// The directory at `path`, whether it is there or not: for those who only look.
+    /// The directory at `path`, whether it exists or not: for a client that only looks for endpoints.
     pub fn at(path: impl Into<PathBuf>) -> RuntimeDirectory {
         RuntimeDirectory { path: path.into() }
     }
@@ -106,7 +106,7 @@ impl RuntimeDirectory {
         Endpoint::Unix(self.path.join(format!("{name}.sock")))
     }
 
-    /// Where `role` listens: at its socket in here, where `listen` is [`Endpoint::local`].
+    /// The address that `role` listens on: its socket in this directory, where `listen` is [`Endpoint::local`]; else `listen`.
     ///
     /// # Errors
     /// Where the directory is relative and the current one is gone.
@@ -125,7 +125,7 @@ impl RuntimeDirectory {
         publish_file(&self.endpoint_file(role), endpoint)
     }
 
-    /// Where `role` is.
+    /// The endpoint of `role`.
     ///
     /// # Errors
     /// [`FindError`] says what is missing.
@@ -138,7 +138,7 @@ impl RuntimeDirectory {
         }
     }
 
-    /// Where `role` is, as soon as it is there.
+    /// The endpoint of `role`, as soon as its file is there.
     ///
     /// # Errors
     /// [`FindError`] after `deadline`, or at once where the file is there and holds nonsense.

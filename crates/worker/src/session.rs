@@ -26,7 +26,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::Status;
 use tonic_types::StatusExt;
 
-/// How long a session lives without a ping unless said otherwise.
+/// How long a session lives without a ping, where the client does not choose a time.
 pub const DEFAULT_TTL: Duration = Duration::from_secs(3);
 
 /// A manager that is not heard for so many times to live, after the first, is not waited for any more.
@@ -52,14 +52,14 @@ pub struct Session {
     task: Option<JoinHandle<()>>,
 }
 
-/// How a session is.
+/// The state of a session.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct SessionState {
-    /// It was pinged within its time to live.
+    /// The manager has answered a ping within the time to live.
     pub alive: bool,
-    /// How often the manager made it; when it grows beyond 1, what the session owned and held is gone.
+    /// How often the manager has made the session. When it grows, everything that the session owned and held is gone.
     pub generation: u64,
-    /// When it was found to have run out here, if it was alive before and is not now.
+    /// When the session was found to have expired on this side; `None` while it is alive, or was never alive.
     pub unheard_since: Option<Instant>,
     /// The manager knew it from before when it was pinged for the first time: it goes on with what it has there.
     pub found: bool,
@@ -75,15 +75,15 @@ pub(crate) struct Belief {
     clock: BootClock,
 }
 
-/// No session within the deadline.
+/// The session was not alive within the deadline.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("the resource manager at {endpoint} opened no session within {waited_s:.1} s; {}", self.next())]
 pub struct SessionError {
-    /// Where it was asked for.
+    /// The resource manager's endpoint.
     pub endpoint: Endpoint,
-    /// The id, where it is another caller's.
+    /// The session's id, where it belongs to another caller.
     pub taken: Option<String>,
-    /// How long was waited, in seconds.
+    /// The deadline, in seconds.
     pub waited_s: f64,
 }
 
@@ -99,18 +99,19 @@ impl SessionError {
 }
 
 impl Session {
-    /// Begins to keep a session alive with the resource manager at `endpoint`. `client` says who this is, for people.
+    /// Opens a session with the resource manager at `endpoint` and keeps it alive. `client` is a name for people, `ttl` the time after which
+    /// the manager ends a session that it does not hear of. Returns at once; [`Session::alive`] waits.
     pub fn open(channels: &Channels, endpoint: &Endpoint, client: &str, ttl: Duration) -> Session {
         Session::open_as(channels, endpoint, fresh_id(client), client, ttl)
     }
 
-    /// As [`Session::open`], under an id of the caller's: that of a session whose client is gone goes on with it, if it still
-    /// lives. Nobody else may have it.
+    /// As [`Session::open`], with an id of the caller's choice. With the id of a session whose client is gone, that session goes on if it
+    /// still lives. No other caller may use the id.
     pub fn open_as(channels: &Channels, endpoint: &Endpoint, id: String, client: &str, ttl: Duration) -> Session {
         Session::open_by(BootClock::default(), channels, endpoint, id, client, ttl)
     }
 
-    /// As [`Session::open_as`], by another clock.
+    /// As [`Session::open_as`], measured by this clock.
     pub fn open_by(
         clock: BootClock,
         channels: &Channels,
@@ -139,25 +140,25 @@ impl Session {
         Session { id, endpoint: endpoint.clone(), ttl, state, belief, end, task }
     }
 
-    /// Its id.
+    /// The session's id.
     pub fn id(&self) -> &str {
         &self.id
     }
 
-    /// How it is, and every change of it.
+    /// The state of the session, and every change of it.
     pub fn state(&self) -> watch::Receiver<SessionState> {
         self.state.clone()
     }
 
-    /// Until when it is believed in.
+    /// The time until which this client trusts its session.
     pub(crate) fn belief(&self) -> Belief {
         self.belief.clone()
     }
 
-    /// Returns once it is alive.
+    /// Returns once the session is alive.
     ///
     /// # Errors
-    /// [`SessionError`] when it is not within `deadline`.
+    /// [`SessionError`] when it is not alive within `deadline`.
     pub async fn alive(&self, deadline: Duration) -> Result<(), SessionError> {
         let mut state = self.state.clone();
         let alive = timeout(deadline, state.wait_for(|state| state.alive)).await;
@@ -168,9 +169,9 @@ impl Session {
         Err(SessionError { endpoint: self.endpoint.clone(), taken, waited_s: deadline.as_secs_f64() })
     }
 
-    /// Returns once what the session owned or held may be another's: it was not answered for its time to live, or the manager made
-    /// it anew since the call. A session that was never alive is waited for first. For those who have to stop then; the
-    /// manager may still know it ([`Session::gone`]).
+    /// Returns once everything that the session owned or held may belong to somebody else: the manager has not answered for the time to
+    /// live, or has made the session anew since the call. A session that was never alive is waited for first. For a client that has to stop
+    /// then; the manager may still know the session ([`Session::gone`]).
     pub async fn lost(&self) {
         let mut state = self.state.clone();
         if state.borrow().unheard_since.is_some() {
@@ -180,8 +181,8 @@ impl Session {
         let _ = state.wait_for(|s| !s.alive || s.generation != generation).await;
     }
 
-    /// Returns once what the session owned or held is gone for good: the manager made it anew, or was not heard for [`GIVEN_UP_AFTER`]
-    /// times to live after the session had run out here. Counts from the session's beginning.
+    /// Returns once everything that the session owned or held is gone for good: the manager has made the session anew, or has not answered
+    /// for [`GIVEN_UP_AFTER`] further times to live after the session had expired here. Counts from the session's beginning.
     pub async fn gone(&self) {
         let mut state = self.state.clone();
         loop {
@@ -204,9 +205,9 @@ impl Session {
         }
     }
 
-    /// Returns once the manager says that the session's id is another caller's, who has a session of it or had the last one. What the
-    /// session owned or held is gone, or ends there with its time to live, and asking again does not help. For clients that can go on with a
-    /// session of another id. For one that provides something nothing is at rest because of that: start its provider anew
+    /// Returns once the manager says that the session's id belongs to another caller. Everything that the session owned or held is gone, or
+    /// ends with its time to live, and asking again does not help. For a client that can go on with a session of another id. A client that
+    /// provides something must not take it for standing still: start its provider anew
     /// ([`crate::provider::Provider::start_at_rest`]).
     pub async fn taken(&self) {
         if self.state.clone().wait_for(|state| state.taken).await.is_err() {
@@ -215,8 +216,8 @@ impl Session {
         }
     }
 
-    /// As [`Session::lost`], but returns this long before the session may be over at the manager: in time to end what only the holder of
-    /// its leases may do.
+    /// As [`Session::lost`], but returns `margin` before the manager may end the session: in time to end what only the holder of its leases
+    /// may do.
     pub async fn nearly_lost(&self, margin: Duration) {
         let nearly = async {
             let mut state = self.state.clone();
@@ -230,7 +231,7 @@ impl Session {
         }
     }
 
-    /// Does not ping it any more, without a word to the manager: what it owns and holds stays its own there until its time to live is over.
+    /// Stops pinging, without telling the manager: the session keeps what it owns and holds until its time to live is over.
     pub async fn abandon(mut self) {
         if let Some(task) = self.task.take() {
             task.abort();
@@ -238,7 +239,7 @@ impl Session {
         }
     }
 
-    /// Ends it with the manager, so that what it holds is free at once.
+    /// Ends the session at the manager: everything that it holds is free at once.
     pub async fn close(mut self) {
         self.end.cancel();
         if let Some(task) = self.task.take() {

@@ -1,4 +1,4 @@
-//! For the tests of a worker: an action performs one goal over a real socket, without a system around it.
+//! For tests of a worker: an action performs one goal over a real socket, without a system.
 
 use crate::action::{Action, ActionServer, Goal, GoalOutcome};
 use crate::client::{ActionClient, Channels, chain};
@@ -9,17 +9,17 @@ use ratn_model::value::Value;
 use std::collections::BTreeMap;
 use tokio_util::sync::CancellationToken;
 
-/// What comes of a goal with these inputs: `perform(Nearest, [("from", Value::Pose(pose))])`. There is no world pool, and no lease.
-/// Not to be called where a runtime runs already: [`performed`] is.
+/// Performs one goal with these inputs, `perform(Nearest, [("from", Value::Pose(pose))])`, and returns its outcome with its outputs. The goal
+/// has no lease and no world pool. It starts a tokio runtime of its own: in an `async` test call [`performed`] instead.
 ///
 /// # Errors
-/// In words: the goal was refused, or the action crashed.
+/// A sentence: why the goal was refused, or how the action crashed.
 pub fn perform<const N: usize>(action: impl Action, inputs: [(&str, Value); N]) -> Result<GoalOutcome, String> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     runtime.map_err(|error| error.to_string())?.block_on(performed(action, inputs))
 }
 
-/// As [`perform`], where a runtime runs.
+/// As [`perform`], on the tokio runtime of the caller.
 ///
 /// # Errors
 /// As [`perform`].

@@ -1,9 +1,10 @@
-//! A worker process in one builder: what `ratn worker path-planner` and the like are.
+//! A worker process in one builder. `ratn worker path-planner` and `ratn worker detector` are made with it.
 //!
-//! A pooled worker only serves: its process manager makes its resource once gRPC health says SERVING, and knows where it
-//! is by the socket that it named (`listen unix:…`) or by the endpoint file that the worker writes. A worker that stands
-//! alone is given the resource manager and offers its resource itself. Either performs goals only under leases of that very resource, which the
-//! resource manager confirms; a pooled one is told in its environment where that is, and which session offers it ([`crate::pooled`]).
+//! A **pooled** worker is started by a process manager and only serves. The process manager offers the worker's resource once gRPC health
+//! says SERVING. It finds the worker by the socket that it named (`listen unix:…`) or by the endpoint file that the worker writes. A
+//! worker that **stands alone** is told where the resource manager is, and offers its resource itself. Both perform a goal only under a
+//! lease of their own resource, which the resource manager confirms. A pooled worker learns from its environment where the resource
+//! manager is and which session offers the worker's resource ([`crate::pooled`]).
 
 use crate::access::{AccessError, LiveAccess, RoleGate};
 use crate::action::{Action, ActionServer, ActionServerBuilder};
@@ -42,30 +43,32 @@ const OFFER_AGAIN: Duration = Duration::from_secs(1);
 /// A part of the process, for its log.
 const LEASES: &str = "the watch of leases";
 
-/// What a worker is told by whoever starts it.
+/// How a worker is started: the options that [`Worker::from_args`] reads from the command line.
 #[derive(Debug, Clone)]
 pub struct WorkerOptions {
-    /// Its resource's id: goals need a lease of it, which the resource manager confirms. Only a worker [`Worker::without_leases`] has none.
+    /// The id of the worker's resource. A goal needs a lease of this resource, which the resource manager confirms. It may be empty only for a
+    /// worker [`Worker::without_leases`].
     pub id: String,
-    /// Its resource's kind, `PathPlanner`.
+    /// The kind of the worker's resource, for example `PathPlanner`.
     pub kind: String,
-    /// Where it listens.
+    /// The address that the worker listens on; port 0 lets the system choose one.
     pub listen: Endpoint,
-    /// Where it writes its endpoint once it serves.
+    /// The file into which the worker writes its endpoint once it serves.
     pub endpoint_file: Option<PathBuf>,
-    /// Ends when its standard input does.
+    /// The worker ends when its standard input is closed.
     pub exit_with_parent: bool,
-    /// Offers its resource there by itself. Not for pooled workers, which `RATN_RESOURCE_MANAGER` tells where to have leases confirmed.
+    /// The resource manager at which the worker offers its resource itself. `None` for a pooled worker: `RATN_RESOURCE_MANAGER` tells that one
+    /// where leases are confirmed.
     pub resource_manager: Option<Endpoint>,
-    /// The host that it says it is on, when it offers its resource.
+    /// The name of the host that the resource is offered with.
     pub host: String,
-    /// What it may listen on.
+    /// Which addresses the worker may listen on, and with which certificate.
     pub exposure: Exposure,
-    /// The system's config, of whose `[service.access]` callers have their roles; that which the environment names unless given
-    /// ([`crate::access::ACCESS_VARIABLE`]). Without any who runs the worker, and root, are operators, and others as by default.
+    /// The system's config, whose `[service.access]` gives callers their roles. Without it, the config that the environment names counts
+    /// ([`crate::access::ACCESS_VARIABLE`]). Without either, root and the user who runs the worker are operators, and all others have the
+    /// default roles.
     pub access: Option<PathBuf>,
-    /// What it trusts and shows as a client, of the resource manager and of others; what the environment names unless given
-    /// ([`ClientTls::from_environment`]).
+    /// The authorities that the worker trusts as a client, and the certificate that it shows; [`ClientTls::from_environment`] unless given.
     pub tls: Option<ClientTls>,
 }
 
@@ -86,19 +89,19 @@ impl Default for WorkerOptions {
     }
 }
 
-/// A worker that failed to start or to go on.
+/// Why a worker did not start, or ended.
 #[derive(Debug, thiserror::Error)]
 pub enum WorkerError {
-    /// It cannot listen.
+    /// The worker cannot listen on its address.
     #[error("the worker cannot start")]
     Bind(#[from] BindError),
-    /// Nobody knows who may call it.
+    /// The roles of callers cannot be read.
     #[error("the worker cannot start")]
     Access(#[from] AccessError),
-    /// Its files of TLS as a client cannot be read.
+    /// The TLS files that it uses as a client cannot be read.
     #[error("the worker cannot start")]
     Tls(#[from] TlsError),
-    /// It cannot serve.
+    /// Serving failed.
     #[error("the worker cannot serve")]
     Serve(#[from] ServeError),
     /// Nobody says where the resource manager is.
@@ -110,18 +113,19 @@ pub enum WorkerError {
         /// The worker's resource.
         id: String,
     },
-    /// It has no resource of which a lease could be asked, and nothing says that it needs none.
+    /// The worker has no id, hence no resource that could be leased, and is not [`Worker::without_leases`].
     #[error(
         "the worker has no id, so its goals would need no lease: give it the id of its resource (WorkerOptions::id), or build it \
          `without_leases()`, so that every caller with the role `task` has it perform goals"
     )]
     NoId,
-    /// Whatever moves is moved under a lease.
+    /// A worker that moves something cannot be [`Worker::without_leases`].
     #[error(
         "the worker moves something (it has a Safety), and asks for no lease: give it the id of its resource (WorkerOptions::id)"
     )]
     MovesWithoutLease,
-    /// Nobody says which session offers the worker's resource: anybody could offer a lookalike of the same id, and lease it.
+    /// It is not known which session offers the worker's resource. Without that, anybody could offer another resource of the same id, and
+    /// lease that.
     #[error(
         "goals of worker `{id}` need a lease, and nobody says which session offers its resource: set {PROVIDER_SESSION_VARIABLE} to that \
          session's id, as a process manager does for its workers, or have the worker offer its resource itself \
@@ -131,7 +135,7 @@ pub enum WorkerError {
         /// The worker's resource.
         id: String,
     },
-    /// It moves something, and its resource may be granted anew before that stands still.
+    /// The worker moves something, and its pool's `standstill_ms` is too short: the resource could be granted again before it stands still.
     #[error(
         "worker `{id}` moves something (it has a Safety), stands still within {needed_ms} ms when a lease has ended, and is pooled without \
          that bound: say `standstill_ms = {needed_ms}`, or more, in its template"
@@ -142,27 +146,38 @@ pub enum WorkerError {
         /// The least bound.
         needed_ms: u128,
     },
-    /// What the process manager has told it is nonsense.
+    /// The variables that its process manager sets cannot be read.
     #[error("the environment of the worker is not that of a pooled one")]
     Pooled(#[from] PooledError),
-    /// What it says of itself is beyond the bounds of that.
+    /// The descriptions of its actions exceed the bounds of a description.
     #[error("the worker's description")]
     Description(#[from] DescriptionError),
-    /// The resource manager does not want it.
+    /// The resource manager refuses its resource.
     #[error("the worker's resource is refused")]
     Resource(#[from] CallError),
-    /// Something of the operating system failed.
+    /// A call of the operating system failed.
     #[error("the worker cannot {what}")]
     System {
-        /// What it wanted to do.
+        /// What the worker was about to do.
         what: String,
-        /// Why it cannot.
+        /// Why that failed.
         #[source]
         source: io::Error,
     },
 }
 
-/// A worker that does not run yet.
+/// A worker that is being put together and does not run yet.
+///
+/// ```no_run
+/// # use ratn_worker::prelude::*;
+/// # fn main() -> std::process::ExitCode {
+/// let worker = match Worker::from_args() {
+///     Ok(worker) => worker.provides("inspector", "Inspector"),
+///     Err(error) => { eprintln!("{error}"); return std::process::ExitCode::from(2) }
+/// };
+/// worker.start()
+/// # }
+/// ```
 #[derive(Debug)]
 pub struct Worker {
     options: WorkerOptions,
@@ -184,7 +199,7 @@ enum Leases {
 }
 
 impl Worker {
-    /// A worker without actions that takes one goal at a time.
+    /// A worker without actions. It performs one goal at a time.
     pub fn new(options: WorkerOptions) -> Worker {
         let actions = ActionServer::builder(options.id.clone()).one_at_a_time();
         let shutdown = CancellationToken::new();
@@ -192,17 +207,17 @@ impl Worker {
         Worker { options, actions, safety: None, standstill: None, resources, leases, shutdown }
     }
 
-    /// One that is told all it has to know by the arguments of this process, as the process manager's template passes them
+    /// A worker with the options that the arguments of this process give, as a template of the process manager passes them
     /// ([`crate::arguments`]).
     ///
     /// # Errors
-    /// [`ArgumentError`] names the argument.
+    /// [`ArgumentError`], which names the argument.
     pub fn from_args() -> Result<Worker, ArgumentError> {
         Arguments::of_process()?.worker()
     }
 
-    /// What tasks call it, `inspector` of `inspector/nearest`, and the kind of resource that it is. It says so, with what its actions say of
-    /// their ports, when it is asked.
+    /// Sets the provider's name, `inspector` in the action `inspector/nearest` of a task, and the kind of the worker's resource. The worker
+    /// describes itself with both, and with the signatures of its actions, when it is asked (`Describe`).
     #[must_use]
     pub fn provides(mut self, provider: &str, kind: &str) -> Worker {
         self.actions = self.actions.provides(provider, kind);
@@ -212,7 +227,7 @@ impl Worker {
         self
     }
 
-    /// With an action. One that names a resource of its own needs leases of that.
+    /// Adds an action. Where the action names a resource of its own ([`Action::resource`]), its goals need a lease of that.
     #[must_use]
     pub fn action(mut self, action: impl Action) -> Worker {
         self.resources.extend(action.resource().map(str::to_owned));
@@ -220,46 +235,51 @@ impl Worker {
         self
     }
 
-    /// With emergency stop and hold: a driver of something that moves.
+    /// Adds emergency stop and hold: for a driver of hardware that moves.
     #[must_use]
     pub fn safety(mut self, safety: Safety) -> Worker {
         self.safety = Some(safety);
         self
     }
 
-    /// The bound within which what it moves stands still when a lease has ended: the next lease of its resource is granted when the
-    /// actions of that one's goals have returned, and at the latest after this. A worker with a
-    /// [`Safety`] has [`standstill_bound`] unless given, one without has none: its resource is granted anew at once. A worker without
-    /// [`crate::safety::Brakes`] that offers its resource itself waits this long before: a process before it may have begun a motion.
-    /// A pooled worker with a [`Safety`] starts only where its template's `standstill_ms` is at least this; its next lease is granted after that.
+    /// Sets the time within which everything stands still after a lease has ended. The next lease of the resource is granted when the actions
+    /// of the ended lease's goals have returned, and after this time at the latest.
+    ///
+    /// Without this call, a worker with a [`Safety`] has [`standstill_bound`], and one without has none: its resource is granted again at
+    /// once. A worker without [`crate::safety::Brakes`] that offers its resource itself waits this long before the first offer, because an
+    /// earlier process may have begun a motion. A pooled worker with a [`Safety`] starts only where the `standstill_ms` of its template is at
+    /// least this long.
     #[must_use]
     pub fn standstill(mut self, bound: Duration) -> Worker {
         self.standstill = Some(bound);
         self
     }
 
-    /// **For tests only.** Believes whatever a goal says of its lease: whoever reaches the worker has it do what it does.
+    /// **For tests only.** Goals are performed without asking the resource manager for their lease: everybody who can reach the worker can
+    /// give it goals.
     #[must_use]
     pub fn dangerously_believe_every_lease(mut self) -> Worker {
         self.leases = Leases::Believed;
         self
     }
 
-    /// It may have no id, and then asks for no lease: whoever may call it has it perform goals. For what only computes, and is no resource.
+    /// Allows the worker to have no id. It then asks for no lease: everybody who may call it can give it goals. For a service that only
+    /// computes and is no resource.
     #[must_use]
     pub fn without_leases(mut self) -> Worker {
         self.leases = Leases::NotAsked;
         self
     }
 
-    /// Ends when `shutdown` is cancelled, too.
+    /// Ends the worker also when `shutdown` is cancelled.
     #[must_use]
     pub fn shutdown(mut self, shutdown: CancellationToken) -> Worker {
         self.shutdown = shutdown;
         self
     }
 
-    /// [`Worker::run`] on a runtime of its own: all that `main` has to do. What went wrong is written to standard error.
+    /// Runs the worker ([`Worker::run`]) on a tokio runtime of its own, and returns the exit code for `main`. Errors are written to standard
+    /// error.
     pub fn start(self) -> ExitCode {
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build();
         let ended = runtime.map_err(|source| WorkerError::System { what: "start its runtime".to_owned(), source });
@@ -273,11 +293,11 @@ impl Worker {
         }
     }
 
-    /// Serves until a signal, the parent's end or the shutdown token says otherwise. Goals under way are told to stop. A panic of the SDK itself
-    /// ends the process ([`crate::panic`]); a panic of an action aborts its goal.
+    /// Serves until SIGTERM or SIGINT, the end of the parent process, or the shutdown token. Goals under way are told to stop then. A panic of
+    /// an action aborts its goal; a panic of the SDK itself ends the process ([`crate::panic`]).
     ///
     /// # Errors
-    /// [`WorkerError`].
+    /// [`WorkerError`]: the worker did not start, or serving failed.
     pub async fn run(self) -> Result<(), WorkerError> {
         let Worker { options, mut actions, safety, standstill, mut resources, leases: asked, shutdown } = self;
         actions.description().check()?;

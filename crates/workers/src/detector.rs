@@ -1,9 +1,9 @@
 //! The detector worker: finds objects on a surface in depth images.
 //!
-//! It asks the camera of its goal's own lease for a picture and works on nothing else: the picture, the poses of camera and
-//! robot in it, and the region or the object that the goal names. What it finds is named `box_1`, `fork_1`, `box_2`, …, the
-//! nearest first, or from another number on where the goal says so, and comes with its class, how sure that is, and the covariance of
-//! its pose.
+//! It asks the camera that its goal's lease holds for a picture. It works on nothing but that picture, the poses of camera and robot that
+//! come with it, and the region or the object that the goal names. Objects are named `box_1`, `fork_1`, `box_2`, …, the nearest first (from
+//! another number on where the goal says `first`). Each has its class, the confidence of that, its pose in the world frame (metres) and the
+//! covariance of the pose.
 
 mod body;
 mod facts;
@@ -33,25 +33,26 @@ const SURFACE_SIGMA_RAD: f64 = 0.002;
 /// Postures of the robot in one picture at the most.
 const MAX_POSTURES: usize = 64;
 
-/// Serves until told to stop. With `pictures`, what it sees and finds is kept there as PNG files.
+/// Serves until a signal or the end of the parent process. With `pictures`, a folder, every picture and what was found in it is kept there
+/// as PNG files.
 ///
 /// # Errors
-/// Where it cannot serve.
+/// The worker cannot start, or serving failed ([`ratn_worker::worker::WorkerError`]).
 pub async fn run(options: WorkerOptions, robot: Robot, pictures: Option<PathBuf>) -> anyhow::Result<()> {
     Ok(worker(options, robot, pictures).run().await?)
 }
 
-/// The worker, not running yet.
+/// The worker, which does not run yet.
 pub fn worker(options: WorkerOptions, robot: Robot, pictures: Option<PathBuf>) -> Worker {
     let eyes = Eyes { robot: Arc::new(robot), pictures: Pictures::into(pictures) };
     Worker::new(options).action(Segment(eyes.clone())).action(Locate(eyes))
 }
 
-/// `detector/segment`
+/// The action `detector/segment`: finds all objects on a surface in a region.
 #[derive(Debug)]
 pub struct Segment(Eyes);
 
-/// `detector/locate`
+/// The action `detector/locate`: looks for one known object again.
 #[derive(Debug)]
 pub struct Locate(Eyes);
 
@@ -149,8 +150,8 @@ impl Action for Locate {
 }
 
 impl Eyes {
-    /// What is found in a picture of the leased camera, on a thread of its own; milliseconds, so a goal that shall stop only leaves the
-    /// answer behind.
+    /// Finds objects in a picture of the leased camera, on a thread of its own. That takes milliseconds: a goal that has to stop meanwhile just
+    /// drops the answer.
     async fn find(
         &self,
         goal: &GoalContext,
@@ -196,14 +197,14 @@ impl Eyes {
 }
 
 impl Seen {
-    /// What was found relative to the camera's pose as given, with what is known of that pose and of the surface.
+    /// The objects relative to the camera's given pose, corrected by what is known of that pose and of the surface.
     fn in_the_world(&self, object: Detection, surface: Option<&Surface>) -> Detection {
         let object = object.with_calibration(&self.camera, &self.calibration);
         surface.map_or(object, |surface| object.standing_on(surface, &self.camera, &self.calibration))
     }
 }
 
-/// The variances of the camera's pose, along and about the axes of its optical frame; none of a camera that does not say.
+/// The variances of the camera's pose along (m²) and about (rad²) the axes of its optical frame; `None` where the camera does not say them.
 fn calibration(port: Option<Port>) -> Result<Calibration, ActionFailure> {
     let Some(port) = port else { return Ok([0.0; 6]) };
     let variances = port.list()?.iter().map(|entry| entry.float()).collect::<Result<Vec<_>, _>>()?;
@@ -213,7 +214,7 @@ fn calibration(port: Option<Port>) -> Result<Calibration, ActionFailure> {
     }
 }
 
-/// How high what is looked at stands, where the goal knows.
+/// The height of the surface in metres, where the goal gives it.
 fn surface(goal: &GoalContext) -> Result<Option<Surface>, ActionFailure> {
     let Some(height_m) = goal.optional_float("surface_m")? else { return Ok(None) };
     Ok(Some(Surface { height_m, sigma_m: SURFACE_SIGMA_M, sigma_rad: SURFACE_SIGMA_RAD }))
@@ -227,7 +228,7 @@ fn posture(robot: &Robot, port: &Port) -> Result<Configuration, ActionFailure> {
     })
 }
 
-/// What the goal looks for: all that there is, unless it says so.
+/// The classes that the goal looks for: all of them, unless it names some.
 fn classes(goal: &GoalContext) -> Result<Vec<ObjectClass>, ActionFailure> {
     let Some(port) = goal.port("classes").optional() else { return Ok(ObjectClass::ALL.to_vec()) };
     let named = |port: &Port| {

@@ -1,9 +1,8 @@
 //! The path planner worker: `plan` for the arm, and `drive` for the base.
 //!
-//! It has the scene of the goal's projection sent, as what it differs by from one that it knows, plans on a thread of its own and answers with a timed
-//! trajectory. All durations in its goals and answers are in the robot's seconds; `clock` knows how many of them pass in
-//! one of ours. Where `budget_s` is given, planning takes exactly that long and gets a quicker motion for it; else the first path is
-//! improved for 50 ms of our time.
+//! For each goal it fetches the scene of the goal's projection (as the difference to a scene that it has), plans on a thread of its own, and
+//! answers with a timed trajectory. All durations in goals and answers are in the robot's seconds; `clock` converts them to wall time. With
+//! `budget_s`, planning takes exactly that long and finds a quicker motion. Without it, the first path is improved for 50 ms of wall time.
 
 mod arms;
 mod bounds;
@@ -22,7 +21,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// `path_planner/plan`.
+/// The action `path_planner/plan`: plans a motion of an arm.
 #[derive(Debug)]
 pub struct PlanAction {
     robot: Arc<Robot>,
@@ -30,23 +29,23 @@ pub struct PlanAction {
     scenes: Arc<SceneCache>,
 }
 
-/// The worker for a robot; `speed` is how many of the robot's seconds pass in one of ours.
+/// The worker for a robot, which does not run yet. `speed` is how many of the robot's seconds pass in one second of wall time.
 pub fn worker(options: WorkerOptions, robot: Robot, speed: f64) -> Worker {
     let plan = PlanAction::new(robot, speed);
     let drive = DriveAction::new(&plan.robot, speed, &plan.scenes);
     Worker::new(options).action(plan).action(drive)
 }
 
-/// Runs the [`worker`] until it is told to stop.
+/// Runs the [`worker`] until a signal or the end of the parent process.
 ///
 /// # Errors
-/// Where it cannot serve.
+/// The worker cannot start, or serving failed ([`ratn_worker::worker::WorkerError`]).
 pub async fn run(options: WorkerOptions, robot: Robot, speed: f64) -> anyhow::Result<()> {
     Ok(worker(options, robot, speed).run().await?)
 }
 
 impl PlanAction {
-    /// For a robot.
+    /// The action for a robot; `speed` as for [`worker`].
     pub fn new(robot: Robot, speed: f64) -> PlanAction {
         PlanAction { robot: Arc::new(robot), speed, scenes: Arc::default() }
     }

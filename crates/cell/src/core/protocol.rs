@@ -1,4 +1,4 @@
-//! What goes into the cell's core and comes out of it.
+//! Events that go into the cell's core, and commands that come out of it.
 
 pub use super::activity::{Module, Ticket};
 use super::contacts::Contact;
@@ -20,7 +20,7 @@ use serde::{Deserialize, Serialize};
 pub enum Event {
     /// A goal for a module.
     Start {
-        /// How the goal will be called.
+        /// The goal's id, by which commands name it.
         ticket: Ticket,
         /// What to do.
         request: Request,
@@ -32,7 +32,7 @@ pub enum Event {
         /// Why.
         reason: String,
     },
-    /// An emergency stop or a hold is in force from now on, or neither.
+    /// An emergency stop or a hold is in force from now on, or neither is any more.
     Safety {
         /// Which.
         state: SafetyState,
@@ -41,15 +41,15 @@ pub enum Event {
     Reset {
         /// From which seed.
         seed: u64,
-        /// With how much on it.
+        /// The objects on it.
         goods: Goods,
     },
-    /// Something shall go wrong.
+    /// A fault is injected.
     Fault {
         /// What and when.
         fault: Fault,
     },
-    /// The state is wanted.
+    /// Asks for the whole state (a snapshot).
     Save,
     /// Back to a state; goals under way end aborted.
     PutBack {
@@ -64,28 +64,28 @@ pub enum Event {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Request {
-    /// The base along a trajectory.
+    /// Moves the base along a trajectory.
     Drive {
-        /// In x, y and heading, from where the base is.
+        /// Points in x, y (metres) and heading (radians), beginning where the base is.
         trajectory: Trajectory,
     },
-    /// The arm along a trajectory.
+    /// Moves the arm along a trajectory.
     Follow {
-        /// From where the arm is.
+        /// Beginning where the arm is; positions in radians.
         trajectory: Trajectory,
     },
-    /// The arm straight to a posture.
+    /// Moves the arm to a posture, in a straight line of joint positions.
     MoveTo {
         /// Where to.
         joints: JointVector,
-        /// How much of its greatest speed, above 0 and at most 1.
+        /// The fraction of its greatest speed, above 0 and at most 1.
         speed: f64,
     },
     /// Closes the fingers around something.
     Grasp {
         /// How the giver calls it.
         object: String,
-        /// Where it should be in the tool frame then.
+        /// The pose in the tool frame that the object is expected to have then.
         expected: Option<Pose>,
     },
     /// Opens the fingers.
@@ -95,20 +95,20 @@ pub enum Request {
         /// Towards this point of the world.
         target: [f64; 3],
     },
-    /// Says where the base stands.
+    /// Asks where the base stands.
     SenseBase,
-    /// Says where the arm's joints are.
+    /// Asks where the arm's joints are.
     SenseArm,
-    /// Says how far the fingers are open, and whether they hold something.
+    /// Asks how far the fingers are open, and whether they hold something.
     SenseGripper,
     /// Takes a picture.
     Capture {
-        /// The average of so many frames.
+        /// How many frames are averaged.
         frames: u32,
     },
 }
 
-/// What the cell has to say.
+/// A command of the core to the process around it.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Command {
     /// A goal has ended.
@@ -130,7 +130,7 @@ pub enum Command {
         /// Which, and how.
         contact: Contact,
     },
-    /// Fingers hold nothing of what they closed around: why, as nobody but the cell knows. For its log.
+    /// The fingers closed and hold nothing: the reason, which only the cell knows. For the cell's log, not for the task.
     Missed {
         /// Why.
         reason: String,

@@ -69,9 +69,8 @@ pub(crate) fn run(arguments: &CheckArguments, tls: &ClientTls) -> Result<(), Fai
     findings.iter().for_each(output::progress);
     workers.iter().for_each(|what| output::progress(format_args!("warning: {what}")));
     // State 0 is the task itself.
-    let states = program.states.len().saturating_sub(1);
-    let plural = if states == 1 { "state" } else { "states" };
-    output::progress(format_args!("{file}: task `{}` is good: {states} {plural}", program.name));
+    let states = output::counted(program.states.len().saturating_sub(1), "state");
+    output::progress(format_args!("{file}: task `{}` is good: {states}", program.name));
     match simulated {
         None => Ok(()),
         Some(Ok(sequential)) => output::result(report(&sequential)).map_err(Failure::from),

@@ -24,6 +24,8 @@ pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
         let word = Word::from(arguments.word);
+        // Before and after: a run that is told to end may be gone when it is asked.
+        let before = control::status(&directory).await.ok().flatten();
         let told = control::tell(&directory, word).await;
         let place = directory.display();
         match told {
@@ -32,8 +34,7 @@ pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
             }
             told => {
                 told.with_context(|| format!("the run in {place} does not take that"))?;
-                // One that has ended meanwhile says nothing any more.
-                let run = control::status(&directory).await.ok().flatten();
+                let run = control::status(&directory).await.ok().flatten().or(before);
                 Ok(output::result(said(word, run.as_ref()))?)
             }
         }

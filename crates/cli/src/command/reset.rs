@@ -6,7 +6,7 @@
 use super::blocking_on;
 use crate::arguments::ResetArguments;
 use crate::failure::Failure;
-use crate::output;
+use crate::output::{self, counted};
 use crate::system::public_directory;
 use anyhow::Context;
 use ratn_daemon::{resource_manager, world_pool};
@@ -82,11 +82,12 @@ async fn reset(
     let many = |kind: &str| objects.iter().filter(|one| one.kind == kind).count();
     let laid = match many("box") {
         0 => {
-            let rack =
-                format!("a new rack with {} bowls, {} forks and {} cups", many("bowl"), many("fork"), many("cup"));
-            format!("{rack}, {} plates on the table", many("plate"))
+            let laid = |kind: &str| counted(many(kind), kind);
+            let rack = format!("a new rack with {}, {} and {}", laid("bowl"), laid("fork"), laid("cup"));
+            format!("{rack}, {} on the table", laid("plate"))
         }
+        1 => "a new table with 1 box".to_owned(),
         boxes => format!("a new table with {boxes} boxes"),
     };
-    Ok(format!("{laid}, from seed {seed}; {} facts are forgotten", facts.len()))
+    Ok(format!("{laid}, from seed {seed}; {} forgotten", counted(facts.len(), "fact")))
 }

@@ -6,7 +6,7 @@ use crate::arguments::{CellArguments, KeptRoleArguments, RoleArguments, WorkerAr
 use crate::failure::Failure;
 use crate::output;
 use crate::system::config::SystemConfig;
-use crate::system::{public_directory, variable};
+use crate::system::{public_directory, sockets_fit, variable};
 use anyhow::Context;
 use ratn_cell::core::recording::{self, Replayed};
 use ratn_daemon::access::LiveAccess;
@@ -238,6 +238,10 @@ fn daemon_on(
             shutdown::exit_with_parent(&shutdown).context("cannot watch standard input")?;
         }
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
+        let own = system.listens().into_iter().find(|(other, _)| *other == role).map(|(_, listen)| listen);
+        if let Some(listen) = arguments.listen.as_ref().or(own) {
+            sockets_fit(&[(role, listen)], &directory)?;
+        }
         let directory = RuntimeDirectory::create(&directory)
             .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
         let metrics = Arc::new(Metrics::new(role));

@@ -79,11 +79,17 @@ async fn begin(
         .bind_parameters(&arguments.set)
         .map_err(|error| Failure::Refused(format!("{}: error[invalid-parameter]: {error}", task.display())))?;
     if found.is_some() && robot.is_some() {
-        let message = format!("ratn: a system runs in {}: its robot is its own", directory.display());
+        let message = format!(
+            "ratn: a system runs in {}: its robot was chosen when it was started; leave --robot out",
+            directory.display()
+        );
         return Err(Failure::Refused(message));
     }
     if found.is_some() && arguments.speed.is_some() {
-        let message = format!("ratn: a system runs in {}: its speed is its own", directory.display());
+        let message = format!(
+            "ratn: a system runs in {}: its speed was chosen when it was started; leave --speed out",
+            directory.display()
+        );
         return Err(Failure::Refused(message));
     }
     if let Some(log) = &arguments.log {

@@ -16,6 +16,7 @@ use ratn_model::program::WORLD_MODEL;
 use ratn_model::resource::Quantity;
 use ratn_proto::types::{Resource, WaitingAcquire};
 use ratn_report::statistics::mode_name;
+use ratn_task_control::RUN_KIND;
 use ratn_task_control::control::{self, RunStatus};
 use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -75,9 +76,12 @@ pub(crate) fn run(arguments: &StatusArguments, tls: &ClientTls) -> Result<(), Fa
                     (true, false) => serde_json::to_string_pretty(&status)?,
                     (false, _) => status.text(&directory, colours),
                 };
-                // A terminal shows one state after the other in the same place.
-                let again = arguments.watch && !arguments.json && std::io::stdout().is_terminal();
-                let text = if again { format!("\x1b[H\x1b[J{text}") } else { text };
+                // A terminal shows one state after the other in the same place; a file has a blank line between two.
+                let text = match arguments.watch && !arguments.json {
+                    true if std::io::stdout().is_terminal() => format!("\x1b[H\x1b[J{text}"),
+                    true if shown.is_some() => format!("\n{text}"),
+                    _ => text,
+                };
                 if !output::line(text)? || !arguments.watch {
                     return Ok(());
                 }
@@ -107,8 +111,9 @@ impl Status {
             };
             resource.holdings.iter().map(held).collect::<Vec<_>>()
         };
-        // Room for projections is no thing that somebody looks for.
-        let things = || resources.iter().filter(|resource| resource.kind != WORLD_MODEL);
+        // Room for projections is no thing that somebody looks for, and the run is told of above.
+        let is_thing = |kind: &str| kind != WORLD_MODEL && kind != RUN_KIND;
+        let things = || resources.iter().filter(|resource| is_thing(&resource.kind));
         let is_free = |resource: &&Resource| resource.holdings.is_empty() && resource.free > Quantity::ZERO;
         Status {
             run,
@@ -171,6 +176,7 @@ mod tests {
     use super::*;
     use insta::assert_snapshot;
     use ratn_executive::protocol::Mode;
+    use ratn_model::resource::ResourceClass;
     use ratn_task_control::progress::UnderWay;
 
     #[test]
@@ -206,6 +212,10 @@ mod tests {
           sort_boxes: look  its turn
         free: arm@sim, base@sim
         ");
+        let kinds = [("run", RUN_KIND), ("world-model@compute", WORLD_MODEL), ("arm@sim", "Arm")];
+        let resources: Vec<Resource> =
+            kinds.into_iter().map(|(id, kind)| Resource::new(id, ResourceClass::Task, kind)).collect();
+        assert_eq!(Status::from(None, &resources, Vec::new()).free, ["arm@sim"]);
         let nothing = Status { run: None, held: Vec::new(), waiting: Vec::new(), free: Vec::new() };
         assert_snapshot!(nothing.text(Path::new("/run/ratn"), Colours::default()), @"no run is under way in /run/ratn");
     }

@@ -8,14 +8,15 @@ use anyhow::Context;
 use ratn_cell::config::{AIMM, CellConfig};
 use ratn_cell::core::protocol::Module;
 use ratn_daemon::config::Check;
-use ratn_daemon::process_manager::{ProcessManagerConfig, Template};
-use ratn_daemon::resource_manager::ResourceManagerConfig;
+use ratn_daemon::process_manager::{self, ProcessManagerConfig, Template};
+use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::service::ServiceConfig;
-use ratn_daemon::world_pool::WorldPoolConfig;
+use ratn_daemon::world_pool::{self, WorldPoolConfig};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_motion::description::DescriptionError;
 use ratn_motion::robot::Robot;
+use ratn_worker::endpoint::Endpoint;
 use ratn_worker::tls::ClientTls;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -114,6 +115,16 @@ impl SystemConfig {
             Some(file) => SystemConfig::read_for(file, robot),
         };
         parsed.map_err(|error| Failure::Refused(format!("ratn: {error:#}")))
+    }
+
+    /// What each daemon listens on, by role.
+    pub(crate) fn listens(&self) -> [(&'static str, &Endpoint); 4] {
+        [
+            (resource_manager::ROLE, &self.resource_manager.listen),
+            (world_pool::ROLE, &self.world_pool.listen),
+            (ratn_cell::ROLE, &self.cell.listen),
+            (process_manager::ROLE, &self.process_manager.listen),
+        ]
     }
 
     /// Reads and checks a config.

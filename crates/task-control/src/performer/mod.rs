@@ -54,6 +54,8 @@ const LONG_WHILE_IDLE: Duration = Duration::from_secs(4);
 const LONG: Duration = Duration::from_secs(30);
 /// The resource that the one run of a system is.
 const RUN: &str = "run";
+/// The kind of the resource that says that a run is under way: a system has one run at a time.
+pub const RUN_KIND: &str = "Run";
 /// At the end of a run, for everything that is still being given back.
 const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
 
@@ -561,7 +563,8 @@ impl Performer {
 /// # Errors
 /// Where another run is under way, or the resource manager cannot be asked.
 pub async fn only_run(resources: &ResourceClient, task: &str) -> anyhow::Result<()> {
-    let claim = Resource::new(RUN, ResourceClass::Task, "Run").with_attribute("task", Value::String(task.to_owned()));
+    let claim =
+        Resource::new(RUN, ResourceClass::Task, RUN_KIND).with_attribute("task", Value::String(task.to_owned()));
     match retry_unanswered(|| resources.create(claim.clone())).await {
         Ok(_) => Ok(()),
         Err(error) if error.code() == Some(tonic::Code::AlreadyExists) => {

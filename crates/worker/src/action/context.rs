@@ -1,4 +1,4 @@
-//! What an action gets: its goal, and what it may do with it.
+//! What an action is given: its goal with the inputs, and access to the world model, the lease and other providers.
 
 use super::ActionFailure;
 use super::goal::GoalEntry;
@@ -22,22 +22,22 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
 
-/// A goal under way.
+/// A goal that an action performs.
 #[derive(Debug)]
 pub struct GoalContext {
-    /// Unique to the attempt.
+    /// The goal's id. Every attempt of a state has one of its own.
     pub id: String,
     /// The action's name.
     pub action: String,
-    /// The input ports.
+    /// The inputs by port. [`GoalContext`] has an `input_…` and an `optional_…` method for every type.
     pub inputs: BTreeMap<String, Value>,
-    /// What every random choice is derived from.
+    /// The seed from which the action derives every random choice: the same goal with the same seed gives the same result.
     pub seed: u64,
-    /// What the action may use.
+    /// The lease of the resources that the action may use; `None` where the worker asks for no lease.
     pub lease: Option<Lease>,
-    /// The world that it works on.
+    /// The projection of the world that the goal works on; `None` for the world as it is.
     pub projection: Option<ProjectionId>,
-    /// Fires when the goal shall stop; [`GoalContext::stopped`] then says with what outcome.
+    /// Fires when the goal has to stop; [`GoalContext::stopped`] is how it then ends.
     pub cancelled: CancellationToken,
     /// Who holds the lease, as the goal says.
     session: String,
@@ -48,36 +48,36 @@ pub struct GoalContext {
     calls: AtomicU32,
 }
 
-/// The world cannot be read.
+/// Why the world cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum WorldFailure {
     /// The goal says nothing of a world pool.
     #[error("the goal names no world pool")]
     NoWorldPool,
-    /// What it says is no endpoint.
+    /// The goal's address of the world pool is no endpoint.
     #[error("the goal's world pool")]
     Endpoint(#[from] EndpointError),
-    /// The world pool did not answer as it should.
+    /// The world pool did not answer, or refused.
     #[error("the world pool")]
     Call(#[from] CallError),
-    /// The facts make no world.
+    /// The facts that were sent contradict each other.
     #[error("the projection's facts")]
     Facts(#[from] ChangeError),
-    /// What the world pool sent makes no scene.
+    /// The facts that were sent make no scene: a shape or a pose is missing or malformed.
     #[error("the projection's scene")]
     Scene(#[from] DeltaError),
 }
 
-/// Another provider's action did not come to an outcome.
+/// Why a call of another provider did not succeed ([`GoalContext::call`]).
 #[derive(Debug, thiserror::Error)]
 pub enum CallFailure {
-    /// The goal's lease holds no such resource.
+    /// The goal's lease holds no resource of this kind.
     #[error("the goal's lease holds no {kind}: the state has to block one")]
     NotLeased {
-        /// Its kind.
+        /// The kind.
         kind: String,
     },
-    /// The resource says nothing of where its action service is.
+    /// The resource does not say at which endpoint its actions are served.
     #[error("the endpoint of {resource}")]
     Endpoint {
         /// Which resource.
@@ -153,19 +153,19 @@ impl GoalContext {
         }
     }
 
-    /// Says how far it is, to whoever listens and to the event log. Never blocks.
+    /// Reports progress to the client and to the event log. Never blocks.
     pub fn progress(&self, message: impl Into<String>) {
         self.progress_with(message, BTreeMap::new());
     }
 
-    /// As [`GoalContext::progress`], with figures.
+    /// As [`GoalContext::progress`], with named values beside the message.
     pub fn progress_with(&self, message: impl Into<String>, values: BTreeMap<String, Value>) {
         let progress = v1::GoalProgress { message: message.into(), values: wire_ports(values) };
         // Nobody may be listening.
         let _ = self.entry.progress.send(progress);
     }
 
-    /// Goes on unless the goal shall stop.
+    /// An error where the goal has to stop: call it with `?` between two steps of the work.
     ///
     /// # Errors
     /// [`GoalContext::stopped`].
@@ -173,8 +173,8 @@ impl GoalContext {
         if self.cancelled.is_cancelled() { Err(self.stopped()) } else { Ok(()) }
     }
 
-    /// Returns at once where no hold is in force and the goal is not suspended, else when that is over: for an action that moves something
-    /// in steps, between them.
+    /// Waits while a hold is in force or the goal is suspended; returns at once otherwise. An action that moves something in steps calls it
+    /// between two steps.
     ///
     /// # Errors
     /// [`GoalContext::stopped`].
@@ -193,18 +193,18 @@ impl GoalContext {
         self.unless_cancelled(over).await
     }
 
-    /// Whether the goal is suspended, and every change of that: nothing may move for it while it is, for its lease may have ended. Only
-    /// goals of an action that can be ([`super::Action::can_be_suspended`]) are; the others end.
+    /// Whether the goal is suspended, and every change of that. Nothing may move while it is, because its lease may have ended. Only goals of
+    /// an action with [`super::Action::can_be_suspended`] are suspended; the others end.
     pub fn suspended(&self) -> watch::Receiver<bool> {
         self.entry.suspension()
     }
 
-    /// What a goal that was told to stop comes to: `preempted`, `aborted` where its lease ended, `stopped` by an emergency stop.
+    /// How a goal ends that was told to stop: `preempted`; `aborted` where its lease ended; `stopped` by an emergency stop.
     pub fn stopped(&self) -> ActionFailure {
         self.entry.stopped()
     }
 
-    /// Waits for `work`, unless the goal shall stop: then `work` is dropped.
+    /// Waits for `work`. Where the goal has to stop before, `work` is dropped.
     ///
     /// # Errors
     /// [`GoalContext::stopped`].
@@ -216,10 +216,10 @@ impl GoalContext {
         }
     }
 
-    /// The facts of the goal's projection (of the root, where it has none) that match any of the patterns.
+    /// The facts that match any of the patterns, in the goal's projection (in the root world, where it has none).
     ///
     /// # Errors
-    /// [`WorldFailure`].
+    /// [`WorldFailure`]: the world pool is not known, does not answer, or the projection is gone.
     pub async fn facts(&self, patterns: &[FactPattern]) -> Result<Vec<FactRecord>, WorldFailure> {
         let client = self.world_client()?;
         // It may be started again just now.
@@ -234,10 +234,10 @@ impl GoalContext {
         Ok(WorldClient::new(&self.channels, &world_pool)?)
     }
 
-    /// As [`GoalContext::facts`], as a world.
+    /// As [`GoalContext::facts`], as a [`World`] that can be queried.
     ///
     /// # Errors
-    /// [`WorldFailure`].
+    /// As [`GoalContext::facts`].
     pub async fn world(&self, patterns: &[FactPattern]) -> Result<World, WorldFailure> {
         let facts = self.facts(patterns).await?;
         let changes: Vec<Change> =
@@ -247,10 +247,10 @@ impl GoalContext {
         Ok(world)
     }
 
-    /// Has another provider of this goal's lease perform an action under the same lease; its outputs.
+    /// Calls an action of another provider whose resource this goal's lease holds, under that lease. Returns the outputs of the action.
     ///
     /// # Errors
-    /// [`CallFailure`] also where its outcome is not success.
+    /// [`CallFailure`], also where the action ends otherwise than with success.
     pub async fn call(
         &self,
         kind: &str,

@@ -39,23 +39,23 @@ use crate::client::chain;
 use std::error::Error;
 use std::iter;
 
-/// Something that can be done.
+/// Something that a worker can do: `nearest` of `inspector/nearest`.
 #[tonic::async_trait]
 pub trait Action: Send + Sync + 'static {
-    /// Its name, the part after the slash of `path_planner/plan`.
+    /// The action's name: the part behind the slash in `path_planner/plan`.
     fn name(&self) -> &str;
 
-    /// What it does, for people.
+    /// A sentence for people that says what the action does; `ratn actions` shows it.
     fn description(&self) -> &str {
         ""
     }
 
-    /// Its ports, outcomes and annotations; without them nobody is told, and the catalogue has to say them.
+    /// The action's ports, outcomes and annotations. Without them the catalogue of the system has to say them, and goals are not checked.
     fn signature(&self) -> Option<Signature> {
         None
     }
 
-    /// The resource whose lease a goal needs, where it is another than the server's own.
+    /// The id of the resource whose lease a goal needs, where that is not the worker's own.
     fn resource(&self) -> Option<&str> {
         None
     }
@@ -65,24 +65,25 @@ pub trait Action: Send + Sync + 'static {
         true
     }
 
-    /// Whether a goal is suspended, instead of ended, while the resource manager is not heard: its lease may have ended, so nothing may
-    /// move for it. For an action that stands still while the goal is ([`GoalContext::while_held`], [`GoalContext::suspended`]), and for
-    /// one that moves nothing.
+    /// Whether a goal is suspended, instead of ended, while the resource manager does not answer. The goal's lease may have ended then, so
+    /// nothing may move. Return true for an action that stands still while its goal is suspended ([`GoalContext::while_held`],
+    /// [`GoalContext::suspended`]), and for one that moves nothing.
     fn can_be_suspended(&self) -> bool {
         false
     }
 
-    /// Does it. Has to look at `goal.cancelled` (or `goal.checkpoint()?`) and to end soon once that fired: its resource is its own until
-    /// it returns, and nothing tears it down. What blocks for longer than a millisecond belongs into `tokio::task::spawn_blocking`.
+    /// Performs a goal. The action has to look at `goal.cancelled` (or call `goal.checkpoint()?`) and to return soon after that fired: it is
+    /// never interrupted, and its resource stays taken until it returns. Work that blocks for longer than a millisecond belongs into
+    /// `tokio::task::spawn_blocking`.
     async fn execute(&self, goal: GoalContext) -> ActionResult;
 }
 
-/// How a goal ends.
+/// How a goal ends: an outcome with its outputs, or a failure.
 pub type ActionResult = Result<GoalOutcome, ActionFailure>;
 
-/// A goal that did not come to an outcome of its own. Made from any error by `?`: what another provider that was called
-/// ([`GoalContext::call`]) ended as, where that is `preempted` or `stopped`; lost, where the world pool or the goal's projection is gone
-/// ([`WorldFailure`]); else `aborted`.
+/// A goal that came to no outcome of the action's own. `?` makes one from any error: `aborted`, with two exceptions. Where a called provider
+/// ([`GoalContext::call`]) ended `preempted` or `stopped`, so does this goal. Where the world pool or the goal's projection is gone
+/// ([`WorldFailure`]), the goal is lost.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ActionFailure {
     /// It failed: the outcome is `aborted`.
@@ -91,17 +92,17 @@ pub enum ActionFailure {
     Preempted(String),
     /// An emergency stop is in force: the outcome is `stopped`.
     Stopped(String),
-    /// The world that it works on is gone: it comes to no outcome, as if its process had been killed, and another attempt may.
+    /// The world that the goal works on is gone. The goal has no outcome, as if the worker's process had been killed, and may be tried again.
     Lost(String),
 }
 
 impl ActionFailure {
-    /// It failed, and why.
+    /// The action failed, for this reason.
     pub fn aborted(reason: impl Into<String>) -> ActionFailure {
         ActionFailure::Aborted(reason.into())
     }
 
-    /// An emergency stop is in force, and why.
+    /// An emergency stop is in force, for this reason.
     pub fn emergency_stop(reason: &str) -> ActionFailure {
         ActionFailure::Stopped(format!("emergency stop: {reason}"))
     }

@@ -3,7 +3,7 @@
 use ratn_model::pose::Pose;
 use ratn_model::value::{Trajectory, Value};
 
-/// An input, or a part of one: there or not, of the right type or not.
+/// An input or a part of one, which may be missing or of another type. The methods read it as a type.
 #[derive(Debug, Clone)]
 pub struct Port<'a> {
     /// Whose input; may be empty.
@@ -12,7 +12,7 @@ pub struct Port<'a> {
     value: Option<&'a Value>,
 }
 
-/// An input that an action cannot work with.
+/// An input that is missing or of another type.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InputError {
     /// It is not there.
@@ -40,27 +40,27 @@ pub enum InputError {
 }
 
 impl<'a> Port<'a> {
-    /// The input `name`; a null counts as none.
+    /// The input `name`. A null value counts as missing.
     pub fn new(name: &str, value: Option<&'a Value>) -> Port<'a> {
         Port::of("", name, value)
     }
 
-    /// The same, of an action that errors shall name.
+    /// The same; errors name the action.
     pub fn of(action: &'a str, name: &str, value: Option<&'a Value>) -> Port<'a> {
         Port { action, path: name.to_owned(), value: value.filter(|v| **v != Value::Null) }
     }
 
-    /// This input if it is there.
+    /// This input; `None` where it is missing.
     pub fn optional(self) -> Option<Port<'a>> {
         self.value.is_some().then_some(self)
     }
 
-    /// A field of it.
+    /// A field of this value, which is a map.
     pub fn field(&self, name: &str) -> Port<'a> {
         Port::of(self.action, &format!("{}.{name}", self.path), self.value.and_then(|v| v.field(name)))
     }
 
-    /// Its value, whatever it is.
+    /// The value, of whatever type.
     ///
     /// # Errors
     /// [`InputError`].
@@ -100,7 +100,7 @@ impl<'a> Port<'a> {
         self.read("a string", |v| if let Value::String(text) = v { Some(text.as_str()) } else { None })
     }
 
-    /// A pose.
+    /// A pose: position in metres, orientation as a unit quaternion (x, y, z, w).
     ///
     /// # Errors
     /// [`InputError`].
@@ -108,7 +108,7 @@ impl<'a> Port<'a> {
         self.read("a pose", |v| if let Value::Pose(pose) = v { Some(*pose) } else { None })
     }
 
-    /// Joint positions.
+    /// Positions of joints, in radians (prismatic joints: metres), in the order of the arm's joints.
     ///
     /// # Errors
     /// [`InputError`].
@@ -116,7 +116,7 @@ impl<'a> Port<'a> {
         self.read("joints", |v| if let Value::Joints(joints) = v { Some(joints.as_slice()) } else { None })
     }
 
-    /// A trajectory.
+    /// A trajectory: joint names, and points with time in seconds, positions and velocities.
     ///
     /// # Errors
     /// [`InputError`].
@@ -142,7 +142,7 @@ impl<'a> Port<'a> {
         Ok(values.iter().enumerate().map(element).collect())
     }
 
-    /// Exactly three numbers, as a list.
+    /// A list of exactly three numbers.
     ///
     /// # Errors
     /// [`InputError`].

@@ -1,4 +1,4 @@
-//! A server of actions: how it is built, and what it is asked.
+//! A server of actions: how it is built, and its requests.
 
 use super::admission::{Admission, Limits, State};
 use super::authority::Authority;
@@ -37,7 +37,7 @@ pub struct ActionServer {
     pub(super) inner: Arc<Inner>,
 }
 
-/// What an [`ActionServer`] shall be.
+/// Builds an [`ActionServer`].
 pub struct ActionServerBuilder {
     resource: String,
     provider: String,
@@ -70,21 +70,21 @@ struct Waiting {
 }
 
 impl ActionServerBuilder {
-    /// With an action. A second one of the same name replaces the first.
+    /// Adds an action. A second one of the same name replaces the first.
     #[must_use]
     pub fn action(mut self, action: impl Action) -> ActionServerBuilder {
         self.actions.insert(action.name().to_owned(), Arc::new(action));
         self
     }
 
-    /// What tasks call it, `inspector` of `inspector/nearest`, and the kind of resource that it is: it says so when it is asked.
+    /// Sets the provider's name, `inspector` in the action `inspector/nearest` of a task, and the kind of its resource, for `Describe`.
     #[must_use]
     pub fn provides(mut self, provider: &str, kind: &str) -> ActionServerBuilder {
         (self.provider, self.kind) = (provider.to_owned(), kind.to_owned());
         self
     }
 
-    /// What it will say of itself.
+    /// The description that the server will answer `Describe` with.
     pub fn description(&self) -> WorkerDescription {
         let said = |action: &Arc<dyn Action>| {
             let signature = action.signature()?.said().clone();
@@ -94,58 +94,60 @@ impl ActionServerBuilder {
         WorkerDescription { provider: self.provider.clone(), kind: self.kind.clone(), actions }
     }
 
-    /// A resource performs one goal at a time: a further one is refused, unless the one before was told to stop: then
-    /// it waits for its end.
+    /// A resource performs one goal at a time. A further goal is refused; but where the one before was told to stop, the further one waits
+    /// for its end.
     #[must_use]
     pub fn one_at_a_time(mut self) -> ActionServerBuilder {
         self.one_at_a_time = true;
         self
     }
 
-    /// Remembers this many results of each resource.
+    /// Sets how many results of each resource are remembered.
     #[must_use]
     pub fn results_kept(mut self, results: usize) -> ActionServerBuilder {
         self.results_kept = Some(results);
         self
     }
 
-    /// Begins at the most this many goals on a resource under one lease.
+    /// Sets how many goals may begin on a resource under one lease.
     #[must_use]
     pub fn goals_per_lease(mut self, goals: usize) -> ActionServerBuilder {
         self.goals_per_lease = Some(goals);
         self
     }
 
-    /// Goals are performed under leases that the resource manager confirms, and end with them. Without this every goal that needs a
-    /// lease is refused.
+    /// Sets the watch by which the resource manager confirms leases; goals end with their lease. Without it every goal that needs a lease is
+    /// refused.
     #[must_use]
     pub fn leases(mut self, watch: &LeaseWatch) -> ActionServerBuilder {
         self.authority = Authority::Watch(watch.clone());
         self
     }
 
-    /// **For tests only.** Believes whatever a goal says of its lease: whoever reaches the server moves what it moves.
+    /// **For tests only.** Goals are performed without asking the resource manager for their lease: everybody who can reach the server can
+    /// give it goals.
     #[must_use]
     pub fn dangerously_believe_every_lease(mut self) -> ActionServerBuilder {
         self.authority = Authority::Claimant;
         self
     }
 
-    /// What its actions ask of others goes over these channels. Without this they reach no server with TLS.
+    /// Sets the channels over which its actions call the world pool and other providers. Without it they reach no server with TLS.
     #[must_use]
     pub fn channels(mut self, channels: Channels) -> ActionServerBuilder {
         self.channels = channels;
         self
     }
 
-    /// Its goals end, and further ones are not begun, while an emergency stop is in force: for what moves something.
+    /// Sets the state of emergency stop and hold. While a stop is in force, its goals end and no goal begins. For a driver of hardware that
+    /// moves.
     #[must_use]
     pub fn safety(mut self, safety: Safety) -> ActionServerBuilder {
         self.safety = safety;
         self
     }
 
-    /// The server. An action whose resource is not among those of the [`LeaseWatch`] refuses every goal, and the log says so.
+    /// Makes the server. An action whose resource the [`LeaseWatch`] does not watch refuses every goal; a log line says so.
     pub fn build(self) -> ActionServer {
         if let Some(watch) = self.authority.watch() {
             let named = self.actions.values().map(|action| action.resource().unwrap_or(&self.resource));
@@ -180,9 +182,9 @@ impl ActionServerBuilder {
 }
 
 impl ActionServer {
-    /// A server that is `resource`: a goal needs a lease of it, which [`ActionServerBuilder::leases`] confirms. With an empty name
-    /// no lease is asked for, except by actions that name a resource of their own; of goals without a lease only the last results are
-    /// known, and one that is given again later is performed again.
+    /// Begins a server for the resource of this id: a goal needs a lease of it, which [`ActionServerBuilder::leases`] confirms. With an empty
+    /// id no lease is asked for, except for actions that name a resource of their own. Of goals without a lease only the last results are
+    /// remembered: one that is given again later is performed again.
     pub fn builder(resource: impl Into<String>) -> ActionServerBuilder {
         ActionServerBuilder {
             resource: resource.into(),
@@ -198,9 +200,9 @@ impl ActionServer {
         }
     }
 
-    /// Ends with the process: begins nothing more, tells every goal to stop, and returns when all actions have returned. Their clients
-    /// hear what they would hear if the process had been killed, unless a goal made it in time: a crash of the attempt, not an outcome.
-    /// Give back what the goals move only after this.
+    /// Shuts the server down before the process ends: no goal begins any more, every goal is told to stop, and the call returns when all
+    /// actions have returned. A goal that did not come to its end in time counts as crashed for its client, as if the process had been
+    /// killed. Give the resources back only after this has returned.
     pub async fn shut_down(&self) {
         let running = self.inner.state().close();
         for goal in running {
@@ -208,19 +210,19 @@ impl ActionServer {
         }
     }
 
-    /// Tells a goal to stop, also one that waits to begin; whether there was one.
+    /// Tells a goal to stop, also one that waits to begin. False where there is no such goal.
     pub fn cancel(&self, goal: &str) -> bool {
         let state = self.inner.state();
         let found = state.running().chain(state.waiting()).filter(|entry| entry.id == goal);
         found.map(|entry| entry.stop(StopCause::Cancelled)).count() > 0
     }
 
-    /// How many goals run, those included that were told to stop and do not.
+    /// How many goals run, including those that were told to stop and have not returned yet.
     pub fn running(&self) -> usize {
         self.inner.state().running().count()
     }
 
-    /// How many goals wait: for a word of their lease, or for the end of one that was told to stop.
+    /// How many goals wait: for their lease to be confirmed, or for the end of a goal that was told to stop.
     pub fn waiting(&self) -> usize {
         self.inner.state().waiting().count()
     }

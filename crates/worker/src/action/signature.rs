@@ -1,4 +1,4 @@
-//! What an action says of itself: its ports with their types and defaults, its outcomes, and what states that perform it may say.
+//! The signature of an action: its ports with types and defaults, its outcomes, and the annotations that a state which performs it may have.
 
 use ratn_model::catalogue::ActionSignature;
 use ratn_model::value::{Type, Value};
@@ -7,15 +7,15 @@ use std::collections::BTreeMap;
 
 /// The ports of an action, built from code: `Signature::new().input("from", Type::Pose).output("object", Type::String)`.
 ///
-/// A goal whose inputs do not fit it ends `aborted` before the action sees it, with the action and the port in the reason; so does a goal of
-/// which the action writes other outputs with success. An optional input with a default is always there.
+/// A goal whose inputs do not fit the signature ends `aborted` before the action is called; the reason names action and port. A goal whose
+/// action succeeds with other outputs than the signature has ends `aborted`, too. An optional input with a default is always there.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Signature {
     said: ActionSignature,
     defaults: BTreeMap<String, Value>,
 }
 
-/// A goal that does not fit what its action says of itself.
+/// Why a goal does not fit the signature of its action.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SignatureError {
     /// A required input is not there.
@@ -28,7 +28,7 @@ pub enum SignatureError {
         /// Its type.
         expected: Type,
     },
-    /// An input is something else.
+    /// An input is of another type.
     #[error("input `{port}` of `{action}` is a {found}: expected {expected}")]
     InputType {
         /// The action.
@@ -47,10 +47,10 @@ pub enum SignatureError {
         action: String,
         /// The input.
         port: String,
-        /// Those that it has.
+        /// The inputs that it has.
         known: String,
     },
-    /// An output was not written, or as something else.
+    /// An output was not written, or is of another type.
     #[error("`{action}` ended with success, and its output `{port}` is {found}: expected {expected}")]
     Output {
         /// The action.
@@ -70,21 +70,21 @@ impl Signature {
         Signature::default()
     }
 
-    /// With an input that every goal has.
+    /// Adds an input that every goal must have.
     #[must_use]
     pub fn input(mut self, name: &str, of_type: Type) -> Signature {
         self.said.inputs.insert(name.to_owned(), of_type);
         self
     }
 
-    /// With an input that a goal may have.
+    /// Adds an input that a goal may leave out.
     #[must_use]
     pub fn optional(mut self, name: &str, of_type: Type) -> Signature {
         self.said.optional.insert(name.to_owned(), of_type);
         self
     }
 
-    /// With an input that is this where a goal does not have it.
+    /// Adds an input with a default: `value` where a goal leaves it out.
     #[must_use]
     pub fn with_default(mut self, name: &str, of_type: Type, value: Value) -> Signature {
         self.said.defaults.insert(name.to_owned(), value.to_string());
@@ -92,64 +92,64 @@ impl Signature {
         self.optional(name, of_type)
     }
 
-    /// With an output that is written with success.
+    /// Adds an output, which the action writes with `success`.
     #[must_use]
     pub fn output(mut self, name: &str, of_type: Type) -> Signature {
         self.said.outputs.insert(name.to_owned(), of_type);
         self
     }
 
-    /// With an outcome besides `success`, `aborted` and `preempted`.
+    /// Adds an outcome beside `success`, `aborted` and `preempted`.
     #[must_use]
     pub fn outcome(mut self, name: &str) -> Signature {
         self.said.outcomes.push(name.to_owned());
         self
     }
 
-    /// A state that performs it may say `computes: true`: it reads its projection and changes nothing.
+    /// A state with this action may say `computes: true`: the action reads its projection and changes nothing.
     #[must_use]
     pub fn computes(mut self) -> Signature {
         self.said.annotations.computes = true;
         self
     }
 
-    /// A state that performs it reads facts of this pattern, `at(?)`.
+    /// A state with this action reads the facts of this pattern, for example `at(?)`.
     #[must_use]
     pub fn reads(mut self, pattern: &str) -> Signature {
         self.said.annotations.reads.push(pattern.to_owned());
         self
     }
 
-    /// A state that performs it senses facts of this pattern.
+    /// A state with this action senses the facts of this pattern.
     #[must_use]
     pub fn senses(mut self, pattern: &str) -> Signature {
         self.said.annotations.senses.push(pattern.to_owned());
         self
     }
 
-    /// A state that performs it requires this.
+    /// A state with this action requires this condition, for example `hand_empty(gripper)`.
     #[must_use]
     pub fn requires(mut self, condition: &str) -> Signature {
         self.said.annotations.requires.push(condition.to_owned());
         self
     }
 
-    /// A state that performs it makes this true.
+    /// A state with this action has this effect with success, for example `not hand_empty(gripper)`.
     #[must_use]
     pub fn effect(mut self, effect: &str) -> Signature {
         self.said.annotations.effects.push(effect.to_owned());
         self
     }
 
-    /// What it says, for a catalogue.
+    /// The signature as a catalogue has it.
     pub fn said(&self) -> &ActionSignature {
         &self.said
     }
 
-    /// Puts in what the inputs of a goal lack and have a default, and looks whether they fit.
+    /// Adds the defaults of inputs that a goal leaves out, and checks all inputs.
     ///
     /// # Errors
-    /// [`SignatureError`] of the first that does not.
+    /// [`SignatureError`] of the first input that does not fit.
     pub fn complete(&self, action: &str, inputs: &mut BTreeMap<String, Value>) -> Result<(), SignatureError> {
         let (action, ActionSignature { inputs: required, optional, .. }) = (|| action.to_owned(), &self.said);
         for (port, value) in &*inputs {
@@ -181,10 +181,10 @@ impl Signature {
         Ok(())
     }
 
-    /// Whether what came of a goal is what the action says.
+    /// Checks the outputs of a goal that ended with success.
     ///
     /// # Errors
-    /// [`SignatureError`] of the first output that is not.
+    /// [`SignatureError`] of the first output that does not fit.
     pub fn check(&self, action: &str, outcome: &GoalOutcome) -> Result<(), SignatureError> {
         let wrong = |(port, expected): (&String, &Type)| {
             let written = outcome.outputs.get(port);

@@ -23,21 +23,21 @@ pub struct ActionClient {
     channels: Channels,
 }
 
-/// What a provider performs.
+/// What a provider can do.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ProviderInfo {
-    /// The resource that it is; empty for none.
+    /// The id of its resource; empty for none.
     pub resource: String,
     /// In the order of names.
     pub actions: Vec<ActionInfo>,
 }
 
-/// What has become of a goal that was given before.
+/// How a goal ended that was given before.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fate {
     /// How it ended.
     pub outcome: GoalOutcome,
-    /// It was stopped because nobody listened to it or its lease had ended: its outcome is not its own doing.
+    /// The goal was stopped because no client listened or its lease had ended: the outcome says nothing of the action.
     pub orphaned: bool,
 }
 
@@ -52,19 +52,19 @@ pub struct ActionInfo {
     pub cancel_when_abandoned: bool,
 }
 
-/// A worker that does not describe itself so that it is believed.
+/// Why the description of a worker cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DescribeError {
-    /// It says nothing: it cannot, or is not reached.
+    /// The worker has no description, or cannot be reached.
     #[error("it does not describe itself: {0}")]
     Unanswered(String),
-    /// What it says is beyond the bounds.
+    /// The description exceeds the bounds.
     #[error("its description is refused: {0}")]
     Refused(String),
 }
 
 impl ActionClient {
-    /// Over shared channels.
+    /// A client that uses these channels.
     pub fn new(channels: Channels) -> ActionClient {
         ActionClient { channels }
     }
@@ -74,11 +74,12 @@ impl ActionClient {
         &self.channels
     }
 
-    /// Has a goal performed. Dropping the future stops listening: what that means to the goal is the action's to say.
+    /// Gives a goal to the provider and waits for its end. Dropping the future stops listening; the action decides whether its goal stops then
+    /// ([`crate::action::Action`]).
     ///
     /// # Errors
-    /// [`CallError::Refused`] when the provider did not take the goal; otherwise what became of the goal is not known. A provider that
-    /// does not hear the resource manager is given the goal again for a while.
+    /// [`CallError::Refused`] when the provider did not take the goal. With any other error it is not known what became of the goal. Where the
+    /// provider cannot reach the resource manager, the goal is given again for a while.
     pub async fn execute(
         &self,
         endpoint: &Endpoint,
@@ -96,7 +97,7 @@ impl ActionClient {
         self.listen(endpoint, question, on_progress).await.map(|fate| fate.outcome)
     }
 
-    /// Waits for the end of a goal that was given before, by this client or by one that is gone; it is never begun by this.
+    /// Waits for the end of a goal that was given before, by this client or by an earlier one. Never begins the goal.
     ///
     /// # Errors
     /// As [`ActionClient::execute`]; [`CallError::Refused`] with `NotFound` when the provider does not know the goal: it was
@@ -140,7 +141,7 @@ impl ActionClient {
         Ok(Fate { outcome: result.try_into().map_err(malformed)?, orphaned })
     }
 
-    /// Tells a goal to stop; whether it was under way. Its outcome comes over its execute.
+    /// Tells a goal to stop. False where it was not under way. The outcome is returned by [`ActionClient::execute`].
     ///
     /// # Errors
     /// [`CallError`].
@@ -150,7 +151,7 @@ impl ActionClient {
         Ok(answer.map_err(|status| CallError::from_status(endpoint, &status))?.into_inner().under_way)
     }
 
-    /// What a provider performs.
+    /// The actions of a provider.
     ///
     /// # Errors
     /// [`CallError`].
@@ -165,7 +166,7 @@ impl ActionClient {
         Ok(ProviderInfo { resource: answer.resource_id, actions: answer.actions.into_iter().map(info).collect() })
     }
 
-    /// What a worker says of itself, within the bounds of that, and not longer than this.
+    /// The description of a worker, with the signatures of its actions; waits for `within` at the most.
     ///
     /// # Errors
     /// [`DescribeError`].

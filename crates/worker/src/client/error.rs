@@ -1,4 +1,4 @@
-//! How a call fails: refused by the one who was asked, or broken on the way.
+//! How a call fails: the server refused it, or the connection broke.
 
 use super::chain;
 use crate::action::{MANAGER_UNHEARD, NOT_AT_REST, TOO_MANY_WAITING};
@@ -8,7 +8,7 @@ use std::error::Error;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
 
-/// A call without an answer.
+/// Why a call failed.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum CallError {
     /// Nobody answered: the process died, the connection broke, or nothing listens there.
@@ -19,17 +19,17 @@ pub enum CallError {
         /// What is known of it.
         reason: String,
     },
-    /// The one who was asked said no.
+    /// The server refused.
     #[error("{message}")]
     Refused {
         /// Who was asked.
         endpoint: Endpoint,
-        /// In which of gRPC's ways.
+        /// The gRPC status code.
         code: Code,
-        /// Why, in its own words.
+        /// The server's message.
         message: String,
     },
-    /// The answer means nothing.
+    /// The answer cannot be read.
     #[error("{endpoint} answered nonsense")]
     Malformed {
         /// Who was asked.
@@ -41,12 +41,12 @@ pub enum CallError {
 }
 
 impl CallError {
-    /// Whether the one who was asked did not get to decide: a crash, not a refusal.
+    /// Whether the call was not answered: a crash or a broken connection, not a refusal.
     pub fn is_crash(&self) -> bool {
         !matches!(self, CallError::Refused { .. })
     }
 
-    /// The code of a refusal.
+    /// The gRPC status code of a refusal; `None` for other errors.
     pub fn code(&self) -> Option<Code> {
         match self {
             CallError::Refused { code, .. } => Some(*code),

@@ -1,4 +1,4 @@
-//! Asking others, in the cores' types: one client per service, one channel per endpoint.
+//! Clients of the daemons and of workers, with the types of the cores: one client per service, one channel per endpoint.
 
 mod action;
 mod error;
@@ -44,12 +44,12 @@ pub struct Channels {
 }
 
 impl Channels {
-    /// None yet. Those to `https://` endpoints will trust and show what `tls` does when they connect.
+    /// No channels yet. Channels to `https://` endpoints trust and show the certificates of `tls`, as they are when a channel connects.
     pub fn new(tls: &ClientTls) -> Channels {
         Channels { tls: tls.clone(), kept: Arc::default(), goals: Arc::default() }
     }
 
-    /// The channel to `endpoint`: its calls carry the trace of the task that makes them, and say the protocol. Needs a tokio runtime.
+    /// The channel to `endpoint`. Its calls carry the trace of the tokio task that makes them, and the protocol version. Needs a tokio runtime.
     ///
     /// # Errors
     /// [`CallError::Broken`] when the endpoint makes no URI.

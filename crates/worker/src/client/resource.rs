@@ -1,4 +1,4 @@
-//! The client of the resource manager. What is asked for again and again while a task runs goes over the session's stream.
+//! The client of the resource manager. The calls that a task makes all the time (acquire, block, release) share one stream per session.
 
 use super::unheard::{Ended, Unheard};
 use super::{CallError, Channels, fresh_id, snapshot};
@@ -32,16 +32,16 @@ pub struct ResourceClient {
     unheard: Unheard,
 }
 
-/// How an acquire waits.
+/// How an acquire waits in the queue.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AcquireOptions {
-    /// Makes it idempotent, `run/instance/attempt`; a fresh one when empty.
+    /// The request id, which makes a repetition harmless, for example `run/instance/attempt`. A fresh one where empty.
     pub request: String,
-    /// Larger first; among equals first come, first served.
+    /// Larger priorities are served first; equal ones in the order in which they came.
     pub priority: i64,
-    /// How long to wait at the most.
+    /// The longest time to wait.
     pub deadline: Duration,
-    /// What the holder is, for people.
+    /// A name of the holder for people: `sort_boxes: place[2]/plan`.
     pub holder: String,
 }
 
@@ -56,7 +56,7 @@ impl Default for AcquireOptions {
     }
 }
 
-/// A running watch of what is missing.
+/// A running watch of the resources that are missing.
 #[derive(Debug)]
 pub struct DemandWatch {
     endpoint: Endpoint,
@@ -89,7 +89,7 @@ impl ResourceClient {
         &self.endpoint
     }
 
-    /// Adds a resource, or updates one that this session added; as the manager knows it now.
+    /// Adds a resource, or updates one that this session added. Returns the resource as the manager has it now.
     ///
     /// # Errors
     /// [`CallError`].
@@ -108,7 +108,7 @@ impl ResourceClient {
         self.field(answer.into_inner().resource, "resource")
     }
 
-    /// Uses capacity up; the ids of what was used.
+    /// Consumes capacity. Returns the ids of the resources that it was taken from.
     ///
     /// # Errors
     /// [`CallError`].
@@ -135,7 +135,7 @@ impl ResourceClient {
         self.delete_target("", v1::delete_request::Target::ResourceId(resource.to_owned())).await.map(|_| ())
     }
 
-    /// Removes as many resources as the requirement says; their ids.
+    /// Removes as many resources as the requirement says. Returns their ids.
     ///
     /// # Errors
     /// [`CallError`].
@@ -182,8 +182,8 @@ impl ResourceClient {
         }
     }
 
-    /// Waits until all requirements can be met at once and takes them under one lease. Dropping the future leaves the queue,
-    /// or gives back a grant that crosses with that, unless another call of the same request waits for it or got it.
+    /// Waits until all requirements can be met at once, and takes them under one lease. Dropping the future leaves the queue; a lease that is
+    /// granted at that moment is given back, unless another call of the same request id waits for it or has got it.
     ///
     /// # Errors
     /// [`CallError`].
@@ -203,8 +203,8 @@ impl ResourceClient {
         }
     }
 
-    /// Undoes an acquire or a block by its request id, for all who asked for it: it leaves the queue, or gives back what it got. The
-    /// same request id once more acquires anew. False when there was nothing to undo.
+    /// Undoes an acquire or a block by its request id, for every call that made it: the request leaves the queue, or its lease is given back.
+    /// The same request id may be used for another acquire. False when there was nothing to undo.
     ///
     /// # Errors
     /// [`CallError`].
@@ -220,7 +220,7 @@ impl ResourceClient {
         }
     }
 
-    /// Gives a lease back; false when it had ended before.
+    /// Gives a lease back. False when it had ended before.
     ///
     /// # Errors
     /// [`CallError`].
@@ -250,7 +250,7 @@ impl ResourceClient {
         Ok(answer.into_inner().freed)
     }
 
-    /// Whether what is required is there, blocked or not.
+    /// Whether resources that meet the requirement exist, blocked or not.
     ///
     /// # Errors
     /// [`CallError`].
@@ -296,7 +296,7 @@ impl ResourceClient {
         self.field(answer.into_inner().resource, "resource")
     }
 
-    /// Why the acquire of a request id waits; with an empty one, why the first hundred of the queue wait.
+    /// Why the acquire of a request id waits. With an empty id: why the first hundred acquires of the queue wait.
     ///
     /// # Errors
     /// [`CallError`], also where the one asked for does not wait.

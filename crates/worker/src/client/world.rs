@@ -23,32 +23,32 @@ pub struct WorldClient {
     client: WorldPoolServiceClient<Traced>,
 }
 
-/// What a projection shall be.
+/// A projection that is to be made.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Projection {
-    /// Unique to what asks, `run/instance/attempt`.
+    /// The request id, `run/instance/attempt`: the same request makes one projection.
     pub request: String,
-    /// The root's revision below it.
+    /// The revision of the root that the projection stands on.
     pub base: Revision,
-    /// The changes over that, in order.
+    /// The changes on top of that revision, in order.
     pub changes: Vec<Change>,
     /// Who will make the change at the same place, by the path of its instance: its commit is compared with what was predicted of
     /// it. Empty or missing: nobody, and the change stands over whatever is committed.
     pub writers: Vec<Arc<str>>,
-    /// What of it may be seen.
+    /// The facts of it that may be seen.
     pub reads: Footprint,
     /// The lease that holds the room for it, with its token.
     pub lease: Option<(LeaseId, FencingToken)>,
 }
 
-/// What shall become real.
+/// Changes that are to become real.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Commit {
-    /// Unique to what is committed, `run/instance`.
+    /// The commit's id, `run/instance`: the same id commits once.
     pub id: String,
     /// The changes, in order.
     pub changes: Vec<Change>,
-    /// What the root's revision must become, where that matters.
+    /// The revision that the root must get by this commit; `None` where that does not matter.
     pub revision: Option<Revision>,
     /// The node that writes, by the path of its instance; may be empty.
     pub writer: String,
@@ -119,8 +119,8 @@ impl WorldClient {
         self.all_pages(v1::QueryRequest::default()).await
     }
 
-    /// Makes changes real; the root's revision with them. `commit` is unique to what is committed, `run/instance`;
-    /// `revision` is what the root's revision must become, where that matters.
+    /// Makes changes real, and returns the revision of the root with them. `commit` is the commit's id, `run/instance`: the same id commits
+    /// once. `revision` is the revision that the root must get, where that matters.
     ///
     /// # Errors
     /// [`CallError`].

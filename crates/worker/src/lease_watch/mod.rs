@@ -1,19 +1,19 @@
-//! Who holds the resources of this provider: the resource manager's word, not that of a goal.
+//! Who holds the resources of this provider, as the resource manager says; what a goal says of its lease proves nothing.
 //!
 //! ```text
 //!   resource manager ──watch──▶ follow (a task) ──▶ Holdings (pure) ◀── check ── ActionServer::admit
 //!                                       └── what ended ──▶ ActionServer: its goals end
 //! ```
 //! A provider makes one [`LeaseWatch`] for its resources, gives it to its [`crate::action::ActionServer`], and has it follow the
-//! manager. While the watch is interrupted nothing begins. What is under way goes on as long as the provider's own session lives (without
-//! a session: for a time after the manager's last answer, and it is asked often enough). Then every goal under a lease ends, but for those
-//! that can be suspended ([`crate::action::Action::can_be_suspended`]): they stand still until the manager is heard again, and end when it
-//! is given up. What the manager says first is compared with what is under way: a goal goes on only where its lease lives.
+//! manager. While the watch is interrupted, no goal begins. Goals under way go on as long as the provider's own session lives (without a
+//! session: for a time after the manager's last answer). After that, every goal under a lease ends, except those that can be suspended
+//! ([`crate::action::Action::can_be_suspended`]): they stand still until the manager answers again, and end when it is given up. When the
+//! manager answers again, a goal goes on only where its lease still lives.
 //!
-//! Of what a lease has left of the provider's own resources when it ended, standstill is confirmed (`standstill.rs`). A provider of its own
-//! resources begins nothing before it has said that it is at rest ([`LeaseWatch::brought_to_rest`]).
+//! When a lease ends, the provider confirms for its own resources that nothing moves any more (`standstill.rs`). No goal begins before the
+//! driver has said that everything is at rest ([`LeaseWatch::brought_to_rest`]).
 //!
-//! How long the manager is trusted is measured by [`BootClock`]: also a machine that was suspended confirms nothing when it wakes up.
+//! The time for which the manager is trusted is measured by [`BootClock`]: a machine that was suspended confirms nothing when it wakes up.
 
 mod holdings;
 mod location;
@@ -70,7 +70,7 @@ pub(crate) trait LeaseListener: Send + Sync {
     fn under_way(&self, resource: &str, lease: Option<(LeaseId, FencingToken)>) -> Vec<CancellationToken>;
 }
 
-/// What is known of the leases of a provider's resources. A handle: clones share everything.
+/// The leases of a provider's resources, as far as the resource manager has told of them. A handle: clones share everything.
 #[derive(Clone)]
 pub struct LeaseWatch {
     shared: Arc<Shared>,
@@ -124,12 +124,12 @@ struct Following {
 struct Answered(Mutex<BootInstant>);
 
 impl LeaseWatch {
-    /// Of the resources of these ids; nothing is known of them before it follows a manager.
+    /// A watch of the resources of these ids. Nothing is known of them before the watch follows a manager.
     pub fn of(resources: impl IntoIterator<Item = impl Into<String>>) -> LeaseWatch {
         LeaseWatch::by(BootClock::default(), resources)
     }
 
-    /// As [`LeaseWatch::of`], by another clock.
+    /// As [`LeaseWatch::of`], measured by this clock.
     pub fn by(clock: BootClock, resources: impl IntoIterator<Item = impl Into<String>>) -> LeaseWatch {
         let shared = Shared {
             resources: resources.into_iter().map(Into::into).collect(),
@@ -149,7 +149,7 @@ impl LeaseWatch {
         &self.shared.resources
     }
 
-    /// What the resource manager says of a claim, as of now.
+    /// What the resource manager has said of a claimed lease until now.
     pub fn check(&self, claim: &Claim<'_>) -> ClaimStatus {
         let standing = self.shared.holdings().check(claim);
         match standing {
@@ -159,20 +159,20 @@ impl LeaseWatch {
         }
     }
 
-    /// Who opened the session of a lease that holds a resource; empty where nobody knows.
+    /// The caller who opened the session of a lease that holds a resource; empty where that is not known.
     pub fn opened_by(&self, resource: &str, lease: LeaseId) -> String {
         self.shared.holdings().opened_by(resource, lease).to_owned()
     }
 
-    /// Whether the manager is heard, or was a moment ago.
+    /// Whether the manager answers, or did a moment ago.
     pub fn is_heard(&self) -> bool {
         self.shared.holdings().is_heard()
     }
 
-    /// The driver says that nothing moves any more of what a process before this one may have begun. A driver that was killed knows nothing of
-    /// its motions when it starts again, and its session may still live. Until the driver says this, no standstill is confirmed,
-    /// [`crate::provider::Provider::start_at_rest`] offers nothing, and where [`LeaseWatch::follow_session`] is used no goal begins.
-    /// [`crate::worker::Worker`] says it by itself.
+    /// Says that nothing moves any more of motions that an earlier process may have begun. A driver that was killed knows nothing of its
+    /// motions when it starts again, and its session may still live. Until this is called, no standstill is confirmed,
+    /// [`crate::provider::Provider::start_at_rest`] offers nothing, and no goal begins where [`LeaseWatch::follow_session`] is used.
+    /// [`crate::worker::Worker`] calls it by itself.
     pub fn brought_to_rest(&self) {
         self.shared.is_brought_to_rest.send_replace(true);
         // Goals that wait for this look again.
@@ -226,7 +226,7 @@ impl LeaseWatch {
         self.clone().follow(Source::Location { channels: channels.clone(), location, provider_session }, patience)
     }
 
-    /// Nothing is known any more: what is under way ends, and nothing begins until a manager is heard.
+    /// Forgets everything: goals under way end, and no goal begins until a manager answers.
     pub fn lost(&self, reason: &str) {
         self.shared.holdings().lost(reason);
         self.shared.tell(|listener| listener.leases_lost(reason));
@@ -242,7 +242,7 @@ impl LeaseWatch {
         self.shared.heard.subscribe()
     }
 
-    /// Takes what the manager tells. For tests of providers without a manager; else [`LeaseWatch::follow_session`] does it.
+    /// Takes an update of the manager. For tests of providers without a manager; otherwise [`LeaseWatch::follow_session`] does it.
     pub fn tell(&self, update: &ResourceUpdate) {
         let ended = self.shared.holdings().tell(update);
         // Whoever waits for the next lease finds the goals of the last one told to stop.
@@ -253,14 +253,14 @@ impl LeaseWatch {
         self.shared.heard.send_modify(|heard| *heard += 1);
     }
 
-    /// Every lease may have ended: what can be suspended is, until the manager is heard, and the rest ends.
+    /// Every lease may have ended: goals that can be suspended are, until the manager answers; the others end.
     pub fn unheard(&self, reason: &str) {
         self.shared.holdings().unheard(reason);
         self.shared.tell(|listener| listener.leases_unheard(reason));
         self.shared.heard.send_modify(|heard| *heard += 1);
     }
 
-    /// The watch broke: nothing begins, and what is under way goes on, until more is heard. For tests of providers without a manager.
+    /// The watch broke: no goal begins, and goals under way go on, until the manager answers. For tests of providers without a manager.
     pub fn interrupted(&self) {
         self.shared.holdings().interrupted();
     }

@@ -1,4 +1,4 @@
-//! Asks drivers for emergency stop and hold.
+//! The client of emergency stop and hold.
 
 use super::SafetyState;
 use crate::client::{CallError, Channels};
@@ -7,7 +7,7 @@ use ratn_proto::v1;
 use ratn_proto::v1::safety_service_client::SafetyServiceClient;
 use tonic::Status;
 
-/// Asks drivers.
+/// Asks a driver for emergency stop and hold.
 #[derive(Debug, Clone)]
 pub struct SafetyClient {
     client: SafetyServiceClient<crate::trace::Traced>,
@@ -15,25 +15,25 @@ pub struct SafetyClient {
 }
 
 impl SafetyClient {
-    /// Of the driver that is served there.
+    /// The client of the driver at `endpoint`.
     ///
     /// # Errors
-    /// Where the endpoint is none.
+    /// [`CallError::Broken`] when the endpoint makes no URI.
     pub fn new(channels: &Channels, endpoint: &Endpoint) -> Result<SafetyClient, CallError> {
         let client = SafetyServiceClient::new(channels.get(endpoint)?);
         Ok(SafetyClient { client, endpoint: endpoint.clone() })
     }
 
-    /// Emergency stop; what is in force then.
+    /// Emergency stop. Returns the state in force, when the driver has confirmed that nothing moves.
     ///
     /// # Errors
-    /// [`CallError`]: it may move on.
+    /// [`CallError`]: the robot may still move.
     pub async fn stop(&self, reason: &str) -> Result<SafetyState, CallError> {
         let question = v1::EmergencyStopRequest { reason: reason.to_owned() };
         self.state_of(self.client.clone().emergency_stop(question).await.map(|answer| answer.into_inner().state))
     }
 
-    /// Ends an emergency stop; what is in force then.
+    /// Ends an emergency stop. Returns the state in force.
     ///
     /// # Errors
     /// [`CallError`].
@@ -42,16 +42,16 @@ impl SafetyClient {
         self.state_of(answer.map(|answer| answer.into_inner().state))
     }
 
-    /// Pauses; what is in force then.
+    /// Hold: pauses everything that moves. Returns the state in force.
     ///
     /// # Errors
-    /// [`CallError`]: it may move on.
+    /// [`CallError`]: the robot may still move.
     pub async fn hold(&self, reason: &str) -> Result<SafetyState, CallError> {
         let question = v1::HoldRequest { reason: reason.to_owned() };
         self.state_of(self.client.clone().hold(question).await.map(|answer| answer.into_inner().state))
     }
 
-    /// Ends a pause; what is in force then.
+    /// Ends a hold. Returns the state in force.
     ///
     /// # Errors
     /// [`CallError`].
@@ -60,7 +60,7 @@ impl SafetyClient {
         self.state_of(answer.map(|answer| answer.into_inner().state))
     }
 
-    /// What is in force.
+    /// The state in force.
     ///
     /// # Errors
     /// [`CallError`].

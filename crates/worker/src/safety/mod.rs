@@ -1,15 +1,16 @@
-//! Emergency stop and hold: what every driver of something that moves serves beside its actions.
+//! Emergency stop and hold. Every driver of hardware that moves serves them beside its actions.
 //!
 //! ```text
 //!   ready ──hold──▶ held ──go on──▶ ready
 //!     └────stop──────┴─▶ stopped ──clear──▶ ready
 //! ```
-//! A [`Safety`] is the state of one driver. A stop and a hold are in force at once, and confirmed to whoever asked when the driver's
-//! [`Brakes`] have made them true (`machine`, which is pure, decides all of that; here its commands are performed). An
-//! [`crate::action::ActionServer`] that is given one ends every goal `stopped` while a stop is in force, and an action pauses itself
-//! with [`crate::action::GoalContext::while_held`]. A stop that is kept in a file
-//! outlasts the process and a reboot. What it does not do: stop
-//! motors. An emergency stop of a real robot is a circuit; this is how its software learns of one, and asks for one.
+//! A [`Safety`] is the state of one driver. A stop and a hold are in force at once. They are confirmed to the caller when the driver's
+//! [`Brakes`] have carried them out. (The pure `machine` decides all of that; this module performs its commands.) An
+//! [`crate::action::ActionServer`] with a `Safety` ends every goal `stopped` while a stop is in force; an action pauses itself with
+//! [`crate::action::GoalContext::while_held`]. A stop that is kept in a file outlasts the process and a reboot.
+//!
+//! It does not stop motors by itself. The emergency stop of a real robot is a circuit; this is how its software learns of one, and asks for
+//! one.
 
 mod client;
 mod latch;
@@ -54,20 +55,21 @@ pub enum SafetyState {
     },
 }
 
-/// What makes a state true: pauses motors, ends motions, lets them go on.
+/// Carries a state out: pauses motors, ends motions, lets them go on.
 #[tonic::async_trait]
 pub trait Brakes: Send + Sync + 'static {
-    /// Returns when the state is true: for `Held` and `Stopped`, when nothing moves. It may be asked for a state that is true already, and
-    /// is asked again for one that it did not confirm. It does not matter whether a caller still waits. A stop or a hold
-    /// does not wait for an application before it: that one is dropped at the point where it waits, and may overlap with the
-    /// next one until it gets there; what was applied meanwhile is applied once more when it is over.
+    /// Carries `state` out and returns when that is done: for `Held` and `Stopped`, when nothing moves.
+    ///
+    /// It may be called for a state that is carried out already, and is called again for one that it did not confirm, whether or not the
+    /// caller who asked still waits. A stop or a hold does not wait for an earlier call: the earlier future is dropped at the point where it
+    /// waits, and the two may overlap until it gets there. What the newer call did is then done once more.
     ///
     /// # Errors
-    /// Why it is not, or may not be.
+    /// Why the state is not carried out, or may not be.
     async fn apply(&self, state: &SafetyState) -> Result<(), String>;
 }
 
-/// For a driver whose actions look at the state themselves.
+/// Brakes for a driver whose actions look at the state themselves.
 #[derive(Debug, Clone, Copy, Default)]
 struct NoBrakes;
 
@@ -78,7 +80,7 @@ impl Brakes for NoBrakes {
     }
 }
 
-/// The state of one driver. A handle: clones share it.
+/// Emergency stop and hold of one driver. A handle: clones share the state.
 #[derive(Clone)]
 pub struct Safety {
     shared: Arc<Shared>,
@@ -108,16 +110,16 @@ struct WaitingCall<'a> {
     call: Call,
 }
 
-/// A state that could not be made so.
+/// Why a state was not carried out.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SafetyError {
-    /// Nothing goes on while an emergency stop is in force.
+    /// An emergency stop is in force, so nothing may go on.
     #[error("an emergency stop is in force ({reason}): clear it first, `ratn stop --clear`")]
     Stopped {
         /// Its reason.
         reason: String,
     },
-    /// Nothing is let go before the brakes, and the disk, have answered for what is in force.
+    /// The brakes, or the disk, have not yet confirmed the stop or the hold that is in force; nothing is released before.
     #[error(
         "{}, and not confirmed yet: it stays in force; ask for it again until it is confirmed, then end it",
         in_force(state)
@@ -126,10 +128,10 @@ pub enum SafetyError {
         /// What is in force.
         state: SafetyState,
     },
-    /// The brakes do not confirm.
+    /// The brakes did not confirm.
     #[error("not confirmed, go and look: {0}")]
     Brakes(String),
-    /// The stop is in force, and a restart may forget it, or find one that is not.
+    /// The stop cannot be written to the disk, or removed from it: after a restart, the driver may have forgotten it, or find an old one.
     #[error("the stop is in force, but not as it is on the disk, which a restart goes by: {0}")]
     Latch(String),
 }
@@ -142,16 +144,16 @@ impl Default for Safety {
 }
 
 impl Safety {
-    /// Ready, with brakes.
+    /// A driver that is ready, with these brakes.
     pub fn new(brakes: impl Brakes) -> Safety {
         Safety::of(brakes, None, Machine::new(false))
     }
 
-    /// As [`Safety::new`]; a stop is kept in `file`, and one that is there already is in force from the beginning. The file belongs
-    /// into a state directory: what is in a runtime directory is gone after a reboot.
+    /// As [`Safety::new`], with stops kept in `file`. A stop that the file holds already is in force from the beginning. Put the file into a
+    /// state directory: a runtime directory may be empty after a reboot.
     ///
     /// # Errors
-    /// Where the file is there and cannot be read, where its folder cannot be made, or where the brakes do not confirm.
+    /// The file exists and cannot be read, its folder cannot be made, or the brakes do not confirm.
     pub async fn kept_in(file: PathBuf, brakes: impl Brakes) -> io::Result<Safety> {
         let latch = Latch::at(file)?;
         let Some(reason) = latch.read()? else {
@@ -171,7 +173,7 @@ impl Safety {
         Safety { shared: Arc::new(shared), has_brakes: true }
     }
 
-    /// What is in force, and every change of it.
+    /// The state in force, and every change of it.
     pub fn watch(&self) -> watch::Receiver<SafetyState> {
         self.shared.state.subscribe()
     }
@@ -181,9 +183,9 @@ impl Safety {
         self.shared.state.borrow().clone()
     }
 
-    /// Emergency stop, from whatever state, and whatever the brakes are doing. In force at once. Returns when nothing moves and the stop is
-    /// on the disk, where it is kept. The state is `Stopped` also where that is not confirmed, or where the future is dropped; asked for
-    /// again, whatever is not confirmed is done again.
+    /// Emergency stop, from any state and whatever the brakes are doing. It is in force at once. Returns when nothing moves and the stop is on
+    /// the disk (where stops are kept). The state is `Stopped` also where that is not confirmed, or where the future is dropped. A second
+    /// call does again what was not confirmed.
     ///
     /// # Errors
     /// [`SafetyError::Brakes`], and [`SafetyError::Latch`].
@@ -192,7 +194,7 @@ impl Safety {
         self.ask(Question::Stop { reason: reason.to_owned() }).await
     }
 
-    /// Ends an emergency stop. What was stopped does not go on.
+    /// Ends an emergency stop. Goals that were stopped do not go on.
     ///
     /// # Errors
     /// [`SafetyError::Brakes`], and [`SafetyError::Latch`] where the file that keeps the stop cannot be removed: it stays in force then.
@@ -202,8 +204,8 @@ impl Safety {
         self.ask(Question::Clear).await
     }
 
-    /// Pauses what is under way and what is given until [`Safety::go_on`]. In force at once. Returns when nothing moves; asked for again,
-    /// the brakes are asked again unless they have confirmed. A stop stays a stop.
+    /// Pauses goals that run, and goals that are given, until [`Safety::go_on`]. It is in force at once. Returns when nothing moves. A second
+    /// call asks the brakes again, unless they have confirmed. During an emergency stop the stop remains.
     ///
     /// # Errors
     /// [`SafetyError::Brakes`]; while a stop is in force as [`Safety::stop`].
@@ -221,8 +223,8 @@ impl Safety {
         self.ask(Question::GoOn).await
     }
 
-    /// Has the brakes end what a process before this one may have begun; then the state in force is made true again. False where there
-    /// are no brakes.
+    /// Has the brakes end motions that an earlier process may have begun; then the state in force is carried out again. False where there are
+    /// no brakes.
     ///
     /// # Errors
     /// [`SafetyError::Brakes`].

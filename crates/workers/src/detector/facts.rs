@@ -61,7 +61,7 @@ impl Facts {
     }
 }
 
-/// What a planner has to keep clear of: of what is hollow or thin, what is around it.
+/// The shape that a planner keeps clear of. For a hollow or thin object it is the shape around it.
 fn shape(model: &Model) -> Shape {
     match *model {
         Model::Round { radius, height, .. } => Shape::Cylinder { radius, length: height },

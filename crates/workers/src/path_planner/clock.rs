@@ -1,4 +1,5 @@
-//! The planner's clock: says when the budget is over, or what improvement gets without one, and gives the processor away where more planning hardly helps.
+//! The planner's clock: it says when the budget, or without one the time for improvement, is over. It leaves the processor to others where more planning
+//! hardly helps.
 
 use ratn_model::value::Value;
 use ratn_motion::pace::{Control, Progress};
@@ -7,10 +8,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// How long a first path is looked for at the most, in our time, where the budget is shorter.
+/// How long a first path is searched for at the most, in wall time, where the budget is shorter.
 const FIRST_PATH_LIMIT: Duration = Duration::from_secs(10);
 
-/// How long a path is improved where no budget is given, in our time: that is what the processor needs, however fast the robot's time goes.
+/// How long a path is improved where no budget is given, in wall time: the processor needs that, however fast the robot's time goes.
 const IMPROVEMENT: Duration = Duration::from_millis(50);
 
 /// After this long without a quicker path the planner lets others have the processor between its iterations, …
@@ -21,7 +22,7 @@ const PAUSE: Duration = Duration::from_millis(1);
 
 pub(super) struct Clock {
     begin: Instant,
-    /// The robot's seconds in one of ours.
+    /// The robot's seconds per second of wall time.
     speed: f64,
     budget: Option<Duration>,
     first_path: Option<Duration>,

@@ -16,7 +16,7 @@ use std::time::Instant;
 /// The fraction of the base's limits where the goal says none.
 const DEFAULT_SPEED: f64 = 0.5;
 
-/// `path_planner/drive`.
+/// The action `path_planner/drive`: plans a motion of the base.
 #[derive(Debug)]
 pub struct DriveAction {
     robot: Arc<Robot>,

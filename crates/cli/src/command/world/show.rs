@@ -15,7 +15,7 @@ pub(super) fn facts(facts: &[FactRecord]) -> String {
     let rows = facts.iter().map(|fact| {
         [
             task_text::key(&fact.key),
-            task_text::value(&fact.value).unwrap_or_else(|| fact.value.to_string()),
+            said(&fact.value),
             fact.revision.0.to_string(),
             fact.writer.as_deref().unwrap_or("-").to_owned(),
             fact.measured.as_deref().map_or_else(String::new, |by| measured(by, &fact.value)),
@@ -24,11 +24,19 @@ pub(super) fn facts(facts: &[FactRecord]) -> String {
     columns(&["FACT", "VALUE", "REVISION", "WRITER", "MEASURED BY"], rows.collect())
 }
 
-/// One line each: as it was, as it is.
+/// A value as a task file says it, where it can.
+fn said(value: &Value) -> String {
+    task_text::value(value).unwrap_or_else(|| value.to_string())
+}
+
+/// One line each: as it was, as it is, and who made it so; who deletes a fact is not kept.
 pub(super) fn differences(differences: &[FactDifference]) -> String {
-    let value = |fact: &Option<FactRecord>| fact.as_ref().map_or_else(|| "-".to_owned(), |fact| fact.value.to_string());
-    let rows = differences.iter().map(|one| [one.key.to_string(), value(&one.before), value(&one.after)]);
-    columns(&["FACT", "BEFORE", "AFTER"], rows.collect())
+    let value = |fact: &Option<FactRecord>| fact.as_ref().map_or_else(|| "-".to_owned(), |fact| said(&fact.value));
+    let rows = differences.iter().map(|one| {
+        let writer = one.after.as_ref().and_then(|fact| fact.writer.as_deref()).unwrap_or("-").to_owned();
+        [task_text::key(&one.key), value(&one.before), value(&one.after), writer]
+    });
+    columns(&["FACT", "BEFORE", "AFTER", "WRITER"], rows.collect())
 }
 
 pub(super) fn differences_json(from: Revision, to: Revision, differences: &[FactDifference]) -> serde_json::Value {
@@ -53,7 +61,7 @@ pub(super) fn versions(key: &FactKey, oldest: Revision, versions: &[FactVersion]
         let fact = version.fact.as_ref();
         [
             version.revision.0.to_string(),
-            fact.map_or_else(|| "(gone)".to_owned(), |fact| fact.value.to_string()),
+            fact.map_or_else(|| "(gone)".to_owned(), |fact| said(&fact.value)),
             fact.and_then(|fact| fact.writer.as_deref()).unwrap_or("-").to_owned(),
             if version.commit.is_empty() { "-".to_owned() } else { version.commit.clone() },
         ]
@@ -75,10 +83,13 @@ pub(super) fn versions_json(oldest: Revision, versions: &[FactVersion]) -> serde
 
 /// A revision, and below what it wrote.
 pub(super) fn change(change: &WorldChange) -> String {
-    let by = if change.commit.is_empty() { "too old" } else { &change.commit };
-    let mut lines = vec![format!("revision {} ({by})", change.revision.0)];
-    lines.extend(change.written.iter().map(|fact| format!("  {} = {}", fact.key, fact.value)));
-    lines.extend(change.gone.iter().map(|key| format!("  {key} is gone")));
+    let commit = if change.commit.is_empty() { "too old" } else { &change.commit };
+    // One commit has one writer, which its facts name.
+    let writer = change.written.iter().find_map(|fact| fact.writer.as_deref());
+    let by = writer.map_or_else(String::new, |writer| format!(" by {writer}"));
+    let mut lines = vec![format!("revision {}{by} ({commit})", change.revision.0)];
+    lines.extend(change.written.iter().map(|fact| format!("  {} = {}", task_text::key(&fact.key), said(&fact.value))));
+    lines.extend(change.gone.iter().map(|key| format!("  {} is gone", task_text::key(key))));
     lines.join("\n")
 }
 
@@ -102,7 +113,7 @@ pub(super) fn rows(rows: &Rows) -> String {
     if rows.variables.is_empty() {
         return if rows.rows.is_empty() { "no" } else { "yes" }.to_owned();
     }
-    let cells = rows.rows.iter().map(|row| row.iter().map(ToString::to_string).collect());
+    let cells = rows.rows.iter().map(|row| row.iter().map(said).collect());
     table(&rows.variables, cells.collect(), rows.more)
 }
 
@@ -201,8 +212,14 @@ mod tests {
         let key = fact("box", 1).key;
         let one = FactDifference { key: key.clone(), before: Some(fact("box", 1)), after: None };
         assert_snapshot!(differences(&[one]), @r"
-        FACT       BEFORE  AFTER
-        full(box)  1       -
+        FACT       BEFORE  AFTER  WRITER
+        full(box)  1       -      -
+        ");
+        let pose = FactRecord { value: Value::Pose(Pose::at(0.5, 0.0, 1.25)), ..fact("box", 1) };
+        let one = FactDifference { key: key.clone(), before: None, after: Some(pose) };
+        assert_snapshot!(differences(&[one]), @r"
+        FACT       BEFORE  AFTER               WRITER
+        full(box)  -       pose(0.5, 0, 1.25)  fill[2]
         ");
         let gone = FactVersion { revision: Revision(9), commit: String::new(), fact: None };
         let was = FactVersion { revision: Revision(3), commit: "run/i1".to_owned(), fact: Some(fact("box", 1)) };
@@ -212,6 +229,22 @@ mod tests {
         3         1       fill[2]  run/i1
         kept since revision 2
         ");
+    }
+
+    #[test]
+    fn a_revision_says_which_state_made_it_and_values_as_a_task_file_does() {
+        let written = vec![FactRecord { value: Value::Pose(Pose::at(0.5, 0.0, 1.25)), ..fact("box", 1) }];
+        let made = WorldChange { revision: Revision(3), commit: "run/i1".to_owned(), written, gone: Vec::new() };
+        assert_snapshot!(change(&made), @r"
+        revision 3 by fill[2] (run/i1)
+          full(box) = pose(0.5, 0, 1.25)
+        ");
+        let gone = vec![FactKey { predicate: "full".to_owned(), arguments: vec![Term::Name("box 2".to_owned())] }];
+        let made = WorldChange { revision: Revision(4), commit: String::new(), written: Vec::new(), gone };
+        assert_snapshot!(change(&made), @r#"
+        revision 4 (too old)
+          full("box 2") is gone
+        "#);
     }
 
     #[test]
@@ -225,6 +258,8 @@ mod tests {
         ?box   ?n
         box_1  2
         ");
+        let pose = Value::Pose(Pose::at(0.5, 0.0, 1.25));
+        assert!(super::rows(&rows(&["at"], vec![vec![pose]])).ends_with("pose(0.5, 0, 1.25)"));
         assert_eq!(super::rows(&rows(&[], vec![Vec::new()])), "yes");
         assert_eq!(super::rows(&rows(&[], Vec::new())), "no");
     }
