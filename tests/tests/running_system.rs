@@ -70,7 +70,7 @@ fn a_task_runs_on_the_system_that_is_up_and_leaves_it_running() -> anyhow::Resul
     // Once more, on a table like the first, of which nothing is known.
     let output = place.ratn(&["reset"]).output()?;
     let (out, err) = support::texts(&output);
-    ensure!(output.status.success() && out.contains("1 boxes") && !out.contains(" 0 facts"), "{out}{err}");
+    ensure!(output.status.success() && out.contains("with 1 box,") && !out.contains(" 0 facts"), "{out}{err}");
     let again = ["run", task, "--set", "boxes=1", "--set", "budget=false"];
     let (out, err) = support::texts(&place.ratn(&again).output()?);
     ensure!(out.contains("delivered = 1") && !err.contains("ratn reset"), "{out}{err}");
