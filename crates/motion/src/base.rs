@@ -81,7 +81,7 @@ pub struct DrivePlan {
 /// Why there is no way.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum DriveError {
-    /// The request makes no sense.
+    /// A part of the request is out of range or contradicts the robot.
     #[error("{what} is {value}: expected {expected}")]
     Malformed {
         /// Which part of it.
@@ -118,7 +118,7 @@ pub enum DriveError {
     /// Nothing was found.
     #[error(transparent)]
     NoPath(ConnectError),
-    /// The caller gave up.
+    /// The caller cancelled the planning.
     #[error("planning was cancelled")]
     Cancelled,
 }

@@ -105,7 +105,7 @@ pub enum ConnectError {
         /// How many.
         iterations: usize,
     },
-    /// The caller gave up.
+    /// The caller cancelled the planning.
     #[error("the search was cancelled")]
     Cancelled,
 }

@@ -30,8 +30,8 @@ use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_world::scene::Scene;
 
-/// The padding where the start is too close to something for the usual one, in metres. As much room is on a free path at the least; a
-/// controller that gives up there stops a little beside it, so a start with less is left, too, as long as it touches nothing.
+/// The padding, in metres, where the start is too close to something for the usual padding. A free path keeps at least this distance. A
+/// controller that aborts on such a path stops a little beside it, so planning may also begin at a start with less room that touches nothing.
 const TIGHT_PADDING_M: f64 = 0.002;
 
 /// The paddings that a start may have, in the order in which they are tried.

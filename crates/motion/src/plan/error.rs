@@ -9,7 +9,7 @@ pub(super) const MAX_REASONS: usize = 5;
 /// Why there is no plan.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PlanError {
-    /// The request makes no sense.
+    /// A part of the request is out of range or contradicts the robot.
     #[error("{what} is {value}: expected {expected}")]
     Malformed {
         /// Which part of it.
@@ -47,7 +47,7 @@ pub enum PlanError {
         /// The different reasons.
         reasons: Vec<String>,
     },
-    /// The tool cannot go straight to any of the goals.
+    /// The tool reaches none of the goals in a straight line.
     #[error("no straight way to any of the {goals} goals: {}", reasons.join("; "))]
     NoStraightWay {
         /// How many alternatives there were.
@@ -55,7 +55,7 @@ pub enum PlanError {
         /// How far the tool gets and why no further, of some of them.
         reasons: Vec<String>,
     },
-    /// What the tool is to keep does not hold.
+    /// A constraint on the tool is broken where it has to hold.
     #[error("{place} {reason}")]
     NotKept {
         /// Where.
@@ -78,7 +78,7 @@ pub enum PlanError {
     /// The caller's time was up before there was any path.
     #[error("no path was found in the time given")]
     TimeUp,
-    /// The caller gave up.
+    /// The caller cancelled the planning.
     #[error("planning was cancelled")]
     Cancelled,
 }

@@ -17,7 +17,7 @@ use rand::RngExt;
 /// Of a hundred steps of improvement, those that look for a new candidate.
 const NEW_CANDIDATES: i32 = 8;
 
-/// A path must have become this much quicker to be worth a word, in seconds.
+/// A path must have become this much quicker to be reported, in seconds.
 const LEAST_REPORT_S: f32 = 1e-3;
 
 /// The motion is timed exactly after so many steps of improvement, and after four times as many, again and again.
