@@ -170,12 +170,9 @@ pub enum WorkerError {
 ///
 /// ```no_run
 /// # use ratn_worker::prelude::*;
-/// # fn main() -> std::process::ExitCode {
-/// let worker = match Worker::from_args() {
-///     Ok(worker) => worker.provides("inspector", "Inspector"),
-///     Err(error) => { eprintln!("{error}"); return std::process::ExitCode::from(2) }
-/// };
-/// worker.start()
+/// # fn started() -> Result<std::process::ExitCode, ArgumentError> {
+/// let worker = Worker::from_args()?.provides("inspector", "Inspector");
+/// Ok(worker.start())
 /// # }
 /// ```
 #[derive(Debug)]
