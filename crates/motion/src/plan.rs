@@ -258,7 +258,7 @@ pub fn plan(
         checker: Checker::new(robot, scene, &here, PADDING_M).reaching_into(&request.reaches_into),
         space: arm::space(&mechanism, &obstacles),
         reach: Reach::new(&mechanism, robot.tool, Pose::IDENTITY),
-        base: arm::on_floor(&scene.base),
+        base: arm::on_floor(robot, &scene.base),
         constraint: None,
         rough: Rough::new(&request.joints(robot), request.speed),
         depart: Vec::new(),
