@@ -20,6 +20,8 @@ fn main() {
         "everything" => Features::EVERYTHING,
         "weak" => Features::WEAK,
         "imprecise" => Features::IMPRECISE,
+        "guards" => Features::GUARDS,
+        "guards-weak" => Features { guards: true, ..Features::WEAK },
         "short" => Features { long: false, ..Features::EVERYTHING },
         "alone" => Features { regions: false, preemptive: false, ..Features::ALL },
         _ => Features::ALL,
