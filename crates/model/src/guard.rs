@@ -404,8 +404,8 @@ impl Unfolding<'_> {
         for (from, outcome, to) in &self.links {
             states[from.0 as usize].transitions.insert(outcome.clone(), to.clone());
         }
-        // The inner ones were made last.
-        for (around, body) in self.outputs.iter().rev() {
+        // The inner ones were made first.
+        for (around, body) in &self.outputs {
             let port = |name: &String, ty: &Type| {
                 let value = Expr::Port { state: *body, port: name.clone() };
                 TaskOutput { name: name.clone(), ty: ty.clone(), value }

@@ -21,6 +21,7 @@ fn main() {
         "weak" => Features::WEAK,
         "imprecise" => Features::IMPRECISE,
         "guards" => Features::GUARDS,
+        "guards-short" => Features { long: false, ..Features::GUARDS },
         "guards-weak" => Features { guards: true, ..Features::WEAK },
         "short" => Features { long: false, ..Features::EVERYTHING },
         "alone" => Features { regions: false, preemptive: false, ..Features::ALL },
