@@ -11,6 +11,7 @@ pub mod diagnostic;
 pub mod expression;
 pub mod fact;
 pub mod grasp;
+pub mod guard;
 pub mod id;
 pub mod load;
 pub mod measurement;

@@ -40,6 +40,7 @@ use crate::check;
 use crate::diagnostic::{Diagnostic, Findings, Severity};
 use crate::expression::EffectExpr;
 use crate::expression::scope::NothingKnown;
+use crate::guard;
 use crate::id::StateId;
 use crate::ontology::Ontology;
 use crate::ontology::turtle::{self, OntologyError};
@@ -219,6 +220,21 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     };
     flow::inherit_exceptions(&mut program.states);
     flow::outcomes_exist(&task, &program, out);
+    if !out.guards.is_empty() && !out.findings.has_errors() {
+        match guard::unfold(&mut program, &out.guards) {
+            Ok(places) => out.places.move_to(&places),
+            Err(guard::TooManyStates) => {
+                let message = "what is done on every way out is there once for each outcome: more than 20,000 states";
+                out.findings.error(
+                    "invalid-state",
+                    root.at,
+                    "",
+                    message,
+                    "put fewer states with `finally` into one another",
+                );
+            }
+        }
+    }
     Some(program)
 }
 

@@ -22,6 +22,11 @@ pub const PREEMPTED: &str = "preempted";
 /// The outcome of a goal that an emergency stop ended. It is `preempted` to a state whose action has none of this name.
 pub const STOPPED: &str = "stopped";
 
+/// The provider of what the executive does itself. No task file can name it.
+pub const CLOCK: &str = "(clock)";
+/// Its action: after so many `seconds` of the robot's time it has succeeded.
+pub const WAIT: &str = "wait";
+
 /// A loaded task program.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Program {
@@ -214,9 +219,49 @@ pub struct Annotations {
     pub deterministic: bool,
     /// On a region: facts that other regions may touch too. The programmer answers for their order.
     pub shared: Vec<FactExpr>,
+    /// That a sequence was made of a state that is tried again ([`crate::guard`]).
+    pub again: Option<Again>,
+    /// That a sequence was made of a state with something to do on every way out.
+    pub finally: Option<Finally>,
 }
 
-/// How often and after which pauses a state that ends `aborted` is tried again. Only the last try's outcome, outputs and effects
+/// What a state became that is tried again. It is said once more what its transitions and variables come to.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Again {
+    /// What is tried.
+    pub body: StateId,
+    /// How many tries after the first.
+    pub count: u32,
+    /// The outcomes after which it is.
+    pub on: Vec<String>,
+    /// What is done before each further try.
+    pub before: Option<StateId>,
+}
+
+/// What a state became that has something to do on every way out.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Finally {
+    /// What was to be done.
+    pub body: StateId,
+    /// What is done behind it, by its outcome.
+    pub lastly: BTreeMap<String, StateId>,
+}
+
+impl Annotations {
+    /// Every state that what a state became names.
+    pub fn each_mark_mut(&mut self, visit: &mut dyn FnMut(&mut StateId)) {
+        if let Some(again) = &mut self.again {
+            visit(&mut again.body);
+            again.before.iter_mut().for_each(&mut *visit);
+        }
+        if let Some(finally) = &mut self.finally {
+            visit(&mut finally.body);
+            finally.lastly.values_mut().for_each(visit);
+        }
+    }
+}
+
+/// How often and after which pauses an action that ends `aborted` is tried again. Only the last try's outcome, outputs and effects
 /// count; each try has a seed of its own.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Retry {
@@ -385,6 +430,11 @@ impl Program {
 }
 
 impl State {
+    /// Whether it is a pause, which the executive does itself: no provider gets a goal.
+    pub fn is_pause(&self) -> bool {
+        matches!(&self.kind, StateKind::Action { provider, .. } if provider == CLOCK)
+    }
+
     /// Whether it is executed as one node although it contains others: what is marked so, and every preemptive concurrency.
     pub fn is_routine(&self) -> bool {
         match self.kind {

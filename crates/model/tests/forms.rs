@@ -310,7 +310,6 @@ states:
     task.yaml:9:60: error[type-mismatch] in b: expected true or false, found text
     task.yaml:9:110: error[conflicting-annotations] in b: `unordered` is said of a `block`. help: leave it out: nothing of it is held while the state runs
     task.yaml:10:68: error[type-mismatch] in c: the default of `n` is string, not int
-    task.yaml:10:78: error[unknown-key] in c: there is no key `retry` here. help: leave it out
     "#);
 }
 

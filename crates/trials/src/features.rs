@@ -48,6 +48,8 @@ pub struct Features {
     pub weak: bool,
     /// Parts of expressions stand in comprehensions that come to the same.
     pub lists: bool,
+    /// States that are tried again, with something done before; something that is done on every way out.
+    pub guards: bool,
 }
 
 impl Features {
@@ -75,6 +77,7 @@ impl Features {
         blind: false,
         weak: false,
         lists: false,
+        guards: false,
     };
 
     /// Sequences, hierarchies, loops over lists, conditions, routines and actions alone.
@@ -101,6 +104,7 @@ impl Features {
         blind: false,
         weak: false,
         lists: false,
+        guards: false,
     };
 
     /// [`Features::ALL`], without those assumptions.
@@ -123,6 +127,9 @@ impl Features {
 
     /// [`Features::EVERYTHING`], said with comprehensions.
     pub const LISTS: Features = Features { lists: true, ..Features::EVERYTHING };
+
+    /// [`Features::EVERYTHING`], with retries of composites and what is done on every way out.
+    pub const GUARDS: Features = Features { guards: true, ..Features::EVERYTHING };
 
     /// Imprecise motions that fail, in programs that never look at the world: where a failure leads is then the same in both
     /// modes, whatever younger motions have done meanwhile.

@@ -7,7 +7,7 @@
 //!
 //! | | |
 //! |---|---|
-//! | the tree | `list`, `composite`, `regions`, `action`, `long`, `patterns` |
+//! | the tree | `list`, `composite`, `regions`, `action`, `guards`, `long`, `patterns` |
 //! | what is said of a state | `annotations`, `variables`, `supplies`, `estimates` |
 //! | facts | `facts`, `effects`, `tolerance` |
 //!
@@ -23,6 +23,7 @@ use super::{
 };
 use annotations::{block, resource, task_resource};
 use ratn_model::expression::{BinaryOperator, EffectExpr, Expr, FactExpr, Function, UnaryOperator};
+use ratn_model::guard::Guard;
 use ratn_model::id::StateId;
 use ratn_model::program::{
     ABORTED, Annotations, Exceptions, Location, PREEMPTED, Program, SUCCESS, State, StateKind, Target, TaskOutput,
@@ -37,6 +38,7 @@ mod composite;
 mod effects;
 mod estimates;
 pub(super) mod facts;
+mod guards;
 mod list;
 mod long;
 mod patterns;
@@ -50,7 +52,8 @@ const MAX_STATES: usize = 26;
 
 /// The random program of a seed.
 pub fn program(seed: u64, features: &Features) -> Program {
-    let mut maker = Maker { dice: Dice(seed), states: Vec::new(), features: *features };
+    let (states, guards) = Default::default();
+    let mut maker = Maker { dice: Dice(seed), states, guards, features: *features };
     maker.push("root".to_owned(), String::new(), None);
     let known = facts::predicates(features);
     let room = Room {
@@ -103,6 +106,10 @@ pub fn program(seed: u64, features: &Features) -> Program {
         states: maker.states,
         digest: String::new(),
     };
+    if !maker.guards.is_empty() {
+        let unfolded = ratn_model::guard::unfold(&mut program, &maker.guards);
+        assert!(unfolded.is_ok(), "a random program is small");
+    }
     if features.tolerance {
         tolerance::declare(&mut program, &mut maker.dice);
     }
@@ -197,6 +204,7 @@ pub(super) struct Visible {
 pub(super) struct Maker {
     pub(super) dice: Dice,
     pub(super) states: Vec<State>,
+    pub(super) guards: BTreeMap<StateId, Guard>,
     pub(super) features: Features,
 }
 

@@ -45,9 +45,24 @@ pub(super) fn without(program: &Program, id: StateId) -> Program {
             Target::Outcome(_) => true,
         });
         state.each_expression_mut(&mut |_, expression| expression.rewrite(&mut |part| renumber(part)));
+        state.annotations.each_mark_mut(&mut |marked| *marked = numbers.get(marked).copied().unwrap_or(*marked));
     }
     next.outputs.iter_mut().for_each(|output| output.value.rewrite(&mut |part| renumber(part)));
     next
+}
+
+/// Whether a state is one of those that a retry or a `finally` was made into, which stay as they were made.
+pub(super) fn is_of_a_guard(program: &Program, id: StateId) -> bool {
+    let is_marked = |id: StateId| {
+        let annotations = &program.state(id).annotations;
+        annotations.again.is_some() || annotations.finally.is_some()
+    };
+    let parent = program.state(id).parent;
+    // The step out of the condition that counts the tries.
+    let of_condition = parent.filter(|parent| matches!(program.state(*parent).kind, StateKind::Condition { .. }));
+    is_marked(id)
+        || parent.is_some_and(is_marked)
+        || of_condition.and_then(|condition| program.state(condition).parent).is_some_and(is_marked)
 }
 
 fn lists(kind: &mut StateKind) -> Vec<&mut Vec<StateId>> {

@@ -1,7 +1,7 @@
 //! From a program that fails to a small one that still does: states are taken out and annotations simplified, one at a time, as
 //! long as anything can go.
 
-use super::rewrite::without;
+use super::rewrite::{is_of_a_guard, without};
 use super::trial::{Conditions, Verdict, trial};
 use super::{BATTERY, POWER, TOOL, around, is_preemptive};
 use ratn_model::expression::{EffectExpr, Expr, Function};
@@ -71,7 +71,10 @@ fn candidate(best: &Shrunk, step: usize) -> Option<(Program, Conditions)> {
         let id = program.states[states - 1 - step].id;
         // The regions of a preemptive concurrency go with it or stay: without actions they would end at one moment.
         let held = around(&program, program.state(id)).skip(1).any(is_preemptive);
-        if id != Program::ROOT && !held {
+        let is_whole = program.state(id).annotations.again.is_some() || program.state(id).annotations.finally.is_some();
+        let stays = is_of_a_guard(&program, id)
+            && !(is_whole && program.state(id).parent.is_some_and(|parent| !is_of_a_guard(&program, parent)));
+        if id != Program::ROOT && !held && !stays {
             program = without(&program, id);
         }
         return Some((program, conditions));
@@ -110,7 +113,10 @@ fn candidate(best: &Shrunk, step: usize) -> Option<(Program, Conditions)> {
     if at >= states {
         return None;
     }
-    simplify(&mut program, at, what);
+    let id = program.states[at].id;
+    if !is_of_a_guard(&program, id) {
+        simplify(&mut program, at, what);
+    }
     Some((program, conditions))
 }
 

@@ -21,6 +21,10 @@ impl Interpreter {
             match current.phase {
                 Phase::Backoff(until) if until <= context.now => self.try_now(context, thread),
                 Phase::Running if current.timeout.is_some_and(|at| at <= context.now) => {
+                    if context.program.state(current.state).is_pause() {
+                        self.has_waited(context, thread);
+                        continue;
+                    }
                     let limit = context.program.state(current.state).annotations.timeout_s.unwrap_or_default();
                     context.commands.push(Command::Cancel { instance, attempt });
                     if !self.is_tried_again(context, thread) {

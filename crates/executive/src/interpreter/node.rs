@@ -175,6 +175,7 @@ impl Interpreter {
             Ok(inputs) => inputs,
             Err(error) => return self.end_node(context, thread, error.reason()),
         };
+        let pause_s = binding::pause_s(state, &inputs);
         let (instance, attempt) = (current.instance, current.attempt);
         let tries = if state.annotations.deterministic { 1 } else { current.tries };
         let mut seed = binding::Seed::of(context.seed);
@@ -189,7 +190,7 @@ impl Interpreter {
             expected_s: self.with_scope(context, thread, None, |scope| binding::expected_s(state, scope)),
             timeout_s: state.annotations.timeout_s,
         };
-        let timeout = state.annotations.timeout_s.map(|seconds| context.now + duration(seconds));
+        let timeout = pause_s.or(state.annotations.timeout_s).map(|seconds| context.now + duration(seconds));
         if self.routine_of(thread).is_none() && self.is_pia(context, thread) {
             self.hold.has_begun();
         }
@@ -200,7 +201,19 @@ impl Interpreter {
         self.has_begun_something(thread);
         context.commands.extend(timeout.map(|at| Command::Wake { at }));
         context.note(Note::Running { instance, attempt });
-        context.commands.push(Command::Start { instance, attempt, goal: Box::new(goal) });
+        if pause_s.is_none() {
+            context.commands.push(Command::Start { instance, attempt, goal: Box::new(goal) });
+        }
+    }
+
+    /// A pause is over.
+    pub(super) fn has_waited(&mut self, context: &mut Context<'_>, thread: u64) {
+        let (outputs, measured, evidence) = Default::default();
+        self.finish(
+            context,
+            thread,
+            GoalEnd { outcome: SUCCESS.to_owned(), outputs, measured, evidence, reason: String::new() },
+        );
     }
 
     /// It ends `aborted` without having done anything (more).

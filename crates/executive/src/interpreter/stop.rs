@@ -67,6 +67,7 @@ impl Interpreter {
         let Some(current) = self.threads.get_mut(&id).and_then(|thread| thread.current.take()) else { return };
         match current.phase {
             Phase::Held | Phase::Stalled | Phase::Backoff(_) => {}
+            Phase::Running if context.program.state(current.state).is_pause() => {}
             Phase::Acquiring => context.commands.push(Command::Withdraw { instance: current.instance }),
             Phase::Projecting | Phase::Running => {
                 context.commands.push(Command::Cancel { instance: current.instance, attempt: current.attempt });

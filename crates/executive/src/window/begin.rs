@@ -330,6 +330,7 @@ impl Window {
         let Some(node) = self.graph.node(id) else { return };
         let Status::Granted(held) = &node.status else { return };
         let attempt = node.attempt;
+        let pause_s = binding::pause_s(state, &inputs);
         let goal = Goal {
             provider,
             action,
@@ -340,12 +341,14 @@ impl Window {
             expected_s,
             timeout_s: state.annotations.timeout_s,
         };
-        if let Some(timeout_s) = state.annotations.timeout_s {
+        if let Some(timeout_s) = pause_s.or(state.annotations.timeout_s) {
             self.set_timer(context, timeout_s, Timer::Timeout(id, attempt));
         }
         self.graph.run(id);
         context.note(Note::Running { instance: id, attempt });
-        context.commands.push(Command::Start { instance: id, attempt, goal: Box::new(goal) });
+        if pause_s.is_none() {
+            context.commands.push(Command::Start { instance: id, attempt, goal: Box::new(goal) });
+        }
     }
 
     /// Each change with the path of who makes it.

@@ -4,7 +4,7 @@ use super::Window;
 use super::graph::instance::{Changed, Ended, Held, Instance, Status};
 use super::growth::environment::assigned;
 use super::waits::{Timer, Wait};
-use crate::binding;
+use crate::binding::{self, Outputs};
 use crate::context::Context;
 use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
 use crate::plan::gives_outputs;
@@ -51,6 +51,10 @@ impl Window {
                     let is_running =
                         instance.node().is_some_and(|node| node.attempt == attempt && node.status.is_running());
                     if !is_running {
+                        continue;
+                    }
+                    if context.program.state(instance.state).is_pause() {
+                        self.finish(context, id, Ended::success(Outputs::new()));
                         continue;
                     }
                     let limit = context.program.state(instance.state).annotations.timeout_s.unwrap_or_default();
@@ -202,7 +206,9 @@ impl Window {
     pub(super) fn stop_node(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(node) = self.graph.node(id) else { return };
         let attempt = node.attempt;
+        let is_pause = self.graph.get(id).is_some_and(|instance| context.program.state(instance.state).is_pause());
         match &node.status {
+            Status::Running(_) if is_pause => {}
             Status::Acquiring { .. } => context.commands.push(Command::Withdraw { instance: id }),
             Status::Projecting(_) | Status::Running(_) => {
                 context.commands.push(Command::Cancel { instance: id, attempt });

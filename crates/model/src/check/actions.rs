@@ -8,7 +8,9 @@ use crate::program::{State, StateKind};
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     let all = subject.program.all_outcomes();
     for (state, own) in subject.program.states.iter().zip(&all) {
-        if let StateKind::Action { provider, action, inputs, .. } = &state.kind {
+        if let StateKind::Action { provider, action, inputs, .. } = &state.kind
+            && !state.is_pause()
+        {
             ports(subject, state, provider, action, inputs.iter().map(|(port, _)| port.as_str()).collect(), findings);
         }
         outcomes(subject, state, own, findings);
@@ -55,7 +57,7 @@ fn ports(
 /// Effects may be declared only for outcomes that the state can have.
 fn outcomes(subject: &Subject<'_>, state: &State, own: &[String], findings: &mut Findings) {
     if let StateKind::Action { provider, action, .. } = &state.kind
-        && subject.catalogue.action(provider, action).is_none()
+        && (subject.catalogue.action(provider, action).is_none() && !state.is_pause())
     {
         // Complained of already.
         return;

@@ -5,6 +5,7 @@ use super::yaml::{Content, Entry, Node};
 use crate::diagnostic::Findings;
 use crate::expression::parse::{Names, ParseError, parse_effect, parse_expression, parse_fact};
 use crate::expression::{EffectExpr, Expr, FactExpr};
+use crate::guard::Guard;
 use crate::id::StateId;
 use crate::program::Location;
 use crate::resource::Quantity;
@@ -22,6 +23,17 @@ impl Places {
         self.places.insert((state, part.into()), at);
     }
 
+    /// The states have become others: transitions belong to the outermost of those that one became, all else to the innermost.
+    pub(crate) fn move_to(&mut self, places: &BTreeMap<StateId, Vec<StateId>>) {
+        let moved = std::mem::take(&mut self.places).into_iter().map(|((id, part), at)| {
+            let is_outside = part.starts_with("transitions") || part == "exceptional" || part.starts_with("shared");
+            let layers = places.get(&id).map_or(&[][..], Vec::as_slice);
+            let now = if is_outside { layers.first() } else { layers.last() };
+            ((now.copied().unwrap_or(id), part), at)
+        });
+        self.places = moved.collect();
+    }
+
     /// The place of a part; of the state where the part's is not known.
     pub(crate) fn of(&self, state: StateId, part: &str, fallback: Location) -> Location {
         self.places.get(&(state, part.to_owned())).copied().unwrap_or(fallback)
@@ -37,6 +49,8 @@ pub(crate) struct Output {
     pub(crate) declares_world: bool,
     /// The paths of the states that use a library.
     pub(crate) libraries: Vec<String>,
+    /// What stands around states.
+    pub(crate) guards: BTreeMap<StateId, Guard>,
 }
 
 /// Reads fields on behalf of one state.

@@ -2,9 +2,10 @@
 
 use super::fields::{Fields, Output};
 use super::names::{Task, suggestion};
-use super::outline::{Form, Step};
+use super::outline::{Branch, Form, Step};
 use super::yaml::{Content, Node};
 use crate::expression::Expr;
+use crate::guard::{Guard, Retried};
 use crate::id::StateId;
 use crate::program::{
     ABORTED, Annotations, Exceptions, Location, PREEMPTED, Program, Retry, SUCCESS, State, StateKind, Target,
@@ -65,7 +66,8 @@ pub(crate) fn transitions(fields: &mut Fields<'_, '_>, id: StateId) -> BTreeMap<
     };
     let siblings: Vec<(StateId, &str)> =
         fields.task.outline.siblings(id).iter().map(|id| (*id, fields.task.outline.step(*id).name.as_str())).collect();
-    let leaving = leaving(around);
+    let is_inside = matches!(step.branch, Branch::First | Branch::Otherwise);
+    let leaving = if is_inside { leaving(around) } else { [SUCCESS, ABORTED, PREEMPTED].map(str::to_owned).into() };
     for entry in fields.mapping(step.body, "transitions", "{ aborted: give_up }") {
         fields.note(format!("transitions.{}", entry.key), entry.at);
         let Some(to) = fields.word(&entry.value, "a state or an outcome") else { continue };
@@ -106,7 +108,9 @@ pub(crate) fn outcomes_exist(task: &Task<'_>, program: &Program, out: &mut Outpu
         let own = &all[state.id.0 as usize];
         let connected = state.transitions.keys().map(|outcome| (outcome, format!("transitions.{outcome}")));
         let marked = state.annotations.exceptional.iter().map(|outcome| (outcome, "exceptional".to_owned()));
-        for (outcome, part) in connected.chain(marked).filter(|(outcome, _)| !own.contains(outcome)) {
+        let retried = out.guards.get(&state.id).and_then(|guard| guard.retried.as_ref());
+        let tried = retried.into_iter().flat_map(|retried| &retried.on).map(|outcome| (outcome, "retry.on".to_owned()));
+        for (outcome, part) in connected.chain(marked).chain(tried).filter(|(outcome, _)| !own.contains(outcome)) {
             let at = out.places.of(state.id, &part, state.location);
             let help = suggestion(outcome, own.iter().map(String::as_str), "", "declare it under `outcomes`");
             out.findings.error(
@@ -206,16 +210,7 @@ pub(crate) fn decide(fields: &mut Fields<'_, '_>, body: &Node) -> Vec<(String, E
 
 /// Retry, timeout, exceptions, determinism, shared facts.
 pub(crate) fn annotate(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotations) {
-    if let Some(node) = body.get("retry") {
-        let count = node.get("count").unwrap_or(node);
-        if node.get("count").is_some() {
-            fields.keys(node, &["count", "backoff"]);
-        }
-        let backoff_s = node.get("backoff").map_or(Some(0.0), |node| seconds(fields, node, "backoff"));
-        if let (Some(count), Some(backoff_s)) = (fields.count(count, "retry", 1), backoff_s) {
-            annotations.retry = Some(Retry { count, backoff_s });
-        }
-    }
+    retry(fields, body, annotations);
     annotations.timeout_s = body.get("timeout").and_then(|node| positive(fields, node, "timeout"));
     annotations.exceptions = body.get("exceptions").and_then(|node| exceptions(fields, node));
     annotations.deterministic = body.get("deterministic").is_some_and(|node| fields.flag(node));
@@ -230,6 +225,49 @@ pub(crate) fn annotate(fields: &mut Fields<'_, '_>, body: &Node, annotations: &m
     }
     for node in body.get("shared").into_iter().flat_map(Node::items) {
         annotations.shared.extend(fields.fact(node));
+    }
+}
+
+/// `retry: 2` or `retry: {times, backoff, on, before}`. What the executive does itself stays with the action; the rest stands around the
+/// state.
+fn retry(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotations) {
+    let Some(id) = fields.view.state else { return };
+    let step = fields.task.outline.step(id);
+    let mut guard = Guard { retried: None, finally: step.finally.clone() };
+    if let Some(node) = body.get("retry") {
+        let is_long = matches!(node.content, Content::Map(_));
+        if is_long {
+            fields.keys(node, &["times", "count", "backoff", "on", "before"]);
+        }
+        let times = node.get("times").or_else(|| node.get("count")).unwrap_or(node);
+        let backoff_s = node.get("backoff").map_or(Some(0.0), |node| seconds(fields, node, "backoff"));
+        let count = fields.count(times, "retry", 1);
+        let mut on = Vec::new();
+        for node in node.get("on").into_iter().flat_map(Node::items) {
+            fields.note("retry.on", node.at);
+            on.extend(fields.word(node, "an outcome").map(str::to_owned));
+        }
+        if on.iter().any(|outcome| outcome == SUCCESS) {
+            let help = "name outcomes after which it is tried again; without `on` that is `aborted`";
+            fields.error("invalid-state", node.at, "a state that has succeeded is not tried again", help);
+        }
+        on.sort();
+        on.dedup();
+        let by_itself = on.is_empty() || on == [ABORTED];
+        if on.is_empty() {
+            on.push(ABORTED.to_owned());
+        }
+        let is_action = matches!(step.form, Form::Action { .. });
+        if let (Some(count), Some(backoff_s)) = (count, backoff_s) {
+            if is_action && by_itself && step.before.is_empty() {
+                annotations.retry = Some(Retry { count, backoff_s });
+            } else {
+                guard.retried = Some(Retried { count, backoff_s, on, before: step.before.clone() });
+            }
+        }
+    }
+    if guard != Guard::default() {
+        fields.out.guards.insert(id, guard);
     }
 }
 

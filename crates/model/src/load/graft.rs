@@ -112,6 +112,7 @@ impl Moving {
                 *id = self.moved(*id);
             }
         }
+        state.annotations.each_mark_mut(&mut |marked| *marked = self.moved(*marked));
         state.variables.iter_mut().chain(&mut state.assign).for_each(|(name, _)| self.variable(name));
         state.annotations.effects.values_mut().flatten().for_each(|effect| self.quantifiers(effect));
         state.each_expression_mut(&mut |_, expression| expression.rewrite(&mut |part| self.expression(part)));

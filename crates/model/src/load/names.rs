@@ -61,8 +61,7 @@ impl Task<'_> {
     /// The variables that the loops around a state bind, innermost first.
     pub(crate) fn loop_variables(&self, state: StateId) -> impl Iterator<Item = &str> {
         self.outline
-            .around(state)
-            .skip(1)
+            .containers(state)
             .flat_map(|id| match &self.outline.step(id).form {
                 Form::ForEach { variable, index, .. } => [Some(variable.as_str()), index.as_deref()],
                 Form::While { index, .. } => [index.as_deref(), None],
@@ -79,7 +78,7 @@ impl Task<'_> {
 
     /// The scoped variables of the states around one, innermost first.
     pub(crate) fn scoped_variables(&self, state: StateId, inside: bool) -> impl Iterator<Item = &str> {
-        let around = self.outline.around(state).skip(usize::from(!inside));
+        let around = inside.then_some(state).into_iter().chain(self.outline.containers(state));
         around.flat_map(|id| {
             let declared = self.outline.step(id).body.get("variables");
             declared.into_iter().flat_map(|node| node.entries()).map(|entry| entry.key.as_str())
@@ -155,8 +154,7 @@ impl Names for NamesFrom<'_, '_> {
             });
         };
         let ports = &self.task.ports[id.0 as usize];
-        let around = self.task.outline.step(id).parent.map(|parent| &self.task.outline.step(parent).form);
-        if port == OUTCOME && matches!(around, Some(Form::Concurrency { .. })) {
+        if port == OUTCOME && self.task.outline.is_region(id) {
             return Ok(Expr::Port { state: id, port: port.to_owned() });
         }
         if !ports.open && !ports.types.contains_key(port) {

@@ -52,6 +52,10 @@ pub(crate) struct Step<'a> {
     /// Its siblings are the steps of the same parent and branch.
     pub(crate) branch: Branch,
     pub(crate) form: Form<'a>,
+    /// What is done before it is tried again.
+    pub(crate) before: Vec<StateId>,
+    /// What is done on every way out.
+    pub(crate) finally: Vec<StateId>,
     /// Its mapping.
     pub(crate) body: &'a Node,
     pub(crate) at: Location,
@@ -64,6 +68,10 @@ pub(crate) enum Branch {
     First,
     /// `else`
     Otherwise,
+    /// `retry: {before: …}`: in none of its lists, and not inside of it.
+    Before,
+    /// `finally`: likewise.
+    Finally,
 }
 
 /// What a step is.
@@ -108,8 +116,11 @@ impl Outline<'_> {
     /// The siblings of a step, itself included, in program order.
     pub(crate) fn siblings(&self, id: StateId) -> &[StateId] {
         let step = self.step(id);
-        match (step.parent.map(|parent| &self.step(parent).form), step.branch) {
+        let parent = step.parent.map(|parent| self.step(parent));
+        match (parent.map(|parent| &parent.form), step.branch) {
             (Some(Form::Condition { otherwise, .. }), Branch::Otherwise) => otherwise,
+            (Some(_), Branch::Before) => parent.map_or(&[], |parent| &parent.before),
+            (Some(_), Branch::Finally) => parent.map_or(&[], |parent| &parent.finally),
             (Some(form), _) => form.first_branch(),
             (None, _) => &[],
         }
@@ -117,12 +128,29 @@ impl Outline<'_> {
 
     /// Whether a step is a region of a concurrency.
     pub(crate) fn is_region(&self, id: StateId) -> bool {
-        self.step(id).parent.is_some_and(|parent| matches!(self.step(parent).form, Form::Concurrency { .. }))
+        let is_concurrency = |parent| matches!(self.step(parent).form, Form::Concurrency { .. });
+        self.step(id).branch == Branch::First && self.step(id).parent.is_some_and(is_concurrency)
     }
 
     /// The step and those around it, innermost first.
     pub(crate) fn around(&self, id: StateId) -> impl Iterator<Item = StateId> + '_ {
         std::iter::successors(Some(id), |id| self.step(*id).parent)
+    }
+}
+
+impl Outline<'_> {
+    /// The states that a step is inside of, innermost first. What is done before another try or on the way out of a state is not inside of
+    /// that.
+    pub(crate) fn containers(&self, id: StateId) -> impl Iterator<Item = StateId> + '_ {
+        std::iter::successors(self.container(id), |id| self.container(*id))
+    }
+
+    fn container(&self, id: StateId) -> Option<StateId> {
+        let step = self.step(id);
+        match step.branch {
+            Branch::First | Branch::Otherwise => step.parent,
+            Branch::Before | Branch::Finally => step.parent.and_then(|parent| self.container(parent)),
+        }
     }
 }
 
@@ -165,6 +193,8 @@ pub(crate) fn outline<'a>(name: &str, root: &'a Node, findings: &mut Findings) -
         parent: None,
         branch: Branch::First,
         form: Form::Sequence { children: Vec::new() },
+        before: Vec::new(),
+        finally: Vec::new(),
         body: root,
         at: root.at,
     });
@@ -324,7 +354,10 @@ impl<'a> Builder<'a, '_> {
         };
         let id = StateId(self.steps.len() as u64);
         let placeholder = Form::Sequence { children: Vec::new() };
-        self.steps.push(Step { name, path: path.clone(), parent: Some(parent), branch, form: placeholder, body, at });
+        let (parent, [before, finally]) = (Some(parent), [Vec::new(), Vec::new()]);
+        let path_of_step = path.clone();
+        let step = Step { name, path: path_of_step, parent, branch, form: placeholder, before, finally, body, at };
+        self.steps.push(step);
         let form = match form.key.as_str() {
             "action" => Form::Action { action: &form.value },
             "states" => Form::Sequence { children: self.list(&form.value, id, Branch::First, depth + 1) },
@@ -358,6 +391,12 @@ impl<'a> Builder<'a, '_> {
             }
         };
         self.steps[id.0 as usize].form = form;
+        if let Some(list) = body.get("retry").and_then(|retry| retry.get("before")) {
+            self.steps[id.0 as usize].before = self.list(list, id, Branch::Before, depth + 1);
+        }
+        if let Some(list) = body.get("finally") {
+            self.steps[id.0 as usize].finally = self.list(list, id, Branch::Finally, depth + 1);
+        }
         Some(id)
     }
 

@@ -19,7 +19,8 @@ const WHILE_KEYS: [&str; 5] = ["while", "do_while", "until", "index", "do"];
 const CONDITION_KEYS: [&str; 3] = ["condition", "then", "else"];
 const CONCURRENCY_KEYS: [&str; 4] = ["concurrency", "regions", "decide", "outputs"];
 const LIBRARY_KEYS: [&str; 2] = ["library", "with"];
-const NODE_KEYS: [&str; 10] = [
+const NODE_KEYS: [&str; 11] = [
+    "retry",
     "reads",
     "routine",
     "duration",
@@ -32,7 +33,7 @@ const NODE_KEYS: [&str; 10] = [
     "shared",
 ];
 const BOUNDARY_KEYS: [&str; 2] = ["requires", "effects"];
-const NATURE_KEYS: [&str; 7] = ["computes", "senses", "pia", "attempts", "retry", "timeout", "deterministic"];
+const NATURE_KEYS: [&str; 6] = ["computes", "senses", "pia", "attempts", "timeout", "deterministic"];
 
 /// Reads one step.
 pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {

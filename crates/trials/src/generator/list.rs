@@ -163,6 +163,9 @@ impl Maker {
             let marked = self.at(id).outcomes.first().cloned();
             self.at(id).annotations.exceptional.extend(marked);
         }
+        if self.features.guards && depth < 3 && !room.is_preemptive && self.dice.percent(15) {
+            self.guard(id, &path, depth, room, visible);
+        }
         id
     }
 }

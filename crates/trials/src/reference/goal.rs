@@ -61,7 +61,7 @@ impl Reference<'_> {
     }
 
     /// Notes a result as the story of a run does: nothing of what is in a routine, and not why something failed.
-    fn tell(&mut self, path: &str, in_routine: bool, outcome: &str, ports: (Outputs, Outputs)) {
+    pub(super) fn tell(&mut self, path: &str, in_routine: bool, outcome: &str, ports: (Outputs, Outputs)) {
         if !in_routine {
             let result = Real::new(outcome.to_owned(), is_good(outcome).then_some(ports));
             self.result.results.entry(path.to_owned()).or_default().push(result);

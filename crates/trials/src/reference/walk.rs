@@ -3,7 +3,7 @@
 use super::evaluate::Read;
 use super::{Fail, MAX_STEPS, Outputs, Reference, effects, fails};
 use ratn_model::id::StateId;
-use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, State, StateKind, Target};
+use ratn_model::program::{ABORTED, Again, Finally, PREEMPTED, Program, SUCCESS, State, StateKind, Target};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 
@@ -52,6 +52,14 @@ impl Reference<'_> {
         let inside = in_routine || begins_routine;
         let left = match &state.kind {
             StateKind::Action { .. } => None,
+            StateKind::Sequence { .. } if state.annotations.finally.is_some() => {
+                let finally = state.annotations.finally.as_ref();
+                finally.map(|finally| self.lastly(finally, path, variables, inside)).transpose()?
+            }
+            StateKind::Sequence { .. } if state.annotations.again.is_some() => {
+                let again = state.annotations.again.as_ref();
+                again.map(|again| self.again(again, state, path, variables, inside)).transpose()?
+            }
             StateKind::Sequence { children, .. } => Some(self.list(children, path, variables, inside)?),
             StateKind::Condition { predicate, then, otherwise } => {
                 match fails(predicate.is_true(&self.place(variables, None)))? {
@@ -158,6 +166,51 @@ impl Reference<'_> {
                 }
             }
         }
+    }
+
+    /// A state is tried until it ends by another outcome than those after which it is tried again, or has had all its tries.
+    fn again(
+        &mut self,
+        again: &Again,
+        around: &State,
+        path: &str,
+        variables: &mut Variables,
+        in_routine: bool,
+    ) -> Result<String, Fail> {
+        for number in 1.. {
+            let visit = |name: &str| if number == 1 { name.to_owned() } else { format!("{name}#{number}") };
+            let outcome = self.visit(again.body, &below(path, &visit("try")), variables, in_routine)?;
+            if number > again.count || !again.on.contains(&outcome) {
+                return Ok(outcome);
+            }
+            if around.children().any(|child| self.program.state(child).is_pause()) {
+                self.tell(&below(path, &visit("pause")), in_routine, SUCCESS, (Outputs::new(), Outputs::new()));
+            }
+            if let Some(before) = again.before {
+                let made_possible = self.visit(before, &below(path, &visit("before")), variables, in_routine)?;
+                if made_possible != SUCCESS {
+                    return Ok(made_possible);
+                }
+            }
+        }
+        Err(Fail::NotMine("a retry without an end"))
+    }
+
+    /// What is to be done at the end is done however it ends; if that fails, so does the whole.
+    fn lastly(
+        &mut self,
+        finally: &Finally,
+        path: &str,
+        variables: &mut Variables,
+        in_routine: bool,
+    ) -> Result<String, Fail> {
+        let outcome = self.visit(finally.body, &below(path, "body"), variables, in_routine)?;
+        let Some(last) = finally.lastly.get(&outcome) else {
+            return Err(Fail::Wrong(format!("nothing is done on the way out by {outcome}")));
+        };
+        let name = if outcome == SUCCESS { "finally".to_owned() } else { format!("finally_{outcome}") };
+        let last = self.visit(*last, &below(path, &name), variables, in_routine)?;
+        Ok(if last == SUCCESS { outcome } else { last })
     }
 
     #[expect(clippy::too_many_arguments, reason = "all of it is one loop")]

@@ -1,0 +1,487 @@
+//! States that are tried again and states with something to do on every way out, said with the transitions, scoped variables and
+//! conditions that every program has. So both modes execute them by what they have for these, and so does a routine.
+//!
+//! ```text
+//! grasp: retry {times: 2, on: [aborted], before: [open]}       finally: [tuck]
+//!
+//! grasp ┬ try ──── success ──► success                         grasp ┬ body ──── success ──► finally
+//!       ├ again    (from aborted) tries < 2, else aborted            ├ finally ─ success ──► success
+//!       ├ pause    where there is one                                ├ finally_aborted ────► aborted
+//!       └ before ─ success ──► try                                   └ …          one for each outcome of the body
+//! ```
+//!
+//! The state that was written is `try` or `body`; with both, `body` is what holds `try`. From outside, the state of its name is seen, with
+//! the same ports. Names of variables that are made here cannot be written in a task file.
+
+use crate::expression::{BinaryOperator, Expr};
+use crate::id::StateId;
+use crate::program::{
+    ABORTED, Again, Annotations, CLOCK, Finally, Nature, PREEMPTED, Program, SUCCESS, State, StateKind, Target,
+    TaskOutput, WAIT,
+};
+use crate::value::{Type, Value};
+use std::collections::BTreeMap;
+
+/// More states than this are not made.
+const MAX_STATES: usize = 20_000;
+
+/// What stands around a state.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Guard {
+    /// How it is tried again.
+    pub retried: Option<Retried>,
+    /// What is done on every way out; states whose parent is the guarded one, and that are in none of its lists.
+    pub finally: Vec<StateId>,
+}
+
+/// How a state is tried again.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Retried {
+    /// How many tries after the first.
+    pub count: u32,
+    /// The pause before the second try, doubled before each further one.
+    pub backoff_s: f64,
+    /// The outcomes after which it is.
+    pub on: Vec<String>,
+    /// What is done before each further try; states as those of [`Guard::finally`].
+    pub before: Vec<StateId>,
+}
+
+/// Where the states of a program are after [`unfold`]: of each the ids, the outermost first. The last is the state as it was written.
+pub type Places = BTreeMap<StateId, Vec<StateId>>;
+
+/// There would be more than 20,000 states.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TooManyStates;
+
+/// Puts what guards say into the program. States get other ids.
+///
+/// # Errors
+/// There would be too many states: what is done on every way out is there once for each outcome.
+pub fn unfold(program: &mut Program, guards: &BTreeMap<StateId, Guard>) -> Result<Places, TooManyStates> {
+    let outcomes = program.all_outcomes();
+    let scopes = vec![Scope { around: None, places: Places::new() }];
+    let (new, of_scope, links, outputs, again, lastly) = Default::default();
+    let old = &program.states;
+    let mut unfolding = Unfolding { old, guards, outcomes, new, of_scope, scopes, links, outputs, again, lastly };
+    unfolding.guarded(Program::ROOT, None, None, 0)?;
+    let resolved: Vec<State> = unfolding.resolved();
+    let Unfolding { scopes, .. } = &unfolding;
+    for output in &mut program.outputs {
+        output.value.rewrite(&mut |part| unfolding.port(StateId(0), part));
+    }
+    let mut places = Places::new();
+    for scope in scopes {
+        for (old, new) in &scope.places {
+            places.entry(*old).or_insert_with(|| new.clone());
+        }
+    }
+    program.states = resolved;
+    Ok(places)
+}
+
+/// States that were copied together: those of one `finally`, for one outcome.
+struct Scope {
+    around: Option<usize>,
+    places: Places,
+}
+
+struct Unfolding<'a> {
+    old: &'a [State],
+    guards: &'a BTreeMap<StateId, Guard>,
+    outcomes: Vec<Vec<String>>,
+    /// With lists of new ids, and with the old ones in transitions and expressions.
+    new: Vec<State>,
+    /// By new id.
+    of_scope: Vec<usize>,
+    scopes: Vec<Scope>,
+    /// Transitions between new ids.
+    links: Vec<(StateId, String, Target)>,
+    /// Output ports that are those of a state within.
+    outputs: Vec<(StateId, StateId)>,
+    /// Marks with new ids.
+    again: Vec<(StateId, Again)>,
+    lastly: Vec<(StateId, Finally)>,
+}
+
+impl Unfolding<'_> {
+    fn old(&self, id: StateId) -> &State {
+        &self.old[id.0 as usize]
+    }
+
+    /// A state with what stands around it; `name` instead of its own.
+    fn guarded(
+        &mut self,
+        id: StateId,
+        parent: Option<StateId>,
+        name: Option<&str>,
+        scope: usize,
+    ) -> Result<StateId, TooManyStates> {
+        let name = name.map_or_else(|| self.old(id).name.clone(), str::to_owned);
+        let Some(guard) = self.guards.get(&id) else { return self.written(id, parent, name, scope, true) };
+        let (retried, finally) = (guard.retried.as_ref(), !guard.finally.is_empty());
+        match (finally, retried) {
+            (true, _) => self.with_finally(id, parent, name, scope, guard),
+            (false, Some(retried)) => self.with_retry(id, parent, name, scope, retried, true),
+            (false, None) => self.written(id, parent, name, scope, true),
+        }
+    }
+
+    /// The state as it was written.
+    fn written(
+        &mut self,
+        id: StateId,
+        parent: Option<StateId>,
+        name: String,
+        scope: usize,
+        is_outermost: bool,
+    ) -> Result<StateId, TooManyStates> {
+        let mut state = self.old(id).clone();
+        state.name = name;
+        if !is_outermost {
+            state.transitions = BTreeMap::new();
+            state.annotations.shared = Vec::new();
+        }
+        let kind = state.kind.clone();
+        let new = self.push(state, parent, scope)?;
+        self.place(id, new, scope);
+        let mut listed = |list: &[StateId]| -> Result<Vec<StateId>, TooManyStates> {
+            list.iter().map(|child| self.guarded(*child, Some(new), None, scope)).collect()
+        };
+        let kind = match kind {
+            StateKind::Action { .. } => kind,
+            StateKind::Sequence { children, outputs } => StateKind::Sequence { children: listed(&children)?, outputs },
+            StateKind::ForEach { variable, index, collection, body } => {
+                StateKind::ForEach { variable, index, collection, body: listed(&body)? }
+            }
+            StateKind::While { predicate, body_first, index, body } => {
+                StateKind::While { predicate, body_first, index, body: listed(&body)? }
+            }
+            StateKind::Concurrency { regions, preemptive, decide, outputs } => {
+                StateKind::Concurrency { regions: listed(&regions)?, preemptive, decide, outputs }
+            }
+            StateKind::Condition { predicate, then, otherwise } => {
+                StateKind::Condition { predicate, then: listed(&then)?, otherwise: listed(&otherwise)? }
+            }
+        };
+        self.at(new).kind = kind;
+        Ok(new)
+    }
+
+    /// It is tried again.
+    fn with_retry(
+        &mut self,
+        id: StateId,
+        parent: Option<StateId>,
+        name: String,
+        scope: usize,
+        retried: &Retried,
+        is_outermost: bool,
+    ) -> Result<StateId, TooManyStates> {
+        let around = self.around(id, parent, name, scope, is_outermost)?;
+        let body = self.written(id, Some(around), "try".to_owned(), scope, false)?;
+        self.at(body).annotations.exceptional.extend(retried.on.iter().cloned());
+        self.links.push((body, SUCCESS.to_owned(), Target::Outcome(SUCCESS.to_owned())));
+        self.outputs.push((around, body));
+        let path = self.at(around).path.clone();
+        let (tries, pause_s) = (format!("tries of {path}"), format!("pause of {path}"));
+        let number = |n: i64| Expr::Literal(Value::Int(n));
+        let variable = |name: &str| Expr::Variable(name.to_owned());
+        let of = |operator, left, right| Expr::Binary(operator, Box::new(left), Box::new(right));
+        self.at(around).variables = vec![(tries.clone(), number(0))];
+        let mut children = vec![body];
+        let mut again = Vec::new();
+        for outcome in &retried.on {
+            let name = if retried.on.len() == 1 { "again".to_owned() } else { format!("again_{outcome}") };
+            let predicate = of(BinaryOperator::Less, variable(&tries), number(i64::from(retried.count)));
+            let kind = StateKind::Condition { predicate, then: Vec::new(), otherwise: Vec::new() };
+            let state = self.made(id, around, &name, kind, scope)?;
+            let enough = self.step(id, state, "enough", outcome, scope)?;
+            if let StateKind::Condition { otherwise, .. } = &mut self.at(state).kind {
+                otherwise.push(enough);
+            }
+            self.at(state).outcomes = own([outcome.as_str()]);
+            self.at(state).assign = vec![(tries.clone(), of(BinaryOperator::Add, variable(&tries), number(1)))];
+            self.links.push((body, outcome.clone(), Target::State(state)));
+            again.push(state);
+        }
+        children.extend(again.iter().copied());
+        let mut last = again;
+        if retried.backoff_s > 0.0 {
+            let seconds = vec![("seconds".to_owned(), variable(&pause_s))];
+            let (provider, action) = (CLOCK.to_owned(), WAIT.to_owned());
+            let kind = StateKind::Action { provider, action, inputs: seconds, outputs: BTreeMap::new() };
+            let pause = self.made(id, around, "pause", kind, scope)?;
+            let nothing = |outcome: &str| (outcome.to_owned(), Vec::new());
+            self.at(pause).annotations.effects = [SUCCESS, ABORTED, PREEMPTED].map(nothing).into();
+            self.at(pause).annotations.duration_s = Some(variable(&pause_s));
+            self.at(pause).assign =
+                vec![(pause_s.clone(), of(BinaryOperator::Multiply, variable(&pause_s), number(2)))];
+            self.at(around).variables.push((pause_s, Expr::Literal(Value::Float(retried.backoff_s))));
+            children.push(pause);
+            self.lead(&last, Target::State(pause));
+            last = vec![pause];
+        }
+        let mut before = None;
+        if !retried.before.is_empty() {
+            let state = self.sequence(id, around, "before", &retried.before, scope)?;
+            children.push(state);
+            self.lead(&last, Target::State(state));
+            last = vec![state];
+            before = Some(state);
+        }
+        self.lead(&last, Target::State(body));
+        let (count, on) = (retried.count, retried.on.clone());
+        self.again.push((around, Again { body, count, on, before }));
+        self.at(around).kind = StateKind::Sequence { children, outputs: Vec::new() };
+        Ok(around)
+    }
+
+    /// Something is done on every way out.
+    fn with_finally(
+        &mut self,
+        id: StateId,
+        parent: Option<StateId>,
+        name: String,
+        scope: usize,
+        guard: &Guard,
+    ) -> Result<StateId, TooManyStates> {
+        let around = self.around(id, parent, name, scope, true)?;
+        let body = match &guard.retried {
+            Some(retried) => self.with_retry(id, Some(around), "body".to_owned(), scope, retried, false)?,
+            None => self.written(id, Some(around), "body".to_owned(), scope, false)?,
+        };
+        self.outputs.push((around, body));
+        self.at(body).annotations.exceptional.extend([ABORTED, PREEMPTED].map(str::to_owned));
+        let mut children = vec![body];
+        let mut lastly = BTreeMap::new();
+        let mut outcomes = self.outcomes[id.0 as usize].clone();
+        let before = guard.retried.iter().flat_map(|retried| &retried.before);
+        for outcome in before.flat_map(|state| self.leaves_by(*state)).collect::<Vec<_>>() {
+            if !outcomes.contains(&outcome) {
+                outcomes.push(outcome);
+            }
+        }
+        for outcome in outcomes {
+            let name = if outcome == SUCCESS { "finally".to_owned() } else { format!("finally_{outcome}") };
+            self.scopes.push(Scope { around: Some(scope), places: Places::new() });
+            let state = self.sequence(id, around, &name, &guard.finally, self.scopes.len() - 1)?;
+            self.links.push((body, outcome.clone(), Target::State(state)));
+            self.links.push((state, SUCCESS.to_owned(), Target::Outcome(outcome.clone())));
+            children.push(state);
+            lastly.insert(outcome, state);
+        }
+        self.lastly.push((around, Finally { body, lastly }));
+        self.at(around).kind = StateKind::Sequence { children, outputs: Vec::new() };
+        Ok(around)
+    }
+
+    /// The state that is seen from outside.
+    fn around(
+        &mut self,
+        id: StateId,
+        parent: Option<StateId>,
+        name: String,
+        scope: usize,
+        is_outermost: bool,
+    ) -> Result<StateId, TooManyStates> {
+        let old = self.old(id);
+        let mut state = bare(old, name, StateKind::Sequence { children: Vec::new(), outputs: Vec::new() });
+        state.outcomes.clone_from(&old.outcomes);
+        state.defaults.clone_from(&old.defaults);
+        state.annotations.exceptional.clone_from(&old.annotations.exceptional);
+        state.annotations.exceptions = old.annotations.exceptions;
+        if is_outermost {
+            state.transitions.clone_from(&old.transitions);
+            state.annotations.shared.clone_from(&old.annotations.shared);
+        }
+        let new = self.push(state, parent, scope)?;
+        self.place(id, new, scope);
+        Ok(new)
+    }
+
+    fn made(
+        &mut self,
+        id: StateId,
+        parent: StateId,
+        name: &str,
+        kind: StateKind,
+        scope: usize,
+    ) -> Result<StateId, TooManyStates> {
+        let state = bare(self.old(id), name.to_owned(), kind);
+        self.push(state, Some(parent), scope)
+    }
+
+    /// Only a step: out of the list by an outcome.
+    fn step(
+        &mut self,
+        id: StateId,
+        parent: StateId,
+        name: &str,
+        outcome: &str,
+        scope: usize,
+    ) -> Result<StateId, TooManyStates> {
+        let kind = StateKind::Sequence { children: Vec::new(), outputs: Vec::new() };
+        let step = self.made(id, parent, name, kind, scope)?;
+        self.links.push((step, SUCCESS.to_owned(), Target::Outcome(outcome.to_owned())));
+        Ok(step)
+    }
+
+    fn sequence(
+        &mut self,
+        id: StateId,
+        parent: StateId,
+        name: &str,
+        list: &[StateId],
+        scope: usize,
+    ) -> Result<StateId, TooManyStates> {
+        let outputs = Vec::new();
+        let state = self.made(id, parent, name, StateKind::Sequence { children: Vec::new(), outputs }, scope)?;
+        let children = list.iter().map(|child| self.guarded(*child, Some(state), None, scope));
+        let children = children.collect::<Result<Vec<StateId>, TooManyStates>>()?;
+        self.at(state).kind = StateKind::Sequence { children, outputs: Vec::new() };
+        Ok(state)
+    }
+
+    /// The outcomes by which a state leaves its list.
+    fn leaves_by(&self, id: StateId) -> Vec<String> {
+        let left = |outcome: &String| match self.old(id).transitions.get(outcome) {
+            Some(Target::Outcome(by)) => Some(by.clone()),
+            Some(Target::State(_)) => None,
+            None => Some(outcome.clone()),
+        };
+        self.outcomes[id.0 as usize].iter().filter_map(left).collect()
+    }
+
+    fn lead(&mut self, from: &[StateId], to: Target) {
+        self.links.extend(from.iter().map(|from| (*from, SUCCESS.to_owned(), to.clone())));
+    }
+
+    fn push(&mut self, mut state: State, parent: Option<StateId>, scope: usize) -> Result<StateId, TooManyStates> {
+        if self.new.len() >= MAX_STATES {
+            return Err(TooManyStates);
+        }
+        let id = StateId(self.new.len() as u64);
+        let around = parent.map_or("", |parent| &self.new[parent.0 as usize].path);
+        state.path = match (parent, around) {
+            (None, _) => String::new(),
+            (Some(_), "") => state.name.clone(),
+            (Some(_), around) => format!("{around}/{}", state.name),
+        };
+        (state.id, state.parent) = (id, parent);
+        self.new.push(state);
+        self.of_scope.push(scope);
+        Ok(id)
+    }
+
+    fn at(&mut self, id: StateId) -> &mut State {
+        &mut self.new[id.0 as usize]
+    }
+
+    fn place(&mut self, old: StateId, new: StateId, scope: usize) {
+        self.scopes[scope].places.entry(old).or_default().push(new);
+    }
+
+    /// The states with new ids in transitions and expressions.
+    fn resolved(&self) -> Vec<State> {
+        let mut states = self.new.clone();
+        for state in &mut states {
+            let id = state.id;
+            for target in state.transitions.values_mut() {
+                if let Target::State(to) = target {
+                    *to = self.entered_from(id, *to);
+                }
+            }
+            state.each_expression_mut(&mut |_, expression| expression.rewrite(&mut |part| self.port(id, part)));
+            state.annotations.each_mark_mut(&mut |marked| *marked = self.seen_from(id, *marked));
+        }
+        for (around, again) in &self.again {
+            states[around.0 as usize].annotations.again = Some(again.clone());
+        }
+        for (around, finally) in &self.lastly {
+            states[around.0 as usize].annotations.finally = Some(finally.clone());
+        }
+        for (from, outcome, to) in &self.links {
+            states[from.0 as usize].transitions.insert(outcome.clone(), to.clone());
+        }
+        // The inner ones were made first.
+        for (around, body) in &self.outputs {
+            let port = |name: &String, ty: &Type| {
+                let value = Expr::Port { state: *body, port: name.clone() };
+                TaskOutput { name: name.clone(), ty: ty.clone(), value }
+            };
+            let own: Vec<TaskOutput> = match &states[body.0 as usize].kind {
+                StateKind::Action { outputs, .. } => outputs.iter().map(|(name, ty)| port(name, ty)).collect(),
+                StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } => {
+                    outputs.iter().map(|output| port(&output.name, &output.ty)).collect()
+                }
+                StateKind::ForEach { .. } | StateKind::While { .. } | StateKind::Condition { .. } => Vec::new(),
+            };
+            if let StateKind::Sequence { outputs, .. } = &mut states[around.0 as usize].kind {
+                *outputs = own;
+            }
+        }
+        states
+    }
+
+    fn port(&self, from: StateId, part: &mut Expr) {
+        if let Expr::Port { state, .. } = part {
+            *state = self.seen_from(from, *state);
+        }
+    }
+
+    /// Which of the states around an old one is meant: the outermost that does not contain where it is named.
+    fn seen_from(&self, from: StateId, old: StateId) -> StateId {
+        let layers = self.layers(from, old);
+        let up = |id: &StateId| self.new[id.0 as usize].parent;
+        let contains = |layer: &StateId| std::iter::successors(Some(from), up).any(|id| id == *layer);
+        layers.iter().find(|layer| !contains(layer)).or(layers.last()).copied().unwrap_or(old)
+    }
+
+    /// Where a transition to an old state leads: to the outermost, with all that stands around it.
+    fn entered_from(&self, from: StateId, old: StateId) -> StateId {
+        self.layers(from, old).first().copied().unwrap_or(old)
+    }
+
+    /// What an old state became, where a new one can see it.
+    fn layers(&self, from: StateId, old: StateId) -> &[StateId] {
+        let mut scope = Some(self.of_scope[from.0 as usize]);
+        while let Some(at) = scope {
+            if let Some(layers) = self.scopes[at].places.get(&old) {
+                return layers;
+            }
+            scope = self.scopes[at].around;
+        }
+        &[]
+    }
+}
+
+/// A state that does and says nothing, where another stands in the file.
+fn bare(old: &State, name: String, kind: StateKind) -> State {
+    let effects = [(SUCCESS.to_owned(), Vec::new())].into();
+    State {
+        id: old.id,
+        name,
+        path: String::new(),
+        parent: None,
+        kind,
+        outcomes: Vec::new(),
+        transitions: BTreeMap::new(),
+        variables: Vec::new(),
+        assign: Vec::new(),
+        defaults: BTreeMap::new(),
+        annotations: Annotations {
+            nature: Nature::Irreversible,
+            reads: Some(Vec::new()),
+            effects,
+            ..Annotations::default()
+        },
+        location: old.location,
+    }
+}
+
+/// Those that not every state has.
+fn own<'n>(outcomes: impl IntoIterator<Item = &'n str>) -> Vec<String> {
+    let is_common = |outcome: &&str| [SUCCESS, ABORTED, PREEMPTED].contains(outcome);
+    outcomes.into_iter().filter(|outcome| !is_common(outcome)).map(str::to_owned).collect()
+}
