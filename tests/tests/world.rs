@@ -49,6 +49,29 @@ const FACTS: &str = r#"
     [] w:predicate "weight" ; w:argument1 "box_2" ; w:value 3 .
 "#;
 
+#[cfg(feature = "sparql")]
+#[test]
+fn sparql_is_answered_over_the_root() -> anyhow::Result<()> {
+    let world = World::new()?;
+    ensure!(world.load("first.ttl", FACTS, &[])?.0 == Some(0));
+    let query = "SELECT ?kg { ?f world:predicate 'weight' ; world:argument1 'box_1' ; world:value ?kg }";
+    let answers = world.done(&["query", "--sparql", query])?;
+    ensure!(answers.lines().collect::<Vec<_>>() == ["?kg", "1.5"], "{answers}");
+    let (code, _, err) = world.ratn(&["query", "--sparql", "SELECT"])?;
+    ensure!(code == Some(2) && err.contains("not SPARQL"), "{code:?} {err}");
+    Ok(())
+}
+
+#[cfg(not(feature = "sparql"))]
+#[test]
+fn a_ratn_without_sparql_says_which_feature_it_was_built_without() -> anyhow::Result<()> {
+    let world = World::new()?;
+    let (code, out, err) = world.ratn(&["query", "--sparql", "SELECT * { ?f ?p ?o }"])?;
+    ensure!(code == Some(2) && out.is_empty(), "{code:?} {out} {err}");
+    ensure!(err.contains("without the feature `sparql`") && err.contains("--features sparql"), "{err}");
+    Ok(())
+}
+
 #[test]
 fn facts_are_loaded_asked_for_compared_and_dumped() -> anyhow::Result<()> {
     let world = World::new()?;
@@ -57,11 +80,6 @@ fn facts_are_loaded_asked_for_compared_and_dumped() -> anyhow::Result<()> {
     ensure!(table.lines().count() == 3 && table.contains("ratn world load"), "{table}");
     let answers = world.done(&["query", "weight(?box) = ?w, ?w < 2"])?;
     ensure!(answers.lines().nth(1) == Some("box_1  1.5"), "{answers}");
-    let sparql = "SELECT ?kg { ?f world:predicate 'weight' ; world:argument1 'box_1' ; world:value ?kg }";
-    let answers = world.done(&["query", "--sparql", sparql])?;
-    ensure!(answers.lines().collect::<Vec<_>>() == ["?kg", "1.5"], "{answers}");
-    let (code, _, err) = world.ratn(&["query", "--sparql", "SELECT"])?;
-    ensure!(code == Some(2) && err.contains("not SPARQL"), "{code:?} {err}");
     let second = r#"{"facts": [{"predicate": "weight", "arguments": ["box_2"], "value": {"float": 0.1}}]}"#;
     ensure!(world.load("second.json", second, &["--replace"])?.0 == Some(0));
     let difference = world.done(&["diff", "1"])?;

@@ -40,7 +40,7 @@ pub(super) enum WorldCommand {
         /// The conditions, as in a task file; with `--sparql` a SELECT or an ASK over what `dump --format turtle` writes
         #[arg(value_name = "QUERY")]
         query: String,
-        /// The query is SPARQL
+        /// The query is SPARQL; for a `ratn` that is built with the feature `sparql`
         #[arg(long)]
         sparql: bool,
         /// Of the root as it was at this revision

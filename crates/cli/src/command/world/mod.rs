@@ -7,6 +7,7 @@ mod arguments;
 mod dump;
 mod pattern;
 mod show;
+#[cfg(feature = "sparql")]
 mod sparql;
 mod task_text;
 mod turtle;
@@ -39,6 +40,12 @@ const MAX_DUMP: usize = 8 * MAX_MESSAGE_BYTES;
 /// Who writes what is loaded.
 const WRITER: &str = "ratn world load";
 
+/// Why `--sparql` is refused by a `ratn` that was built without it.
+#[cfg(not(feature = "sparql"))]
+const NO_SPARQL: &str = "ratn: --sparql: this ratn was built without the feature `sparql`. Build it with \
+    `cargo install --path crates/cli --features sparql`, or ask with the conditions of task files: \
+    `ratn world query 'at(?box) = ?pose'`";
+
 /// Where the world pool is, and how its answers are shown.
 struct Asking {
     client: WorldClient,
@@ -47,6 +54,10 @@ struct Asking {
 
 /// Performs one operation.
 pub(super) fn run(arguments: &WorldArguments, tls: &ClientTls) -> Result<(), Failure> {
+    #[cfg(not(feature = "sparql"))]
+    if matches!(arguments.command, WorldCommand::Query { sparql: true, .. }) {
+        return Err(Failure::Refused(NO_SPARQL.to_owned()));
+    }
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let endpoint = match &arguments.pool {
             Some(endpoint) => endpoint.clone(),
@@ -83,10 +94,11 @@ impl Asking {
                     unheard_of(patterns.iter().map(|pattern| pattern.predicate.as_str()), &all);
                 }
             }
+            #[cfg(feature = "sparql")]
             WorldCommand::Query { query, sparql: true, at, limit } => {
                 self.sparql(query, at.map(Revision), *limit).await?;
             }
-            WorldCommand::Query { query, sparql: false, at, limit } => {
+            WorldCommand::Query { query, at, limit, .. } => {
                 self.query(query, at.map(Revision), *limit).await?;
             }
             WorldCommand::Diff { from, to, patterns } => {
@@ -123,6 +135,7 @@ impl Asking {
         Ok(self.show(&show::rows_json(revision, &rows), || show::rows(&rows))?)
     }
 
+    #[cfg(feature = "sparql")]
     async fn sparql(&self, text: &str, at: Option<Revision>, limit: usize) -> Result<(), Failure> {
         let (revision, facts) = self.client.root_at(at, &[]).await?;
         let answer = sparql::answer(text, &facts, limit);

@@ -66,16 +66,8 @@ pub(super) fn triples(number: usize, fact: &FactRecord) -> anyhow::Result<Vec<Tr
     of_fact(number, said)
 }
 
-/// Who wrote a fact when; a dump says nothing of that, for it is not loaded.
-pub(super) fn origin(number: usize, fact: &FactRecord) -> anyhow::Result<Vec<Triple>> {
-    let revision = Literal::new_typed_literal(fact.revision.0.to_string(), xsd::INTEGER);
-    let mut said: Vec<(String, RdfTerm)> = vec![("revision".to_owned(), revision.into())];
-    let writer = fact.writer.as_deref().map(Literal::new_simple_literal);
-    said.extend(writer.map(|writer| ("writer".to_owned(), writer.into())));
-    of_fact(number, said)
-}
-
-fn of_fact(number: usize, said: Vec<(String, RdfTerm)>) -> anyhow::Result<Vec<Triple>> {
+/// Triples about a fact, the `number`th: properties and their values.
+pub(super) fn of_fact(number: usize, said: Vec<(String, RdfTerm)>) -> anyhow::Result<Vec<Triple>> {
     let subject = BlankNode::new(format!("fact{number}"))?;
     let triple = |(property, object): (String, RdfTerm)| {
         Ok(Triple::new(subject.clone(), NamedNode::new(format!("{WORLD}{property}"))?, object))
