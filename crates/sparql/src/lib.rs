@@ -183,7 +183,7 @@ mod tests {
     }
 
     fn kitchen() -> Vec<Triple> {
-        let name = Literal::new_simple_literal::<&str>;
+        let name = |text: &str| Literal::new_simple_literal(text);
         let on = |what, place| {
             [("predicate", name("on")), ("argument1", name(what)), ("argument2", name(place)), ("value", true.into())]
         };
