@@ -118,6 +118,28 @@ states:
     }
 }
 
+/// Nor does it ask for what a hierarchy around it blocks for the states in it.
+#[test]
+fn a_pause_holds_nothing() {
+    let text = "
+states:
+  - both:
+      concurrency: barrier
+      regions:
+        - left:
+            resources: [{ block: Head }]
+            states: [ grasp: { MOVE, effects: [], retry: { times: 1, backoff: 10, before: [ open: { MOVE, effects: [] } ] } } ]
+        - right: { TURN }
+";
+    for mode in MODES {
+        let run =
+            run_with(text, mode, &|path| (if path.ends_with("try") { "aborted" } else { "success" }, Value::Null));
+        let expected =
+            ["0 both/left/grasp/try", "1 both/right", "11 both/left/grasp/before/open", "12 both/left/grasp/try#2"];
+        assert_eq!(starts(&run), expected, "{mode:?}");
+    }
+}
+
 /// What a retry may come to is not computed ahead; what it comes to if nothing fails is.
 #[test]
 fn a_plan_behind_a_state_that_may_be_tried_again_is_made_while_that_runs() {

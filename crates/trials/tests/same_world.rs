@@ -164,9 +164,15 @@ fn random_programs_with_comprehensions_leave_the_same_world_in_both_modes() {
 /// The reference does not look at the transitions, variables and conditions that a retry or a `finally` becomes.
 #[test]
 fn random_programs_with_retries_of_composites_leave_the_same_world_in_both_modes() {
-    none_fails(trial, FURTHER, 300, &Features::GUARDS);
+    none_fails(trial, FURTHER, 200, &Features::GUARDS);
     none_fails(trial_from_outside, FURTHER, 60, &Features::GUARDS);
     none_fails(trial_interrupted, FURTHER, 60, &Features::GUARDS);
+}
+
+/// A pause asked for what a state around it blocks.
+#[test]
+fn programs_that_once_failed_because_a_pause_was_refused_leave_the_same_world() {
+    once_failed(trial, &Features::GUARDS, &[70]);
 }
 
 #[test]

@@ -45,6 +45,10 @@ pub(super) fn operated_anywhere(program: &Program) -> BTreeSet<&str> {
 /// Blocks of one state add up, those of states inside of each other merge by maximum. What an action consumes and what has to
 /// exist add up as they are, but only from the state itself and what it contains.
 fn requirements(subject: &Subject<'_>) -> Vec<ResourceExpr> {
+    // Nothing is held while time passes, whatever is blocked around.
+    if subject.state.is_pause() {
+        return Vec::new();
+    }
     let within = subject.contained.iter().map(|state| (state, true));
     let around = subject.around.iter().map(|state| (state, false));
     let mut merged: Vec<ResourceExpr> = Vec::new();
