@@ -85,3 +85,77 @@ fn a_check_without_simulation_says_only_what_is_wrong() -> anyhow::Result<()> {
     ensure!(found["sequential"].is_null() && found["findings"] == serde_json::json!([]), "{found}");
     Ok(())
 }
+
+/// Five activities that need up to two of the units of one resource, and one of another's; 9 s is the best that there is.
+const PROJECT: &str = "\
+jobs (incl. supersource/sink ):  5
+  - renewable                 :  2   R
+  - nonrenewable              :  0   N
+  - doubly constrained        :  0   D
+PRECEDENCE RELATIONS:
+jobnr.    #modes  #successors   successors
+   1        1          2           2   3
+   2        1          1           4
+   3        1          1           5
+   4        1          1           5
+   5        1          0
+****
+REQUESTS/DURATIONS:
+jobnr. mode duration  R 1  R 2
+----
+  1      1     0       0    0
+  2      1     3       1    0
+  3      1     4       2    1
+  4      1     2       1    1
+  5      1     0       0    0
+****
+RESOURCEAVAILABILITIES:
+  R 1  R 2
+    2    1
+";
+
+#[test]
+fn projects_are_simulated_and_compared_with_a_table() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let path = |name: &str, text: &str| -> anyhow::Result<String> {
+        let path = place.path().join(name);
+        std::fs::write(&path, text)?;
+        Ok(path.to_str().context("a path")?.to_owned())
+    };
+    let (one, other) =
+        (path("one.sm", PROJECT)?, path("other.sm", &PROJECT.replace("2      1     3 ", "2      1     5 "))?);
+    let table = path("best.csv", "instance,lower_bound,best_known\none.sm,7,8\nother,9,11\n")?;
+    let found = json(&place, &["simulate", "--project", &one, &other, "--best-known", &table, "--json"])?;
+    let expected = serde_json::json!({
+        "projects": [
+            { "instance": "one", "makespan": 9.0, "best_known": 8.0, "ratio": 1.125, "lower_bound": 6.5 },
+            { "instance": "other", "makespan": 11.0, "best_known": 11.0, "ratio": 1.0, "lower_bound": 7.5 },
+        ],
+        "mean_ratio": 1.0625,
+        "worst_ratio": 1.125,
+    });
+    ensure!(found == expected, "{found}");
+    let varied = json(&place, &["simulate", "--project", &one, "--vary", "0.3", "--json"])?;
+    let varied = &varied["projects"][0];
+    ensure!(varied["clairvoyant"] == varied["makespan"] && varied["makespan"] != 9.0, "{varied}");
+    let output = place.ratn(&["simulate", "--project", &one, &other]).output()?;
+    let (out, err) = texts(&output);
+    let help = "give a table of best known ones with --best-known";
+    ensure!(
+        out == format!("one: makespan 9; {help}; at least 6.5\nother: makespan 11; {help}; at least 7.5\n"),
+        "{out}{err}"
+    );
+    Ok(())
+}
+
+#[test]
+fn what_is_no_project_is_refused_with_its_line() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let file = place.path().join("bad.sm");
+    std::fs::write(&file, PROJECT.replace("R 2\n    2    1\n", "R 2\n    1    1\n"))?;
+    let output = place.ratn(&["simulate", "--project", file.to_str().context("a path")?]).output()?;
+    let (out, err) = texts(&output);
+    ensure!(output.status.code() == Some(2) && out.is_empty(), "{:?}, {out}", output.status);
+    ensure!(err.contains("bad.sm: no project: line 18: job 3 needs 2 of R1, and line 24 has 1"), "{err}");
+    Ok(())
+}

@@ -1,5 +1,6 @@
 //! Events into the executive and commands out of it. Together they are the event log, line by line.
 
+use crate::lookahead::Held;
 use ratn_model::fact::{Change, FactKey, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision, StateId};
 use ratn_model::measurement::Evidence;
@@ -114,6 +115,9 @@ pub enum Event {
     Advised {
         /// Seconds, by instance; it stands in for the longest remaining path.
         urgency_s: Vec<(InstanceId, f64)>,
+        /// Who is held back so that others begin first; whoever was held back and is not in here is not any more.
+        #[serde(default)]
+        held: Vec<Held>,
     },
     /// The resource manager granted an [`Command::Acquire`].
     Granted {

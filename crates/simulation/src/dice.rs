@@ -19,6 +19,11 @@ impl Dice {
         self.roll() % bound.max(1)
     }
 
+    /// From 0 up to, not including, 1.
+    pub fn share(&mut self) -> f64 {
+        (self.roll() >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
     /// True with this chance in percent.
     pub fn percent(&mut self, chance: u64) -> bool {
         self.below(100) < chance

@@ -4,8 +4,10 @@
 //! Nothing here waits, opens a socket or reads a clock: the same program, oracle and seed give the same run to the last
 //! event. [`tables`] replays the paper's tables this way; the property tests compare the two modes.
 
+pub mod activities;
 pub mod dice;
 pub mod jobshop;
+pub mod psplib;
 pub mod run;
 pub mod sequential;
 pub mod tables;

@@ -8,7 +8,7 @@ pub use circumstances::{Circumstances, MAX_EVENTS, Mischief, Trigger};
 
 use crate::dice::Dice;
 use ratn_executive::executive::Executive;
-use ratn_executive::lookahead::{Lookout, Problem, Search};
+use ratn_executive::lookahead::{Lookout, Memory, Problem, Search};
 use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Mode, Origin};
 use ratn_model::catalogue::ResourceOffer;
 use ratn_model::fact::{Change, FactKey, Footprint};
@@ -26,6 +26,9 @@ use std::time::Duration;
 
 /// So many facts of the executive's mirror are compared with the root's at each revision.
 const COMPARED_FACTS: usize = 256;
+
+/// When something took another time than was planned with, this part of the orders is looked at.
+const GLANCE_PART: usize = 10;
 
 /// What the providers do.
 pub trait Oracle {
@@ -239,6 +242,7 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
     };
     let mut executive = Executive::new(setup.program.clone(), setup.tolerance);
     let mut lookout = Lookout::default();
+    let mut memory = Memory::default();
     simulation.at(
         Duration::ZERO,
         Event::Started {
@@ -267,15 +271,21 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
         while let Some(event) = next.take() {
             simulation.log.push(LogLine { at: now, entry: LogEntry::Event(event.clone()) });
             let commands = executive.handle(now, event);
-            lookout.observe(&commands);
+            lookout.observe(now, &commands);
             for command in commands {
                 simulation.log.push(LogLine { at: now, entry: LogEntry::Command(command.clone()) });
                 simulation.perform(command)?;
             }
-            if orders > 0 && lookout.is_due() && simulation.end.is_none() {
+            if orders > 0 && (lookout.is_due() || lookout.is_surprised()) && simulation.end.is_none() {
                 let outlook = executive.outlook(now);
-                lookout.looks(outlook.tasks.len());
-                next = advice(&outlook, orders, setup.seed);
+                let orders = if lookout.is_due() {
+                    lookout.looks(outlook.tasks.len());
+                    orders
+                } else {
+                    lookout.glances();
+                    orders.div_ceil(GLANCE_PART)
+                };
+                next = advice(&outlook, orders, setup.seed, &mut memory);
             }
         }
         if simulation.circumstances.checkpoint_every.is_some_and(|every| event % every == 0) {
@@ -309,12 +319,13 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
 }
 
 /// A better order than the executive's own, if so many tries find one.
-fn advice(outlook: &Problem, orders: usize, seed: u64) -> Option<Event> {
+fn advice(outlook: &Problem, orders: usize, seed: u64, memory: &mut Memory) -> Option<Event> {
     // What cannot be planned goes as it goes.
-    let mut search = Search::new(outlook, seed).ok()?;
+    let mut search = Search::remembering(outlook, seed, memory).ok()?;
     search.step(orders);
+    *memory = search.memory();
     let advice = search.best();
-    (advice.end_s < advice.plain_s).then_some(Event::Advised { urgency_s: advice.urgency_s })
+    (advice.end_s < advice.plain_s).then_some(Event::Advised { urgency_s: advice.urgency_s, held: advice.held })
 }
 
 impl Simulation<'_> {

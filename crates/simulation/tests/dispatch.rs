@@ -179,9 +179,9 @@ fn what_a_look_ahead_advises_stays_until_it_advises_otherwise() {
     let states = [think("first", "", "9"), think("second", "", "5")];
     let mut begun = Begun::of(&task(&states), &[]);
     let second = begun.instance("second");
-    begun.handle(1, Event::Advised { urgency_s: vec![(second, 10.0)] });
+    begun.handle(1, Event::Advised { urgency_s: vec![(second, 10.0)], held: Vec::new() });
     assert_eq!(begun.ranked(), ["second", "first"], "it asks again with what was advised");
-    begun.handle(2, Event::Advised { urgency_s: vec![(second, f64::NAN)] });
+    begun.handle(2, Event::Advised { urgency_s: vec![(second, f64::NAN)], held: Vec::new() });
     assert_eq!(begun.ranked(), ["second", "first"]);
     assert_eq!(begun.planned(2, "second").urgency_s, 10.0);
 }

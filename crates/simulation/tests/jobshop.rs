@@ -1,7 +1,8 @@
 //! Scheduling quality on instances that nobody here has made: classic job shops as tasks, in CDTN mode.
 
 use ratn_model::program::SUCCESS;
-use ratn_simulation::jobshop::{DEFAULT_ORDERS, JobShop, best_known};
+use ratn_simulation::activities::{DEFAULT_ORDERS, Execution};
+use ratn_simulation::jobshop::{JobShop, best_known};
 
 macro_rules! instances {
     ($($name:literal),*) => {
@@ -20,7 +21,10 @@ fn ratios(orders: usize) -> Vec<f64> {
         .iter()
         .map(|(name, text)| {
             let shop = JobShop::parse(text).unwrap_or_else(|error| unreachable!("{name}: {error}"));
-            let run = shop.execute(orders, 1).unwrap_or_else(|error| unreachable!("{name}: {error}"));
+            let run = shop
+                .activities()
+                .execute(Execution { orders, ..Execution::default() })
+                .unwrap_or_else(|error| unreachable!("{name}: {error}"));
             assert_eq!(run.outcome, SUCCESS, "{name}: {}", run.reason);
             let best = best_known(name).unwrap_or_else(|| unreachable!("{name} is not known"));
             assert!(run.end_s >= best, "{name}: {} is better than the best possible {best}", run.end_s);

@@ -119,7 +119,7 @@ impl TurnContext {
         // What is no number would not read back from a log.
         let is_usable = best.urgency_s.iter().all(|(_, seconds)| seconds.is_finite());
         let is_worthwhile = is_usable && best.end_s < best.plain_s * (1.0 - WORTHWHILE) && !best.urgency_s.is_empty();
-        is_worthwhile.then_some(Event::Advised { urgency_s: best.urgency_s })
+        is_worthwhile.then_some(Event::Advised { urgency_s: best.urgency_s, held: best.held })
     }
 }
 
@@ -147,6 +147,7 @@ mod tests {
             demands: vec![(kind.to_owned(), 1.into())],
             after: after.to_vec(),
             is_speculative: false,
+            held_for: Vec::new(),
             urgency_s: 0.0,
             probability: 1.0,
         }
@@ -169,7 +170,7 @@ mod tests {
         let mut advisor = Advisor::start(1)?;
         assert!(is_worth_asking(&problem()));
         advisor.ask(problem());
-        let Event::Advised { urgency_s } = advisor.told().await else { anyhow::bail!("no advice") };
+        let Event::Advised { urgency_s, .. } = advisor.told().await else { anyhow::bail!("no advice") };
         let urgency = |id| urgency_s.iter().find(|(instance, _)| *instance == InstanceId(id)).map(|(_, s)| *s);
         assert!(urgency(2) > urgency(1), "{urgency_s:?}");
         Ok(())

@@ -242,8 +242,8 @@ impl Shell {
         for line in self.progress.follow(now, event, &commands) {
             self.messages.say(line);
         }
-        self.lookout.observe(&commands);
-        if self.lookout.is_due() {
+        self.lookout.observe(now, &commands);
+        if self.lookout.is_due() || self.lookout.is_surprised() {
             self.ask_at.get_or_insert_with(|| Instant::now() + advisor::PAUSE);
         }
         Ok((now, commands))

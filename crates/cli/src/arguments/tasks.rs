@@ -1,6 +1,6 @@
 //! What is said of tasks: how they are checked, run, steered, reported and simulated, and of planning problems.
 
-use super::values::{at_least_one, chart, makespan, padding, setting, speed};
+use super::values::{at_least_one, chart, makespan, padding, setting, share, speed};
 use clap::{Args, Subcommand, ValueEnum};
 use ratn_task_control::checkpoint::EVERY_EVENTS;
 use std::path::PathBuf;
@@ -247,13 +247,23 @@ pub(crate) struct TablesArguments {
 #[derive(Debug, Clone, Args)]
 pub(crate) struct SimulateArguments {
     /// A job shop: a line with the numbers of jobs and machines, then per job a line of pairs of machine and duration
-    #[arg(long, value_name = "FILE")]
-    pub(crate) jobshop: PathBuf,
-    /// The best makespan known; of well-known instances it is known
+    #[arg(long, value_name = "FILE", required_unless_present = "project", conflicts_with = "project")]
+    pub(crate) jobshop: Option<PathBuf>,
+    /// Projects in PSPLIB's `.sm` format: activities that need units of several resources
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "best")]
+    pub(crate) project: Vec<PathBuf>,
+    /// The best makespan known; of well-known job shops it is known
     #[arg(long, value_name = "N", value_parser = makespan)]
     pub(crate) best: Option<f64>,
-    /// Orders to look at whenever much of what is to be done has changed; 0 for plain dispatch
-    #[arg(long, value_name = "N", default_value_t = ratn_simulation::jobshop::DEFAULT_ORDERS)]
+    /// A table of best makespans of projects: lines `file,lower bound,best known`, with or without the bound
+    #[arg(long, value_name = "CSV", requires = "project")]
+    pub(crate) best_known: Option<PathBuf>,
+    /// What activities really take differs from the estimates by up to this share of them (0.3: 30 %); the reference then is a run that
+    /// knows what they take
+    #[arg(long, value_name = "SHARE", value_parser = share)]
+    pub(crate) vary: Option<f64>,
+    /// Schedules to look at whenever much of what is to be done has changed; 0 for plain dispatch
+    #[arg(long, value_name = "N", default_value_t = ratn_simulation::activities::DEFAULT_ORDERS)]
     pub(crate) orders: usize,
     /// Every random choice is derived from this number
     #[arg(long, value_name = "N", default_value_t = 1)]

@@ -44,6 +44,13 @@ pub(super) fn makespan(text: &str) -> Result<f64, String> {
     }
 }
 
+pub(super) fn share(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(share) if (0.0..1.0).contains(&share) => Ok(share),
+        _ => Err("expected a number from 0 to less than 1".to_owned()),
+    }
+}
+
 pub(super) fn chart(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     let known = path.extension().is_some_and(|end| ["svg", "html"].iter().any(|known| end.eq_ignore_ascii_case(known)));

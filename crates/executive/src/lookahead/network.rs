@@ -1,7 +1,8 @@
 //! A problem as numbers: what the inner loop of a look-ahead works on.
 
 use super::problem::{Problem, ProblemError};
-use std::collections::BTreeMap;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BinaryHeap};
 
 /// A task, as its place in [`Problem::tasks`].
 pub(super) type Place = u32;
@@ -18,7 +19,7 @@ pub(super) struct Lists<T> {
 }
 
 impl<T> Lists<T> {
-    fn of(lists: impl Iterator<Item = Vec<T>>) -> Lists<T> {
+    pub(super) fn of(lists: impl Iterator<Item = Vec<T>>) -> Lists<T> {
         let (mut bounds, mut items) = (vec![0], Vec::new());
         for list in lists {
             items.extend(list);
@@ -33,6 +34,9 @@ impl<T> Lists<T> {
         &self.items[self.bounds[at] as usize..self.bounds[at + 1] as usize]
     }
 }
+
+/// Tasks that do not ask before others have begun: who, and for whom.
+pub(super) type Holds = Vec<(Place, Vec<Place>)>;
 
 /// What one task takes of one kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -53,6 +57,10 @@ pub(super) struct Network {
     pub(super) demands: Lists<Demand>,
     pub(super) before: Lists<Place>,
     pub(super) behind: Lists<Place>,
+    /// Each after those it waits for, else in program order.
+    pub(super) order: Vec<Place>,
+    /// Who is held back now.
+    pub(super) holds: Holds,
     /// By kind, in thousandths of a unit.
     pub(super) capacity: Vec<u64>,
     /// In nanoseconds, with its own duration; plain dispatch goes by it.
@@ -80,7 +88,15 @@ impl Network {
                 };
                 list.push(place as Place);
             }
+            if let Some(held_for) = task.held_for.iter().find(|held_for| **held_for >= size) {
+                return Err(ProblemError::Unknown { instance, after: *held_for, tasks: size });
+            }
         }
+        let held = problem
+            .tasks
+            .iter()
+            .enumerate()
+            .filter(|(_, task)| !task.held_for.is_empty() && !task.is_running && !task.demands.is_empty());
         let demands = |task: &super::problem::Task| {
             let mut units: BTreeMap<u32, u64> = BTreeMap::new();
             for (kind, count) in &task.demands {
@@ -91,13 +107,16 @@ impl Network {
             // More than there is can never be granted; the executive hears of that otherwise.
             units.into_iter().map(|(kind, units)| Demand { kind, units: units.min(capacity[kind as usize]) }).collect()
         };
+        let places = |list: &[usize]| list.iter().map(|at| *at as Place).collect::<Vec<Place>>();
         let mut network = Network {
             durations: problem.tasks.iter().map(|task| (task.duration_s * NANOSECONDS).round() as u64).collect(),
             is_running: problem.tasks.iter().map(|task| task.is_running).collect(),
             is_speculative: problem.tasks.iter().map(|task| task.is_speculative).collect(),
             demands: Lists::of(problem.tasks.iter().map(demands)),
-            before: Lists::of(problem.tasks.iter().map(|t| t.after.iter().map(|at| *at as Place).collect())),
+            before: Lists::of(problem.tasks.iter().map(|task| places(&task.after))),
             behind: Lists::of(behind.into_iter()),
+            holds: held.map(|(at, task)| (at as Place, places(&task.held_for))).collect(),
+            order: Vec::with_capacity(size),
             remaining: vec![0; size],
             capacity,
         };
@@ -137,17 +156,10 @@ impl Network {
     /// The longest path to each, without its own duration.
     fn heads(&self) -> Vec<u64> {
         let mut heads = vec![0; self.len()];
-        let mut open: Vec<u32> = (0..self.len()).map(|at| self.before.of_place(at as Place).len() as u32).collect();
-        let mut next: Vec<Place> = (0..self.len() as Place).filter(|place| open[*place as usize] == 0).collect();
-        while let Some(place) = next.pop() {
-            let end = heads[place as usize] + self.durations[place as usize];
-            for behind in self.behind.of_place(place) {
-                let at = *behind as usize;
-                heads[at] = heads[at].max(end);
-                open[at] -= 1;
-                if open[at] == 0 {
-                    next.push(*behind);
-                }
+        for place in &self.order {
+            let end = heads[*place as usize] + self.durations[*place as usize];
+            for behind in self.behind.of_place(*place) {
+                heads[*behind as usize] = heads[*behind as usize].max(end);
             }
         }
         heads
@@ -157,23 +169,25 @@ impl Network {
         self.durations.len()
     }
 
-    /// Remaining paths, from the last tasks on; a task that waits for itself, if there is one.
+    /// The order, and remaining paths from its end on; a task that waits for itself, if there is one.
     fn measure(&mut self) -> Option<Place> {
         let size = self.len();
-        let mut open: Vec<u32> = (0..size).map(|at| self.behind.of_place(at as Place).len() as u32).collect();
-        let mut next: Vec<Place> = (0..size as Place).filter(|place| open[*place as usize] == 0).collect();
-        let mut measured = 0;
-        while let Some(place) = next.pop() {
-            measured += 1;
-            let behind = self.behind.of_place(place).iter().map(|after| self.remaining[*after as usize]);
-            self.remaining[place as usize] = self.durations[place as usize] + behind.max().unwrap_or(0);
-            for before in self.before.of_place(place) {
-                open[*before as usize] -= 1;
-                if open[*before as usize] == 0 {
-                    next.push(*before);
+        let mut open: Vec<u32> = (0..size).map(|at| self.before.of_place(at as Place).len() as u32).collect();
+        let ready = (0..size as Place).filter(|place| open[*place as usize] == 0);
+        let mut next: BinaryHeap<Reverse<Place>> = ready.map(Reverse).collect();
+        while let Some(Reverse(place)) = next.pop() {
+            self.order.push(place);
+            for behind in self.behind.of_place(place) {
+                open[*behind as usize] -= 1;
+                if open[*behind as usize] == 0 {
+                    next.push(Reverse(*behind));
                 }
             }
         }
-        if measured == size { None } else { (0..size as Place).find(|place| open[*place as usize] > 0) }
+        for place in self.order.iter().rev() {
+            let behind = self.behind.of_place(*place).iter().map(|after| self.remaining[*after as usize]);
+            self.remaining[*place as usize] = self.durations[*place as usize] + behind.max().unwrap_or(0);
+        }
+        if self.order.len() == size { None } else { (0..size as Place).find(|place| open[*place as usize] > 0) }
     }
 }

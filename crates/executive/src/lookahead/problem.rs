@@ -27,6 +27,8 @@ pub struct Task {
     /// The tasks that must have ended before it may ask for resources, as places in [`Problem::tasks`]: producers of its inputs, the writers
     /// of what it reads, and for a PIA everything that must have ended before it.
     pub after: Vec<usize>,
+    /// By what was advised before, it does not ask for resources before these have begun, as places in [`Problem::tasks`].
+    pub held_for: Vec<usize>,
     /// A condition on its path is undecided: it is served after everything for which none is.
     pub is_speculative: bool,
     /// By what it is served now, in seconds: the longest remaining path, or what was advised before.

@@ -1,53 +1,55 @@
-//! The search for a better order: simulated annealing over the order in which tasks are served.
+//! The search for a better plan, and the advice that makes the executive's dispatch come to it.
 //!
-//! A schedule made by dispatch is the order in which its tasks begin: dispatched in that order, it comes out the same. So the order
-//! is the solution that is searched: a step moves one task to another place in it, simulates the dispatch, and keeps the
-//! result if the end is not later, or by chance if it is, with a temperature that falls over some thousand steps and is then
-//! raised again (Kirkpatrick, Gelatt, Vecchi: Optimization by simulated annealing, 1983; over dispatched schedules: Kolisch,
-//! Hartmann: Heuristic algorithms for the resource-constrained project scheduling problem, 1999). It is over early when
-//! nothing can be better.
+//! How it searches depends on what there is to schedule: [`Tabu`] where contested resources can only be had by one task at a time, a
+//! [`Population`] of lists where they have several units, [`Annealing`] of the dispatch itself where tasks are speculative. Whatever is
+//! found is simulated under the very dispatch of the executive, with those held back that it needs to come to the plan, and counts
+//! only if that ends earlier. It is over early when nothing can be better.
 
-use super::dice::Dice;
-use super::network::{NANOSECONDS, Network, Place};
+use super::annealing::Annealing;
+use super::network::{Holds, NANOSECONDS, Network, Place};
+use super::population::Population;
 use super::problem::{Problem, ProblemError};
+use super::project::{Plan, Project};
 use super::rollout::Rollout;
+use super::tabu::Tabu;
 use ratn_model::id::InstanceId;
 use std::cmp::Reverse;
-
-/// From the highest temperature to the lowest in so many steps; the next cycle begins with the best order.
-const CYCLE: u32 = 4_000;
-/// An end that is later by this share of the whole is kept with probability 1/e at the beginning of a cycle …
-const HOT: f64 = 0.01;
-/// … and this one at its end.
-const COLD: f64 = 0.0005;
+use std::collections::BTreeMap;
 
 /// Two instances that begin at the same moment are advised this far apart, in seconds: the executive counts milliseconds.
 const APART_S: f64 = 0.002;
 /// The same as a share of the whole, for what the executive's numbers can tell apart.
 const APART_SHARE: f64 = 1.0 / 1_000_000.0;
 
+/// Who is held back may ask after so many times the time that was planned, whatever has become of the plan.
+const GIVES_UP_AFTER: f64 = 2.0;
+
 /// A search that goes on as long as it is let.
 #[derive(Debug, Clone)]
 pub struct Search {
     network: Network,
     instances: Vec<(InstanceId, f64)>,
-    dice: Dice,
     rollout: Rollout,
     ranks: Vec<u32>,
     /// The order that is tried.
     tried: Vec<Place>,
-    current: Vec<Place>,
-    current_end: u64,
     best: Vec<Place>,
+    best_holds: Holds,
     best_end: u64,
     plain_end: u64,
     /// No order ends earlier than this.
     bound: u64,
-    /// In the present cycle.
-    steps: u32,
+    method: Method,
 }
 
-/// The best order found.
+#[derive(Debug, Clone)]
+enum Method {
+    Annealing(Annealing),
+    Population(Box<Population>),
+    Tabu(Box<Tabu>),
+}
+
+/// The best plan found.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Advice {
     /// When everything has ended, in seconds from now, if it is served so.
@@ -56,6 +58,34 @@ pub struct Advice {
     pub plain_s: f64,
     /// For [`crate::protocol::Event::Advised`]: every task that has not begun.
     pub urgency_s: Vec<(InstanceId, f64)>,
+    /// For the same: who is held back.
+    pub held: Vec<Held>,
+}
+
+/// An instance that does not ask for resources although it could, so that others get them first.
+#[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct Held {
+    /// Which.
+    pub instance: InstanceId,
+    /// It may ask once these have begun.
+    pub until_begun: Vec<InstanceId>,
+    /// It may ask after this time in any case, in seconds.
+    pub at_most_s: f64,
+}
+
+/// Good orders of what is to be done, which a later search begins with.
+#[derive(Debug, Clone, Default)]
+pub struct Memory {
+    lists: Vec<Vec<InstanceId>>,
+}
+
+impl Memory {
+    /// The orders, of what is still to be done, as places.
+    fn lists_of(&self, problem: &Problem) -> impl Iterator<Item = Vec<Place>> {
+        let places: BTreeMap<InstanceId, Place> =
+            problem.tasks.iter().enumerate().map(|(at, task)| (task.instance, at as Place)).collect();
+        self.lists.iter().map(move |list| list.iter().filter_map(|id| places.get(id).copied()).collect())
+    }
 }
 
 impl Search {
@@ -64,6 +94,14 @@ impl Search {
     /// # Errors
     /// [`ProblemError`] where the problem cannot be simulated.
     pub fn new(problem: &Problem, seed: u64) -> Result<Search, ProblemError> {
+        Search::remembering(problem, seed, &Memory::default())
+    }
+
+    /// As [`Search::new`]; the search before, of what was to be done then, is gone on with.
+    ///
+    /// # Errors
+    /// As [`Search::new`].
+    pub fn remembering(problem: &Problem, seed: u64, memory: &Memory) -> Result<Search, ProblemError> {
         let network = Network::of(problem)?;
         let size = network.len();
         let in_order = |urgency: &dyn Fn(usize) -> i64| {
@@ -77,80 +115,93 @@ impl Search {
             i64::from(((task.urgency_s * task.probability).max(0.0) as f32).to_bits())
         });
         let longest = in_order(&|at| i64::try_from(network.remaining[at]).unwrap_or(i64::MAX));
+        let project = Project::of(&network);
         let mut search = Search {
             instances: problem.tasks.iter().map(|task| (task.instance, task.probability)).collect(),
-            dice: Dice(seed),
             rollout: Rollout::new(&network),
             ranks: vec![0; size],
             tried: present,
-            current: Vec::new(),
-            current_end: 0,
             best: Vec::new(),
-            best_end: 0,
+            best_holds: network.holds.clone(),
+            best_end: u64::MAX,
             plain_end: 0,
             bound: network.bound(),
-            steps: 0,
+            method: Method::Annealing(Annealing::new(seed, &[], 0)),
             network,
         };
-        search.plain_end = search.simulate();
-        search.best_end = search.plain_end;
+        let holds = search.best_holds.clone();
+        search.plain_end = search.simulate(&holds);
         search.best = search.rollout.sequence.clone();
+        search.best_end = search.plain_end;
+        let mut lists = vec![search.rollout.sequence.clone()];
         search.tried = longest;
-        let end = search.simulate();
+        let end = search.simulate(&Holds::new());
+        lists.push(search.rollout.sequence.clone());
         if end < search.best_end {
-            search.best_end = end;
-            search.best.clone_from(&search.rollout.sequence);
+            search.keep(end, Holds::new());
+            lists.swap(0, 1);
         }
-        search.current.clone_from(&search.best);
-        search.current_end = search.best_end;
+        search.method = if search.network.is_speculative.contains(&true) {
+            Method::Annealing(Annealing::new(seed, &search.best, search.best_end))
+        } else {
+            // Those that are held back and wait for each other began nothing.
+            lists.retain(|list| list.len() == size);
+            lists.extend(memory.lists_of(problem));
+            lists.iter_mut().for_each(|list| *list = project.list_of(list));
+            match Tabu::new(project.clone(), seed, &lists) {
+                Some(tabu) => Method::Tabu(Box::new(tabu)),
+                None => Method::Population(Box::new(Population::new(project, seed, lists))),
+            }
+        };
         Ok(search)
     }
 
-    /// Simulates so many orders; whether one of them ends earlier than everything before.
+    /// Makes so many schedules; whether one of them ends earlier than everything before.
     pub fn step(&mut self, orders: usize) -> bool {
         let before = self.best_end;
-        let size = self.current.len();
-        for _ in 0..orders {
-            if self.is_over() {
-                break;
-            }
-            if self.steps == CYCLE {
-                self.steps = 0;
-                self.current.copy_from_slice(&self.best);
-                self.current_end = self.best_end;
-            }
-            let (from, to) = (self.dice.below(size), self.dice.below(size));
-            self.tried.copy_from_slice(&self.current);
-            if from < to {
-                self.tried[from..=to].rotate_left(1);
-            } else {
-                self.tried[to..=from].rotate_right(1);
-            }
-            let end = self.simulate();
-            let temperature = HOT * (COLD / HOT).powf(f64::from(self.steps) / f64::from(CYCLE)) * self.best_end as f64;
-            self.steps += 1;
-            let later = end.saturating_sub(self.current_end) as f64;
-            if later == 0.0 || self.dice.share() < (-later / temperature).exp() {
-                self.current_end = end;
-                self.current.copy_from_slice(&self.rollout.sequence);
-                if end < self.best_end {
-                    self.best_end = end;
-                    self.best.copy_from_slice(&self.rollout.sequence);
+        if self.is_over() {
+            return false;
+        }
+        let found = match &mut self.method {
+            Method::Annealing(_) => {
+                for _ in 0..orders {
+                    self.anneal();
+                    if self.is_over() {
+                        break;
+                    }
                 }
+                None
             }
+            Method::Population(population) => population.step(orders, self.bound),
+            Method::Tabu(tabu) => tabu.step(orders, self.bound),
+        };
+        if let Some(plan) = found {
+            self.confirm(&plan);
         }
         self.best_end < before
     }
 
-    /// Whether nothing better can be found.
-    pub fn is_over(&self) -> bool {
-        self.best_end <= self.bound || self.current.len() < 2
+    /// The orders that a later search goes on with.
+    pub fn memory(&mut self) -> Memory {
+        let (lists, project) = match &mut self.method {
+            Method::Annealing(_) => return Memory::default(),
+            Method::Population(population) => (population.lists(), population.project()),
+            Method::Tabu(tabu) => (tabu.lists(), tabu.project()),
+        };
+        let instance = |task: &u32| self.instances[project.places[*task as usize] as usize].0;
+        Memory { lists: lists.iter().map(|list| list.iter().map(instance).collect()).collect() }
     }
 
-    /// The best order so far.
+    /// Whether nothing better can be found.
+    pub fn is_over(&self) -> bool {
+        self.best_end <= self.bound || self.best.len() < 2
+    }
+
+    /// The best plan so far.
     pub fn best(&mut self) -> Advice {
         self.tried.copy_from_slice(&self.best);
-        self.simulate();
+        let holds = self.best_holds.clone();
+        self.simulate(&holds);
         let end_s = self.best_end as f64 / NANOSECONDS;
         let apart_s = APART_S.max(end_s * APART_SHARE);
         let mut urgency_s = Vec::with_capacity(self.best.len());
@@ -167,16 +218,60 @@ impl Search {
             let (instance, probability) = self.instances[at];
             urgency_s.push((instance, seconds / probability));
         }
-        Advice { end_s, plain_s: self.plain_end as f64 / NANOSECONDS, urgency_s }
+        let instance = |place: &Place| self.instances[*place as usize].0;
+        let held = holds.iter().map(|(place, held_for)| Held {
+            instance: instance(place),
+            until_begun: held_for.iter().map(instance).collect(),
+            at_most_s: GIVES_UP_AFTER * self.rollout.began[*place as usize] as f64 / NANOSECONDS,
+        });
+        let held = held.collect();
+        Advice { end_s, plain_s: self.plain_end as f64 / NANOSECONDS, urgency_s, held }
+    }
+
+    /// Simulates another order; it is kept if it ends earlier.
+    fn anneal(&mut self) {
+        let Method::Annealing(annealing) = &mut self.method else { return };
+        annealing.vary(&mut self.tried, &self.best, self.best_end);
+        let end = self.simulate(&Holds::new());
+        if let Method::Annealing(annealing) = &mut self.method {
+            annealing.judge(&self.rollout.sequence, end, self.best_end);
+        }
+        if end < self.best_end {
+            self.keep(end, Holds::new());
+        }
+    }
+
+    /// Simulates the dispatch that comes to a plan; it is kept if it ends earlier.
+    fn confirm(&mut self, plan: &Plan) {
+        self.tried.clear();
+        self.tried.extend((0..self.network.len() as Place).filter(|place| self.network.is_running[*place as usize]));
+        self.tried.extend_from_slice(&plan.order);
+        self.ranks_of_tried();
+        let holds = self.rollout.holds_of_plan(&self.network, &self.ranks, &plan.begins);
+        let end = self.rollout.run(&self.network, &self.ranks, &holds);
+        if end < self.best_end {
+            self.keep(end, holds);
+        }
+    }
+
+    /// What was simulated last is the best.
+    fn keep(&mut self, end: u64, holds: Holds) {
+        self.best_end = end;
+        self.best.clone_from(&self.rollout.sequence);
+        self.best_holds = holds;
     }
 
     /// When everything has ended that is served in the tried order.
-    fn simulate(&mut self) -> u64 {
+    fn simulate(&mut self, holds: &Holds) -> u64 {
+        self.ranks_of_tried();
+        self.rollout.run(&self.network, &self.ranks, holds)
+    }
+
+    fn ranks_of_tried(&mut self) {
         let late = self.network.len() as u32;
         for (rank, place) in self.tried.iter().enumerate() {
             let speculative = if self.network.is_speculative[*place as usize] { late } else { 0 };
             self.ranks[*place as usize] = speculative + rank as u32;
         }
-        self.rollout.run(&self.network, &self.ranks)
     }
 }

@@ -13,6 +13,7 @@ fn task(id: u64, duration_s: f64, kind: &str, after: &[usize]) -> Task {
         demands: vec![(kind.to_owned(), Quantity::ONE)],
         after: after.to_vec(),
         is_speculative: false,
+        held_for: Vec::new(),
         urgency_s: 0.0,
         probability: 1.0,
     }
@@ -75,6 +76,10 @@ fn what_is_advised_reproduces_the_end_and_is_never_worse_than_what_was() {
         for (instance, seconds) in &advice.urgency_s {
             problem.tasks[instance.0 as usize].urgency_s = *seconds;
         }
+        for held in &advice.held {
+            let places = held.until_begun.iter().map(|instance| instance.0 as usize);
+            problem.tasks[held.instance.0 as usize].held_for = places.collect();
+        }
         let again = Search::new(&problem, 0).unwrap().best().plain_s;
         assert!((again - advice.end_s).abs() < 1e-9, "seed {seed}: advised {}, came to {again}", advice.end_s);
     }
@@ -134,4 +139,125 @@ fn nothing_to_do_is_over_at_once() {
     let mut search = Search::new(&Problem::default(), 1).unwrap();
     assert!(search.is_over() && !search.step(10));
     assert_eq!(search.best().urgency_s, Vec::new());
+}
+
+/// The shortest schedule, by trying all lists: tasks in the order of a list, each as early as those before it allow. Shares nothing
+/// with the search; whole seconds only.
+fn shortest_s(problem: &Problem) -> usize {
+    const HORIZON: usize = 100;
+    struct Trial<'a> {
+        problem: &'a Problem,
+        ends: Vec<Option<usize>>,
+        used: Vec<std::collections::BTreeMap<String, u64>>,
+        best: usize,
+    }
+    fn extend(trial: &mut Trial<'_>) {
+        let problem = trial.problem;
+        let end = trial.ends.iter().flatten().copied().max().unwrap_or(0);
+        if end >= trial.best {
+            return;
+        }
+        if trial.ends.iter().all(Option::is_some) {
+            trial.best = end;
+            return;
+        }
+        for (place, task) in problem.tasks.iter().enumerate() {
+            let ready: Option<usize> =
+                task.after.iter().map(|after| trial.ends[*after]).try_fold(0, |ready, end| Some(ready.max(end?)));
+            let (None, Some(ready)) = (trial.ends[place], ready) else { continue };
+            let duration = task.duration_s as usize;
+            let fits = |used: &std::collections::BTreeMap<String, u64>| {
+                let left = |kind: &String| problem.capacity[kind].thousandths() - used.get(kind).copied().unwrap_or(0);
+                task.demands.iter().all(|(kind, units)| units.thousandths() <= left(kind))
+            };
+            let begins = (ready..).find(|from| trial.used[*from..from + duration].iter().all(fits)).unwrap();
+            let before = trial.used.clone();
+            for used in &mut trial.used[begins..begins + duration] {
+                task.demands
+                    .iter()
+                    .for_each(|(kind, units)| *used.entry(kind.clone()).or_default() += units.thousandths());
+            }
+            trial.ends[place] = Some(begins + duration);
+            extend(trial);
+            trial.ends[place] = None;
+            trial.used = before;
+        }
+    }
+    let (ends, used) = (vec![None; problem.tasks.len()], vec![Default::default(); HORIZON]);
+    let mut trial = Trial { problem, ends, used, best: HORIZON };
+    extend(&mut trial);
+    trial.best
+}
+
+/// Up to seven tasks that need units of two resources, or one machine of two.
+fn small(seed: u64, machines: bool) -> Problem {
+    let mut dice = Dice(seed);
+    let size = 3 + dice.below(5);
+    let tasks = (0..size).map(|place| {
+        let after: Vec<usize> = if place > 0 && dice.below(2) == 0 { vec![dice.below(place)] } else { Vec::new() };
+        let kinds = ["a", "b"];
+        let one = vec![(kinds[dice.below(2)].to_owned(), Quantity::ONE)];
+        let units = |dice: &mut Dice| Quantity::whole(1 + dice.below(3) as u32);
+        let several = vec![("a".to_owned(), units(&mut dice)), ("b".to_owned(), units(&mut dice))];
+        let demands = if machines { one } else { several };
+        Task { demands, ..task(place as u64, 1.0 + dice.below(9) as f64, "a", &after) }
+    });
+    let units = if machines { 1 } else { 4 };
+    problem(tasks.collect(), &[("a", units), ("b", units)])
+}
+
+#[test]
+fn the_plan_of_a_small_problem_is_the_shortest_there_is() {
+    for (seed, machines) in (0..60).flat_map(|seed| [(seed, false), (seed, true)]) {
+        let mut problem = small(seed, machines);
+        let shortest_s = shortest_s(&problem) as f64;
+        let mut search = Search::new(&problem, seed).unwrap();
+        search.step(3_000);
+        let advice = search.best();
+        assert_eq!(advice.end_s, shortest_s, "seed {seed}, machines: {machines}");
+        // And a dispatch that is advised so comes to it.
+        for (instance, seconds) in &advice.urgency_s {
+            problem.tasks[instance.0 as usize].urgency_s = *seconds;
+        }
+        for held in &advice.held {
+            let places = held.until_begun.iter().map(|instance| instance.0 as usize);
+            problem.tasks[held.instance.0 as usize].held_for = places.collect();
+        }
+        assert_eq!(Search::new(&problem, 0).unwrap().best().plain_s, shortest_s, "seed {seed}, machines: {machines}");
+    }
+}
+
+#[test]
+fn a_plan_that_needs_it_holds_somebody_back() {
+    // The first could have the machine at once, and the long way of the second begins with it a second later.
+    let tasks = vec![task(0, 5.0, "m", &[]), task(1, 1.0, "n", &[]), task(2, 1.0, "m", &[1]), task(3, 9.0, "n", &[2])];
+    let mut search = Search::new(&problem(tasks, &[("m", 1), ("n", 1)]), 1).unwrap();
+    search.step(100);
+    let advice = search.best();
+    assert_eq!((advice.plain_s, advice.end_s), (15.0, 11.0));
+    let held: Vec<_> = advice.held.iter().map(|held| (held.instance, held.until_begun.clone())).collect();
+    assert_eq!(held, [(InstanceId(0), vec![InstanceId(2)])]);
+}
+
+#[test]
+fn those_held_back_for_each_other_are_no_plan() {
+    let mut tasks = vec![task(0, 1.0, "m", &[]), task(1, 1.0, "m", &[])];
+    (tasks[0].held_for, tasks[1].held_for) = (vec![1], vec![0]);
+    let advice = Search::new(&problem(tasks.clone(), &[("m", 1)]), 1).unwrap().best();
+    assert!(advice.end_s == 2.0 && advice.plain_s > 1e9 && advice.held.is_empty(), "{advice:?}");
+    tasks[1].held_for = vec![7];
+    assert!(matches!(Search::new(&problem(tasks, &[("m", 1)]), 1), Err(ProblemError::Unknown { after: 7, .. })));
+}
+
+#[test]
+fn a_later_search_begins_where_the_one_before_ended() {
+    for (seed, machines) in (0..60).flat_map(|seed| [(seed, false), (seed, true)]) {
+        let problem = small(seed, machines);
+        let mut search = Search::new(&problem, seed).unwrap();
+        search.step(600);
+        let memory = search.memory();
+        let mut later = Search::remembering(&problem, seed, &memory).unwrap();
+        later.step(3);
+        assert!(later.best().end_s <= search.best().end_s, "seed {seed}");
+    }
 }

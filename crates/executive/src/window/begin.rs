@@ -10,6 +10,7 @@ use super::waits::{Timer, Wait};
 use crate::binding::{self, Outputs, Seed};
 use crate::context::Context;
 use crate::interpreter::{Interpreter, Routine, Target};
+use crate::lookahead::Held;
 use crate::plan::NodeNature;
 use crate::protocol::{Command, Event, Goal, Note};
 use ratn_model::expression::{FactExpr, Scope};
@@ -436,10 +437,31 @@ impl Window {
         }
     }
 
+    /// A look-ahead advises who is to be held back: what was advised before is over.
+    pub(super) fn hold_back(&mut self, context: &mut Context<'_>, held: &[Held]) {
+        let (before, holds) = self.dispatch.hold(&self.graph, context.now, held);
+        for (id, until) in holds {
+            self.waits.set_timer_at(until, Timer::Hold(id));
+            context.commands.push(Command::Wake { at: until });
+            let Some(instance) = self.graph.get(id) else { continue };
+            let wanted = &context.plan.state(instance.state).requirements;
+            let is_asking = instance.node().is_some_and(|node| matches!(node.status, Status::Acquiring { .. }));
+            // As when it asks again: what a crossing grant has used up stays used up.
+            let uses_up = wanted.iter().any(|r| r.operation == ResourceOperation::Consume);
+            if is_asking && !uses_up && self.dispatch.is_held(&self.graph, id) {
+                self.step_back(context, id, Wait::Turn);
+            }
+        }
+        for id in before {
+            self.waits.enqueue(&mut self.graph, id);
+        }
+    }
+
     /// Speculative holders give way to certain nodes, and whoever waits for room begins where there is some; whether anybody did.
     pub(super) fn give_way(&mut self, context: &mut Context<'_>) -> bool {
         let in_the_way = self.dispatch.in_the_way(&self.graph, context.plan);
-        let first = self.dispatch.take_stalled(&self.graph);
+        let mut first = self.dispatch.take_stalled(&self.graph);
+        first.extend(self.dispatch.take_released(&self.graph));
         let changed = !in_the_way.is_empty() || !first.is_empty();
         for (holder, by) in in_the_way {
             context.note(Note::Preempted { instance: holder, by });

@@ -46,6 +46,11 @@ impl Window {
         while let Some(timer) = self.waits.next_due(context.now) {
             match timer {
                 Timer::Retry(id) => self.waits.enqueue(&mut self.graph, id),
+                Timer::Hold(id) => {
+                    if self.dispatch.let_go(id, context.now) {
+                        self.waits.enqueue(&mut self.graph, id);
+                    }
+                }
                 Timer::Timeout(id, attempt) => {
                     let Some(instance) = self.graph.get(id) else { continue };
                     let is_running =

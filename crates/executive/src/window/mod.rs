@@ -144,8 +144,9 @@ impl Window {
                 self.hold.step();
                 self.look_at_those_held();
             }
-            Event::Advised { urgency_s } => {
+            Event::Advised { urgency_s, held } => {
                 Dispatch::advise(&mut self.graph, &urgency_s);
+                self.hold_back(context, &held);
                 self.ask_again(context);
             }
             Event::WorldChanged { facts, .. } => self.world_changed(context, facts.iter().map(|(fact, _)| fact)),

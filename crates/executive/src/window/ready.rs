@@ -106,6 +106,9 @@ impl Window {
                 Err(error) => return not_bound(view, &error),
             }
         }
+        if !requirements.is_empty() && self.dispatch.is_held(&self.graph, instance.id) {
+            return Readiness::Waits(Wait::Turn);
+        }
         Readiness::Ready(requirements, bound)
     }
 

@@ -43,6 +43,8 @@ pub(crate) enum Wait {
     Pause,
     /// Room: what is speculative leaves some to what is not.
     Room,
+    /// Others that are to have resources first, by what a look-ahead advised.
+    Turn,
     /// The resource manager.
     Resources,
 }
@@ -60,7 +62,9 @@ impl Wait {
             | Wait::Twin(id)
             | Wait::Decision(id)
             | Wait::Settling(id) => Some(id),
-            Wait::Nothing | Wait::Order | Wait::Backoff | Wait::Pause | Wait::Room | Wait::Resources => None,
+            Wait::Nothing | Wait::Order | Wait::Backoff | Wait::Pause | Wait::Room | Wait::Turn | Wait::Resources => {
+                None
+            }
         }
     }
 
@@ -83,6 +87,7 @@ impl Wait {
             Wait::Backoff => format!("{path} waits before it is tried again"),
             Wait::Pause => format!("{path} waits for the operator"),
             Wait::Room => format!("{path} is speculative and leaves room to what is not"),
+            Wait::Turn => format!("{path} leaves its resources to others that are to begin first"),
             Wait::Resources => format!("{path} waits for the resource manager"),
         }
     }
@@ -116,6 +121,8 @@ pub(crate) enum Timer {
     Retry(InstanceId),
     /// The goal of this attempt has had its time.
     Timeout(InstanceId, u32),
+    /// It has been held back as long as it may be.
+    Hold(InstanceId),
     /// The task has had its time.
     Deadline,
 }
@@ -206,8 +213,13 @@ impl Waits {
     pub(crate) fn set_timer(&mut self, now: Timestamp, after_s: f64, timer: Timer) -> Timestamp {
         let after = Duration::try_from_secs_f64(after_s.max(0.0)).unwrap_or(Duration::MAX);
         let at: Timestamp = now + after;
-        self.timers.insert((at, timer));
+        self.set_timer_at(at, timer);
         at
+    }
+
+    /// Something happens at a moment.
+    pub(crate) fn set_timer_at(&mut self, at: Timestamp, timer: Timer) {
+        self.timers.insert((at, timer));
     }
 
     /// The next timer that is due.

@@ -5,6 +5,7 @@
 //! projections to others, and gives back what it holds where it keeps a certain one from it.
 
 mod estimate;
+mod holds;
 mod outlook;
 
 use super::graph::Graph;
@@ -49,14 +50,17 @@ pub(crate) struct Dispatch {
     in_rooms: BTreeSet<InstanceId>,
     /// Speculative nodes that leave room.
     stalled: BTreeSet<InstanceId>,
+    /// Who is held back.
+    #[serde(default)]
+    holds: holds::Holds,
     /// Certain nodes that have asked since the speculative ones were looked at.
     asked: Vec<InstanceId>,
 }
 
 impl Dispatch {
     pub(crate) fn new(capacity: BTreeMap<String, Quantity>, learned_s: BTreeMap<String, f64>) -> Dispatch {
-        let (active, speculative, in_rooms, stalled, asked) = Default::default();
-        Dispatch { capacity, learned_s, active, speculative, in_rooms, stalled, asked }
+        let (active, speculative, in_rooms, stalled, holds, asked) = Default::default();
+        Dispatch { capacity, learned_s, active, speculative, in_rooms, stalled, holds, asked }
     }
 
     /// Nodes under way, oldest first.
@@ -101,6 +105,7 @@ impl Dispatch {
     pub(crate) fn forget(&mut self, id: InstanceId) {
         self.end(id);
         self.stalled.remove(&id);
+        self.holds.remove(&id);
     }
 
     /// Its path is decided. Whether it has to ask anew, as somebody who is certain.

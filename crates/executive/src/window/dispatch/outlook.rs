@@ -48,12 +48,16 @@ impl Dispatch {
                 instance: instance.id,
                 duration_s: (f64::from(duration_s) - elapsed_s).clamp(0.0, LONGEST_S),
                 is_running: began.is_some(),
+                held_for: Vec::new(),
                 is_speculative: graph.is_speculative(instance.segment),
                 urgency_s: f64::from(instance.dispatch.remaining_s.unwrap_or(duration_s)),
                 probability: graph.probability(instance.segment),
                 demands: blocks(sight.plan, instance).map(|(kind, count)| (kind.to_owned(), count)).collect(),
                 after,
             });
+        }
+        for task in tasks.iter_mut().filter(|task| !task.is_running) {
+            task.held_for = self.held_for(graph, task.instance).filter_map(|id| places.get(&id).copied()).collect();
         }
         Problem { tasks, capacity: self.capacity.clone() }
     }

@@ -1,0 +1,178 @@
+//! The disjunctive graph of a project whose contested resources can only be had by one task at a time: per resource the order of its
+//! tasks, and the longest paths that follow from it.
+//!
+//! Orders of machines and heads and tails are those of the job shop (Balas 1969); tasks may wait for several others.
+
+use super::project::Project;
+
+/// No neighbour.
+pub(super) const NONE: u32 = u32::MAX;
+
+/// The orders, and what follows from them.
+#[derive(Debug, Clone)]
+pub(super) struct Disjunctive {
+    pub(super) project: Project,
+    /// By task; [`NONE`] where it needs nothing that is contested.
+    pub(super) machine: Vec<u32>,
+    /// By machine, its tasks in order.
+    pub(super) orders: Vec<Vec<u32>>,
+    /// By task, its place in the order of its machine.
+    pub(super) position: Vec<u32>,
+    /// By task, when it is ready at the earliest, whatever the orders.
+    pub(super) releases: Vec<u64>,
+    /// By task, the longest path to it.
+    pub(super) heads: Vec<u64>,
+    /// By task, the longest path from its end on.
+    pub(super) tails: Vec<u64>,
+    sorted: Vec<u32>,
+    open: Vec<u32>,
+    /// When everything has ended.
+    pub(super) end: u64,
+}
+
+impl Disjunctive {
+    /// `None` where a resource can be had by two tasks at a time, or a task needs two that are contested.
+    pub(super) fn of(project: Project) -> Option<Disjunctive> {
+        let size = project.len();
+        let mut least = project.capacity.clone();
+        let each = (0..size as u32).flat_map(|task| project.demands.of_place(task));
+        for demand in each.chain(project.occupied.iter().map(|(_, demand)| demand)) {
+            let least = &mut least[demand.kind as usize];
+            *least = demand.units.min(*least);
+        }
+        let is_single = least.iter().zip(&project.capacity).all(|(least, all)| least.saturating_mul(2) > *all);
+        let is_one_each = (0..size as u32).all(|task| project.demands.of_place(task).len() <= 1);
+        if !is_single || !is_one_each {
+            return None;
+        }
+        let machine: Vec<u32> = (0..size as u32)
+            .map(|task| project.demands.of_place(task).first().map_or(NONE, |demand| demand.kind))
+            .collect();
+        let mut free = vec![0; project.capacity.len()];
+        for (until, demand) in &project.occupied {
+            free[demand.kind as usize] = (*until).max(free[demand.kind as usize]);
+        }
+        let release = |(task, machine): (usize, &u32)| {
+            let own = project.releases[task];
+            if *machine == NONE { own } else { own.max(free[*machine as usize]) }
+        };
+        Some(Disjunctive {
+            releases: machine.iter().enumerate().map(release).collect(),
+            orders: vec![Vec::new(); project.capacity.len()],
+            machine,
+            position: vec![0; size],
+            heads: vec![0; size],
+            tails: vec![0; size],
+            sorted: Vec::with_capacity(size),
+            open: vec![0; size],
+            end: 0,
+            project,
+        })
+    }
+
+    /// Orders the tasks of each machine as in a list in which each task comes after those it waits for.
+    pub(super) fn order_by(&mut self, list: &[u32]) {
+        self.orders.iter_mut().for_each(Vec::clear);
+        for task in list {
+            if let Some(order) = self.orders.get_mut(self.machine[*task as usize] as usize) {
+                self.position[*task as usize] = order.len() as u32;
+                order.push(*task);
+            }
+        }
+        self.measure();
+    }
+
+    /// Orders the tasks of each machine as they were ordered before.
+    pub(super) fn order_as(&mut self, orders: &[Vec<u32>]) {
+        for (order, kept) in self.orders.iter_mut().zip(orders) {
+            order.clone_from(kept);
+            for (at, task) in order.iter().enumerate() {
+                self.position[*task as usize] = at as u32;
+            }
+        }
+        self.measure();
+    }
+
+    /// The task before another one on its machine.
+    pub(super) fn machine_before(&self, task: u32) -> u32 {
+        let (machine, position) = (self.machine[task as usize], self.position[task as usize]);
+        if machine == NONE || position == 0 { NONE } else { self.orders[machine as usize][position as usize - 1] }
+    }
+
+    /// The task behind another one on its machine.
+    pub(super) fn machine_behind(&self, task: u32) -> u32 {
+        let (machine, position) = (self.machine[task as usize], self.position[task as usize]);
+        let order = if machine == NONE { None } else { self.orders.get(machine as usize) };
+        order.and_then(|order| order.get(position as usize + 1)).copied().unwrap_or(NONE)
+    }
+
+    pub(super) fn duration(&self, task: u32) -> u64 {
+        self.project.durations[task as usize]
+    }
+
+    /// When those have ended that a task waits for, whatever its machine does.
+    pub(super) fn ready(&self, task: u32) -> u64 {
+        let before = self.project.before.of_place(task).iter();
+        let ends = before.map(|before| self.heads[*before as usize] + self.duration(*before));
+        ends.max().unwrap_or(0).max(self.releases[task as usize])
+    }
+
+    /// The longest path through what waits for a task, whatever its machine does.
+    pub(super) fn rest(&self, task: u32) -> u64 {
+        let behind = self.project.behind.of_place(task).iter();
+        behind.map(|behind| self.tails[*behind as usize] + self.duration(*behind)).max().unwrap_or(0)
+    }
+
+    /// Moves a task of a machine to another place in its order.
+    pub(super) fn shift(&mut self, machine: u32, from: usize, to: usize) {
+        let order = &mut self.orders[machine as usize];
+        if from < to {
+            order[from..=to].rotate_left(1);
+        } else {
+            order[to..=from].rotate_right(1);
+        }
+        for at in from.min(to)..=from.max(to) {
+            self.position[order[at] as usize] = at as u32;
+        }
+        self.measure();
+    }
+
+    /// Works out heads, tails and the end. The orders must not contradict what waits for what.
+    pub(super) fn measure(&mut self) {
+        self.sorted.clear();
+        for task in 0..self.project.len() as u32 {
+            let on_machine = u32::from(self.machine_before(task) != NONE);
+            let open = self.project.before.of_place(task).len() as u32 + on_machine;
+            self.open[task as usize] = open;
+            if open == 0 {
+                self.sorted.push(task);
+            }
+        }
+        let mut next = 0;
+        self.end = self.project.running_end;
+        while let Some(task) = self.sorted.get(next).copied() {
+            next += 1;
+            let before = self.machine_before(task);
+            let machine_free = if before == NONE { 0 } else { self.heads[before as usize] + self.duration(before) };
+            let head = self.ready(task).max(machine_free);
+            self.heads[task as usize] = head;
+            self.end = self.end.max(head + self.duration(task));
+            let behind = self.machine_behind(task);
+            let machine_next = (behind != NONE).then_some(behind);
+            for behind in self.project.behind.of_place(task).iter().copied().chain(machine_next) {
+                let open = &mut self.open[behind as usize];
+                *open -= 1;
+                if *open == 0 {
+                    self.sorted.push(behind);
+                }
+            }
+        }
+        debug_assert_eq!(self.sorted.len(), self.project.len(), "the orders contradict what waits for what");
+        for at in (0..self.sorted.len()).rev() {
+            let task = self.sorted[at];
+            let behind = self.machine_behind(task);
+            let machine_rest = if behind == NONE { 0 } else { self.tails[behind as usize] + self.duration(behind) };
+            self.tails[task as usize] = self.rest(task).max(machine_rest);
+        }
+    }
+}

@@ -1,0 +1,187 @@
+//! Schedules made from lists: the serial schedule generation scheme for several resources with several units, and double
+//! justification.
+//!
+//! The scheme takes the tasks in the order of a list and begins each as early as those it waits for and the resources allow (Kolisch,
+//! Hartmann: Heuristic algorithms for the resource-constrained project scheduling problem, 1999): for some list the schedule is
+//! optimal. Justification moves all tasks as far to the end as they go, the last first, and then all to the beginning again, the
+//! first first; the schedule never becomes longer and often shorter (Valls, Ballestín, Quintanilla: Justification and RCPSP, 2005).
+
+use super::network::Demand;
+use super::profile::Profile;
+use super::project::Project;
+use std::cmp::Reverse;
+use std::collections::{BTreeSet, BinaryHeap};
+
+/// Makes schedules; its memory is used again by the next.
+#[derive(Debug, Clone)]
+pub(super) struct Scheduler {
+    profile: Profile,
+    /// When each task begins in the schedule made last.
+    pub(super) starts: Vec<u64>,
+    /// Of the time from the end: when each ends.
+    mirrored: Vec<u64>,
+    parallel: Parallel,
+}
+
+/// What the parallel scheme needs.
+#[derive(Debug, Clone, Default)]
+struct Parallel {
+    free: Vec<u64>,
+    /// By task, how many have not ended that it waits for.
+    open: Vec<u32>,
+    /// Those that could begin if there were room, by rank.
+    asking: BTreeSet<(u32, u32)>,
+    ending: BinaryHeap<Reverse<(u64, Ending)>>,
+    ranks: Vec<u32>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Ending {
+    /// What a running task holds is free.
+    Occupied(u32),
+    /// The running tasks that a task waits for have ended.
+    Released(u32),
+    Task(u32),
+}
+
+impl Scheduler {
+    pub(super) fn new(project: &Project) -> Scheduler {
+        Scheduler {
+            profile: Profile::default(),
+            starts: vec![0; project.len()],
+            mirrored: vec![0; project.len()],
+            parallel: Parallel::default(),
+        }
+    }
+
+    /// Begins everything as early as possible, in the order of a list in which each task comes after those it waits for. When everything
+    /// has ended.
+    pub(super) fn forward(&mut self, project: &Project, list: &[u32]) -> u64 {
+        self.profile.clear(&project.capacity);
+        for (until, demand) in &project.occupied {
+            self.profile.take(std::slice::from_ref(demand), 0, *until);
+        }
+        let mut end = project.running_end;
+        for task in list {
+            let at = *task as usize;
+            let ends = |before: &u32| self.starts[*before as usize] + project.durations[*before as usize];
+            let ready = project.before.of_place(*task).iter().map(ends).max().unwrap_or(0).max(project.releases[at]);
+            let demands: &[Demand] = project.demands.of_place(*task);
+            let start = self.profile.earliest(demands, ready, project.durations[at]);
+            self.profile.take(demands, start, project.durations[at]);
+            self.starts[at] = start;
+            end = end.max(start + project.durations[at]);
+        }
+        end
+    }
+
+    /// Begins at each moment what can begin then, in the order of a list as above, as dispatch does (the parallel scheme). When everything
+    /// has ended.
+    pub(super) fn parallel(&mut self, project: &Project, list: &[u32]) -> u64 {
+        let Parallel { free, open, asking, ending, ranks } = &mut self.parallel;
+        free.clone_from(&project.capacity);
+        ending.clear();
+        asking.clear();
+        ranks.resize(list.len(), 0);
+        for (rank, task) in list.iter().enumerate() {
+            ranks[*task as usize] = rank as u32;
+        }
+        for (number, (until, demand)) in project.occupied.iter().enumerate() {
+            free[demand.kind as usize] = free[demand.kind as usize].saturating_sub(demand.units);
+            ending.push(Reverse((*until, Ending::Occupied(number as u32))));
+        }
+        open.clear();
+        for task in 0..project.len() as u32 {
+            let before = project.before.of_place(task).len() as u32;
+            // Running ones that it waits for count as one.
+            open.push(before + 1);
+            ending.push(Reverse((project.releases[task as usize], Ending::Released(task))));
+        }
+        let mut end = project.running_end;
+        while let Some(Reverse((now, first))) = ending.pop() {
+            let mut ended = Some(first);
+            while let Some(this) = ended {
+                match this {
+                    Ending::Occupied(number) => {
+                        let (_, demand) = project.occupied[number as usize];
+                        free[demand.kind as usize] += demand.units;
+                    }
+                    Ending::Released(task) => {
+                        open[task as usize] -= 1;
+                        if open[task as usize] == 0 {
+                            asking.insert((ranks[task as usize], task));
+                        }
+                    }
+                    Ending::Task(task) => {
+                        for demand in project.demands.of_place(task) {
+                            free[demand.kind as usize] += demand.units;
+                        }
+                        for behind in project.behind.of_place(task) {
+                            open[*behind as usize] -= 1;
+                            if open[*behind as usize] == 0 {
+                                asking.insert((ranks[*behind as usize], *behind));
+                            }
+                        }
+                    }
+                }
+                ended = match ending.peek() {
+                    Some(Reverse((then, _))) if *then == now => ending.pop().map(|Reverse((_, next))| next),
+                    _ => None,
+                };
+            }
+            asking.retain(|(_, task)| {
+                let demands = project.demands.of_place(*task);
+                if !demands.iter().all(|demand| free[demand.kind as usize] >= demand.units) {
+                    return true;
+                }
+                for demand in demands {
+                    free[demand.kind as usize] -= demand.units;
+                }
+                self.starts[*task as usize] = now;
+                let ends = now + project.durations[*task as usize];
+                end = end.max(ends);
+                ending.push(Reverse((ends, Ending::Task(*task))));
+                false
+            });
+        }
+        end
+    }
+
+    /// Justifies the schedule made last to the end and again to the beginning. `list` becomes the tasks in the order in which they
+    /// begin. When everything has ended.
+    pub(super) fn justify(&mut self, project: &Project, list: &mut [u32], end: u64) -> u64 {
+        // Who waits for whom is also in the order of the numbers, which decides among tasks without a duration.
+        let (starts, durations) = (&self.starts, &project.durations);
+        list.sort_unstable_by_key(|task| {
+            let at = *task as usize;
+            Reverse((starts[at] + durations[at], *task))
+        });
+        self.profile.clear(&project.capacity);
+        for (until, demand) in &project.occupied {
+            self.profile.take(std::slice::from_ref(demand), end - until, *until);
+        }
+        for task in list.iter() {
+            let at = *task as usize;
+            let begins = |behind: &u32| self.mirrored[*behind as usize] + project.durations[*behind as usize];
+            let ready = project.behind.of_place(*task).iter().map(begins).max().unwrap_or(0);
+            let demands = project.demands.of_place(*task);
+            let from_end = self.profile.earliest(demands, ready, project.durations[at]);
+            self.profile.take(demands, from_end, project.durations[at]);
+            self.mirrored[at] = from_end;
+        }
+        let (mirrored, durations) = (&self.mirrored, &project.durations);
+        let key = |task: &u32| {
+            let at = *task as usize;
+            (end.saturating_sub(mirrored[at] + durations[at]), *task)
+        };
+        list.sort_unstable_by_key(key);
+        let end = self.forward(project, list);
+        self.sort(list);
+        end
+    }
+
+    /// Puts a list into the order in which its tasks begin in the schedule made last.
+    pub(super) fn sort(&self, list: &mut [u32]) {
+        list.sort_unstable_by_key(|task| (self.starts[*task as usize], *task));
+    }
+}
