@@ -1,0 +1,309 @@
+//! The arm in the scene of one request: what is free, what the tool keeps, how the tool goes straight, and how long a motion takes.
+//!
+//! Two checks know the scene. The exact shapes ([`Checker`]) decide about straight parts, where contact may be allowed, and about starts and
+//! goals. The vector checks ([`Space`]) decide about free motions; a posture where they have room is a *door* from one to the other.
+
+use super::contact;
+use super::error::PlanError;
+use crate::arm::{self, joints};
+use crate::collision::{Checker, Collision, Contact, PADDING_M};
+use crate::connect::{Budget, ConnectError, Route, connect};
+use crate::constrained::{self, Constraint};
+use crate::joint_vector::JointVector;
+use crate::keep::{KeptAxis, timed_keeping};
+use crate::line::LineError;
+use crate::mechanism::Mechanism;
+use crate::pace::{Pace, Stop};
+use crate::reach::{Postures, Reach, Target};
+use crate::refine::{End, Measure, Refinement};
+use crate::request::Request;
+use crate::robot::{Configuration, Robot};
+use crate::simplify::shortened;
+use crate::space::{Space, State, state};
+use crate::straight::Straight;
+use crate::timing::rough::Rough;
+use crate::timing::{Section, timed_while};
+use crate::trajectory::Curve;
+use crate::way_points::{Followed, Follower, WayPoints};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use ratn_model::pose::Pose;
+use ratn_world::scene::Scene;
+
+/// The padding where the start is too close to something for the usual one, in metres. As much room is on a free path at the least; a
+/// controller that gives up there stops a little beside it, so a start with less is left, too, as long as it touches nothing.
+const TIGHT_PADDING_M: f64 = 0.002;
+
+/// The paddings that a start may have, in the order in which they are tried.
+pub(super) const PADDINGS_M: [f64; 3] = [PADDING_M, TIGHT_PADDING_M, 0.0];
+
+/// Postures tried around one that has no room, and how far away the last of them are, in radians per joint.
+const WAYS_OUT: usize = 100;
+const WAY_OUT_RAD: f64 = 0.4;
+
+/// The arm of a request in its scene.
+pub(super) struct ArmInScene<'a> {
+    robot: &'a Robot,
+    scene: &'a Scene,
+    request: &'a Request,
+    here: Configuration,
+    mechanism: Mechanism,
+    checker: Checker<'a>,
+    space: Space,
+    /// The tool, in the frame of the base, which is at `base`.
+    reach: Reach,
+    base: Pose,
+    /// What the tool keeps.
+    constraint: Option<Constraint>,
+    rough: Rough,
+    random: ChaCha8Rng,
+}
+
+impl<'a> ArmInScene<'a> {
+    pub(super) fn new(robot: &'a Robot, scene: &'a Scene, request: &'a Request) -> ArmInScene<'a> {
+        let here = request.start.with_base(&scene.base);
+        let (mechanism, obstacles) = arm::in_scene(robot, scene, &here);
+        ArmInScene {
+            robot,
+            scene,
+            request,
+            checker: Checker::new(robot, scene, &here, PADDING_M).reaching_into(&request.reaches_into),
+            space: arm::space(&mechanism, &obstacles),
+            reach: Reach::new(&mechanism, robot.tool, Pose::IDENTITY),
+            base: arm::on_floor(&scene.base),
+            constraint: None,
+            rough: Rough::new(&request.joints(robot), request.speed),
+            random: ChaCha8Rng::seed_from_u64(request.seed),
+            here,
+            mechanism,
+        }
+    }
+
+    pub(super) fn request(&self) -> &'a Request {
+        self.request
+    }
+
+    pub(super) fn robot(&self) -> &'a Robot {
+        self.robot
+    }
+
+    pub(super) fn random(&mut self) -> &mut ChaCha8Rng {
+        &mut self.random
+    }
+
+    pub(super) fn joints(&self, state: &State) -> JointVector {
+        joints(self.robot, state)
+    }
+
+    /// The tool in the world frame.
+    pub(super) fn tool_pose(&self, arm: &JointVector) -> Pose {
+        self.robot.tool_pose(&Configuration { arm: *arm, ..self.here })
+    }
+
+    /// Has the exact shapes checked with another padding from now on.
+    pub(super) fn pad(&mut self, padding_m: f64) {
+        if self.checker.padding() != padding_m {
+            let checker = Checker::new(self.robot, self.scene, &self.here, padding_m);
+            self.checker = checker.reaching_into(&self.request.reaches_into);
+        }
+    }
+
+    /// Has them checked with room: an arm may stand closer to something, where it was stopped, but it does not go there.
+    pub(super) fn pad_at_least_tightly(&mut self) {
+        if self.checker.padding() < TIGHT_PADDING_M {
+            self.pad(TIGHT_PADDING_M);
+        }
+    }
+
+    /// The exact shapes as the tool leaves a goal where it lets go of what it holds; `None` where it holds nothing.
+    pub(super) fn with_open_fingers(&self) -> Option<Checker<'a>> {
+        contact::with_open_fingers(self.robot, self.scene, self.request, self.checker.padding())
+    }
+
+    /// What touches what, or has less room than the padding.
+    pub(super) fn collision(&mut self, posture: &JointVector, contact: Contact) -> Option<Collision> {
+        self.checker.collision(posture, contact)
+    }
+
+    /// The same on a straight motion of the joints, where nothing may touch.
+    pub(super) fn edge_collision(&mut self, from: &JointVector, to: &JointVector) -> Option<Collision> {
+        self.checker.edge_collision(from, to, Contact::None)
+    }
+
+    /// What a straight part touches first that it may not.
+    pub(super) fn straight_collision(&mut self, postures: &[JointVector], press_m: f64) -> Option<Collision> {
+        contact::straight_collision(&mut self.checker, postures, press_m)
+    }
+
+    /// Postures along a straight part (`sense` 1) or against its direction (-1), from the first of them.
+    pub(super) fn line(&self, from: &JointVector, part: &Straight, sense: f64) -> Result<Vec<JointVector>, LineError> {
+        let tool = self.reach.pose(from);
+        // A request that names an object which is not there has been refused.
+        let way = part.way(self.scene, &self.base, &tool).unwrap_or_default();
+        arm::line(&self.reach, from, way.map(|c| sense * c))
+    }
+
+    /// From a posture in straight lines of the tool through way points to a goal.
+    pub(super) fn follow(
+        &mut self,
+        start: &JointVector,
+        way: &WayPoints,
+        leaving: Option<&mut Checker<'a>>,
+        pace: &mut Pace<'_>,
+    ) -> Result<Followed, PlanError> {
+        let mut follower = Follower {
+            scene: self.scene,
+            reach: &self.reach,
+            base: self.base,
+            checker: &mut self.checker,
+            leaving,
+            constraint: self.constraint.as_ref(),
+            presses_m: contact::presses_m(self.robot),
+        };
+        follower.follow(start, self.request, way, pace)
+    }
+
+    /// All postures at a pose of the tool in the world frame.
+    pub(super) fn postures(&self, pose: &Pose) -> Postures {
+        self.reach.postures(&Target::at(self.base.inverse().compose(pose)))
+    }
+
+    /// Some of them, the nearest to `near` first; every attempt gives others.
+    pub(super) fn attempt(&mut self, postures: &Postures, near: &JointVector, attempt: usize) -> Vec<JointVector> {
+        self.reach.attempt(postures, near, attempt, &mut self.random)
+    }
+
+    /// The one of them that is nearest to a posture.
+    pub(super) fn nearest(&self, postures: &Postures, near: &JointVector) -> Option<JointVector> {
+        self.reach.nearest(postures, near).first().copied()
+    }
+
+    /// From now on the tool keeps what the request wants, from this posture on.
+    ///
+    /// # Errors
+    /// What is broken on the departure, which ends there.
+    pub(super) fn keep_from(&mut self, departure: &[JointVector]) -> Result<(), PlanError> {
+        let start = departure[departure.len() - 1];
+        let tool = self.reach.pose(&start);
+        let mut keep = self.request.keep;
+        if let Some(tolerance_rad) = self.request.upright_rad {
+            let up = [0.0, 0.0, 1.0];
+            keep.axis = Some(KeptAxis { axis: tool.inverse().rotate(up), direction: Some(up), tolerance_rad });
+        }
+        self.constraint = keep.constraint(&self.mechanism, self.robot.tool, &self.base, &tool);
+        self.kept_along(departure).map_err(|reason| PlanError::NotKept { place: "on the departure", reason })?;
+        self.kept_at(&state(&start)).map_err(|reason| PlanError::NotKept { place: "at the start", reason })
+    }
+
+    /// What the tool keeps is kept at a posture, or what is broken.
+    pub(super) fn kept_at(&self, at: &State) -> Result<(), String> {
+        match self.constraint.as_ref().filter(|constraint| !constraint.holds(at)) {
+            Some(constraint) => Err(constraint.breach(at)),
+            None => Ok(()),
+        }
+    }
+
+    /// What the tool keeps is kept along postures, or what is broken.
+    pub(super) fn kept_along(&self, postures: &[JointVector]) -> Result<(), String> {
+        let Some(constraint) = &self.constraint else { return Ok(()) };
+        let breaks = |pair: &&[JointVector]| !constraint.holds_along(&state(&pair[0]), &state(&pair[1]));
+        match postures.windows(2).find(breaks) {
+            Some(pair) => Err(constraint.breach(&state(&pair[1]))),
+            None => Ok(()),
+        }
+    }
+
+    /// The posture itself where the vector checks find room for it, else one close by that can be reached from it.
+    pub(super) fn door(&mut self, posture: &JointVector) -> Option<State> {
+        let here = state(posture);
+        if self.space.is_within(&here) && self.space.is_free(&here) {
+            return Some(here);
+        }
+        (1..=WAYS_OUT).find_map(|attempt| {
+            let radius = WAY_OUT_RAD * attempt as f64 / WAYS_OUT as f64;
+            let aside = posture.map(|q| q + radius * self.random.random_range(-1.0..=1.0));
+            let door = state(&self.robot.clamp(&aside));
+            let keeps = self.constraint.as_ref().is_none_or(|c| c.holds_along(&here, &door));
+            let free = keeps
+                && self.space.is_free(&door)
+                && self.checker.edge_is_free(posture, &joints(self.robot, &door), Contact::None);
+            free.then_some(door)
+        })
+    }
+
+    /// About how long a motion along postures takes, in seconds.
+    pub(super) fn lasts_s(&mut self, path: &[State]) -> f64 {
+        self.rough.duration_s(path)
+    }
+
+    /// A free path from a door to one of others.
+    pub(super) fn connect(
+        &mut self,
+        from: &State,
+        to: &[State],
+        budget: Budget,
+        pace: &mut Pace<'_>,
+    ) -> Result<Route, ConnectError> {
+        let control = &mut |_: usize| pace.answer();
+        match &self.constraint {
+            None => connect(&mut self.space, from, to, budget, control),
+            Some(constraint) => constrained::connect(&mut self.space, constraint, from, to, budget, control),
+        }
+    }
+
+    /// A free path with fewer and shorter motions.
+    pub(super) fn shorten(&mut self, path: &mut Vec<State>, pace: &mut Pace<'_>) -> Result<(), Stop> {
+        let control = &mut |_: usize| pace.answer();
+        if let Some(constraint) = &self.constraint {
+            let (shortcuts, seed) = (constrained::SHORTCUTS, self.request.seed);
+            let stopped = constrained::shorten(&mut self.space, constraint, path, shortcuts, seed, control);
+            return stopped.map_err(Stop::from);
+        }
+        match shortened(&mut self.space, path, control) {
+            Ok(short) => *path = short,
+            Err(ConnectError::Cancelled) => return Err(Stop::Cancelled),
+            Err(_) => {}
+        }
+        Ok(())
+    }
+
+    /// The improvement of a free path to the first of the ends, by its duration.
+    pub(super) fn refinement(&self, path: Vec<State>, end: usize, ends: Vec<End>) -> Refinement {
+        let measure = Measure::Duration(Box::new(self.rough.clone()));
+        let refinement = Refinement::new(path, end, ends, measure, self.request.seed);
+        match &self.constraint {
+            Some(constraint) => refinement.keeping(constraint.clone()),
+            None => refinement,
+        }
+    }
+
+    /// One step of it.
+    pub(super) fn step(&mut self, refinement: &mut Refinement, pace: &mut Pace<'_>) -> Result<(), Stop> {
+        Ok(refinement.step(&mut self.space, &mut |_| pace.answer())?)
+    }
+
+    /// The sections as one motion within the limits that were asked for, which keeps what is to be kept between all its knots as well.
+    pub(super) fn timed(
+        &mut self,
+        sections: &[Section],
+        goes_on: &mut dyn FnMut() -> bool,
+    ) -> Result<Curve, PlanError> {
+        let request = self.request;
+        let joints = request.joints(self.robot);
+        let (space, constraint) = (&mut self.space, &self.constraint);
+        let mut is_free = |from: &JointVector, to: &JointVector| {
+            let (from, to) = (state(from), state(to));
+            constraint.as_ref().is_none_or(|c| c.holds_along(&from, &to)) && space.is_free_motion(&from, &to)
+        };
+        let curve = match constraint {
+            None => timed_while(&joints, sections, request.speed, &mut is_free, goes_on),
+            Some(constraint) => timed_keeping(&joints, sections, request.speed, constraint, &mut is_free, goes_on)
+                .ok_or(PlanError::NotKept {
+                    place: "on the way",
+                    reason: "the tool does not keep what it is to keep between the postures that were planned"
+                        .to_owned(),
+                })?,
+        };
+        Ok(request.tool_speed.keep(&self.reach, curve))
+    }
+}

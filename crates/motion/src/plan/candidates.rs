@@ -1,0 +1,206 @@
+//! The candidates for the end of the free path: every posture at a goal from which the approach is free, with that approach.
+
+use super::arm_in_scene::ArmInScene;
+use super::contact::{presses_m, straight_collision};
+use super::error::{MAX_REASONS, PlanError};
+use crate::collision::{Checker, Contact, distance, length};
+use crate::joint_vector::JointVector;
+use crate::pace::{Pace, Stop};
+use crate::reach::is_new;
+use crate::refine::End;
+use crate::request::Goal;
+use crate::space::{State, state};
+use ratn_model::pose::Pose;
+use std::ops::Index;
+
+/// Postures looked for per goal pose, and attempts spent on it: at first, and once more if there were none.
+const SOLUTIONS: [(usize, usize); 2] = [(6, 8), (40, 80)];
+
+/// Postures taken from one attempt: the nearest that it gives.
+const SOLUTIONS_PER_ATTEMPT: usize = 2;
+
+/// The most candidates.
+const MAX_CANDIDATES: usize = 64;
+
+/// A posture at the goal, with the straight part that leads to it.
+#[derive(Debug, Clone)]
+pub(super) struct Candidate {
+    /// Where the free path ends.
+    pub(super) door: State,
+    /// From there to the goal: the way in where the approach begins with little room, and the approach; at least one posture.
+    pub(super) way_in: Option<JointVector>,
+    pub(super) approach: Vec<JointVector>,
+    /// Length of both.
+    pub(super) length_rad: f64,
+    /// How long both take, roughly.
+    lasts_s: f64,
+}
+
+impl Candidate {
+    /// The posture at the goal.
+    pub(super) fn goal(&self) -> JointVector {
+        self.approach[self.approach.len() - 1]
+    }
+
+    pub(super) fn end(&self) -> End {
+        End { state: self.door, rest: self.length_rad as f32, rest_s: self.lasts_s as f32 }
+    }
+}
+
+/// The candidates of one request; their numbers stay.
+pub(super) struct Candidates<'a> {
+    /// How deep an approach may press into what it touches.
+    press_m: f64,
+    /// The tool as it leaves a goal where it lets go of what it holds.
+    leaving: Option<Checker<'a>>,
+    found: Vec<Candidate>,
+}
+
+impl Index<usize> for Candidates<'_> {
+    type Output = Candidate;
+
+    fn index(&self, number: usize) -> &Candidate {
+        &self.found[number]
+    }
+}
+
+impl<'a> Candidates<'a> {
+    /// Those that keep away from what they need not touch, or else those that press the least; the nearest to a posture first.
+    pub(super) fn find(
+        arm: &mut ArmInScene<'a>,
+        near: &JointVector,
+        pace: &mut Pace<'_>,
+    ) -> Result<Candidates<'a>, PlanError> {
+        let mut candidates = Candidates { press_m: 0.0, leaving: arm.with_open_fingers(), found: Vec::new() };
+        let mut reasons: Vec<String> = Vec::new();
+        for (wanted, attempts) in SOLUTIONS {
+            let postures = goal_postures(arm, near, wanted, attempts, &mut reasons, pace)?;
+            let mut refused = Vec::new();
+            for press_m in presses_m(arm.robot()) {
+                candidates.press_m = press_m;
+                refused.clear();
+                for posture in &postures {
+                    pace.poll()?;
+                    match candidates.candidate(arm, posture) {
+                        Ok(candidate) => candidates.found.push(candidate),
+                        Err(reason) => refused.push(reason),
+                    }
+                }
+                if !candidates.found.is_empty() {
+                    let cost = |c: &Candidate| distance(near, &arm.joints(&c.door)) + c.length_rad;
+                    candidates.found.sort_by(|a, b| cost(a).total_cmp(&cost(b)));
+                    return Ok(candidates);
+                }
+            }
+            reasons.append(&mut refused);
+        }
+        reasons.sort();
+        reasons.dedup();
+        reasons.truncate(MAX_REASONS);
+        Err(PlanError::NoGoal { goals: arm.request().goals.len(), reasons })
+    }
+
+    /// Where the free path may end, by number.
+    pub(super) fn doors(&self) -> Vec<State> {
+        self.found.iter().map(|candidate| candidate.door).collect()
+    }
+
+    /// The same with what follows.
+    pub(super) fn ends(&self) -> Vec<End> {
+        self.found.iter().map(Candidate::end).collect()
+    }
+
+    pub(super) fn is_full(&self) -> bool {
+        self.found.len() >= MAX_CANDIDATES
+    }
+
+    pub(super) fn add(&mut self, candidate: Candidate) {
+        self.found.push(candidate);
+    }
+
+    /// The goal posture with its approach, or why it is none.
+    pub(super) fn candidate(&mut self, arm: &mut ArmInScene<'a>, goal: &JointVector) -> Result<Candidate, String> {
+        let part = &arm.request().approach;
+        let mut approach = vec![*goal];
+        if part.is_some() {
+            let back = arm.line(goal, part, -1.0);
+            approach = back.map_err(|e| format!("approaching the goal {part}, backwards from there: {e}"))?;
+            if let Some(collision) = arm.straight_collision(&approach, self.press_m) {
+                return Err(format!("approaching the goal, {collision}"));
+            }
+            let leaving = self.leaving.as_mut();
+            if let Some(collision) = leaving.and_then(|open| straight_collision(open, &approach, self.press_m)) {
+                return Err(format!("leaving the goal with open fingers, {collision}"));
+            }
+            approach.reverse();
+        }
+        match arm.collision(&approach[0], Contact::None) {
+            Some(collision) if part.is_some() => Err(format!("before the approach, {collision}")),
+            Some(collision) => Err(format!("at the goal, {collision}")),
+            None => with_door(arm, approach),
+        }
+    }
+}
+
+/// Postures at the goals, and why there are none at some of them.
+fn goal_postures(
+    arm: &mut ArmInScene<'_>,
+    near: &JointVector,
+    wanted: usize,
+    attempts: usize,
+    reasons: &mut Vec<String>,
+    pace: &mut Pace<'_>,
+) -> Result<Vec<JointVector>, Stop> {
+    let mut postures = Vec::new();
+    for goal in &arm.request().goals {
+        match goal {
+            Goal::Joints(posture) => postures.push(*posture),
+            Goal::Pose(pose) => {
+                let found = postures_at(arm, pose, near, wanted, attempts, pace)?;
+                if found.is_empty() {
+                    let [x, y, z] = pose.position;
+                    reasons.push(format!("the arm does not reach ({x:.3}, {y:.3}, {z:.3})"));
+                }
+                postures.extend(found);
+            }
+        }
+    }
+    Ok(postures)
+}
+
+/// As [`Reach::solutions`](crate::reach::Reach::solutions), asking between the attempts whether to go on.
+fn postures_at(
+    arm: &mut ArmInScene<'_>,
+    pose: &Pose,
+    near: &JointVector,
+    wanted: usize,
+    attempts: usize,
+    pace: &mut Pace<'_>,
+) -> Result<Vec<JointVector>, Stop> {
+    let postures = arm.postures(pose);
+    let mut found = Vec::new();
+    for attempt in 0..attempts {
+        pace.poll()?;
+        for posture in arm.attempt(&postures, near, attempt).into_iter().take(SOLUTIONS_PER_ATTEMPT) {
+            if found.len() < wanted && is_new(&found, &posture) {
+                found.push(posture);
+            }
+        }
+        if found.len() == wanted || postures.is_empty() {
+            break;
+        }
+    }
+    Ok(found)
+}
+
+fn with_door(arm: &mut ArmInScene<'_>, approach: Vec<JointVector>) -> Result<Candidate, String> {
+    let entry = approach[0];
+    let door = arm.door(&entry).ok_or_else(|| "there is too little room before the goal".to_owned())?;
+    arm.kept_at(&door).map_err(|reason| format!("at the goal {reason}"))?;
+    arm.kept_along(&approach).map_err(|reason| format!("approaching the goal {reason}"))?;
+    let way_in = (door != state(&entry)).then(|| arm.joints(&door));
+    let length_rad = length(&approach) + way_in.map_or(0.0, |way_in| distance(&way_in, &entry));
+    let way_in_s = way_in.map_or(0.0, |way_in| arm.lasts_s(&[state(&way_in), state(&entry)]));
+    let lasts_s = way_in_s + arm.lasts_s(&approach.iter().map(|posture| state(posture)).collect::<Vec<_>>());
+    Ok(Candidate { door, way_in, approach, length_rad, lasts_s })
+}

@@ -1,0 +1,61 @@
+//! What may touch what on the straight parts next to start and goal.
+
+use crate::collision::{Checker, Collision, Contact};
+use crate::joint_vector::JointVector;
+use crate::request::Request;
+use crate::robot::{Configuration, Geometry, Robot};
+use ratn_world::scene::{Placement, Scene, SceneObject};
+
+/// How far off the measured poses of objects are, in metres: as far as that the fingers keep away from what they need not touch, where
+/// there is a way.
+const MEASURED_WITHIN_M: f64 = 0.002;
+
+/// Steps from touching to the deepest that may be pressed: of the ways to a goal those count that press the least.
+const PRESS_STEPS: u32 = 4;
+
+/// What a straight part touches first that it may not.
+pub(crate) fn straight_collision(
+    checker: &mut Checker<'_>,
+    postures: &[JointVector],
+    press_m: f64,
+) -> Option<Collision> {
+    let contact = Contact::Gripper(press_m);
+    let first = checker.collision(&postures[0], contact);
+    first.or_else(|| postures.windows(2).find_map(|w| checker.edge_collision(&w[0], &w[1], contact)))
+}
+
+/// How deep the fingers and what they hold may press into what they touch on the way to a goal, in metres, in the order in which it is
+/// tried; negative: how far they keep away. The deepest is half a finger's thickness: a finger that comes down beside an edge pushes
+/// it aside, and one that comes down with more than half of itself on it stands on it.
+pub(super) fn presses_m(robot: &Robot) -> Vec<f64> {
+    let steps = (0..=PRESS_STEPS).map(|step| f64::from(step) / f64::from(PRESS_STEPS) * half_finger_m(robot));
+    std::iter::once(-MEASURED_WITHIN_M).chain(steps).collect()
+}
+
+/// Half of a finger's thickness along the direction in which it closes; 0 for a robot without fingers made of boxes.
+pub(super) fn half_finger_m(robot: &Robot) -> f64 {
+    let halves = robot.finger_link().into_iter().flat_map(|link| &robot.model.links[link].bodies);
+    let thickness = halves.filter_map(|body| match body.geometry {
+        Geometry::Box { half } => Some(half[1]),
+        _ => None,
+    });
+    thickness.fold(0.0, f64::max)
+}
+
+/// The tool as it leaves a goal where it lets go of what it holds: fingers that open there may press a neighbour, too. `None` where it
+/// holds nothing.
+pub(super) fn with_open_fingers<'a>(
+    robot: &'a Robot,
+    scene: &Scene,
+    request: &Request,
+    padding: f64,
+) -> Option<Checker<'a>> {
+    let is_held = |object: &SceneObject| matches!(object.placement, Placement::Gripper(_));
+    if !scene.objects.iter().any(is_held) {
+        return None;
+    }
+    let left = scene.objects.iter().filter(|object| !is_held(object)).cloned().collect();
+    let scene = Scene { objects: left, ..scene.clone() };
+    let opened = Configuration { finger: robot.open_finger_m(), ..request.start };
+    Some(Checker::new(robot, &scene, &opened, padding).reaching_into(&request.reaches_into))
+}

@@ -1,0 +1,101 @@
+//! Why there is no plan.
+
+use crate::collision::Collision;
+use crate::pace::Stop;
+
+/// How many different reasons an error names.
+pub(super) const MAX_REASONS: usize = 5;
+
+/// Why there is no plan.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum PlanError {
+    /// The request makes no sense.
+    #[error("{what} is {value}: expected {expected}")]
+    Malformed {
+        /// Which part of it.
+        what: String,
+        /// What it is.
+        value: String,
+        /// What it should be.
+        expected: String,
+    },
+    /// The arm touches something where it stands.
+    #[error("at the start {collision}")]
+    StartInCollision {
+        /// What touches what.
+        collision: Collision,
+    },
+    /// The straight part at the start cannot be followed.
+    #[error("departing {part}: {reason}")]
+    Depart {
+        /// How far it should go, and where.
+        part: String,
+        /// What is in the way.
+        reason: String,
+    },
+    /// The start is free, but nothing around it.
+    #[error("at the start {reason}")]
+    NoRoom {
+        /// What is close.
+        reason: String,
+    },
+    /// No alternative of the goal has a posture that is free.
+    #[error("none of the {goals} goals can be reached: {}", reasons.join("; "))]
+    NoGoal {
+        /// How many alternatives there were.
+        goals: usize,
+        /// The different reasons.
+        reasons: Vec<String>,
+    },
+    /// The tool cannot go straight to any of the goals.
+    #[error("no straight way to any of the {goals} goals: {}", reasons.join("; "))]
+    NoStraightWay {
+        /// How many alternatives there were.
+        goals: usize,
+        /// How far the tool gets and why no further, of some of them.
+        reasons: Vec<String>,
+    },
+    /// What the tool is to keep does not hold.
+    #[error("{place} {reason}")]
+    NotKept {
+        /// Where.
+        place: &'static str,
+        /// What is broken.
+        reason: String,
+    },
+    /// There are goals, but no way was found.
+    #[error(
+        "no way found to any of {postures} goal postures after {iterations} iterations; on the straight way {collision}"
+    )]
+    NoPath {
+        /// How many goal postures were tried.
+        postures: usize,
+        /// Iterations of the search.
+        iterations: usize,
+        /// What blocks the straight way to the nearest of them.
+        collision: String,
+    },
+    /// The caller's time was up before there was any path.
+    #[error("no path was found in the time given")]
+    TimeUp,
+    /// The caller gave up.
+    #[error("planning was cancelled")]
+    Cancelled,
+}
+
+impl PlanError {
+    pub(crate) fn no_straight_way(mut reasons: Vec<String>) -> PlanError {
+        let goals = reasons.len();
+        reasons.truncate(MAX_REASONS);
+        PlanError::NoStraightWay { goals, reasons }
+    }
+}
+
+impl From<Stop> for PlanError {
+    fn from(stop: Stop) -> PlanError {
+        match stop {
+            Stop::TimeUp => PlanError::TimeUp,
+            Stop::Cancelled => PlanError::Cancelled,
+        }
+    }
+}

@@ -1,0 +1,205 @@
+//! Makes the motion quicker while the caller gives time: other free paths and other candidates, compared by how long they roughly take, and
+//! taken where the whole motion, timed exactly, is quicker.
+
+use super::arm_in_scene::ArmInScene;
+use super::candidates::{Candidate, Candidates};
+use super::error::PlanError;
+use crate::joint_vector::JointVector;
+use crate::pace::{Control, Pace, Progress, Stop};
+use crate::refine::{End, Refinement};
+use crate::request::Goal;
+use crate::simplify::path_length;
+use crate::space::{State, state};
+use crate::timing::Section;
+use crate::trajectory::Curve;
+use rand::RngExt;
+
+/// Of a hundred steps of improvement, those that look for a new candidate.
+const NEW_CANDIDATES: i32 = 8;
+
+/// A path must have become this much quicker to be worth a word, in seconds.
+const LEAST_REPORT_S: f32 = 1e-3;
+
+/// The motion is timed exactly after so many steps of improvement, and after four times as many, again and again.
+const FIRST_TIMED: usize = 64;
+const TIMED_AGAIN: usize = 4;
+
+/// How much of a straight part a blend may take, at the end that is away from what it leads to or from.
+const BLENDED_SHARE: f64 = 0.5;
+
+/// How far from the present path a posture is looked for from which another goal posture is near, in radians per joint.
+const ASIDE_RAD: f64 = 0.5;
+
+/// A free path from the door at the start to that of a candidate.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Way {
+    pub(super) path: Vec<State>,
+    pub(super) candidate: usize,
+}
+
+/// A way, and the whole motion along it.
+pub(super) struct Motion {
+    pub(super) way: Way,
+    pub(super) curve: Curve,
+}
+
+/// What came of improvement.
+pub(super) struct Improved {
+    pub(super) first_duration_s: f64,
+    /// The quickest that was timed.
+    pub(super) motion: Motion,
+    /// The caller's time was up before all steps were done.
+    pub(super) time_up: bool,
+}
+
+/// Improvement under way.
+pub(super) struct Improvement<'p, 'a> {
+    arm: &'p mut ArmInScene<'a>,
+    candidates: &'p mut Candidates<'a>,
+    /// The straight part at the start.
+    depart: &'p [JointVector],
+}
+
+impl<'p, 'a> Improvement<'p, 'a> {
+    pub(super) fn new(
+        arm: &'p mut ArmInScene<'a>,
+        candidates: &'p mut Candidates<'a>,
+        depart: &'p [JointVector],
+    ) -> Improvement<'p, 'a> {
+        Improvement { arm, candidates, depart }
+    }
+
+    /// The quickest motion found, if only that along the first path: to be timed is part of every plan, also when time is up.
+    pub(super) fn run(mut self, first: Way, first_length_rad: f64, pace: &mut Pace<'_>) -> Result<Improved, PlanError> {
+        let mut shorter = first.clone();
+        let reported = pace.report(Progress::FirstPath { length_rad: first_length_rad });
+        let shortened = reported.and_then(|()| self.arm.shorten(&mut shorter.path, pace));
+        if shortened == Err(Stop::Cancelled) {
+            return Err(PlanError::Cancelled);
+        }
+        let mut stopped = shortened.err();
+        let timed = self.motion(shorter, &mut not_cancelled(pace));
+        let Ok(mut motion) = timed else {
+            // A shorter path that cannot be timed so that the tool keeps what it is to keep is no start for improvement.
+            let motion = self.motion(first, &mut not_cancelled(pace))?;
+            return finished(motion.curve.duration_s(), motion, stopped, pace);
+        };
+        let first_duration_s = motion.curve.duration_s();
+        if stopped.is_none() {
+            stopped = self.refine(&mut motion, pace).err();
+        }
+        finished(first_duration_s, motion, stopped, pace)
+    }
+
+    /// As many steps of improvement as were asked for; from time to time what they have led to is timed.
+    fn refine(&mut self, best: &mut Motion, pace: &mut Pace<'_>) -> Result<(), Stop> {
+        let Way { path, candidate } = best.way.clone();
+        let mut refinement = self.arm.refinement(path, candidate, self.candidates.ends());
+        let stopped = self.steps(&mut refinement, best, pace);
+        if stopped != Err(Stop::Cancelled) {
+            self.time_if_new(&refinement, best, &mut not_cancelled(pace));
+        }
+        stopped
+    }
+
+    fn steps(&mut self, refinement: &mut Refinement, best: &mut Motion, pace: &mut Pace<'_>) -> Result<(), Stop> {
+        let (mut reported, mut timed_at) = (refinement.cost(), FIRST_TIMED);
+        for iteration in 1..=self.arm.request().improvement_iterations {
+            pace.iteration()?;
+            if self.arm.random().random_range(0..100) < NEW_CANDIDATES {
+                self.find_another(refinement);
+            } else {
+                self.arm.step(refinement, pace)?;
+            }
+            let about_s = refinement.cost();
+            if about_s < reported - LEAST_REPORT_S {
+                reported = about_s;
+                pace.report(Progress::Quicker { about_s: f64::from(about_s) })?;
+            }
+            if iteration == timed_at {
+                timed_at = timed_at.saturating_mul(TIMED_AGAIN);
+                self.time_if_new(refinement, best, &mut || pace.answer() == Control::Continue);
+            }
+        }
+        Ok(())
+    }
+
+    /// Times the path of a refinement, and takes it where the motion is quicker: never one that is slower, whatever the estimate says.
+    fn time_if_new(&mut self, refinement: &Refinement, best: &mut Motion, goes_on: &mut dyn FnMut() -> bool) {
+        let way = Way { path: refinement.path().to_vec(), candidate: refinement.end() };
+        if way == best.way {
+            return;
+        }
+        match self.motion(way, goes_on) {
+            Ok(motion) if motion.curve.duration_s() < best.curve.duration_s() => *best = motion,
+            _ => {}
+        }
+    }
+
+    /// The whole motion along a way, as quick as the limits allow.
+    fn motion(&mut self, way: Way, goes_on: &mut dyn FnMut() -> bool) -> Result<Motion, PlanError> {
+        let chosen = &self.candidates[way.candidate];
+        let sections = [
+            Section::Loose(self.depart.to_vec(), [0.0, BLENDED_SHARE]),
+            Section::Blended(self.whole(&way.path, chosen)),
+            Section::Loose(chosen.approach.clone(), [BLENDED_SHARE, 0.0]),
+        ];
+        let curve = self.arm.timed(&sections, goes_on)?;
+        Ok(Motion { way, curve })
+    }
+
+    /// The free path with its ways out and in, from the end of the departure to the beginning of the approach.
+    fn whole(&self, path: &[State], candidate: &Candidate) -> Vec<JointVector> {
+        let start = self.depart[self.depart.len() - 1];
+        let mut whole: Vec<JointVector> = path.iter().map(|s| self.arm.joints(s)).collect();
+        if path[0] == state(&start) {
+            whole[0] = start;
+        } else {
+            whole.insert(0, start);
+        }
+        let entry = candidate.approach[0];
+        match candidate.way_in {
+            None if whole.len() > 1 => whole.last_mut().into_iter().for_each(|last| *last = entry),
+            _ => whole.push(entry),
+        }
+        whole
+    }
+
+    /// Looks for a posture at the goal that a quicker path could lead to.
+    fn find_another(&mut self, refinement: &mut Refinement) {
+        let goals = &self.arm.request().goals;
+        let Goal::Pose(pose) = &goals[self.arm.random().random_range(0..goals.len())] else { return };
+        if self.candidates.is_full() {
+            return;
+        }
+        let along = self.arm.random().random_range(0.0..=1.0) * path_length(refinement.path());
+        let near = self.arm.joints(&refinement.point(along).0);
+        let seed = near.map(|q| q + self.arm.random().random_range(-ASIDE_RAD..ASIDE_RAD));
+        let Some(posture) = self.arm.nearest(&self.arm.postures(pose), &seed) else { return };
+        // The posture itself is no end of the path, but where the end is cannot be much nearer.
+        if !refinement.is_promising(&End { state: state(&posture), rest: 0.0, rest_s: 0.0 }) {
+            return;
+        }
+        let Ok(candidate) = self.candidates.candidate(self.arm, &posture) else { return };
+        if refinement.is_promising(&candidate.end()) {
+            refinement.add(candidate.end());
+            self.candidates.add(candidate);
+        }
+    }
+}
+
+fn not_cancelled<'p>(pace: &'p mut Pace<'_>) -> impl FnMut() -> bool + 'p {
+    move || pace.answer() != Control::Cancelled
+}
+
+fn finished(
+    first_duration_s: f64,
+    motion: Motion,
+    stopped: Option<Stop>,
+    pace: &mut Pace<'_>,
+) -> Result<Improved, PlanError> {
+    if stopped == Some(Stop::Cancelled) || pace.answer() == Control::Cancelled {
+        return Err(PlanError::Cancelled);
+    }
+    Ok(Improved { first_duration_s, motion, time_up: stopped.is_some() })
+}
