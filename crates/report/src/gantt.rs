@@ -194,7 +194,7 @@ fn rows(run: &Timeline) -> Vec<Row<'_>> {
             of(&mut rows, ELSEWHERE).jobs.push((instance, job));
         }
     }
-    for instance in &run.instances {
+    for instance in run.instances() {
         for wait in instance.waits.iter().filter(|w| w.to_s - w.from_s >= SHORTEST_WAIT_S) {
             for resource in &wait.resources {
                 of(&mut rows, resource).waits.push((instance, wait.from_s, wait.to_s));
