@@ -176,6 +176,7 @@ impl Timeline {
                 let holder = path(self, *instance);
                 let (wait, over) = self.resources.grants(*instance, &holder, at, lease);
                 changed.released.extend(over);
+                changed.granted.extend_from_slice(self.resources.held_under(lease.id));
                 self.known(*instance, at).waits.extend(wait);
                 self.enter(*instance, Stage::Preparing, at);
             }
@@ -275,7 +276,12 @@ impl Timeline {
                 instance.path = path.as_str().into();
                 instance.speculative = *speculative;
             }
-            Note::Decided { decision, .. } => self.known(id, at).decision = Some(decision.clone()),
+            // A loop decides and is no instance of its own.
+            Note::Decided { decision, .. } => {
+                if let Some(instance) = self.instances.get_mut(&id) {
+                    instance.decision = Some(decision.clone());
+                }
+            }
             Note::Running { .. } => {}
             Note::Finished { outcome, .. } => {
                 let instance = self.known(id, at);
@@ -335,12 +341,16 @@ impl Timeline {
     fn end(&mut self, id: InstanceId, attempt: u32, at: f64, ending: Ending, outputs: &BTreeMap<String, Value>) {
         let crashed = !matches!(ending, Ending::Outcome(..));
         let with_result = matches!(ending, Ending::Outcome(..));
+        // Whoever follows a run has no use for its trajectories.
+        let keeps_outputs = self.left.keep == usize::MAX;
         let instance = self.known(id, at);
         let open = |job: &Job| job.ending == Ending::Open && job.attempt == attempt;
         if let Some(index) = instance.jobs.iter().rposition(open) {
             let job = &mut instance.jobs[index];
             (job.to_s, job.ending) = (at, ending);
-            job.outputs.clone_from(outputs);
+            if keeps_outputs {
+                job.outputs.clone_from(outputs);
+            }
             if !instance.jobs.iter().any(|job| job.ending == Ending::Open) {
                 self.at_work.remove(&id);
             }

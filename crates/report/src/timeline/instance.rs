@@ -192,6 +192,17 @@ impl Instance {
         self.retired || self.squashed
     }
 
+    /// The times for which it waited before it went on; the last one of an instance that was discarded instead is not among them.
+    pub fn awaited(&self) -> impl DoubleEndedIterator<Item = &Phase> {
+        let goes_on = |index: usize| {
+            let next = self.phases.get(index + 1).map_or(self.stage, |phase| phase.stage);
+            !matches!(next, Stage::Squashed | Stage::Waiting)
+        };
+        let waits =
+            self.phases.iter().enumerate().filter(move |(index, one)| one.stage == Stage::Waiting && goes_on(*index));
+        waits.map(|(_, phase)| phase)
+    }
+
     /// What came of a job.
     pub fn yield_of(&self, job: &Job) -> Yield {
         let failed = job.invalidated.is_some() || matches!(job.ending, Ending::Crashed(_) | Ending::Cancelled);

@@ -139,6 +139,8 @@ pub struct Speculation {
 pub struct Changed {
     /// The instance that the line is about.
     pub instance: Option<InstanceId>,
+    /// What is held since.
+    pub granted: Vec<Holding>,
     /// What is held no more.
     pub released: Vec<Holding>,
     /// Instances that are given away: nothing more will be said of them.

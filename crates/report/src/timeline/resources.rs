@@ -141,6 +141,11 @@ impl Resources {
         (wait, over)
     }
 
+    /// What is held under a lease.
+    pub(super) fn held_under(&self, lease: LeaseId) -> &[Holding] {
+        self.held.get(&lease).map_or(&[], Vec::as_slice)
+    }
+
     /// Gives back what is held under a lease, and says what that was.
     pub(super) fn releases(&mut self, lease: LeaseId, at_s: f64) -> Vec<Holding> {
         let mut over = self.held.remove(&lease).unwrap_or_default();

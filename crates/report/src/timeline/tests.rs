@@ -180,3 +180,11 @@ fn time_goes_on_without_a_line() {
     let waiting = run.waiting().next().unwrap().id;
     assert_snapshot!(run.explain(waiting).unwrap(), @"plan_transfer[2] waits for PathPlanner: both are held, by plan_approach[3] for 5 s and plan_retract[1] for 2 s");
 }
+
+#[test]
+fn a_loop_that_decides_is_no_instance_and_nothing_is_ahead_of_it() {
+    let decided = r#"{"at":0,"command":"note","note":"decided","instance":9,"path":"for_box","decision":"3"}"#;
+    let mut run = Timeline::new();
+    run.apply(&serde_json::from_str(decided).unwrap());
+    assert_eq!((run.instances().len(), run.count.expanded, run.oldest_open().is_none()), (0, 0, true));
+}
