@@ -16,7 +16,7 @@ use std::time::Duration;
 
 /// A connection attempt that takes longer has failed.
 pub const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
-/// A connection is probed this often, idle or not: by pings of both sides, or by the system ([`Watched`]) …
+/// A connection is probed this often, idle or not: by pings of both sides, or by the system (`Watched`) …
 pub const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(5);
 /// … and given up when a probe stays unanswered for this long.
 pub const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);

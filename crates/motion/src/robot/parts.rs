@@ -14,6 +14,9 @@ const ROUNDED: f64 = 1e-6;
 /// Where the base is put to see whether its joints move it there: x, y and heading.
 const ELSEWHERE: [f64; 3] = [1.0, 2.0, 0.5];
 
+/// Least and greatest x and y, and heading where it is limited.
+type DriveLimits = ([[f64; 2]; 2], Option<[f64; 2]>);
+
 impl RobotDescription {
     /// No joint is of two parts.
     pub(super) fn check_shared(&self) -> Result<(), RobotFault> {
@@ -117,7 +120,7 @@ impl Part {
 impl Robot {
     /// Where the base may drive: least and greatest x, y and heading, in metres and radians. None of a heading where its limits are a whole
     /// turn apart.
-    pub fn drive_area(&self) -> Option<([[f64; 2]; 2], Option<[f64; 2]>)> {
+    pub fn drive_area(&self) -> Option<DriveLimits> {
         let [x, y, heading] = self.base_joints() else { return None };
         let limits = |joint: &Joint| [joint.lower, joint.upper];
         let turns = heading.upper - heading.lower >= TAU;
