@@ -122,8 +122,9 @@ pub struct ControllersConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GripperConfig {
-    /// The opening between the fingers, in metres; at most what the fingers can.
-    pub opening_m: f64,
+    /// The opening between the fingers, in metres; unless given, as far as the robot's fingers can open, which is also the most.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub opening_m: Option<f64>,
     /// How long it takes to close, in the robot's seconds.
     pub close_s: f64,
     /// How long it takes to open, in the robot's seconds.
@@ -347,9 +348,9 @@ impl CellConfig {
             ),
             (
                 "gripper.opening_m",
-                self.gripper.opening_m,
-                (0.02..=0.11).contains(&self.gripper.opening_m),
-                "0.02 to 0.11",
+                self.gripper.opening_m.unwrap_or_default(),
+                self.gripper.opening_m.is_none_or(|metres| metres > 0.0 && metres.is_finite()),
+                "above 0, and at most what the robot's gripper opens to",
             ),
             ("gripper.close_s", self.gripper.close_s, (0.0..=60.0).contains(&self.gripper.close_s), "0 to 60"),
             ("gripper.force_n", self.gripper.force_n, (0.1..=200.0).contains(&self.gripper.force_n), "0.1 to 200"),
@@ -475,7 +476,7 @@ impl Default for ControllersConfig {
 
 impl Default for GripperConfig {
     fn default() -> GripperConfig {
-        GripperConfig { opening_m: 0.11, close_s: 1.1, open_s: 0.8, force_n: 40.0 }
+        GripperConfig { opening_m: None, close_s: 1.1, open_s: 0.8, force_n: 40.0 }
     }
 }
 

@@ -134,6 +134,9 @@ fn a_goal_under_way_ends_when_the_cell_is_put_back() {
 fn what_is_no_snapshot_is_refused_with_the_reason() {
     let text = saved(&mut Bench::new(1, 4)).to_json();
     let refused = |from: &str, to: &str| Snapshot::from_json(&text.replace(from, to)).unwrap_err();
+    let six = Snapshot::from_json(&text).unwrap().check_joints(6).unwrap_err();
+    assert_eq!(six, SnapshotError::OtherRobot { of: 7, here: 6 });
+    assert!(six.to_string().contains("7 joints") && six.to_string().contains("6, so"), "{six}");
     assert!(matches!(refused("{", "["), SnapshotError::Unreadable(_)));
     assert_eq!(refused("\"form\":1", "\"form\":2"), SnapshotError::OtherForm(2));
     assert!(matches!(refused("\"ids\":[\"slc_1\"]", "\"ids\":[]"), SnapshotError::Inconsistent(_)));

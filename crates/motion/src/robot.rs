@@ -430,6 +430,11 @@ impl Robot {
         self.gripper.map(|[_, finger]| finger)
     }
 
+    /// The links of all fingers: what the gripper's joint moves, by itself or through joints that mimic it.
+    pub fn finger_links(&self) -> Vec<usize> {
+        self.finger.as_ref().map_or_else(Vec::new, |finger| finger.moved_links(&self.model))
+    }
+
     /// The body of the base, on top of which things ride along.
     pub fn body(&self) -> Option<usize> {
         self.body

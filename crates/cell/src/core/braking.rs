@@ -328,7 +328,7 @@ mod tests {
             at = std::array::from_fn(|j| at[j] + 0.5 * (velocity(j, time_s) + velocity(j, time_s + dt)) * dt);
         }
         let trajectory = Trajectory { joints: joints.iter().map(|j| j.name.clone()).collect(), points };
-        let stiff = Controller { of: "base", stiffness: 100.0, most_off: 10.0, slides: 2 };
+        let stiff = Controller { of: "base", stiffness: 100.0, most_off: 10.0, slides: Controller::base_slides() };
         Motion::new(
             Curve::of(joints, &trajectory).unwrap(),
             JointVector::zeros(3),

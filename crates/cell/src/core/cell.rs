@@ -77,7 +77,7 @@ impl Cell {
     /// [`PlacementError`] when no table can be laid, or the robot is none for a cell.
     pub fn new(config: CellConfig) -> Result<Cell, PlacementError> {
         let robot = Robot::named_or_file(&config.robot)?;
-        let pads = placement::fit(&robot, config.scene)?;
+        let pads = placement::fit(&robot, &config)?;
         let objects = placement::objects(&robot, config.scene, config.goods(), config.seed)?;
         let resting = first_posture(&robot, &config);
         let errors = Errors::new(config.errors, robot.arm_joints().len(), config.seed, 0);
@@ -98,7 +98,7 @@ impl Cell {
             tilts: vec![0.0; ids.len()],
             ids,
             held: None,
-            contacts: Contacts::default(),
+            contacts: Contacts::of(&robot),
             faults: Faults::new(&config.faults, config.seed),
             blind_until: now,
             lost_until: now,
@@ -472,7 +472,7 @@ impl Cell {
         // The request was checked before it became an event; a table that cannot be laid is an empty one.
         let objects = placement::objects(&self.robot, self.config.scene, goods, seed).unwrap_or_default();
         self.held = None;
-        self.contacts = Contacts::default();
+        self.contacts = Contacts::of(&self.robot);
         self.tilts = vec![0.0; objects.len()];
         (self.environment, self.ids) = environment(&self.robot, &self.configuration(), self.config.scene, &objects);
         self.environment.skip_until(self.now);
@@ -527,7 +527,7 @@ fn first_posture(robot: &Robot, config: &CellConfig) -> Configuration {
     Configuration { arm: placement::home(robot), finger: open_finger(robot, config), ..robot.at_zero() }
 }
 
-/// As the config says, but not wider than the fingers can.
+/// As the config says, else as wide as the fingers can.
 fn open_finger(robot: &Robot, config: &CellConfig) -> f64 {
-    (config.gripper.opening_m / 2.0).min(robot.open_finger_m())
+    config.gripper.opening_m.map_or(robot.open_finger_m(), |opening_m| opening_m / 2.0)
 }

@@ -81,6 +81,7 @@ struct Episode {
 /// Watches a cell's contacts.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Contacts {
+    fingers: Fingers,
     open: BTreeMap<[Thing; 2], Episode>,
     /// Fingers at objects, over before it is known what for.
     waiting: Vec<(usize, Contact)>,
@@ -96,6 +97,10 @@ pub(super) struct Contacts {
     /// Of those, the ones that nobody was told of.
     fresh: Vec<Contact>,
 }
+
+/// The names of the links that are fingers.
+#[derive(Debug, Clone, Default)]
+struct Fingers(Vec<String>);
 
 /// What the fingers part from.
 #[derive(Debug, Clone, Copy)]
@@ -158,13 +163,30 @@ impl std::fmt::Display for Contact {
     }
 }
 
+impl Fingers {
+    /// The object at which one of them is.
+    fn at(&self, things: &[Thing; 2]) -> Option<usize> {
+        match things {
+            [Thing::Link(link), Thing::Object(object)] if self.0.contains(link) => Some(*object),
+            _ => None,
+        }
+    }
+}
+
 impl Contacts {
+    /// Of this robot, nothing touched yet.
+    pub(super) fn of(robot: &Robot) -> Contacts {
+        let names = robot.finger_links().into_iter().map(|link| robot.model.links[link].name.clone());
+        Contacts { fingers: Fingers(names.collect()), ..Contacts::default() }
+    }
+
     /// After a step: what touches what.
     pub(super) fn observe(&mut self, touches: &[Touch], doing: Doing<'_>, environment: &Environment, ids: &[String]) {
+        let fingers = self.fingers.clone();
         if doing.fingers_solid {
             // They have opened after a grasp in vain: what they are in from now on they push.
             let in_vain = |things: &[Thing; 2], e: &Episode| {
-                e.contact.meant == Some(Purpose::Grasp) && finger_at(things) != doing.held
+                e.contact.meant == Some(Purpose::Grasp) && fingers.at(things) != doing.held
             };
             self.end(in_vain);
         }
@@ -172,7 +194,7 @@ impl Contacts {
             self.see(touch, doing, environment, ids);
         }
         for (things, episode) in self.take(|things, _| touches.iter().all(|touch| touch.things != *things)) {
-            match finger_at(&things) {
+            match fingers.at(&things) {
                 Some(object) if episode.contact.meant.is_none() && (doing.moves || !doing.fingers_solid) => {
                     self.waiting.push((object, episode.contact));
                 }
@@ -185,15 +207,17 @@ impl Contacts {
 
     /// The fingers begin to close: what they touch already they came to.
     pub(super) fn closing(&mut self) {
-        let came = self.take(|things, episode| finger_at(things).is_some() && episode.contact.meant.is_none());
-        self.waiting.extend(came.into_iter().filter_map(|(things, e)| Some((finger_at(&things)?, e.contact))));
+        let fingers = self.fingers.clone();
+        let came = self.take(|things, episode| fingers.at(things).is_some() && episode.contact.meant.is_none());
+        self.waiting.extend(came.into_iter().filter_map(|(things, e)| Some((fingers.at(&things)?, e.contact))));
     }
 
     /// The fingers have closed around an object, in vain or not; `None`: around nothing.
     pub(super) fn closed(&mut self, around: Option<usize>, environment: &Environment) {
         self.settle(|object| Some(object) == around, environment);
-        for (things, episode) in &mut self.open {
-            if finger_at(things).is_some() && finger_at(things) == around {
+        let Contacts { fingers, open, .. } = self;
+        for (things, episode) in open {
+            if fingers.at(things).is_some() && fingers.at(things) == around {
                 episode.contact.meant = Some(Purpose::Grasp);
             }
         }
@@ -224,8 +248,9 @@ impl Contacts {
         for (_, contact) in std::mem::take(&mut self.waiting) {
             self.judge(contact);
         }
+        let fingers = self.fingers.clone();
         let in_vain = |things: &[Thing; 2], episode: &Episode| {
-            episode.contact.meant == Some(Purpose::Grasp) && finger_at(things) != held
+            episode.contact.meant == Some(Purpose::Grasp) && fingers.at(things) != held
         };
         self.end(in_vain);
         if let Some(parting) = &mut self.parting {
@@ -317,7 +342,7 @@ impl Contacts {
             things if things.iter().any(|thing| self.put.map(Thing::Object).as_ref() == Some(thing)) => {
                 Some(Purpose::PutThere)
             }
-            [Thing::Link(_), Thing::Object(object)] if finger_at(&touch.things).is_some() => {
+            [Thing::Link(_), Thing::Object(object)] if self.fingers.at(&touch.things).is_some() => {
                 if doing.held == Some(*object) {
                     return Some(Purpose::Grasp);
                 }
@@ -376,16 +401,9 @@ fn is_moved(touch: &Touch, doing: Doing<'_>) -> bool {
     robot.link(link).is_some_and(|link| robot.arm_links.contains(&link))
 }
 
-/// The object at which a finger is.
-fn finger_at(things: &[Thing; 2]) -> Option<usize> {
-    match things {
-        [Thing::Link(link), Thing::Object(object)] if link.starts_with("finger") => Some(*object),
-        _ => None,
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::super::environment::{Kind, Model};
     use super::*;
     use ratn_model::pose::Pose;
@@ -423,7 +441,8 @@ mod tests {
             let model = Model { kind: Kind::Box, size: [0.1, 0.1, 0.1] };
             let stands = Configuration { finger: 0.055, ..robot.at_zero() };
             let environment = Environment::new(&robot, &stands, &[], &[(model, Pose::at(2.0, 0.0, 0.5))]);
-            Watched { robot, environment, contacts: Contacts::default() }
+            let contacts = Contacts::of(&robot);
+            Watched { robot, environment, contacts }
         }
 
         /// A step in which the box is `x` metres from where it was and a link is so deep in it, or none is.
@@ -445,6 +464,22 @@ mod tests {
         fn pushed_mm(&self) -> Vec<f64> {
             self.contacts.unintended().iter().map(|contact| (contact.pushed_m * 1e3).round()).collect()
         }
+    }
+
+    #[test]
+    fn a_finger_is_a_link_that_the_gripper_moves_whatever_it_is_called() {
+        let description = |file: &str| std::fs::read_to_string(format!("../motion/robots/aimm.{file}")).unwrap();
+        let [toml, urdf, srdf] = ["toml", "urdf", "srdf"].map(|file| {
+            description(file)
+                .replace("finger_left", "jaw_a")
+                .replace("finger_right", "jaw_b")
+                .replace("\"arm_4\"", "\"finger_like\"")
+        });
+        let read = ratn_motion::description::RobotDescription::read(&toml).unwrap();
+        let robot = Robot::of(read, &urdf, Some(&srdf), &mut |_| unreachable!("it has no meshes")).unwrap();
+        let fingers = Contacts::of(&robot).fingers;
+        let at = |link: &str| fingers.at(&[Thing::Link(link.to_owned()), Thing::Object(3)]);
+        assert_eq!((at("jaw_a"), at("jaw_b"), at("finger_like")), (Some(3), Some(3), None));
     }
 
     #[test]

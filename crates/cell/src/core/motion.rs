@@ -7,7 +7,7 @@
 //! starts.
 
 use super::environment::STEP;
-use ratn_motion::joint_vector::JointVector;
+use ratn_motion::joint_vector::{JointVector, PerJoint};
 use ratn_motion::trajectory::Curve;
 use serde::{Deserialize, Serialize};
 
@@ -17,8 +17,8 @@ pub(crate) struct Motion {
     trajectory: Curve,
     /// Where the joints are, every [`STEP`] from the start.
     course: Vec<JointVector>,
-    /// How many of the joints slide; they come first.
-    slides: usize,
+    /// Which of the joints slide.
+    slides: PerJoint<bool>,
     /// When it ends before it is done, and why.
     breaks: Option<(f64, String)>,
 }
@@ -32,8 +32,8 @@ pub(crate) struct Controller {
     pub(crate) stiffness: f64,
     /// How far the joints may be from their trajectory, in radians and in metres.
     pub(crate) most_off: f64,
-    /// How many of the joints slide; they come first.
-    pub(crate) slides: usize,
+    /// Which of the joints slide.
+    pub(crate) slides: PerJoint<bool>,
 }
 
 /// How far joints were from a trajectory while they followed it.
@@ -151,7 +151,8 @@ impl Motion {
     /// How well it was followed for so many seconds.
     pub(crate) fn tracking(&self, time_s: f64) -> Tracking {
         let dt = STEP.as_secs_f64();
-        let (mut tracking, turns) = (Tracking::default(), self.course[0].len() - self.slides);
+        let turning: Vec<usize> = (0..self.course[0].len()).filter(|j| !self.slides[*j]).collect();
+        let mut tracking = Tracking::default();
         let passed = self.course.iter().enumerate().take_while(|(i, _)| *i as f64 * dt <= time_s);
         let mut count = 0.0;
         for (i, at) in passed {
@@ -160,8 +161,8 @@ impl Motion {
             tracking.most_rad = tracking.most_rad.max(radians);
             tracking.most_m = tracking.most_m.max(metres);
             tracking.rms_m += metres.powi(2);
-            tracking.rms_rad +=
-                (self.slides..at.len()).map(|j| (at[j] - wanted[j]).powi(2)).sum::<f64>() / turns as f64;
+            let squares: f64 = turning.iter().map(|j| (at[*j] - wanted[*j]).powi(2)).sum();
+            tracking.rms_rad += squares / turning.len().max(1) as f64;
             count += 1.0;
         }
         let root = |sum: f64| (sum / f64::max(count, 1.0)).sqrt();
@@ -171,12 +172,18 @@ impl Motion {
     /// How far the joints are from where they should be: the one that is turned too far at the most, and those that slide together.
     fn off(&self, at: &JointVector, wanted: &JointVector) -> (f64, f64) {
         let off = |j: usize| (at[j] - wanted[j]).abs();
-        let metres = (0..self.slides).map(|j| off(j).powi(2)).sum::<f64>().sqrt();
-        ((self.slides..at.len()).map(off).fold(0.0, f64::max), metres)
+        let (sliding, turning): (Vec<usize>, Vec<usize>) = (0..at.len()).partition(|j| self.slides[*j]);
+        let metres = sliding.into_iter().map(|j| off(j).powi(2)).sum::<f64>().sqrt();
+        (turning.into_iter().map(off).fold(0.0, f64::max), metres)
     }
 }
 
 impl Controller {
+    /// Which joints of a base slide: x and y.
+    pub(crate) fn base_slides() -> PerJoint<bool> {
+        PerJoint::from_fn(3, |j| j < 2)
+    }
+
     fn lost(&self, radians: f64, metres: f64) -> String {
         let (off, unit) = if radians > self.most_off { (radians, "rad") } else { (metres, "m") };
         format!(
@@ -205,7 +212,9 @@ mod tests {
     use ratn_model::value::{Trajectory, TrajectoryPoint};
     use ratn_motion::robot::Robot;
 
-    const CONTROLLER: Controller = Controller { of: "base", stiffness: 20.0, most_off: 0.05, slides: 2 };
+    fn controller() -> Controller {
+        Controller { of: "base", stiffness: 20.0, most_off: 0.05, slides: Controller::base_slides() }
+    }
 
     /// Straight along x with an acceleration of 0.5 m/s² for two seconds, and down again.
     fn straight(robot: &Robot) -> Curve {
@@ -223,13 +232,13 @@ mod tests {
 
     #[test]
     fn the_lag_is_that_of_the_model_and_a_stiffer_controller_lags_less() {
-        let motion = Motion::new(straight(&Robot::aimm()), JointVector::zeros(3), CONTROLLER, None);
+        let motion = Motion::new(straight(&Robot::aimm()), JointVector::zeros(3), controller(), None);
         // 0.5 / 20² m.
         let tracking = motion.tracking(f64::INFINITY);
         assert!((tracking.most_m - 0.00125).abs() < 2e-4, "{tracking:?}");
         assert!(tracking.rms_m > 0.5 * tracking.most_m && tracking.rms_m < tracking.most_m, "{tracking:?}");
         assert_eq!((tracking.most_rad, tracking.rms_rad), (0.0, 0.0));
-        let stiffer = Controller { stiffness: 40.0, ..CONTROLLER };
+        let stiffer = Controller { stiffness: 40.0, ..controller() };
         let stiffer =
             Motion::new(straight(&Robot::aimm()), JointVector::zeros(3), stiffer, None).tracking(f64::INFINITY);
         assert!(stiffer.most_m < 0.3 * tracking.most_m, "{stiffer:?}");
@@ -237,7 +246,7 @@ mod tests {
 
     #[test]
     fn it_waits_until_the_joints_have_settled_and_then_stands_where_it_should() {
-        let motion = Motion::new(straight(&Robot::aimm()), JointVector::zeros(3), CONTROLLER, None);
+        let motion = Motion::new(straight(&Robot::aimm()), JointVector::zeros(3), controller(), None);
         let over = motion.lasts_s() - 4.0;
         assert!(over > 0.1 && over < 1.0, "{over} s");
         assert!((motion.at(4.0)[0] - 2.0).abs() > SETTLED && (motion.at(motion.lasts_s())[0] - 2.0).abs() <= SETTLED);
@@ -246,7 +255,7 @@ mod tests {
 
     #[test]
     fn what_is_too_far_off_breaks_off_there_and_says_how_far() {
-        let weak = Controller { stiffness: 3.0, ..CONTROLLER };
+        let weak = Controller { stiffness: 3.0, ..controller() };
         let motion = Motion::new(straight(&Robot::aimm()), JointVector::zeros(3), weak, None);
         let reason = motion.end();
         assert!(motion.lasts_s() < 3.0 && motion.at(motion.lasts_s())[0] < 2.0);
@@ -256,7 +265,7 @@ mod tests {
 
     #[test]
     fn a_motion_that_starts_beside_its_trajectory_comes_to_it() {
-        let motion = Motion::new(straight(&Robot::aimm()), JointVector::of([0.0, 0.01, 0.01]), CONTROLLER, None);
+        let motion = Motion::new(straight(&Robot::aimm()), JointVector::of([0.0, 0.01, 0.01]), controller(), None);
         let tracking = motion.tracking(f64::INFINITY);
         assert!((tracking.most_rad - 0.01).abs() < 1e-9 && tracking.rms_rad < 0.002, "{tracking:?}");
         assert_eq!(motion.end(), Ok(JointVector::of([2.0, 0.0, 0.0])));

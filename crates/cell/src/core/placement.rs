@@ -5,7 +5,7 @@ use super::environment::{Furniture, Kind, Model};
 use super::grasping::Pads;
 use super::objects::Placed;
 use super::tableware;
-use crate::config::{AIMM, Goods, Setting};
+use crate::config::{AIMM, CellConfig, Goods, Setting};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::grasp;
@@ -48,6 +48,14 @@ pub enum PlacementError {
     /// The robot's description.
     #[error(transparent)]
     Robot(#[from] DescriptionError),
+    /// A gripper that opens to something else than the config says.
+    #[error("`gripper.opening_m` of the cell is {opening_m}: {reason}")]
+    Opening {
+        /// What the config says, in metres.
+        opening_m: f64,
+        /// What it must be.
+        reason: String,
+    },
     /// A robot that cannot do what a cell is for.
     #[error("the robot `{robot}` cannot stand in a cell: {reason}")]
     Unfit {
@@ -128,24 +136,41 @@ pub fn workplace(robot: &Robot) -> &Workplace {
     }
 }
 
-/// The pads of a robot that can stand in a cell of this setting.
+/// The pads of a robot that can stand in a cell of this config.
 ///
 /// # Errors
-/// [`PlacementError::Unfit`] says what it lacks.
-pub fn fit(robot: &Robot, setting: Setting) -> Result<Pads, PlacementError> {
+/// [`PlacementError::Unfit`] says what it lacks, [`PlacementError::Opening`] how its gripper opens.
+pub fn fit(robot: &Robot, config: &CellConfig) -> Result<Pads, PlacementError> {
     let pads = Pads::of(robot);
     let lacks = if robot.workplace().is_none() {
         "its robot.toml has no [workplace], so nobody knows where the table and the boxes are: add one (docs/robots.md)"
     } else if robot.camera_pose(&robot.at_zero()).is_none() {
         "its robot.toml has no [camera]"
-    } else if setting == Setting::Table && robot.name() != AIMM {
+    } else if config.scene == Setting::Table && config.robot != AIMM {
         "the scene `table` is made for `aimm`; use the scene `boxes`"
     } else if let Some(pads) = pads {
+        check_opening(robot, config)?;
         return Ok(pads);
     } else {
         "it needs a [gripper] whose finger is a box in the URDF"
     };
     Err(PlacementError::Unfit { robot: robot.name().to_owned(), reason: lacks })
+}
+
+/// The gripper opens as far as the config says, and then around every box.
+fn check_opening(robot: &Robot, config: &CellConfig) -> Result<(), PlacementError> {
+    let Some(opening_m) = config.gripper.opening_m else { return Ok(()) };
+    let (most, name, widest) = (2.0 * robot.open_finger_m(), robot.name(), workplace(robot).boxes.greatest[1]);
+    let reason = if opening_m > most {
+        format!("the gripper of `{name}` opens to {most} m")
+    } else if config.scene == Setting::Boxes && opening_m <= widest {
+        format!(
+            "the boxes of the [workplace] of `{name}` are up to {widest} m across; leave it out, or make them smaller"
+        )
+    } else {
+        return Ok(());
+    };
+    Err(PlacementError::Opening { opening_m, reason })
 }
 
 /// What never moves, as objects of the scene.
@@ -346,5 +371,23 @@ mod tests {
         let one = Rectangle { centre: [0.0, 0.0], yaw: 0.0, half: [0.1, 0.05] };
         assert!(one.overlaps(&Rectangle { centre: [0.12, 0.08], yaw: 0.8, half: [0.1, 0.05] }));
         assert!(!one.overlaps(&Rectangle { centre: [0.18, 0.12], yaw: -0.8, half: [0.1, 0.05] }));
+    }
+
+    #[test]
+    fn the_gripper_opens_as_the_robot_does_unless_the_config_says_less() {
+        let config = |text: &str| toml::from_str::<CellConfig>(text).unwrap();
+        let fits = |text: &str| {
+            let config = config(text);
+            fit(&Robot::named_or_file(&config.robot).unwrap(), &config).map(drop).map_err(|error| error.to_string())
+        };
+        assert_eq!(fits("robot = \"panda\""), Ok(()));
+        assert_eq!(fits("robot = \"panda\"\ngripper.opening_m = 0.07"), Ok(()));
+        let beyond = fits("robot = \"panda\"\ngripper.opening_m = 0.11").unwrap_err();
+        assert!(beyond.contains("0.11") && beyond.contains("`panda` opens to 0.08 m"), "{beyond}");
+        let narrow = fits("robot = \"panda\"\ngripper.opening_m = 0.06").unwrap_err();
+        assert!(narrow.contains("0.06") && narrow.contains("up to 0.06 m across"), "{narrow}");
+        assert!(
+            config("gripper.opening_m = 0.0").check().is_err() && config("gripper.opening_m = 0.2").check().is_ok()
+        );
     }
 }

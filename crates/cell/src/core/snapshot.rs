@@ -71,6 +71,16 @@ pub enum SnapshotError {
     /// Of another version.
     #[error("this snapshot has form {0}, this cell knows {FORM}")]
     OtherForm(u32),
+    /// Of a robot with another number of joints.
+    #[error(
+        "this snapshot is of a robot whose arm has {of} joints: the arm of this cell has {here}, so it cannot be put back to it"
+    )]
+    OtherRobot {
+        /// Of the snapshot's.
+        of: usize,
+        /// Of the cell's.
+        here: usize,
+    },
     /// Parts that do not fit each other.
     #[error("this snapshot contradicts itself: {0}")]
     Inconsistent(&'static str),
@@ -104,6 +114,15 @@ impl Snapshot {
             return Err(SnapshotError::Inconsistent("its battery is fuller than full or emptier than empty"));
         }
         Ok(snapshot)
+    }
+
+    /// Whether a cell whose arm has so many joints can be put back to it.
+    ///
+    /// # Errors
+    /// [`SnapshotError::OtherRobot`].
+    pub fn check_joints(&self, here: usize) -> Result<(), SnapshotError> {
+        let of = self.posture.arm.len();
+        if of == here { Ok(()) } else { Err(SnapshotError::OtherRobot { of, here }) }
     }
 }
 
@@ -149,7 +168,7 @@ impl Cell {
         );
         self.environment.set_time(self.now);
         self.held = snapshot.held.as_ref().map(|held| Held::new(held.object, held.in_tool, held.friction));
-        self.contacts = Contacts::default();
+        self.contacts = Contacts::of(&self.robot);
         self.ids.clone_from(&snapshot.ids);
         self.tilts.clone_from(&snapshot.tilts);
         self.battery = Battery::at(self.config.battery, snapshot.battery);

@@ -8,7 +8,7 @@ use super::motion::{Controller, Motion};
 use super::protocol::Request;
 use super::trajectory;
 use ratn_motion::drive::wrapped;
-use ratn_motion::joint_vector::JointVector;
+use ratn_motion::joint_vector::{JointVector, PerJoint};
 use ratn_motion::robot::Configuration;
 use ratn_motion::trajectory::Curve;
 use ratn_perception::camera::Camera;
@@ -127,8 +127,13 @@ impl Cell {
     fn following(&mut self, trajectory: Curve) -> (Kind, f64) {
         let lasts_s = trajectory.duration_s();
         let config = self.config.controllers;
-        let controller =
-            Controller { of: "arm", stiffness: config.arm_stiffness, most_off: config.arm_most_off_rad, slides: 0 };
+        let slides = self.robot.arm_slides();
+        let controller = Controller {
+            of: "arm",
+            stiffness: config.arm_stiffness,
+            most_off: config.arm_most_off_rad,
+            slides: PerJoint::from_fn(slides.len(), |j| slides[j]),
+        };
         let breaks = self.arm_breaks_off(lasts_s);
         let motion = Motion::new(trajectory, self.measured().arm, controller, breaks);
         let lasts_s = motion.lasts_s();
@@ -139,8 +144,12 @@ impl Cell {
     fn driving(&mut self, trajectory: Curve) -> (Kind, f64) {
         let lasts_s = trajectory.duration_s();
         let config = self.config.controllers;
-        let controller =
-            Controller { of: "base", stiffness: config.base_stiffness, most_off: config.base_most_off, slides: 2 };
+        let controller = Controller {
+            of: "base",
+            stiffness: config.base_stiffness,
+            most_off: config.base_most_off,
+            slides: Controller::base_slides(),
+        };
         let breaks = self.drive_breaks_off(lasts_s);
         // A heading is the same after a whole turn: the one that the trajectory begins at.
         let ([x, y, heading], first) = (self.measured().base, trajectory.knots()[0].positions[2]);

@@ -19,7 +19,7 @@ use ratn_motion::robot::Robot;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::tls::ClientTls;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// What is used without `--config`.
@@ -92,13 +92,21 @@ impl Default for Parts {
 }
 
 impl Parts {
-    /// What the robot does not have is not offered, and its arm has as many joints as it has.
-    fn fit(&self, catalogue: &mut Catalogue) {
+    /// What the robot does not have is not offered, unless a template or a provider of one's own offers it; and its arm has as many joints as
+    /// it has. Providers of one's own are as they say.
+    fn fit(&self, catalogue: &mut Catalogue, templates: &[Template]) {
+        let standard = Catalogue::standard();
         let lacks =
             |kind: &str| Module::ALL.iter().any(|module| module.kind() == kind && !self.modules.contains(module));
-        catalogue.resources.retain(|kind, _| !lacks(kind));
-        catalogue.providers.retain(|_, provider| !lacks(&provider.resource));
-        for provider in catalogue.providers.values_mut().filter(|provider| provider.joints.is_some()) {
+        let started = |kind: &str| templates.iter().any(|template| template.kind == kind);
+        catalogue.providers.retain(|name, provider| {
+            !lacks(&provider.resource) || started(&provider.resource) || !standard.providers.contains_key(name)
+        });
+        let Catalogue { providers, resources, .. } = catalogue;
+        let provided = |kind: &str| providers.values().any(|provider| provider.resource == kind);
+        resources.retain(|kind, _| !lacks(kind) || started(kind) || provided(kind));
+        let of_the_robot = providers.iter_mut().filter(|(name, _)| standard.providers.contains_key(*name));
+        for (_, provider) in of_the_robot.filter(|(_, provider)| provider.joints.is_some()) {
             provider.joints = self.joints.or(provider.joints);
             let has = |chain: &&JointChain| u32::try_from(chain.joints.len()).ok() == provider.joints;
             provider.chain = self.chain.as_ref().filter(has).cloned();
@@ -186,7 +194,8 @@ impl SystemConfig {
         self.cell.check().context("[cell]")
     }
 
-    /// Makes the catalogue of what it is made of. Workers of the built-in one that no template of this config starts are not there.
+    /// Makes the catalogue of what it is made of. Workers of the built-in one that no template of this config starts are not there, unless its
+    /// own section says how many there are.
     fn compose(&mut self, folder: &Path) -> anyhow::Result<()> {
         if self.catalogues.is_empty() {
             return Ok(());
@@ -195,11 +204,13 @@ impl SystemConfig {
         let (mut composed, built_in) = catalogue::compose(&names, folder).context("`catalogues`")?;
         let own = std::mem::take(&mut self.catalogue);
         // Left out of the file, it is the built-in one.
+        let mut declared = BTreeSet::new();
         if own != Catalogue::standard() {
+            declared.extend(own.resources.keys().cloned());
             catalogue::extend(&mut composed, own);
         }
         let starts = |kind: &String| self.process_manager.templates.iter().any(|template| template.kind == *kind);
-        let is_absent = |kind: &String| built_in.contains(kind) && !starts(kind);
+        let is_absent = |kind: &String| built_in.contains(kind) && !declared.contains(kind) && !starts(kind);
         composed.resources.retain(|kind, offer| offer.class != ResourceClass::Process || !is_absent(kind));
         self.catalogue = composed;
         Ok(())
@@ -208,39 +219,50 @@ impl SystemConfig {
     /// What follows from the robot: what it does not have is not offered, and its arm has as many joints as it has.
     fn fit_robot(&mut self) -> anyhow::Result<()> {
         self.cell.robot.clone_from(&self.robot);
+        // The built-in configuration has all that the standard robot has; only the names of its joints are not in it.
         if self.robot == AIMM {
-            // It has all that a catalogue can name; its joints are named in its description.
             self.parts.chain = Robot::built_in_description(AIMM).map(|robot| JointChain {
                 robot: robot.name,
                 arm: robot.arm.name,
                 joints: robot.arm.joints,
             });
-            self.parts.fit(&mut self.catalogue);
+        } else {
+            let robot = Robot::named_or_file(&self.robot).map_err(|error| match error {
+                DescriptionError::Read { .. } if !Path::new(&self.robot).exists() => {
+                    let known: Vec<&str> = Robot::built_in_names().collect();
+                    anyhow::anyhow!("{} is no file, and no built-in robot: those are {}", self.robot, known.join(", "))
+                }
+                error => error.into(),
+            })?;
+            let chain = JointChain {
+                robot: robot.name().to_owned(),
+                arm: robot.arm_name().to_owned(),
+                joints: robot.arm_joints().iter().map(|joint| joint.name.clone()).collect(),
+            };
+            let joints = Some(u32::try_from(chain.joints.len())?);
+            self.parts = Parts { modules: Module::of(&robot), joints, chain: Some(chain) };
+        }
+        self.parts.fit(&mut self.catalogue, &self.process_manager.templates);
+        self.process_manager_config().templates.iter().try_for_each(|template| self.check_told(template))
+    }
+
+    /// A bundled worker is for the robot of the system. `{robot}` is filled in.
+    fn check_told(&self, template: &Template) -> anyhow::Result<()> {
+        let Template { name, program, python, args, .. } = template;
+        let is_ratn = program.as_ref().is_none_or(|program| Path::new(program).file_name() == Some("ratn".as_ref()));
+        if python.is_some() || !is_ratn || !args.iter().any(|argument| argument == "worker") {
             return Ok(());
         }
-        let robot = Robot::named_or_file(&self.robot).map_err(|error| match error {
-            DescriptionError::Read { .. } if !Path::new(&self.robot).exists() => {
-                let known: Vec<&str> = Robot::built_in_names().collect();
-                anyhow::anyhow!("{} is no file, and no built-in robot: those are {}", self.robot, known.join(", "))
-            }
-            error => error.into(),
-        })?;
-        let chain = JointChain {
-            robot: robot.name().to_owned(),
-            arm: robot.arm_name().to_owned(),
-            joints: robot.arm_joints().iter().map(|joint| joint.name.clone()).collect(),
-        };
-        let joints = Some(u32::try_from(chain.joints.len())?);
-        self.parts = Parts { modules: Module::of(&robot), joints, chain: Some(chain) };
-        self.parts.fit(&mut self.catalogue);
-        let not_told = |template: &&Template| {
-            let says = |word: &str| template.args.iter().any(|argument| argument == word);
-            template.program.is_none() && template.python.is_none() && says("worker") && !says("--robot")
-        };
-        match self.process_manager.templates.iter().find(not_told) {
-            None => Ok(()),
-            Some(Template { name, .. }) => anyhow::bail!(
-                "the template `{name}` does not say for which robot its worker is: add \"--robot\", \"{ROBOT_PLACEHOLDER}\" to its args"
+        let said = "\"--robot\", \"{robot}\"";
+        match told(args) {
+            None if self.robot == AIMM => Ok(()),
+            None => anyhow::bail!(
+                "the template `{name}` does not say for which robot its worker is: add {said} to its args"
+            ),
+            Some(robot) if is_same(robot, &self.robot) => Ok(()),
+            Some(robot) => anyhow::bail!(
+                "the worker of the template `{name}` is for `{robot}`, the system for `{}`: a system has one robot; write {said} in its args",
+                self.robot
             ),
         }
     }
@@ -250,7 +272,7 @@ impl SystemConfig {
     fn settle(&mut self) {
         self.cell.speed = self.speed;
         let mut standard = Catalogue::standard();
-        self.parts.fit(&mut standard);
+        self.parts.fit(&mut standard, &self.process_manager.templates);
         let built_in = self.catalogue == standard;
         let templates = &self.process_manager.templates;
         self.catalogue.resources.retain(|kind, offer| {
@@ -322,6 +344,23 @@ impl SystemConfig {
     pub(crate) fn to_toml(&self) -> anyhow::Result<String> {
         toml::to_string(self).context("cannot write the config")
     }
+}
+
+/// What a worker's arguments say of its robot, in one word or in two.
+fn told(args: &[String]) -> Option<&str> {
+    let after = |i: usize| args.get(i + 1).map(String::as_str);
+    args.iter().enumerate().find_map(|(i, argument)| match argument.strip_prefix("--robot") {
+        Some("") => after(i),
+        Some(rest) => rest.strip_prefix('='),
+        None => None,
+    })
+}
+
+/// Whether two say the same robot: a built-in one by its name, another by its file.
+pub(crate) fn is_same(one: &str, other: &str) -> bool {
+    let is_built_in = |robot: &str| Robot::built_in_names().any(|name| name == robot);
+    let file = |robot: &str| Path::new(robot).canonicalize().ok();
+    one == other || !is_built_in(one) && !is_built_in(other) && file(one).is_some() && file(one) == file(other)
 }
 
 /// A robot as processes elsewhere find it: a built-in one by its name, another by its whole path.
@@ -408,6 +447,52 @@ mod tests {
         assert!(six.contains(words) && six.ends_with("), and these are the positions of 7"), "{six}");
         let seven = refusal("", "joints(0, 0, 0)").remove(0);
         assert!(seven.contains("of the robot `aimm` has 7 joints (arm_joint_1, "), "{seven}");
+    }
+
+    #[test]
+    fn a_worker_for_another_robot_than_that_of_the_system_is_refused() {
+        let with = |robot: &str, args: &str| {
+            let template = "name = \"path-planner\"\nkind = \"PathPlanner\"";
+            parse(&format!("robot = \"{robot}\"\n[[process-manager.template]]\n{template}\n{args}\n"), "x.toml")
+        };
+        let worker = |more: &str| format!("args = [\"worker\", \"path-planner\"{more}]");
+        for (robot, args) in [
+            ("panda", worker(", \"--robot\", \"{robot}\"")),
+            ("panda", worker(", \"--robot={robot}\"")),
+            ("panda", worker(", \"--robot=panda\"")),
+            ("aimm", worker("")),
+            ("panda", "program = \"/opt/mine\"\nargs = [\"worker\"]".to_owned()),
+        ] {
+            assert!(with(robot, &args).is_ok(), "{args}: {:#}", with(robot, &args).unwrap_err());
+        }
+        for (robot, args, other) in [
+            ("panda", worker(", \"--robot\", \"aimm\""), "`aimm`"),
+            ("aimm", worker(", \"--robot\", \"panda\""), "`panda`"),
+            ("panda", worker(", \"--robot=ur5\""), "`ur5`"),
+            ("panda", worker(""), "does not say for which robot"),
+            ("panda", format!("program = \"/usr/bin/ratn\"\n{}", worker("")), "does not say for which robot"),
+        ] {
+            let refused = format!("{:#}", with(robot, &args).unwrap_err());
+            let parts = ["x.toml: `robot`", "`path-planner`", "{robot}", other];
+            assert!(parts.iter().all(|part| refused.contains(part)), "{args}: {refused}");
+        }
+    }
+
+    #[test]
+    fn what_a_config_offers_itself_stays_whatever_the_robot_has() {
+        let own = "catalogues = [\"built-in\"]\n[catalogue.resources.PathPlanner]\nclass = \"process\"\ncount = 3\n\
+            [process-manager]\ntemplate = []\n";
+        assert_eq!(parse(own, "x.toml").unwrap().catalogue.resources[PATH_PLANNER].count, 3);
+        let hand = "robot = \"ur5\"\ncatalogues = [\"built-in\"]\n[catalogue.resources.Hand]\nclass = \"module\"\ncount = 1\n\
+            [catalogue.providers.left_hand]\nresource = \"Hand\"\njoints = 16\n";
+        let hand = parse(hand, "x.toml").unwrap().catalogue;
+        assert_eq!((hand.providers["left_hand"].joints, hand.providers["arm"].joints), (Some(16), Some(6)));
+        let head =
+            "robot = \"panda\"\ncatalogues = [\"built-in\"]\n[catalogue.providers.mast]\nresource = \"PanTilt\"\n";
+        let head = parse(head, "x.toml").unwrap();
+        assert!(head.catalogue.resources.contains_key("PanTilt") && head.catalogue.providers.contains_key("mast"));
+        assert!(!head.catalogue.providers.contains_key("pan_tilt") && !head.catalogue.resources.contains_key("Base"));
+        assert!(!head.promised_resources().contains_key("PanTilt"));
     }
 
     #[test]

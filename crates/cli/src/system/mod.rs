@@ -8,7 +8,7 @@ pub(crate) mod workers;
 use crate::failure::Failure;
 use crate::output;
 use anyhow::Context;
-use config::SystemConfig;
+use config::{SystemConfig, is_same};
 use launch::Processes;
 use nix::unistd::{AccessFlags, access};
 use ratn_daemon::config::{Durability, state_directory};
@@ -226,10 +226,17 @@ pub(crate) fn sockets_fit(listens: &[(&str, &Endpoint)], directory: &Path) -> Re
     )))
 }
 
-/// The config of the system that runs in `directory`. One that is given says what there is; how fast it goes is decided already.
+/// The config of the system that runs in `directory`. One that is given says what there is; how fast it goes and with which robot is decided
+/// already, and another robot is refused.
 fn config_of(directory: &Path, given: Option<SystemConfig>) -> anyhow::Result<SystemConfig> {
     let own = SystemConfig::read(&directory.join(CONFIG_FILE));
     match (given, own) {
+        (Some(given), Ok(own)) if !is_same(&given.robot, &own.robot) => anyhow::bail!(
+            "the system that runs in {} has the robot `{}`, the config says `{}`: leave --config out, or start a system of your own",
+            directory.display(),
+            own.robot,
+            given.robot
+        ),
         (Some(given), Ok(own)) => Ok(given.at_speed(own.speed)),
         (Some(given), Err(_)) => Ok(given),
         (None, own) => own.with_context(|| {
@@ -395,6 +402,16 @@ mod tests {
         std::fs::write(place.path().join(CONFIG_FILE), running.to_toml().unwrap()).unwrap();
         assert_eq!(config_of(place.path(), Some(given())).unwrap().speed, 17.0);
         assert_eq!(config_of(place.path(), None).unwrap().speed, 17.0);
+    }
+
+    #[test]
+    fn a_running_system_keeps_its_robot_and_a_config_for_another_one_is_refused() {
+        let place = tempfile::tempdir().unwrap();
+        let of = |robot: &str| SystemConfig::load_for(None, Some(robot)).unwrap();
+        std::fs::write(place.path().join(CONFIG_FILE), of("panda").to_toml().unwrap()).unwrap();
+        assert_eq!(config_of(place.path(), Some(of("panda"))).unwrap().robot, "panda");
+        let refused = config_of(place.path(), Some(of("ur5"))).unwrap_err().to_string();
+        assert!(refused.contains("`panda`") && refused.contains("`ur5`") && refused.contains("--config"), "{refused}");
     }
 
     #[tokio::test]

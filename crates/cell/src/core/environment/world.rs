@@ -484,13 +484,14 @@ impl Environment {
 
     fn add_robot(&mut self, robot: &Robot, configuration: &Configuration) {
         let bodies = robot.model.links.iter().flat_map(|link| &link.bodies);
+        let fingers = robot.finger_links();
         for ((link, pose, shape), of_link) in robot.shapes(configuration).into_iter().zip(bodies) {
             let name = &robot.model.links[link].name;
             let body = self.bodies.insert(RigidBodyBuilder::new(LINK).pose(pose));
             let collider = ColliderBuilder::new(shape).friction(ROBOT_FRICTION).collision_groups(robot_groups());
             let collider = self.colliders.insert_with_parent(collider, body, &mut self.bodies);
             self.supports.push((collider, name.clone()));
-            let finger = name.starts_with("finger");
+            let finger = fingers.contains(&link);
             self.links.push(RobotBody { body, collider, finger, link, pose: of_link.pose, at: pose, stands: false });
         }
     }
