@@ -236,39 +236,114 @@ pub fn first(path: &Path) -> Result<LogLine, LogError> {
 }
 
 fn read_from(path: &Path, bytes: u64, before: usize, at_most: usize) -> Result<Log, LogError> {
-    let io = |source| LogError::Io { what: "read", path: path.to_owned(), source };
-    let mut file = File::open(path).map_err(io)?;
-    if bytes > 0 {
-        file.seek(SeekFrom::Start(bytes)).map_err(io)?;
+    let mut all = Lines::open(path, bytes, before)?;
+    let lines = all.by_ref().take(at_most).collect::<Result<Vec<LogLine>, LogError>>()?;
+    Ok(Log { lines, before, torn: all.torn, whole: all.whole })
+}
+
+/// Follows an event log that grows.
+#[derive(Debug)]
+pub struct Tail {
+    path: PathBuf,
+    bytes: u64,
+    lines: usize,
+}
+
+impl Tail {
+    /// Of a log that may not be there yet.
+    pub fn of(path: &Path) -> Tail {
+        Tail { path: path.to_owned(), bytes: 0, lines: 0 }
     }
-    let mut reader = BufReader::new(file);
-    let mut lines = Vec::new();
-    let (mut torn, mut whole) = (None, bytes);
-    let mut text = Vec::new();
-    while lines.len() < at_most {
-        text.clear();
-        let limit = MAX_LINE_BYTES as u64 + 1;
-        let length = reader.by_ref().take(limit).read_until(b'\n', &mut text).map_err(io)?;
-        if length == 0 {
-            break;
+
+    /// The whole lines that were written since the last call.
+    ///
+    /// # Errors
+    /// As [`read`].
+    pub fn more(&mut self) -> Result<Vec<LogLine>, LogError> {
+        if !self.path.exists() {
+            return Ok(Vec::new());
         }
-        let line = before + lines.len() + 1;
-        let foreign = |reason: String| LogError::Foreign { path: path.to_owned(), line, reason };
-        if text.last() != Some(&b'\n') {
+        let log = read_behind(&self.path, self.bytes, self.lines)?;
+        (self.bytes, self.lines) = (log.whole, self.lines + log.lines.len());
+        Ok(log.lines)
+    }
+}
+
+/// Reads an event log line by line, holding one of them. A torn last line is left out.
+#[derive(Debug)]
+pub struct Lines {
+    path: PathBuf,
+    reader: BufReader<File>,
+    read: usize,
+    whole: u64,
+    torn: Option<usize>,
+    text: Vec<u8>,
+    is_over: bool,
+}
+
+impl Lines {
+    /// Of a whole log.
+    ///
+    /// # Errors
+    /// Where it cannot be read.
+    pub fn of(path: &Path) -> Result<Lines, LogError> {
+        Lines::open(path, 0, 0)
+    }
+
+    /// The number of its last line if that is torn; known once all others were read.
+    pub fn torn(&self) -> Option<usize> {
+        self.torn
+    }
+
+    fn open(path: &Path, bytes: u64, before: usize) -> Result<Lines, LogError> {
+        let io = |source| LogError::Io { what: "read", path: path.to_owned(), source };
+        let mut file = File::open(path).map_err(io)?;
+        if bytes > 0 {
+            file.seek(SeekFrom::Start(bytes)).map_err(io)?;
+        }
+        let (reader, path) = (BufReader::new(file), path.to_owned());
+        Ok(Lines { path, reader, read: before, whole: bytes, torn: None, text: Vec::new(), is_over: false })
+    }
+
+    fn line(&mut self) -> Result<Option<LogLine>, LogError> {
+        self.text.clear();
+        let limit = MAX_LINE_BYTES as u64 + 1;
+        let length = self.reader.by_ref().take(limit).read_until(b'\n', &mut self.text);
+        let length = length.map_err(|source| LogError::Io { what: "read", path: self.path.clone(), source })?;
+        if length == 0 {
+            return Ok(None);
+        }
+        let line = self.read + 1;
+        let foreign = |reason: String| LogError::Foreign { path: self.path.clone(), line, reason };
+        if self.text.last() != Some(&b'\n') {
             if length as u64 == limit {
                 return Err(foreign(format!("longer than {MAX_LINE_BYTES} bytes")));
             }
-            torn = Some(line);
-            break;
+            self.torn = Some(line);
+            return Ok(None);
         }
-        let parsed: LogLine = serde_json::from_slice(&text).map_err(|error| foreign(explain(&text, &error)))?;
+        let parsed: LogLine =
+            serde_json::from_slice(&self.text).map_err(|error| foreign(explain(&self.text, &error)))?;
         if line == 1 && !matches!(parsed.entry, LogEntry::Event(Event::Started { .. })) {
             return Err(foreign("an event log begins with the event `started`".into()));
         }
-        lines.push(parsed);
-        whole += length as u64;
+        self.read = line;
+        self.whole += length as u64;
+        Ok(Some(parsed))
     }
-    Ok(Log { lines, before, torn, whole })
+}
+
+impl Iterator for Lines {
+    type Item = Result<LogLine, LogError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.is_over {
+            return None;
+        }
+        let line = self.line().transpose();
+        self.is_over = !matches!(line, Some(Ok(_)));
+        line
+    }
 }
 
 /// The path of a state, of the path of one of its visits: `place_all[2]/plan_transfer` → `place_all/plan_transfer`
@@ -347,6 +422,22 @@ mod tests {
         assert_eq!(lines[2], LogLine { at: Timestamp(0), entry: LogEntry::Command(wake) });
         assert_eq!(lines[0], LogLine { at: Timestamp(0), entry: LogEntry::Event(started()) });
         assert_eq!(lines[1], LogLine { at: Timestamp(0), entry: LogEntry::Command(command) });
+    }
+
+    #[test]
+    fn a_log_that_grows_is_followed_by_whole_lines() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("log.jsonl");
+        let mut tail = Tail::of(&path);
+        assert_eq!(tail.more().unwrap(), []);
+        let line =
+            |entry: &LogEntry| serde_json::to_string(&LogLine { at: Timestamp(0), entry: entry.clone() }).unwrap();
+        let (first, second) = (line(&LogEntry::Event(started())), line(&LogEntry::Event(Event::Resumed)));
+        std::fs::write(&path, format!("{first}\n{}", &second[..9])).unwrap();
+        assert_eq!(tail.more().unwrap().len(), 1);
+        assert_eq!(tail.more().unwrap(), []);
+        std::fs::write(&path, format!("{first}\n{second}\n")).unwrap();
+        assert_eq!(tail.more().unwrap(), [LogLine { at: Timestamp(0), entry: LogEntry::Event(Event::Resumed) }]);
     }
 
     #[test]

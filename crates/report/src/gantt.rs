@@ -1,11 +1,13 @@
-//! A Gantt chart of a run, as the paper's Fig. 10: one row per resource, the robot's seconds to the right.
+//! A Gantt chart of a run, as the paper's Fig. 10: one row per resource, or per state, the robot's seconds to the right. Several runs
+//! stand one below the other on one time axis.
 //!
 //! A bar is a job, coloured by what it is (it moves, it looks, it plans), in three shades so that the visits of a loop can be
 //! told apart. Hatched strips below the bars are waits: instances that had asked for the resource and did not have it yet.
 //! The same timeline gives the same bytes. SVG when the file is named so, else HTML with the statistics below the chart.
 
 use super::statistics::{Statistics, mode_name};
-use super::timeline::{Activity, Ending, Instance, Job, Span, Timeline};
+use super::timeline::{Activity, Ending, Instance, Job, Span, Timeline, Wait};
+use ratn_event_log::without_visits;
 use std::fmt::Write as _;
 use std::path::Path;
 
@@ -28,21 +30,38 @@ const PAUSED: &str = "#efe4f7";
 const ABSENT: &str = "#f7dedb";
 const ELSEWHERE: &str = "no resource";
 
-/// Writes the chart as the file's name says. `scale_s` makes charts of different runs comparable: where the axis ends.
-pub fn write(path: &Path, run: &Timeline, scale_s: Option<f64>) -> std::io::Result<()> {
-    let chart = svg(run, scale_s);
-    let svg_wanted = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("svg"));
-    std::fs::write(path, if svg_wanted { chart } else { html(run, &chart) })
+/// What a row is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum By {
+    /// A resource.
+    #[default]
+    Resource,
+    /// A state; of visits that overlap, each its own row.
+    Node,
 }
 
-fn html(run: &Timeline, chart: &str) -> String {
+/// Writes the chart as the file's name says. `scale_s` makes charts of different runs comparable: where the axis ends.
+pub fn write(path: &Path, run: &Timeline, scale_s: Option<f64>) -> std::io::Result<()> {
+    write_all(path, &[run], By::Resource, scale_s)
+}
+
+/// Writes a chart of several runs below each other.
+pub fn write_all(path: &Path, runs: &[&Timeline], by: By, scale_s: Option<f64>) -> std::io::Result<()> {
+    let chart = stacked(runs, by, scale_s);
+    let svg_wanted = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("svg"));
+    std::fs::write(path, if svg_wanted { chart } else { html(runs, &chart) })
+}
+
+fn html(runs: &[&Timeline], chart: &str) -> String {
+    let titles: Vec<String> = runs.iter().map(|run| title(run)).collect();
+    let statistics: Vec<String> = runs.iter().map(|run| Statistics::of(run).to_string()).collect();
     format!(
         "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>{title}</title>\n<style>\
          body{{margin:24px auto;max-width:{WIDTH}px;background:#fff;color:#1c2430;font:14px system-ui,sans-serif}}\
          svg{{width:100%;height:auto}}pre{{font:12.5px/1.45 ui-monospace,monospace;background:#f5f6f8;padding:14px 18px;\
          border-radius:6px;overflow-x:auto}}</style></head><body>\n{chart}\n<pre>{statistics}</pre>\n</body></html>\n",
-        title = escaped(&title(run)),
-        statistics = escaped(&Statistics::of(run).to_string()),
+        title = escaped(&titles.join("; ")),
+        statistics = escaped(&statistics.join("\n\n")),
     )
 }
 
@@ -57,9 +76,15 @@ fn title(run: &Timeline) -> String {
 
 /// The chart as one SVG element.
 pub fn svg(run: &Timeline, scale_s: Option<f64>) -> String {
-    let rows = rows(run);
-    let axis = Axis { end_s: scale_s.unwrap_or(run.end_s).max(run.end_s).max(1e-3) };
-    let bottom = TOP + ROW * rows.len() as f64;
+    stacked(&[run], By::Resource, scale_s)
+}
+
+/// A chart of several runs below each other, on one time axis, as one SVG element.
+pub fn stacked(runs: &[&Timeline], by: By, scale_s: Option<f64>) -> String {
+    let end_s = runs.iter().map(|run| run.end_s).fold(scale_s.unwrap_or(0.0), f64::max);
+    let axis = Axis { end_s: end_s.max(1e-3) };
+    let panels: Vec<(&Timeline, Vec<Row<'_>>)> = runs.iter().map(|run| (*run, rows(run, by))).collect();
+    let height = |rows: &[Row<'_>]| TOP + ROW * rows.len() as f64 + BOTTOM;
     let mut out = String::new();
     let _ = write!(
         out,
@@ -68,19 +93,34 @@ pub fn svg(run: &Timeline, scale_s: Option<f64>) -> String {
          patternUnits=\"userSpaceOnUse\" patternTransform=\"rotate(45)\"><rect width=\"6\" height=\"6\" fill=\"#e4e7ec\"/>\
          <rect width=\"2.5\" height=\"6\" fill=\"#7a8699\"/></pattern></defs>\n\
          <rect width=\"{WIDTH}\" height=\"{height}\" fill=\"#ffffff\"/>\n",
-        height = bottom + BOTTOM,
+        height = panels.iter().map(|(_, rows)| height(rows)).fold(0.0, |all, one| all + one),
     );
+    let mut y = 0.0;
+    for (run, rows) in &panels {
+        if y > 0.0 {
+            let _ = writeln!(out, "<g transform=\"translate(0 {y:.1})\">");
+        }
+        panel(&mut out, run, rows, &axis);
+        out.push_str(if y > 0.0 { "</g>\n" } else { "" });
+        y += height(rows);
+    }
+    out.push_str("</svg>");
+    out
+}
+
+fn panel(out: &mut String, run: &Timeline, rows: &[Row<'_>], axis: &Axis) {
+    let bottom = TOP + ROW * rows.len() as f64;
     let _ =
         writeln!(out, "<text x=\"16\" y=\"30\" font-size=\"18\" font-weight=\"600\">{}</text>", escaped(&title(run)));
-    legend(&mut out, run);
+    legend(out, run);
     for (spans, colour, what) in [(&run.pauses, PAUSED, "paused"), (&run.absences, ABSENT, "task control was gone")] {
         for span in spans {
-            band(&mut out, &axis, bottom, *span, colour, what);
+            band(out, axis, bottom, *span, colour, what);
         }
     }
-    axis.draw(&mut out, bottom);
+    axis.draw(out, bottom);
     for (i, row) in rows.iter().enumerate() {
-        row.draw(&mut out, &axis, TOP + ROW * i as f64, i % 2 == 1);
+        row.draw(out, axis, TOP + ROW * i as f64, i % 2 == 1);
     }
     // The end of the run, where the axis goes on.
     let x = axis.x(run.end_s);
@@ -89,8 +129,6 @@ pub fn svg(run: &Timeline, scale_s: Option<f64>) -> String {
         "<line x1=\"{x:.1}\" y1=\"{:.1}\" x2=\"{x:.1}\" y2=\"{bottom:.1}\" stroke=\"#1c2430\" stroke-width=\"1.5\"/>",
         TOP - 6.0
     );
-    out.push_str("</svg>");
-    out
 }
 
 /// A time from top to bottom.
@@ -171,44 +209,79 @@ impl Axis {
 }
 
 struct Row<'a> {
-    resource: &'a str,
+    /// The resource, or the state.
+    name: String,
     jobs: Vec<(&'a Instance, &'a Job)>,
     waits: Vec<(&'a Instance, f64, f64)>,
 }
 
-/// One per resource: what moves first, then what looks, then what plans; within these by name.
-fn rows(run: &Timeline) -> Vec<Row<'_>> {
-    let mut rows: Vec<Row<'_>> = Vec::new();
-    fn of<'r, 'a>(rows: &'r mut Vec<Row<'a>>, resource: &'a str) -> &'r mut Row<'a> {
-        let at = rows.iter().position(|row| row.resource == resource).unwrap_or_else(|| {
-            rows.push(Row { resource, jobs: vec![], waits: vec![] });
-            rows.len() - 1
-        });
-        &mut rows[at]
-    }
-    for (instance, job) in run.jobs() {
-        for resource in &job.resources {
-            of(&mut rows, resource).jobs.push((instance, job));
-        }
-        if job.resources.is_empty() {
-            of(&mut rows, ELSEWHERE).jobs.push((instance, job));
-        }
-    }
-    for instance in &run.instances {
-        for wait in instance.waits.iter().filter(|w| w.to_s - w.from_s >= SHORTEST_WAIT_S) {
-            for resource in &wait.resources {
-                of(&mut rows, resource).waits.push((instance, wait.from_s, wait.to_s));
-            }
-        }
-    }
-    let rank = |row: &Row<'_>| row.jobs.iter().map(|(_, job)| job.activity).min();
-    rows.sort_by(|a, b| {
-        (a.resource == ELSEWHERE, rank(a), a.resource).cmp(&(b.resource == ELSEWHERE, rank(b), b.resource))
-    });
+fn rows(run: &Timeline, by: By) -> Vec<Row<'_>> {
+    let mut rows = match by {
+        By::Resource => by_resource(run),
+        By::Node => by_node(run),
+    };
     for row in &mut rows {
         row.waits.sort_by(|a, b| a.1.total_cmp(&b.1).then(a.0.id.cmp(&b.0.id)));
     }
     rows
+}
+
+/// What moves first, then what looks, then what plans; within these by name.
+fn by_resource(run: &Timeline) -> Vec<Row<'_>> {
+    let mut rows: Vec<Row<'_>> = Vec::new();
+    for (instance, job) in run.jobs() {
+        for resource in &job.resources {
+            row_of(&mut rows, resource).jobs.push((instance, job));
+        }
+        if job.resources.is_empty() {
+            row_of(&mut rows, ELSEWHERE).jobs.push((instance, job));
+        }
+    }
+    for (instance, wait) in long_waits(run) {
+        for resource in &wait.resources {
+            row_of(&mut rows, resource).waits.push((instance, wait.from_s, wait.to_s));
+        }
+    }
+    let rank = |row: &Row<'_>| row.jobs.iter().map(|(_, job)| job.activity).min();
+    rows.sort_by(|a, b| (a.name == ELSEWHERE, rank(a), &a.name).cmp(&(b.name == ELSEWHERE, rank(b), &b.name)));
+    rows
+}
+
+/// In the order in which the states were first visited.
+fn by_node(run: &Timeline) -> Vec<Row<'_>> {
+    let mut rows: Vec<(String, Vec<Row<'_>>)> = Vec::new();
+    for instance in run.instances().filter(|one| !one.jobs.is_empty()) {
+        let state = without_visits(&instance.path);
+        let at = rows.iter().position(|(name, _)| *name == state).unwrap_or_else(|| {
+            rows.push((state.clone(), Vec::new()));
+            rows.len() - 1
+        });
+        let lanes = &mut rows[at].1;
+        let begins_s = instance.jobs[0].from_s;
+        let is_free = |row: &Row<'_>| row.jobs.iter().all(|(_, job)| job.to_s <= begins_s);
+        let lane = lanes.iter().position(is_free).unwrap_or_else(|| {
+            let name = if lanes.is_empty() { state } else { format!("{state} ({})", lanes.len() + 1) };
+            lanes.push(Row { name, jobs: vec![], waits: vec![] });
+            lanes.len() - 1
+        });
+        lanes[lane].jobs.extend(instance.jobs.iter().map(|job| (instance, job)));
+        let waits = instance.waits.iter().filter(|wait| wait.to_s - wait.from_s >= SHORTEST_WAIT_S);
+        lanes[lane].waits.extend(waits.map(|wait| (instance, wait.from_s, wait.to_s)));
+    }
+    rows.into_iter().flat_map(|(_, lanes)| lanes).collect()
+}
+
+fn row_of<'r, 'a>(rows: &'r mut Vec<Row<'a>>, name: &str) -> &'r mut Row<'a> {
+    let at = rows.iter().position(|row| row.name == name).unwrap_or_else(|| {
+        rows.push(Row { name: name.to_owned(), jobs: vec![], waits: vec![] });
+        rows.len() - 1
+    });
+    &mut rows[at]
+}
+
+fn long_waits(run: &Timeline) -> impl Iterator<Item = (&Instance, &Wait)> {
+    let waits = run.instances().flat_map(|one| one.waits.iter().map(move |wait| (one, wait)));
+    waits.filter(|(_, wait)| wait.to_s - wait.from_s >= SHORTEST_WAIT_S)
 }
 
 impl Row<'_> {
@@ -224,7 +297,7 @@ impl Row<'_> {
             "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{}</text>",
             LEFT - 10.0,
             y + 19.0,
-            escaped(&shortened(self.resource, 26))
+            escaped(&shortened(&self.name, 26))
         );
         self.draw_waits(out, axis, y + 3.0 + BAR + 1.0);
         for (instance, job) in &self.jobs {
@@ -246,7 +319,7 @@ impl Row<'_> {
                 axis.x(*to_s) - axis.x(*from_s),
                 WAIT_LANE - 0.5,
                 escaped(&instance.path),
-                escaped(self.resource)
+                escaped(&self.name)
             );
         }
     }

@@ -1,19 +1,27 @@
-//! What an event log tells of a run: its timeline, its statistics and its Gantt chart.
+//! What an event log tells of a run: its timeline, its statistics, its critical path and its Gantt chart.
 //!
-//! It owns the fold of a log's lines into what each instance did when ([`timeline`]), the figures made of that ([`statistics`]) and
-//! the chart drawn of it ([`gantt`]). It needs no task file, no system that runs and no network, and prints nothing: the same
+//! It owns the fold of a log's lines into what each instance did when and why ([`timeline`]), the figures made of that ([`statistics`]),
+//! what the run waited for ([`critical`], [`waiting`]), what several runs have in common ([`report`]) and the chart drawn of them
+//! ([`gantt`]). It needs no task file, no system that runs and no network, and prints nothing: the same
 //! lines give the same bytes. Reading the lines from a file is `ratn_event_log`'s.
 
+pub mod critical;
 pub mod gantt;
+pub mod report;
 pub mod statistics;
 pub mod timeline;
+pub mod waiting;
 
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
-    use super::{gantt, statistics::Statistics, timeline::Timeline};
+    use super::gantt::{self, By};
+    use super::report::{self, Report, Spread};
+    use super::statistics::Statistics;
+    use super::timeline::Timeline;
+    use super::{critical, waiting};
     use ratn_event_log as log;
-    use ratn_executive::protocol::LogLine;
+    use ratn_executive::protocol::{LogLine, Mode};
     use std::path::Path;
 
     /// A run with a wait, a crash and its second attempt, a discarded plan and an aborted motion.
@@ -110,5 +118,130 @@ mod tests {
         ] {
             assert!(chart.contains(shown), "{shown}: {chart}");
         }
+    }
+
+    /// `look`, then `plan`, which waits until `other` gives back the only planner, then `move` along that plan.
+    const CHAIN: &str = r#"{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":7,"world":[],"revision":1,"capacity":{"PathPlanner":1},"origin":{"run":"r","natures":{"computes":["plan","other"],"actuating":["Arm"]}}}
+{"at":0,"command":"note","note":"expanded","instance":1,"state":1,"path":"look","speculative":false}
+{"at":0,"command":"note","note":"expanded","instance":2,"state":2,"path":"other","speculative":false}
+{"at":0,"command":"note","note":"expanded","instance":3,"state":3,"path":"plan","speculative":false}
+{"at":0,"command":"note","note":"expanded","instance":4,"state":4,"path":"move","speculative":false}
+{"at":0,"command":"acquire","instance":2,"requirements":[{"operation":"block","kind":"PathPlanner","class":null,"attributes":{},"count":1}],"priority":1}
+{"at":0,"command":"start","instance":1,"attempt":1,"goal":{"provider":"eye","action":"look","inputs":{},"seed":1,"lease":null,"projection":null,"expected_s":null}}
+{"at":0,"event":"granted","instance":2,"lease":{"id":1,"token":1,"resources":[{"id":"p1@compute","kind":"PathPlanner","endpoint":""}]}}
+{"at":0,"command":"start","instance":2,"attempt":1,"goal":{"provider":"path_planner","action":"plan","inputs":{},"seed":1,"lease":{"id":1,"token":1,"resources":[{"id":"p1@compute","kind":"PathPlanner","endpoint":""}]},"projection":1,"expected_s":null}}
+{"at":2000000000,"event":"finished","instance":1,"attempt":1,"outcome":"success","outputs":{},"measured":[],"reason":""}
+{"at":2000000000,"command":"note","note":"finished","instance":1,"outcome":"success"}
+{"at":2000000000,"command":"acquire","instance":3,"requirements":[{"operation":"block","kind":"PathPlanner","class":null,"attributes":{},"count":1}],"priority":1}
+{"at":4000000000,"event":"finished","instance":2,"attempt":1,"outcome":"success","outputs":{},"measured":[],"reason":""}
+{"at":4000000000,"command":"note","note":"finished","instance":2,"outcome":"success"}
+{"at":4000000000,"command":"release","instance":2,"lease":1,"projection":1}
+{"at":4100000000,"event":"granted","instance":3,"lease":{"id":2,"token":2,"resources":[{"id":"p1@compute","kind":"PathPlanner","endpoint":""}]}}
+{"at":4100000000,"command":"start","instance":3,"attempt":1,"goal":{"provider":"path_planner","action":"plan","inputs":{},"seed":1,"lease":{"id":2,"token":2,"resources":[{"id":"p1@compute","kind":"PathPlanner","endpoint":""}]},"projection":2,"expected_s":null}}
+{"at":6000000000,"event":"finished","instance":3,"attempt":1,"outcome":"success","outputs":{},"measured":[],"reason":""}
+{"at":6000000000,"command":"note","note":"finished","instance":3,"outcome":"success"}
+{"at":6000000000,"command":"acquire","instance":4,"requirements":[{"operation":"block","kind":"Arm","class":null,"attributes":{},"count":1}],"priority":1}
+{"at":6200000000,"event":"granted","instance":4,"lease":{"id":3,"token":3,"resources":[{"id":"arm@sim","kind":"Arm","endpoint":""}]}}
+{"at":6200000000,"command":"start","instance":4,"attempt":1,"goal":{"provider":"arm","action":"follow","inputs":{},"seed":1,"lease":{"id":3,"token":3,"resources":[{"id":"arm@sim","kind":"Arm","endpoint":""}]},"projection":null,"expected_s":null}}
+{"at":9000000000,"event":"finished","instance":4,"attempt":1,"outcome":"success","outputs":{},"measured":[],"reason":""}
+{"at":9000000000,"command":"note","note":"finished","instance":4,"outcome":"success"}
+{"at":9000000000,"command":"end","outcome":"success","outputs":{},"reason":""}"#;
+
+    #[test]
+    fn the_critical_path_goes_through_whoever_held_what_was_waited_for() {
+        let text = critical::table(&critical::path(&told(CHAIN)));
+        insta::assert_snapshot!(text, @r"
+        critical path             from s    to s  length  was          began on
+          other                      0.0     4.0     4.0  running      the start
+          plan                       4.0     4.1     0.1  asking       p1@compute, given back by other
+          plan                       4.1     6.0     1.9  running      look
+          move                       6.0     6.2     0.2  asking       Arm
+          move                       6.2     9.0     2.8  running      plan
+          9.0 s in 5 links, 0 of them shorter than 0.05 s and not shown
+        ");
+        // Nothing is on it twice, and nothing of it overlaps.
+        for run in [told(CHAIN), two_boxes(), incidents(), told(WITH_A_LABEL)] {
+            let links = critical::path(&run);
+            assert!(links.windows(2).all(|pair| pair[0].to_s <= pair[1].from_s + 1e-9), "{links:?}");
+        }
+    }
+
+    #[test]
+    fn what_was_waited_for_is_told_by_cause() {
+        insta::assert_snapshot!(waiting::table(&waiting::by_cause(&told(CHAIN))), @r"
+        waited for                       times  total s longest s
+          the result of plan                 1      6.0       6.0
+          PathPlanner, held by other         1      2.1       2.1
+          the result of look                 1      2.0       2.0
+          Arm, from the resource manager     1      0.2       0.2
+        ");
+    }
+
+    #[test]
+    fn what_is_reported_of_a_run() {
+        let text = Report::of(&two_boxes()).to_string();
+        let behind = text.split_once("\nwork ahead of time").unwrap().1;
+        insta::assert_snapshot!(behind, @r"
+        , in jobs: 1 of use (8.0 s), 1 discarded (3.3 s), 0 open
+
+        critical path             from s    to s  length  was          began on
+          look                       0.0     0.1     0.1  asking       PanTilt
+          look                       0.1     3.5     3.4  running      the start
+          segment                    3.5     3.6     0.1  asking       Camera, Detector
+          segment                    3.6    10.5     6.9  running      look
+          fetch[1]/move             28.6    28.7     0.1  asking       Arm
+          fetch[1]/move             28.7    32.0     3.3  running      the resources of when_empty/plan
+          13.9 s in 6 links, 0 of them shorter than 0.05 s and not shown
+
+        waited for                                    times  total s longest s
+          the resources of when_empty/plan                1     18.1      18.1
+          PathPlanner, held by fetch/plan                 1     10.1      10.1
+          the resources of fetch[1]/plan                  1     10.0      10.0
+          the result of look                              1      3.5       3.5
+          PathPlanner, from the resource manager          2      0.5       0.4
+          Arm, from the resource manager                  2      0.2       0.1
+          a projection                                    2      0.2       0.1
+          Camera, Detector, from the resource manager     1      0.1       0.1
+          PanTilt, from the resource manager              1      0.1       0.1
+        ");
+    }
+
+    #[test]
+    fn repeated_runs_have_a_mean_and_a_spread_and_cdtn_is_compared_with_hsm() {
+        let run = |mode: Mode, end_s: f64| {
+            let mut run = told(CHAIN);
+            (run.mode, run.end_s) = (mode, end_s);
+            Statistics::of(&run)
+        };
+        let failed = Statistics { outcome: Some("aborted".to_owned()), ..run(Mode::Hsm, 99.0) };
+        let runs = [run(Mode::Cdtn, 8.0), run(Mode::Hsm, 12.0), run(Mode::Cdtn, 10.0), failed];
+        insta::assert_snapshot!(report::table(&report::repeated(&runs)), @r"
+        task       mode  runs  makespan s        least  largest  two at once s   planning awaited s
+        t          CDTN     2  9.0 ± 1.4           8.0     10.0  2.0 ± 0.0       3.9 ± 0.0
+        t          HSM    1/2  12.0 ± 0.0         12.0     12.0  2.0 ± 0.0       3.9 ± 0.0
+        t: CDTN is 25.0 % shorter than HSM
+        ");
+        assert_eq!(Spread::of(&[]), Spread::default());
+        assert_eq!(Spread::of(&[2.0, 4.0]).deviation, 2.0_f64.sqrt());
+    }
+
+    #[test]
+    fn several_runs_stand_below_each_other_on_one_time_axis() {
+        let (short, long) = (told(CHAIN), two_boxes());
+        let chart = gantt::stacked(&[&short, &long], By::Resource, None);
+        assert_eq!(chart.matches("seconds of the robot's time").count(), 2);
+        // Both axes end with the longer run.
+        assert_eq!(chart.matches(">30</text>").count(), 2, "{chart}");
+        assert_eq!(chart.matches("<g transform=\"translate(0 ").count(), 1);
+        assert_eq!(gantt::svg(&long, None), gantt::stacked(&[&long], By::Resource, None));
+    }
+
+    #[test]
+    fn a_chart_by_node_has_a_row_for_each_state_and_for_visits_that_overlap() {
+        let chart = gantt::stacked(&[&two_boxes()], By::Node, None);
+        for row in [">look</text>", ">fetch/plan</text>", ">fetch/move</text>", ">when_empty/plan</text>"] {
+            assert!(chart.contains(row), "{row}: {chart}");
+        }
+        assert!(!chart.contains("fetch/plan (2)"), "the plans do not overlap: {chart}");
     }
 }

@@ -174,11 +174,11 @@ impl Statistics {
                 .map(|(older, younger)| ImpreciseOverlap { older: older.clone(), younger: younger.clone() })
                 .collect(),
             instances: Instances {
-                expanded: run.instances.len(),
-                retired: run.instances.iter().filter(|i| i.retired).count(),
-                squashed: run.instances.iter().filter(|i| i.squashed).count(),
-                invalidated: run.instances.iter().map(|i| i.invalidations.len()).sum(),
-                reused: run.instances.iter().filter(|i| i.reused).count(),
+                expanded: run.count.expanded,
+                retired: run.count.retired,
+                squashed: run.count.squashed,
+                invalidated: run.instances().map(|i| i.invalidations.len()).sum(),
+                reused: run.instances().filter(|i| i.reused).count(),
                 crashed_attempts: jobs.iter().filter(|job| matches!(job.ending, Ending::Crashed(_))).count(),
             },
             ahead_of_time: ahead_of_time(run),
@@ -214,7 +214,7 @@ fn divide(end_s: f64, jobs: &[&Job]) -> (Shares, f64) {
 
 fn ahead_of_time(run: &Timeline) -> AheadOfTime {
     let mut count = AheadOfTime::default();
-    for instance in &run.instances {
+    for instance in run.instances() {
         let ahead = || {
             instance
                 .jobs
@@ -243,7 +243,7 @@ fn busy(run: &Timeline) -> Vec<Busy> {
 
 fn states(run: &Timeline) -> Vec<StateTime> {
     let mut order: Vec<StateTime> = Vec::new();
-    for instance in run.instances.iter().filter(|i| !i.jobs.is_empty()) {
+    for instance in run.instances().filter(|i| !i.jobs.is_empty()) {
         let state = without_visits(&instance.path);
         let at = order.iter().position(|s| s.state == state).unwrap_or_else(|| {
             order.push(StateTime { state, runs: 0, total_s: 0.0, longest_s: 0.0, waited_s: 0.0 });

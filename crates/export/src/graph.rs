@@ -1,0 +1,329 @@
+//! Graphs for Graphviz and Mermaid: the network of instances, each with what it waited for, or the states in their hierarchy.
+//!
+//! The network is written as it comes. In Graphviz's language a cluster can be gone on with, so the hierarchy is in it; in Mermaid's it
+//! cannot, and the paths say it. The task is drawn at the end: there are as many states as the task has.
+
+use super::Writer;
+use ratn_event_log::without_visits;
+use ratn_executive::protocol::{Command, LogEntry, LogLine};
+use ratn_model::id::InstanceId;
+use ratn_report::timeline::{Activity, Cause, Changed, Instance, Timeline};
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write as _;
+use std::io::{self, Write};
+
+/// In which language.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Language {
+    /// Graphviz's.
+    Dot,
+    /// Mermaid's.
+    Mermaid,
+}
+
+/// Why one waited for another.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Bond {
+    /// It began when the other had a result.
+    Result,
+    /// Its projection showed what the other writes.
+    World,
+    /// The other held what it wanted.
+    Resource,
+}
+
+impl Bond {
+    fn name(self) -> &'static str {
+        match self {
+            Bond::Result => "result",
+            Bond::World => "world",
+            Bond::Resource => "resource",
+        }
+    }
+
+    fn colour(self) -> &'static str {
+        match self {
+            Bond::Result => "#1c2430",
+            Bond::World => "#2f7d32",
+            Bond::Resource => "#c3362b",
+        }
+    }
+}
+
+/// A node as both languages draw it.
+struct Node {
+    name: String,
+    label: String,
+    fill: &'static str,
+    is_dashed: bool,
+    is_faded: bool,
+}
+
+pub(crate) fn writer<'w, W: Write + 'w>(out: W, language: Language, drawing: super::Drawing) -> Box<dyn Writer + 'w> {
+    match drawing {
+        super::Drawing::Network => Box::new(Network { out, language, has_begun: false, edges: BTreeSet::new() }),
+        super::Drawing::Task => Box::new(Task { out, language, states: BTreeMap::new(), edges: BTreeMap::new() }),
+    }
+}
+
+struct Network<W> {
+    out: W,
+    language: Language,
+    has_begun: bool,
+    /// Those that are written and can come again.
+    edges: BTreeSet<(InstanceId, InstanceId, Bond)>,
+}
+
+impl<W: Write> Network<W> {
+    fn edge(&mut self, from: InstanceId, to: InstanceId, bond: Bond) -> io::Result<()> {
+        if from == to || !self.edges.insert((to, from, bond)) {
+            return Ok(());
+        }
+        let label = bond.name();
+        writeln!(self.out, "{}", edge(self.language, &format!("i{}", from.0), &format!("i{}", to.0), bond, label))
+    }
+
+    fn nodes(&mut self, left: &[Instance]) -> io::Result<()> {
+        for one in left {
+            for wait in &one.waits {
+                let last = wait.behind.iter().filter(|behind| behind.released).max_by(|a, b| a.to_s.total_cmp(&b.to_s));
+                if let Some(behind) = last {
+                    self.edge(behind.instance, one.id, Bond::Resource)?;
+                }
+            }
+            for phase in one.awaited() {
+                if let Cause::Result(of, _) = &phase.ended_by {
+                    self.edge(*of, one.id, Bond::Result)?;
+                }
+            }
+            let took = one.jobs.iter().map(|job| job.length_s()).fold(0.0, |all, one| all + one);
+            let node = Node {
+                name: format!("i{}", one.id.0),
+                label: if one.jobs.is_empty() {
+                    last_name(&one.path).to_owned()
+                } else {
+                    format!("{}\n{took:.1} s", last_name(&one.path))
+                },
+                fill: one.jobs.last().map_or("#eceff3", |job| fill(job.activity)),
+                is_dashed: one.speculative,
+                is_faded: one.squashed,
+            };
+            writeln!(self.out, "{}", placed(self.language, &one.path, &node))?;
+            // Nothing more is said of it: its edges cannot come again.
+            let of_it: Vec<_> = self
+                .edges
+                .range((one.id, InstanceId(0), Bond::Result)..(InstanceId(one.id.0 + 1), InstanceId(0), Bond::Result))
+                .copied()
+                .collect();
+            of_it.iter().for_each(|edge| _ = self.edges.remove(edge));
+        }
+        Ok(())
+    }
+
+    fn begin(&mut self, run: &Timeline) -> io::Result<()> {
+        if !std::mem::replace(&mut self.has_begun, true) {
+            writeln!(self.out, "{}", head(self.language, &run.task))?;
+        }
+        Ok(())
+    }
+}
+
+impl<W: Write> Writer for Network<W> {
+    fn line(&mut self, line: &LogLine, run: &Timeline, changed: &Changed) -> io::Result<()> {
+        self.begin(run)?;
+        if let LogEntry::Command(Command::Project { instance, writers, .. }) = &line.entry {
+            for path in writers {
+                let writer = run.instances().rfind(|one| one.id < *instance && one.path == *path).map(|one| one.id);
+                if let Some(writer) = writer {
+                    self.edge(writer, *instance, Bond::World)?;
+                }
+            }
+        }
+        self.nodes(&changed.left)
+    }
+
+    fn end(&mut self, run: &Timeline, changed: &Changed) -> io::Result<()> {
+        self.begin(run)?;
+        self.nodes(&changed.left)?;
+        tail(&mut self.out, self.language)
+    }
+}
+
+struct Task<W> {
+    out: W,
+    language: Language,
+    states: BTreeMap<String, Visits>,
+    edges: BTreeMap<(String, String, Bond), usize>,
+}
+
+/// Of one state.
+#[derive(Default)]
+struct Visits {
+    all: usize,
+    squashed: usize,
+    took_s: f64,
+    activity: Option<Activity>,
+}
+
+impl<W: Write> Task<W> {
+    fn add(&mut self, left: &[Instance]) {
+        for one in left {
+            let state = without_visits(&one.path);
+            for phase in one.awaited() {
+                if let Cause::Result(of, path) = &phase.ended_by
+                    && *of != one.id
+                {
+                    *self.edges.entry((without_visits(path), state.clone(), Bond::Result)).or_default() += 1;
+                }
+            }
+            for behind in one.waits.iter().flat_map(|wait| &wait.behind).filter(|behind| behind.released) {
+                *self.edges.entry((without_visits(&behind.holder), state.clone(), Bond::Resource)).or_default() += 1;
+            }
+            for writer in &one.writers {
+                *self.edges.entry((without_visits(writer), state.clone(), Bond::World)).or_default() += 1;
+            }
+            let visits = self.states.entry(state).or_default();
+            visits.all += 1;
+            visits.squashed += usize::from(one.squashed);
+            visits.took_s += one.jobs.iter().map(|job| job.length_s()).fold(0.0, |all, one| all + one);
+            visits.activity = visits.activity.or(one.jobs.last().map(|job| job.activity));
+        }
+    }
+}
+
+impl<W: Write> Writer for Task<W> {
+    fn line(&mut self, _: &LogLine, _: &Timeline, changed: &Changed) -> io::Result<()> {
+        self.add(&changed.left);
+        Ok(())
+    }
+
+    fn end(&mut self, run: &Timeline, changed: &Changed) -> io::Result<()> {
+        self.add(&changed.left);
+        writeln!(self.out, "{}", head(self.language, &run.task))?;
+        let numbers: BTreeMap<&str, usize> = self.states.keys().map(String::as_str).zip(1..).collect();
+        for (state, visits) in &self.states {
+            let times = if visits.all == 1 { String::new() } else { format!(" × {}", visits.all) };
+            let took = if visits.activity.is_some() { format!("\n{:.1} s", visits.took_s) } else { String::new() };
+            let node = Node {
+                name: format!("s{}", numbers[state.as_str()]),
+                label: format!("{}{times}{took}", last_name(state)),
+                fill: visits.activity.map_or("#eceff3", fill),
+                is_dashed: visits.squashed > 0,
+                is_faded: visits.squashed == visits.all,
+            };
+            writeln!(self.out, "{}", placed(self.language, state, &node))?;
+        }
+        for ((from, to, bond), times) in &self.edges {
+            // A state that wrote what is real was perhaps never seen.
+            if let (Some(from), Some(to)) = (numbers.get(from.as_str()), numbers.get(to.as_str())) {
+                let label = if *times == 1 { bond.name().to_owned() } else { format!("{} × {times}", bond.name()) };
+                writeln!(self.out, "{}", edge(self.language, &format!("s{from}"), &format!("s{to}"), *bond, &label))?;
+            }
+        }
+        tail(&mut self.out, self.language)
+    }
+}
+
+fn fill(activity: Activity) -> &'static str {
+    match activity {
+        Activity::Motion => "#b3d0f2",
+        Activity::Detection => "#b4e0bb",
+        Activity::Other => "#ddd0ef",
+        Activity::Planning => "#fad79c",
+    }
+}
+
+fn last_name(path: &str) -> &str {
+    path.rsplit('/').next().unwrap_or(path)
+}
+
+fn head(language: Language, task: &str) -> String {
+    match language {
+        Language::Dot => format!(
+            "digraph {} {{\n  rankdir=LR; compound=true; node [shape=box, style=\"rounded,filled\", fontname=\"sans-serif\"];",
+            dot_text(task)
+        ),
+        Language::Mermaid => "flowchart LR".to_owned(),
+    }
+}
+
+fn tail(out: &mut impl Write, language: Language) -> io::Result<()> {
+    match language {
+        Language::Dot => writeln!(out, "}}"),
+        Language::Mermaid => Ok(()),
+    }
+}
+
+/// A node, in Graphviz's language in the clusters of its path.
+fn placed(language: Language, path: &str, node: &Node) -> String {
+    if language == Language::Mermaid {
+        let label = format!("{}\n{}", path, node.label.split_once('\n').map_or("", |(_, rest)| rest));
+        let mut style = format!("fill:{}", node.fill);
+        style.push_str(if node.is_dashed { ",stroke-dasharray:4 3" } else { "" });
+        style.push_str(if node.is_faded { ",opacity:0.4" } else { "" });
+        return format!("  {name}[\"{}\"]\n  style {name} {style}", mermaid_text(label.trim_end()), name = node.name);
+    }
+    let style = if node.is_dashed { "rounded,filled,dashed" } else { "rounded,filled" };
+    let colours = if node.is_faded { ", fontcolor=\"#8a93a3\", color=\"#b8bfca\"" } else { "" };
+    let mut text = format!(
+        "{} [label={}, fillcolor=\"{}\", style=\"{style}\"{colours}];",
+        node.name,
+        dot_text(&node.label),
+        node.fill
+    );
+    let parents: Vec<&str> = path.split('/').collect();
+    for depth in (1..parents.len()).rev() {
+        let cluster = parents[..depth].join("/");
+        text = format!(
+            "subgraph {} {{ label={}; {text} }}",
+            dot_text(&format!("cluster_{cluster}")),
+            dot_text(parents[depth - 1])
+        );
+    }
+    format!("  {text}")
+}
+
+fn edge(language: Language, from: &str, to: &str, bond: Bond, label: &str) -> String {
+    match (language, bond) {
+        (Language::Dot, _) => {
+            let style = if bond == Bond::Result { "solid" } else { "dashed" };
+            format!(
+                "  {from} -> {to} [color=\"{}\", style={style}, tooltip={}, label={}];",
+                bond.colour(),
+                dot_text(label),
+                dot_text(if bond == Bond::Result { "" } else { label })
+            )
+        }
+        (Language::Mermaid, Bond::Result) => format!("  {from} --> {to}"),
+        (Language::Mermaid, _) => format!("  {from} -. \"{}\" .-> {to}", mermaid_text(label)),
+    }
+}
+
+/// A quoted string of Graphviz's language. Only the quote and the backslash mean something in it.
+fn dot_text(text: &str) -> String {
+    format!("\"{}\"", text.replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n"))
+}
+
+/// What stands in quotes in Mermaid: characters that mean something there, and those of HTML, as numbers.
+fn mermaid_text(text: &str) -> String {
+    let mut out = String::new();
+    for c in text.chars() {
+        match c {
+            '\n' => out.push_str("<br/>"),
+            '"' | '#' | '<' | '>' | '&' | ';' | '`' => _ = write!(out, "#{};", u32::from(c)),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_users_do_nothing_in_a_graph() {
+        assert_eq!(dot_text("a\"];b -> c\\"), r#""a\"];b -> c\\""#);
+        assert_eq!(mermaid_text("a\"]\n<script>"), "a#34;]<br/>#60;script#62;");
+    }
+}

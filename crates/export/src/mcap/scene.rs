@@ -1,0 +1,112 @@
+//! The objects as the task believes them: the facts of the log as a world, and the scene that follows from it.
+
+use crate::wire::foxglove::{
+    Color, CubePrimitive, CylinderPrimitive, FrameTransform, FrameTransforms, Pose, Quaternion, SceneEntity,
+    SceneEntityDeletion, SceneUpdate, Vector3,
+};
+use prost_types::Timestamp;
+use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
+use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+use ratn_world::world::World;
+
+/// Frames: of the world, of the robot's base, and of what the gripper holds.
+const WORLD: &str = "world";
+const BASE: &str = "base";
+/// Where the URDF calls its tool otherwise, what is held is not shown.
+const TOOL: &str = "tool";
+const GREY: Color = Color { r: 0.55, g: 0.6, b: 0.68, a: 0.6 };
+const BLUE: Color = Color { r: 0.25, g: 0.5, b: 0.85, a: 1.0 };
+/// What has an edge as long as this is furniture.
+const FURNITURE_M: f64 = 0.5;
+
+/// The root world, and what was shown of it.
+#[derive(Debug, Default)]
+pub(super) struct Believed {
+    world: World,
+    shown: Option<Scene>,
+}
+
+impl Believed {
+    /// Whether a line says something of the root world.
+    pub(super) fn follow(&mut self, line: &LogLine) -> bool {
+        match &line.entry {
+            LogEntry::Event(Event::Started { world, .. }) => {
+                self.world.overwrite(world.iter().map(|(fact, value)| (fact.clone(), Some(value.clone()))));
+                !world.is_empty()
+            }
+            LogEntry::Event(Event::WorldChanged { facts, .. }) => {
+                self.world.overwrite(facts.iter().cloned());
+                true
+            }
+            // The run has made the same changes. What does not fit here is left out, and what is known is shown.
+            LogEntry::Command(Command::Commit { changes, .. }) => self.world.apply(changes).is_ok(),
+            _ => false,
+        }
+    }
+
+    /// What is otherwise than was shown. A world that makes no scene, because a fact has another form, shows nothing new.
+    pub(super) fn update(&mut self, at: Timestamp) -> Option<SceneUpdate> {
+        let scene = Scene::of(&self.world).ok()?;
+        let before = self.shown.as_ref().map_or(&[][..], |shown| &shown.objects);
+        let gone = before.iter().filter(|old| !scene.objects.iter().any(|new| new.name == old.name));
+        let changed = scene.objects.iter().filter(|new| !before.contains(new));
+        let deletions: Vec<SceneEntityDeletion> =
+            gone.map(|old| SceneEntityDeletion { timestamp: Some(at), r#type: 0, id: old.name.clone() }).collect();
+        let entities: Vec<SceneEntity> = changed.map(|object| entity(object, at)).collect();
+        let is_new = self.shown.as_ref().is_none_or(|shown| shown.base != scene.base);
+        self.shown = Some(scene);
+        let update = SceneUpdate { deletions, entities };
+        (is_new || !update.deletions.is_empty() || !update.entities.is_empty()).then_some(update)
+    }
+
+    /// Where the base stands.
+    pub(super) fn base(&self, at: Timestamp) -> Option<FrameTransforms> {
+        let base = self.shown.as_ref()?.base;
+        Some(FrameTransforms {
+            transforms: vec![FrameTransform {
+                timestamp: Some(at),
+                parent_frame_id: WORLD.to_owned(),
+                child_frame_id: BASE.to_owned(),
+                translation: Some(vector(base.position)),
+                rotation: Some(quaternion(base.quaternion_xyzw)),
+            }],
+        })
+    }
+}
+
+fn entity(object: &SceneObject, at: Timestamp) -> SceneEntity {
+    let (frame, pose) = match object.placement {
+        Placement::World(pose) => (WORLD, pose),
+        Placement::Gripper(pose) => (TOOL, pose),
+    };
+    let pose =
+        Some(Pose { position: Some(vector(pose.position)), orientation: Some(quaternion(pose.quaternion_xyzw)) });
+    let mut entity = SceneEntity {
+        timestamp: Some(at),
+        frame_id: frame.to_owned(),
+        id: object.name.clone(),
+        frame_locked: true,
+        ..SceneEntity::default()
+    };
+    let colour = |longest: f64| Some(if longest >= FURNITURE_M { GREY } else { BLUE });
+    match object.shape {
+        Shape::Box { size } => {
+            let longest = size.into_iter().fold(0.0, f64::max);
+            entity.cubes.push(CubePrimitive { pose, size: Some(vector(size)), color: colour(longest) });
+        }
+        Shape::Cylinder { radius, length } => {
+            let size = Some(vector([2.0 * radius, 2.0 * radius, length]));
+            let color = colour(length.max(2.0 * radius));
+            entity.cylinders.push(CylinderPrimitive { pose, size, bottom_scale: 1.0, top_scale: 1.0, color });
+        }
+    }
+    entity
+}
+
+fn vector([x, y, z]: [f64; 3]) -> Vector3 {
+    Vector3 { x, y, z }
+}
+
+fn quaternion([x, y, z, w]: [f64; 4]) -> Quaternion {
+    Quaternion { x, y, z, w }
+}

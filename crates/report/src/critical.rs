@@ -1,0 +1,148 @@
+//! The critical path: walked backwards from the end of a run, at each moment what everything was waiting for.
+//!
+//! An instance that ran had waited for the result that let it begin, or for a resource that somebody gave back; there the path goes on.
+//! The links lie behind each other in time, and what is between two of them is what the parts of the system took.
+
+use super::timeline::{Behind, Cause, Instance, Phase, Stage, Timeline};
+use ratn_model::id::InstanceId;
+use serde::Serialize;
+use std::fmt::Write as _;
+
+/// A shorter link is not shown to people.
+const SHORTEST_S: f64 = 0.05;
+
+/// A link: what the run waited for during a time.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Link {
+    /// When it begins.
+    pub from_s: f64,
+    /// When it ends.
+    pub to_s: f64,
+    /// Which instance.
+    pub path: String,
+    /// What it was at.
+    pub stage: Stage,
+    /// What let it begin.
+    pub waited_for: String,
+}
+
+/// From the start of a run to its end. Empty where the run has not ended, or ended by itself.
+pub fn path(run: &Timeline) -> Vec<Link> {
+    let mut links = Vec::new();
+    let mut at = run.ended_by.instance().and_then(|id| last_phase(run, id, run.end_s));
+    // Each step goes to an earlier phase, so there are no more than there are phases.
+    let bound: usize = run.instances().map(|one| one.phases.len() + 1).sum();
+    for _ in 0..bound {
+        let Some((instance, index)) = at else { break };
+        let phase = &instance.phases[index];
+        let (link, before) = step(run, instance, index, phase);
+        links.extend(link);
+        at = before.filter(|(next, to)| is_before((next, *to), (instance, index)));
+    }
+    links.reverse();
+    links
+}
+
+type Place<'r> = (&'r Instance, usize);
+
+/// What a phase is on the path, and where the path comes from.
+fn step<'r>(
+    run: &'r Timeline,
+    instance: &'r Instance,
+    index: usize,
+    phase: &'r Phase,
+) -> (Option<Link>, Option<Place<'r>>) {
+    let earlier = index.checked_sub(1).map(|index| (instance, index));
+    let link = |waited_for: String| Link {
+        from_s: phase.from_s,
+        to_s: phase.to_s,
+        path: instance.path.to_string(),
+        stage: phase.stage,
+        waited_for,
+    };
+    match phase.stage {
+        // What it had waited for was under way meanwhile: the path is there.
+        Stage::Waiting => match &phase.ended_by {
+            Cause::Result(id, _) if *id != instance.id => (None, last_phase(run, *id, phase.to_s)),
+            Cause::Result(..) => (None, earlier),
+            Cause::Start => (None, None),
+            Cause::Answer(id, _) | Cause::Projected(id, _) if *id != instance.id => {
+                (None, last_phase(run, *id, phase.to_s))
+            }
+            other => {
+                let came_from = earlier.or_else(|| last_phase(run, instance.expanded_by.instance()?, phase.from_s));
+                ((phase.to_s > phase.from_s).then(|| link(other.awaited())), came_from)
+            }
+        },
+        Stage::Asking => {
+            let wait = instance.waits.iter().find(|wait| wait.to_s == phase.to_s);
+            let freed = wait.and_then(|wait| {
+                let released = wait.behind.iter().filter(|one| one.released && one.instance != instance.id);
+                released.max_by(|a, b| a.to_s.total_cmp(&b.to_s))
+            });
+            let kinds = wait.map(|wait| wait.kinds.join(", ")).unwrap_or_default();
+            match freed {
+                Some(Behind { instance: holder, holder: path, resource, to_s, .. }) => {
+                    let given = link(format!("{resource}, given back by {path}"));
+                    (Some(Link { from_s: to_s.max(phase.from_s), ..given }), last_phase(run, *holder, *to_s))
+                }
+                None => (Some(link(kinds)), earlier),
+            }
+        }
+        Stage::Preparing => (Some(link("its projection".to_owned())), earlier),
+        Stage::Running => (Some(link(began_on(instance, index))), earlier),
+        Stage::Finished => (Some(link("what is before it, to become real".to_owned())), earlier),
+        Stage::Retired | Stage::Squashed => (None, earlier),
+    }
+}
+
+/// What let an instance run that did at last.
+fn began_on(instance: &Instance, index: usize) -> String {
+    let waits = instance.phases[..index].iter().rev().find(|phase| phase.stage == Stage::Waiting);
+    let cause = waits.map_or(&instance.expanded_by, |phase| &phase.ended_by);
+    match cause {
+        Cause::Result(id, _) if *id == instance.id => "its own attempt before".to_owned(),
+        other => other.awaited(),
+    }
+}
+
+/// The phase of an instance that had ended by a moment, last.
+fn last_phase(run: &Timeline, id: InstanceId, to_s: f64) -> Option<Place<'_>> {
+    let instance = run.instance(id)?;
+    let is_work = |phase: &&Phase| phase.stage != Stage::Finished;
+    let index = instance.phases.iter().rposition(|phase| phase.to_s <= to_s && is_work(&phase))?;
+    Some((instance, index))
+}
+
+/// Time goes backwards along the path; where it stands still, so does the order of phases, or that of instances.
+fn is_before((next, to): (&Instance, usize), (instance, index): (&Instance, usize)) -> bool {
+    let (next_s, now_s) = (next.phases[to].to_s, instance.phases[index].to_s);
+    next_s < now_s || (next_s == now_s && (next.id != instance.id || to < index))
+}
+
+/// As a table for people.
+pub fn table(links: &[Link]) -> String {
+    let mut text = String::new();
+    if links.is_empty() {
+        return text;
+    }
+    let width = links.iter().map(|link| link.path.chars().count()).max().unwrap_or(0).max(22);
+    let _ = writeln!(text, "\n{:<w$}  from s    to s  length  was          began on", "critical path", w = width + 2);
+    let shown = |link: &&Link| link.to_s - link.from_s >= SHORTEST_S;
+    for Link { from_s, to_s, path, stage, waited_for } in links.iter().filter(shown) {
+        let length = to_s - from_s;
+        let _ = writeln!(
+            text,
+            "  {path:<width$} {from_s:>7.1} {to_s:>7.1} {length:>7.1}  {:<11}  {waited_for}",
+            stage.name()
+        );
+    }
+    let along: f64 = links.iter().map(|link| link.to_s - link.from_s).fold(0.0, |all, one| all + one);
+    let short = links.len() - links.iter().filter(shown).count();
+    let _ = writeln!(
+        text,
+        "  {along:.1} s in {} links, {short} of them shorter than {SHORTEST_S} s and not shown",
+        links.len()
+    );
+    text
+}

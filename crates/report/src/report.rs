@@ -1,0 +1,153 @@
+//! All that is said of one run, and what several runs have in common.
+
+use super::critical::{self, Link};
+use super::statistics::{Statistics, mode_name};
+use super::timeline::{Speculation, Timeline};
+use super::waiting::{self, Waiting};
+use ratn_executive::protocol::Mode;
+use serde::Serialize;
+use std::fmt;
+
+/// Of one run.
+#[derive(Debug, Clone, Serialize)]
+pub struct Report {
+    /// Where the time went.
+    #[serde(flatten)]
+    pub statistics: Statistics,
+    /// What the run waited for, from its start to its end.
+    pub critical_path: Vec<Link>,
+    /// What instances waited for.
+    pub waiting: Vec<Waiting>,
+    /// What work ahead of time was good for.
+    pub speculation: Speculation,
+}
+
+impl Report {
+    /// Reads it off a timeline.
+    pub fn of(run: &Timeline) -> Report {
+        Report {
+            statistics: Statistics::of(run),
+            critical_path: critical::path(run),
+            waiting: waiting::by_cause(run),
+            speculation: run.speculation(),
+        }
+    }
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.statistics)?;
+        let Speculation { useful, useful_s, wasted, wasted_s, open } = self.speculation;
+        if useful + wasted + open > 0 {
+            writeln!(
+                f,
+                "\nwork ahead of time, in jobs: {useful} of use ({useful_s:.1} s), {wasted} discarded ({wasted_s:.1} s), {open} open"
+            )?;
+        }
+        f.write_str(&critical::table(&self.critical_path))?;
+        f.write_str(&waiting::table(&self.waiting))
+    }
+}
+
+/// Several runs of one task in one mode.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Repeated {
+    /// The task.
+    pub task: String,
+    /// How it was executed.
+    pub mode: Mode,
+    /// How many runs.
+    pub runs: usize,
+    /// How many of them ended with success.
+    pub successes: usize,
+    /// Of those: their makespans.
+    pub makespan_s: Spread,
+    /// How long at least two jobs ran at once.
+    pub overlap_s: Spread,
+    /// How long planning was waited for.
+    pub planning_waited_for_s: Spread,
+}
+
+/// A figure of several runs.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Spread {
+    /// The mean.
+    pub mean: f64,
+    /// The standard deviation of the runs as a sample; 0 of fewer than two.
+    pub deviation: f64,
+    /// The least.
+    pub least: f64,
+    /// The largest.
+    pub largest: f64,
+}
+
+impl Spread {
+    /// Of figures; all 0 of none.
+    pub fn of(figures: &[f64]) -> Spread {
+        let Some(first) = figures.first() else { return Spread::default() };
+        let number = figures.len() as f64;
+        let mean = figures.iter().sum::<f64>() / number;
+        let squares: f64 = figures.iter().map(|one| (one - mean).powi(2)).sum();
+        let deviation = if figures.len() > 1 { (squares / (number - 1.0)).sqrt() } else { 0.0 };
+        let (least, largest) = figures.iter().fold((*first, *first), |(a, b), one| (a.min(*one), b.max(*one)));
+        Spread { mean, deviation, least, largest }
+    }
+}
+
+/// Runs of the same task and mode together, in the order of their first ones.
+pub fn repeated(runs: &[Statistics]) -> Vec<Repeated> {
+    let mut kinds: Vec<(&str, Mode)> = Vec::new();
+    for run in runs {
+        if !kinds.contains(&(&run.task, run.mode)) {
+            kinds.push((&run.task, run.mode));
+        }
+    }
+    let of = |(task, mode): (&str, Mode)| {
+        let all: Vec<&Statistics> = runs.iter().filter(|run| run.task == task && run.mode == mode).collect();
+        let good: Vec<&&Statistics> = all.iter().filter(|run| run.outcome.as_deref() == Some("success")).collect();
+        let spread =
+            |figure: fn(&Statistics) -> f64| Spread::of(&good.iter().map(|run| figure(run)).collect::<Vec<_>>());
+        Repeated {
+            task: task.to_owned(),
+            mode,
+            runs: all.len(),
+            successes: good.len(),
+            makespan_s: spread(|run| run.makespan_s),
+            overlap_s: spread(|run| run.overlap_s),
+            planning_waited_for_s: spread(|run| run.time.planning_waited_for_s),
+        }
+    };
+    kinds.into_iter().map(of).collect()
+}
+
+/// As a table for people, with how much shorter CDTN is where there are both.
+pub fn table(all: &[Repeated]) -> String {
+    let width = all.iter().map(|one| one.task.chars().count()).max().unwrap_or(0).max(10);
+    let spread = |spread: Spread| format!("{:.1} ± {:.1}", spread.mean, spread.deviation);
+    let mut text = format!(
+        "{:<width$} mode  runs  makespan s        least  largest  two at once s   planning awaited s\n",
+        "task"
+    );
+    for one in all {
+        let runs =
+            if one.successes == one.runs { one.runs.to_string() } else { format!("{}/{}", one.successes, one.runs) };
+        text.push_str(&format!(
+            "{:<width$} {:<4} {runs:>5}  {:<15} {:>7.1} {:>8.1}  {:<14}  {}\n",
+            one.task,
+            mode_name(one.mode),
+            spread(one.makespan_s),
+            one.makespan_s.least,
+            one.makespan_s.largest,
+            spread(one.overlap_s),
+            spread(one.planning_waited_for_s),
+        ));
+    }
+    for cdtn in all.iter().filter(|one| one.mode == Mode::Cdtn && one.successes > 0) {
+        let hsm = all.iter().find(|one| one.mode == Mode::Hsm && one.task == cdtn.task && one.successes > 0);
+        if let Some(hsm) = hsm.filter(|hsm| hsm.makespan_s.mean > 0.0) {
+            let shorter = 100.0 * (1.0 - cdtn.makespan_s.mean / hsm.makespan_s.mean);
+            text.push_str(&format!("{}: CDTN is {shorter:.1} % shorter than HSM\n", cdtn.task));
+        }
+    }
+    text
+}

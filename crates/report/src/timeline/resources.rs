@@ -1,0 +1,212 @@
+//! Who of a run holds which resource since when, and who has asked for what and stands behind whom.
+//!
+//! It knows what the log tells: the leases of this run, and how many of a kind the system has where that was said at the start. What
+//! others hold is the resource manager's word (`ratn resource list`).
+
+use super::instance::{Behind, Wait};
+use ratn_model::id::{InstanceId, LeaseId};
+use ratn_model::program::WORLD_MODEL;
+use ratn_model::resource::{Lease, LeasedResource, Quantity, Requirement, ResourceOperation};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+/// Of a wait so many who held what was waited for are kept, the last ones.
+const MOST_BEHIND: usize = 64;
+
+/// A resource in the hands of an instance.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Holding {
+    /// The resource's id.
+    pub resource: Arc<str>,
+    /// Its kind.
+    pub kind: Arc<str>,
+    /// The kinds that its kind is one of.
+    superclasses: Arc<[String]>,
+    /// Who has it.
+    pub instance: InstanceId,
+    /// The path of that instance.
+    pub holder: Arc<str>,
+    /// Since when.
+    pub from_s: f64,
+    /// Until when; of one that is not over, infinite.
+    pub to_s: f64,
+}
+
+impl Holding {
+    /// Whether it is of a kind, or of one of its subclasses.
+    pub fn is_a(&self, kind: &str) -> bool {
+        *self.kind == *kind || self.superclasses.iter().any(|superclass| superclass == kind)
+    }
+}
+
+/// An instance that has asked and has no answer.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Asked {
+    /// Who.
+    pub instance: InstanceId,
+    /// Since when.
+    pub from_s: f64,
+    /// Larger goes first.
+    pub priority: i64,
+    /// The kinds of which it wants something for itself, room for projections left out.
+    pub kinds: Vec<String>,
+    behind: Vec<Behind>,
+}
+
+/// Holders and queues of a run.
+#[derive(Debug, Clone, Default)]
+pub struct Resources {
+    capacity: BTreeMap<String, Quantity>,
+    /// Every resource that was held once, by id.
+    seen: BTreeMap<Arc<str>, Holding>,
+    held: BTreeMap<LeaseId, Vec<Holding>>,
+    queue: BTreeMap<InstanceId, Asked>,
+}
+
+impl Resources {
+    pub(super) fn begin(&mut self, capacity: &BTreeMap<String, Quantity>) {
+        self.capacity.clone_from(capacity);
+    }
+
+    /// What is held, room for projections left out.
+    pub fn held(&self) -> impl Iterator<Item = &Holding> {
+        self.held.values().flatten().filter(|holding| *holding.kind != *WORLD_MODEL)
+    }
+
+    /// Who waits for an answer, in the order in which they are served where they want the same.
+    pub fn queue(&self) -> Vec<&Asked> {
+        let mut queue: Vec<&Asked> = self.queue.values().collect();
+        queue.sort_by(|a, b| {
+            b.priority.cmp(&a.priority).then(a.from_s.total_cmp(&b.from_s)).then(a.instance.cmp(&b.instance))
+        });
+        queue
+    }
+
+    /// What an instance has asked for.
+    pub fn asked(&self, instance: InstanceId) -> Option<&Asked> {
+        self.queue.get(&instance)
+    }
+
+    /// Ids and kinds of what has been held so far, room for projections left out.
+    pub fn known(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.seen.iter().filter(|(_, one)| *one.kind != *WORLD_MODEL).map(|(id, one)| (&**id, &*one.kind))
+    }
+
+    /// How many there are of a kind: as was said at the start, or more where more were held.
+    pub fn total(&self, kind: &str) -> usize {
+        let seen = self.seen.values().filter(|one| one.is_a(kind)).count();
+        seen.max(self.capacity.get(kind).map_or(0, |count| count.units() as usize))
+    }
+
+    pub(super) fn asks(&mut self, instance: InstanceId, at_s: f64, requirements: &[Requirement], priority: i64) {
+        let mut kinds = BTreeSet::new();
+        for one in requirements {
+            let takes = matches!(one.operation, ResourceOperation::Block | ResourceOperation::Consume);
+            if takes && one.kind != WORLD_MODEL {
+                kinds.insert(one.kind.clone());
+            }
+        }
+        let kinds: Vec<String> = kinds.into_iter().collect();
+        let wanted = self.held().filter(|holding| kinds.iter().any(|kind| holding.is_a(kind)));
+        let behind = wanted.map(|holding| behind(holding, f64::INFINITY, false)).collect();
+        self.queue.insert(instance, Asked { instance, from_s: at_s, priority, kinds, behind });
+    }
+
+    /// Asks no more.
+    pub(super) fn withdraws(&mut self, instance: InstanceId) {
+        self.queue.remove(&instance);
+    }
+
+    /// It has what it asked for. What was held under the same lease until now is over.
+    pub(super) fn grants(
+        &mut self,
+        instance: InstanceId,
+        holder: &Arc<str>,
+        at_s: f64,
+        lease: &Lease,
+    ) -> (Option<Wait>, Vec<Holding>) {
+        let over = self.releases(lease.id, at_s);
+        let wait = self.queue.remove(&instance).map(|asked| wait(asked, at_s, &lease.resources));
+        let holdings: Vec<Holding> =
+            lease.resources.iter().map(|one| self.held_by(one, instance, holder, at_s)).collect();
+        for holding in &holdings {
+            for asked in self.queue.values_mut().filter(|asked| asked.kinds.iter().any(|kind| holding.is_a(kind))) {
+                if asked.behind.len() >= MOST_BEHIND {
+                    asked.behind.remove(0);
+                }
+                asked.behind.push(behind(holding, f64::INFINITY, false));
+            }
+        }
+        self.held.insert(lease.id, holdings);
+        (wait, over)
+    }
+
+    /// What is held under a lease.
+    pub(super) fn held_under(&self, lease: LeaseId) -> &[Holding] {
+        self.held.get(&lease).map_or(&[], Vec::as_slice)
+    }
+
+    /// Gives back what is held under a lease, and says what that was.
+    pub(super) fn releases(&mut self, lease: LeaseId, at_s: f64) -> Vec<Holding> {
+        let mut over = self.held.remove(&lease).unwrap_or_default();
+        for holding in &mut over {
+            holding.to_s = at_s;
+            for asked in self.queue.values_mut() {
+                let open = asked
+                    .behind
+                    .iter_mut()
+                    .find(|one| !one.released && one.instance == holding.instance && one.resource == holding.resource);
+                if let Some(one) = open {
+                    (one.to_s, one.released) = (at_s, true);
+                }
+            }
+        }
+        over
+    }
+
+    /// Everything that is still held at the end of the log.
+    pub(super) fn close(&mut self, at_s: f64) -> Vec<Holding> {
+        let leases: Vec<LeaseId> = self.held.keys().copied().collect();
+        leases.into_iter().flat_map(|lease| self.releases(lease, at_s)).collect()
+    }
+
+    fn held_by(&mut self, one: &LeasedResource, instance: InstanceId, holder: &Arc<str>, at_s: f64) -> Holding {
+        let (from_s, to_s, holder) = (at_s, f64::INFINITY, holder.clone());
+        if let Some(known) = self.seen.get(one.id.as_str()) {
+            return Holding { instance, holder, from_s, to_s, ..known.clone() };
+        }
+        let (resource, kind) = (Arc::from(one.id.as_str()), Arc::from(one.kind.as_str()));
+        let holding =
+            Holding { resource, kind, superclasses: one.superclasses.clone().into(), instance, holder, from_s, to_s };
+        self.seen.insert(holding.resource.clone(), holding.clone());
+        holding
+    }
+}
+
+fn behind(holding: &Holding, to_s: f64, released: bool) -> Behind {
+    Behind {
+        instance: holding.instance,
+        holder: holding.holder.clone(),
+        resource: holding.resource.clone(),
+        from_s: holding.from_s,
+        to_s,
+        released,
+    }
+}
+
+fn wait(asked: Asked, at_s: f64, granted: &[LeasedResource]) -> Wait {
+    let mut behind = asked.behind;
+    for one in behind.iter_mut().filter(|one| !one.released) {
+        one.to_s = at_s;
+    }
+    // Whoever gave it back at the moment in which it was asked for kept nobody waiting.
+    behind.retain(|one| one.to_s > asked.from_s);
+    let overlap_s = |one: &Behind| one.to_s - one.from_s.max(asked.from_s);
+    behind.sort_by(|a, b| overlap_s(b).total_cmp(&overlap_s(a)).then(a.instance.cmp(&b.instance)));
+    Wait { from_s: asked.from_s, to_s: at_s, kinds: asked.kinds, resources: named(granted.iter()), behind }
+}
+
+/// Ids of resources; room for projections is no place where something happens.
+pub(super) fn named<'a>(resources: impl Iterator<Item = &'a LeasedResource>) -> Vec<String> {
+    resources.filter(|one| one.kind != WORLD_MODEL).map(|one| one.id.clone()).collect()
+}
