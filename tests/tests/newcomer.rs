@@ -59,6 +59,44 @@ fn a_worker_that_the_catalogue_does_not_know_so_is_told_at_its_start_and_what_no
     Ok(())
 }
 
+/// A label reader that is started and never serves.
+const NEVER_READY: &str = r#"
+catalogues = ["built-in"]
+[catalogue.resources.LabelReader]
+class = "process"
+count = 1
+[process-manager]
+host = "compute"
+[[process-manager.template]]
+name = "label"
+kind = "LabelReader"
+program = "/bin/sleep"
+args = ["600"]
+min = 0
+max = 1
+start_timeout_s = 0.5
+crash_limit = 1000
+"#;
+
+#[test]
+fn a_run_that_waits_for_a_worker_which_never_becomes_ready_says_why_in_its_line() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let (config, task) = (place.path().join("system.toml"), place.path().join("task.yaml"));
+    std::fs::write(&config, NEVER_READY)?;
+    std::fs::write(&task, TASK)?;
+    let mut run = place.start_as("run", &["run", text(&task)?, "--config", text(&config)?])?;
+    let why = "@compute: not ready within 0.5 s: its endpoint file label-";
+    let line = wait_for("the reason", || {
+        let said = run.said();
+        Ok(said.lines().find(|line| line.contains(why)).map(str::to_owned))
+    })
+    .with_context(|| run.said())?;
+    ensure!(line.contains("read") && line.contains("LabelReader"), "{line}");
+    run.signal(nix::sys::signal::Signal::SIGINT)?;
+    run.finish()?;
+    Ok(())
+}
+
 #[test]
 fn a_new_task_is_good_and_nothing_is_overwritten() -> anyhow::Result<()> {
     let place = Place::new()?;

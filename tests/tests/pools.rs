@@ -3,6 +3,7 @@
 mod support;
 
 use anyhow::{Context, ensure};
+use std::collections::BTreeMap;
 use support::{Place, Started, texts, wait_for};
 
 /// Of one host; the other's runtime directory is another.
@@ -121,4 +122,43 @@ fn a_drained_host_has_no_workers_also_after_a_restart_until_that_is_undone() -> 
     let (code, _, err) = asked(&place, &["drain", "nowhere"])?;
     ensure!(code == Some(2) && err.contains("asked: here, there"), "{code:?} {err}");
     Ok(())
+}
+
+/// One worker is kept, and another one is started when there is work for it.
+const GROWING: &str = r#"
+[process-manager]
+host = "here"
+[[process-manager.template]]
+name = "shell"
+kind = "Shell"
+program = "/bin/sh"
+args = ["-c", "echo I am {id}; exec cat"]
+readiness = { kind = "line", contains = "I am" }
+min = 1
+max = 2
+idle_s = 1
+"#;
+
+#[test]
+fn four_who_wait_for_one_worker_start_another_one_which_ends_when_it_is_idle() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let config = place.path().join("here.toml");
+    std::fs::write(&config, GROWING)?;
+    let config = config.to_str().context("a path")?;
+    let _manager = place.start_as("rm", &["resource-manager", "--config", config])?;
+    let _host = place.start_as("here", &["process-manager", "--config", config])?;
+    wait_for_ready(&place, &["shell-1@here"])?;
+    let begin = std::time::Instant::now();
+    let goals =
+        ["a", "b", "c", "d"].map(|name| place.start_as(name, &["resource", "block", "Shell", "--", "sleep", "2"]));
+    let mut used = BTreeMap::<String, usize>::new();
+    for goal in goals {
+        let (code, out, err) = goal?.finish()?;
+        let worker = ["shell-1@here", "shell-2@here"].into_iter().find(|id| out.contains(id));
+        ensure!(code == Some(0), "{out} {err}");
+        *used.entry(worker.with_context(|| format!("no worker: {out}"))?.to_owned()).or_default() += 1;
+    }
+    eprintln!("four goals of 2 s: {:.1} s, by {used:?}", begin.elapsed().as_secs_f64());
+    ensure!(used.len() == 2, "{used:?}");
+    wait_for("one to end", || Ok((ready(&place)?.len() == 1).then_some(())))
 }

@@ -1,7 +1,7 @@
 //! The part of a provider's link that hears what is missing and what is held, and says why there is no more of it.
 
 use ratn_model::value::Value;
-use ratn_proto::types::{Demand, Resource, ResourceEventKind, ResourceUpdate};
+use ratn_proto::types::{Demand, Provision, Resource, ResourceEventKind, ResourceUpdate};
 use ratn_worker::client::{CallError, Channels, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::Session;
@@ -45,8 +45,8 @@ pub(crate) struct DemandLink {
 
 /// The part of it about what is missing.
 pub(crate) struct WantedLink {
-    /// What it can provide: kinds, and how many of each at the most.
-    pub(crate) kinds: BTreeMap<String, u32>,
+    /// What it can provide, by kind.
+    pub(crate) kinds: BTreeMap<String, Provision>,
     /// What all of it has in common.
     pub(crate) attributes: BTreeMap<String, Value>,
     /// Hears what is missing.

@@ -8,11 +8,12 @@ use ratn_model::condition::{Comparison, Condition};
 use ratn_model::id::Revision;
 use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_model::value::Value;
-use ratn_proto::types::{Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceUpdate};
+use ratn_proto::types::{Provision, Resource, ResourceEvent, ResourceEventKind, ResourceFilter, ResourceUpdate};
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_resources::Limits;
 use ratn_worker::client::{AcquireOptions, ResourceWatch};
+use std::collections::BTreeMap;
 use std::time::Duration;
 use support::{TestSystem, block, in_time};
 use tonic::Code;
@@ -260,6 +261,10 @@ async fn next_event(watch: &mut ResourceWatch) -> ResourceEvent {
     }
 }
 
+fn planner() -> BTreeMap<String, Provision> {
+    [("PathPlanner".to_owned(), Provision { most: 1, grows: false })].into()
+}
+
 /// A resource of the kind of a provider, made by a task, is there first; who asks for what says where it is waits for the provider.
 #[tokio::test]
 async fn what_a_task_made_is_nobodys_performer_and_the_real_provider_is_asked() {
@@ -267,7 +272,7 @@ async fn what_a_task_made_is_nobodys_performer_and_the_real_provider_is_asked() 
     let manager = system.resource_manager().await;
     let (a, b) = (system.client(&manager, "a").await, system.client(&manager, "b").await);
     a.resources.create(Resource::new("fake", ResourceClass::Task, "PathPlanner")).await.unwrap();
-    let mut demand = b.resources.watch_demand(&[("PathPlanner".to_owned(), 1)].into(), &[].into()).await.unwrap();
+    let mut demand = b.resources.watch_demand(&planner(), &[].into()).await.unwrap();
     let performer = Requirement { conditions: vec![Condition::has("endpoint")], ..block("PathPlanner") };
     let provide = async {
         let asked = loop {
@@ -292,7 +297,7 @@ async fn only_who_is_asked_for_a_kind_says_that_there_is_no_more_of_it() {
     let a = system.client(&manager, "a").await;
     let refused = a.resources.report_shortage("PathPlanner", 0, "none left").await.unwrap_err();
     assert_eq!(refused.code(), Some(Code::FailedPrecondition), "{refused}");
-    let watch = a.resources.watch_demand(&[("PathPlanner".to_owned(), 1)].into(), &[].into()).await.unwrap();
+    let watch = a.resources.watch_demand(&planner(), &[].into()).await.unwrap();
     a.resources.report_shortage("PathPlanner", 0, "none left").await.unwrap();
     a.resources.report_shortage("Arm", 0, "none left").await.unwrap_err();
     drop(watch);

@@ -270,15 +270,26 @@ pub struct ResourceEvent {
     pub part: u32,
 }
 
-/// What waits for more than exists.
+/// How a provider provides a kind.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Provision {
+    /// At most so many of it.
+    pub most: u32,
+    /// It starts more of it as well for requests that wait for what exists and is held.
+    pub grows: bool,
+}
+
+/// What waits for more than exists, or has waited for long for what is held.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Demand {
-    /// What is selected; its count is how much is missing beside those that exist.
+    /// What is selected; its count is how much is to come beside those that the provider's session provides.
     pub requirement: Requirement,
     /// The kinds that would do: its kind, and those below it.
     pub kinds: Vec<String>,
     /// How much of it the provider's session provides already.
     pub provided: Quantity,
+    /// How much of the count is for requests that wait for what exists and is held.
+    pub queued: Quantity,
 }
 
 /// From where a watch goes on.

@@ -211,8 +211,11 @@ impl Pool {
             self.memory.wait(&request_id, fingerprint, id);
         }
         let reserved = vec![Units::new(); request.requirements.len()];
-        let (hopeful, lacks, overtaken, missing) = Default::default();
-        self.join(id, Waiter { request, request_id, groups, hopeful, reserved, lacks, overtaken, missing });
+        let (hopeful, hopeful_since, lacks, overtaken, missing) = Default::default();
+        self.join(
+            id,
+            Waiter { request, request_id, groups, hopeful, hopeful_since, reserved, lacks, overtaken, missing },
+        );
         self.schedule();
         match full {
             Some(full) if self.queue.get(id).is_some() => {

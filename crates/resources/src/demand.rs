@@ -1,10 +1,12 @@
-//! Demand: resources that requests wait for and that do not exist yet, for the providers that could create them; and why a provider does not.
+//! Demand: resources that requests wait for and that do not exist yet, or are held for long (`growth.rs`), for the providers that could
+//! create them; and why a provider does not.
 //!
 //! Demand is of now: it goes when its waiters do, or when what they want is there. It is not written down, nor is what providers
 //! say of it; both are said again after a restart.
 
 use crate::error::{PoolError, malformed};
 use crate::group::{Group, Key};
+use crate::growth::{Provided, Queued};
 use crate::id::SessionId;
 use crate::pool::Pool;
 use crate::queue::Place;
@@ -24,50 +26,66 @@ const SHORTAGES: usize = 64;
 /// Characters of a reason; the rest is cut off.
 const REASON_LENGTH: usize = 512;
 
+/// The most urgent one that waits for a selector, what is missing of that, and what is queued for.
+type Lacking<'a> = (Place, &'a Key, Quantity, Quantity);
+
 /// What one selector lacks.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Demand {
-    /// What is selected; its count is how much is missing beside those that exist.
+    /// What is selected; its count is how much is missing beside those that exist, which may be nothing.
     pub requirement: Requirement,
+    /// How much has been waited for for long although what exists would do.
+    pub queued: Quantity,
     /// The kinds that would do: its kind, and those below.
     pub kinds: Vec<String>,
 }
 
 impl Pool {
     /// What is missing now of what these kinds would do for, where that may be something else than at the last call.
-    pub fn take_demand(&mut self, provided: &Arc<BTreeSet<String>>) -> Option<Vec<Demand>> {
+    pub fn take_demand(&mut self, provided: &Arc<Provided>) -> Option<Vec<Demand>> {
         if !Arc::ptr_eq(&self.queue.provided, provided) && self.queue.provided != *provided {
             self.queue.provided = Arc::clone(provided);
             self.queue.demand_changed = true;
         }
-        if !std::mem::take(&mut self.queue.demand_changed) {
+        if !self.queue.demand_changed && !self.queue.growth.is_due() {
+            return None;
+        }
+        let (queued, news) = self.look_for_growth();
+        if !std::mem::take(&mut self.queue.demand_changed) && !news {
             return None;
         }
         let mut turns: Vec<_> =
-            self.callers.waited_for().map(|selectors| self.lacking(selectors).into_iter()).collect();
+            self.callers.waited_for().map(|selectors| self.lacking(selectors, &queued).into_iter()).collect();
         let (mut told, mut missing, mut bytes) = (BTreeSet::new(), Vec::new(), 0);
         while missing.len() < SELECTORS && bytes < DEMAND_BYTES && !turns.is_empty() {
             turns.retain_mut(|selectors| {
                 // Of several callers who lack the same, one has had their turn for it.
-                let next = selectors.find(|(_, key, _)| told.insert(Key::clone(key)));
-                let Some((_, key, amount)) = next.filter(|_| missing.len() < SELECTORS) else { return false };
+                let next = selectors.find(|(_, key, ..)| told.insert(Key::clone(key)));
+                let Some((_, key, missing_here, queued_here)) = next.filter(|_| missing.len() < SELECTORS) else {
+                    return false;
+                };
                 bytes += key.len();
-                missing.extend(self.queue.groups.get(key).map(|group| self.demand(group, amount)));
+                missing.extend(self.queue.groups.get(key).map(|group| self.demand(group, missing_here, queued_here)));
                 true
             });
         }
         Some(missing)
     }
 
-    /// Which of these selectors lack something that is provided, and how much; as many as are told of, the most urgent first.
-    fn lacking<'a>(&'a self, selectors: impl Iterator<Item = &'a Key>) -> Vec<(Place, &'a Key, Quantity)> {
+    /// Which of these selectors lack something that is provided, how much, and how much is queued for; as many as are told of, the most
+    /// urgent first.
+    fn lacking<'a>(&'a self, selectors: impl Iterator<Item = &'a Key>, queued: &Queued) -> Vec<Lacking<'a>> {
         let kinds = self.resources.kinds();
         let lacking = selectors.filter_map(|key| {
             let group = self.queue.groups.get(key)?;
-            let first = group.lacking.first()?;
-            let is_provided = kinds.subclasses(&group.selector.kind).any(|kind| self.queue.provided.contains(kind));
-            let amount = if is_provided { self.missing(key, group) } else { Quantity::ZERO };
-            (!amount.is_zero()).then_some((*first, key, amount))
+            let (queued, waits) =
+                queued.get(key).map_or((Quantity::ZERO, None), |(amount, first)| (*amount, Some(first)));
+            let first = *group.lacking.first().into_iter().chain(waits).min()?;
+            let is_provided =
+                kinds.subclasses(&group.selector.kind).any(|kind| self.queue.provided.kinds.contains(kind));
+            let missing =
+                if is_provided && !group.lacking.is_empty() { self.missing(key, group) } else { Quantity::ZERO };
+            (!missing.is_zero() || !queued.is_zero()).then_some((first, key, missing, queued))
         });
         let mut lacking: Vec<_> = lacking.collect();
         if lacking.len() > SELECTORS {
@@ -90,9 +108,9 @@ impl Pool {
         looked_at.filter_map(found).max().unwrap_or_default().max(counted)
     }
 
-    fn demand(&self, group: &Group, amount: Quantity) -> Demand {
+    fn demand(&self, group: &Group, missing: Quantity, queued: Quantity) -> Demand {
         let kinds = self.resources.kinds().subclasses(&group.selector.kind).map(str::to_owned).collect();
-        Demand { requirement: Requirement { count: amount, ..group.selector.clone() }, kinds }
+        Demand { requirement: Requirement { count: missing, ..group.selector.clone() }, queued, kinds }
     }
 
     /// A provider says why there are no more of a kind, to those who wait for it; an empty reason takes that back. It goes with the

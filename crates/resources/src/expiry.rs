@@ -50,7 +50,7 @@ impl Pool {
             return Some(self.now);
         }
         let timer = self.timers.first().map(|(at, _)| *at).filter(|at| *at < Timestamp(u64::MAX));
-        timer.into_iter().chain(self.served_later()).min()
+        timer.into_iter().chain(self.served_later()).chain(self.queue.growth.look_at()).min()
     }
 
     /// A turn: ends what has run out by `now`, then grants what became free.
@@ -84,6 +84,7 @@ impl Pool {
         (self.worked, self.enough) = (0, enough);
         let now = self.now;
         self.pace.iter_mut().for_each(|pace| pace.heard_of(now));
+        self.queue.growth.advance(now);
         let mut ended = self.queue.is_behind() || !self.queue.ready.is_empty() || !self.overdue.is_empty();
         while self.timers.first().is_some_and(|(at, _)| *at <= self.now) {
             let Some((_, timer)) = self.timers.pop_first() else { break };

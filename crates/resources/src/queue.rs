@@ -2,6 +2,7 @@
 
 use crate::changed::Touched;
 use crate::group::{Family, Group, Key};
+use crate::growth::{Growth, Provided};
 use crate::id::{SessionId, Slot, WaiterId};
 use crate::memory::RequestId;
 use crate::resource::Units;
@@ -44,6 +45,8 @@ pub(crate) struct Waiter {
     pub(crate) groups: Vec<Key>,
     /// Whether what exists would do if nobody held any of it. Only then it reserves.
     pub(crate) hopeful: bool,
+    /// Since when that is so.
+    pub(crate) hopeful_since: Timestamp,
     /// Per requirement, what it has reserved: free, and for nobody else.
     pub(crate) reserved: Vec<Units>,
     /// The families of which it lacks something.
@@ -81,8 +84,10 @@ pub(crate) struct Queue {
     pub(crate) hopeless: BTreeSet<Place>,
     /// What they lack may be something else.
     pub(crate) demand_changed: bool,
-    /// The kinds of which somebody wants to know that.
-    pub(crate) provided: Arc<BTreeSet<String>>,
+    /// What of that somebody wants to know.
+    pub(crate) provided: Arc<Provided>,
+    /// What is waited for although it exists.
+    pub(crate) growth: Growth,
     /// Whether somebody could be served for whom a turn had no time left.
     pub(crate) unserved: bool,
 }
@@ -116,6 +121,13 @@ impl Waiter {
     /// What was missing of a group when what exists would last not have done.
     pub(crate) fn missing_of(&self, key: &Key) -> Quantity {
         self.groups.iter().zip(&self.missing).filter(|(other, _)| *other == key).map(|(_, amount)| *amount).sum()
+    }
+
+    /// What of a group it wants and has not reserved.
+    pub(crate) fn lacks_of(&self, key: &Key) -> Quantity {
+        let wanted = self.request.requirements.iter().zip(&self.reserved).zip(&self.groups);
+        let of_group = wanted.filter(|(_, other)| *other == key).map(|(wanted, _)| wanted);
+        of_group.map(|(wanted, reserved)| wanted.count.saturating_sub(reserved.values().copied().sum())).sum()
     }
 }
 

@@ -19,7 +19,7 @@ use crate::assignment::{Assignment, Available};
 use crate::group::{Key, takes};
 use crate::id::{Slot, WaiterId};
 use crate::pool::Pool;
-use crate::queue::Place;
+use crate::queue::{Place, Waiter};
 use crate::resource::Units;
 use ratn_model::resource::{Quantity, Requirement};
 use std::collections::BTreeSet;
@@ -154,8 +154,9 @@ impl Pool {
             self.queue.ready.insert(place);
         }
         if let Some(waiter) = self.queue.waiters.get_mut(&place.1) {
-            (waiter.hopeful, waiter.lacks) = (true, lacks);
+            (waiter.hopeful, waiter.lacks, waiter.hopeful_since) = (true, lacks, self.now);
         }
+        self.queue.growth.look_later(self.now, &self.queue.provided);
     }
 
     /// Gives what is free in a family to those who lack it, in order; on from where an earlier turn stopped.
@@ -253,7 +254,8 @@ impl Pool {
         known.reserving.remove(&place);
         let kept = self.limits.overtaken == 0 || known.strict.last().is_some_and(|last| place <= *last);
         let passes = self.passes(place, family);
-        let Some((indices, assignment)) = self.assigned(place, family) else { return };
+        let Some(waiter) = self.queue.get(place.1) else { return };
+        let (indices, assignment) = self.assigned(waiter, family);
         self.worked += assignment.looked_at;
         let complete = assignment.is_complete();
         if (complete && !passes) || (!complete && kept) {
@@ -286,7 +288,7 @@ impl Pool {
             if self.queue.changed.contains_key(family) {
                 return;
             }
-            let Some((indices, assignment)) = self.assigned(place, family) else { return };
+            let (indices, assignment) = self.assigned(waiter, family);
             if !assignment.is_complete() || indices.iter().any(|index| !waiter.reserved[*index].is_empty()) {
                 return;
             }
@@ -298,8 +300,7 @@ impl Pool {
     }
 
     /// What of a family a waiter could have now, beside what is reserved; and for which of its requirements that is.
-    fn assigned(&self, place: Place, family: &Arc<str>) -> Option<(Vec<usize>, Assignment)> {
-        let waiter = self.queue.get(place.1)?;
+    pub(crate) fn assigned(&self, waiter: &Waiter, family: &Arc<str>) -> (Vec<usize>, Assignment) {
         let of_family = |key: &Key| self.queue.groups.get(key).is_some_and(|group| group.family == *family);
         let indices: Vec<usize> = (0..waiter.groups.len())
             .filter(|index| takes(&waiter.request.requirements[*index]) && of_family(&waiter.groups[*index]))
@@ -308,7 +309,7 @@ impl Pool {
             indices.iter().map(|index| &waiter.request.requirements[*index]).collect();
         let available = Available::Free(&self.queue.reserved);
         let assignment = Assignment::of(&self.resources, available, &requirements);
-        Some((indices, assignment))
+        (indices, assignment)
     }
 
     fn reserve(&mut self, place: Place, family: &Arc<str>, indices: &[usize], assignment: Assignment) {

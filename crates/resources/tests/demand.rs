@@ -4,8 +4,8 @@
 use ratn_model::resource::{Quantity, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
-use ratn_resources::{AcquireRequest, Limits, Pool, ResourceSpec, SessionId, Speaker};
-use std::collections::{BTreeMap, BTreeSet};
+use ratn_resources::{AcquireRequest, Limits, Pool, Provided, ResourceSpec, SessionId, Speaker, WaiterId};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -21,10 +21,17 @@ fn pool() -> Pool {
     pool
 }
 
-/// All kinds that anybody here waits for.
-fn everything() -> Arc<BTreeSet<String>> {
+/// All kinds that anybody here waits for; none of them grows.
+fn everything() -> Arc<Provided> {
     let ghosts = (0..300).map(|number| format!("Ghost-{number}"));
-    ["Planner", "Arm", "Ghost"].map(str::to_owned).into_iter().chain(ghosts).collect::<BTreeSet<String>>().into()
+    let kinds = ["Planner", "Arm", "Ghost"].map(str::to_owned).into_iter().chain(ghosts).collect();
+    Arc::new(Provided { kinds, ..Provided::default() })
+}
+
+/// These alone; none of them grows.
+fn provided(kinds: &[&str]) -> Arc<Provided> {
+    let kinds = kinds.iter().map(|&kind| kind.to_owned()).collect();
+    Arc::new(Provided { kinds, ..Provided::default() })
 }
 
 fn block(kind: &str, count: impl Into<Quantity>) -> Requirement {
@@ -133,7 +140,7 @@ fn what_nobody_provides_takes_no_room_from_what_somebody_does() {
     }
     ask(&mut pool, "eve", 0, vec![block("Planner", 2)]);
     let told = |pool: &mut Pool, kinds: &[&str]| {
-        let demand = pool.take_demand(&Arc::new(kinds.iter().map(|&kind| kind.to_owned()).collect()))?;
+        let demand = pool.take_demand(&provided(kinds))?;
         Some(demand.into_iter().map(|demand| demand.requirement.kind).collect::<Vec<_>>())
     };
     assert_eq!(told(&mut pool, &["Planner", "Arm"]), Some(vec!["Planner".to_owned()]));
@@ -153,7 +160,7 @@ fn those_who_lack_nothing_of_a_kind_do_not_hide_who_does() {
     }
     ask(&mut pool, "adam", 0, vec![block("Planner", 2), block("Planner", 1)]);
     pool.check_invariants().unwrap();
-    let provided = Arc::new(["Planner".to_owned()].into());
+    let provided = provided(&["Planner"]);
     let missing = |pool: &mut Pool| {
         let demand = pool.take_demand(&provided).unwrap();
         demand.into_iter().map(|demand| demand.requirement.count).collect::<Vec<_>>()
@@ -169,4 +176,94 @@ fn those_who_lack_nothing_of_a_kind_do_not_hide_who_does() {
         assert_eq!(missing(&mut pool), expected);
         create(&mut pool, planner());
     }
+}
+
+const PATIENCE: Duration = Duration::from_millis(250);
+
+/// Planners and arms, of which planners grow.
+fn growing() -> Arc<Provided> {
+    let kinds = ["Planner", "Arm"].map(str::to_owned).into();
+    Arc::new(Provided { kinds, growing: ["Planner".to_owned()].into(), patience: PATIENCE })
+}
+
+fn at(ms: u64) -> Timestamp {
+    NOW + Duration::from_millis(ms)
+}
+
+/// What is missing and what is queued for of planners at a moment, where that may have changed.
+fn planners_at(pool: &mut Pool, ms: u64) -> Option<(u32, u32)> {
+    pool.advance(at(ms));
+    pool.check_invariants().unwrap();
+    let demand = pool.take_demand(&growing())?;
+    let amounts = |demand: &ratn_resources::Demand| (demand.requirement.count.units(), demand.queued.units());
+    assert!(demand.iter().all(|demand| demand.requirement.kind == "Planner"), "{demand:?}");
+    Some(demand.first().map(amounts).unwrap_or_default())
+}
+
+fn ask_at(pool: &mut Pool, ms: u64, requirements: Vec<Requirement>) -> WaiterId {
+    pool.acquire(at(ms), AcquireRequest::new(SessionId::from("adam"), requirements)).unwrap()
+}
+
+#[test]
+fn who_waits_for_long_for_what_others_hold_is_in_demand_where_it_grows() {
+    let mut pool = pool();
+    create(&mut pool, planner());
+    let waiters = [(); 4].map(|()| ask_at(&mut pool, 0, vec![block("Planner", 1)]));
+    assert_eq!(planners_at(&mut pool, 0), Some((0, 0)), "it is asked for the first time");
+    assert_eq!(pool.next_deadline(), Some(at(250)));
+    assert_eq!(planners_at(&mut pool, 249), None);
+    assert_eq!(planners_at(&mut pool, 250), Some((0, 3)), "one has it, three wait");
+    create(&mut pool, planner());
+    assert_eq!(pool.waiting(), 2);
+    assert_eq!(planners_at(&mut pool, 500), Some((0, 2)));
+    pool.cancel(at(600), waiters[2]).unwrap();
+    assert_eq!(planners_at(&mut pool, 600), None, "it is looked at again later");
+    assert_eq!(planners_at(&mut pool, 750), Some((0, 1)));
+    pool.cancel(at(800), waiters[3]).unwrap();
+    assert_eq!(planners_at(&mut pool, 1_000), Some((0, 0)));
+    assert_eq!(pool.next_deadline().filter(|at| *at < Timestamp::from_seconds(10.0)), None, "nobody waits");
+}
+
+#[test]
+fn waits_that_end_before_long_are_in_no_demand() {
+    let mut pool = pool();
+    create(&mut pool, planner());
+    planners_at(&mut pool, 0);
+    // Each waits 200 ms for the one before it.
+    let session = SessionId::from("adam");
+    ask_at(&mut pool, 0, vec![block("Planner", 1)]);
+    for round in 0..20 {
+        ask_at(&mut pool, 200 * round, vec![block("Planner", 1)]);
+        assert!(planners_at(&mut pool, 200 * round + 199).is_none_or(|demand| demand == (0, 0)), "{round}");
+        let held = pool.leases()[0].id;
+        pool.release(at(200 * round + 199), Some(&session), held).unwrap();
+    }
+}
+
+#[test]
+fn who_waits_for_something_else_as_well_is_not_helped_by_more_of_what_grows() {
+    let mut pool = pool();
+    create(&mut pool, planner());
+    create(&mut pool, ResourceSpec::new(ResourceClass::Module, "Arm"));
+    planners_at(&mut pool, 0);
+    ask_at(&mut pool, 0, vec![block("Planner", 1)]);
+    ask_at(&mut pool, 0, vec![block("Arm", 1)]);
+    ask_at(&mut pool, 0, vec![block("Planner", 1), block("Arm", 1)]);
+    ask_at(&mut pool, 0, vec![block("Arm", 1)]);
+    assert!(planners_at(&mut pool, 1_000).is_none(), "it waits for the arm, which does not grow");
+    let arm = pool.leases()[1].id;
+    pool.release(at(1_000), Some(&SessionId::from("adam")), arm).unwrap();
+    assert_eq!(planners_at(&mut pool, 1_250), Some((0, 1)), "it has the arm reserved");
+}
+
+#[test]
+fn a_wait_begins_when_what_exists_would_do() {
+    let mut pool = pool();
+    planners_at(&mut pool, 0);
+    (0..2).for_each(|_| drop(ask_at(&mut pool, 0, vec![block("Planner", 1)])));
+    assert_eq!(planners_at(&mut pool, 0), Some((1, 0)), "the most that one of them lacks");
+    pool.create(at(5_000), None, planner()).unwrap();
+    assert_eq!(planners_at(&mut pool, 5_000), Some((0, 0)));
+    assert_eq!(planners_at(&mut pool, 5_249).unwrap_or_default(), (0, 0), "the next one would have ended by now");
+    assert_eq!(planners_at(&mut pool, 5_500), Some((0, 1)));
 }

@@ -422,7 +422,10 @@ fn what_fits_fewer_other_requests_is_given_away_first() {
 #[test]
 fn what_waits_for_more_than_exists_is_in_demand_until_it_does_not_and_is_told_why_there_is_no_more() {
     let mut bench = Bench::new();
-    let provided = || std::sync::Arc::new(["PathPlanner".to_owned()].into());
+    let provided = || {
+        let kinds = ["PathPlanner".to_owned()].into();
+        std::sync::Arc::new(ratn_resources::Provided { kinds, ..Default::default() })
+    };
     let told = |pool: &mut Pool| {
         let demand = pool.take_demand(&provided())?;
         Some(

@@ -8,6 +8,7 @@ use super::tracking::Tracking;
 use crate::config::{Check, ConfigError, rule};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::value::Value;
+use ratn_proto::types::Provision;
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
@@ -113,10 +114,12 @@ impl Default for ProcessManagerConfig {
 impl ProcessManagerConfig {
     /// The kinds of its workers, and how many there are of each at the most. Of several templates of a kind the first one, in the
     /// order of names, meets demand.
-    pub(crate) fn kinds(&self) -> BTreeMap<String, u32> {
+    pub(crate) fn kinds(&self) -> BTreeMap<String, Provision> {
         let mut templates: Vec<&Template> = self.templates.iter().collect();
         templates.sort_by(|a, b| b.name.cmp(&a.name));
-        templates.into_iter().map(|template| (template.kind.clone(), template.max_workers())).collect()
+        let provision =
+            |template: &Template| Provision { most: template.max_workers(), grows: template.grows_with_the_queue() };
+        templates.into_iter().map(|template| (template.kind.clone(), provision(template))).collect()
     }
 }
 

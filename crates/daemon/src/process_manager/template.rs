@@ -238,6 +238,11 @@ impl Template {
         Duration::from_secs_f64(self.stable_s)
     }
 
+    /// Whether there may be more of it because others wait for what is held. Not of what moves something: there is one robot.
+    pub(crate) fn grows_with_the_queue(&self) -> bool {
+        self.standstill_ms.is_none() && self.max_workers() > 1
+    }
+
     /// Whether a worker of this one is started as one of `other` is: how many there are and what follows a crash does not count.
     pub(crate) fn starts_the_same_as(&self, other: &Template) -> bool {
         let of_the_process = |template: &Template| Template {

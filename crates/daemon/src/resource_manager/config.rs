@@ -21,6 +21,8 @@ pub struct ResourceManagerConfig {
     pub max_watchers: usize,
     /// A provider that is asked for more of a kind has so long for each, in milliseconds; then another one is asked.
     pub provider_patience_ms: u64,
+    /// A request that has waited for what others hold for so long, in milliseconds, is one for which providers start more of it.
+    pub grow_after_ms: u64,
     /// The direct superclasses of kinds, `VacuumGripper = ["Gripper"]`: who asks for a kind may get one of a kind below it.
     pub kinds: BTreeMap<String, Vec<String>>,
     /// Bounds of everything that a client can make grow.
@@ -37,6 +39,7 @@ impl Default for ResourceManagerConfig {
             max_wait_ms: 24 * 3_600_000,
             max_watchers: 1_024,
             provider_patience_ms: 15_000,
+            grow_after_ms: 250,
             kinds: BTreeMap::new(),
             limits: Limits::default(),
             storage: StorageConfig::default(),
@@ -58,6 +61,10 @@ impl ResourceManagerConfig {
         Duration::from_millis(self.provider_patience_ms)
     }
 
+    pub(crate) fn grow_after(&self) -> Duration {
+        Duration::from_millis(self.grow_after_ms)
+    }
+
     pub(crate) fn max_wait(&self) -> Duration {
         Duration::from_millis(self.max_wait_ms)
     }
@@ -69,6 +76,7 @@ impl Check for ResourceManagerConfig {
         rule("max_wait_ms", self.max_wait_ms >= 1, "at least 1 ms")?;
         rule("max_watchers", self.max_watchers >= 1, "at least 1")?;
         rule("provider_patience_ms", self.provider_patience_ms >= 1, "at least 1 ms")?;
+        rule("grow_after_ms", self.grow_after_ms >= 10, "at least 10 ms")?;
         let kinds = Kinds::new(&self.kinds).map(drop).map_err(|cyclic| cyclic.to_string());
         rule("kinds", kinds.is_ok(), kinds.err().unwrap_or_default())?;
         self.storage.check()

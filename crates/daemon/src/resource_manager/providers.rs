@@ -4,10 +4,10 @@ use super::handout::HandOut;
 use super::round::Round;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
-use ratn_proto::types::Demand;
-use ratn_resources::{Pool, SessionId};
+use ratn_proto::types::{Demand, Provision};
+use ratn_resources::{Pool, Provided, SessionId};
 use std::borrow::Cow;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
@@ -20,8 +20,8 @@ const A_MOMENT: Duration = Duration::from_millis(1);
 /// What somebody can provide.
 #[derive(Debug, Default)]
 pub(super) struct Provisions {
-    /// Kinds, and how many of each at the most.
-    pub(super) kinds: BTreeMap<String, u32>,
+    /// By kind.
+    pub(super) kinds: BTreeMap<String, Provision>,
     /// What all of it has in common.
     pub(super) attributes: BTreeMap<String, Value>,
 }
@@ -39,10 +39,20 @@ pub(super) struct Provider {
 impl Provider {
     /// Of how many more it can be asked; nothing where none that it has would do.
     pub(super) fn room(&self, demand: &ratn_resources::Demand, provided: u32) -> Option<u32> {
+        self.room_of(demand, provided, |_| true)
+    }
+
+    /// The same for those who wait for what is held.
+    pub(super) fn room_to_grow(&self, demand: &ratn_resources::Demand, provided: u32) -> Option<u32> {
+        self.room_of(demand, provided, |provision| provision.grows)
+    }
+
+    fn room_of(&self, demand: &ratn_resources::Demand, provided: u32, of: impl Fn(&Provision) -> bool) -> Option<u32> {
         if !demand.requirement.accepts(|name| self.provisions.attributes.get(name).map(Cow::Borrowed)) {
             return None;
         }
-        let kinds = demand.kinds.iter().filter_map(|kind| Some((kind, *self.provisions.kinds.get(kind)?)));
+        let provision = |kind| self.provisions.kinds.get(kind).filter(|provision| of(provision));
+        let kinds = demand.kinds.iter().filter_map(|kind| Some((kind, provision(kind)?.most)));
         let most = |(kind, most): (&String, u32)| self.bounds.get(kind).map_or(most, |bound| most.min(*bound));
         kinds.map(most).reduce(u32::saturating_add).map(|most| most.saturating_sub(provided))
     }
@@ -66,16 +76,17 @@ pub(super) struct Providers {
     /// In which they are being told.
     round: Option<Round>,
     /// What any of them can provide.
-    kinds: Arc<BTreeSet<String>>,
+    provided: Arc<Provided>,
     /// Something is to be told that nobody was told yet.
     news: bool,
 }
 
 impl Providers {
-    /// Nobody yet; each has so long to come closer to what is asked of it.
-    pub(super) fn new(patience: Duration) -> Providers {
-        let (round, kinds) = Default::default();
-        Providers { all: Vec::new(), hand_out: HandOut::new(patience), round, kinds, news: false }
+    /// Nobody yet; each has so long to come closer to what is asked of it. A request waits so long for what is held before they are asked
+    /// for more.
+    pub(super) fn new(patience: Duration, grow_after: Duration) -> Providers {
+        let provided = Arc::new(Provided { patience: grow_after, ..Provided::default() });
+        Providers { all: Vec::new(), hand_out: HandOut::new(patience), round: None, provided, news: false }
     }
 
     /// One more listens; how many there are where that is `most` already.
@@ -90,11 +101,9 @@ impl Providers {
         if there >= most {
             return Err(there);
         }
-        if provisions.kinds.keys().any(|kind| !self.kinds.contains(kind)) {
-            Arc::make_mut(&mut self.kinds).extend(provisions.kinds.keys().cloned());
-        }
         let (listener, told) = watch::channel(Vec::new());
         self.all.push(Provider { session, provisions, bounds: BTreeMap::new(), listener });
+        self.note_what_is_provided();
         self.news = true;
         Ok(told)
     }
@@ -117,9 +126,19 @@ impl Providers {
         self.news = true;
     }
 
-    /// The kinds that anybody may be asked for.
-    pub(super) fn kinds(&self) -> &Arc<BTreeSet<String>> {
-        &self.kinds
+    /// What anybody may be asked for.
+    pub(super) fn provided(&self) -> &Arc<Provided> {
+        &self.provided
+    }
+
+    fn note_what_is_provided(&mut self) {
+        let all = || self.all.iter().flat_map(|provider| &provider.provisions.kinds);
+        let kinds = all().map(|(kind, _)| kind.clone()).collect();
+        let growing = all().filter(|(_, provision)| provision.grows).map(|(kind, _)| kind.clone()).collect();
+        let provided = Provided { kinds, growing, patience: self.provided.patience };
+        if provided != *self.provided {
+            self.provided = Arc::new(provided);
+        }
     }
 
     /// When something changes by time alone, or there is more to tell than a turn could.
@@ -151,8 +170,7 @@ impl Providers {
             let there = self.all.len();
             self.all.retain(|provider| !provider.listener.is_closed() && pool.has_session(&provider.session));
             if self.all.len() < there {
-                let kinds = self.all.iter().flat_map(|provider| provider.provisions.kinds.keys());
-                self.kinds = Arc::new(kinds.cloned().collect());
+                self.note_what_is_provided();
             }
             self.round = Some(Round::begin(&self.all, demands, &mut self.hand_out));
         }
@@ -168,7 +186,7 @@ impl Providers {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
-    use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
+    use ratn_model::resource::{Quantity, Requirement, ResourceClass, ResourceOperation};
     use ratn_resources::{Limits, ResourceSpec};
 
     const NOW: Timestamp = Timestamp(0);
@@ -176,7 +194,7 @@ mod tests {
     /// Sessions `0`, `1`, ... that each provide so many planners on a host of their own, and listen.
     fn providers(count: usize, planners: usize) -> (Pool, Providers, Vec<watch::Receiver<Vec<Demand>>>) {
         let mut pool = Pool::new(Limits::default());
-        let mut providers = Providers::new(Duration::from_secs(15));
+        let mut providers = Providers::new(Duration::from_secs(15), Duration::from_millis(250));
         let mut told = Vec::new();
         for number in 0..count {
             let session = SessionId::from(number.to_string().as_str());
@@ -185,7 +203,10 @@ mod tests {
                 || ResourceSpec::new(ResourceClass::Process, "Planner").attribute("host", Value::Int(number as i64));
             (0..planners).for_each(|_| drop(pool.create(NOW, Some(&session), spec()).unwrap()));
             let attributes = (0..256).map(|size| (format!("size-{size}"), Value::Bool(true))).collect();
-            let provisions = Provisions { kinds: [("Planner".to_owned(), 100_000)].into(), attributes };
+            let provisions = Provisions {
+                kinds: [("Planner".to_owned(), Provision { most: 100_000, grows: true })].into(),
+                attributes,
+            };
             told.push(providers.join(session, provisions, count).unwrap());
         }
         (pool, providers, told)
@@ -196,7 +217,7 @@ mod tests {
         let demand = |number: usize| {
             let mut requirement = Requirement::new(ResourceOperation::Block, "Planner");
             requirement.attributes.insert(format!("size-{number}"), Value::Bool(true));
-            ratn_resources::Demand { requirement, kinds: vec!["Planner".to_owned()] }
+            ratn_resources::Demand { requirement, queued: Quantity::ZERO, kinds: vec!["Planner".to_owned()] }
         };
         (0..count).map(demand).collect()
     }
@@ -229,6 +250,34 @@ mod tests {
     }
 
     #[test]
+    fn what_is_held_and_waited_for_is_asked_of_those_that_grow_beside_what_is_missing() {
+        let (mut pool, mut providers, told) = providers(2, 1);
+        let session = SessionId::from("driver");
+        pool.keep_alive(NOW, &session, "provider", Duration::from_secs(60)).unwrap();
+        let kinds = [("Planner".to_owned(), Provision { most: 9, grows: false })].into();
+        let driver = providers.join(session, Provisions { kinds, attributes: BTreeMap::new() }, 10).unwrap();
+        assert_eq!(providers.provided().growing, providers.provided().kinds);
+        let demand = |missing: u32, queued: u32| ratn_resources::Demand {
+            requirement: Requirement { count: missing.into(), ..Requirement::new(ResourceOperation::Block, "Planner") },
+            queued: queued.into(),
+            kinds: vec!["Planner".to_owned()],
+        };
+        let mut asked = |missing, queued| {
+            turns(&pool, &mut providers, &[demand(missing, queued)]);
+            let one = |told: &watch::Receiver<Vec<Demand>>| {
+                let told = told.borrow();
+                told.first().map(|demand| (demand.requirement.count.units(), demand.queued.units()))
+            };
+            assert_eq!((one(&told[1]), one(&driver)), (None, None), "the first has room for all of it");
+            one(&told[0])
+        };
+        assert_eq!(asked(0, 3), Some((3, 3)));
+        assert_eq!(asked(1, 3), Some((3, 2)), "who lacks one waits for three as well");
+        assert_eq!(asked(2, 1), Some((2, 0)));
+        assert_eq!(asked(0, 0), None);
+    }
+
+    #[test]
     fn one_that_comes_while_others_are_told_is_told_in_the_next_round() {
         let (mut pool, mut providers, told) = providers(2, 3_000);
         let demands = demands(4);
@@ -237,15 +286,19 @@ mod tests {
         assert!(told[0].borrow().is_empty(), "it is not all counted yet");
         let session = SessionId::from("late");
         pool.keep_alive(NOW, &session, "provider", Duration::from_secs(60)).unwrap();
-        let provisions = Provisions { kinds: [("Arm".to_owned(), 1)].into(), attributes: BTreeMap::new() };
+        let provisions = Provisions {
+            kinds: [("Arm".to_owned(), Provision { most: 1, grows: false })].into(),
+            attributes: BTreeMap::new(),
+        };
         let late = providers.join(session, provisions, 10).unwrap();
-        assert!(providers.kinds().contains("Arm"));
+        assert!(providers.provided().kinds.contains("Arm"));
         while providers.deadline(NOW) == Some(NOW + A_MOMENT) {
             providers.tell(NOW, &pool, &demands);
         }
         assert_eq!((told[0].borrow().len(), late.borrow().len()), (4, 0));
         let arm = ratn_resources::Demand {
             requirement: Requirement::new(ResourceOperation::Block, "Arm"),
+            queued: Quantity::ZERO,
             kinds: vec!["Arm".to_owned()],
         };
         turns(&pool, &mut providers, &[arm]);
@@ -253,6 +306,6 @@ mod tests {
         // One that has gone is not asked any more, and its kinds are not provided.
         drop(late);
         turns(&pool, &mut providers, &demands);
-        assert!(!providers.kinds().contains("Arm"));
+        assert!(!providers.provided().kinds.contains("Arm"));
     }
 }

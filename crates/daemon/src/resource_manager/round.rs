@@ -30,8 +30,15 @@ pub(super) struct Round {
 
 #[derive(Debug, Clone, Copy)]
 struct Asked {
-    amount: u32,
+    missing: u32,
+    queued: u32,
     provided: u32,
+}
+
+impl Asked {
+    fn amount(self) -> u32 {
+        self.missing.saturating_add(self.queued)
+    }
 }
 
 impl Round {
@@ -62,19 +69,8 @@ impl Round {
                 return false;
             }
             looks = (looks - looked_at).saturating_sub(1 + self.sessions.len());
-            let part = |(session, provider): (&SessionId, &Provider)| {
-                let provided = counted.of(session).units();
-                Part { provided, room: provider.room(demand, provided) }
-            };
-            let missing = Missing {
-                selector: format!("{:?}", Requirement { count: Quantity::ONE, ..demand.requirement.clone() }).into(),
-                // Whole resources are provided, also for parts of them.
-                count: demand.requirement.count.units_up(),
-                of: self.sessions.iter().zip(providers).map(part).collect(),
-            };
-            let asked = hand_out.hand_out(now, &self.sessions, &missing);
-            let asked = asked.into_iter().zip(&missing.of);
-            self.handed_out.push(asked.map(|(amount, part)| Asked { amount, provided: part.provided }).collect());
+            let provided: Vec<u32> = self.sessions.iter().map(|session| counted.of(session).units()).collect();
+            self.handed_out.push(handed_out(now, demand, (&self.sessions, providers, &provided), hand_out));
             self.counted = None;
         }
         for (index, provider) in providers.iter().enumerate().take(self.sessions.len()).skip(self.told) {
@@ -91,14 +87,44 @@ impl Round {
 
     fn asked_of(&self, provider: usize) -> Vec<Demand> {
         let all = self.demands.iter().zip(&self.handed_out).map(|(demand, asked)| (demand, asked[provider]));
-        let of_it = all.filter(|(_, asked)| asked.amount > 0);
+        let of_it = all.filter(|(_, asked)| asked.amount() > 0);
         let demand = |(demand, asked): (&ratn_resources::Demand, Asked)| Demand {
-            requirement: Requirement { count: asked.amount.into(), ..demand.requirement.clone() },
+            requirement: Requirement { count: asked.amount().into(), ..demand.requirement.clone() },
             kinds: demand.kinds.clone(),
             provided: asked.provided.into(),
+            queued: asked.queued.into(),
         };
         of_it.map(demand).collect()
     }
+}
+
+/// What is asked of each provider for one demand: what is missing, and of those that grow what is waited for beside it.
+fn handed_out(
+    now: Timestamp,
+    demand: &ratn_resources::Demand,
+    (sessions, providers, provided): (&[SessionId], &[Provider], &[u32]),
+    hand_out: &mut HandOut,
+) -> Vec<Asked> {
+    let selector = format!("{:?}", Requirement { count: Quantity::ONE, ..demand.requirement.clone() });
+    // Whole resources are provided, also for parts of them.
+    let (missing, queued) = (demand.requirement.count.units_up(), demand.queued.units_up());
+    let mut handed_out = |selector: &str, count: u32, room: &dyn Fn(usize, &Provider) -> Option<u32>| {
+        if count == 0 {
+            return vec![0; sessions.len()];
+        }
+        let part = |(index, provider)| Part { provided: provided[index], room: room(index, provider) };
+        let of = providers.iter().take(sessions.len()).enumerate().map(part).collect();
+        hand_out.hand_out(now, sessions, &Missing { selector: selector.into(), count, of })
+    };
+    let handed_out_missing = handed_out(&selector, missing, &|index, provider| provider.room(demand, provided[index]));
+    // Who waits for more than exists waits for what is held as well.
+    let more = queued.saturating_sub(missing);
+    let handed_out_queued = handed_out(&format!("{selector}, held"), more, &|index, provider| {
+        let room = provider.room_to_grow(demand, provided[index])?;
+        Some(room.saturating_sub(handed_out_missing[index]))
+    });
+    let asked = |((missing, queued), provided): ((u32, u32), &u32)| Asked { missing, queued, provided: *provided };
+    handed_out_missing.iter().copied().zip(handed_out_queued).zip(provided).map(asked).collect()
 }
 
 /// What a provider provides says where it is, once it is there: who asks for that is asked for like everybody else.

@@ -163,6 +163,7 @@ impl From<Demand> for v1::Demand {
             requirement: Some(demand.requirement.into()),
             kinds: demand.kinds,
             provided: demand.provided.into(),
+            queued: demand.queued.into(),
         }
     }
 }
@@ -172,7 +173,12 @@ impl TryFrom<v1::Demand> for Demand {
 
     fn try_from(demand: v1::Demand) -> Result<Demand, Malformed> {
         let requirement = required(demand.requirement, "requirement")?;
-        Ok(Demand { requirement, kinds: demand.kinds, provided: amount(demand.provided, "provided")? })
+        Ok(Demand {
+            requirement,
+            kinds: demand.kinds,
+            provided: amount(demand.provided, "provided")?,
+            queued: amount(demand.queued, "queued")?,
+        })
     }
 }
 

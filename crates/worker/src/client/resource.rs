@@ -11,7 +11,7 @@ use ratn_model::resource::{Lease, Requirement};
 use ratn_model::value::Value;
 use ratn_proto::convert::{Malformed, all, each, required, wire_ports};
 use ratn_proto::types::{
-    Demand, Resource, ResourceFilter, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition,
+    Demand, Provision, Resource, ResourceFilter, ResourceUpdate, SessionStatus, WaitingAcquire, WatchPosition,
 };
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
@@ -370,17 +370,21 @@ impl ResourceClient {
         Ok(ResourceWatch { endpoint: self.endpoint.clone(), stream: answer.into_inner() })
     }
 
-    /// Tells a provider of so many of these kinds at the most, all with these attributes, what is asked of it: what is missing at
-    /// first, and then whenever that changes.
+    /// Tells a provider of these kinds, all with these attributes, what is asked of it: what is missing at first, and then whenever that
+    /// changes.
     ///
     /// # Errors
     /// [`CallError`].
     pub async fn watch_demand(
         &self,
-        kinds: &BTreeMap<String, u32>,
+        kinds: &BTreeMap<String, Provision>,
         attributes: &BTreeMap<String, Value>,
     ) -> Result<DemandWatch, CallError> {
-        let provision = |(kind, most): (&String, &u32)| v1::Provision { kind: kind.clone(), most: *most };
+        let provision = |(kind, provision): (&String, &Provision)| v1::Provision {
+            kind: kind.clone(),
+            most: provision.most,
+            grows: provision.grows,
+        };
         let provisions = kinds.iter().map(provision).collect();
         let question = v1::WatchDemandRequest {
             session_id: self.session.clone(),

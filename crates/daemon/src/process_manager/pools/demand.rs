@@ -1,13 +1,22 @@
 //! Demand: how many workers the waiting requests need from one host.
 
 use crate::process_manager::config::Labels;
-use ratn_model::resource::ResourceClass;
+use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::value::Value;
 use ratn_proto::types::Demand;
 use std::borrow::Cow;
 
-/// How many workers of a kind there should be on `host` for all of `demands`; those there are count. 0 for none.
-pub(super) fn demanded(demands: &[Demand], kind: &str, (host, labels): (&str, &Labels)) -> u32 {
+/// How many workers of a kind there should be, those that are there included. 0 for none.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Demanded {
+    /// For those who wait for more than exists.
+    pub(super) missing: u32,
+    /// For those who have waited for long for what is held, as well.
+    pub(super) queued: u32,
+}
+
+/// How many workers of a kind there should be on `host` for all of `demands`.
+pub(super) fn demanded(demands: &[Demand], kind: &str, (host, labels): (&str, &Labels)) -> Demanded {
     let host = Value::String(host.to_owned());
     let of_workers = |name: &str| match name {
         "host" => Some(Cow::Borrowed(&host)),
@@ -18,8 +27,14 @@ pub(super) fn demanded(demands: &[Demand], kind: &str, (host, labels): (&str, &L
             && demand.requirement.class.is_none_or(|class| class == ResourceClass::Process)
             && demand.requirement.accepts(of_workers)
     };
-    let count = |demand: &Demand| (demand.provided + demand.requirement.count).units_up();
-    demands.iter().filter(met).map(count).max().unwrap_or(0)
+    let mut demanded = Demanded::default();
+    for demand in demands.iter().filter(met) {
+        let missing = demand.requirement.count.saturating_sub(demand.queued);
+        let with = |more: Quantity| if more.is_zero() { 0 } else { (demand.provided + more).units_up() };
+        demanded.missing = demanded.missing.max(with(missing));
+        demanded.queued = demanded.queued.max(if demand.queued.is_zero() { 0 } else { with(demand.requirement.count) });
+    }
+    demanded
 }
 
 #[cfg(test)]
@@ -32,14 +47,25 @@ mod tests {
         let mut requirement =
             Requirement { count: missing.into(), ..Requirement::new(ResourceOperation::Block, "PathPlanner") };
         edit(&mut requirement);
-        Demand { requirement, kinds: vec!["Planner".to_owned(), "PathPlanner".to_owned()], provided: 1.into() }
+        Demand {
+            requirement,
+            kinds: vec!["Planner".to_owned(), "PathPlanner".to_owned()],
+            provided: 1.into(),
+            queued: Quantity::ZERO,
+        }
+    }
+
+    fn missing(demands: &[Demand], kind: &str, of: (&str, &Labels)) -> u32 {
+        let demanded = demanded(demands, kind, of);
+        assert_eq!(demanded.queued, 0);
+        demanded.missing
     }
 
     #[test]
     fn the_largest_demand_counts_beside_what_is_provided() {
         let demands = [demand(2, |_| {}), demand(4, |_| {}), demand(1, |_| {})];
-        assert_eq!(demanded(&demands, "PathPlanner", ("compute", &Labels::new())), 5);
-        assert_eq!(demanded(&demands, "Detector", ("compute", &Labels::new())), 0);
+        assert_eq!(missing(&demands, "PathPlanner", ("compute", &Labels::new())), 5);
+        assert_eq!(missing(&demands, "Detector", ("compute", &Labels::new())), 0);
     }
 
     #[test]
@@ -47,15 +73,24 @@ mod tests {
         let elsewhere = |r: &mut Requirement| {
             r.attributes.insert("host".to_owned(), Value::String("elsewhere".to_owned()));
         };
-        assert_eq!(demanded(&[demand(1, elsewhere)], "PathPlanner", ("compute", &Labels::new())), 0);
-        assert_eq!(demanded(&[demand(1, elsewhere)], "PathPlanner", ("elsewhere", &Labels::new())), 2);
+        assert_eq!(missing(&[demand(1, elsewhere)], "PathPlanner", ("compute", &Labels::new())), 0);
+        assert_eq!(missing(&[demand(1, elsewhere)], "PathPlanner", ("elsewhere", &Labels::new())), 2);
         let with_gpu = |r: &mut Requirement| {
             r.attributes.insert("gpu".to_owned(), Value::Bool(true));
         };
         let labels = |gpu| [("gpu".to_owned(), Label::Bool(gpu))].into();
-        assert_eq!(demanded(&[demand(1, with_gpu)], "PathPlanner", ("compute", &labels(true))), 2);
-        assert_eq!(demanded(&[demand(1, with_gpu)], "PathPlanner", ("compute", &labels(false))), 0);
+        assert_eq!(missing(&[demand(1, with_gpu)], "PathPlanner", ("compute", &labels(true))), 2);
+        assert_eq!(missing(&[demand(1, with_gpu)], "PathPlanner", ("compute", &labels(false))), 0);
         let module = |r: &mut Requirement| r.class = Some(ResourceClass::Module);
-        assert_eq!(demanded(&[demand(1, module)], "PathPlanner", ("compute", &Labels::new())), 0);
+        assert_eq!(missing(&[demand(1, module)], "PathPlanner", ("compute", &Labels::new())), 0);
+    }
+
+    #[test]
+    fn what_is_waited_for_is_told_apart_from_what_is_missing() {
+        let queued = |missing: u32, queued: u32| Demand { queued: queued.into(), ..demand(missing + queued, |_| {}) };
+        let of = |demands: &[Demand]| demanded(demands, "PathPlanner", ("compute", &Labels::new()));
+        assert_eq!(of(&[queued(0, 3)]), Demanded { missing: 0, queued: 4 });
+        assert_eq!(of(&[queued(1, 2)]), Demanded { missing: 2, queued: 4 });
+        assert_eq!(of(&[queued(2, 0), queued(0, 1)]), Demanded { missing: 3, queued: 2 });
     }
 }

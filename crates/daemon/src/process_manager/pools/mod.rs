@@ -22,6 +22,7 @@ pub use command::{Command, Event, PoolError};
 
 use super::config::Labels;
 use super::template::Template;
+use demand::Demanded;
 use motion::Motion;
 use pool::Pool;
 use ratn_model::time::Timestamp;
@@ -356,8 +357,8 @@ impl Pools {
         for pool in self.pools.values_mut() {
             // Of several templates of a kind the first meets what is asked for.
             let kind = pool.template().kind.clone();
-            let count = demand::demanded(demands, &kind, (&self.host, &self.labels));
-            pool.demanded(now, if taken.insert(kind) { count } else { 0 }, commands);
+            let demanded = demand::demanded(demands, &kind, (&self.host, &self.labels));
+            pool.demanded(now, if taken.insert(kind) { demanded } else { Demanded::default() }, commands);
         }
         self.advance(now, commands);
     }

@@ -1,6 +1,7 @@
 //! The workers of one template: as many as its size says, replaced as its restarts allow.
 
 use super::command::{Command, PoolError};
+use super::demand::Demanded;
 use super::motion::Motion;
 use super::restart::Restarts;
 use super::size::{Size, retiring};
@@ -35,6 +36,8 @@ pub(super) struct Pool {
     /// Workers that ended unasked, and how the last one did.
     crashes: u64,
     last_exit: String,
+    /// How the last one ended that never served, since one was ready.
+    never_ready: String,
 }
 
 impl Pool {
@@ -50,6 +53,7 @@ impl Pool {
             motion: Motion::default(),
             crashes: 0,
             last_exit: String::new(),
+            never_ready: String::new(),
             host: host.to_owned(),
             template,
         }
@@ -94,6 +98,8 @@ impl Pool {
             (most, format!("`{name}` needs {} for one more worker", self.template.needs.words()))
         } else if self.size.is_short() || max < self.template.max_workers() {
             (max, format!("`{name}` has {max} workers at the most"))
+        } else if !self.never_ready.is_empty() && !self.has_ready() {
+            (max, format!("`{name}` has no worker that became ready, and starts another one: {}", self.never_ready))
         } else {
             return None;
         };
@@ -150,6 +156,9 @@ impl Pool {
 
     /// Starts what is missing, unless it has to wait; the ids. Of those that are to be replaced the next one goes where it may.
     pub(super) fn fill(&mut self, now: Timestamp, commands: &mut Vec<Command>) -> Vec<String> {
+        if self.count(Worker::is_starting) == 0 {
+            self.size.all_started();
+        }
         self.roll(now, commands);
         if !self.restarts.allow(now) {
             return Vec::new();
@@ -218,6 +227,9 @@ impl Pool {
             let what = format!("{id}: {reason}{words}");
             self.crashes += 1;
             self.last_exit.clone_from(&what);
+            if worker.serves_since().is_none() {
+                self.never_ready.clone_from(&what);
+            }
             self.restarts.crashed(now, &self.template, worker.serves_since(), &what);
         }
     }
@@ -254,6 +266,7 @@ impl Pool {
 
     /// A worker's resource is there.
     pub(super) fn offered(&mut self, now: Timestamp, number: u64, commands: &mut Vec<Command>) {
+        self.never_ready.clear();
         if let Some(worker) = self.workers.get_mut(&number) {
             worker.offered(now, commands);
         }
@@ -286,9 +299,11 @@ impl Pool {
         Ok(started.split_off(started.len().saturating_sub(count as usize)))
     }
 
-    /// So many are demanded now. What does not serve yet and is wanted no more is ended; the rest stays.
-    pub(super) fn demanded(&mut self, now: Timestamp, count: u32, commands: &mut Vec<Command>) {
-        if self.size.demand(count) && self.restarts.has_failed() {
+    /// So many are demanded now. What does not serve yet and is wanted no more is ended; the rest stays. Of what moves something there are
+    /// no more because others wait for one that is held.
+    pub(super) fn demanded(&mut self, now: Timestamp, demanded: Demanded, commands: &mut Vec<Command>) {
+        let queued = if self.template.grows_with_the_queue() { demanded.queued } else { 0 };
+        if self.size.demand(Demanded { queued, ..demanded }) && self.restarts.has_failed() {
             self.restarts.forgive();
         }
         let surplus = self.there().saturating_sub(self.wanted()) as usize;

@@ -1,10 +1,14 @@
 //! The desired size of a pool.
 //!
 //! ```text
-//!   wanted = max(asked for (at least `min`), held) + spares,   or what is demanded where that is more;   `max` at the most
+//!   wanted = max(asked for (at least `min`), held) + spares,   or what is demanded or queued for where that is more;   `max` at the most
 //! ```
-//! Those above it end when they have been idle for long enough, the longest idle ones first; who is held never does.
+//! Those above it end when they have been idle for long enough, the longest idle ones first; who is held never does. What is demanded does
+//! not exist, and is wanted for as long as that is so. What is queued for exists and is held: a worker that is being started for it is
+//! started to the end also where that wait is over by then, for the next one to find it. If it were ended, waits that are a little shorter
+//! than a start would start workers again and again and never have one.
 
+use super::demand::Demanded;
 use ratn_model::time::Timestamp;
 use ratn_proto::types::Scale;
 use std::time::Duration;
@@ -19,15 +23,19 @@ pub(super) struct Size {
     most: u32,
     /// What is kept without any demand.
     asked: u32,
-    /// How many there should be for those who wait; 0 when nobody does.
+    /// How many there should be for those who wait for more than exists; 0 when nobody does.
     demanded: u32,
-    /// More is demanded than there may be.
+    /// How many there should be for those who wait for what is held; 0 when nobody does.
+    queued: u32,
+    /// The most of that since nothing was being started.
+    begun: u32,
+    /// More is missing than there may be.
     short: bool,
 }
 
 impl Size {
     pub(super) fn new(min: u32, max: u32, spares: u32) -> Size {
-        Size { min, max, spares, most: max, asked: min, demanded: 0, short: false }
+        Size { min, max, spares, most: max, asked: min, demanded: 0, queued: 0, begun: 0, short: false }
     }
 
     /// At least so many are kept, at most so many started, and so many kept ready beside those that are held.
@@ -53,16 +61,18 @@ impl Size {
         }
         self.asked = if scale.min.is_some() { min } else { self.asked.min(max) };
         self.demanded = self.demanded.min(max);
+        (self.queued, self.begun) = (self.queued.min(max), self.begun.min(max));
         (self.min, self.max, self.spares) = (min, max, spares);
         Ok(())
     }
 
     /// How many there shall be now that so many are held.
     pub(super) fn wanted(&self, held: u32) -> u32 {
-        self.asked.max(held).saturating_add(self.spares).max(self.demanded).min(self.max)
+        let others = self.demanded.max(self.queued).max(self.begun);
+        self.asked.max(held).saturating_add(self.spares).max(others).min(self.max)
     }
 
-    /// More is demanded than there may be.
+    /// More is missing than there may be.
     pub(super) fn is_short(&self) -> bool {
         self.short
     }
@@ -87,12 +97,19 @@ impl Size {
         self.asked = self.asked.saturating_sub(1).max(self.min);
     }
 
-    /// So many are demanded now. True where nothing was before.
-    pub(super) fn demand(&mut self, count: u32) -> bool {
-        let begins = self.demanded == 0 && count > 0;
-        self.short = count > self.max;
-        self.demanded = count.min(self.max);
+    /// So many are demanded now. True where nothing was missing before.
+    pub(super) fn demand(&mut self, demanded: Demanded) -> bool {
+        let begins = self.demanded == 0 && demanded.missing > 0;
+        self.short = demanded.missing > self.max;
+        self.demanded = demanded.missing.min(self.max);
+        self.queued = demanded.queued.min(self.max);
+        self.begun = self.begun.max(self.queued);
         begins
+    }
+
+    /// No worker is being started.
+    pub(super) fn all_started(&mut self) {
+        self.begun = self.queued;
     }
 }
 
@@ -134,12 +151,27 @@ mod tests {
     #[test]
     fn demand_raises_it_for_as_long_as_it_is_there_and_to_the_maximum_only() {
         let mut size = Size::new(0, 3, 0);
-        assert!(size.demand(2));
+        let missing = |missing| Demanded { missing, queued: 0 };
+        assert!(size.demand(missing(2)));
         assert_eq!((size.wanted(0), size.is_short()), (2, false));
-        assert!(!size.demand(9), "it goes on");
+        assert!(!size.demand(missing(9)), "it goes on");
         assert_eq!((size.wanted(0), size.is_short()), (3, true));
-        size.demand(0);
+        size.demand(missing(0));
         assert_eq!((size.wanted(0), size.is_short()), (0, false));
+    }
+
+    #[test]
+    fn what_is_begun_for_those_who_wait_for_what_is_held_is_wanted_until_it_is_there() {
+        let mut size = Size::new(1, 3, 0);
+        let queued = |queued| Demanded { missing: 0, queued };
+        assert!(!size.demand(queued(2)), "nothing is missing: a failed pool is not tried again for it");
+        assert_eq!(size.wanted(1), 2);
+        size.demand(queued(0));
+        assert_eq!(size.wanted(1), 2, "one is being started");
+        size.all_started();
+        assert_eq!(size.wanted(1), 1);
+        size.demand(queued(9));
+        assert_eq!((size.wanted(1), size.is_short()), (3, false), "nothing is missing");
     }
 
     #[test]

@@ -5,7 +5,7 @@ use super::*;
 use crate::process_manager::machine::Sample;
 use crate::process_manager::readiness::Readiness;
 use crate::process_manager::template::{Liveness, Needs};
-use ratn_model::resource::{Requirement, ResourceOperation};
+use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use ratn_model::value::Value;
 use ratn_proto::types::WorkerState;
 use std::ops::Deref;
@@ -311,7 +311,12 @@ fn in_the_end_everything_is_stopped_and_nothing_is_started() {
 fn demand(provided: u32, missing: u32) -> [Demand; 1] {
     let requirement =
         Requirement { count: missing.into(), ..Requirement::new(ResourceOperation::Block, "PathPlanner") };
-    [Demand { requirement, kinds: vec!["Planner".to_owned(), "PathPlanner".to_owned()], provided: provided.into() }]
+    [Demand {
+        requirement,
+        kinds: vec!["Planner".to_owned(), "PathPlanner".to_owned()],
+        provided: provided.into(),
+        queued: Quantity::ZERO,
+    }]
 }
 
 #[test]
@@ -339,6 +344,73 @@ fn for_those_who_wait_workers_are_started_once_and_up_to_the_maximum() {
     });
     assert_eq!(terminated.collect::<Vec<_>>(), ["planner-3@compute", "planner-2@compute"]);
     assert!(pools.shortages().is_empty());
+}
+
+/// So many wait for what is held.
+fn queue(provided: u32, queued: u32) -> [Demand; 1] {
+    demand(provided, queued).map(|demand| Demand { queued: queued.into(), ..demand })
+}
+
+#[test]
+fn a_worker_is_started_for_those_who_wait_for_what_is_held_and_ends_when_it_has_been_idle() {
+    let mut pools = pools(|template| (template.max, template.idle_s) = (Some(2), 20.0));
+    pools.bring_up(at(0.0), "planner-1@compute");
+    pools.used(at(0.0), "planner-1@compute", true);
+    pools.take_commands();
+    pools.demanded(at(1.0), &queue(1, 3));
+    assert_eq!(started(&mut pools), ["planner-2@compute"]);
+    assert!(pools.shortages().is_empty(), "nothing is missing");
+    // The wait is over before the worker is there: it is not ended for that, and the next wait starts no other one.
+    pools.demanded(at(1.2), &[]);
+    pools.demanded(at(1.4), &queue(1, 1));
+    pools.demanded(at(1.6), &[]);
+    assert_eq!(pools.take_commands(), []);
+    pools.bring_up(at(2.0), "planner-2@compute");
+    pools.run_until(at(21.9));
+    assert_eq!(pools.ids().len(), 2);
+    pools.run_until(at(22.0));
+    assert_eq!(pools.ids(), ["planner-1@compute"]);
+}
+
+#[test]
+fn what_does_not_come_up_is_not_tried_again_when_nobody_waits_any_more() {
+    let mut pools = pools(|template| template.max = Some(2));
+    pools.bring_up(at(0.0), "planner-1@compute");
+    pools.used(at(0.0), "planner-1@compute", true);
+    pools.take_commands();
+    pools.demanded(at(1.0), &queue(1, 1));
+    assert_eq!(started(&mut pools), ["planner-2@compute"]);
+    pools.demanded(at(1.2), &[]);
+    pools.exited(at(2.0), "planner-2@compute", "exited with status 1", "");
+    pools.run_until(at(100.0));
+    assert_eq!(started(&mut pools).len(), 0);
+}
+
+#[test]
+fn who_waits_for_a_worker_that_never_becomes_ready_hears_why_while_others_are_tried() {
+    let mut pools = pools(|template| template.crash_limit = 100);
+    assert!(pools.shortages().is_empty());
+    pools.spawned("planner-1@compute");
+    pools.exited(at(1.0), "planner-1@compute", "exited with status 3", "no model");
+    let why = "`planner` has no worker that became ready, and starts another one: planner-1@compute: exited with status 3; \
+               its last words: no model";
+    assert_eq!(pools.shortages()["PathPlanner"], shortage(1, why), "as many may come as before");
+    pools.bring_up(at(2.0), "planner-2@compute");
+    assert!(pools.shortages().is_empty());
+    pools.exited(at(3.0), "planner-2@compute", "killed by signal 9", "");
+    assert!(pools.shortages().is_empty(), "one that was ready");
+}
+
+#[test]
+fn of_what_moves_there_are_no_more_because_others_wait_for_it() {
+    let mut pools = pools(|template| (template.max, template.standstill_ms) = (Some(2), Some(100)));
+    pools.bring_up(at(0.0), "planner-1@compute");
+    pools.used(at(0.0), "planner-1@compute", true);
+    pools.take_commands();
+    pools.demanded(at(1.0), &queue(1, 1));
+    assert_eq!(started(&mut pools).len(), 0);
+    pools.demanded(at(2.0), &demand(1, 1));
+    assert_eq!(started(&mut pools).len(), 1, "what is missing is another matter");
 }
 
 #[test]

@@ -43,9 +43,9 @@ impl ResourceCore {
         Ok(())
     }
 
-    /// Tells providers what is missing, where that may have changed.
+    /// Tells providers what is missing or waited for, where that may have changed.
     pub(super) fn spread_demand(&mut self, context: &ResourceTurn) {
-        if let Some(demand) = self.pool.take_demand(self.providers.kinds()) {
+        if let Some(demand) = self.pool.take_demand(self.providers.provided()) {
             self.demand = demand;
             self.providers.are_to_be_told();
         }

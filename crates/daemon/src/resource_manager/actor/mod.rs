@@ -80,7 +80,7 @@ pub(super) fn start(
         shared: BTreeMap::new(),
         repeated: BTreeMap::new(),
         demand: Vec::new(),
-        providers: Providers::new(live.borrow().provider_patience()),
+        providers: Providers::new(live.borrow().provider_patience(), live.borrow().grow_after()),
         opening: BTreeMap::new(),
         metrics,
     };

@@ -8,6 +8,7 @@ use crate::resource_manager::actor::Message;
 use crate::resource_manager::providers::Provisions;
 use futures::StreamExt;
 use ratn_proto::convert::{all, few, label, name, ports};
+use ratn_proto::types::Provision;
 use ratn_proto::v1;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
@@ -24,7 +25,7 @@ pub(super) async fn watch(
         name(&provision.kind, &format!("provisions[{index}].kind"))?;
     }
     let provisions = Provisions {
-        kinds: request.provisions.into_iter().map(|provision| (provision.kind, provision.most)).collect(),
+        kinds: request.provisions.into_iter().map(kind).collect(),
         attributes: ports(request.attributes, "attributes")?,
     };
     let speaker = speaker(caller);
@@ -37,6 +38,10 @@ pub(super) async fn watch(
         Some((Ok(v1::WatchDemandResponse { demands }), demand))
     });
     Ok(Box::pin(stream.take_until(shutdown.cancelled_owned())))
+}
+
+fn kind(provision: v1::Provision) -> (String, Provision) {
+    (provision.kind, Provision { most: provision.most, grows: provision.grows })
 }
 
 pub(super) async fn report_shortage(
