@@ -27,7 +27,42 @@ mod said {
         let actions = (0..129).map(|n| (format!("a{n}"), None)).collect();
         let crowd = WorkerDescription { actions, ..WorkerDescription::default() };
         assert!(crowd.check().unwrap_err().to_string().starts_with("it says 129 actions"));
+        let defaulted = |of: Type, default: &str| ActionSignature {
+            optional: [("n".to_owned(), of)].into(),
+            defaults: [("n".to_owned(), default.to_owned())].into(),
+            ..ActionSignature::default()
+        };
+        for (of, default) in [(Type::Int, "fast"), (Type::Int, "2.5"), (Type::Joints, "[1, 2]"), (Type::Pose, "-3")] {
+            let words = format!("action `read`: the default of port `n` is `{default}`, which is no {of}");
+            assert_eq!(refused(defaulted(of, default)), words);
+        }
+        for (of, default) in [
+            (Type::Float, "3"),
+            (Type::String, "3"),
+            (Type::Int, "null"),
+            (Type::Joints, "joints(0.1, -0.2)"),
+            (Type::List(Box::new(Type::Float)), "[0.36, -1]"),
+            (Type::Pose, "pose(1.000, 0.000, 0.700; 0.000, 0.000, 0.000, 1.000)"),
+            // Nobody computes what somebody else wrote.
+            (Type::Int, "repeat(repeat(1, 1000000), 1000000)"),
+        ] {
+            assert_eq!(described(defaulted(of, default)).check(), Ok(()));
+        }
         assert_eq!(described(ActionSignature { inputs: ports(128), ..ActionSignature::default() }).check(), Ok(()));
+    }
+
+    #[test]
+    fn an_action_has_a_name_of_any_language_that_a_task_can_write() {
+        let called = |name: &str| {
+            let actions = [(name.to_owned(), None)].into();
+            WorkerDescription { actions, ..WorkerDescription::default() }.check().map_err(|error| error.to_string())
+        };
+        for name in ["3d_scan", "_private", "scan.v2", "scan-twice"] {
+            assert_eq!(called(name), Ok(()));
+        }
+        for name in ["", "-x", ".x", "a/b", "a b", "größe", "a\u{1b}[2J"] {
+            assert!(called(name).unwrap_err().contains("the first one a letter, a digit or `_`"), "{name}");
+        }
     }
 
     #[test]

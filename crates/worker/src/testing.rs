@@ -26,7 +26,7 @@ pub fn perform<const N: usize>(action: impl Action, inputs: [(&str, Value); N]) 
 pub async fn performed<const N: usize>(action: impl Action, inputs: [(&str, Value); N]) -> Result<GoalOutcome, String> {
     let name = action.name().to_owned();
     let server = ActionServer::builder("").action(action);
-    server.description().check().map_err(|error| chain(&error))?;
+    server.check().map_err(|error| chain(&error))?;
     let bound = bind_as(&Endpoint::loopback(), &Exposure::default()).await.map_err(|error| chain(&error))?;
     let (endpoint, shutdown) = (bound.endpoint().clone(), CancellationToken::new());
     let services = Services::new().with(server.build().into_service());

@@ -280,7 +280,7 @@ impl Worker {
     /// [`WorkerError`].
     pub async fn run(self) -> Result<(), WorkerError> {
         let Worker { options, mut actions, safety, standstill, mut resources, leases: asked, shutdown } = self;
-        actions.description().check()?;
+        actions.check()?;
         let has_resource = !options.id.is_empty() || !resources.is_empty();
         match asked {
             _ if safety.is_some() && !has_resource => return Err(WorkerError::MovesWithoutLease),

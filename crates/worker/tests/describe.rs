@@ -73,6 +73,46 @@ async fn a_description_beyond_the_bounds_is_refused_whatever_its_worker_is() {
     assert_eq!(long, DescribeError::Refused("it has more than 65536 bytes".to_owned()));
 }
 
+/// As much as 128 annotations and a description may be, which together is too much.
+struct Wordy(usize, String);
+
+#[async_trait]
+impl Action for Wordy {
+    fn name(&self) -> &str {
+        "word"
+    }
+
+    fn description(&self) -> &str {
+        &self.1
+    }
+
+    fn signature(&self) -> Option<Signature> {
+        Some((0..self.0).fold(Signature::new(), |signature, _| signature.reads(&"x".repeat(512))))
+    }
+
+    async fn execute(&self, _: GoalContext) -> ActionResult {
+        Ok(GoalOutcome::success())
+    }
+}
+
+#[tokio::test]
+async fn what_nobody_would_believe_is_refused_where_the_worker_starts() {
+    let refused = |action: Result<(), ratn_model::catalogue::DescriptionError>| action.unwrap_err().to_string();
+    let wordy = |annotations| ActionServer::builder("").action(Wordy(annotations, "x".repeat(2_048))).check();
+    assert_eq!(wordy(120), Ok(()));
+    let long = refused(wordy(128));
+    assert!(long.starts_with("it has 6") && long.ends_with("bytes: at most 65536 are taken"), "{long}");
+    let defaulted = |of, value| Talker(Some(Signature::new().with_default("n", of, value)), 0);
+    let words = "action `talk`: the default of port `n` is `fast`, which is no int";
+    let wrong = || defaulted(Type::Int, Value::String("fast".to_owned()));
+    assert_eq!(refused(ActionServer::builder("").action(wrong()).check()), words);
+    assert_eq!(performed(wrong(), []).await.unwrap_err(), words);
+    // What is not told by its text, either.
+    let pose = defaulted(Type::Joints, Value::Pose(ratn_model::pose::Pose::at(1.0, 0.0, 0.0)));
+    assert!(refused(ActionServer::builder("").action(pose).check()).contains("which is no joints"));
+    assert_eq!(ActionServer::builder("").action(defaulted(Type::Int, Value::Null)).check(), Ok(()));
+}
+
 #[tokio::test]
 async fn goals_are_as_the_signature_says_with_its_defaults() {
     let talk = || Talker(Some(signature()), 0);

@@ -2,8 +2,12 @@
 //! words: it is believed only within these bounds.
 
 use super::{ActionSignature, Catalogue, Provider, ResourceOffer};
+use crate::expression::parse::parse_expression;
+use crate::expression::scope::NothingKnown;
+use crate::expression::{Expr, Function};
+use crate::parameters::NoNames;
 use crate::resource::{Quantity, ResourceClass};
-use crate::value::Type;
+use crate::value::{Type, Value};
 use std::collections::BTreeMap;
 
 /// Actions of one worker.
@@ -44,9 +48,7 @@ pub enum DescriptionError {
         most: usize,
     },
     /// A name that no task could write.
-    #[error(
-        "its {what} `{name}`{of} is no name: 1 to {NAME_BYTES} ASCII letters, digits, `_` and `-`, the first one a letter"
-    )]
+    #[error("its {what} `{name}`{of} is no name: {rule}")]
     Name {
         /// Of what.
         what: &'static str,
@@ -54,6 +56,8 @@ pub enum DescriptionError {
         of: String,
         /// As it says it, cut.
         name: String,
+        /// What names are like.
+        rule: &'static str,
     },
     /// A text that nobody would read.
     #[error("its {what}{of} is too long, or not one line of text: at most {most} bytes without control characters")]
@@ -73,6 +77,26 @@ pub enum DescriptionError {
         /// Which.
         port: String,
     },
+    /// A default that the port would not take.
+    #[error("action `{action}`: the default of port `{port}` is `{default}`, which is no {expected}")]
+    Default {
+        /// Of which action.
+        action: String,
+        /// Which.
+        port: String,
+        /// As it says it, cut.
+        default: String,
+        /// The port's type.
+        expected: Type,
+    },
+    /// More than is read.
+    #[error("it has {bytes} bytes: at most {most} are taken")]
+    TooLarge {
+        /// On the wire.
+        bytes: usize,
+        /// How many are taken.
+        most: usize,
+    },
     /// A type that the grammar does not know.
     #[error("action `{action}`: port `{port}`: {why}")]
     Type {
@@ -91,6 +115,18 @@ pub enum DescriptionError {
     },
 }
 
+impl DescriptionError {
+    /// A default that is not of its port's type.
+    pub fn default_of(action: &str, port: &str, default: &str, expected: &Type) -> DescriptionError {
+        DescriptionError::Default {
+            action: shown(action),
+            port: shown(port),
+            default: shown(default),
+            expected: expected.clone(),
+        }
+    }
+}
+
 impl WorkerDescription {
     /// Refuses what is beyond the bounds, by name.
     ///
@@ -104,7 +140,7 @@ impl WorkerDescription {
             }
         }
         for (action, signature) in &self.actions {
-            name("action", "", action)?;
+            action_name(action)?;
             signature.as_ref().map_or(Ok(()), |signature| check(action, signature))?;
         }
         Ok(())
@@ -156,9 +192,37 @@ fn check(action: &str, signature: &ActionSignature) -> Result<(), DescriptionErr
         return Err(DescriptionError::Port { action: action.to_owned(), port: shown(port) });
     }
     outcomes.iter().try_for_each(|outcome| name("outcome", &of, outcome))?;
-    defaults.values().try_for_each(|default| text("default", &of, default, TEXT_BYTES))?;
+    for (port, default) in defaults {
+        text("default", &of, default, TEXT_BYTES)?;
+        if let Some(expected) = optional.get(port).filter(|expected| !may_be(default, expected)) {
+            return Err(DescriptionError::default_of(action, port, default, expected));
+        }
+    }
     let mut lists = annotations.lists().into_iter();
     lists.try_for_each(|(key, list)| list.iter().try_for_each(|said| text(key, &of, said, TEXT_BYTES)))
+}
+
+/// Whether a default as people write it may be of this type. What is no plain constant (a trajectory, a pose with a quaternion) may be anything,
+/// and is not computed: a few characters of somebody else's make a list of a million elements.
+fn may_be(default: &str, expected: &Type) -> bool {
+    if matches!(expected, Type::Any | Type::String) {
+        return true;
+    }
+    let plain = parse_expression(default, &mut NoNames).ok().filter(is_plain);
+    match plain.and_then(|expr| expr.evaluate(&NothingKnown).ok()) {
+        None | Some(Value::Null) => true,
+        Some(value) => expected.accepts(&value),
+    }
+}
+
+fn is_plain(expr: &Expr) -> bool {
+    match expr {
+        Expr::Literal(_) => true,
+        Expr::Unary(_, of) => is_plain(of),
+        Expr::List(items) | Expr::Call(Function::Pose | Function::Joints, items) => items.iter().all(is_plain),
+        Expr::Map(fields) => fields.iter().all(|(_, item)| is_plain(item)),
+        _ => false,
+    }
 }
 
 fn bound(what: &'static str, of: &str, count: usize, most: usize) -> Result<(), DescriptionError> {
@@ -171,7 +235,19 @@ fn name(what: &'static str, of: &str, said: &str) -> Result<(), DescriptionError
     if begins && said.len() <= NAME_BYTES && said.chars().all(good) {
         return Ok(());
     }
-    Err(DescriptionError::Name { what, of: of.to_owned(), name: shown(said) })
+    let rule = "1 to 64 ASCII letters, digits, `_` and `-`, the first one a letter";
+    Err(DescriptionError::Name { what, of: of.to_owned(), name: shown(said), rule })
+}
+
+/// An action's name stands behind a slash and in no expression: it may be any word of a language that others write workers in.
+fn action_name(said: &str) -> Result<(), DescriptionError> {
+    let good = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
+    let begins = said.chars().next().is_some_and(|c| c.is_ascii_alphanumeric() || c == '_');
+    if begins && said.len() <= NAME_BYTES && said.chars().all(good) {
+        return Ok(());
+    }
+    let rule = "1 to 64 ASCII letters, digits, `_`, `-` and `.`, the first one a letter, a digit or `_`";
+    Err(DescriptionError::Name { what: "action", of: String::new(), name: shown(said), rule })
 }
 
 fn text(what: &'static str, of: &str, said: &str, most: usize) -> Result<(), DescriptionError> {

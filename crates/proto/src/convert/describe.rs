@@ -1,11 +1,21 @@
 //! What a worker says of itself.
 
 use crate::v1;
+use prost::Message;
 use ratn_model::catalogue::{ActionSignature, Annotations, DescriptionError, WorkerDescription};
 use std::collections::BTreeMap;
 
 /// Bytes of a description on the wire.
 pub const MAX_DESCRIPTION_BYTES: usize = 65_536;
+
+/// Whether a description is as small as who asks for it takes it.
+///
+/// # Errors
+/// [`DescriptionError::TooLarge`].
+pub fn check_size(said: &v1::DescribeResponse) -> Result<(), DescriptionError> {
+    let (bytes, most) = (said.encoded_len(), MAX_DESCRIPTION_BYTES);
+    if bytes <= most { Ok(()) } else { Err(DescriptionError::TooLarge { bytes, most }) }
+}
 
 impl From<ActionSignature> for v1::ActionSignature {
     fn from(signature: ActionSignature) -> v1::ActionSignature {

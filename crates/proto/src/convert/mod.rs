@@ -20,7 +20,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use crate::v1;
-pub use describe::MAX_DESCRIPTION_BYTES;
+pub use describe::{MAX_DESCRIPTION_BYTES, check_size};
 pub use scene::digest;
 
 /// Lists and maps nest at most this deep.

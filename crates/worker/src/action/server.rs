@@ -4,7 +4,7 @@ use super::admission::{Admission, Limits, State};
 use super::authority::Authority;
 use super::goal::{Ending, Fingerprint, GoalEntry, LeaseKey, StopCause};
 use super::run::run;
-use super::service::Messages;
+use super::service::{Messages, described};
 use super::{Action, GoalContext};
 use crate::access::Caller;
 use crate::client::Channels;
@@ -14,7 +14,8 @@ use crate::panic::exit_on_panic;
 use crate::safety::Safety;
 use crate::tls::ClientTls;
 use crate::trace;
-use ratn_model::catalogue::{ActionSignature, WorkerDescription};
+use ratn_model::catalogue::{ActionSignature, DescriptionError, WorkerDescription};
+use ratn_proto::convert::check_size;
 use ratn_proto::types::Goal;
 use std::collections::BTreeMap;
 use std::fmt;
@@ -92,6 +93,18 @@ impl ActionServerBuilder {
         };
         let actions = self.actions.iter().map(|(name, action)| (name.clone(), said(action))).collect();
         WorkerDescription { provider: self.provider.clone(), kind: self.kind.clone(), actions }
+    }
+
+    /// Whether all of that is believed by whoever asks: what is beyond the bounds is told here, to who wrote it.
+    ///
+    /// # Errors
+    /// [`DescriptionError`] of the first thing that is not.
+    pub fn check(&self) -> Result<(), DescriptionError> {
+        for (name, action) in &self.actions {
+            action.signature().map_or(Ok(()), |signature| signature.check_defaults(name))?;
+        }
+        self.description().check()?;
+        check_size(&described(&self.resource, (&self.provider, &self.kind), &self.actions))
     }
 
     /// A resource performs one goal at a time: a further one is refused, unless the one before was told to stop: then

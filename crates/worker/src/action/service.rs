@@ -15,6 +15,7 @@ use ratn_proto::types::Goal;
 use ratn_proto::v1;
 use ratn_proto::v1::action_service_server::{ActionService, ActionServiceServer};
 use ratn_proto::v1::execute_response::Kind;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use tokio::sync::broadcast::error::RecvError;
 use tokio::sync::{broadcast, watch};
@@ -79,18 +80,28 @@ impl ActionService for ActionServer {
     }
 
     async fn describe(&self, _: Request<v1::DescribeRequest>) -> Result<Response<v1::DescribeResponse>, Status> {
-        let description = |action: &Arc<dyn super::Action>| v1::ActionDescription {
-            name: action.name().to_owned(),
-            description: action.description().to_owned(),
-            cancel_when_abandoned: action.cancel_when_abandoned(),
-            signature: action.signature().map(|signature| signature.said().clone().into()),
-        };
-        Ok(Response::new(v1::DescribeResponse {
-            resource_id: self.inner.resource.clone(),
-            actions: self.inner.actions.values().map(description).collect(),
-            provider: self.inner.provider.clone(),
-            kind: self.inner.kind.clone(),
-        }))
+        let inner = &self.inner;
+        Ok(Response::new(described(&inner.resource, (&inner.provider, &inner.kind), &inner.actions)))
+    }
+}
+
+/// What a provider of this resource, name and kind says of itself.
+pub(super) fn described(
+    resource: &str,
+    (provider, kind): (&str, &str),
+    actions: &BTreeMap<String, Arc<dyn super::Action>>,
+) -> v1::DescribeResponse {
+    let description = |action: &Arc<dyn super::Action>| v1::ActionDescription {
+        name: action.name().to_owned(),
+        description: action.description().to_owned(),
+        cancel_when_abandoned: action.cancel_when_abandoned(),
+        signature: action.signature().map(|signature| signature.said().clone().into()),
+    };
+    v1::DescribeResponse {
+        resource_id: resource.to_owned(),
+        actions: actions.values().map(description).collect(),
+        provider: provider.to_owned(),
+        kind: kind.to_owned(),
     }
 }
 

@@ -1,6 +1,6 @@
 //! What an action says of itself: its ports with their types and defaults, its outcomes, and what states that perform it may say.
 
-use ratn_model::catalogue::ActionSignature;
+use ratn_model::catalogue::{ActionSignature, DescriptionError};
 use ratn_model::value::{Type, Value};
 use ratn_proto::types::GoalOutcome;
 use std::collections::BTreeMap;
@@ -139,6 +139,19 @@ impl Signature {
     pub fn effect(mut self, effect: &str) -> Signature {
         self.said.annotations.effects.push(effect.to_owned());
         self
+    }
+
+    /// Whether every default is of its port's type.
+    ///
+    /// # Errors
+    /// [`DescriptionError::Default`] of the first that is not.
+    pub fn check_defaults(&self, action: &str) -> Result<(), DescriptionError> {
+        let wrong = |(port, value): (&String, &Value)| {
+            let expected = self.said.optional.get(port)?;
+            let fits = *value == Value::Null || expected.accepts(value);
+            (!fits).then(|| DescriptionError::default_of(action, port, &value.to_string(), expected))
+        };
+        self.defaults.iter().find_map(wrong).map_or(Ok(()), Err)
     }
 
     /// What it says, for a catalogue.
