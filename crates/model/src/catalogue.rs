@@ -67,9 +67,23 @@ pub struct Provider {
     /// How many joint positions its inputs of type `joints` have; `None` is any number.
     #[serde(default)]
     pub joints: Option<u32>,
+    /// Whose joints these are, for messages; known where the robot is.
+    #[serde(skip)]
+    pub chain: Option<JointChain>,
     /// By action name, the part after the slash.
     #[serde(default)]
     pub actions: BTreeMap<String, ActionSignature>,
+}
+
+/// The joints that a provider moves.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct JointChain {
+    /// What the robot is called.
+    pub robot: String,
+    /// What its arm is called.
+    pub arm: String,
+    /// From the foot to the tool.
+    pub joints: Vec<String>,
 }
 
 /// The ports of an action, and what else a task has to know of it.

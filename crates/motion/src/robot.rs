@@ -171,6 +171,12 @@ impl Robot {
         BUILT_IN.into_iter().map(|(name, ..)| name)
     }
 
+    /// What the `robot.toml` says of the robot of this name that we ship; its URDF is not read.
+    pub fn built_in_description(name: &str) -> Option<RobotDescription> {
+        let (_, description, ..) = BUILT_IN.into_iter().find(|(known, ..)| *known == name)?;
+        RobotDescription::read(description).ok()
+    }
+
     /// The robot of this name that we ship.
     pub fn built_in(name: &str) -> Option<Robot> {
         let (_, description, urdf, srdf) = BUILT_IN.into_iter().find(|(known, ..)| *known == name)?;

@@ -28,8 +28,9 @@ pub(crate) struct CheckArguments {
     /// Check against the system that runs there, too: what its workers say of themselves extends the catalogue, or is compared with it
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
-    /// The robot: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml; the config's unless given
-    #[arg(long, value_name = "ROBOT")]
+    /// The robot: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml; the config's unless given. The robot of a
+    /// system that runs is its own
+    #[arg(long, value_name = "ROBOT", conflicts_with = "runtime_dir")]
     pub(crate) robot: Option<String>,
     /// Only check: leave out the simulation that says what keeps the task sequential
     #[arg(long)]

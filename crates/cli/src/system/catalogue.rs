@@ -40,16 +40,18 @@ pub(crate) fn read(file: &Path) -> anyhow::Result<Catalogue> {
 
 /// Adds another catalogue; of what both have the added one decides.
 pub(crate) fn extend(catalogue: &mut Catalogue, by: Catalogue) {
-    for (name, Provider { resource, joints, actions }) in by.providers {
+    for (name, Provider { resource, joints, chain, actions }) in by.providers {
         match catalogue.providers.entry(name) {
             Entry::Occupied(mut known) => {
                 let known = known.get_mut();
                 known.resource = resource;
-                known.joints = joints.or(known.joints);
+                if joints.is_some() {
+                    (known.joints, known.chain) = (joints, chain);
+                }
                 known.actions.extend(actions);
             }
             Entry::Vacant(place) => {
-                place.insert(Provider { resource, joints, actions });
+                place.insert(Provider { resource, joints, chain, actions });
             }
         }
     }

@@ -12,7 +12,7 @@ use ratn_daemon::process_manager::{ProcessManagerConfig, Template};
 use ratn_daemon::resource_manager::ResourceManagerConfig;
 use ratn_daemon::service::ServiceConfig;
 use ratn_daemon::world_pool::WorldPoolConfig;
-use ratn_model::catalogue::Catalogue;
+use ratn_model::catalogue::{Catalogue, JointChain};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_motion::description::DescriptionError;
 use ratn_motion::robot::Robot;
@@ -80,11 +80,13 @@ struct Parts {
     modules: Vec<Module>,
     /// Of its arm; as the catalogue says unless given.
     joints: Option<u32>,
+    /// Which those are.
+    chain: Option<JointChain>,
 }
 
 impl Default for Parts {
     fn default() -> Self {
-        Parts { modules: Module::ALL.to_vec(), joints: None }
+        Parts { modules: Module::ALL.to_vec(), joints: None, chain: None }
     }
 }
 
@@ -97,6 +99,8 @@ impl Parts {
         catalogue.providers.retain(|_, provider| !lacks(&provider.resource));
         for provider in catalogue.providers.values_mut().filter(|provider| provider.joints.is_some()) {
             provider.joints = self.joints.or(provider.joints);
+            let has = |chain: &&JointChain| u32::try_from(chain.joints.len()).ok() == provider.joints;
+            provider.chain = self.chain.as_ref().filter(has).cloned();
         }
     }
 }
@@ -193,6 +197,13 @@ impl SystemConfig {
     fn fit_robot(&mut self) -> anyhow::Result<()> {
         self.cell.robot.clone_from(&self.robot);
         if self.robot == AIMM {
+            // It has all that a catalogue can name; its joints are named in its description.
+            self.parts.chain = Robot::built_in_description(AIMM).map(|robot| JointChain {
+                robot: robot.name,
+                arm: robot.arm.name,
+                joints: robot.arm.joints,
+            });
+            self.parts.fit(&mut self.catalogue);
             return Ok(());
         }
         let robot = Robot::named_or_file(&self.robot).map_err(|error| match error {
@@ -202,7 +213,13 @@ impl SystemConfig {
             }
             error => error.into(),
         })?;
-        self.parts = Parts { modules: Module::of(&robot), joints: Some(u32::try_from(robot.arm_joints().len())?) };
+        let chain = JointChain {
+            robot: robot.name().to_owned(),
+            arm: robot.arm_name().to_owned(),
+            joints: robot.arm_joints().iter().map(|joint| joint.name.clone()).collect(),
+        };
+        let joints = Some(u32::try_from(chain.joints.len())?);
+        self.parts = Parts { modules: Module::of(&robot), joints, chain: Some(chain) };
         self.parts.fit(&mut self.catalogue);
         let not_told = |template: &&Template| {
             let says = |word: &str| template.args.iter().any(|argument| argument == word);
@@ -361,6 +378,24 @@ mod tests {
         assert_eq!(parse(&config.to_toml().unwrap(), "again").unwrap(), config);
         let six = parse("robot = \"ur5\"", "x.toml").unwrap();
         assert_eq!(six.catalogue.providers["arm"].joints, Some(6));
+    }
+
+    #[test]
+    fn joints_of_the_wrong_number_are_refused_with_the_robot_and_its_joints() {
+        let refusal = |config: &str, joints: &str| {
+            let config =
+                if config.is_empty() { SystemConfig::load(None).unwrap() } else { parse(config, "x.toml").unwrap() };
+            let task = format!(
+                "task: t\nstates:\n  - go: {{ action: arm/move_to, in: {{ joints: \"{joints}\" }}, resources: [Arm] }}\n"
+            );
+            let findings = ratn_model::load::load(&task, "t.yaml", &config.catalogue).unwrap_err();
+            findings.iter().map(|finding| finding.message.clone()).collect::<Vec<_>>()
+        };
+        let six = refusal("robot = \"ur5\"", "joints(0, 0, 0, 0, 0, 0, 0)").remove(0);
+        let words = "the arm `arm` of the robot `ur5` has 6 joints (";
+        assert!(six.contains(words) && six.ends_with("), and these are the positions of 7"), "{six}");
+        let seven = refusal("", "joints(0, 0, 0)").remove(0);
+        assert!(seven.contains("of the robot `aimm` has 7 joints (arm_joint_1, "), "{seven}");
     }
 
     #[test]

@@ -161,6 +161,7 @@ impl Catalogue {
         let provider = self.providers.entry(worker.provider.clone()).or_insert_with(|| Provider {
             resource: kind.to_owned(),
             joints: None,
+            chain: None,
             actions: BTreeMap::new(),
         });
         if provider.resource != kind {

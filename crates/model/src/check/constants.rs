@@ -1,6 +1,7 @@
 //! Constants that have no value: what needs neither variables, outputs nor facts is evaluated here and now, as it will be then.
 
 use super::{Subject, named};
+use crate::catalogue::JointChain;
 use crate::diagnostic::Findings;
 use crate::expression::scope::NothingKnown;
 use crate::expression::{EvaluateError, Expr, FactExpr, Function};
@@ -25,10 +26,20 @@ pub(super) fn check(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: 
 /// Joint positions of another number than the provider's.
 fn joints(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: &Expr) -> Option<String> {
     let StateKind::Action { provider, .. } = &state.kind else { return None };
-    let wanted = subject.catalogue.providers.get(provider)?.joints?;
+    let known = subject.catalogue.providers.get(provider)?;
+    let wanted = known.joints?;
     let Ok(Value::Joints(found)) = expr.evaluate(&NothingKnown) else { return None };
     let fits = !matches!(slot, Slot::Input(_)) || usize::try_from(wanted).is_ok_and(|wanted| wanted == found.len());
-    (!fits).then(|| format!("`{provider}` has {wanted} joints, and these are the positions of {}", found.len()))
+    (!fits).then(|| {
+        let count = found.len();
+        match &known.chain {
+            None => format!("`{provider}` has {wanted} joints, and these are the positions of {count}"),
+            Some(JointChain { robot, arm, joints }) => format!(
+                "the arm `{arm}` of the robot `{robot}` has {wanted} joints ({}), and these are the positions of {count}",
+                joints.join(", ")
+            ),
+        }
+    })
 }
 
 /// What is wrong with the first part that is a constant and has no value. A part that may be passed over (the branches of an `if`, the
