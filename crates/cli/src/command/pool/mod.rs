@@ -165,6 +165,13 @@ async fn mismatches(arguments: &HostArguments, tls: &ClientTls) -> Vec<String> {
     }
 }
 
+/// More of workers that are otherwise than the catalogue says are told of, as far as those of the template that are ready say.
+async fn warn_of_mismatches(arguments: &HostArguments, tls: &ClientTls, template: &str) {
+    let is_of_it = |what: &&String| what.strip_prefix(template).is_some_and(|rest| rest.starts_with('-'));
+    let mismatches = mismatches(arguments, tls).await;
+    mismatches.iter().filter(is_of_it).for_each(|what| output::progress(format_args!("warning: {what}")));
+}
+
 /// Prints what workers wrote.
 pub(super) fn logs(arguments: &LogsArguments, tls: &ClientTls) -> Result<(), Failure> {
     asking(logs::print(arguments, tls))
@@ -177,7 +184,9 @@ pub(super) fn run(arguments: &PoolArguments, tls: &ClientTls) -> Result<(), Fail
         match &arguments.command {
             PoolCommand::Start { template, count } => {
                 let one = hosts::the_one(host, tls, &format!("template `{template}`"), has(template)).await?;
-                ids(host, &one.client.spawn(template, *count).await.context("not started")?)
+                ids(host, &one.client.spawn(template, *count).await.context("not started")?)?;
+                warn_of_mismatches(host, tls, template).await;
+                Ok(())
             }
             PoolCommand::Stop { workers } => {
                 for id in workers {
@@ -190,6 +199,7 @@ pub(super) fn run(arguments: &PoolArguments, tls: &ClientTls) -> Result<(), Fail
                 let one = hosts::the_one(host, tls, &format!("template `{template}`"), has(template)).await?;
                 let scale = Scale { min: size.min, max: size.max, spares: size.spares };
                 let pool = one.client.scale(template, scale).await?;
+                warn_of_mismatches(host, tls, template).await;
                 if host.json {
                     return Ok(output::result(show::pool_json(&pool))?);
                 }
