@@ -96,7 +96,7 @@ pub(crate) enum Budget {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct DemoArguments {
-    /// The robot: the name of a built-in one: aimm, panda or ur5; the config's unless given
+    /// The robot: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml with a workplace; the config's unless given
     #[arg(long, value_name = "ROBOT")]
     pub(crate) robot: Option<String>,
     /// Which of the paper's experiments: boxes are fetched onto the base, or a table is set with tableware from a rack

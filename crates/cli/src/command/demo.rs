@@ -3,6 +3,7 @@
 //! Every run gets a system of its own, started fresh from the same seed, so that nothing of one run helps or hinders the next.
 
 mod result;
+mod table_task;
 
 use super::run::{on_system, starting};
 use super::{blocking_here, check};
@@ -25,6 +26,7 @@ use ratn_report::timeline::Timeline;
 use ratn_task_control::shell::Run;
 use ratn_worker::tls::ClientTls;
 use result::{Demonstration, Outcome, Plan};
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -44,8 +46,6 @@ const LOOK_AND_SET: (&str, &str) =
 /// How far a bowl or a cup may have leaned on its way, in radians: as far as the task says, and what the grasp adds.
 const MAX_TILT_RAD: f64 = 0.11;
 
-/// The robots that fetch boxes on a table; their workplaces are the same.
-const ON_TABLE: [&str; 2] = ["panda", "ur5"];
 /// The posture that the task begins to look in, and its parameter for it.
 const OBSERVATION: &str = "observation";
 
@@ -63,13 +63,13 @@ pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Fail
     let config = SystemConfig::load_for(arguments.config.as_deref(), arguments.robot.as_deref())?;
     let tls = &config.client_tls(tls)?;
     let (file, text) = match arguments.scenario {
-        scenario if config.robot != AIMM => on_table(&config.robot, scenario, arguments)?,
-        Setting::Boxes if arguments.faults.fault.is_empty() => FETCH,
-        Setting::Boxes => RECOVERING,
-        Setting::Table => LOOK_AND_SET,
+        scenario if config.robot != AIMM => (FETCH_ON_TABLE.0, on_table(&config.robot, scenario, arguments)?.into()),
+        Setting::Boxes if arguments.faults.fault.is_empty() => built_in(FETCH),
+        Setting::Boxes => built_in(RECOVERING),
+        Setting::Table => built_in(LOOK_AND_SET),
     };
     let goods = result::Goods::of(arguments, config.robot == AIMM)?;
-    let program = Arc::new(check::load_from(&BuiltIn, text, file, &config.catalogue)?);
+    let program = Arc::new(check::load_from(&BuiltIn, &text, file, &config.catalogue)?);
     let directory = out_directory(arguments)?;
     let setup = Setup { goods: &goods, arguments, config: &config, program: &program, directory: &directory, tls };
     let mut demonstration = Demonstration::new(arguments, goods);
@@ -111,23 +111,22 @@ pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Fail
     failed.map_or(Ok(()), |failed| Err(anyhow!(failed).into()))
 }
 
-/// The task for a robot that is not the paper's.
-fn on_table(
-    robot: &str,
-    scenario: Setting,
-    arguments: &DemoArguments,
-) -> Result<(&'static str, &'static str), Failure> {
-    let why = if !ON_TABLE.contains(&robot) {
-        let known = ON_TABLE.join(" and ");
-        format!("the demo has tasks for {AIMM}, {known}: run your own with `ratn run TASK --robot {robot}`")
-    } else if scenario != Setting::Boxes {
-        format!("the scenario `table` is made for {AIMM}: use `--scenario boxes`")
-    } else if !arguments.faults.fault.is_empty() {
-        format!("the task that recovers from faults is made for {AIMM}: leave out --fault")
-    } else {
-        return Ok(FETCH_ON_TABLE);
-    };
-    Err(Failure::Refused(format!("ratn: --robot {robot}: {why}")))
+fn built_in((file, text): (&'static str, &'static str)) -> (&'static str, Cow<'static, str>) {
+    (file, text.into())
+}
+
+/// The text of the task for a robot that is not the paper's, with the table and the places of its workplace.
+fn on_table(robot: &str, scenario: Setting, arguments: &DemoArguments) -> Result<String, Failure> {
+    let refused = |why: String| Failure::Refused(format!("ratn: --robot {robot}: {why}"));
+    if scenario != Setting::Boxes {
+        return Err(refused(format!("the scenario `table` is made for {AIMM}: use `--scenario boxes`")));
+    }
+    if !arguments.faults.fault.is_empty() {
+        return Err(refused(format!("the task that recovers from faults is made for {AIMM}: leave out --fault")));
+    }
+    let described = Robot::named_or_file(robot).map_err(|error| refused(error.to_string()))?;
+    let workplace = table_task::workplace(&described, OBSERVATION, arguments.boxes).map_err(refused)?;
+    Ok(table_task::at(FETCH_ON_TABLE.1, workplace)?)
 }
 
 /// A robot's posture out of the camera's view, as a parameter of its task.
