@@ -52,11 +52,10 @@ fn parts(workplace: &Workplace) -> [String; 6] {
         let _ = writeln!(lines, "  - \"at(place_{}) = pose({x}, {y}, {z}, 0, 0, {yaw})\"", index + 1);
     }
     // Around a box that stands at the edge, whichever way; and around one that lies as the places do.
-    let [longer, shorter, _] = boxes.greatest;
-    let around = longer + 0.04;
-    let (along, across) = (2.0 * longer, shorter + 0.1);
+    let [longer, ..] = boxes.greatest;
+    let (around, along) = (longer + 0.04, 2.0 * longer);
     let (cosine, sine) = (places.yaw.cos().abs(), places.yaw.sin().abs());
-    let beside = [along * cosine + across * sine, along * sine + across * cosine];
+    let beside = [along * cosine + around * sine, along * sine + around * cosine];
     let of_places = [0, 1].map(|axis| range(places.at.iter().map(|at| at[axis])));
     [
         format!("at(table) = pose({})", numbers(&table.centre)),
