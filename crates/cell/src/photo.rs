@@ -3,7 +3,6 @@
 use crate::config::CellConfig;
 use crate::core::cell::Cell;
 use anyhow::{Context as _, ensure};
-use ratn_model::pose::Pose;
 use ratn_motion::robot::Configuration;
 use ratn_perception::camera::{Camera, Intrinsics};
 
@@ -25,7 +24,7 @@ pub fn photo(config: CellConfig, from: Option<[f64; 3]>, towards: [f64; 3]) -> a
             Camera::looking(eye, towards, OPTICS)
         }
         None => {
-            let (pan, tilt) = cell.robot().look_at(&Pose::IDENTITY, towards);
+            let (pan, tilt) = cell.robot().look_at(&cell.configuration(), towards);
             let looking = Configuration { pan, tilt, ..cell.configuration() };
             let pose = cell.robot().camera_pose(&looking).context("the robot has no camera: say from where")?;
             Camera { intrinsics: OPTICS, pose }

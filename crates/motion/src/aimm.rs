@@ -21,9 +21,6 @@ pub const TABLE_CENTRE: [f64; 3] = [0.80, 0.0, 0.675];
 /// The table's top slab: its edges.
 pub const TABLE_SIZE: [f64; 3] = [0.60, 1.20, 0.05];
 
-/// Where the base may drive: least and greatest x, least and greatest y.
-pub const DRIVE_AREA: [[f64; 2]; 2] = [[-4.5, 4.5], [-4.5, 4.5]];
-
 /// Where the centres of boxes may stand on the table: least and greatest x, least and greatest y. Any yaw.
 pub const BOX_REGION: [[f64; 2]; 2] = [[0.62, 0.84], [-0.38, 0.38]];
 
@@ -178,7 +175,7 @@ mod tests {
     /// Which points of a patch of floor, or up to a box's height above it, the robot hides from the camera looking at `target`.
     fn hidden(arm: JointVector, target: [f64; 3], [x_low, x_high]: [f64; 2], [y_low, y_high]: [f64; 2]) -> Vec<String> {
         let robot = Robot::aimm();
-        let (pan, tilt) = robot.look_at(&Pose::IDENTITY, target);
+        let (pan, tilt) = robot.look_at(&robot.at_zero(), target);
         let configuration = Configuration { arm, pan, tilt, finger: GRIPPER_OPENING_M / 2.0, ..robot.at_zero() };
         let eye = robot.camera_pose(&configuration).unwrap().position;
         // The base carries the deck: looking at it, its surface is no obstacle.

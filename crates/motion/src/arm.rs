@@ -1,6 +1,6 @@
-//! Our robot's arm among the objects of a scene, as the vector checks want it.
+//! A robot's arm among the objects of a scene, as the vector checks want it.
 //!
-//! A [`Mechanism`] of the seven arm joints in the frame of the base. What the arm moves (links, hand, fingers, what is held) has
+//! A [`Mechanism`] of the arm's joints in the frame of the base. What the arm moves (links, hand, fingers, what is held) has
 //! spheres; what it does not move (base, mast, the objects of the scene) are obstacles. The spheres stand out of the shapes by
 //! at most [`OVERHANG_M`] and hold them with at least [`CLEARANCE_M`] to spare. So what the exact check with a padding of `OVERHANG_M`
 //! finds clear of obstacles the spheres do too, and what the spheres find free is free by the exact check with `CLEARANCE_M`.
@@ -46,7 +46,7 @@ pub fn in_scene(robot: &Robot, scene: &Scene, here: &Configuration) -> (Mechanis
             obstacles.push(Obstacle { name, pose: resting[index].compose(&body.upright()), geometry: body.geometry });
         }
     }
-    let inverse = on_floor(&scene.base).inverse();
+    let inverse = on_floor(robot, &scene.base).inverse();
     // What holds something and what is held may touch each other.
     let mut grips: Vec<usize> = (0..arm.links.len()).filter(|l| is_gripper(robot, *l)).collect();
     for object in &scene.objects {
@@ -77,8 +77,11 @@ pub fn assumed(robot: &Robot, scene: &Scene) -> Configuration {
     Configuration { finger: finger_around_held(robot, scene), ..robot.at_zero().with_base(&scene.base) }
 }
 
-/// The base's place and heading on the floor.
-pub fn on_floor(base: &Pose) -> Pose {
+/// The base's place and heading on the floor. A robot without a base stands where its URDF puts it, whatever is said of a base.
+pub fn on_floor(robot: &Robot, base: &Pose) -> Pose {
+    if robot.base_joints().is_empty() {
+        return Pose::IDENTITY;
+    }
     let [x, y, yaw] = crate::robot::on_floor(base);
     Pose::from_rpy([x, y, 0.0], 0.0, 0.0, yaw)
 }

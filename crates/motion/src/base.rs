@@ -4,7 +4,6 @@
 //! The path is that of `drive`, its corners are rounded and it is timed like the arm's (`timing`), in x, y and heading. What
 //! stands on the deck, and what is held, rides along. Headings of a trajectory go on beyond half a turn; those of a place do not.
 
-use crate::aimm;
 use crate::collision::length;
 use crate::connect::{Budget, ConnectError};
 use crate::drive::{Vehicle, drive_in, wrapped};
@@ -186,12 +185,14 @@ pub fn plan_drive(
     request.check(robot)?;
     let here = request.start.with_base(&scene.base);
     let riding = riding(robot, scene);
-    let (vehicle, obstacles) = Vehicle::of(robot, scene, &here, &riding, aimm::DRIVE_AREA, PADDING_M);
+    let (vehicle, obstacles) = Vehicle::of(robot, scene, &here, &riding, PADDING_M);
     let mechanism = vehicle.mechanism();
     let mut space = Space::new(&mechanism, &obstacles);
     let budget = Budget { iterations: ITERATIONS, seed: request.seed };
-    let found = match drive_in(&mut space, request.start.base, &request.goals, budget, control) {
-        Err(ConnectError::Goal { .. }) => drive_in(&mut space, request.start.base, &request.around(), budget, control),
+    let found = match drive_in(&vehicle, &mut space, request.start.base, &request.goals, budget, control) {
+        Err(ConnectError::Goal { .. }) => {
+            drive_in(&vehicle, &mut space, request.start.base, &request.around(), budget, control)
+        }
         other => other,
     };
     let (path, _) = found.map_err(|error| match error {
@@ -237,7 +238,7 @@ pub fn check_drive(
     }
     check_rest(&joints, &trajectory)?;
     check_limits(&joints, &trajectory)?;
-    let (vehicle, obstacles) = Vehicle::of(robot, scene, configuration, riding, aimm::DRIVE_AREA, 0.0);
+    let (vehicle, obstacles) = Vehicle::of(robot, scene, configuration, riding, 0.0);
     let roomy = Vehicle { padding_m: ROOMY_M, ..vehicle.clone() };
     check_way([&vehicle, &roomy], &obstacles, &trajectory)?;
     Ok(trajectory)
@@ -288,12 +289,13 @@ fn check_way(
     look(end.time_s, &end.positions)
 }
 
-/// The base's joints within the driving area; a heading has no limits.
+/// The base's joints within the area that it drives in; a heading that turns on and on goes as far as a trajectory does.
 fn limits(robot: &Robot) -> Vec<Joint> {
-    let [[x_low, x_high], [y_low, y_high]] = aimm::DRIVE_AREA;
-    let within = [[x_low, x_high], [y_low, y_high], [-2.0 * TAU, 2.0 * TAU]];
-    let joints = robot.base_joints().iter().zip(within);
-    joints.map(|(joint, [lower, upper])| Joint { lower, upper, ..joint.clone() }).collect()
+    let mut joints = robot.base_joints().to_vec();
+    if let (Some((_, None)), Some(heading)) = (robot.drive_area(), joints.last_mut()) {
+        (heading.lower, heading.upper) = (-2.0 * TAU, 2.0 * TAU);
+    }
+    joints
 }
 
 impl DriveRequest {

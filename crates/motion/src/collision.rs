@@ -8,6 +8,7 @@
 
 use crate::frame::compose;
 use crate::joint_vector::JointVector;
+use crate::levers::Levers;
 use crate::robot::{Body, Configuration, Geometry, Robot, to_f32};
 use parry3d::math::{Pose as Pose32, Vector};
 use parry3d::query;
@@ -37,7 +38,7 @@ pub struct Checker<'a> {
     moving: Vec<Moving>,
     /// Pairs of moving shapes that can meet.
     pairs: Vec<(usize, usize)>,
-    /// How far a point can be from the axis of each arm joint, in metres.
+    /// How far a point moves at the most per radian of each arm joint (per metre of one that slides), in metres.
     reach: JointVector,
     poses: Vec<Pose>,
     placed: Vec<Pose32>,
@@ -225,30 +226,14 @@ impl<'a> Checker<'a> {
         }
     }
 
+    /// The farthest that any of the shapes moves.
     fn find_reach(&mut self) {
-        let mut beyond = 0.0;
-        for joint in (0..self.reach.len()).rev() {
-            let link = self.robot.arm_joint_links[joint];
-            let mut reach: f64 = beyond;
-            for moving in self.moving.iter().filter(|m| self.nearest_joint(m.link) == joint) {
-                let offset = self.poses[link].inverse().compose(&self.poses[moving.link].compose(&moving.local));
-                reach = reach.max(offset.distance(&Pose::IDENTITY) + f64::from(moving.radius));
-            }
-            self.reach[joint] = reach;
-            beyond = reach + self.robot.model.links[link].origin.distance(&Pose::IDENTITY);
-        }
-    }
-
-    /// The last arm joint that moves a link.
-    fn nearest_joint(&self, mut link: usize) -> usize {
-        loop {
-            if let Some(joint) = self.robot.arm_joint_links.iter().position(|l| *l == link) {
-                return joint;
-            }
-            match self.robot.model.links[link].parent {
-                Some(parent) => link = parent,
-                None => return 0,
-            }
+        let joints = self.reach.len();
+        for moving in &self.moving {
+            let chain = self.robot.arm_chain(&self.configuration, moving.link);
+            let end_m = chain.tip.compose(&moving.local).distance(&Pose::IDENTITY) + f64::from(moving.radius);
+            let shape = Levers::new(&chain.joints, end_m, self.robot.arm_joints()).per_joint(joints);
+            self.reach = JointVector::from_fn(joints, |j| self.reach[j].max(shape[j]));
         }
     }
 
@@ -286,7 +271,7 @@ impl<'a> Checker<'a> {
         Some(Collision { moving: self.moving[i].name.clone(), other, depth_m: depth })
     }
 
-    /// How far any point of the robot moves at the most when the joints turn by so much, in metres.
+    /// How far any point of the robot moves at the most when the joints move by so much, in metres.
     pub(crate) fn moves_m(&self, turns: &JointVector) -> f64 {
         (0..self.reach.len()).map(|j| turns[j].abs() * self.reach[j]).sum()
     }
@@ -446,6 +431,7 @@ fn intersects(pose_a: &Pose32, a: &SharedShape, pose_b: &Pose32, b: &SharedShape
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
     use parry3d::shape::HalfSpace;
 
@@ -459,5 +445,70 @@ mod tests {
         assert!(intersects(&at(1.0), &floor, &at(0.0), &floor));
         assert!(intersects(&at(0.05), &ball, &at(0.0), &floor));
         assert!(!intersects(&at(0.2), &ball, &at(0.0), &floor));
+    }
+
+    /// A robot whose arm is moved by `a` and then `b`, with what a URDF says between and behind them.
+    fn robot(joints: &str, arm: &str, tool: &str) -> Robot {
+        let toml = format!("name = 'r'\nurdf = 'r'\n[arm]\njoints = [{arm}]\ntool = '{tool}'\n");
+        let description = crate::description::RobotDescription::read(&toml).unwrap();
+        let urdf = format!("<robot name='r'><link name='foot'/>{joints}</robot>");
+        Robot::of(description, &urdf, None, &mut |_| unreachable!("it has no meshes")).unwrap()
+    }
+
+    fn joint(name: &str, kind: &str, [parent, child]: [&str; 2], origin: &str, axis: &str, range: [f64; 2]) -> String {
+        let [lower, upper] = range;
+        format!(
+            "<joint name='{name}' type='{kind}'><parent link='{parent}'/><child link='{child}'/><origin xyz='{origin}'/>\
+             <axis xyz='{axis}'/><limit lower='{lower}' upper='{upper}' velocity='1' effort='1'/></joint>"
+        )
+    }
+
+    fn solid(name: &str, shape: &str) -> String {
+        format!("<link name='{name}'><collision>{shape}</collision></link>")
+    }
+
+    fn checker<'a>(robot: &'a Robot, objects: Vec<ratn_world::scene::SceneObject>) -> Checker<'a> {
+        Checker::new(robot, &Scene { base: Pose::IDENTITY, objects }, &robot.at_zero(), 0.0)
+    }
+
+    #[test]
+    fn a_link_that_slides_does_not_pass_through_a_box() {
+        let ball = solid("ball", "<geometry><sphere radius='0.03'/></geometry>");
+        let slide = joint("j1", "prismatic", ["foot", "ball"], "0 0 0", "1 0 0", [0.0, 1.0]);
+        let robot = robot(&(ball + &slide), "'j1'", "ball");
+        let in_the_way = ratn_world::scene::SceneObject {
+            name: "box".into(),
+            shape: ratn_world::scene::Shape::Box { size: [0.04; 3] },
+            placement: Placement::World(Pose::at(0.25, 0.0, 0.0)),
+        };
+        let mut checker = checker(&robot, vec![in_the_way]);
+        let [from, to] = [[0.0], [1.0]].map(JointVector::of);
+        assert!(checker.is_free(&from, Contact::None) && checker.is_free(&to, Contact::None));
+        assert!(!checker.edge_is_free(&from, &to, Contact::None));
+        assert_eq!(checker.edge_collision(&from, &to, Contact::None).unwrap().other, "box");
+        assert_eq!(checker.reach, JointVector::of([1.0]));
+    }
+
+    #[test]
+    fn fixed_links_and_slides_between_joints_and_the_factor_of_a_mimic_lengthen_the_lever() {
+        let fixed =
+            "<joint name='f' type='fixed'><parent link='upper'/><child link='mid'/><origin xyz='0.5 0 0'/></joint>";
+        let capsule = solid("mid", "<geometry><capsule radius='0.01' length='0.02'/></geometry>");
+        let ball = solid("tip", "<origin xyz='0.5 0 0'/><geometry><sphere radius='0.03'/></geometry>");
+        let j1 = joint("j1", "revolute", ["foot", "upper"], "0 0 0", "0 0 1", [-2.0, 2.0]);
+        let chain = ["<link name='upper'/>", &capsule, &ball, &j1, fixed].concat();
+        let turning = joint("j2", "revolute", ["mid", "tip"], "0 0 0", "0 0 1", [-2.0, 2.0]);
+        let close = |robot: &Robot, expected: [f64; 2]| {
+            let reach = checker(robot, Vec::new()).reach;
+            assert!(reach.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{reach:?} is not {expected:?}");
+        };
+        close(&robot(&(chain.clone() + &turning), "'j1', 'j2'", "tip"), [1.03, 0.53]);
+        // The joint that slides may be as far out as its limits say.
+        let sliding = joint("j2", "prismatic", ["mid", "tip"], "0 0 0", "1 0 0", [-0.2, 0.7]);
+        close(&robot(&(chain.clone() + &sliding), "'j1', 'j2'", "tip"), [1.73, 1.0]);
+        let triple = turning.replace("</joint>", "<mimic joint='j1' multiplier='0.5'/></joint>");
+        let links = chain.clone() + &triple + &solid("end", "<geometry><sphere radius='0.01'/></geometry>");
+        let last = joint("j3", "revolute", ["tip", "end"], "0 0 0", "0 0 1", [-2.0, 2.0]);
+        close(&robot(&(links + &last), "'j1', 'j3'", "end"), [1.03 + 0.5 * 0.53, 0.01]);
     }
 }

@@ -91,6 +91,19 @@ pub struct BaseDescription {
     pub joints: [String; 3],
     /// The link of its body: what stands on top of it rides along.
     pub body: String,
+    /// Where it may drive, as far as the limits of its joints allow. Without it these alone count.
+    #[serde(default)]
+    pub area: Option<DriveArea>,
+}
+
+/// A rectangle on the floor, in the world frame, in metres.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DriveArea {
+    /// Least and greatest x of the base.
+    pub x: [f64; 2],
+    /// Least and greatest y.
+    pub y: [f64; 2],
 }
 
 /// A pan-tilt unit.

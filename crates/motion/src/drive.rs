@@ -27,6 +27,8 @@ pub struct Vehicle {
     pub bodies: Vec<Body>,
     /// Least and greatest x, least and greatest y, in metres.
     pub area: [[f64; 2]; 2],
+    /// Least and greatest heading, in radians; without them it turns on and on.
+    pub heading: Option<[f64; 2]>,
     /// Room that it keeps, in metres.
     pub padding_m: f64,
 }
@@ -35,18 +37,19 @@ impl Vehicle {
     /// A disc of a radius and a height, standing on the floor, in metres.
     pub fn round(radius: f64, height: f64, area: [[f64; 2]; 2], padding_m: f64) -> Vehicle {
         let geometry = Geometry::Cylinder { radius, half_length: height / 2.0 };
-        Vehicle { bodies: vec![geometry.at(Pose::at(0.0, 0.0, height / 2.0))], area, padding_m }
+        Vehicle { bodies: vec![geometry.at(Pose::at(0.0, 0.0, height / 2.0))], area, heading: None, padding_m }
     }
 
-    /// Our robot as it stands, with what it holds and the objects of the scene that ride on it; and what it may not touch.
+    /// A robot as it stands, with what it holds and the objects of the scene that ride on it; and what it may not touch. It drives in the
+    /// robot's area; one without a base does not.
     pub fn of(
         robot: &Robot,
         scene: &Scene,
         configuration: &Configuration,
         riding: &[String],
-        area: [[f64; 2]; 2],
         padding_m: f64,
     ) -> (Vehicle, Vec<Obstacle>) {
+        let (area, heading) = robot.drive_area().unwrap_or_default();
         let [x, y, yaw] = configuration.base;
         let base = Pose::from_rpy([x, y, 0.0], 0.0, 0.0, yaw).inverse();
         let poses = robot.poses(configuration);
@@ -65,7 +68,14 @@ impl Vehicle {
                 Placement::World(pose) => obstacles.push(Obstacle { name: object.name.clone(), pose, geometry }),
             }
         }
-        (Vehicle { bodies, area, padding_m }, obstacles)
+        (Vehicle { bodies, area, heading, padding_m }, obstacles)
+    }
+
+    /// A heading as its own joint has it: within half a turn of zero, or a turn away where the limits are elsewhere.
+    fn heading_of(&self, heading: f64) -> f64 {
+        let near = wrapped(heading);
+        let within = |turned: &f64| self.heading.is_none_or(|[least, greatest]| (least..=greatest).contains(turned));
+        [near, near + TAU, near - TAU].into_iter().find(within).unwrap_or(near)
     }
 
     pub(crate) fn mechanism(&self) -> Mechanism {
@@ -78,7 +88,8 @@ impl Vehicle {
             acceleration: 1.0,
             jerk: 10.0,
         };
-        let joints = vec![joint("x", x_low, x_high), joint("y", y_low, y_high), joint("heading", -TAU, TAU)];
+        let [least, greatest] = self.heading.unwrap_or([-TAU, TAU]);
+        let joints = vec![joint("x", x_low, x_high), joint("y", y_low, y_high), joint("heading", least, greatest)];
         let link = |parent, drive| Link::bare("base", parent, Pose::IDENTITY, drive);
         let slide = |joint, axis| Some(Drive { joint, axis, slides: true, factor: 1.0 });
         let turn = Some(Drive { joint: 2, axis: [0.0, 0.0, 1.0], slides: false, factor: 1.0 });
@@ -106,11 +117,12 @@ pub fn drive(
     budget: Budget,
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<(Vec<[f64; 3]>, usize), ConnectError> {
-    drive_in(&mut Space::new(&vehicle.mechanism(), obstacles), start, goals, budget, control)
+    drive_in(vehicle, &mut Space::new(&vehicle.mechanism(), obstacles), start, goals, budget, control)
 }
 
 /// As [`drive`], in the vehicle's space.
 pub(crate) fn drive_in(
+    vehicle: &Vehicle,
     space: &mut Space,
     start: [f64; 3],
     goals: &[[f64; 3]],
@@ -119,7 +131,7 @@ pub(crate) fn drive_in(
 ) -> Result<(Vec<[f64; 3]>, usize), ConnectError> {
     let offer = |goal: &[f64; 3]| [-TAU, 0.0, TAU].map(|turn| state(&[goal[0], goal[1], wrapped(goal[2]) + turn]));
     let ends: Vec<State> = goals.iter().flat_map(offer).collect();
-    let from = state(&[start[0], start[1], wrapped(start[2])]);
+    let from = state(&[start[0], start[1], vehicle.heading_of(start[2])]);
     let route = match connect(space, &from, &ends, budget, control) {
         Err(ConnectError::Goal { .. }) => return Err(ConnectError::Goal { goals: goals.len() }),
         other => other?,

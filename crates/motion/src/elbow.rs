@@ -52,7 +52,7 @@ pub(crate) fn arcs(arm: &Spherical, target: &Pose, limits: &[Joint]) -> Vec<Arc>
             let is_within = |posture: &JointVector| {
                 arm.joints.iter().all(|i| (limits[*i].lower..=limits[*i].upper).contains(&posture[*i]))
             };
-            arm.solve(target, bend, turn, &others).iter().any(is_within)
+            arm.solve(target, bend, turn, limits, &others).iter().any(is_within)
         };
         let cuts = cuts(arm, target, bend, limits);
         for (i, from) in cuts.iter().enumerate() {

@@ -1,11 +1,38 @@
-//! How far the end of a chain of joints moves at the most while its joints do.
+//! Chains of joints, and how far the end of one moves at the most while its joints do.
 //!
-//! The end of a chain is no further from a joint's axis than its lever: the sum of all offsets that follow, and of all that can slide.
+//! A [`Chain`] is the one walk from the root to a link: for the tool's inverse kinematics, and for how far each shape of an arm can move. The end of a chain is no further from a joint's axis than its lever: the sum of all offsets that follow, and of all that can slide.
 //! These bounds hold in every posture. They say what cannot happen between two postures that were looked at.
 
 use crate::joint_vector::JointVector;
-use crate::robot_model::{Drive, Joint};
+use crate::robot_model::{Drive, Joint, Link};
 use ratn_model::pose::Pose;
+
+/// The joints between the root and a link.
+#[derive(Debug, Clone)]
+pub(crate) struct Chain {
+    /// From the root: where each moving link's joint sits in the frame before it.
+    pub(crate) joints: Vec<(Pose, Drive)>,
+    /// The link in the frame of the last joint.
+    pub(crate) tip: Pose,
+}
+
+impl Chain {
+    /// To the link with this index; `place` says where a link sits in its parent's frame, and what moves it there.
+    pub(crate) fn to(link: usize, links: &[Link], place: impl Fn(&Link) -> (Pose, Option<Drive>)) -> Chain {
+        let mut way: Vec<usize> = std::iter::successors(Some(link), |index| links[*index].parent).collect();
+        way.reverse();
+        let (mut joints, mut tip) = (Vec::new(), Pose::IDENTITY);
+        for index in way {
+            let (origin, drive) = place(&links[index]);
+            tip = tip.compose(&origin);
+            if let Some(drive) = drive {
+                joints.push((tip, drive));
+                tip = Pose::IDENTITY;
+            }
+        }
+        Chain { joints, tip }
+    }
+}
 
 /// The levers of a chain, from its root to its end.
 #[derive(Debug, Clone)]
@@ -19,10 +46,10 @@ struct Lever {
 }
 
 impl Levers {
-    /// Of joints, each at its place in the frame before it, and an end in the frame of the last.
-    pub(crate) fn new(chain: &[(Pose, Drive)], tip: &Pose, joints: &[Joint]) -> Levers {
+    /// Of joints, each at its place in the frame before it, and an end so far from the last.
+    pub(crate) fn new(chain: &[(Pose, Drive)], end_m: f64, joints: &[Joint]) -> Levers {
         let mut levers = Vec::with_capacity(chain.len());
-        let mut beyond = tip.distance(&Pose::IDENTITY);
+        let mut beyond = end_m;
         for (origin, drive) in chain.iter().rev() {
             levers.push(Lever { drive: *drive, length_m: if drive.slides { 1.0 } else { beyond } });
             if drive.slides {
@@ -33,6 +60,15 @@ impl Levers {
         }
         levers.reverse();
         Levers(levers)
+    }
+
+    /// How far the end moves at the most per radian of each joint (per metre of one that slides), in metres.
+    pub(crate) fn per_joint(&self, joints: usize) -> JointVector {
+        let mut lengths = JointVector::zeros(joints);
+        for Lever { drive, length_m } in &self.0 {
+            lengths[drive.joint] += drive.factor.abs() * length_m;
+        }
+        lengths
     }
 
     /// How far the end moves at the most where no joint moves by more than so much, in metres.

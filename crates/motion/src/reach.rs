@@ -11,7 +11,7 @@ use crate::closed_form::ClosedForm;
 use crate::elbow::{self, Arc};
 use crate::frame::{compose, cross, difference, norm, rotate};
 use crate::joint_vector::JointVector;
-use crate::levers::Levers;
+use crate::levers::{Chain, Levers};
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 use crate::robot_model::{Drive, Joint};
 use crate::spherical::Spherical;
@@ -199,26 +199,14 @@ struct Axis {
 impl Reach {
     /// The chain to the link with this index, and from there to a frame fixed to it.
     pub fn new(mechanism: &Mechanism, link: usize, frame: Pose) -> Reach {
-        let mut links = vec![link];
-        while let Some(parent) = mechanism.links[links[links.len() - 1]].parent {
-            links.push(parent);
-        }
-        let (mut chain, mut fixed) = (Vec::new(), Pose::IDENTITY);
-        for index in links.into_iter().rev() {
-            let link = &mechanism.links[index];
-            fixed = fixed.compose(&link.origin);
-            if let Some(drive) = link.drive {
-                chain.push((fixed, drive));
-                fixed = Pose::IDENTITY;
-            }
-        }
-        let tip = fixed.compose(&frame);
+        let Chain { joints: chain, tip } = Chain::to(link, &mechanism.links, |link| (link.origin, link.drive));
+        let tip = tip.compose(&frame);
         let spherical = Spherical::of(&chain, &tip);
         let joints = mechanism.joints.clone();
         let closed_form = if spherical.is_some() { None } else { ClosedForm::of(&chain, &joints) };
         let is_other = |joint: &usize| chain.iter().all(|(_, drive)| drive.joint != *joint);
         let others = (0..joints.len()).filter(is_other).collect();
-        let levers = Levers::new(&chain, &tip, &joints);
+        let levers = Levers::new(&chain, tip.distance(&Pose::IDENTITY), &joints);
         Reach { chain, tip, joints, others, spherical, closed_form, levers }
     }
 
@@ -456,7 +444,8 @@ impl Reach {
         let target = &postures.target;
         let Some(arm) = &self.spherical else { return Vec::new() };
         // At the end of an arc a joint is at its limit, but for rounding.
-        let clamped = arm.solve(&target.pose, bend, turn, others).into_iter().map(|posture| self.clamp(&posture));
+        let clamped =
+            arm.solve(&target.pose, bend, turn, &self.joints, others).into_iter().map(|posture| self.clamp(&posture));
         clamped.filter(|posture| target.is_met_by(&self.pose(posture))).collect()
     }
 

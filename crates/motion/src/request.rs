@@ -4,7 +4,7 @@ use crate::constrained::LEAST_TOLERANCE;
 use crate::joint_vector::JointVector;
 use crate::keep::Keep;
 use crate::plan::PlanError;
-use crate::robot::{Configuration, Joint, Robot};
+use crate::robot::{Configuration, Joint, Robot, on_floor};
 use crate::straight::Straight;
 use crate::tool_speed::ToolSpeed;
 use crate::way_points::WayPoints;
@@ -17,6 +17,9 @@ pub const MAX_GOALS: usize = 64;
 
 /// The slowest motion, as a fraction of the limits: a trajectory's points are as many as its time is long.
 pub const MIN_SPEED: f64 = 0.01;
+
+/// How far from the origin the base of a robot without one may be said to be, in metres and radians: rounding.
+const STANDS_STILL: f64 = 1e-6;
 
 /// What to plan.
 #[derive(Debug, Clone, PartialEq)]
@@ -99,6 +102,15 @@ impl Request {
         if !(MIN_SPEED..=1.0).contains(&self.speed) {
             return malformed("speed", self.speed.to_string(), &format!("a fraction from {MIN_SPEED} to 1"));
         }
+        let [x, y, heading] = on_floor(&scene.base);
+        if robot.base_joints().is_empty() && [x, y, heading].iter().any(|c| c.abs() > STANDS_STILL) {
+            let value = format!("({x}, {y}) with the heading {heading}");
+            let name = robot.name();
+            let expected = format!(
+                "the origin, or no such fact: {name} has no [base], so it stands where its URDF puts it; move its root there instead"
+            );
+            return malformed("the place of the base (`at(base)`)", value, &expected);
+        }
         let joints = robot.arm_joints().len();
         let expected = || format!("{joints}, one for each joint of the arm of {}", robot.name());
         let asked = self.goals.iter().filter_map(|goal| match goal {
@@ -147,7 +159,7 @@ impl Request {
         };
         within("the start's", outside_of_limits(robot, &self.start))?;
         for (whose, posture) in goals {
-            within(whose, outside(posture, robot.arm_joints(), "rad"))?;
+            within(whose, outside(posture, robot.arm_joints(), robot.arm_slides()))?;
         }
         let finite = |pose: &Pose| pose.position.iter().chain(&pose.quaternion_xyzw).all(|c| c.is_finite());
         if let Some(Goal::Pose(pose)) = self.goals.iter().find(|g| matches!(g, Goal::Pose(p) if !finite(p))) {
@@ -165,16 +177,22 @@ pub(crate) struct Outside {
     pub(crate) range: String,
 }
 
-/// The first joint of arm, head and fingers that is beyond its limits.
-pub(crate) fn outside_of_limits(robot: &Robot, at: &Configuration) -> Option<Outside> {
-    let head = || outside(&[at.pan, at.tilt], robot.head_joints(), "rad");
-    let fingers = || outside(&[at.finger], robot.finger().map_or(&[], std::slice::from_ref), "m");
-    outside(&at.arm, robot.arm_joints(), "rad").or_else(head).or_else(fingers)
+/// What positions of a joint are given in.
+pub(crate) fn unit(slides: bool) -> &'static str {
+    if slides { "m" } else { "rad" }
 }
 
-fn outside(positions: &[f64], joints: &[Joint], unit: &str) -> Option<Outside> {
-    let mut all = positions.iter().zip(joints);
-    let (position, joint) = all.find(|(q, joint)| !(joint.lower - 1e-6..=joint.upper + 1e-6).contains(*q))?;
-    let range = format!("{:.3} to {:.3} {unit}", joint.lower, joint.upper);
+/// The first joint of arm, head and fingers that is beyond its limits.
+pub(crate) fn outside_of_limits(robot: &Robot, at: &Configuration) -> Option<Outside> {
+    let head = || outside(&[at.pan, at.tilt], robot.head_joints(), &[false; 2]);
+    let fingers = || outside(&[at.finger], robot.finger().map_or(&[], std::slice::from_ref), &[true]);
+    outside(&at.arm, robot.arm_joints(), robot.arm_slides()).or_else(head).or_else(fingers)
+}
+
+fn outside(positions: &[f64], joints: &[Joint], slides: &[bool]) -> Option<Outside> {
+    let mut all = positions.iter().zip(joints).zip(slides);
+    let beyond = |(q, joint): (&f64, &Joint)| !(joint.lower - 1e-6..=joint.upper + 1e-6).contains(q);
+    let ((position, joint), slides) = all.find(|(held, _)| beyond(*held))?;
+    let range = format!("{:.3} to {:.3} {}", joint.lower, joint.upper, unit(*slides));
     Some(Outside { joint: joint.name.clone(), position: *position, range })
 }

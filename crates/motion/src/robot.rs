@@ -5,10 +5,12 @@
 //! Planning moves the arm; the others are where a configuration has them, joints of no part at zero or at the limit next to it.
 
 mod arms;
+mod parts;
 
 use crate::description::RobotDescription;
 pub use crate::geometry::{Body, Geometry};
 use crate::joint_vector::JointVector;
+use crate::levers::Chain;
 use crate::mechanism::{MAX_JOINTS, Mechanism, MechanismError};
 use crate::mesh::MeshError;
 pub use crate::robot_model::{Drive, Joint, Link, RobotModel};
@@ -55,6 +57,8 @@ struct Part {
     /// Among the model's joints.
     indices: Vec<usize>,
     joints: Vec<Joint>,
+    /// Whether each joint slides.
+    slides: Vec<bool>,
 }
 
 /// Where the parts of a robot are. What it does not have does not count.
@@ -98,11 +102,68 @@ pub enum RobotFault {
         /// The name.
         arm: String,
     },
-    /// A joint that is of two arms.
-    #[error("the joint `{joint}` is of two arms: only one of them can move it, leave it out of the other")]
+    /// A joint that is of two parts.
+    #[error(
+        "the joint `{joint}` is of two parts, {first} and {second}: only one of them can move it, leave it out of the other"
+    )]
     JointOfTwo {
         /// The joint.
         joint: String,
+        /// A part.
+        first: String,
+        /// Another part.
+        second: String,
+    },
+    /// Joints of an arm in another order.
+    #[error(
+        "`arm.joints` goes from the foot to the tool: the joint `{joint}` is nearer to the foot than `{before}`, put it before that one"
+    )]
+    Order {
+        /// The joint.
+        joint: String,
+        /// The one that is named before it.
+        before: String,
+    },
+    /// A joint of a kind that its part cannot have.
+    #[error("`{key}`: the joint `{joint}` {does}; expected {expected}")]
+    Kind {
+        /// Where the description names it.
+        key: &'static str,
+        /// The joint.
+        joint: String,
+        /// How it moves its link, or one that mimics it.
+        does: String,
+        /// How it should.
+        expected: &'static str,
+    },
+    /// A finger that the gripper does not move.
+    #[error("`gripper.finger`: the joint `{joint}` does not move the link `{finger}`; name one that it does")]
+    Finger {
+        /// The gripper's joint.
+        joint: String,
+        /// The finger.
+        finger: String,
+    },
+    /// A base that is not where its joints say.
+    #[error(
+        "`base.joints`: at x = 1, y = 2 and heading 0.5 the link `{link}` is at {at:?} or turned; the base's joints begin at the root of \
+         the URDF, without an offset before or between them: put an offset behind the last one"
+    )]
+    BaseOff {
+        /// The link that the heading turns.
+        link: String,
+        /// Where it is.
+        at: [f64; 3],
+    },
+    /// An area in which the base cannot be.
+    #[error("`base.area`: {area:?} has nothing in common with the limits {limits:?} of the joint `{joint}`")]
+    Area {
+        /// The joint.
+        joint: String,
+        /// What the description says, in metres.
+        area: [f64; 2],
+        /// What the URDF says.
+        limits: [f64; 2],
     },
     /// An arm that is not there.
     #[error("{robot} has no arm `{arm}` for this: its arms are {arms}")]
@@ -210,12 +271,12 @@ impl Robot {
         if !(1..=MAX_JOINTS).contains(&arm.joints.len()) {
             return Err(RobotFault::ArmJoints { count: arm.joints.len() });
         }
-        let part = |names: &[String]| Part::of(&model, names);
+        description.check_shared()?;
         let tool = link(&arm.tool)?;
-        let arm_part = part(&arm.joints)?;
-        let base_part = base.as_ref().map(|base| part(&base.joints)).transpose()?;
-        let head_part = head.as_ref().map(|head| part(&head.joints)).transpose()?;
-        let finger = gripper.as_ref().map(|gripper| part(std::slice::from_ref(&gripper.joint))).transpose()?;
+        let arm_part = Part::of(&model, &arm.joints)?;
+        let base_part = base.as_ref().map(|base| Part::base(&model, base)).transpose()?;
+        let head_part = head.as_ref().map(|head| Part::head(&model, head)).transpose()?;
+        let finger = gripper.as_ref().map(|gripper| Part::gripper(&model, gripper)).transpose()?;
         let camera = camera.as_ref().map(|camera| link(&camera.link)).transpose()?;
         let body = base.as_ref().map(|base| link(&base.body)).transpose()?;
         let gripper = match gripper {
@@ -316,12 +377,23 @@ impl Robot {
         self.model.restricted(&self.arm.indices, &self.positions(configuration))
     }
 
+    /// The arm's joints on the way to a link; everything else is as in a configuration.
+    pub(crate) fn arm_chain(&self, configuration: &Configuration, link: usize) -> Chain {
+        let positions = self.positions(configuration);
+        Chain::to(link, &self.model.links, |link| link.moved_by(&self.arm.indices, &positions))
+    }
+
     /// The limits of the arm's joints.
     pub fn arm_joints(&self) -> &[Joint] {
         &self.arm.joints
     }
 
-    /// The limits of the base's x, y and heading; none of a robot that stands.
+    /// Whether each joint of the arm slides: then its positions are metres, else radians.
+    pub fn arm_slides(&self) -> &[bool] {
+        &self.arm.slides
+    }
+
+    /// The limits of the base's x, y and heading, x and y within its area; none of a robot that stands.
     pub fn base_joints(&self) -> &[Joint] {
         self.base.as_ref().map_or(&[], |base| &base.joints)
     }
@@ -386,9 +458,10 @@ impl Robot {
         self.camera.map(|camera| self.pose(configuration, camera))
     }
 
-    /// Pan and tilt that point the camera at a point of the world, held within their limits.
-    pub fn look_at(&self, base: &Pose, target: [f64; 3]) -> (f64, f64) {
-        let mut looking = self.at_zero().with_base(base);
+    /// Pan and tilt that point the camera at a point of the world, held within their limits, where the rest of the robot is as in `here`.
+    pub fn look_at(&self, here: &Configuration, target: [f64; 3]) -> (f64, f64) {
+        let ahead = self.at_zero();
+        let mut looking = Configuration { pan: ahead.pan, tilt: ahead.tilt, ..*here };
         let [pan, tilt] = self.head_joints() else { return (looking.pan, looking.tilt) };
         // The optical centre sits off the tilt axis: a few rounds make up for it.
         for _ in 0..8 {
@@ -426,7 +499,10 @@ impl Part {
         }
         let indices = names.iter().map(|name| model.plannable(name)).collect::<Result<Vec<_>, _>>()?;
         let joints = indices.iter().map(|index| model.joints[*index].clone()).collect();
-        Ok(Part { indices, joints })
+        let drive =
+            |index: &usize| model.links.iter().filter_map(|link| link.drive).find(|drive| drive.joint == *index);
+        let slides = indices.iter().map(|index| drive(index).is_some_and(|drive| drive.slides)).collect();
+        Ok(Part { indices, joints, slides })
     }
 
     /// The links that its joints move, parents before children.
@@ -443,11 +519,16 @@ impl Part {
     fn links_to(&self, model: &RobotModel, tool: usize) -> Result<Vec<usize>, RobotFault> {
         let way: Vec<usize> = std::iter::successors(Some(tool), |index| model.links[*index].parent).collect();
         let moved = |(index, joint): (&usize, &Joint)| {
-            let is_moved = |link: &&usize| model.links[**link].drive.is_some_and(|drive| drive.joint == *index);
+            let is_moved = |link: &usize| model.links[*link].drive.is_some_and(|drive| drive.joint == *index);
             let beside = || RobotFault::Beside { joint: joint.name.clone(), tool: model.links[tool].name.clone() };
-            way.iter().rfind(is_moved).copied().ok_or_else(beside)
+            way.iter().rposition(is_moved).ok_or_else(beside)
         };
-        self.indices.iter().zip(&self.joints).map(moved).collect()
+        let moved = self.indices.iter().zip(&self.joints).map(moved).collect::<Result<Vec<usize>, _>>()?;
+        if let Some(j) = (1..moved.len()).find(|j| moved[*j] > moved[*j - 1]) {
+            let [before, joint] = [j - 1, j].map(|j| self.joints[j].name.clone());
+            return Err(RobotFault::Order { joint, before });
+        }
+        Ok(moved.into_iter().map(|at| way[at]).collect())
     }
 
     fn posture(&self, name: &str, values: &[f64]) -> Result<JointVector, RobotFault> {

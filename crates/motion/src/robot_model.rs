@@ -119,6 +119,16 @@ impl Link {
         }
     }
 
+    /// Where it sits in its parent's frame, and what moves it there, where some joints move and the others stay where `positions` has them;
+    /// the joint's index is that among those that move.
+    pub(crate) fn moved_by(&self, moving: &[usize], positions: &[f64]) -> (Pose, Option<Drive>) {
+        let Some(drive) = self.drive else { return (self.origin, None) };
+        match moving.iter().position(|joint| *joint == drive.joint) {
+            Some(joint) => (self.origin, Some(Drive { joint, ..drive })),
+            None => (self.origin.compose(&drive.moved(positions[drive.joint])), None),
+        }
+    }
+
     /// Where it is in its parent's frame.
     #[inline]
     fn in_parent(&self, positions: &[f64]) -> Pose {
@@ -254,15 +264,8 @@ impl RobotModel {
 
     /// The links moved by some joints, the others where `positions` has them.
     pub(crate) fn moved_by(&self, planned: &[usize], positions: &[f64], checks: Checks) -> Mechanism {
-        let place = |link: &Link| match link.drive {
-            None => (link.origin, None),
-            Some(drive) => match planned.iter().position(|joint| *joint == drive.joint) {
-                Some(joint) => (link.origin, Some(Drive { joint, ..drive })),
-                None => (link.origin.compose(&drive.moved(positions[drive.joint])), None),
-            },
-        };
         let held = |link: &Link| {
-            let (origin, drive) = place(link);
+            let (origin, drive) = link.moved_by(planned, positions);
             Link { origin, drive, ..link.clone() }
         };
         let joints = planned.iter().map(|joint| self.joints[*joint].clone()).collect();

@@ -6,7 +6,7 @@
 
 use crate::frame::{compose, cross, difference, norm, rotate};
 use crate::joint_vector::JointVector;
-use crate::robot_model::Drive;
+use crate::robot_model::{Drive, Joint};
 use ratn_model::pose::Pose;
 use std::f64::consts::{PI, TAU};
 
@@ -74,19 +74,26 @@ impl Spherical {
         self.bends(norm(difference(motion.transform(self.wrist), self.shoulder)))
     }
 
-    /// All postures, limits aside, that bring the frame to a pose with the elbow at one of its bends and at this turn. Joints that are
-    /// none of the arm's are as in `others`.
-    pub(crate) fn solve(&self, target: &Pose, bend: f64, turn: f64, others: &JointVector) -> Vec<JointVector> {
+    /// All postures that bring the frame to a pose with the elbow at one of its bends and at this turn: each joint in the turn within its
+    /// limits that is nearest to `near`, or beyond them where there is none. Joints that are none of the arm's are as in `near`.
+    pub(crate) fn solve(
+        &self,
+        target: &Pose,
+        bend: f64,
+        turn: f64,
+        limits: &[Joint],
+        near: &JointVector,
+    ) -> Vec<JointVector> {
         let motion = self.motion(target);
         let mut solutions = Vec::new();
         for first in self.turns(0, &self.turned_shoulder(&motion, bend, turn)) {
             // The turns themselves, not what they should be, so that errors do not add up.
             let wrist = self.turned_wrist(&motion, bend, &self.three(0, first));
             for last in self.turns(4, &wrist) {
-                let mut positions = *others;
+                let mut positions = *near;
                 let all = first.into_iter().chain([bend]).chain(last);
                 for (joint, value) in self.joints.iter().zip(all) {
-                    positions[*joint] = wrapped(value);
+                    positions[*joint] = turn_within(value, &limits[*joint], near[*joint]);
                 }
                 solutions.push(positions);
             }
@@ -215,6 +222,17 @@ fn from_to(from: Vector, to: Vector) -> Pose {
         return about(unit(cross(from, aside)), if dot(from, to) > 0.0 { 0.0 } else { PI });
     }
     about(unit(axis), norm(axis).atan2(dot(from, to)))
+}
+
+/// The turn of an angle within the limits of a joint that is nearest to a position; where there is none, the nearest to the limits.
+fn turn_within(angle: f64, Joint { lower, upper, .. }: &Joint, near: f64) -> f64 {
+    let (least, most) = (((lower - angle) / TAU).ceil(), ((upper - angle) / TAU).floor());
+    let turn = if least <= most {
+        ((near - angle) / TAU).round().clamp(least, most)
+    } else {
+        ((f64::midpoint(*lower, *upper) - angle) / TAU).round()
+    };
+    angle + TAU * turn
 }
 
 /// The angle within half a turn of zero.

@@ -6,13 +6,14 @@ use crate::arm::{self, line};
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Contact, PADDING_M};
 use crate::joint_vector::JointVector;
 use crate::reach::Target;
-use crate::robot::Robot;
+use crate::robot::{Joint, Robot};
 use crate::workplace::{HOME, Surface, Workplace};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
-use std::f64::consts::PI;
+use std::f64::consts::{PI, TAU};
+use std::ops::RangeInclusive;
 
 /// Postures looked at for how far the tool reaches.
 const SAMPLES: usize = 5_000;
@@ -77,17 +78,25 @@ fn extent(robot: &Robot) -> [f64; 3] {
     let reach = arm::reach(robot);
     let joints = robot.arm_joints();
     let foot = robot.pose(&robot.at_zero(), robot.arm_joint_links[0]).position;
+    let ranges: Vec<_> = joints.iter().zip(robot.arm_slides()).map(|(joint, slides)| range(joint, *slides)).collect();
     let mut random = ChaCha8Rng::seed_from_u64(1);
     let mut extent = [f64::INFINITY, f64::NEG_INFINITY, 0.0];
     for _ in 0..SAMPLES {
-        // A joint that turns without end has no limits.
-        let drawn = |j: usize| random.random_range(joints[j].lower.max(-PI)..=joints[j].upper.min(PI));
-        let posture = JointVector::from_fn(joints.len(), drawn);
+        let posture = JointVector::from_fn(joints.len(), |j| random.random_range(ranges[j].clone()));
         let at = reach.pose(&posture).position;
         let away = (0..3).map(|i| (at[i] - foot[i]).powi(2)).sum::<f64>().sqrt();
         extent = [extent[0].min(at[2]), extent[1].max(at[2]), extent[2].max(away)];
     }
     extent
+}
+
+/// All places of a joint: of one that turns further than a whole turn, one turn of them, about zero where its limits allow.
+fn range(Joint { lower, upper, .. }: &Joint, slides: bool) -> RangeInclusive<f64> {
+    if slides || upper - lower <= TAU {
+        return *lower..=*upper;
+    }
+    let least = (-PI).clamp(*lower, upper - TAU);
+    least..=least + TAU
 }
 
 /// The corners and the middle of the region in which boxes stand.
@@ -153,5 +162,23 @@ mod tests {
             assert_eq!(lines[0], format!("robot     {name}"));
             assert!(lines.iter().any(|line| line.starts_with("posture   home: free")), "{lines:#?}");
         }
+    }
+
+    #[test]
+    fn a_rail_of_eight_metres_and_limits_beyond_half_a_turn_are_surveyed() {
+        let urdf = "<robot name='rail'><link name='foot'/><link name='cart'/><link name='tool'/>\
+            <joint name='rail' type='prismatic'><parent link='foot'/><child link='cart'/><axis xyz='0 0 1'/>\
+            <limit lower='0' upper='8' velocity='1' effort='1'/></joint>\
+            <joint name='turn' type='revolute'><parent link='cart'/><child link='tool'/><axis xyz='0 1 0'/>\
+            <limit lower='3.5' upper='6' velocity='1' effort='1'/></joint></robot>";
+        let toml = "name = 'rail'\nurdf = 'rail'\n[arm]\njoints = ['rail', 'turn']\ntool = 'tool'\n";
+        let description = crate::description::RobotDescription::read(toml).unwrap();
+        let robot = Robot::of(description, urdf, None, &mut |_| unreachable!("it has no meshes")).unwrap();
+        let [below, above, _] = extent(&robot);
+        assert!(below < 0.1 && above > 7.9, "{below} to {above}");
+        let turning = |lower, upper| range(&Joint { lower, upper, ..robot.arm_joints()[1].clone() }, false);
+        assert_eq!(turning(-2.0 * TAU, 2.0 * TAU), -PI..=PI);
+        assert_eq!(turning(-3.5, 1.0), -3.5..=1.0);
+        assert_eq!(turning(2.0, 20.0), 2.0..=2.0 + TAU);
     }
 }

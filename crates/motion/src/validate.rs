@@ -3,12 +3,13 @@
 use crate::collision::{Checker, Collision, Contact};
 use crate::cubic::Cubic;
 use crate::joint_vector::{JointVector, PerJoint};
+use crate::request::unit;
 use crate::robot::{Configuration, Joint, Robot};
 use crate::trajectory::{Curve, Knot, TrajectoryError};
 use ratn_model::value::Trajectory;
 use ratn_world::scene::Scene;
 
-/// How far from the arm's position a trajectory may start, per joint, in radians.
+/// How far from the arm's position a trajectory may start, per joint, in radians (metres for one that slides).
 pub const START_TOLERANCE_RAD: f64 = 0.01;
 
 /// How much a limit may be exceeded, as a fraction: rounding.
@@ -27,14 +28,16 @@ pub enum Violation {
     #[error(transparent)]
     Malformed(#[from] TrajectoryError),
     /// It starts elsewhere.
-    #[error("{joint} is at {actual_rad:.4} rad, the trajectory starts at {start_rad:.4} rad")]
+    #[error("{joint} is at {actual:.4} {unit}, the trajectory starts at {start:.4} {unit}")]
     Start {
         /// Which joint.
         joint: String,
         /// Where it is.
-        actual_rad: f64,
+        actual: f64,
         /// Where the trajectory starts.
-        start_rad: f64,
+        start: f64,
+        /// What positions of the joint are given in.
+        unit: &'static str,
     },
     /// It does not start or end at rest.
     #[error("{joint} moves at {velocity:.4} per second at {time_s:.3} s, where the trajectory must be at rest")]
@@ -108,8 +111,8 @@ fn check_start(robot: &Robot, start: &JointVector, trajectory: &Curve) -> Result
     for (j, joint) in robot.arm_joints().iter().enumerate() {
         let planned = knots[0].positions[j];
         if (start[j] - planned).abs() > START_TOLERANCE_RAD {
-            let (joint, actual_rad) = (joint.name.clone(), start[j]);
-            return Err(Violation::Start { joint, actual_rad, start_rad: planned });
+            let unit = unit(robot.arm_slides()[j]);
+            return Err(Violation::Start { joint: joint.name.clone(), actual: start[j], start: planned, unit });
         }
     }
     Ok(())

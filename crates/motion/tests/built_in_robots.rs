@@ -183,3 +183,21 @@ fn every_built_in_robot_goes_from_posture_to_posture_however_many_joints_it_has(
         validate_trajectory(&robot, &scene, &start, &plan.trajectory, Contact::None).unwrap();
     }
 }
+
+#[test]
+fn a_robot_without_a_base_stands_where_its_urdf_puts_it_whatever_is_said_of_a_base() {
+    let robot = Robot::built_in("panda").unwrap();
+    let workplace = robot.workplace().unwrap();
+    let here = scene(workplace, &[], workplace.boxes.greatest);
+    let away = Scene { base: Pose::from_rpy([0.3, -0.1, 0.0], 0.0, 0.0, 0.4), ..here.clone() };
+    let at = Configuration { arm: robot.posture(HOME).unwrap(), ..arm::assumed(&robot, &here) };
+    let seen = |scene: &Scene| format!("{:?}", arm::in_scene(&robot, scene, &at).1);
+    assert_eq!(seen(&away), seen(&here));
+    assert_eq!(arm::on_floor(&robot, &away.base), Pose::IDENTITY);
+    let request = Request::new(at, vec![Goal::Joints(robot.posture("observation").unwrap())]);
+    assert!(plan(&robot, &here, &request, &mut |_| Control::Continue).is_ok());
+    let refused = plan(&robot, &away, &request, &mut |_| Control::Continue).unwrap_err().to_string();
+    for part in ["`at(base)`", "panda has no [base]", "(0.3, -0.1)"] {
+        assert!(refused.contains(part), "{refused}");
+    }
+}

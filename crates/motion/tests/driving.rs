@@ -85,7 +85,8 @@ fn our_robot_turns_to_fit_through_a_gap_and_does_not_try_one_that_is_too_narrow(
             vec![wall("left", gap / 2.0 + width / 2.0, width), wall("right", -gap / 2.0 - width / 2.0, width)];
         let scene = Scene { base: Pose::IDENTITY, objects };
         let here = Configuration { arm: aimm::STOWED, base: [0.0, 0.0, FRAC_PI_2], ..robot.at_zero() };
-        let (vehicle, obstacles) = Vehicle::of(&robot, &scene, &here, &[], AREA, 0.01);
+        let (vehicle, obstacles) = Vehicle::of(&robot, &scene, &here, &[], 0.01);
+        let vehicle = Vehicle { area: AREA, ..vehicle };
         let budget = Budget { iterations: 30_000, seed: 3 };
         let outcome = drive(&vehicle, &obstacles, here.base, &[[2.9, 0.0, FRAC_PI_2]], budget, &mut go_on);
         match outcome {
@@ -114,7 +115,8 @@ fn what_rides_on_the_base_is_no_obstacle_and_what_stands_at_the_goal_is() {
     };
     let here = Configuration { arm: aimm::STOWED, ..robot.at_zero() };
     let riding = ["cargo".to_owned()];
-    let (vehicle, obstacles) = Vehicle::of(&robot, &scene, &here, &riding, AREA, 0.01);
+    let (vehicle, obstacles) = Vehicle::of(&robot, &scene, &here, &riding, 0.01);
+    let vehicle = Vehicle { area: AREA, ..vehicle };
     assert_eq!(obstacles.len(), 1);
     let to = |y: f64| drive(&vehicle, &obstacles, [0.0; 3], &[[0.0, y, PI / 4.0]], BUDGET, &mut go_on);
     assert!(to(-2.0).is_ok());

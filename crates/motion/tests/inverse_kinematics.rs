@@ -133,3 +133,22 @@ fn a_pose_that_leaves_a_joint_free_is_reached() {
         holds(&reach, &target, &found[0]);
     }
 }
+
+#[test]
+fn limits_beyond_half_a_turn_keep_what_an_arm_of_seven_joints_reaches() {
+    let urdf = include_str!("../robots/aimm.urdf");
+    // The zero of joint 2 moved by 3.5 rad: the same arm, that counts otherwise.
+    let second = "<parent link=\"arm_1\"/><child link=\"arm_2\"/><origin xyz=\"0 0 0.2005\"/><axis xyz=\"0 -1 0\"/>\n    \
+        <limit lower=\"-2.0943951023931953\" upper=\"2.0943951023931953\"";
+    let moved = "<parent link=\"arm_1\"/><child link=\"arm_2\"/><origin xyz=\"0 0 0.2005\" rpy=\"0 3.5 0\"/><axis xyz=\"0 -1 0\"/>\n    \
+        <limit lower=\"1.4056048976068047\" upper=\"5.594395102393195\"";
+    let first = "<child link=\"arm_1\"/><origin xyz=\"0 0 0.11\"/><axis xyz=\"0 0 1\"/>\n    \
+        <limit lower=\"-2.9670597283903604\" upper=\"2.9670597283903604\"";
+    let endless = first.replace("-2.9670597283903604", "-6.1").replace("\"2.9670597283903604", "\"5.8");
+    assert!(urdf.contains(second) && urdf.contains(first));
+    let joints: Vec<String> = (1..=7).map(|n| format!("arm_joint_{n}")).collect();
+    for (name, urdf) in [("moved", urdf.replace(second, moved)), ("endless", urdf.replace(first, &endless))] {
+        let arm = ratn_motion::mechanism::Mechanism::read(&urdf, None, &joints).unwrap();
+        check(name, &Reach::new(&arm, arm.link("tool").unwrap(), Pose::IDENTITY), FEW);
+    }
+}

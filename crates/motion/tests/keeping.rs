@@ -121,7 +121,7 @@ fn any_arm_keeps_a_direction_and_a_box_between_all_samples() {
 
 fn tools(cell: &Cell, plan: &Plan) -> Vec<Pose> {
     let curve = Curve::of_arm(&cell.robot, &plan.trajectory).unwrap();
-    let (reach, base) = (arm::reach(&cell.robot), arm::on_floor(&cell.scene.base));
+    let (reach, base) = (arm::reach(&cell.robot), arm::on_floor(&cell.robot, &cell.scene.base));
     let tool = |t: f64| base.compose(&reach.pose(&curve.sample(t).positions));
     moments(&curve).into_iter().map(tool).collect()
 }

@@ -74,7 +74,7 @@ fn looking_at_a_point_puts_it_on_the_optical_axis() {
     let robot = Robot::aimm();
     let base = Pose::from_rpy([0.2, -0.1, 0.0], 0.0, 0.0, 0.4);
     let target = base.transform(aimm::TABLE_CENTRE);
-    let (pan, tilt) = robot.look_at(&base, target);
+    let (pan, tilt) = robot.look_at(&robot.at_zero().with_base(&base), target);
     let camera = robot.camera_pose(&Configuration { pan, tilt, ..robot.at_zero().with_base(&base) }).unwrap();
     let seen = camera.inverse().transform(target);
     assert!(seen[0].abs() < 1e-6 && seen[1].abs() < 1e-6 && seen[2] > 1.0, "{seen:?}");
@@ -89,4 +89,31 @@ fn a_description_without_a_joint_is_refused_by_name() {
     let urdf = r#"<robot name="r"><link name="world"/><link name="tool"/><joint name="j" type="fixed"><parent link="world"/><child link="tool"/></joint></robot>"#;
     let error = Robot::of(description, urdf, Some("<robot/>"), &mut |_| unreachable!("it has no meshes")).unwrap_err();
     assert_eq!(error.to_string(), "the robot description has no joint `arm_joint_1`");
+}
+
+#[test]
+fn the_camera_looks_from_where_the_arm_has_lifted_it() {
+    let joint = |name: &str, kind: &str, parent: &str, axis: &str| {
+        format!(
+            "<link name='{name}'/><joint name='{name}_joint' type='{kind}'><parent link='{parent}'/><child link='{name}'/>\
+             <axis xyz='{axis}'/><limit lower='-1.5' upper='1.5' velocity='1' effort='1'/></joint>"
+        )
+    };
+    let urdf = format!(
+        "<robot name='lift'><link name='foot'/>{}{}{}{}<link name='eye'/><joint name='eye_joint' type='fixed'><parent link='tilt'/>\
+         <child link='eye'/><origin rpy='-1.5707963267948966 0 -1.5707963267948966'/></joint></robot>",
+        joint("lift", "prismatic", "foot", "0 0 1"),
+        joint("tool", "revolute", "lift", "0 0 1"),
+        joint("pan", "revolute", "lift", "0 0 1"),
+        joint("tilt", "revolute", "pan", "0 1 0"),
+    );
+    let toml = "name = 'lift'\nurdf = 'lift'\n[arm]\njoints = ['lift_joint', 'tool_joint']\ntool = 'tool'\n\
+        [head]\njoints = ['pan_joint', 'tilt_joint']\n[camera]\nlink = 'eye'\n";
+    let description = ratn_motion::description::RobotDescription::read(toml).unwrap();
+    let robot = Robot::of(description, &urdf, None, &mut |_| unreachable!("it has no meshes")).unwrap();
+    for lift in [0.0, 1.0] {
+        let here = Configuration { arm: [lift, 0.0].into(), ..robot.at_zero() };
+        let (pan, tilt) = robot.look_at(&here, [1.0, 0.0, 0.0]);
+        assert!(pan.abs() < 1e-6 && (tilt - lift.atan2(1.0)).abs() < 1e-6, "{pan} {tilt} at {lift}");
+    }
 }

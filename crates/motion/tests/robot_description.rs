@@ -74,6 +74,96 @@ fn what_does_not_fit_is_refused_by_its_name() {
     );
     assert_eq!(refused("[0.1, -0.2]", "[0.1]"), "the posture `home` has 1 positions: the arm has 2 joints");
     assert_eq!(refused("[0.1, -0.2]", "[0.1, 2.5]"), "the posture `home` has b at 2.5: its limits are -2 to 2");
+    assert_eq!(
+        refused(r#""a", "b""#, r#""b", "a""#),
+        "`arm.joints` goes from the foot to the tool: the joint `a` is nearer to the foot than `b`, put it before that one"
+    );
     let unknown = RobotDescription::read(&TOML.replace("tool =", "tol =")).unwrap_err();
     assert!(unknown.contains("line 6") && unknown.contains("tol"), "{unknown}");
+}
+
+/// A base, an arm of one joint, a head and two fingers, of joints as they are given.
+fn mobile(joints: &[(&str, &str)], more: &str) -> Result<Robot, RobotFault> {
+    let limit = "<limit lower='-10' upper='10' velocity='1' effort='1'/>";
+    let mut parents = ["world", "along_x", "along_y", "base", "arm", "base", "pan", "arm", "arm"].into_iter();
+    let mut urdf = "<robot name='mobile'><link name='world'/>".to_owned();
+    for (name, kind) in [
+        ("along_x", "prismatic 1 0 0"),
+        ("along_y", "prismatic 0 1 0"),
+        ("base", "revolute 0 0 1"),
+        ("arm", "revolute 0 1 0"),
+        ("tool", "fixed 1 0 0"),
+        ("pan", "revolute 0 0 1"),
+        ("tilt", "revolute 0 1 0"),
+        ("left", "prismatic 0 1 0"),
+        ("right", "prismatic 0 -1 0"),
+    ] {
+        let kind = joints.iter().find(|(joint, _)| *joint == name).map_or(kind, |(_, kind)| kind);
+        let (kind, axis) = kind.split_once(' ').unwrap();
+        let (axis, origin) = axis.split_once(" at ").unwrap_or((axis, "0 0 0"));
+        let mimic = if name == "right" { "<mimic joint='left_joint'/>" } else { "" };
+        urdf += &format!(
+            "<link name='{name}'/><joint name='{name}_joint' type='{kind}'><parent link='{}'/><child link='{name}'/>\
+             <origin xyz='{origin}'/><axis xyz='{axis}'/>{limit}{mimic}</joint>",
+            parents.next().unwrap()
+        );
+    }
+    let toml = format!(
+        "name = 'mobile'\nurdf = 'x'\n[arm]\njoints = ['arm_joint']\ntool = 'tool'\n\
+         [head]\njoints = ['pan_joint', 'tilt_joint']\n\
+         [gripper]\njoint = 'left_joint'\nhand = 'arm'\nfinger = 'left'\n\
+         [base]\njoints = ['along_x_joint', 'along_y_joint', 'base_joint']\nbody = 'base'\n{more}"
+    );
+    let description = RobotDescription::read(&toml).unwrap();
+    Robot::of(description, &(urdf + "</robot>"), None, &mut |_| unreachable!("it has no meshes"))
+}
+
+#[test]
+fn joints_that_cannot_move_their_part_are_refused_by_name() {
+    assert!(mobile(&[], "").is_ok());
+    let refused = |joint: &str, kind: &str| mobile(&[(joint, kind)], "").unwrap_err().to_string();
+    let says = |joint: &str, kind: &str, parts: &[&str]| {
+        let said = refused(joint, kind);
+        assert!(parts.iter().all(|part| said.contains(part)), "{said}");
+    };
+    says("left", "revolute 0 1 0", &["`gripper.joint`", "`left_joint`", "turns about (0, 1, 0)", "slides a finger"]);
+    says("right", "revolute 1 0 0", &["`gripper.joint`", "`left_joint`", "turns about (1, 0, 0)", "mimic"]);
+    says("pan", "prismatic 0 0 1", &["`head.joints`", "`pan_joint`", "slides along (0, 0, 1)", "turns"]);
+    says("along_x", "prismatic -1 0 0", &["`base.joints`", "`along_x_joint`", "slides along (-1, 0, 0)", "(1, 0, 0)"]);
+    says("along_y", "revolute 0 1 0", &["`base.joints`", "`along_y_joint`", "turns about", "slides along (0, 1, 0)"]);
+    says("base", "revolute 0 0 -1", &["`base.joints`", "`base_joint`", "turns about (0, 0, -1)", "about (0, 0, 1)"]);
+}
+
+#[test]
+fn a_base_that_is_not_where_its_joints_say_is_refused() {
+    for (joint, kind) in [
+        ("along_x", "prismatic 1 0 0 at 0 0 0.1"),
+        ("along_y", "prismatic 0 1 0 at 0.3 0 0"),
+        ("base", "revolute 0 0 1 at 0 -1 0"),
+    ] {
+        let said = mobile(&[(joint, kind)], "").unwrap_err().to_string();
+        assert!(
+            said.contains("`base.joints`") && said.contains("without an offset") && said.contains("`base`"),
+            "{said}"
+        );
+    }
+}
+
+#[test]
+fn a_joint_of_two_parts_is_refused() {
+    let toml = "[[other_arm]]\nname = 'second'\njoints = ['pan_joint']\ntool = 'pan'\n";
+    let said = mobile(&[], toml).unwrap_err().to_string();
+    assert!(said.starts_with("the joint `pan_joint` is of two parts, the arm `second` and [head]"), "{said}");
+}
+
+#[test]
+fn the_base_drives_where_both_its_joints_and_its_area_allow() {
+    let area = |more: &str| mobile(&[], more).unwrap().drive_area();
+    assert_eq!(area(""), Some(([[-10.0, 10.0]; 2], None)));
+    assert_eq!(area("area = { x = [-2, 30], y = [1, 4.5] }"), Some(([[-2.0, 10.0], [1.0, 4.5]], None)));
+    let said = mobile(&[], "area = { x = [11, 12], y = [1, 4.5] }").unwrap_err().to_string();
+    assert!(said.contains("`base.area`") && said.contains("`along_x_joint`"), "{said}");
+    assert_eq!(read(TOML).unwrap().drive_area(), None);
+    let aimm = Robot::aimm().drive_area();
+    assert_eq!(aimm, Some(([[-4.5, 4.5]; 2], None)));
 }

@@ -154,7 +154,10 @@ fn what_is_wrong_with_an_arm_is_said() {
     let said = |from: &str, to: &str| robot(&DESCRIPTION.replace(from, to), HAND).unwrap_err().to_string();
     assert_eq!(said("name = \"right\"", "name = \"left\""), "two arms are called `left`");
     let shared = said("\"right_joint_1\"", "\"left_joint_1\"");
-    assert!(shared.starts_with("the joint `left_joint_1` is of two arms"), "{shared}");
+    assert!(
+        shared.starts_with("the joint `left_joint_1` is of two parts, the arm `left` and the arm `right`"),
+        "{shared}"
+    );
     let posture = said("home = [0, -0.4, 0]", "home = [0, -0.4]");
     assert_eq!(posture, "the posture `home` has 2 positions: the arm has 3 joints");
     let beside = said("tool = \"right_3\"", "tool = \"left_3\"");

@@ -109,7 +109,7 @@ fn a_line_that_cannot_be_followed_says_how_far_and_which_joint_ends_it() {
 /// half of `part`, a hundred times between any two knots; and where it goes, in the world.
 fn strays(cell: &Cell, plan: &Plan, at_end: bool, length_m: f64) -> (f64, f64, [f64; 3]) {
     let trajectory = Curve::of_arm(&cell.robot, &plan.trajectory).unwrap();
-    let (reach, base) = (arm::reach(&cell.robot), arm::on_floor(&cell.scene.base));
+    let (reach, base) = (arm::reach(&cell.robot), arm::on_floor(&cell.robot, &cell.scene.base));
     let tool = |t: f64| base.compose(&reach.pose(&trajectory.sample(t).positions));
     let rest = tool(if at_end { trajectory.duration_s() } else { 0.0 });
     let mut times = Vec::new();

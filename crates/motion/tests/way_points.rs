@@ -89,7 +89,7 @@ fn any_arm_passes_its_way_points_and_rounds_corners_only_where_it_may() {
 
 fn places(cell: &Cell, plan: &Plan) -> Vec<[f64; 3]> {
     let curve = Curve::of_arm(&cell.robot, &plan.trajectory).unwrap();
-    let (reach, base) = (arm::reach(&cell.robot), arm::on_floor(&cell.scene.base));
+    let (reach, base) = (arm::reach(&cell.robot), arm::on_floor(&cell.robot, &cell.scene.base));
     let tool = |t: f64| base.compose(&reach.pose(&curve.sample(t).positions));
     moments(&curve).into_iter().map(|t| tool(t).position).collect()
 }

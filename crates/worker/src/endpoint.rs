@@ -5,6 +5,7 @@ use crate::leader::LeaderConnector;
 use crate::tls::ClientTls;
 use crate::tls::connect::Connector;
 use crate::trace::Traced;
+use hyper_util::client::legacy::connect::HttpConnector;
 use serde::{Deserialize, Serialize};
 use std::error::Error;
 use std::fmt;
@@ -15,9 +16,9 @@ use std::time::Duration;
 
 /// A connection attempt that takes longer has failed.
 pub const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
-/// Both sides ping a connection this often, idle or not …
+/// A connection is probed this often, idle or not: by pings of both sides, or by the system (`Watched`) …
 pub const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(5);
-/// … and give it up when a ping stays unanswered for this long.
+/// … and given up when a probe stays unanswered for this long.
 pub const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// A socket path has to fit into `sockaddr_un`, with its final zero.
@@ -187,12 +188,49 @@ impl TryFrom<String> for Endpoint {
 /// # Errors
 /// [`ConnectError`] when the endpoint makes no URI.
 pub fn connect_lazily(endpoint: &Endpoint, tls: &ClientTls) -> Result<Traced, ConnectError> {
-    let configured = configured(endpoint)?;
+    connect_lazily_as(endpoint, tls, Watched::ByPings)
+}
+
+/// As [`connect_lazily`].
+pub(crate) fn connect_lazily_as(
+    endpoint: &Endpoint,
+    tls: &ClientTls,
+    watched: Watched,
+) -> Result<Traced, ConnectError> {
+    let configured = match watched {
+        Watched::ByPings => configured(endpoint)?,
+        Watched::BySystem => unwatched(endpoint)?,
+    };
     Ok(Traced::new(match connector_of(endpoint, tls) {
         Some(By::Tls(connector)) => configured.connect_with_connector_lazy(connector),
         Some(By::Leader(connector)) => configured.connect_with_connector_lazy(connector),
+        Some(By::Tcp(connector)) => configured.connect_with_connector_lazy(connector),
         None => configured.connect_lazy(),
     }))
+}
+
+/// How a client notices that the other side of a quiet connection is gone.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Watched {
+    /// By pings of HTTP/2: what does not answer is suspended or gone. For the daemons of a system.
+    ByPings,
+    /// By the system's own probes of a TCP connection (keep-alive, and a bound for what is not acknowledged): its host is gone. For providers,
+    /// whose processes are watched over by leases and health. Servers of other gRPC libraries close a connection with GOAWAY
+    /// (`too_many_pings`) after the third ping within five minutes without data, and nothing tells them not to.
+    BySystem,
+}
+
+/// Connects over TCP; the system notices when the other host is gone.
+pub(crate) fn over_tcp() -> HttpConnector {
+    let mut tcp = HttpConnector::new();
+    tcp.enforce_http(false);
+    tcp.set_nodelay(true);
+    tcp.set_connect_timeout(Some(CONNECT_TIMEOUT));
+    tcp.set_keepalive(Some(KEEPALIVE_INTERVAL));
+    tcp.set_keepalive_interval(Some(KEEPALIVE_INTERVAL));
+    // It bounds unanswered probes and data that is not acknowledged alike.
+    tcp.set_tcp_user_timeout(Some(KEEPALIVE_INTERVAL + KEEPALIVE_TIMEOUT));
+    tcp
 }
 
 /// A channel that is connected, as [`connect_lazily`].
@@ -219,6 +257,7 @@ async fn connected(
     let connected = match connector_of(endpoint, tls) {
         Some(By::Tls(connector)) => configured.connect_with_connector(connector).await,
         Some(By::Leader(connector)) => configured.connect_with_connector(connector).await,
+        Some(By::Tcp(connector)) => configured.connect_with_connector(connector).await,
         None => configured.connect().await,
     };
     connected.map(Traced::new).map_err(|source| ConnectError { endpoint: endpoint.clone(), source })
@@ -229,13 +268,16 @@ enum By {
     /// TLS: tonic's own would be as it was when the channel was made.
     Tls(Connector),
     Leader(LeaderConnector),
+    /// Tonic's own does not bound what is not acknowledged.
+    Tcp(HttpConnector),
 }
 
 fn connector_of(endpoint: &Endpoint, tls: &ClientTls) -> Option<By> {
     match endpoint {
         Endpoint::Tls { host, .. } => Some(By::Tls(Connector::to(host, tls))),
         Endpoint::AnyOf(members) => Some(By::Leader(LeaderConnector::among(members, tls))),
-        Endpoint::Tcp { .. } | Endpoint::Unix(_) => None,
+        Endpoint::Tcp { .. } => Some(By::Tcp(over_tcp())),
+        Endpoint::Unix(_) => None,
     }
 }
 
@@ -253,7 +295,7 @@ fn unwatched(endpoint: &Endpoint) -> Result<tonic::transport::Endpoint, ConnectE
         let origin = tonic::transport::Endpoint::from_shared(endpoint.to_string()).map_err(failed)?;
         configured = configured.origin(origin.uri().clone());
     }
-    Ok(configured.connect_timeout(CONNECT_TIMEOUT).tcp_nodelay(true))
+    Ok(configured.connect_timeout(CONNECT_TIMEOUT))
 }
 
 /// As tonic takes it: of TLS it knows nothing.

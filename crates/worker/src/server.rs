@@ -363,8 +363,10 @@ impl Bound {
                 }
                 Listener::Unix(listener, file) => {
                     let incoming = accept_in_a_thread(listener, &limits, gate.clone(), true).map_err(cannot_accept)?;
-                    let incoming =
-                        incoming.filter_map(move |accepted| take_in(&taking, &*gate, accepted, true).transpose());
+                    let take_in = move |accepted| take_in(&taking, &*gate, accepted, true);
+                    let incoming = incoming.filter_map(move |accepted| {
+                        take_in(accepted).map(|taken| taken.map(Connection::at_a_path)).transpose()
+                    });
                     // Removed while it is still listened on: afterwards the file may be a successor's.
                     let stop = async {
                         stop.await;

@@ -8,6 +8,7 @@
 //! | `yaml` | a whole task, which `check` takes without an error, with `config=` on that system; `yaml fragment` is states of one |
 //! | `toml` | a config; `toml template` is the rest of a `[[process-manager.template]]`; `toml part-of=FILE` are lines of that file of the repository, in its order |
 //! | `rust example=FILE` | that file of the repository, which the compiler has read |
+//! | `python example=FILE` | that file of the repository, which `scripts/check-python` runs |
 //! | `json`, `turtle` | JSON, one or several documents; an ontology |
 //! | `text`, `xml` | not read here; commands of the document may read a `file=` |
 //! | anything else | must say why nothing runs it, behind `not run:`; they are counted |
@@ -118,7 +119,7 @@ fn examined(fence: &Fence, place: &Place) -> anyhow::Result<()> {
             Ok(())
         }
         "toml" => config(fence, place),
-        "rust" => {
+        "rust" | "python" => {
             let example = fence.value("example").context("no `example=` says which file this is")?;
             ensure!(std::fs::read_to_string(repository(example))? == fence.text, "this is not what {example} has");
             Ok(())

@@ -161,7 +161,7 @@ impl Cell {
         if self.robot.head_joints().is_empty() {
             return Err(NO_HEAD.to_owned());
         }
-        let (pan, tilt) = self.robot.look_at(&self.believed_base_pose(), target);
+        let (pan, tilt) = self.robot.look_at(&self.measured(), target);
         let looking = Configuration { pan, tilt, ..self.measured() };
         let camera = self.robot.camera_pose(&looking).ok_or_else(|| NO_CAMERA.to_owned())?;
         let seen = camera.inverse().transform(target);

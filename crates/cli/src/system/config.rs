@@ -133,6 +133,7 @@ impl SystemConfig {
             toml::from_str(text).map_err(|error| anyhow::anyhow!("{name}: {}", error.to_string().trim_end()))?;
         config.check().with_context(|| name.to_owned())?;
         config.compose(folder).with_context(|| name.to_owned())?;
+        config.process_manager.templates.iter_mut().for_each(|template| template.settle(folder));
         config.robot = match robot {
             Some(robot) => absolute(robot, Path::new(""))?,
             None => absolute(&config.robot, folder).with_context(|| name.to_owned())?,
@@ -206,7 +207,7 @@ impl SystemConfig {
         self.parts.fit(&mut self.catalogue);
         let not_told = |template: &&Template| {
             let says = |word: &str| template.args.iter().any(|argument| argument == word);
-            template.program.is_none() && says("worker") && !says("--robot")
+            template.program.is_none() && template.python.is_none() && says("worker") && !says("--robot")
         };
         match self.process_manager.templates.iter().find(not_told) {
             None => Ok(()),

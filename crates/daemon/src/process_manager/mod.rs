@@ -26,6 +26,7 @@ mod parameter;
 pub mod pools;
 mod predecessor;
 mod processes;
+mod python;
 mod readiness;
 mod roster;
 mod service;

@@ -229,9 +229,10 @@ impl Processes {
             (ReadinessCheck::Line(seen), Readiness::Line { contains }) => Some(Awaited::new(contains, seen.clone())),
             _ => None,
         };
+        let (program, args) = template.invocation();
         let job = Job {
             id: id.to_owned(),
-            args: template.args.iter().map(|arg| fill(arg)).collect(),
+            args: args.iter().map(|arg| fill(arg)).collect(),
             env,
             directory: template.directory.clone(),
             account,
@@ -241,7 +242,7 @@ impl Processes {
             log: self.log_file(id),
             max_log_bytes: self.max_log_bytes,
             outlives: template.adopt,
-            program: template.program.clone().unwrap_or_else(|| self.this_program.clone()),
+            program: program.unwrap_or_else(|| self.this_program.clone()),
         };
         let place = self.jobs.try_reserve().map_err(|_| BeginError::Busy)?;
         // Written before the process exists: a successor knows of every process.

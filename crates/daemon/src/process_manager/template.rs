@@ -5,6 +5,7 @@ use super::config::check_name;
 use super::limits::Limits;
 use super::machine::Sample;
 use super::parameter::{self, Parameter};
+use super::python::{self, Interpreter};
 use super::readiness::Readiness;
 use crate::config::{ConfigError, rule};
 use nix::unistd::{AccessFlags, access};
@@ -29,6 +30,14 @@ pub struct Template {
     /// What to run; without it, this program.
     #[serde(default)]
     pub program: Option<PathBuf>,
+    /// A worker in Python, in place of `program`: the script, from the folder of the config. It gets `--id {id} --endpoint-file {endpoint_file}
+    /// --kind {kind}` before `args`.
+    #[serde(default)]
+    pub python: Option<PathBuf>,
+    /// What runs the script; unless given the virtual environment (`.venv`, `venv`) beside it or in a folder above, then the one that the
+    /// process manager was started in, then `python3`.
+    #[serde(default)]
+    pub interpreter: Option<PathBuf>,
     /// Its arguments. `{id}`, `{kind}`, `{host}`, `{runtime_dir}`, `{endpoint_file}` and the names of `parameters` are filled in.
     /// The worker writes where it serves to `{endpoint_file}`, which is `{runtime_dir}/{id}.endpoint`; its standard input is a
     /// pipe that ends with the process manager.
@@ -170,8 +179,30 @@ impl Liveness {
 impl Template {
     /// What is run, for messages.
     pub(super) fn command_line(&self) -> String {
-        let program = self.program.as_ref().map_or_else(|| "ratn".to_owned(), |program| program.display().to_string());
-        std::iter::once(program).chain(self.args.iter().cloned()).collect::<Vec<_>>().join(" ")
+        let (program, args) = self.invocation();
+        let program = program.map_or_else(|| "ratn".to_owned(), |program| program.display().to_string());
+        std::iter::once(program).chain(args).collect::<Vec<_>>().join(" ")
+    }
+
+    /// What to run (this program, where none is named) with which arguments, in which nothing is filled in yet.
+    pub(super) fn invocation(&self) -> (Option<PathBuf>, Vec<String>) {
+        match &self.python {
+            None => (self.program.clone(), self.args.clone()),
+            Some(script) => (Some(self.interpreter_of(script).program), python::arguments(script, &self.args)),
+        }
+    }
+
+    fn interpreter_of(&self, script: &Path) -> Interpreter {
+        let active = std::env::var_os("VIRTUAL_ENV").map(PathBuf::from);
+        Interpreter::of(script, self.interpreter.as_deref(), active.as_deref(), Path::is_file)
+    }
+
+    /// With the paths of a config as they are from the folder that it is in.
+    pub fn settle(&mut self, folder: &Path) {
+        if let Some(script) = self.python.as_mut().filter(|script| script.is_relative()) {
+            let from_here = folder.join(&*script);
+            *script = std::path::absolute(&from_here).unwrap_or(from_here);
+        }
     }
 
     /// A template with the default of every optional key.
@@ -180,6 +211,8 @@ impl Template {
             name: name.into(),
             kind: kind.into(),
             program: None,
+            python: None,
+            interpreter: None,
             args: Vec::new(),
             parameters: BTreeMap::new(),
             env: BTreeMap::new(),
@@ -244,6 +277,8 @@ impl Template {
             name: String::new(),
             kind: template.kind.clone(),
             program: template.program.clone(),
+            python: template.python.clone(),
+            interpreter: template.interpreter.clone(),
             args: template.args.clone(),
             parameters: template.parameters.clone(),
             env: template.env.clone(),
@@ -268,18 +303,20 @@ impl Template {
         if let Some(Err(why)) = self.user.as_deref().map(Account::named) {
             return Some(why);
         }
-        let program = self.program.as_ref()?;
-        let runs = |file: &Path| file.is_file() && access(file, AccessFlags::X_OK).is_ok();
-        if program.components().count() > 1 {
-            return match (program.is_file(), runs(program)) {
-                (false, _) => Some(format!("there is no program {}", program.display())),
-                (true, false) => Some(format!("{} may not be executed", program.display())),
-                (true, true) => None,
-            };
+        if let Some(script) = &self.python {
+            if !script.is_file() {
+                return Some(format!("there is no Python script {}", script.display()));
+            }
+            let Interpreter { program, because } = self.interpreter_of(script);
+            return not_there(&program).map(|why| format!("{why}, which is to run {} ({because})", script.display()));
         }
-        let path = std::env::var_os("PATH").unwrap_or_default();
-        let found = std::env::split_paths(&path).any(|directory| runs(&directory.join(program)));
-        (!found).then(|| format!("there is no program {} in PATH", program.display()))
+        not_there(self.program.as_ref()?)
+    }
+
+    /// What runs a worker in Python, and why that, for people.
+    pub fn interpreter(&self) -> Option<String> {
+        let Interpreter { program, because } = self.interpreter_of(self.python.as_deref()?);
+        Some(format!("{} runs it ({because})", program.display()))
     }
 
     /// Says what is wrong with it; `at` is its place in the config.
@@ -287,6 +324,10 @@ impl Template {
         let key = |name: &str| format!("{at}.{name}");
         check_name(&key("name"), &self.name)?;
         check_name(&key("kind"), &self.kind)?;
+        let one_of_both = self.python.is_none() || self.program.is_none();
+        rule(key("python"), one_of_both, "instead of `program`, not beside it: `interpreter` is what runs the script")?;
+        let runs_something = self.interpreter.is_none() || self.python.is_some();
+        rule(key("interpreter"), runs_something, "beside `python`, whose script it runs")?;
         let max = self.max_workers();
         rule(key("max"), self.min <= max, format!("min = {} is above max = {max}", self.min))?;
         rule(key("max"), max <= MAX_WORKERS, format!("at most {MAX_WORKERS}"))?;
@@ -343,6 +384,21 @@ impl Template {
     }
 }
 
+/// Why a program cannot be started.
+fn not_there(program: &Path) -> Option<String> {
+    let runs = |file: &Path| file.is_file() && access(file, AccessFlags::X_OK).is_ok();
+    if program.components().count() > 1 {
+        return match (program.is_file(), runs(program)) {
+            (false, _) => Some(format!("there is no program {}", program.display())),
+            (true, false) => Some(format!("{} may not be executed", program.display())),
+            (true, true) => None,
+        };
+    }
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let found = std::env::split_paths(&path).any(|directory| runs(&directory.join(program)));
+    (!found).then(|| format!("there is no program {} in PATH", program.display()))
+}
+
 fn one() -> u32 {
     1
 }
@@ -378,6 +434,24 @@ fn crash_limit() -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_script_is_run_in_place_of_a_program() {
+        let with = |program: Option<&str>, python: Option<&str>, interpreter: Option<&str>| Template {
+            program: program.map(PathBuf::from),
+            python: python.map(PathBuf::from),
+            interpreter: interpreter.map(PathBuf::from),
+            ..Template::new("near", "Near")
+        };
+        let refused = |template: Template| template.check("templates[0]").map_err(|error| error.to_string());
+        assert!(refused(with(None, Some("near.py"), Some("python3"))).is_ok());
+        assert!(refused(with(Some("x"), Some("near.py"), None)).is_err_and(|why| why.contains("templates[0].python")));
+        assert!(refused(with(None, None, Some("x"))).is_err_and(|why| why.contains("templates[0].interpreter")));
+        let mut near = with(None, Some("near.py"), Some("python3"));
+        near.settle(Path::new("/project"));
+        assert!(near.command_line().starts_with("python3 /project/near.py --id {id} "), "{}", near.command_line());
+        assert!(near.obstacle().is_some_and(|why| why.contains("no Python script /project/near.py")));
+    }
 
     #[test]
     fn what_moves_has_one_worker() {

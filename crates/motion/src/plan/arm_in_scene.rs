@@ -70,7 +70,7 @@ impl<'a> ArmInScene<'a> {
             checker: Checker::new(robot, scene, &here, PADDING_M).reaching_into(&request.reaches_into),
             space: arm::space(&mechanism, &obstacles),
             reach: Reach::new(&mechanism, robot.tool, Pose::IDENTITY),
-            base: arm::on_floor(&scene.base),
+            base: arm::on_floor(robot, &scene.base),
             constraint: None,
             rough: Rough::new(&request.joints(robot), request.speed),
             random: ChaCha8Rng::seed_from_u64(request.seed),

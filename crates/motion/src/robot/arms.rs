@@ -44,10 +44,6 @@ impl OtherArm {
             if taken.iter().any(|arm| arm.name == other.name) {
                 return Err(RobotFault::ArmTwice { arm: other.name.clone() });
             }
-            let shared = |joint: &&String| taken.iter().any(|arm| arm.joints.contains(joint));
-            if let Some(joint) = other.joints.iter().find(shared) {
-                return Err(RobotFault::JointOfTwo { joint: joint.clone() });
-            }
             let part = Part::of(model, &other.joints)?;
             if let Some(home) = other.postures.get(HOME) {
                 part.put(&part.posture(HOME, home)?, neutral);

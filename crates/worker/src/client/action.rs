@@ -11,11 +11,12 @@ use ratn_proto::convert::{MAX_DESCRIPTION_BYTES, Malformed, ports};
 use ratn_proto::types::{Goal, GoalOutcome};
 use ratn_proto::v1;
 use ratn_proto::v1::action_service_client::ActionServiceClient;
+use ratn_proto::v1::execute_response::Kind;
 use ratn_proto::v1::perform_request::Kind as Asked;
 use ratn_proto::v1::perform_response::Kind as Heard;
 use std::collections::BTreeMap;
 use std::time::Duration;
-use tonic::Code;
+use tonic::{Code, Status};
 
 /// Gives goals to providers.
 #[derive(Debug, Clone)]
@@ -118,7 +119,7 @@ impl ActionClient {
     ) -> Result<Fate, CallError> {
         let malformed = |m: Malformed| CallError::malformed(endpoint, m);
         let mut nonsense = None;
-        let heard = |answer| {
+        let mut heard = |answer| {
             let Heard::Progress(progress) = answer else { return };
             match ports(progress.values, "progress.values") {
                 Ok(values) => on_progress(progress.message, values),
@@ -128,7 +129,12 @@ impl ActionClient {
         let mut client = self.client(endpoint)?;
         let open = |questions| async move { client.perform(questions).await };
         let stream = self.channels.goals(endpoint);
-        let answer = stream.call_with_progress(open, Asked::Execute(question), heard).await;
+        let answer = stream.call_with_progress(open, Asked::Execute(question.clone()), &mut heard).await;
+        let answer = match answer {
+            // Its author has implemented only what is needed for one goal.
+            Err(status) if status.code() == Code::Unimplemented => self.execute_alone(endpoint, question, heard).await,
+            answer => answer,
+        };
         let answer = answer.map_err(|status| CallError::from_status(endpoint, &status))?;
         let Heard::Result(result) = answer else {
             return Err(malformed(Malformed::new("kind", "is not that of a goal's end")));
@@ -138,6 +144,25 @@ impl ActionClient {
         }
         let orphaned = result.orphaned;
         Ok(Fate { outcome: result.try_into().map_err(malformed)?, orphaned })
+    }
+
+    /// A goal over a stream of its own.
+    async fn execute_alone(
+        &self,
+        endpoint: &Endpoint,
+        question: v1::ExecuteRequest,
+        mut heard: impl FnMut(Heard),
+    ) -> Result<Heard, Status> {
+        let mut client = self.client(endpoint).map_err(|error| Status::unavailable(chain(&error)))?;
+        let mut answers = client.execute(question).await?.into_inner();
+        while let Some(answer) = answers.message().await? {
+            match answer.kind {
+                Some(Kind::Progress(progress)) => heard(Heard::Progress(progress)),
+                Some(Kind::Result(result)) => return Ok(Heard::Result(result)),
+                Some(Kind::Accepted(_)) | None => {}
+            }
+        }
+        Err(Status::unavailable("the stream ended without the goal's result"))
     }
 
     /// Tells a goal to stop; whether it was under way. Its outcome comes over its execute.
@@ -170,7 +195,7 @@ impl ActionClient {
     /// # Errors
     /// [`DescribeError`].
     pub async fn description(&self, endpoint: &Endpoint, within: Duration) -> Result<WorkerDescription, DescribeError> {
-        let channel = self.channels.get(endpoint).map_err(|error| DescribeError::Unanswered(chain(&error)))?;
+        let channel = self.channels.to_provider(endpoint).map_err(|error| DescribeError::Unanswered(chain(&error)))?;
         let mut client = ActionServiceClient::new(channel).max_decoding_message_size(MAX_DESCRIPTION_BYTES);
         let answer = tokio::time::timeout(within, client.describe(v1::DescribeRequest {})).await;
         let late = |_| DescribeError::Unanswered(format!("no answer within {:.1} s", within.as_secs_f64()));
@@ -183,7 +208,7 @@ impl ActionClient {
     }
 
     fn client(&self, endpoint: &Endpoint) -> Result<ActionServiceClient<Traced>, CallError> {
-        Ok(ActionServiceClient::new(self.channels.get(endpoint)?)
+        Ok(ActionServiceClient::new(self.channels.to_provider(endpoint)?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES))
     }

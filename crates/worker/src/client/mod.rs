@@ -3,6 +3,7 @@
 mod action;
 mod error;
 mod health;
+mod pattern;
 mod process;
 mod resource;
 mod retry;
@@ -13,12 +14,13 @@ mod world;
 pub use action::{ActionClient, ActionInfo, DescribeError, Fate, ProviderInfo};
 pub use error::CallError;
 pub use health::{Health, NOT_SERVING, wait_until_serving};
+pub use pattern::{fact, pattern};
 pub use process::{LogPieces, ProcessClient, WorkerWatch};
 pub use resource::{AcquireOptions, DemandWatch, ResourceClient, ResourceWatch};
 pub use retry::{PAUSE, retry_unanswered, retry_until_answered};
 pub use world::{Commit, Projection, ProjectionWatch, WorldClient, WorldWatch};
 
-use crate::endpoint::{Endpoint, connect_lazily};
+use crate::endpoint::{Endpoint, Watched, connect_lazily_as};
 use crate::multiplex::GoalCalls;
 use crate::multiplex::client::Multiplexer;
 use crate::tls::ClientTls;
@@ -39,29 +41,46 @@ const MAX_STREAMS: usize = 256;
 #[derive(Debug, Clone)]
 pub struct Channels {
     tls: ClientTls,
-    kept: Arc<Mutex<BTreeMap<Endpoint, Traced>>>,
+    kept: Kept,
+    providers: Kept,
     goals: Arc<Mutex<BTreeMap<Endpoint, Multiplexer<GoalCalls>>>>,
 }
+
+type Kept = Arc<Mutex<BTreeMap<Endpoint, Traced>>>;
 
 impl Channels {
     /// None yet. Those to `https://` endpoints will trust and show what `tls` does when they connect.
     pub fn new(tls: &ClientTls) -> Channels {
-        Channels { tls: tls.clone(), kept: Arc::default(), goals: Arc::default() }
+        Channels { tls: tls.clone(), kept: Arc::default(), providers: Arc::default(), goals: Arc::default() }
     }
 
-    /// The channel to `endpoint`: its calls carry the trace of the task that makes them, and say the protocol. Needs a tokio runtime.
+    /// The channel to the daemon at `endpoint`: its calls carry the trace of the task that makes them, and say the protocol. Needs a tokio
+    /// runtime.
     ///
     /// # Errors
     /// [`CallError::Broken`] when the endpoint makes no URI.
     pub fn get(&self, endpoint: &Endpoint) -> Result<Traced, CallError> {
-        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        self.kept_or_made(&self.kept, endpoint, Watched::ByPings)
+    }
+
+    /// As [`Channels::get`], to a provider, which may be written in any language: it is not pinged, for
+    /// servers of other libraries take pings for abuse.
+    ///
+    /// # Errors
+    /// As [`Channels::get`].
+    pub fn to_provider(&self, endpoint: &Endpoint) -> Result<Traced, CallError> {
+        self.kept_or_made(&self.providers, endpoint, Watched::BySystem)
+    }
+
+    fn kept_or_made(&self, kept: &Kept, endpoint: &Endpoint, watched: Watched) -> Result<Traced, CallError> {
+        let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(channel) = kept.get(endpoint) {
             return Ok(channel.clone());
         }
         if kept.len() >= MAX_CHANNELS {
             kept.clear();
         }
-        let channel = connect_lazily(endpoint, &self.tls)
+        let channel = connect_lazily_as(endpoint, &self.tls, watched)
             .map_err(|error| CallError::Broken { endpoint: endpoint.clone(), reason: chain(&error) })?;
         kept.insert(endpoint.clone(), channel.clone());
         Ok(channel)
@@ -78,7 +97,9 @@ impl Channels {
 
     /// Forgets the channel to an endpoint that is gone for good.
     pub fn forget(&self, endpoint: &Endpoint) {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner).remove(endpoint);
+        for kept in [&self.kept, &self.providers] {
+            kept.lock().unwrap_or_else(PoisonError::into_inner).remove(endpoint);
+        }
     }
 }
 

@@ -15,6 +15,7 @@
 //! - A connection without a call is closed at its deadline.
 
 pub(crate) mod accepting;
+mod authority;
 mod limits;
 mod origin;
 mod rates;
@@ -90,7 +91,7 @@ impl Connections {
         drop(state);
         let link = Link { id, connections: self.clone() };
         let closed = Box::pin(close.cancelled_owned());
-        Ok(Connection { stream, closed, registered: Registered(link) })
+        Ok(Connection { stream, closed, registered: Registered(link), authority: None })
     }
 
     /// Closes all that are still open.

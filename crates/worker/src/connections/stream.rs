@@ -1,6 +1,7 @@
 //! The bytes of a connection that is counted, and closed when its time is over.
 
 use super::Link;
+use super::authority::Authority;
 use std::io;
 use std::pin::Pin;
 use std::task::{Context, Poll};
@@ -14,6 +15,15 @@ pub(crate) struct Connection<S> {
     pub(super) stream: S,
     pub(super) closed: Pin<Box<WaitForCancellationFutureOwned>>,
     pub(super) registered: Registered,
+    pub(super) authority: Option<Authority>,
+}
+
+impl<S> Connection<S> {
+    /// At a Unix socket, where clients may name the server by its path.
+    pub(crate) fn at_a_path(mut self) -> Connection<S> {
+        self.authority = Some(Authority::default());
+        self
+    }
 }
 
 #[derive(Debug)]
@@ -49,7 +59,12 @@ impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
         if self.closed.as_mut().poll(context).is_ready() {
             return Poll::Ready(Err(io::Error::new(io::ErrorKind::TimedOut, "nothing was asked for too long")));
         }
-        Pin::new(&mut self.stream).poll_read(context, buffer)
+        let known = buffer.filled().len();
+        let read = Pin::new(&mut self.stream).poll_read(context, buffer);
+        if let Some(authority) = &mut self.authority {
+            authority.pass(&mut buffer.filled_mut()[known..]);
+        }
+        read
     }
 }
 

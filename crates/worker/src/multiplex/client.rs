@@ -1,7 +1,8 @@
 //! The asking side: the calls of all tasks share one stream.
 //!
 //! The stream is opened with the first call, and again with the first one after it broke; the calls that were under way then fail
-//! as calls of their own would.
+//! as calls of their own would. A call does not wait until the other side has answered the opening: many servers do that with their first
+//! message, which is the answer to a call.
 
 use super::Protocol;
 use crate::panic::exit_on_panic;
@@ -23,7 +24,7 @@ type LastAnswer<P> = oneshot::Sender<Result<<P as Protocol>::Answer, Status>>;
 
 /// A stream that is opened when it is needed. Clones share it.
 pub(crate) struct Multiplexer<P: Protocol> {
-    stream: Arc<tokio::sync::Mutex<Option<Stream<P>>>>,
+    stream: Arc<Mutex<Option<Stream<P>>>>,
 }
 
 /// An open stream.
@@ -54,9 +55,9 @@ impl<P: Protocol> Multiplexer<P> {
         call: P::Call,
     ) -> Result<P::Answer, Status>
     where
-        F: Future<Output = Opened<P>>,
+        F: Future<Output = Opened<P>> + Send + 'static,
     {
-        self.open(open).await?.call(call, None, |_| {}).await
+        self.open(open).call(call, None, |_| {}).await
     }
 
     /// As [`Multiplexer::call`]; what the other side is told when the call is dropped is completed then.
@@ -67,9 +68,9 @@ impl<P: Protocol> Multiplexer<P> {
         when_dropped: impl FnOnce(&mut P::Call),
     ) -> Result<P::Answer, Status>
     where
-        F: Future<Output = Opened<P>>,
+        F: Future<Output = Opened<P>> + Send + 'static,
     {
-        self.open(open).await?.call(call, None, when_dropped).await
+        self.open(open).call(call, None, when_dropped).await
     }
 
     /// Makes a call that may have other answers before the last one.
@@ -80,9 +81,9 @@ impl<P: Protocol> Multiplexer<P> {
         mut on_progress: impl FnMut(P::Answer),
     ) -> Result<P::Answer, Status>
     where
-        F: Future<Output = Opened<P>>,
+        F: Future<Output = Opened<P>> + Send + 'static,
     {
-        let stream = self.open(open).await?;
+        let stream = self.open(open);
         let (progress, mut heard) = mpsc::channel(PROGRESS);
         let listened = async {
             while let Some(answer) = heard.recv().await {
@@ -94,25 +95,28 @@ impl<P: Protocol> Multiplexer<P> {
         last
     }
 
-    /// Whether a call is under way, or the stream is being opened.
+    /// Whether a call is under way.
     pub(crate) fn is_used(&self) -> bool {
-        let Ok(stream) = self.stream.try_lock() else { return true };
-        stream.as_ref().is_some_and(|stream| !stream.calls().waiting.is_empty())
+        self.kept().as_ref().is_some_and(|stream| !stream.calls().waiting.is_empty())
     }
 
-    async fn open<F>(&self, open: impl FnOnce(ReceiverStream<P::Request>) -> F) -> Result<Stream<P>, Status>
+    fn open<F>(&self, open: impl FnOnce(ReceiverStream<P::Request>) -> F) -> Stream<P>
     where
-        F: Future<Output = Opened<P>>,
+        F: Future<Output = Opened<P>> + Send + 'static,
     {
-        let mut kept = self.stream.lock().await;
+        let mut kept = self.kept();
         if let Some(stream) = kept.as_ref().filter(|stream| stream.calls().broken.is_none()) {
-            return Ok(stream.clone());
+            return stream.clone();
         }
         let (requests, outgoing) = mpsc::channel(OUTGOING);
-        let responses = open(ReceiverStream::new(outgoing)).await?.into_inner();
+        let opened = open(ReceiverStream::new(outgoing));
         let calls = Arc::new(Mutex::new(Calls { last_id: 0, waiting: BTreeMap::new(), broken: None }));
-        tokio::spawn(exit_on_panic("the reader of a stream of calls", read(responses, Arc::clone(&calls))));
-        Ok(kept.insert(Stream { requests, calls }).clone())
+        tokio::spawn(exit_on_panic("the reader of a stream of calls", read(opened, Arc::clone(&calls))));
+        kept.insert(Stream { requests, calls }).clone()
+    }
+
+    fn kept(&self) -> MutexGuard<'_, Option<Stream<P>>> {
+        self.stream.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -191,16 +195,22 @@ impl<P: Protocol, F: FnOnce(&mut P::Call)> Drop for UnderWay<'_, P, F> {
 }
 
 /// Hands out the answers until there are no more.
-async fn read<P: Protocol>(mut responses: Streaming<P::Response>, calls: Arc<Mutex<Calls<P>>>) {
+async fn read<P: Protocol>(opened: impl Future<Output = Opened<P>>, calls: Arc<Mutex<Calls<P>>>) {
     let lock = || calls.lock().unwrap_or_else(PoisonError::into_inner);
-    let broken = loop {
-        match responses.message().await {
-            Ok(Some(response)) => {
-                let (id, answer) = P::answer(response);
-                lock().answered(id, answer);
+    let broken = match opened.await {
+        Err(status) => status,
+        Ok(opened) => {
+            let mut responses = opened.into_inner();
+            loop {
+                match responses.message().await {
+                    Ok(Some(response)) => {
+                        let (id, answer) = P::answer(response);
+                        lock().answered(id, answer);
+                    }
+                    Ok(None) => break closed(),
+                    Err(status) => break status,
+                }
             }
-            Ok(None) => break closed(),
-            Err(status) => break status,
         }
     };
     let mut calls = lock();

@@ -20,7 +20,7 @@ impl SafetyClient {
     /// # Errors
     /// Where the endpoint is none.
     pub fn new(channels: &Channels, endpoint: &Endpoint) -> Result<SafetyClient, CallError> {
-        let client = SafetyServiceClient::new(channels.get(endpoint)?);
+        let client = SafetyServiceClient::new(channels.to_provider(endpoint)?);
         Ok(SafetyClient { client, endpoint: endpoint.clone() })
     }
 

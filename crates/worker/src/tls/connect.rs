@@ -1,7 +1,7 @@
 //! A client's side of handshakes: each connection is made with what the client trusts and shows at that time.
 
 use super::{ALPN_H2, CA_VARIABLE, ClientTls};
-use crate::endpoint::CONNECT_TIMEOUT;
+use crate::endpoint::over_tcp;
 use hyper_util::client::legacy::connect::HttpConnector;
 use hyper_util::rt::TokioIo;
 use std::future::Future;
@@ -25,11 +25,7 @@ pub(crate) struct Connector {
 impl Connector {
     /// To `host`, as it is in the server's certificate, with what `tls` trusts and shows.
     pub(crate) fn to(host: &str, tls: &ClientTls) -> Connector {
-        let mut tcp = HttpConnector::new();
-        tcp.enforce_http(false);
-        tcp.set_nodelay(true);
-        tcp.set_connect_timeout(Some(CONNECT_TIMEOUT));
-        Connector { tcp, host: host.to_owned(), tls: tls.clone() }
+        Connector { tcp: over_tcp(), host: host.to_owned(), tls: tls.clone() }
     }
 }
 

@@ -12,7 +12,7 @@ pub(super) fn check(findings: &mut Findings, config: &ProcessManagerConfig) {
                 obstacle,
                 "if its workers run on another host, this is well there: `ratn doctor` on that host says so",
             ),
-            None => findings.ok(about, "what it starts is there"),
+            None => findings.ok(about, template.interpreter().as_deref().unwrap_or("what it starts is there")),
         }
     }
 }

@@ -1,8 +1,8 @@
 //! The command line of `ratn world`.
 
-use super::pattern::{fact, pattern};
 use clap::{Args, Subcommand, ValueEnum};
 use ratn_model::fact::{FactKey, FactPattern};
+use ratn_worker::client::{fact, pattern};
 use ratn_worker::endpoint::Endpoint;
 use std::path::PathBuf;
 

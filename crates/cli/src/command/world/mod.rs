@@ -5,7 +5,6 @@
 
 mod arguments;
 mod dump;
-mod pattern;
 mod show;
 mod sparql;
 mod task_text;

@@ -4,7 +4,10 @@
 use ratn_model::fact::{FactKey, FactPattern, Term};
 
 /// Reads a pattern.
-pub(super) fn pattern(text: &str) -> Result<FactPattern, String> {
+///
+/// # Errors
+/// What is expected instead.
+pub fn pattern(text: &str) -> Result<FactPattern, String> {
     let wrong = || format!("`{text}` is no pattern: expected `predicate(argument, ?)`");
     let (predicate, rest) = text.trim().split_once('(').ok_or_else(wrong)?;
     let inside = rest.strip_suffix(')').ok_or_else(wrong)?;
@@ -37,7 +40,10 @@ pub(super) fn pattern(text: &str) -> Result<FactPattern, String> {
 }
 
 /// Reads a pattern that matches one fact only.
-pub(super) fn fact(text: &str) -> Result<FactKey, String> {
+///
+/// # Errors
+/// What is expected instead.
+pub fn fact(text: &str) -> Result<FactKey, String> {
     let FactPattern { predicate, arguments } = pattern(text)?;
     let arguments: Option<Vec<Term>> = arguments.into_iter().collect();
     let arguments = arguments.ok_or_else(|| format!("`{text}` is no single fact: say every argument"))?;

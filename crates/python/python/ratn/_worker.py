@@ -1,0 +1,138 @@
+"""A worker: a process that performs actions, which are functions."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+import pathlib
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from ratn import _ports, _ratn
+from ratn._ratn import Cancelled, Goal
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+@dataclass
+class Outcome:
+    """How a goal ends that ends otherwise than with success: one of the action's ``outcomes``."""
+
+    name: str
+    outputs: dict[str, Any] = field(default_factory=dict)
+    reason: str = ""
+
+
+class Worker:
+    """A worker that takes one goal at a time. As many processes of it run in parallel as its template says.
+
+    ``provider`` is what tasks call it (``inspector`` of ``inspector/nearest``): the name of its file unless given. ``kind`` is the
+    kind of resource that it is: what the template says (``--kind``), or ``Inspector`` of ``inspector``.
+    """
+
+    def __init__(self, provider: str | None = None, *, kind: str | None = None) -> None:
+        self.provider = provider or _name_of_script()
+        self.kind = kind
+        self._actions: dict[str, _ports.Action] = {}
+
+    def action(
+        self,
+        function: _Function | None = None,
+        *,
+        name: str | None = None,
+        outputs: dict[str, Any] | None = None,
+        outcomes: Iterable[str] = (),
+        computes: bool | None = None,
+        reads: Iterable[str] = (),
+        senses: Iterable[str] = (),
+        requires: Iterable[str] = (),
+        effects: Iterable[str] = (),
+    ) -> Any:
+        """Makes a function (also an ``async def``) an action. Its first parameter is the goal, the others are the input ports.
+
+        It returns its outputs as a ``dict``, or an ``Outcome``. ``computes`` is true where it neither senses nor changes anything.
+        """
+
+        def known(function: _Function) -> _Function:
+            senses_, effects_ = list(senses), list(effects)
+            inputs, arrays = _ports.inputs_of(function)
+            action = _ports.Action(
+                name=name or function.__name__,
+                description=(inspect.getdoc(function) or "").split("\n\n")[0].replace("\n", " "),
+                inputs=inputs,
+                outputs=_ports.outputs_of(function, outputs),
+                outcomes=list(outcomes),
+                computes=not (senses_ or effects_) if computes is None else computes,
+                reads=list(reads),
+                senses=senses_,
+                requires=list(requires),
+                effects=effects_,
+                perform=lambda *_: ("aborted", {}, "not ready"),
+                arrays=arrays,
+            )
+            if action.name in self._actions:
+                raise ValueError(f"{_ports.where(function)}: there is an action `{action.name}` already")
+            action.perform = lambda goal, given: _performed(function, action, goal, given)
+            self._actions[action.name] = action
+            return function
+
+        return known if function is None else known(function)
+
+    def run(self, arguments: list[str] | None = None, *, without_leases: bool = False) -> None:
+        """Serves goals until the process is told to end, by a signal or by the end of its standard input.
+
+        ``arguments`` are those that a template passes: the process's own unless given. What is logged with ``logging`` is in the
+        worker's log (``ratn logs``). Without leases whoever may call it has it perform goals: for trying it out.
+        """
+        if not self._actions:
+            raise ValueError("the worker has no actions: decorate a function with `@worker.action`")
+        if not logging.getLogger().handlers:
+            logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+        arguments = sys.argv[1:] if arguments is None else arguments
+        kind = self.kind or "".join(part.capitalize() for part in self.provider.split("_"))
+        _ratn.serve(arguments, self.provider, kind, list(self._actions.values()), without_leases)
+
+
+def _name_of_script() -> str:
+    script = pathlib.Path(getattr(sys.modules.get("__main__"), "__file__", None) or "worker").stem
+    return "".join(letter if letter.isalnum() else "_" for letter in script).lower().strip("_") or "worker"
+
+
+def _performed(
+    function: Callable[..., Any], action: _ports.Action, goal: Goal, given: dict[str, Any]
+) -> tuple[str, dict[str, Any], str]:
+    for port in action.arrays & given.keys():
+        import numpy
+
+        given[port] = numpy.asarray(given[port], dtype=float)
+    ended = function(goal, **given)
+    if inspect.isawaitable(ended):
+        ended = asyncio.run(_until_cancelled(goal, ended))
+    if isinstance(ended, Outcome):
+        return ended.name, ended.outputs, ended.reason
+    ended = {} if ended is None else ended
+    if not isinstance(ended, dict):
+        raise TypeError(f"{_ports.where(function)} returned a {type(ended).__name__}: expected a dict of outputs, or an Outcome")
+    kinds = dict(action.outputs)
+    return "success", {port: _ports.fitting(value, kinds.get(port, "any")) for port, value in ended.items()}, ""
+
+
+async def _until_cancelled(goal: Goal, work: Any) -> Any:
+    """Awaits the work of an ``async def``, which is cancelled as asyncio does it when the goal shall stop."""
+    task = asyncio.ensure_future(work)
+    loop = asyncio.get_running_loop()
+
+    def cancel() -> None:
+        if not loop.is_closed():
+            loop.call_soon_threadsafe(task.cancel)
+
+    goal.on_cancel(cancel)
+    try:
+        return await task
+    except asyncio.CancelledError:
+        if goal.cancelled:
+            raise Cancelled("the goal shall stop") from None
+        raise

@@ -1,0 +1,273 @@
+//! A client of a running system: its resources and its world. Sessions are kept alive in a thread of their own, whatever Python does.
+
+use crate::error::{Error, Unavailable, line, of_call};
+use crate::value::{Fact, from_python};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use ratn_model::fact::{Change, FactPattern};
+use ratn_model::resource::{Requirement, ResourceOperation};
+use ratn_proto::types::WorldUpdate;
+use ratn_worker::client::{AcquireOptions, CallError, Channels, ResourceClient, WorldClient, fact, fresh_id, pattern};
+use ratn_worker::endpoint::Endpoint;
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::session::{DEFAULT_TTL, Session};
+use ratn_worker::tls::ClientTls;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+use tokio::runtime::{Builder, Runtime};
+use tokio::sync::mpsc;
+
+/// A resource manager that opens no session for so long is not there.
+const SESSION_PATIENCE: Duration = Duration::from_secs(5);
+/// How often Python is asked for a signal (Ctrl-C) while something is waited for.
+const SIGNALS: Duration = Duration::from_millis(100);
+const MAX_WAIT_S: f64 = 1e9;
+/// Revisions that Python has not asked for yet; more wait in the world pool.
+const MAX_UPDATES: usize = 64;
+
+/// What speaks to the system whose endpoint files are in a directory.
+#[pyclass(frozen, module = "ratn")]
+pub(crate) struct Client {
+    runtime: Arc<Runtime>,
+    channels: Channels,
+    resource_manager: Endpoint,
+    world: WorldClient,
+    session: Mutex<Option<Arc<Held>>>,
+}
+
+/// A session, and what asks in its name.
+struct Held {
+    session: Session,
+    client: ResourceClient,
+}
+
+impl Client {
+    fn held(&self, py: Python<'_>) -> PyResult<Arc<Held>> {
+        let mut kept = self.session.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(held) = kept.as_ref() {
+            return Ok(Arc::clone(held));
+        }
+        let _within = self.runtime.enter();
+        let session = Session::open(&self.channels, &self.resource_manager, "python", DEFAULT_TTL);
+        let alive = py.detach(|| self.runtime.block_on(session.alive(SESSION_PATIENCE)));
+        alive.map_err(|error| Unavailable::new_err(line(&error)))?;
+        let client = ResourceClient::new(&self.channels, &self.resource_manager, session.id());
+        let client = client.map_err(|error| of_call(&error))?;
+        Ok(Arc::clone(kept.insert(Arc::new(Held { session, client }))))
+    }
+}
+
+/// Waits without Python's lock, and hears Ctrl-C meanwhile.
+fn wait_for<T: Send>(
+    py: Python<'_>,
+    runtime: &Runtime,
+    work: impl Future<Output = Result<T, CallError>> + Send,
+) -> PyResult<T> {
+    let mut work = Box::pin(work);
+    loop {
+        let waited = py.detach(|| runtime.block_on(async { tokio::time::timeout(SIGNALS, &mut work).await }));
+        match waited {
+            Ok(ended) => return ended.map_err(|error| of_call(&error)),
+            Err(_) => py.check_signals()?,
+        }
+    }
+}
+
+fn patterns_of(texts: &[String]) -> PyResult<Vec<FactPattern>> {
+    texts.iter().map(|text| pattern(text)).collect::<Result<Vec<_>, _>>().map_err(PyValueError::new_err)
+}
+
+#[pymethods]
+impl Client {
+    #[new]
+    fn new(py: Python<'_>, directory: PathBuf) -> PyResult<Client> {
+        let wrong = |error: &(dyn std::error::Error + 'static)| Error::new_err(line(error));
+        let runtime =
+            Builder::new_multi_thread().worker_threads(1).enable_all().build().map_err(|error| wrong(&error))?;
+        let tls = ClientTls::from_environment().map_err(|error| wrong(&error))?;
+        let directory = RuntimeDirectory::at(directory);
+        let find = |role| directory.find(role).map_err(|error| Unavailable::new_err(line(&error)));
+        let (resource_manager, world_pool) = (find("resource-manager")?, find("world-pool")?);
+        let channels = Channels::new(&tls);
+        let world = py.detach(|| runtime.block_on(async { WorldClient::new(&channels, &world_pool) }));
+        let world = world.map_err(|error| of_call(&error))?;
+        Ok(Client { runtime: Arc::new(runtime), channels, resource_manager, world, session: Mutex::default() })
+    }
+
+    /// Waits until one of each of the kinds is free, and takes them under one lease.
+    #[pyo3(signature = (kinds, *, priority=0, timeout_s=None, holder="python"))]
+    fn acquire(
+        &self,
+        py: Python<'_>,
+        kinds: Vec<String>,
+        priority: i64,
+        timeout_s: Option<f64>,
+        holder: &str,
+    ) -> PyResult<Lease> {
+        let deadline = Duration::try_from_secs_f64(timeout_s.unwrap_or(MAX_WAIT_S))
+            .map_err(|_| PyValueError::new_err("timeout_s: is no time to wait"))?;
+        let held = self.held(py)?;
+        let requirements = kinds.iter().map(|kind| Requirement::new(ResourceOperation::Block, kind)).collect();
+        let options = AcquireOptions { request: fresh_id("python"), priority, deadline, holder: holder.to_owned() };
+        let granted = wait_for(py, &self.runtime, held.client.acquire(requirements, options))?;
+        Ok(Lease { granted, held, runtime: Arc::clone(&self.runtime) })
+    }
+
+    /// The resources, each as a dict; of these kinds, where any is given.
+    #[pyo3(signature = (*kinds))]
+    fn resources<'py>(&self, py: Python<'py>, kinds: Vec<String>) -> PyResult<Vec<Bound<'py, PyDict>>> {
+        let _within = self.runtime.enter();
+        let client =
+            ResourceClient::new(&self.channels, &self.resource_manager, "").map_err(|error| of_call(&error))?;
+        let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();
+        let found = wait_for(py, &self.runtime, client.list(&kinds))?;
+        let shown = found.iter().map(|resource| {
+            let shown = PyDict::new(py);
+            shown.set_item("id", &resource.id)?;
+            shown.set_item("kind", &resource.kind)?;
+            shown.set_item("class", resource.class.to_string())?;
+            shown.set_item("host", &resource.host)?;
+            shown.set_item("endpoint", resource.endpoint())?;
+            shown.set_item("held", !resource.holdings.is_empty())?;
+            Ok(shown)
+        });
+        shown.collect()
+    }
+
+    /// The facts of the root world that match any of the patterns; all of them without one.
+    #[pyo3(signature = (*patterns))]
+    fn query(&self, py: Python<'_>, patterns: Vec<String>) -> PyResult<Vec<Fact>> {
+        let patterns = patterns_of(&patterns)?;
+        Ok(Fact::all(wait_for(py, &self.runtime, self.world.root_at(None, &patterns))?.1))
+    }
+
+    /// Writes a fact to the root world; the world's revision with it. `None` deletes it.
+    fn set(&self, py: Python<'_>, fact_text: &str, value: &Bound<'_, PyAny>) -> PyResult<u64> {
+        let key = fact(fact_text).map_err(PyValueError::new_err)?;
+        let change = match value.is_none() {
+            true => Change::Delete { pattern: FactPattern::of(&key) },
+            false => Change::Set { fact: key, value: from_python(value)? },
+        };
+        let commit = fresh_id("python");
+        Ok(wait_for(py, &self.runtime, self.world.commit(&commit, vec![change], None))?.0)
+    }
+
+    /// What holds now, then what changes, of the patterns; of everything without one.
+    #[pyo3(signature = (*patterns))]
+    fn watch(&self, py: Python<'_>, patterns: Vec<String>) -> PyResult<WorldWatch> {
+        let patterns = patterns_of(&patterns)?;
+        let mut watch = wait_for(py, &self.runtime, self.world.watch(None, &patterns))?;
+        let (tell, updates) = mpsc::channel(MAX_UPDATES);
+        self.runtime.spawn(async move {
+            while let Some(update) = watch.next().await.transpose() {
+                if tell.send(update).await.is_err() {
+                    return;
+                }
+            }
+        });
+        Ok(WorldWatch { runtime: Arc::clone(&self.runtime), updates: Mutex::new(updates) })
+    }
+
+    /// Ends the session, with all that it holds.
+    fn close(&self, py: Python<'_>) {
+        let kept = self.session.lock().unwrap_or_else(PoisonError::into_inner).take();
+        // Where a lease is still in use, its last user ends it.
+        if let Some(held) = kept.and_then(Arc::into_inner) {
+            py.detach(|| self.runtime.block_on(held.session.close()));
+        }
+    }
+}
+
+/// Resources that are held until the end of the `with` block, or until `release()`.
+#[pyclass(frozen, module = "ratn")]
+pub(crate) struct Lease {
+    granted: ratn_model::resource::Lease,
+    held: Arc<Held>,
+    runtime: Arc<Runtime>,
+}
+
+#[pymethods]
+impl Lease {
+    #[getter]
+    fn id(&self) -> u64 {
+        self.granted.id.0
+    }
+
+    /// Grows over all leases: who does the work refuses an older one than it has seen.
+    #[getter]
+    fn token(&self) -> u64 {
+        self.granted.token.0
+    }
+
+    /// Id, kind and endpoint of each resource.
+    #[getter]
+    fn resources(&self) -> Vec<(String, String, String)> {
+        let each = self.granted.resources.iter();
+        each.map(|held| (held.id.clone(), held.kind.clone(), held.endpoint.clone())).collect()
+    }
+
+    /// Whether the session in whose name it is held still lives, as far as is known here.
+    #[getter]
+    fn alive(&self) -> bool {
+        self.held.session.state().borrow().alive
+    }
+
+    /// Gives the resources back; false where the lease had ended before.
+    fn release(&self, py: Python<'_>) -> PyResult<bool> {
+        wait_for(py, &self.runtime, self.held.client.release(self.granted.id))
+    }
+
+    fn __enter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
+        slf
+    }
+
+    #[pyo3(signature = (*_exception))]
+    fn __exit__(&self, py: Python<'_>, _exception: &Bound<'_, pyo3::types::PyTuple>) -> PyResult<bool> {
+        self.release(py)?;
+        Ok(false)
+    }
+
+    fn __repr__(&self) -> String {
+        let ids: Vec<&str> = self.granted.resources.iter().map(|held| held.id.as_str()).collect();
+        format!("<Lease {} of {}>", self.granted.id.0, ids.join(", "))
+    }
+}
+
+/// What holds, then each revision of the root world, as dicts with `revision`, `written` (facts) and `gone` (texts).
+#[pyclass(frozen, module = "ratn")]
+pub(crate) struct WorldWatch {
+    runtime: Arc<Runtime>,
+    updates: Mutex<mpsc::Receiver<Result<WorldUpdate, CallError>>>,
+}
+
+#[pymethods]
+impl WorldWatch {
+    fn __iter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
+        slf
+    }
+
+    fn __next__<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
+        let next = || {
+            let mut updates = self.updates.lock().unwrap_or_else(PoisonError::into_inner);
+            self.runtime.block_on(async { tokio::time::timeout(SIGNALS, updates.recv()).await })
+        };
+        let update = loop {
+            match py.detach(next) {
+                Ok(update) => break update,
+                Err(_) => py.check_signals()?,
+            }
+        };
+        let Some(update) = update.transpose().map_err(|error| of_call(&error))? else { return Ok(None) };
+        let (revision, written, gone) = match update {
+            WorldUpdate::Snapshot { revision, facts } => (revision, facts, Vec::new()),
+            WorldUpdate::Changed(change) => (change.revision, change.written, change.gone),
+        };
+        let shown = PyDict::new(py);
+        shown.set_item("revision", revision.0)?;
+        shown.set_item("written", Fact::all(written))?;
+        shown.set_item("gone", gone.iter().map(ToString::to_string).collect::<Vec<_>>())?;
+        Ok(Some(shown))
+    }
+}

@@ -1,0 +1,95 @@
+//! The exceptions of the package. Each has the words of whoever refused, which say what to do next.
+
+use pyo3::create_exception;
+use pyo3::exceptions::PyException;
+use pyo3::prelude::*;
+use ratn_worker::action::{ActionFailure, WorldFailure};
+use ratn_worker::client::CallError;
+use std::error::Error as StdError;
+use std::iter::successors;
+
+create_exception!(_ratn, Error, PyException, "What went wrong with a system; the base of the others.");
+create_exception!(_ratn, Unavailable, Error, "Nobody answered: a process is gone, or a connection broke.");
+create_exception!(_ratn, Malformed, Error, "An answer that means nothing.");
+create_exception!(_ratn, Refused, Error, "The one who was asked said no; the base of the gRPC codes below.");
+create_exception!(_ratn, NotFound, Refused, "There is no such thing (NOT_FOUND).");
+create_exception!(_ratn, AlreadyExists, Refused, "It is another's, or was asked for otherwise (ALREADY_EXISTS).");
+create_exception!(_ratn, InvalidArgument, Refused, "What was asked for makes no sense (INVALID_ARGUMENT).");
+create_exception!(_ratn, FailedPrecondition, Refused, "It cannot be as things are (FAILED_PRECONDITION).");
+create_exception!(_ratn, PermissionDenied, Refused, "The caller's roles do not allow it (PERMISSION_DENIED).");
+create_exception!(_ratn, ResourceExhausted, Refused, "There is no more of it (RESOURCE_EXHAUSTED).");
+create_exception!(_ratn, DeadlineExceeded, Refused, "It did not come in time (DEADLINE_EXCEEDED).");
+create_exception!(_ratn, Cancelled, Error, "The goal shall stop: let it through, after putting things in order.");
+create_exception!(
+    _ratn,
+    Aborted,
+    Error,
+    "Raised by an action: the goal's outcome is `aborted`, with this as the reason."
+);
+create_exception!(_ratn, Lost, Error, "The world that the goal works on is gone; another attempt may have more luck.");
+
+/// Makes the exceptions known.
+pub(crate) fn add_to(py: Python<'_>, module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add("Error", py.get_type::<Error>())?;
+    module.add("Unavailable", py.get_type::<Unavailable>())?;
+    module.add("Malformed", py.get_type::<Malformed>())?;
+    module.add("Refused", py.get_type::<Refused>())?;
+    module.add("NotFound", py.get_type::<NotFound>())?;
+    module.add("AlreadyExists", py.get_type::<AlreadyExists>())?;
+    module.add("InvalidArgument", py.get_type::<InvalidArgument>())?;
+    module.add("FailedPrecondition", py.get_type::<FailedPrecondition>())?;
+    module.add("PermissionDenied", py.get_type::<PermissionDenied>())?;
+    module.add("ResourceExhausted", py.get_type::<ResourceExhausted>())?;
+    module.add("DeadlineExceeded", py.get_type::<DeadlineExceeded>())?;
+    module.add("Cancelled", py.get_type::<Cancelled>())?;
+    module.add("Aborted", py.get_type::<Aborted>())?;
+    module.add("Lost", py.get_type::<Lost>())
+}
+
+/// An error and its sources in one line.
+pub(crate) fn line(error: &(dyn StdError + 'static)) -> String {
+    let mut line = String::new();
+    for part in successors(Some(error), |&error| error.source()).map(ToString::to_string) {
+        if !line.ends_with(&part) {
+            line = if line.is_empty() { part } else { format!("{line}: {part}") };
+        }
+    }
+    line
+}
+
+/// What a call without an answer is in Python.
+pub(crate) fn of_call(error: &CallError) -> PyErr {
+    let message = line(error);
+    // The names of gRPC's codes; the crate that has them is not among those that are used here.
+    let code = error.code().map(|code| format!("{code:?}")).unwrap_or_default();
+    match (error, code.as_str()) {
+        (CallError::Broken { .. }, _) => Unavailable::new_err(message),
+        (CallError::Malformed { .. }, _) => Malformed::new_err(message),
+        (_, "NotFound") => NotFound::new_err(message),
+        (_, "AlreadyExists") => AlreadyExists::new_err(message),
+        (_, "InvalidArgument") => InvalidArgument::new_err(message),
+        (_, "FailedPrecondition") => FailedPrecondition::new_err(message),
+        (_, "PermissionDenied") => PermissionDenied::new_err(message),
+        (_, "ResourceExhausted") => ResourceExhausted::new_err(message),
+        (_, "DeadlineExceeded") => DeadlineExceeded::new_err(message),
+        (_, "Unavailable") => Unavailable::new_err(message),
+        _ => Refused::new_err(message),
+    }
+}
+
+/// What an action that cannot read its world raises.
+pub(crate) fn of_world(failure: WorldFailure) -> PyErr {
+    match ActionFailure::from(failure) {
+        ActionFailure::Lost(reason) => Lost::new_err(reason),
+        failure => of_failure(failure),
+    }
+}
+
+/// What a goal that did not come to an outcome raises.
+pub(crate) fn of_failure(failure: ActionFailure) -> PyErr {
+    match failure {
+        ActionFailure::Aborted(reason) => Aborted::new_err(reason),
+        ActionFailure::Preempted(reason) | ActionFailure::Stopped(reason) => Cancelled::new_err(reason),
+        ActionFailure::Lost(reason) => Lost::new_err(reason),
+    }
+}

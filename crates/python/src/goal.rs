@@ -1,0 +1,171 @@
+//! A goal as an action in Python sees it. Whatever waits lets go of Python's lock, and ends when the goal shall stop.
+
+use crate::error::{line, of_failure, of_world};
+use crate::value::{Fact, fields_from_python, fields_to_python, from_python};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use ratn_model::fact::FactKey;
+use ratn_model::measurement::{Certainty, Measurement};
+use ratn_model::value::Value;
+use ratn_proto::types::GoalOutcome;
+use ratn_worker::action::{ActionFailure, GoalContext};
+use ratn_worker::client::{fact, pattern};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+use tokio::runtime::Handle;
+
+/// A goal under way: what is to be done, and what may be done with it.
+#[pyclass(frozen, module = "ratn")]
+pub(crate) struct Goal {
+    pub(crate) context: Arc<GoalContext>,
+    pub(crate) runtime: Handle,
+    measured: Mutex<Vec<(FactKey, Value, Measurement)>>,
+}
+
+impl Goal {
+    pub(crate) fn new(context: Arc<GoalContext>, runtime: Handle) -> Goal {
+        Goal { context, runtime, measured: Mutex::default() }
+    }
+
+    /// The outcome with what was measured.
+    pub(crate) fn with_measured(&self, mut outcome: GoalOutcome) -> GoalOutcome {
+        let measured = std::mem::take(&mut *self.measured.lock().unwrap_or_else(PoisonError::into_inner));
+        for (key, value, measurement) in measured {
+            outcome.evidence.push((key.clone(), measurement));
+            outcome.measured.push((key, value));
+        }
+        outcome
+    }
+}
+
+#[pymethods]
+impl Goal {
+    /// Unique to the attempt.
+    #[getter]
+    fn id(&self) -> &str {
+        &self.context.id
+    }
+
+    /// The action's name.
+    #[getter]
+    fn action(&self) -> &str {
+        &self.context.action
+    }
+
+    /// What every random choice is to be derived from.
+    #[getter]
+    fn seed(&self) -> u64 {
+        self.context.seed
+    }
+
+    /// Whether the goal shall stop.
+    #[getter]
+    fn cancelled(&self) -> bool {
+        self.context.cancelled.is_cancelled()
+    }
+
+    /// Goes on unless the goal shall stop: then it raises `ratn.Cancelled`. Often enough is ten times a second.
+    fn checkpoint(&self) -> PyResult<()> {
+        self.context.checkpoint().map_err(of_failure)
+    }
+
+    /// Waits so many seconds of wall time; raises `ratn.Cancelled` as soon as the goal shall stop.
+    fn sleep(&self, py: Python<'_>, seconds: f64) -> PyResult<()> {
+        let pause = Duration::try_from_secs_f64(seconds)
+            .map_err(|_| PyValueError::new_err(format!("seconds: {seconds} is no time to wait")))?;
+        let slept = async { self.context.unless_cancelled(tokio::time::sleep(pause)).await };
+        py.detach(|| self.runtime.block_on(slept)).map_err(of_failure)
+    }
+
+    /// The facts of the goal's world that match any of the patterns: `goal.facts("at(?)", "on(?, table)")`.
+    #[pyo3(signature = (*patterns))]
+    fn facts(&self, py: Python<'_>, patterns: Vec<String>) -> PyResult<Vec<Fact>> {
+        let patterns = patterns.iter().map(|text| pattern(text)).collect::<Result<Vec<_>, _>>();
+        let patterns = patterns.map_err(PyValueError::new_err)?;
+        let asked = async { self.context.unless_cancelled(self.context.facts(&patterns)).await };
+        let facts = py.detach(|| self.runtime.block_on(asked)).map_err(of_failure)?;
+        Ok(Fact::all(facts.map_err(of_world)?))
+    }
+
+    /// Says how far it is, to whoever listens and to the event log; figures as keyword arguments.
+    #[pyo3(signature = (message, **figures))]
+    fn progress(&self, message: String, figures: Option<&Bound<'_, PyDict>>) -> PyResult<()> {
+        let figures = figures.map(fields_from_python).transpose()?.unwrap_or_default();
+        self.context.progress_with(message, figures);
+        Ok(())
+    }
+
+    /// A fact as measured, `goal.measured("at(box_1)", pose, covariance=…)`: it is told with the outcome. `covariance` is a square matrix,
+    /// row by row or as an array (of a pose x, y, z in metres, and the rotation about them in radians); `confidence` is a probability.
+    #[pyo3(signature = (fact_text, value, *, covariance=None, confidence=None, source=String::new()))]
+    fn measured(
+        &self,
+        fact_text: &str,
+        value: &Bound<'_, PyAny>,
+        covariance: Option<&Bound<'_, PyAny>>,
+        confidence: Option<f64>,
+        source: String,
+    ) -> PyResult<()> {
+        let key = fact(fact_text).map_err(PyValueError::new_err)?;
+        let value = from_python(value)?;
+        let certainty = match (covariance, confidence) {
+            (Some(_), Some(_)) => return Err(PyValueError::new_err("say a covariance or a confidence, not both")),
+            (Some(matrix), None) => Some(Certainty::Covariance(numbers(&from_python(matrix)?)?)),
+            (None, confidence) => confidence.map(Certainty::Confidence),
+        };
+        certainty.as_ref().map_or(Ok(()), Certainty::check).map_err(PyValueError::new_err)?;
+        let mut measured = self.measured.lock().unwrap_or_else(PoisonError::into_inner);
+        measured.push((key, value, Measurement { source, certainty }));
+        Ok(())
+    }
+
+    /// Has another provider of this goal's lease do something, `goal.call("Camera", "capture", exposure_s=0.01)`; its outputs.
+    #[pyo3(signature = (kind, action, **inputs))]
+    fn call<'py>(
+        &self,
+        py: Python<'py>,
+        kind: &str,
+        action: &str,
+        inputs: Option<&Bound<'py, PyDict>>,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let inputs = inputs.map(fields_from_python).transpose()?.unwrap_or_default();
+        let called = py.detach(|| self.runtime.block_on(self.context.call(kind, action, inputs)));
+        fields_to_python(py, &called.map_err(|error| of_failure(ActionFailure::from(error)))?)
+    }
+
+    /// Calls `back` without arguments, in another thread, when the goal shall stop.
+    fn on_cancel(&self, back: Py<PyAny>) {
+        let cancelled = self.context.cancelled.clone();
+        self.runtime.spawn(async move {
+            cancelled.cancelled().await;
+            let called = tokio::task::spawn_blocking(move || Python::attach(|py| back.call0(py).map(drop)));
+            if let Ok(Err(error)) = called.await {
+                tracing::warn!(error = %line(&error), "what was to be called when the goal shall stop has failed");
+            }
+        });
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<Goal {} of {}>", self.context.id, self.context.action)
+    }
+}
+
+/// A matrix, row by row or as rows, as its numbers.
+fn numbers(value: &Value) -> PyResult<Vec<f64>> {
+    let wrong = || PyValueError::new_err("covariance: expected a square matrix of numbers");
+    match value {
+        Value::Joints(numbers) => Ok(numbers.clone()),
+        Value::List(rows) => {
+            let mut all = Vec::new();
+            for row in rows {
+                match row {
+                    Value::List(_) => all.extend(numbers(row)?),
+                    number => all.push(number.as_number().ok_or_else(wrong)?),
+                }
+            }
+            Ok(all)
+        }
+        _ => Err(wrong()),
+    }
+}

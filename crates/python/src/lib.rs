@@ -1,0 +1,29 @@
+//! The native part of the Python package `ratn`: what speaks to a system.
+//!
+//! It wraps `ratn-worker`, so that leases, fencing, sessions, drain and signals are the same code as in every other worker. It owns the
+//! conversion between Python's objects and the values of a system ([`value`]), and lets go of Python's lock wherever it waits. What is
+//! Python's business (annotations, decorators, `async def`, processes) is Python, beside it in `python/ratn`.
+
+mod client;
+mod error;
+mod goal;
+mod value;
+mod worker;
+
+use pyo3::prelude::*;
+
+#[pymodule]
+fn _ratn(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    let py = module.py();
+    module.add_class::<value::Pose>()?;
+    module.add_class::<value::Joints>()?;
+    module.add_class::<value::Trajectory>()?;
+    module.add_class::<value::Fact>()?;
+    module.add_class::<goal::Goal>()?;
+    module.add_class::<client::Client>()?;
+    module.add_class::<client::Lease>()?;
+    module.add_class::<client::WorldWatch>()?;
+    module.add_function(wrap_pyfunction!(worker::serve, module)?)?;
+    module.add_function(wrap_pyfunction!(value::as_written, module)?)?;
+    error::add_to(py, module)
+}

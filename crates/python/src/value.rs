@@ -1,0 +1,376 @@
+//! The values of a system as Python's objects, and back.
+//!
+//! | value | Python |
+//! |---|---|
+//! | null, bool, int, float, string, bytes | `None`, `bool`, `int`, `float`, `str`, `bytes` |
+//! | list, map | `list`, `dict` with names as keys |
+//! | pose, joints, trajectory | [`Pose`], [`Joints`], [`Trajectory`] |
+//!
+//! What has a method `tolist` (an array or a number of numpy) is taken as what that gives.
+
+use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyBool, PyByteArray, PyBytes, PyDict, PyFloat, PyInt, PyList, PyString, PyTuple};
+use ratn_model::fact::Term;
+use ratn_model::measurement::Certainty;
+use ratn_model::pose;
+use ratn_model::value::{self, TrajectoryPoint, Value};
+use ratn_proto::types::FactRecord;
+use std::collections::BTreeMap;
+
+/// Lists within lists, and the like: no deeper.
+const MAX_DEPTH: usize = 32;
+
+/// A rigid pose: a position in metres, and an orientation as a unit quaternion (x, y, z, w).
+#[pyclass(frozen, from_py_object, module = "ratn")]
+#[derive(Clone, Debug)]
+pub(crate) struct Pose(pub(crate) pose::Pose);
+
+#[pymethods]
+impl Pose {
+    /// `Pose(x, y, z)`, with roll, pitch and yaw in radians, or with `quaternion=(x, y, z, w)`.
+    #[new]
+    #[pyo3(signature = (x=0.0, y=0.0, z=0.0, roll=0.0, pitch=0.0, yaw=0.0, *, quaternion=None))]
+    fn new(x: f64, y: f64, z: f64, roll: f64, pitch: f64, yaw: f64, quaternion: Option<[f64; 4]>) -> PyResult<Pose> {
+        let Some(quaternion) = quaternion else { return Ok(Pose(pose::Pose::from_rpy([x, y, z], roll, pitch, yaw))) };
+        let length = quaternion.iter().map(|part| part * part).sum::<f64>().sqrt();
+        if [roll, pitch, yaw] != [0.0; 3] {
+            return Err(PyValueError::new_err("an orientation is roll, pitch and yaw, or a quaternion, not both"));
+        }
+        if !(length.is_finite() && length > 1e-9) {
+            return Err(PyValueError::new_err("quaternion: has no length; expected (x, y, z, w)"));
+        }
+        let quaternion_xyzw = quaternion.map(|part| part / length);
+        Ok(Pose(pose::Pose { position: [x, y, z], quaternion_xyzw }))
+    }
+
+    #[getter]
+    fn x(&self) -> f64 {
+        self.0.position[0]
+    }
+
+    #[getter]
+    fn y(&self) -> f64 {
+        self.0.position[1]
+    }
+
+    #[getter]
+    fn z(&self) -> f64 {
+        self.0.position[2]
+    }
+
+    /// Metres.
+    #[getter]
+    fn position(&self) -> (f64, f64, f64) {
+        self.0.position.into()
+    }
+
+    /// x, y, z, w.
+    #[getter]
+    fn quaternion(&self) -> (f64, f64, f64, f64) {
+        self.0.quaternion_xyzw.into()
+    }
+
+    /// Metres between the positions.
+    fn distance(&self, other: &Pose) -> f64 {
+        self.0.distance(&other.0)
+    }
+
+    /// Radians between the orientations.
+    fn angle(&self, other: &Pose) -> f64 {
+        self.0.angle(&other.0)
+    }
+
+    /// The pose that is `other` as seen from this one.
+    fn __matmul__(&self, other: &Pose) -> Pose {
+        Pose(self.0.compose(&other.0))
+    }
+
+    fn inverse(&self) -> Pose {
+        Pose(self.0.inverse())
+    }
+
+    /// The point, given as seen from this pose, as seen from where this pose is given.
+    fn transform(&self, point: [f64; 3]) -> (f64, f64, f64) {
+        self.0.transform(point).into()
+    }
+
+    fn __eq__(&self, other: &Pose) -> bool {
+        self.0 == other.0
+    }
+
+    fn __repr__(&self) -> String {
+        let ([x, y, z], [a, b, c, d]) = (self.0.position, self.0.quaternion_xyzw);
+        match [a, b, c, d] == pose::Pose::IDENTITY.quaternion_xyzw {
+            true => format!("Pose({x}, {y}, {z})"),
+            false => format!("Pose({x}, {y}, {z}, quaternion=({a}, {b}, {c}, {d}))"),
+        }
+    }
+}
+
+/// Positions of a robot's joints: radians, metres for sliding ones, in the robot's order.
+#[pyclass(frozen, from_py_object, sequence, module = "ratn")]
+#[derive(Clone, Debug)]
+pub(crate) struct Joints(pub(crate) Vec<f64>);
+
+#[pymethods]
+impl Joints {
+    #[new]
+    fn new(positions: Vec<f64>) -> Joints {
+        Joints(positions)
+    }
+
+    fn __len__(&self) -> usize {
+        self.0.len()
+    }
+
+    fn __getitem__(&self, index: isize) -> PyResult<f64> {
+        let from_end = |index: isize| usize::try_from(index).ok().and_then(|back| self.0.len().checked_sub(back));
+        let place = if index < 0 { from_end(-index) } else { usize::try_from(index).ok() };
+        let found = place.and_then(|place| self.0.get(place)).copied();
+        found.ok_or_else(|| pyo3::exceptions::PyIndexError::new_err("there is no such joint"))
+    }
+
+    /// As a list of floats.
+    fn tolist(&self) -> Vec<f64> {
+        self.0.clone()
+    }
+
+    fn __eq__(&self, other: &Joints) -> bool {
+        self.0 == other.0
+    }
+
+    fn __repr__(&self) -> String {
+        format!("Joints({:?})", self.0)
+    }
+}
+
+/// A timed path of joints: names, and points of seconds, positions (radians) and velocities (radians per second).
+#[pyclass(frozen, from_py_object, module = "ratn")]
+#[derive(Clone, Debug)]
+pub(crate) struct Trajectory(pub(crate) value::Trajectory);
+
+#[pymethods]
+impl Trajectory {
+    /// `Trajectory(joints, [(time_s, positions, velocities), …])`.
+    #[new]
+    fn new(joints: Vec<String>, points: Vec<(f64, Vec<f64>, Vec<f64>)>) -> PyResult<Trajectory> {
+        let width = joints.len();
+        let mut taken = Vec::with_capacity(points.len());
+        for (number, (time_s, positions, velocities)) in points.into_iter().enumerate() {
+            if positions.len() != width || velocities.len() != width {
+                let wrong = format!("points[{number}]: {width} joints need as many positions and velocities");
+                return Err(PyValueError::new_err(wrong));
+            }
+            taken.push(TrajectoryPoint { time_s, positions, velocities });
+        }
+        Ok(Trajectory(value::Trajectory { joints, points: taken }))
+    }
+
+    #[getter]
+    fn joints(&self) -> Vec<String> {
+        self.0.joints.clone()
+    }
+
+    /// `(time_s, positions, velocities)` each.
+    #[getter]
+    fn points(&self) -> Vec<(f64, Vec<f64>, Vec<f64>)> {
+        let point = |point: &TrajectoryPoint| (point.time_s, point.positions.clone(), point.velocities.clone());
+        self.0.points.iter().map(point).collect()
+    }
+
+    /// Seconds from the first to the last point.
+    #[getter]
+    fn duration_s(&self) -> f64 {
+        self.0.duration_s()
+    }
+
+    fn __eq__(&self, other: &Trajectory) -> bool {
+        self.0 == other.0
+    }
+
+    fn __repr__(&self) -> String {
+        format!("Trajectory({} joints, {} points, {} s)", self.0.joints.len(), self.0.points.len(), self.duration_s())
+    }
+}
+
+/// A fact of a world: `at(box_1) = pose(…)` has the predicate `at`, the key `("box_1",)` and a `Pose` as its value.
+#[pyclass(frozen, module = "ratn")]
+#[derive(Debug)]
+pub(crate) struct Fact(FactRecord);
+
+impl Fact {
+    pub(crate) fn all(records: Vec<FactRecord>) -> Vec<Fact> {
+        records.into_iter().map(Fact).collect()
+    }
+}
+
+#[pymethods]
+impl Fact {
+    #[getter]
+    fn predicate(&self) -> &str {
+        &self.0.key.predicate
+    }
+
+    /// Its arguments, in order.
+    #[getter]
+    fn key<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        let terms = self.0.key.arguments.iter().map(|term| match term {
+            Term::Int(number) => Ok(number.into_pyobject(py)?.into_any()),
+            Term::Name(name) => Ok(PyString::new(py, name).into_any()),
+        });
+        PyTuple::new(py, terms.collect::<PyResult<Vec<_>>>()?)
+    }
+
+    #[getter]
+    fn value<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        to_python(py, &self.0.value)
+    }
+
+    /// The revision of the world with which it was written.
+    #[getter]
+    fn revision(&self) -> u64 {
+        self.0.revision.0
+    }
+
+    /// What measured it; nothing where it was not measured.
+    #[getter]
+    fn source(&self) -> Option<String> {
+        self.0.measured.as_ref().map(|measured| measured.source.clone())
+    }
+
+    /// The covariance of its numbers, row by row, where its source said so.
+    #[getter]
+    fn covariance(&self) -> Option<Vec<f64>> {
+        match self.0.measured.as_ref()?.certainty.as_ref()? {
+            Certainty::Covariance(entries) => Some(entries.clone()),
+            Certainty::Confidence(_) => None,
+        }
+    }
+
+    /// The probability that it is so, where its source said so.
+    #[getter]
+    fn confidence(&self) -> Option<f64> {
+        match self.0.measured.as_ref()?.certainty.as_ref()? {
+            Certainty::Confidence(confidence) => Some(*confidence),
+            Certainty::Covariance(_) => None,
+        }
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<Fact {} = {}>", self.0.key, self.0.value)
+    }
+}
+
+/// A value as task files write it: `pose(1, 0, 0.7)`, `[1, 2]`.
+#[pyfunction]
+pub(crate) fn as_written(value: &Bound<'_, PyAny>) -> PyResult<String> {
+    Ok(from_python(value)?.to_string())
+}
+
+/// A value as Python has it.
+pub(crate) fn to_python<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>> {
+    Ok(match value {
+        Value::Null => py.None().into_bound(py),
+        Value::Bool(truth) => PyBool::new(py, *truth).to_owned().into_any(),
+        Value::Int(number) => number.into_pyobject(py)?.into_any(),
+        Value::Float(number) => PyFloat::new(py, *number).into_any(),
+        Value::String(text) => PyString::new(py, text).into_any(),
+        Value::Pose(pose) => Bound::new(py, Pose(pose.clone()))?.into_any(),
+        Value::Joints(positions) => Bound::new(py, Joints(positions.clone()))?.into_any(),
+        Value::Trajectory(trajectory) => Bound::new(py, Trajectory(trajectory.clone()))?.into_any(),
+        Value::List(items) => {
+            let items = items.iter().map(|item| to_python(py, item)).collect::<PyResult<Vec<_>>>()?;
+            PyList::new(py, items)?.into_any()
+        }
+        Value::Map(fields) => fields_to_python(py, fields)?.into_any(),
+        Value::Bytes(bytes) => PyBytes::new(py, bytes).into_any(),
+    })
+}
+
+/// Ports, or the fields of a map, as Python has them.
+pub(crate) fn fields_to_python<'py>(py: Python<'py>, fields: &BTreeMap<String, Value>) -> PyResult<Bound<'py, PyDict>> {
+    let taken = PyDict::new(py);
+    for (name, value) in fields {
+        taken.set_item(name, to_python(py, value)?)?;
+    }
+    Ok(taken)
+}
+
+/// What Python gives as a value.
+pub(crate) fn from_python(object: &Bound<'_, PyAny>) -> PyResult<Value> {
+    taken(object, 0)
+}
+
+/// What Python gives as ports.
+pub(crate) fn fields_from_python(fields: &Bound<'_, PyDict>) -> PyResult<BTreeMap<String, Value>> {
+    named(fields, 0)
+}
+
+fn named(fields: &Bound<'_, PyDict>, depth: usize) -> PyResult<BTreeMap<String, Value>> {
+    let mut found = BTreeMap::new();
+    for (name, value) in fields.iter() {
+        let name = name.cast::<PyString>().map_err(|_| PyTypeError::new_err("the keys of a map are names (str)"))?;
+        let name = name.to_str()?.to_owned();
+        let value = taken(&value, depth)
+            .map_err(|error| PyTypeError::new_err(format!("`{name}`: {}", error.value(fields.py()))))?;
+        found.insert(name, value);
+    }
+    Ok(found)
+}
+
+fn taken(object: &Bound<'_, PyAny>, depth: usize) -> PyResult<Value> {
+    if depth > MAX_DEPTH {
+        return Err(PyTypeError::new_err(format!("a value has at most {MAX_DEPTH} levels")));
+    }
+    let items = |items: Vec<Bound<'_, PyAny>>| {
+        items.iter().map(|item| taken(item, depth + 1)).collect::<PyResult<Vec<_>>>().map(Value::List)
+    };
+    if object.is_none() {
+        return Ok(Value::Null);
+    }
+    if let Ok(truth) = object.cast::<PyBool>() {
+        return Ok(Value::Bool(truth.is_true()));
+    }
+    if object.is_instance_of::<PyInt>() {
+        let number = object.extract();
+        return number.map(Value::Int).map_err(|_| PyValueError::new_err(format!("{object} has more than 64 bits")));
+    }
+    if object.is_instance_of::<PyFloat>() {
+        return object.extract().map(Value::Float);
+    }
+    if let Ok(text) = object.cast::<PyString>() {
+        return Ok(Value::String(text.to_str()?.to_owned()));
+    }
+    if let Ok(bytes) = object.cast::<PyBytes>() {
+        return Ok(Value::Bytes(bytes.as_bytes().to_vec()));
+    }
+    if let Ok(bytes) = object.cast::<PyByteArray>() {
+        return Ok(Value::Bytes(bytes.to_vec()));
+    }
+    if let Ok(pose) = object.cast::<Pose>() {
+        return Ok(Value::Pose(pose.get().0.clone()));
+    }
+    if let Ok(joints) = object.cast::<Joints>() {
+        return Ok(Value::Joints(joints.get().0.clone()));
+    }
+    if let Ok(trajectory) = object.cast::<Trajectory>() {
+        return Ok(Value::Trajectory(trajectory.get().0.clone()));
+    }
+    if let Ok(fields) = object.cast::<PyDict>() {
+        return named(fields, depth + 1).map(Value::Map);
+    }
+    if let Ok(list) = object.cast::<PyList>() {
+        return items(list.iter().collect());
+    }
+    if let Ok(tuple) = object.cast::<PyTuple>() {
+        return items(tuple.iter().collect());
+    }
+    if object.hasattr("tolist")? {
+        return taken(&object.call_method0("tolist")?, depth + 1);
+    }
+    let kind = object.get_type().name()?;
+    Err(PyTypeError::new_err(format!(
+        "a {kind} is no value of a system: expected None, bool, int, float, str, bytes, list, dict, Pose, Joints, Trajectory or an array"
+    )))
+}

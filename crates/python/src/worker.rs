@@ -1,0 +1,193 @@
+//! A worker whose actions are Python functions. Each goal is performed in a thread of its own, which has Python's lock only while Python
+//! runs; the daemon's questions are answered meanwhile.
+
+use crate::error::{Aborted, Cancelled, Error, Lost, line};
+use crate::goal::Goal;
+use crate::value::{fields_from_python, fields_to_python, from_python};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use ratn_model::value::Type;
+use ratn_proto::types::GoalOutcome;
+use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, Signature};
+use ratn_worker::arguments::Arguments;
+use ratn_worker::prelude::async_trait;
+use ratn_worker::worker::WorkerError;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::runtime::{Builder, Handle};
+use tracing_subscriber::EnvFilter;
+
+/// Threads of goals that have not ended are left alone after this long.
+const LAST_THREADS: Duration = Duration::from_secs(1);
+/// No more of a traceback goes into a run's reason.
+const MAX_TRACEBACK_BYTES: usize = 8 * 1024;
+
+/// An action as Python describes it.
+#[derive(FromPyObject)]
+pub(crate) struct Described {
+    name: String,
+    description: String,
+    /// Name, type, whether every goal has it, and else what it is without.
+    inputs: Vec<(String, String, bool, Py<PyAny>)>,
+    outputs: Vec<(String, String)>,
+    outcomes: Vec<String>,
+    computes: bool,
+    reads: Vec<String>,
+    senses: Vec<String>,
+    requires: Vec<String>,
+    effects: Vec<String>,
+    /// Called with the goal and its inputs as a dict; gives an outcome, its outputs as a dict and a reason.
+    perform: Py<PyAny>,
+}
+
+/// Serves until a signal or the parent's end says otherwise. `arguments` are those of the process, as a template passes them.
+#[pyfunction]
+pub(crate) fn serve(
+    py: Python<'_>,
+    arguments: Vec<String>,
+    provider: &str,
+    kind: &str,
+    actions: Vec<Described>,
+    without_leases: bool,
+) -> PyResult<()> {
+    let pooled = std::env::var_os("RATN_PROVIDER_SESSION").is_some_and(|session| !session.is_empty());
+    let arguments = Arguments::of(arguments, pooled).and_then(Arguments::worker);
+    let mut worker = arguments.map_err(|error| PyValueError::new_err(line(&error)))?.provides(provider, kind);
+    for action in actions {
+        worker = worker.action(PythonAction::of(py, action)?);
+    }
+    if without_leases {
+        worker = worker.without_leases();
+    }
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
+    // Where a program has one already, that one is told.
+    let _ = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(false).try_init();
+    let ended = py.detach(|| {
+        let runtime = Builder::new_multi_thread().worker_threads(2).enable_all().build();
+        let runtime = runtime.map_err(|source| WorkerError::System { what: "start its runtime".to_owned(), source })?;
+        let ended = runtime.block_on(worker.run());
+        runtime.shutdown_timeout(LAST_THREADS);
+        ended
+    });
+    ended.map_err(|error| Error::new_err(line(&error)))
+}
+
+struct PythonAction {
+    name: String,
+    description: String,
+    signature: Signature,
+    perform: Arc<Py<PyAny>>,
+}
+
+impl PythonAction {
+    fn of(py: Python<'_>, described: Described) -> PyResult<PythonAction> {
+        let Described { name, description, inputs, outputs, outcomes, perform, .. } = described;
+        let of_type = |port: &str, text: String| {
+            let read = Type::try_from(text);
+            read.map_err(|error| PyValueError::new_err(format!("port `{port}` of `{name}`: {error}")))
+        };
+        let mut signature = Signature::new();
+        for (port, text, is_required, default) in inputs {
+            let kind = of_type(&port, text)?;
+            let default = default.into_bound(py);
+            signature = match (is_required, default.is_none()) {
+                (true, _) => signature.input(&port, kind),
+                (false, true) => signature.optional(&port, kind),
+                (false, false) => signature.with_default(&port, kind, from_python(&default)?),
+            };
+        }
+        for (port, text) in outputs {
+            let kind = of_type(&port, text)?;
+            signature = signature.output(&port, kind);
+        }
+        signature = outcomes.iter().fold(signature, |signature, outcome| signature.outcome(outcome));
+        if described.computes {
+            signature = signature.computes();
+        }
+        signature = described.reads.iter().fold(signature, |signature, pattern| signature.reads(pattern));
+        signature = described.senses.iter().fold(signature, |signature, pattern| signature.senses(pattern));
+        signature = described.requires.iter().fold(signature, |signature, condition| signature.requires(condition));
+        signature = described.effects.iter().fold(signature, |signature, effect| signature.effect(effect));
+        Ok(PythonAction { name, description, signature, perform: Arc::new(perform) })
+    }
+}
+
+#[async_trait]
+impl Action for PythonAction {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn description(&self) -> &str {
+        &self.description
+    }
+
+    fn signature(&self) -> Option<Signature> {
+        Some(self.signature.clone())
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        let (goal, function, runtime) = (Arc::new(goal), Arc::clone(&self.perform), Handle::current());
+        let performed =
+            tokio::task::spawn_blocking(move || Python::attach(|py| perform(py, &goal, &function, runtime)));
+        performed.await.unwrap_or_else(|error| Err(ActionFailure::Aborted(line(&error))))
+    }
+}
+
+fn perform(py: Python<'_>, context: &Arc<GoalContext>, function: &Py<PyAny>, runtime: Handle) -> ActionResult {
+    let given = || -> PyResult<GoalOutcome> {
+        let goal = Bound::new(py, Goal::new(Arc::clone(context), runtime))?;
+        let inputs = fields_to_python(py, &context.inputs)?;
+        let ended = function.bind(py).call1((&goal, inputs))?;
+        let (outcome, outputs, reason): (String, Bound<'_, PyDict>, String) = ended.extract()?;
+        let outputs = fields_from_python(&outputs)?;
+        Ok(goal.get().with_measured(GoalOutcome { outputs, reason, ..GoalOutcome::named(&outcome) }))
+    };
+    given().map_err(|error| failure(py, context, &error))
+}
+
+/// What an exception makes of the goal. One that is nobody's plan is in the worker's log and in the goal's reason, with its traceback.
+fn failure(py: Python<'_>, context: &GoalContext, error: &PyErr) -> ActionFailure {
+    let message = || error.value(py).to_string();
+    if error.is_instance_of::<Cancelled>(py) && context.cancelled.is_cancelled() {
+        return context.stopped();
+    }
+    if error.is_instance_of::<Lost>(py) {
+        return ActionFailure::Lost(message());
+    }
+    if error.is_instance_of::<Aborted>(py) {
+        return ActionFailure::Aborted(message());
+    }
+    let traceback = error.traceback(py).and_then(|traceback| traceback.format().ok()).unwrap_or_default();
+    error.print(py);
+    ActionFailure::Aborted(shortened(format!("{error}\n{traceback}")))
+}
+
+/// Without its middle, where it is too long.
+fn shortened(text: String) -> String {
+    if text.len() <= MAX_TRACEBACK_BYTES {
+        return text.trim_end().to_owned();
+    }
+    let half = MAX_TRACEBACK_BYTES / 2;
+    let head = text.floor_char_boundary(half);
+    let tail = text.ceil_char_boundary(text.len() - half);
+    format!("{}\n…\n{}", &text[..head], text[tail..].trim_end())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_traceback_keeps_its_head_and_its_end() {
+        let long = format!("ValueError: é\n{}\nlast line", "ä".repeat(MAX_TRACEBACK_BYTES));
+        let short = shortened(long);
+        assert!(
+            short.len() < MAX_TRACEBACK_BYTES + 16
+                && short.starts_with("ValueError: é")
+                && short.ends_with("last line")
+        );
+        assert_eq!(shortened("short\n".to_owned()), "short");
+    }
+}

@@ -1,0 +1,138 @@
+"""A system and its runs, resources and world, from Python."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pathlib
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+import ratn
+from conftest import ROOT, Place, program
+
+EXAMPLE = ROOT / "examples" / "fetch_boxes.yaml"
+
+
+@pytest.fixture(scope="module")
+def system() -> Iterator[ratn.System]:
+    os.environ["RATN"] = program()
+    os.environ.pop("RATN_RUNTIME_DIR", None)
+    with ratn.System(boxes=2, speed=50) as system:
+        yield system
+
+
+def test_a_run_gives_its_events_its_result_and_its_nodes(system: ratn.System) -> None:
+    run = system.run(EXAMPLE, boxes=1, seed=3)
+    events = list(run)
+    assert events[0]["event"] == "started" and events[0]["parameters"]["boxes"] == {"int": 1}
+    result = run.result()
+    assert result.is_success and result.makespan_s > 0, run.messages()
+    nodes = run.nodes()
+    assert {"path", "provider", "action", "began_s", "ended_s", "outcome"} <= nodes[0].keys()
+    moves = [node for node in nodes if node["action"] == "move_to"]
+    assert moves and all(node["outcome"] == "success" and node["ended_s"] > node["began_s"] for node in moves)
+    assert run.report()["makespan_s"] == pytest.approx(result.makespan_s)
+
+
+def test_events_come_while_a_run_is_under_way_also_asynchronously(system: ratn.System) -> None:
+    async def first() -> tuple[dict, bool]:
+        run = system.run(EXAMPLE, boxes=1)
+        async for event in run:
+            under_way = run.under_way
+            run.abort()
+            run.result(60)
+            return event, under_way
+        raise AssertionError("no event")
+
+    event, under_way = asyncio.run(first())
+    assert event["event"] == "started" and under_way
+
+
+def test_a_run_is_paused_stepped_and_aborted(system: ratn.System) -> None:
+    run = system.run(EXAMPLE, boxes=1)
+    for _ in run:
+        break
+    run.pause()
+    run.step()
+    run.resume()
+    run.abort()
+    result = run.result(60)
+    assert not result.is_success and result.reason, result
+    words = [event["event"] for event in run if "event" in event]
+    for word in ("pause_requested", "step_requested", "resume_requested", "abort_requested"):
+        assert word in words
+
+
+def test_a_run_that_cannot_begin_says_why(system: ratn.System, tmp_path: pathlib.Path) -> None:
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("task: broken\nstates:\n  - x: { action: no_such/thing }\n")
+    with pytest.raises(ratn.Error, match="no_such"):
+        system.run(broken).result(60)
+
+
+def test_a_resource_is_held_for_a_block_and_nobody_else_gets_it(system: ratn.System) -> None:
+    with system.acquire("Camera", holder="a test") as lease:
+        assert lease.alive and [kind for _, kind, _ in lease.resources] == ["Camera"]
+        assert [resource["held"] for resource in system.resources("Camera")] == [True]
+        with pytest.raises(ratn.DeadlineExceeded):
+            system.acquire("Camera", timeout_s=0.2)
+    assert [resource["held"] for resource in system.resources("Camera")] == [False]
+    assert lease.release() is False
+
+
+def test_python_goes_on_while_a_thread_waits_for_a_resource(system: ratn.System) -> None:
+    with system.acquire("Camera"):
+        got: list[ratn.Lease] = []
+        waiting = threading.Thread(target=lambda: got.append(system.acquire("Camera", timeout_s=30)))
+        waiting.start()
+        time.sleep(0.2)
+        assert not got
+    waiting.join(30)
+    assert got and got[0].release()
+
+
+def test_the_world_is_read_written_and_watched(system: ratn.System) -> None:
+    seen: list[dict] = []
+    watch = system.watch("at(probe)")
+    assert next(watch)["written"] == []
+    revision = system.set("at(probe)", ratn.Pose(1, 2, 3))
+    (fact,) = system.query("at(probe)")
+    assert (fact.predicate, fact.key, fact.value, fact.revision) == ("at", ("probe",), ratn.Pose(1, 2, 3), revision)
+    seen.append(next(watch))
+    assert seen[0]["revision"] == revision and seen[0]["written"][0].value == ratn.Pose(1, 2, 3)
+    system.set("at(probe)", None)
+    assert next(watch)["gone"] == ["at(probe)"] and system.query("at(probe)") == []
+
+
+def test_errors_have_the_names_of_the_codes_and_say_what_to_do(system: ratn.System, tmp_path: pathlib.Path) -> None:
+    with pytest.raises(ValueError, match="expected `predicate"):
+        system.query("at box")
+    with pytest.raises(ratn.Refused) as refused:
+        system.set("on(a)", ratn.Trajectory([], []) if False else float("nan"))
+    assert isinstance(refused.value, ratn.Error)
+    with pytest.raises(ratn.Unavailable, match="ratn up"):
+        from ratn import _ratn
+
+        _ratn.Client(tmp_path)
+
+
+def test_a_system_that_runs_is_found(system: ratn.System) -> None:
+    with ratn.System(runtime_dir=system.runtime_dir) as found:
+        assert found.runtime_dir == system.runtime_dir and "started here" not in repr(found)
+        assert {resource["id"] for resource in found.resources()} == {resource["id"] for resource in system.resources()}
+    assert system.resources("Arm")
+
+
+def test_the_tour_of_the_documentation_goes_through(place: Place) -> None:
+    environment = {**os.environ, "RATN": program()}
+    environment.pop("RATN_RUNTIME_DIR", None)
+    command = [sys.executable, str(pathlib.Path(__file__).parent / "tour.py")]
+    told = subprocess.run(command, env=environment, cwd=place.folder, capture_output=True, text=True, timeout=200)
+    assert told.returncode == 0, told.stderr
+    for part in ("Result(outcome='success'", "the longest was ", "<Lease ", "'camera@sim'", "box_1 ("):
+        assert part in told.stdout, told.stdout

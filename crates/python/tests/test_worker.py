@@ -1,0 +1,184 @@
+"""Workers in Python, in a real system."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+
+import pytest
+import ratn
+from conftest import PYTHON, TESTS, Place, template
+
+NO_CATALOGUE = 'catalogues = ["built-in"]\n[process-manager]\nhost = "compute"\n'
+
+
+@pytest.fixture(scope="module")
+def tester(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+    """A system with the two workers of these tests, of which its catalogue knows nothing."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory(prefix="ratn-py-") as folder:
+        place = Place(pathlib.Path(folder))
+        for name in ("tester.py", "nearest.py"):
+            shutil.copy(TESTS / "workers" / name, folder)
+        config = place.write(
+            "system.toml",
+            NO_CATALOGUE
+            + template("tester", "Tester", python="tester.py", interpreter=PYTHON, max=2, min=1)
+            + template("nearest", "Nearest", python="nearest.py", interpreter=PYTHON),
+        )
+        with place.up(config, "--speed", "1"):
+            yield place
+
+
+def state(name: str, action: str, kind: str, inputs: str = "{}", more: str = "computes: true, reads: []") -> str:
+    return f"  - {name}: {{ action: {action}, in: {inputs}, {more}, resources: [{kind}] }}\n"
+
+
+def task(name: str, states: str, outputs: str = "") -> str:
+    return f"task: {name}\n{outputs}states:\n{states}"
+
+
+def performed(place: Place, name: str, action: str, inputs: str, output: str, kind: str = "any") -> object:
+    text = task(name, state("it", f"tester/{action}", "Tester", inputs), f"outputs:\n  out: {{ type: {kind}, value: it.{output} }}\n")
+    ended = place.run(place.write(f"{name}.yaml", text))
+    assert ended["outcome"] == "success", f"{ended['reason']}\n{ended['stderr']}"
+    return ended["outputs"]["out"]
+
+
+def test_the_worker_of_fifteen_lines_reads_the_world_of_its_goal(tester: Place) -> None:
+    assert len((TESTS / "workers" / "nearest.py").read_text().split("\n\n", 1)[1].strip().splitlines()) <= 15
+    text = (
+        "task: near\noutputs:\n  object: { type: any, value: it.object }\nworld:\n"
+        '  - "at(cup) = pose(1, 0, 0)"\n  - "at(plate) = pose(0.2, 0, 0)"\nstates:\n'
+        "  - it:\n      action: nearest/nearest\n      in: { start: 'pose(0.9, 0, 0)' }\n      computes: true\n"
+        "      reads: ['at(?)']\n      resources: [Nearest, world_model]\n"
+    )
+    ended = tester.run(tester.write("near.yaml", text))
+    assert ended["outcome"] == "success", ended["stderr"]
+    assert ended["outputs"] == {"object": "cup"}
+    assert '"message":"found"' in ended["log"]
+
+
+def test_what_raises_aborted_is_the_reason_of_the_run(tester: Place) -> None:
+    text = task("far", state("it", "nearest/nearest", "Nearest", "{ start: 'pose(900, 0, 0)', within_m: 0.5 }", "computes: true, reads: ['at(?)']"))
+    ended = tester.run(tester.write("far.yaml", text.replace("[Nearest]", "[Nearest, world_model]")))
+    assert ended["outcome"] == "aborted"
+    assert "nothing so near" in ended["reason"], ended["reason"]
+
+
+def test_a_worker_describes_itself(tester: Place) -> None:
+    told = json.loads(tester.ratn("actions", "--runtime-dir", tester.runtime, "--json").stdout)
+    text = json.dumps(told)
+    assert "nearest" in text and "tester" in text, text
+    shown = tester.ratn("actions", "nearest/nearest", "--runtime-dir", tester.runtime).stdout
+    for part in ("The object nearest to a pose.", "start", "pose", "within_m", "9", "object"):
+        assert part in shown, shown
+
+
+def test_arrays_of_numpy_come_and_go(tester: Place) -> None:
+    assert performed(tester, "total", "add", "{ numbers: '[1, 2.5]' }", "total", "float") == 7.0
+    assert performed(tester, "joints", "add", "{ numbers: '[1, 2.5]', factor: 1 }", "joints", "joints") == [1.0, 2.5]
+
+
+@pytest.mark.parametrize("value", ["true", "3", "0.25", "'\"text\"'", "'[1, [2, null]]'", "'joints(0.5, 1)'"])
+def test_every_kind_of_value_comes_back_as_it_was(tester: Place, value: str) -> None:
+    expected = {"'\"text\"'": "text", "'[1, [2, null]]'": [1, [2, None]], "'joints(0.5, 1)'": [0.5, 1.0]}
+    got = performed(tester, "echo", "echo", f"{{ value: {value} }}", "echo")
+    assert got == expected.get(value, json.loads(value) if value not in expected else None)
+    assert not isinstance(got, bool) or value == "true"
+
+
+def test_an_outcome_of_its_own_is_followed(tester: Place) -> None:
+    text = (
+        "task: odd\nstates:\n  - it:\n      action: tester/halve\n      in: { number: 7 }\n      computes: true\n      reads: []\n"
+        "      resources: [Tester]\n      transitions: { odd: success }\n"
+    )
+    ended = tester.run(tester.write("odd.yaml", text))
+    assert '"outcome":"odd"' in ended["log"], ended
+
+
+def test_a_crash_is_in_the_reason_and_in_the_log_with_its_traceback(tester: Place) -> None:
+    ended = tester.run(tester.write("crash.yaml", task("crash", state("it", "tester/crash", "Tester"))))
+    assert ended["outcome"] == "aborted"
+    for part in ("IndexError: list index out of range", "tester.py", 'return {"never": [][7]}'):
+        assert part in ended["reason"], ended["reason"]
+        assert part in tester.logs()
+    assert "INFO tester: before the crash" in tester.logs()
+
+
+@pytest.mark.parametrize(("action", "word"), [("nap", "woken"), ("wait", "cancelled")])
+def test_a_goal_that_is_told_to_stop_ends_at_once(tester: Place, action: str, word: str) -> None:
+    text = tester.write(f"{action}.yaml", task(action, state("it", f"tester/{action}", "Tester", "{ seconds: 60 }")))
+    log = tester.folder / f"{action}.jsonl"
+    from conftest import program
+
+    command = [program(), "run", str(text), "--runtime-dir", str(tester.runtime), "--log", str(log), "--json"]
+    run = subprocess.Popen(command, env=tester.environment, stdout=subprocess.PIPE, text=True)
+    until = time.monotonic() + 30
+    while not (log.exists() and '"note":"running"' in log.read_text()):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    time.sleep(0.3)
+    began = time.monotonic()
+    assert tester.ratn("control", "abort", "--runtime-dir", tester.runtime).returncode == 0
+    run.communicate(timeout=30)
+    assert time.monotonic() - began < 10
+    assert f"INFO tester: {word}" in tester.logs()
+
+
+def test_async_def_performs_goals_and_tells_how_far_it_is(tester: Place) -> None:
+    assert performed(tester, "slept", "nap", "{ seconds: 0.05 }", "slept") == 0.05
+
+
+def test_which_interpreter_runs_a_script_is_said_and_what_is_missing_is_explained(place: Place) -> None:
+    place.write("w.py", "")
+    config = place.write("system.toml", NO_CATALOGUE + template("w", "W", python="w.py", interpreter=PYTHON))
+    told = place.ratn("doctor", "--config", config, "--runtime-dir", place.runtime).stdout
+    assert f"{PYTHON} runs it (the template's `interpreter`)" in told, told
+    config = place.write("system.toml", NO_CATALOGUE + template("w", "W", python="none.py"))
+    told = place.ratn("doctor", "--config", config, "--runtime-dir", place.runtime).stdout
+    assert f"there is no Python script {place.folder / 'none.py'}" in told, told
+
+
+def broken(function: object, **said: object) -> str:
+    with pytest.raises(TypeError) as refused:
+        ratn.Worker("broken").action(function, **said)  # type: ignore[arg-type]
+    return str(refused.value)
+
+
+def test_what_is_no_port_is_refused_with_the_line_of_the_function() -> None:
+    def complex_(goal: ratn.Goal, z: complex) -> dict:
+        return {}
+
+    def no_goal(x: int) -> dict:
+        return {}
+
+    def unseen(goal: ratn.Goal) -> dict:
+        return dict(x=1)
+
+    def many(goal: ratn.Goal, *numbers: int) -> dict:
+        return {}
+
+    for function, part in [(complex_, "parameter `z`"), (no_goal, "is its goal"), (unseen, "outputs={"), (many, "`*numbers")]:
+        said = broken(function)
+        assert part in said and f"{__file__}:" in said, said
+
+
+def test_a_pose_is_a_pose() -> None:
+    import math
+
+    turned = ratn.Pose(1, 2, 3, yaw=math.pi / 2)
+    assert turned.position == (1, 2, 3) and turned.distance(ratn.Pose(1, 2, 0)) == 3
+    x, y, z = turned.transform((1, 0, 0))
+    assert (round(x, 9), round(y, 9), round(z, 9)) == (1, 3, 3)
+    assert (turned @ turned.inverse()).distance(ratn.Pose()) < 1e-12
+    assert math.isclose(turned.angle(ratn.Pose()), math.pi / 2)
+    assert eval(repr(turned), {"Pose": ratn.Pose}) == turned
+    with pytest.raises(ValueError, match="not both"):
+        ratn.Pose(roll=1, quaternion=(0, 0, 0, 1))
+    assert list(ratn.Joints([1, 2.5])) == [1.0, 2.5] and ratn.Joints([1])[-1] == 1

@@ -1,0 +1,82 @@
+"""Actions that do what tests need."""
+
+import asyncio
+import logging
+import os
+import time
+from typing import Annotated, Any, TypedDict
+
+import numpy as np
+import ratn
+
+w = ratn.Worker("tester", kind="Tester")
+log = logging.getLogger("tester")
+
+
+class Sums(TypedDict):
+    total: float
+    joints: ratn.Joints
+    count: int
+
+
+@w.action
+def add(goal: ratn.Goal, numbers: np.ndarray, factor: float = 2.0) -> Sums:
+    """Adds numbers. Numpy's arrays come and go."""
+    assert isinstance(numbers, np.ndarray) and numbers.dtype == float
+    return {"total": numbers.sum() * factor, "joints": numbers * factor, "count": np.int64(len(numbers))}
+
+
+@w.action(outputs={"echo": "any"})
+def echo(goal: ratn.Goal, value: Any) -> dict:
+    return {"echo": value}
+
+
+@w.action(outcomes=["odd"], outputs={"half": int})
+def halve(goal: ratn.Goal, number: int) -> dict:
+    if number % 2:
+        return ratn.Outcome("odd", reason=f"{number} is odd")
+    return {"half": number // 2}
+
+
+@w.action
+def crash(goal: ratn.Goal) -> dict:
+    log.info("before the crash")
+    return {"never": [][7]}
+
+
+@w.action
+async def nap(goal: ratn.Goal, seconds: float) -> dict:
+    goal.progress("asleep", seconds=seconds)
+    try:
+        await asyncio.sleep(seconds)
+    except asyncio.CancelledError:
+        log.info("woken")
+        raise
+    return {"slept": seconds}
+
+
+@w.action
+def wait(goal: ratn.Goal, seconds: float) -> dict:
+    try:
+        goal.sleep(seconds)
+    except ratn.Cancelled:
+        log.info("cancelled")
+        raise
+    return {"slept": seconds}
+
+
+@w.action
+def spin(goal: ratn.Goal, rounds: int) -> dict:
+    began = time.perf_counter()
+    total = 0
+    for number in range(rounds):
+        total += number
+    return {"took_s": time.perf_counter() - began, "pid": os.getpid()}
+
+
+@w.action(senses=["at(?)"])
+def look(goal: ratn.Goal) -> None:
+    goal.measured("at(ball)", ratn.Pose(1, 2, 3), covariance=np.eye(6) * 0.25, source="eye")
+
+
+w.run()
