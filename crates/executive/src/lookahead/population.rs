@@ -33,6 +33,8 @@ pub(super) struct Population {
     scheduler: Scheduler,
     dice: Dice,
     individuals: Vec<Individual>,
+    /// Lists that are still to be decoded, the first last.
+    given: Vec<Vec<u32>>,
     /// Lists that were decoded since something was found that is better.
     in_vain: usize,
     child: Vec<u32>,
@@ -49,10 +51,11 @@ impl Population {
     /// Begins with these lists, the best first.
     pub(super) fn new(project: Project, seed: u64, lists: Vec<Vec<u32>>) -> Population {
         let size = project.len();
-        let mut population = Population {
+        Population {
             scheduler: Scheduler::new(&project),
             dice: Dice(seed),
             individuals: Vec::with_capacity(SIZE),
+            given: lists.into_iter().take(SIZE).rev().collect(),
             in_vain: 0,
             child: Vec::with_capacity(size),
             taken: vec![false; size],
@@ -62,20 +65,15 @@ impl Population {
             best_end: u64::MAX,
             told_end: u64::MAX,
             project,
-        };
-        for list in lists.into_iter().take(SIZE) {
-            population.child = list;
-            let end = population.decode();
-            population.join(end);
         }
-        population
     }
 
     /// The lists, the best first.
     pub(super) fn lists(&self) -> Vec<Vec<u32>> {
         let mut individuals: Vec<&Individual> = self.individuals.iter().collect();
         individuals.sort_by_key(|individual| individual.end);
-        individuals.into_iter().map(|individual| individual.list.clone()).collect()
+        let lists = individuals.into_iter().map(|individual| &individual.list);
+        lists.chain(self.given.iter().rev()).take(SIZE).cloned().collect()
     }
 
     /// The project that the lists are of.
@@ -92,7 +90,10 @@ impl Population {
             if self.in_vain >= PATIENCE {
                 self.begin_anew();
             }
-            let end = if self.individuals.len() < SIZE {
+            let end = if let Some(list) = self.given.pop() {
+                self.child = list;
+                self.decode()
+            } else if self.individuals.len() < SIZE {
                 self.draw();
                 // One in two by each scheme.
                 if self.individuals.len().is_multiple_of(2) { self.decode_in_parallel() } else { self.decode() }
