@@ -9,7 +9,7 @@ mod values;
 use crate::command::actions::ActionsArguments;
 use crate::command::doctor::DoctorArguments;
 use crate::command::new::NewArguments;
-use crate::command::pool::{DrainArguments, HostArguments, LogsArguments, PoolArguments, RestartArguments};
+use crate::command::pool::{DrainArguments, LogsArguments, PoolArguments, PsArguments, RestartArguments};
 use crate::command::resource::ResourceArguments;
 use crate::command::world::WorldArguments;
 use clap::{Parser, Subcommand};
@@ -20,8 +20,9 @@ pub(crate) use operating::{
 pub(crate) use roles::{CellArguments, KeptRoleArguments, RoleArguments, WorkerArguments, WorkerKind};
 pub(crate) use systems::{Budget, DemoArguments, GoodsArguments, ResetArguments, SystemArguments, UpArguments};
 pub(crate) use tasks::{
-    CheckArguments, ControlArguments, ModeArgument, PlanArguments, ReportArguments, RobotArguments, RobotCommand,
-    RunArguments, SimulateArguments, StatusArguments, TablesArguments, WordArgument,
+    CheckArguments, CompletionsArguments, ControlArguments, DrawingArgument, ExportArguments, FormatArgument,
+    JsonArgument, ManArguments, ModeArgument, PlanArguments, ReportArguments, RobotArguments, RobotCommand,
+    RowArgument, RunArguments, SimulateArguments, StatusArguments, TablesArguments, TopArguments, WordArgument,
 };
 
 /// Runs robot tasks, written as sequential state machines, as fast as their real dependencies allow.
@@ -46,7 +47,9 @@ pub(crate) enum Command {
     /// Show which states run, which resources are held, and what waits for what
     Status(StatusArguments),
     /// Show the worker processes of all hosts
-    Ps(HostArguments),
+    Ps(PsArguments),
+    /// Watch a whole system: its run, who holds what and who waits for what, workers, hosts with CPU and memory
+    Top(TopArguments),
     /// Print the output of a worker on any host
     Logs(LogsArguments),
     /// Start and end workers of a host's pools, and change how many there are
@@ -73,6 +76,12 @@ pub(crate) enum Command {
     New(NewArguments),
     /// Say where the time of a run went, from its event log
     Report(ReportArguments),
+    /// Write an event log in a form that other tools open: Perfetto, OpenTelemetry, Foxglove and Rerun, spreadsheets, graphs
+    Export(ExportArguments),
+    /// Print a script that lets a shell complete what is typed
+    Completions(CompletionsArguments),
+    /// Write man pages of every command into a folder
+    Man(ManArguments),
     /// Replay the paper's tables in virtual time
     Tables(TablesArguments),
     /// Run a scheduling problem of the literature in virtual time, as a task, and compare with the best known schedule

@@ -2,7 +2,7 @@
 
 use std::io::IsTerminal;
 
-/// Whether standard output is coloured.
+/// Whether what is written is coloured.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Colours(bool);
 
@@ -10,8 +10,13 @@ impl Colours {
     /// As standard output and the environment are.
     pub(crate) fn of_output() -> Colours {
         let is_set = |name: &str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
-        let is_dumb = std::env::var_os("TERM").is_some_and(|term| term == "dumb");
-        Colours::chosen(std::io::stdout().is_terminal(), is_set("NO_COLOR"), is_dumb)
+        Colours::chosen(std::io::stdout().is_terminal(), is_set("NO_COLOR"), !can_paint())
+    }
+
+    /// As standard error and the environment are.
+    pub(crate) fn of_errors() -> Colours {
+        let is_set = |name: &str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
+        Colours::chosen(std::io::stderr().is_terminal(), is_set("NO_COLOR"), !can_paint())
     }
 
     fn chosen(is_terminal: bool, unwanted: bool, is_dumb: bool) -> Colours {
@@ -36,6 +41,11 @@ impl Colours {
     fn painted(self, code: &str, text: &str) -> String {
         if self.0 { format!("\x1b[{code}m{text}\x1b[0m") } else { text.to_owned() }
     }
+}
+
+/// Whether a terminal takes commands at all.
+pub(crate) fn can_paint() -> bool {
+    std::env::var_os("TERM").is_none_or(|term| term != "dumb")
 }
 
 #[cfg(test)]

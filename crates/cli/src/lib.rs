@@ -12,7 +12,9 @@ mod command;
 mod failure;
 mod input;
 mod interrupt;
+mod live;
 mod output;
+mod repainting;
 mod system;
 
 use clap::Parser;

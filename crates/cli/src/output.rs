@@ -10,10 +10,52 @@ use ratn_task_control::Messages;
 use std::fmt::Display;
 use std::io::{self, ErrorKind, Write};
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 
-/// Writes one line to standard error, if somebody is there to read it.
+/// What is said of progress, and how.
+static PROGRESS: Mutex<Progress> = Mutex::new(Progress { is_quiet: false, area: 0 });
+
+struct Progress {
+    is_quiet: bool,
+    /// So many lines at the end of the terminal are painted again and again.
+    area: usize,
+}
+
+/// Writes one line to standard error, if somebody is there to read it: above what is painted there.
 pub(crate) fn progress(line: impl Display) {
-    let _ = io::stderr().write_all(format!("{line}\n").as_bytes());
+    let mut progress = PROGRESS.lock().unwrap_or_else(PoisonError::into_inner);
+    if !progress.is_quiet {
+        let _ = io::stderr().write_all(format!("{}{line}\n", progress.cleared()).as_bytes());
+    }
+}
+
+/// From now on nothing is said of progress.
+pub(crate) fn be_quiet() {
+    PROGRESS.lock().unwrap_or_else(PoisonError::into_inner).is_quiet = true;
+}
+
+/// Paints lines at the end of the terminal of standard error, over those that were painted before.
+pub(crate) fn paint_area(lines: &[String]) {
+    let mut progress = PROGRESS.lock().unwrap_or_else(PoisonError::into_inner);
+    let text: String =
+        std::iter::once(progress.cleared()).chain(lines.iter().map(|line| format!("{line}\n"))).collect();
+    progress.area = lines.len();
+    let _ = io::stderr().write_all(text.as_bytes());
+}
+
+/// Takes away what is painted.
+pub(crate) fn clear_area() {
+    paint_area(&[]);
+}
+
+impl Progress {
+    /// What takes away what is painted: up to its first line, and everything from there.
+    fn cleared(&mut self) -> String {
+        match std::mem::take(&mut self.area) {
+            0 => String::new(),
+            lines => format!("\x1b[{lines}A\r\x1b[J"),
+        }
+    }
 }
 
 /// [`progress`], for task control.

@@ -46,6 +46,14 @@ pub struct RunStatus {
     pub ended: u64,
     /// The states that are under way, those that began first first.
     pub under_way: Vec<UnderWay>,
+    /// What the states wait for that have not begun, a sentence each; none in HSM mode. As many as are said at most.
+    #[serde(default)]
+    pub waits: Vec<String>,
+}
+
+impl RunStatus {
+    /// More sentences are not said.
+    pub(crate) const MOST_WAITS: usize = 256;
 }
 
 /// What somebody wants of a run.
@@ -251,6 +259,7 @@ mod tests {
             paused: true,
             ended: 2,
             under_way: vec![UnderWay { path: "place[2]/plan".to_owned(), for_s: 1.5 }],
+            waits: vec!["move waits for an output of place[2]/plan".to_owned()],
         };
         let said = doing.clone();
         let answering = tokio::spawn(async move {

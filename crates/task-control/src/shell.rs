@@ -288,6 +288,7 @@ impl Shell {
             paused: self.progress.is_paused(),
             ended: self.progress.retired(),
             under_way: self.progress.under_way(now),
+            waits: self.executive.explain().into_iter().take(RunStatus::MOST_WAITS).collect(),
         }
     }
 

@@ -89,9 +89,21 @@ pub(crate) struct RunArguments {
     /// Write a checkpoint beside the event log after so many events, for a quick `--resume`; 0: none
     #[arg(long, value_name = "EVENTS", default_value_t = EVERY_EVENTS)]
     pub(crate) checkpoint_every: u64,
-    /// Print one JSON document on standard output
-    #[arg(long)]
-    pub(crate) json: bool,
+    /// Say nothing but the result
+    #[arg(short, long)]
+    pub(crate) quiet: bool,
+    /// Print JSON on standard output: one document at the end, with `--json=lines` the event log as it grows before it, all of it a line each
+    #[arg(long, value_enum, value_name = "HOW", num_args = 0..=1, require_equals = true, default_missing_value = "document")]
+    pub(crate) json: Option<JsonArgument>,
+}
+
+/// How a run is told in JSON, on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum JsonArgument {
+    /// One document at the end
+    Document,
+    /// Every line of the event log as it is written, then the document in one line
+    Lines,
 }
 
 /// What a run can be told, on the command line.
@@ -131,16 +143,94 @@ pub(crate) struct StatusArguments {
 }
 
 #[derive(Debug, Clone, Args)]
+pub(crate) struct TopArguments {
+    /// Show it once
+    #[arg(long)]
+    pub(crate) once: bool,
+    /// Where the endpoint files of the system are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct CompletionsArguments {
+    /// The shell
+    #[arg(value_enum)]
+    pub(crate) shell: clap_complete::Shell,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ManArguments {
+    /// The folder, which is made
+    #[arg(value_name = "DIR")]
+    pub(crate) directory: PathBuf,
+}
+
+#[derive(Debug, Clone, Args)]
 pub(crate) struct ReportArguments {
-    /// The event log
-    #[arg(value_name = "LOG")]
-    pub(crate) log: PathBuf,
+    /// The event log; several are compared
+    #[arg(value_name = "LOG", required = true)]
+    pub(crate) logs: Vec<PathBuf>,
     /// Print one JSON document
     #[arg(long)]
     pub(crate) json: bool,
-    /// Write a Gantt chart; `.svg` or `.html`
+    /// Write a Gantt chart; `.svg` or `.html`. Several runs stand below each other on one time axis, HSM first
     #[arg(long, value_name = "FILE", value_parser = chart)]
     pub(crate) gantt: Option<PathBuf>,
+    /// What a row of the chart is
+    #[arg(long, value_enum, value_name = "WHAT", default_value = "resource")]
+    pub(crate) by: RowArgument,
+}
+
+/// The rows of a chart, on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum RowArgument {
+    /// A resource
+    Resource,
+    /// A state
+    Node,
+}
+
+/// The forms of an export, on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum FormatArgument {
+    /// A trace for ui.perfetto.dev: a track per resource, and what led to what
+    Perfetto,
+    /// Spans as OTLP/JSON, a request a line
+    Otlp,
+    /// A recording for Foxglove and Rerun: what happened, the objects as believed, the joints
+    Mcap,
+    /// A table of the instances
+    Csv,
+    /// A graph for Graphviz
+    Dot,
+    /// A graph for Mermaid
+    Mermaid,
+}
+
+/// What a graph shows, on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum DrawingArgument {
+    /// Every instance, and what it waited for
+    Network,
+    /// The states, all visits of one together
+    Task,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ExportArguments {
+    /// The form
+    #[arg(value_enum)]
+    pub(crate) format: FormatArgument,
+    /// The event log; that of a run under way is exported as far as it is written
+    #[arg(value_name = "LOG")]
+    pub(crate) log: PathBuf,
+    /// Where it goes; standard output unless given
+    #[arg(short, long, value_name = "FILE")]
+    pub(crate) output: Option<PathBuf>,
+    /// What a graph shows
+    #[arg(long, value_enum, value_name = "WHAT", default_value = "network")]
+    pub(crate) of: DrawingArgument,
 }
 
 #[derive(Debug, Clone, Args)]

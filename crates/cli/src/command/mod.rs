@@ -3,9 +3,11 @@
 pub(crate) mod actions;
 mod certs;
 mod check;
+mod completions;
 mod control;
 mod demo;
 pub(crate) mod doctor;
+mod export;
 mod leader;
 pub(crate) mod new;
 mod plan;
@@ -22,6 +24,7 @@ mod simulate;
 mod state;
 mod status;
 mod tables;
+mod top;
 mod up;
 pub(crate) mod world;
 
@@ -62,6 +65,10 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::World(arguments) => world::run(&arguments, tls),
         Command::State(arguments) => state::run(&arguments),
         Command::Certs(arguments) => certs::run(&arguments),
+        Command::Completions(arguments) => completions::run(&arguments),
+        Command::Man(arguments) => completions::man(&arguments),
+        Command::Top(arguments) => top::run(&arguments, tls),
+        Command::Export(arguments) => export::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Plan(arguments) => plan::run(&arguments),

@@ -3,10 +3,13 @@
 mod resume;
 
 use super::{blocking_here, check};
-use crate::arguments::{ModeArgument, RunArguments, SystemArguments};
+use crate::arguments::{JsonArgument, ModeArgument, RunArguments, SystemArguments};
+use crate::colour::can_paint;
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
+use crate::live::{Live, Way};
 use crate::output;
+use crate::repainting::json_text;
 use crate::system::config::SystemConfig;
 use crate::system::{System, public_directory};
 use anyhow::{Context, anyhow, bail};
@@ -20,6 +23,7 @@ use ratn_report::timeline::Timeline;
 use ratn_task_control::learn;
 use ratn_task_control::shell::{self, Ended, Run};
 use ratn_worker::tls::ClientTls;
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -34,6 +38,9 @@ impl From<ModeArgument> for Mode {
 
 /// Runs a task once, or goes on with a run.
 pub(crate) fn run(arguments: &RunArguments, tls: &ClientTls) -> Result<(), Failure> {
+    if arguments.quiet {
+        output::be_quiet();
+    }
     blocking_here(async {
         let interrupt = Interrupt::listen()?;
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
@@ -111,6 +118,7 @@ async fn begin(
         }
     };
     system.offered.lacking(&program).iter().for_each(|what| output::progress(format_args!("warning: {what}")));
+    let way = way(arguments);
     let run = Run {
         program: Arc::new(program),
         file: std::path::absolute(task)?.display().to_string(),
@@ -119,13 +127,24 @@ async fn begin(
         seed: arguments.seed,
         learned,
         log: log.clone(),
-        quiet: false,
+        quiet: arguments.quiet || way == Some(Way::Painted),
         checkpoint_every: arguments.checkpoint_every,
     };
+    let live = way.map(|way| Live::follow(&log, way, system.place().speed));
     let ended = on_system(run, system, interrupt, async |_| Ok(())).await;
+    drop(live);
     output::progress(format_args!("event log: {}", log.display()));
     let (ended, ()) = ended?;
     conclude(&ended, &log, arguments)
+}
+
+/// How the run is followed while it goes on, beside the lines of its nodes; on a terminal in place of them.
+fn way(arguments: &RunArguments) -> Option<Way> {
+    let is_seen = std::io::stderr().is_terminal() && can_paint();
+    match arguments.json {
+        Some(JsonArgument::Lines) => Some(Way::Lines),
+        _ => (is_seen && !arguments.quiet).then_some(Way::Painted),
+    }
 }
 
 fn conclude(ended: &Ended, log: &Path, arguments: &RunArguments) -> Result<(), Failure> {
@@ -175,13 +194,13 @@ fn say(ended: &Ended, log: &Path, arguments: &RunArguments) -> anyhow::Result<()
         output::progress(format_args!("chart: {}", path.display()));
     }
     let statistics = Statistics::of(&timeline);
-    if arguments.json {
+    if let Some(how) = arguments.json {
         let outputs: serde_json::Map<_, _> = ended.outputs.iter().map(|(k, v)| (k.clone(), plain(v))).collect();
         let document = serde_json::json!({
             "outcome": ended.outcome, "reason": ended.reason, "outputs": outputs,
             "makespan_s": ended.makespan_s, "log": log, "statistics": statistics,
         });
-        return output::result(serde_json::to_string_pretty(&document)?);
+        return output::result(json_text(&document, how == JsonArgument::Lines)?);
     }
     let outputs = ended.outputs.iter().map(|(name, value)| format!("\n{name} = {value}"));
     output::result(format_args!("{statistics}{}", outputs.collect::<String>()))

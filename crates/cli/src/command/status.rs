@@ -8,7 +8,7 @@ use crate::arguments::StatusArguments;
 use crate::colour::Colours;
 use crate::columns::aligned;
 use crate::failure::Failure;
-use crate::output;
+use crate::repainting::{Repainting, json_text};
 use crate::system::public_directory;
 use anyhow::Context;
 use ratn_daemon::resource_manager;
@@ -21,18 +21,14 @@ use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
 use serde::Serialize;
-use std::io::IsTerminal;
 use std::path::Path;
-use std::time::Duration;
 
-/// How often it is looked at.
-const PERIOD: Duration = Duration::from_millis(500);
 /// More lines of one kind are counted, not shown.
 const MOST_LINES: usize = 40;
 
 /// What is shown.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-struct Status {
+pub(super) struct Status {
     /// None where no run is under way.
     run: Option<RunStatus>,
     held: Vec<Held>,
@@ -66,30 +62,19 @@ pub(crate) fn run(arguments: &StatusArguments, tls: &ClientTls) -> Result<(), Fa
         let manager = manager.map_err(|error| Failure::Refused(format!("ratn: {error}")))?;
         let client = ResourceClient::new(&Channels::new(tls), &manager, "")?;
         let colours = Colours::of_output();
-        let mut shown = None;
-        loop {
+        Repainting::repeat(arguments.watch, arguments.json, async || {
             let status = Status::of(&directory, &client).await.map_err(unanswered)?;
-            if shown.as_ref() != Some(&status) {
-                let text = match (arguments.json, arguments.watch) {
-                    (true, true) => serde_json::to_string(&status)?,
-                    (true, false) => serde_json::to_string_pretty(&status)?,
-                    (false, _) => status.text(&directory, colours),
-                };
-                // A terminal shows one state after the other in the same place.
-                let again = arguments.watch && !arguments.json && std::io::stdout().is_terminal();
-                let text = if again { format!("\x1b[H\x1b[J{text}") } else { text };
-                if !output::line(text)? || !arguments.watch {
-                    return Ok(());
-                }
-                shown = Some(status);
-            }
-            tokio::time::sleep(PERIOD).await;
-        }
+            Ok(match arguments.json {
+                true => json_text(&status, arguments.watch)?,
+                false => status.text(&directory, colours),
+            })
+        })
+        .await
     })
 }
 
 impl Status {
-    async fn of(directory: &Path, client: &ResourceClient) -> Result<Status, Failure> {
+    pub(super) async fn of(directory: &Path, client: &ResourceClient) -> Result<Status, Failure> {
         let run = control::status(directory).await;
         let run = run.with_context(|| format!("the run in {} does not say what it is doing", directory.display()))?;
         let resources = client.list(&[]).await?;
@@ -124,7 +109,7 @@ impl Status {
         }
     }
 
-    fn text(&self, directory: &Path, colours: Colours) -> String {
+    pub(super) fn text(&self, directory: &Path, colours: Colours) -> String {
         let mut lines = Vec::new();
         match &self.run {
             None => lines.push(format!("no run is under way in {}", directory.display())),
@@ -137,6 +122,8 @@ impl Status {
                 lines.push(format!("event log: {}", log.display()));
                 let rows = run.under_way.iter().map(|one| [one.path.clone(), format!("for {:.1} s", one.for_s)]);
                 section(&mut lines, &colours.green("under way"), rows.collect());
+                let rows = run.waits.iter().map(|sentence| [sentence.clone(), String::new()]);
+                section(&mut lines, &colours.yellow("states that wait"), rows.collect());
             }
         }
         let rows = self.held.iter().map(|held| [held.resource.clone(), held.holder.clone()]);
@@ -185,6 +172,7 @@ mod tests {
                 paused: true,
                 ended: 3,
                 under_way: vec![UnderWay { path: "place[2]/plan".to_owned(), for_s: 1.5 }],
+                waits: vec!["place[2]/move waits for an output of place[2]/plan".to_owned()],
             }),
             held: vec![Held {
                 resource: "path-planner-1@compute".to_owned(),
@@ -200,6 +188,8 @@ mod tests {
         event log: log.jsonl
         under way:
           place[2]/plan  for 1.5 s
+        states that wait:
+          place[2]/move waits for an output of place[2]/plan
         held:
           path-planner-1@compute  sort_boxes: place[2]/plan
         waiting:

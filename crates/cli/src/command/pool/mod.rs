@@ -7,6 +7,7 @@ mod show;
 use super::{blocking_on, leader};
 use crate::failure::Failure;
 use crate::output;
+use crate::repainting::Repainting;
 use crate::system::{System, public_directory};
 use anyhow::Context;
 use clap::{Args, Subcommand};
@@ -36,6 +37,15 @@ pub(crate) struct HostArguments {
     /// Print one JSON document on standard output
     #[arg(long, global = true)]
     json: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct PsArguments {
+    /// Show them again whenever something changes, until Ctrl-C
+    #[arg(long)]
+    watch: bool,
+    #[command(flatten)]
+    host: HostArguments,
 }
 
 #[derive(Debug, Clone, Args)]
@@ -115,42 +125,60 @@ pub(crate) struct DrainArguments {
     host: HostArguments,
 }
 
-/// Shows the workers of all hosts; fails where one does not answer.
-pub(super) fn ps(arguments: &HostArguments, tls: &ClientTls) -> Result<(), Failure> {
+/// Shows the workers of all hosts, once or again and again; fails where one does not answer.
+pub(super) fn ps(arguments: &PsArguments, tls: &ClientTls) -> Result<(), Failure> {
+    let PsArguments { host, watch } = arguments;
     asking(async {
-        let managers = match hosts::resource_manager(arguments) {
-            Some(endpoint) => leader::ask(&endpoint, tls).await,
-            None => Vec::new(),
+        let mut problems = Vec::new();
+        let look = async || {
+            let (text, said) = workers(host, tls).await?;
+            problems = said;
+            Ok::<String, Failure>(text)
         };
-        let found = hosts::find(arguments, tls).await.inspect_err(|_| {
-            if !managers.is_empty() {
-                output::progress(leader::line(resource_manager::ROLE, &managers));
-            }
-        });
-        let mut answered = hosts::ask_all(found?).await;
-        answered.retain(|one| arguments.host.as_deref().is_none_or(|host| host == one.name()));
-        if let Some(host) = arguments.host.as_deref().filter(|_| answered.is_empty()) {
-            return Err(Failure::Refused(format!("ratn: there is no host `{host}`; `ratn ps` shows all")));
-        }
-        let pools: Vec<&HostPools> = answered.iter().filter_map(|one| one.pools.as_ref().ok()).collect();
-        let mismatches = mismatches(arguments, tls).await;
-        if arguments.json {
-            let mut document = show::in_json(&answered);
-            document["mismatches"] = json!(mismatches);
-            if !managers.is_empty() {
-                document["resource_managers"] = leader::in_json(&managers);
-            }
-            output::result(document)?;
-        } else {
-            output::result(show::table(&pools))?;
-            mismatches.iter().try_for_each(output::result)?;
-            if !managers.is_empty() {
-                output::result(leader::line(resource_manager::ROLE, &managers))?;
-            }
-        }
-        let problems: Vec<String> = answered.iter().filter_map(Answered::problem).collect();
+        Repainting::repeat(*watch, host.json, look).await?;
         if problems.is_empty() { Ok(()) } else { Err(anyhow::anyhow!(problems.join("\nratn: ")).into()) }
     })
+}
+
+/// The workers of all hosts as text, or JSON, and which hosts do not answer.
+async fn workers(arguments: &HostArguments, tls: &ClientTls) -> Result<(String, Vec<String>), Failure> {
+    let managers = match hosts::resource_manager(arguments) {
+        Some(endpoint) => leader::ask(&endpoint, tls).await,
+        None => Vec::new(),
+    };
+    let found = hosts::find(arguments, tls).await.inspect_err(|_| {
+        if !managers.is_empty() {
+            output::progress(leader::line(resource_manager::ROLE, &managers));
+        }
+    });
+    let mut answered = hosts::ask_all(found?).await;
+    answered.retain(|one| arguments.host.as_deref().is_none_or(|host| host == one.name()));
+    if let Some(host) = arguments.host.as_deref().filter(|_| answered.is_empty()) {
+        return Err(Failure::Refused(format!("ratn: there is no host `{host}`; `ratn ps` shows all")));
+    }
+    let pools: Vec<&HostPools> = answered.iter().filter_map(|one| one.pools.as_ref().ok()).collect();
+    let mismatches = mismatches(arguments, tls).await;
+    let problems: Vec<String> = answered.iter().filter_map(Answered::problem).collect();
+    if arguments.json {
+        let mut document = show::in_json(&answered);
+        document["mismatches"] = json!(mismatches);
+        if !managers.is_empty() {
+            document["resource_managers"] = leader::in_json(&managers);
+        }
+        return Ok((document.to_string(), problems));
+    }
+    let managers = (!managers.is_empty()).then(|| leader::line(resource_manager::ROLE, &managers));
+    let lines = std::iter::once(show::table(&pools)).chain(mismatches).chain(managers);
+    Ok((lines.collect::<Vec<_>>().join("\n"), problems))
+}
+
+/// The workers of all hosts, and what each host uses, for whoever shows them beside other things.
+pub(super) async fn overview(runtime_dir: Option<PathBuf>, tls: &ClientTls) -> Result<String, Failure> {
+    let arguments = HostArguments { runtime_dir, resource_manager: None, manager: None, host: None, json: false };
+    let answered = hosts::ask_all(hosts::find(&arguments, tls).await?).await;
+    let pools: Vec<&HostPools> = answered.iter().filter_map(|one| one.pools.as_ref().ok()).collect();
+    let silent = answered.iter().filter_map(Answered::problem);
+    Ok([show::hosts(&pools), show::table(&pools)].into_iter().chain(silent).collect::<Vec<_>>().join("\n"))
 }
 
 /// Where workers say something else than the catalogue of the system in the runtime directory; nothing where none is known.

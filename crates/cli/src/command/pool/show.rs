@@ -36,6 +36,26 @@ pub(super) fn table(hosts: &[&HostPools]) -> String {
     lines.join("\n")
 }
 
+/// A line for each host: its workers, and what they take of it.
+pub(super) fn hosts(hosts: &[&HostPools]) -> String {
+    let row = |host: &&HostPools| {
+        let workers = || host.pools.iter().flat_map(|pool| &pool.workers);
+        let memory: u64 = workers().map(|worker| worker.resident_bytes).sum();
+        let cpu: u32 = workers().map(|worker| worker.cpu_millicores).sum();
+        let held = workers().filter(|worker| worker.held).count();
+        let crashes: u64 = host.pools.iter().map(|pool| pool.crashes).sum();
+        [
+            host.host.clone(),
+            workers().count().to_string(),
+            held.to_string(),
+            format!("{} MiB", memory >> 20),
+            format!("{} %", cpu / 10),
+            crashes.to_string(),
+        ]
+    };
+    columns(&["HOST", "WORKERS", "HELD", "MEMORY", "CPU", "CRASHES"], hosts.iter().map(row).collect())
+}
+
 fn tracking(mode: Option<TrackingMode>) -> &'static str {
     match mode {
         Some(TrackingMode::Cgroup) => "cgroup",

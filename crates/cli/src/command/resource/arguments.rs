@@ -58,6 +58,9 @@ pub(super) enum ResourceCommand {
         /// Only those that meet this condition, `payload >= 2.5`, `tool in [gripper, welder]`, `has camera`; may be repeated
         #[arg(long = "where", value_name = "CONDITION")]
         conditions: Vec<Condition>,
+        /// Show them again whenever something changes, until Ctrl-C
+        #[arg(long)]
+        watch: bool,
     },
     /// Show everything about one resource
     Get {

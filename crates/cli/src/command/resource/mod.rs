@@ -14,6 +14,7 @@ pub(crate) use arguments::ResourceArguments;
 use super::{blocking_on, leader, unanswered};
 use crate::failure::Failure;
 use crate::output;
+use crate::repainting::{Repainting, json_text};
 use crate::system::public_directory;
 use anyhow::Context;
 use arguments::{ResourceCommand, Selector};
@@ -106,11 +107,17 @@ impl Asking {
                     return Err(anyhow::anyhow!("there is not what would satisfy `{requirement}`").into());
                 }
             }
-            ResourceCommand::List { kinds, conditions } => {
+            ResourceCommand::List { kinds, conditions, watch } => {
                 let (kinds, conditions) = (kinds.clone(), conditions.clone());
                 let filter = ResourceFilter { kinds, conditions, ..ResourceFilter::default() };
-                let resources = client.list_where(filter).await?;
-                self.show(&resources.iter().map(show::resource_json).collect(), || show::table(&resources))?;
+                let look = async || {
+                    let resources = client.list_where(filter.clone()).await?;
+                    Ok::<String, Failure>(match self.json {
+                        true => json_text(&resources.iter().map(show::resource_json).collect::<Vec<_>>(), *watch)?,
+                        false => show::table(&resources),
+                    })
+                };
+                Repainting::repeat(*watch, self.json, look).await?;
             }
             ResourceCommand::Get { id } => {
                 let found = client.get(id).await?;

@@ -34,6 +34,9 @@ pub(super) enum WorldCommand {
         /// As the `world` of a task file
         #[arg(long)]
         task: bool,
+        /// Show them again whenever they change, until Ctrl-C
+        #[arg(long, conflicts_with = "at")]
+        watch: bool,
     },
     /// Answer a query, `at(?box) = ?pose, not in_gripper(?box)`
     Query {

@@ -14,6 +14,7 @@ pub(crate) use arguments::WorldArguments;
 
 use super::{blocking_on, unanswered};
 use crate::failure::Failure;
+use crate::repainting::{Repainting, json_text};
 use crate::system::public_directory;
 use crate::{input, output};
 use anyhow::Context;
@@ -73,7 +74,18 @@ impl Asking {
     async fn perform(&self, command: &WorldCommand) -> Result<(), Failure> {
         let client = &self.client;
         match command {
-            WorldCommand::Facts { patterns, at, task } => {
+            WorldCommand::Facts { patterns, task, watch: true, .. } => {
+                let look = async || {
+                    let (revision, facts) = client.root_at(None, patterns).await?;
+                    Ok::<String, Failure>(match (self.json, task) {
+                        (true, _) => json_text(&dump::json(revision, &facts), true)?,
+                        (false, true) => task_text::world(&facts),
+                        (false, false) => show::facts(&facts),
+                    })
+                };
+                Repainting::repeat(true, self.json, look).await?;
+            }
+            WorldCommand::Facts { patterns, at, task, watch: false } => {
                 let (revision, facts) = client.root_at(at.map(Revision), patterns).await?;
                 let text = || if *task { task_text::world(&facts) } else { show::facts(&facts) };
                 self.show(&dump::json(revision, &facts), text)?;

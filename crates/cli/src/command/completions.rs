@@ -1,0 +1,25 @@
+//! `ratn completions SHELL` and `ratn man DIR`: what the command line says of itself.
+
+use crate::arguments::{Arguments, CompletionsArguments, ManArguments};
+use crate::failure::Failure;
+use crate::output;
+use anyhow::Context;
+use clap::CommandFactory;
+
+const NAME: &str = "ratn";
+
+/// Prints a script for a shell.
+pub(crate) fn run(arguments: &CompletionsArguments) -> Result<(), Failure> {
+    let mut script = Vec::new();
+    clap_complete::generate(arguments.shell, &mut Arguments::command(), NAME, &mut script);
+    Ok(output::result(String::from_utf8_lossy(&script).trim_end())?)
+}
+
+/// Writes `ratn.1`, and a page for each command, `ratn-run.1`.
+pub(crate) fn man(arguments: &ManArguments) -> Result<(), Failure> {
+    let directory = &arguments.directory;
+    let cannot = || format!("cannot write man pages to {}", directory.display());
+    std::fs::create_dir_all(directory).with_context(cannot)?;
+    clap_mangen::generate_to(Arguments::command(), directory).with_context(cannot)?;
+    Ok(())
+}

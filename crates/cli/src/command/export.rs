@@ -1,0 +1,62 @@
+//! `ratn export FORMAT LOG`
+
+use crate::arguments::{DrawingArgument, ExportArguments, FormatArgument};
+use crate::failure::Failure;
+use crate::output;
+use anyhow::Context;
+use ratn_event_log::Lines;
+use ratn_export::{Drawing, ExportError, Format, export};
+use std::fs::File;
+use std::io::{BufWriter, ErrorKind, IsTerminal};
+use std::path::Path;
+
+/// Writes an event log in another form.
+pub(crate) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
+    let format = format(arguments);
+    let mut lines = Lines::of(&arguments.log)?;
+    match &arguments.output {
+        Some(path) => {
+            output::check_writable(path)?;
+            if is_same(path, &arguments.log) {
+                let place = path.display();
+                return Err(Failure::Refused(format!("ratn: {place} is the event log itself: name another file")));
+            }
+            let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
+            let written = export(format, lines.by_ref(), BufWriter::new(file));
+            written.with_context(|| format!("{} is incomplete", path.display()))?;
+        }
+        None if matches!(format, Format::Perfetto | Format::Mcap) && std::io::stdout().is_terminal() => {
+            let help = "ratn: this form is not for a terminal: name a file with -o FILE";
+            return Err(Failure::Refused(help.to_owned()));
+        }
+        None => match export(format, lines.by_ref(), BufWriter::new(std::io::stdout().lock())) {
+            // Whoever read it has had enough.
+            Err(ExportError::Write(error)) if error.kind() == ErrorKind::BrokenPipe => return Ok(()),
+            other => other.map_err(anyhow::Error::from)?,
+        },
+    }
+    if let Some(line) = lines.torn() {
+        let place = arguments.log.display();
+        output::progress(format_args!("{place}:{line}: warning: the last line is torn; exported is what is before it"));
+    }
+    Ok(())
+}
+
+fn format(arguments: &ExportArguments) -> Format {
+    let drawing = match arguments.of {
+        DrawingArgument::Network => Drawing::Network,
+        DrawingArgument::Task => Drawing::Task,
+    };
+    match arguments.format {
+        FormatArgument::Perfetto => Format::Perfetto,
+        FormatArgument::Otlp => Format::Otlp,
+        FormatArgument::Mcap => Format::Mcap,
+        FormatArgument::Csv => Format::Csv,
+        FormatArgument::Dot => Format::Dot(drawing),
+        FormatArgument::Mermaid => Format::Mermaid(drawing),
+    }
+}
+
+fn is_same(a: &Path, b: &Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
+}

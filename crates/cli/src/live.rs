@@ -1,0 +1,211 @@
+//! A run while it goes on, from its event log as it grows: on a terminal a few lines that are painted again, for programs the log's lines.
+//!
+//! It reads what the run has written, in a thread of its own, so a run is not slower for being watched. What is painted is the one
+//! projection of the log; this file only lays it out.
+
+use crate::colour::Colours;
+use crate::output;
+use ratn_event_log::Tail;
+use ratn_executive::protocol::LogLine;
+use ratn_report::statistics::mode_name;
+use ratn_report::timeline::{Instance, Speculation, Stage, Timeline};
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+const PERIOD: Duration = Duration::from_millis(100);
+/// Instances that have left the window are not shown.
+const KEPT: usize = 64;
+/// At most so many lines of what runs, and of what waits.
+const MOST_RUNNING: usize = 8;
+const MOST_WAITING: usize = 6;
+const BAR: usize = 20;
+
+/// What is done with a log that grows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Way {
+    /// Painted on the terminal of standard error.
+    Painted,
+    /// Each line on standard output.
+    Lines,
+}
+
+/// Follows a log until it is dropped.
+#[derive(Debug)]
+pub(crate) struct Live {
+    end: Option<Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Live {
+    /// Follows a log that is about to be written. `speed` is the robot's seconds per second.
+    pub(crate) fn follow(log: &Path, way: Way, speed: f64) -> Live {
+        let (end, ends) = channel();
+        let log: PathBuf = log.to_owned();
+        let follow = move || {
+            let mut painter = Painter { way, speed, run: Timeline::following(KEPT), heard: (Instant::now(), 0.0) };
+            let mut tail = Tail::of(&log);
+            loop {
+                let is_over = !matches!(ends.recv_timeout(PERIOD), Err(RecvTimeoutError::Timeout));
+                // What cannot be read is reported by whoever writes it, or reads it as a whole afterwards.
+                if !painter.take(tail.more().unwrap_or_default()) || is_over {
+                    break;
+                }
+                painter.paint();
+            }
+            output::clear_area();
+        };
+        let thread = std::thread::Builder::new().name("live view".to_owned()).spawn(follow).ok();
+        Live { end: Some(end), thread }
+    }
+}
+
+impl Drop for Live {
+    fn drop(&mut self) {
+        self.end.take();
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+struct Painter {
+    way: Way,
+    speed: f64,
+    run: Timeline,
+    /// When the last line came, and its moment.
+    heard: (Instant, f64),
+}
+
+impl Painter {
+    /// False once nobody reads.
+    fn take(&mut self, lines: Vec<LogLine>) -> bool {
+        for line in &lines {
+            self.heard = (Instant::now(), line.at.seconds());
+            match self.way {
+                Way::Painted => drop(self.run.apply(line)),
+                Way::Lines => {
+                    let text = serde_json::to_string(line).unwrap_or_default();
+                    if !matches!(output::line(text), Ok(true)) {
+                        return false;
+                    }
+                }
+            }
+        }
+        true
+    }
+
+    fn paint(&mut self) {
+        if self.way != Way::Painted || self.run.task.is_empty() {
+            return;
+        }
+        let (heard, at_s) = self.heard;
+        self.run.wait_until(at_s + heard.elapsed().as_secs_f64() * self.speed);
+        let size = terminal_size::terminal_size_of(std::io::stderr());
+        let (width, height) = size.map_or((80, 24), |(width, height)| (usize::from(width.0), usize::from(height.0)));
+        output::paint_area(&page(&self.run, width, height, Colours::of_errors()));
+    }
+}
+
+/// A run as it is now, in so many columns and fewer than so many lines.
+fn page(run: &Timeline, width: usize, height: usize, colours: Colours) -> Vec<String> {
+    let room = height.saturating_sub(4).max(1);
+    let running = run.running();
+    let runs = running.len().min(MOST_RUNNING).min(room);
+    let waits = MOST_WAITING.min(room - runs);
+    let mut lines = vec![colours.bold(&cut(&head(run), width))];
+    for (instance, job) in running.iter().take(runs) {
+        let on = if job.resources.is_empty() { String::new() } else { format!("  on {}", job.resources.join(", ")) };
+        let text = format!("  runs   {} for {:.1} s{on}", instance.path, (run.end_s - job.from_s).max(0.0));
+        lines.push(colours.green(&cut(&text, width)));
+    }
+    lines.extend(more(running.len(), runs, "run"));
+    // Who has asked for resources has a cause that can be seen; the others stand behind those.
+    let mut waiting: Vec<&Instance> = run.waiting().collect();
+    waiting.sort_by_key(|one| (one.stage != Stage::Asking, one.id));
+    for sentence in waiting.iter().take(waits).filter_map(|one| run.explain(one.id)) {
+        lines.push(colours.yellow(&cut(&format!("  waits  {sentence}"), width)));
+    }
+    lines.extend(more(waiting.len(), waits, "wait"));
+    lines
+}
+
+/// `fetch_boxes in CDTN mode: 12.3 s  [#####...............] 12 of 35 states have ended; ahead of time: 3 of use (8.0 s), 1 discarded (2.0 s)`
+fn head(run: &Timeline) -> String {
+    let (ended, known) = (run.count.retired, run.count.expanded - run.count.squashed);
+    let full = if known == 0 { 0 } else { BAR * ended / known };
+    let bar = format!("{}{}", "#".repeat(full), ".".repeat(BAR - full));
+    let paused = if run.is_paused() { ", paused" } else { "" };
+    let Speculation { useful, useful_s, wasted, wasted_s, .. } = run.speculation();
+    let ahead = match useful + wasted {
+        0 => String::new(),
+        _ => format!("; ahead of time: {useful} of use ({useful_s:.1} s), {wasted} discarded ({wasted_s:.1} s)"),
+    };
+    let mode = mode_name(run.mode);
+    format!(
+        "{} in {mode} mode: {:.1} s{paused}  [{bar}] {ended} of {known} known states have ended{ahead}",
+        run.task, run.end_s
+    )
+}
+
+fn more(all: usize, shown: usize, what: &str) -> Option<String> {
+    (all > shown).then(|| format!("  and {} more {what}", all - shown))
+}
+
+/// At most so many characters: a line that is broken would not be painted over.
+fn cut(text: &str, width: usize) -> String {
+    let plain: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    if plain.chars().count() < width {
+        return plain;
+    }
+    plain.chars().take(width.saturating_sub(2)).chain(['…']).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use insta::assert_snapshot;
+
+    const LOG: &str = r#"{"at":0,"event":"started","task":"sort","digest":"d","mode":"cdtn","parameters":{},"seed":1,"world":[],"revision":0,"capacity":{"PathPlanner":1}}
+{"at":0,"command":"note","note":"expanded","instance":1,"state":1,"path":"plan[1]","speculative":false}
+{"at":0,"command":"note","note":"expanded","instance":2,"state":1,"path":"plan[2]","speculative":false}
+{"at":0,"command":"note","note":"expanded","instance":3,"state":2,"path":"move","speculative":false}
+{"at":0,"command":"acquire","instance":1,"requirements":[{"operation":"block","kind":"PathPlanner","class":null,"attributes":{},"count":1}],"priority":2}
+{"at":0,"command":"acquire","instance":2,"requirements":[{"operation":"block","kind":"PathPlanner","class":null,"attributes":{},"count":1}],"priority":1}
+{"at":1000000000,"event":"granted","instance":1,"lease":{"id":1,"token":1,"resources":[{"id":"p1@compute","kind":"PathPlanner","endpoint":""}]}}
+{"at":1000000000,"command":"start","instance":1,"attempt":1,"goal":{"provider":"path_planner","action":"plan","inputs":{},"seed":1,"lease":{"id":1,"token":1,"resources":[{"id":"p1@compute","kind":"PathPlanner","endpoint":""}]},"projection":1,"expected_s":null}}"#;
+
+    fn sort() -> Timeline {
+        let mut run = Timeline::following(KEPT);
+        for line in LOG.lines() {
+            run.apply(&serde_json::from_str(line).expect("a line of a log"));
+        }
+        run.wait_until(4.5);
+        run
+    }
+
+    #[test]
+    fn what_runs_and_why_others_wait_is_on_the_page() {
+        assert_snapshot!(page(&sort(), 120, 24, Colours::default()).join("\n"), @r"
+        sort in CDTN mode: 4.5 s  [....................] 0 of 3 known states have ended
+          runs   plan[1] for 3.5 s  on p1@compute
+          waits  plan[2] waits for PathPlanner: it is held, by plan[1] for 3.5 s
+          waits  move waits for what is before it: plan[1] (running for 3.5 s)
+        ");
+    }
+
+    #[test]
+    fn a_small_terminal_has_fewer_and_shorter_lines() {
+        for (width, height) in [(30, 6), (10, 3), (1, 1)] {
+            let lines = page(&sort(), width, height, Colours::default());
+            assert!(lines.len() < height.max(6), "{lines:?}");
+            assert!(lines.iter().take(2).all(|line| line.chars().count() <= width), "{lines:?}");
+        }
+    }
+
+    #[test]
+    fn what_a_name_contains_does_nothing_to_the_terminal() {
+        assert_eq!(cut("a\u{1b}[2Jb\nc", 80), "a [2Jb c");
+    }
+}
