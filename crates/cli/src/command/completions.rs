@@ -23,3 +23,18 @@ pub(crate) fn man(arguments: &ManArguments) -> Result<(), Failure> {
     clap_mangen::generate_to(Arguments::command(), directory).with_context(cannot)?;
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn there_is_a_page_for_each_command() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        assert!(man(&ManArguments { directory: place.path().join("man") }).is_ok());
+        for page in ["ratn.1", "ratn-run.1", "ratn-export.1", "ratn-resource-list.1"] {
+            assert!(std::fs::read_to_string(place.path().join("man").join(page))?.contains(".TH"), "{page}");
+        }
+        Ok(())
+    }
+}

@@ -60,3 +60,27 @@ fn format(arguments: &ExportArguments) -> Format {
 fn is_same(a: &Path, b: &Path) -> bool {
     matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LOG: &str = r#"{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":1,"world":[],"revision":0}
+{"at":0,"command":"note","note":"expanded","instance":1,"state":1,"path":"look","speculative":false}
+{"at":0,"command":"end","outcome":"success","outputs":{},"reason":""}
+"#;
+
+    #[test]
+    fn an_export_is_written_and_never_over_its_own_log() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        let (log, table) = (place.path().join("run.jsonl"), place.path().join("run.csv"));
+        std::fs::write(&log, LOG)?;
+        let (format, of) = (FormatArgument::Csv, DrawingArgument::Network);
+        let to = |output: &Path| ExportArguments { format, log: log.clone(), output: Some(output.to_owned()), of };
+        assert!(run(&to(&table)).is_ok());
+        assert!(std::fs::read_to_string(&table)?.contains("\r\n1,look,look,waiting,"));
+        assert!(matches!(run(&to(&place.path().join("./run.jsonl"))), Err(Failure::Refused(_))));
+        assert_eq!(std::fs::read_to_string(&log)?, LOG);
+        Ok(())
+    }
+}
