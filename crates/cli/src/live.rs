@@ -134,7 +134,7 @@ fn page(run: &Timeline, width: usize, height: usize, colours: Colours) -> Vec<St
 /// `fetch_boxes in CDTN mode: 12.3 s  [#####...............] 12 of 35 states have ended; ahead of time: 3 of use (8.0 s), 1 discarded (2.0 s)`
 fn head(run: &Timeline) -> String {
     let (ended, known) = (run.count.retired, run.count.expanded - run.count.squashed);
-    let full = if known == 0 { 0 } else { BAR * ended / known };
+    let full = (BAR * ended).checked_div(known).unwrap_or(0).min(BAR);
     let bar = format!("{}{}", "#".repeat(full), ".".repeat(BAR - full));
     let paused = if run.is_paused() { ", paused" } else { "" };
     let Speculation { useful, useful_s, wasted, wasted_s, .. } = run.speculation();

@@ -32,10 +32,9 @@ pub(crate) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
         && let Some(run) = runs.pop()
     {
         let report = Report::of(&run);
-        return Ok(match arguments.json {
-            true => output::result(serde_json::to_string_pretty(&report)?)?,
-            false => output::result(report.to_string().trim_end())?,
-        });
+        let text = if arguments.json { serde_json::to_string_pretty(&report)? } else { report.to_string() };
+        output::result(text.trim_end())?;
+        return Ok(());
     }
     let each: Vec<Statistics> = runs.iter().map(Statistics::of).collect();
     let together = repeated(&each);
