@@ -1,6 +1,6 @@
 """What an export keeps must not grow with the log: a million events take hardly more memory than a twentieth of them.
 
-    python check-exports-memory.py RATN FOLDER
+    python check-exports-memory.py RATN FOLDER [EVENTS]        a million unless given
 """
 
 import json
@@ -10,6 +10,7 @@ import sys
 import time
 
 ratn, folder = sys.argv[1:3]
+events = int(sys.argv[3]) if len(sys.argv) > 3 else 1_000_000
 # The index of an MCAP file has some 100 bytes for each MiB.
 MAY_GROW_KB = 8 * 1024
 REQUIREMENT = {"operation": "block", "kind": "PathPlanner", "class": None, "attributes": {}, "count": 1}
@@ -49,11 +50,11 @@ def most_kb(form, log):
 
 
 short, long = f"{folder}/short.jsonl", f"{folder}/long.jsonl"
-write(short, 50_000)
-write(long, 1_000_000)
+write(short, events // 20)
+write(long, events)
 for form in (["perfetto"], ["otlp"], ["mcap"], ["csv"], ["dot"], ["mermaid"], ["dot", "--of", "task"]):
     few, _ = most_kb(form, short)
     many, took = most_kb(form, long)
-    print(f"{' '.join(form)}: 1,000,000 events in {took:.1f} s with at most {many} kB resident; 50,000 with {few} kB")
+    print(f"{' '.join(form)}: {events} events in {took:.1f} s with at most {many} kB resident; {events // 20} with {few} kB", flush=True)
     assert many - few < MAY_GROW_KB, "what is kept grows with the log"
 os.remove(long)
