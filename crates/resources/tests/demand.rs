@@ -260,7 +260,9 @@ fn who_waits_for_something_else_as_well_is_not_helped_by_more_of_what_grows() {
 fn a_wait_begins_when_what_exists_would_do() {
     let mut pool = pool();
     planners_at(&mut pool, 0);
-    (0..2).for_each(|_| drop(ask_at(&mut pool, 0, vec![block("Planner", 1)])));
+    for _ in 0..2 {
+        ask_at(&mut pool, 0, vec![block("Planner", 1)]);
+    }
     assert_eq!(planners_at(&mut pool, 0), Some((1, 0)), "the most that one of them lacks");
     pool.create(at(5_000), None, planner()).unwrap();
     assert_eq!(planners_at(&mut pool, 5_000), Some((0, 0)));
