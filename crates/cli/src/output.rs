@@ -13,12 +13,12 @@ use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
 /// What is said of progress, and how.
-static PROGRESS: Mutex<Progress> = Mutex::new(Progress { is_quiet: false, area: 0 });
+static PROGRESS: Mutex<Progress> = Mutex::new(Progress { is_quiet: false, area: Vec::new() });
 
 struct Progress {
     is_quiet: bool,
-    /// So many lines at the end of the terminal are painted again and again.
-    area: usize,
+    /// How many characters there are in each line at the end of the terminal that is painted again and again.
+    area: Vec<usize>,
 }
 
 /// Writes one line to standard error, if somebody is there to read it: above what is painted there.
@@ -39,7 +39,7 @@ pub(crate) fn paint_area(lines: &[String]) {
     let mut progress = PROGRESS.lock().unwrap_or_else(PoisonError::into_inner);
     let text: String =
         std::iter::once(progress.cleared()).chain(lines.iter().map(|line| format!("{line}\n"))).collect();
-    progress.area = lines.len();
+    progress.area = lines.iter().map(|line| visible(line)).collect();
     let _ = io::stderr().write_all(text.as_bytes());
 }
 
@@ -51,11 +51,30 @@ pub(crate) fn clear_area() {
 impl Progress {
     /// What takes away what is painted: up to its first line, and everything from there.
     fn cleared(&mut self) -> String {
-        match std::mem::take(&mut self.area) {
-            0 => String::new(),
-            lines => format!("\x1b[{lines}A\r\x1b[J"),
+        let area = std::mem::take(&mut self.area);
+        if area.is_empty() {
+            return String::new();
         }
+        let width = terminal_size::terminal_size_of(io::stderr()).map_or(usize::MAX, |(width, _)| usize::from(width.0));
+        format!("\x1b[{}A\r\x1b[J", rows(&area, width))
     }
+}
+
+/// How many rows lines take: a terminal that has become narrower since breaks those that are longer.
+fn rows(lengths: &[usize], width: usize) -> usize {
+    lengths.iter().map(|length| length.div_ceil(width.max(1)).max(1)).sum()
+}
+
+/// How many characters of a line are seen: without what colours it.
+fn visible(line: &str) -> usize {
+    let mut is_colour = false;
+    let seen = line.chars().filter(|c| {
+        is_colour |= *c == '\x1b';
+        let is_seen = !is_colour;
+        is_colour &= *c != 'm';
+        is_seen
+    });
+    seen.count()
 }
 
 /// [`progress`], for task control.
@@ -123,6 +142,12 @@ fn write(to: &mut impl Write, text: &impl Display) -> anyhow::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_line_that_is_broken_by_a_narrower_terminal_takes_several_rows() {
+        assert_eq!(visible("\x1b[32mruns  plan\x1b[0m"), 10);
+        assert_eq!((rows(&[10, 0, 25], 80), rows(&[10, 0, 25], 10), rows(&[3], 0)), (3, 5, 3));
+    }
 
     struct Broken(ErrorKind);
 
