@@ -131,8 +131,8 @@ impl Disjunctive {
         } else {
             order[to..=from].rotate_right(1);
         }
-        for at in from.min(to)..=from.max(to) {
-            self.position[order[at] as usize] = at as u32;
+        for (at, task) in order.iter().enumerate().take(from.max(to) + 1).skip(from.min(to)) {
+            self.position[*task as usize] = at as u32;
         }
         self.measure();
     }
