@@ -211,16 +211,24 @@ mod tests {
         let run = |mode: Mode, end_s: f64| {
             let mut run = told(CHAIN);
             (run.mode, run.end_s) = (mode, end_s);
-            Statistics::of(&run)
+            run
         };
-        let failed = Statistics { outcome: Some("aborted".to_owned()), ..run(Mode::Hsm, 99.0) };
-        let runs = [run(Mode::Cdtn, 8.0), run(Mode::Hsm, 12.0), run(Mode::Cdtn, 10.0), failed];
+        let mut failed = run(Mode::Hsm, 99.0);
+        failed.outcome = Some("aborted".to_owned());
+        let mut runs = vec![run(Mode::Cdtn, 8.0), run(Mode::Hsm, 12.0), run(Mode::Cdtn, 10.0), failed];
         insta::assert_snapshot!(report::table(&report::repeated(&runs)), @r"
         task       mode  runs  makespan s        least  largest  two at once s   planning awaited s
         t          CDTN     2  9.0 ± 1.4           8.0     10.0  2.0 ± 0.0       3.9 ± 0.0
         t          HSM    1/2  12.0 ± 0.0         12.0     12.0  2.0 ± 0.0       3.9 ± 0.0
         t: CDTN is 25.0 % shorter than HSM
         ");
+        // With other parameters it is another task.
+        runs[0].parameters.insert("boxes".to_owned(), ratn_model::value::Value::Int(3));
+        let together = report::repeated(&runs);
+        assert_eq!(
+            together.iter().map(|one| (one.with.join(","), one.runs)).collect::<Vec<_>>(),
+            [("boxes=3".to_owned(), 1), (String::new(), 2), (String::new(), 1)]
+        );
         assert_eq!(Spread::of(&[]), Spread::default());
         assert_eq!(Spread::of(&[2.0, 4.0]).deviation, 2.0_f64.sqrt());
     }

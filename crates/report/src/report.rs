@@ -5,6 +5,7 @@ use super::statistics::{Statistics, mode_name};
 use super::timeline::{Speculation, Timeline};
 use super::waiting::{self, Waiting};
 use ratn_executive::protocol::Mode;
+use ratn_model::program::SUCCESS;
 use serde::Serialize;
 use std::fmt;
 
@@ -49,11 +50,13 @@ impl fmt::Display for Report {
     }
 }
 
-/// Several runs of one task in one mode.
+/// Several runs of one task with the same parameters in one mode.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Repeated {
     /// The task.
     pub task: String,
+    /// Its parameters in which the runs of this task differ, `boxes=3`.
+    pub with: Vec<String>,
     /// How it was executed.
     pub mode: Mode,
     /// How many runs.
@@ -94,22 +97,31 @@ impl Spread {
     }
 }
 
-/// Runs of the same task and mode together, in the order of their first ones.
-pub fn repeated(runs: &[Statistics]) -> Vec<Repeated> {
-    let mut kinds: Vec<(&str, Mode)> = Vec::new();
+/// Runs of the same task with the same parameters in the same mode together, in the order of their first ones.
+pub fn repeated(runs: &[Timeline]) -> Vec<Repeated> {
+    let mut kinds: Vec<&Timeline> = Vec::new();
     for run in runs {
-        if !kinds.contains(&(&run.task, run.mode)) {
-            kinds.push((&run.task, run.mode));
+        if !kinds.iter().any(|kind| is_alike(kind, run)) {
+            kinds.push(run);
         }
     }
-    let of = |(task, mode): (&str, Mode)| {
-        let all: Vec<&Statistics> = runs.iter().filter(|run| run.task == task && run.mode == mode).collect();
-        let good: Vec<&&Statistics> = all.iter().filter(|run| run.outcome.as_deref() == Some("success")).collect();
+    let of = |kind: &&Timeline| {
+        let all: Vec<Statistics> = runs.iter().filter(|run| is_alike(kind, run)).map(Statistics::of).collect();
+        let good: Vec<&Statistics> = all.iter().filter(|run| run.outcome.as_deref() == Some(SUCCESS)).collect();
         let spread =
             |figure: fn(&Statistics) -> f64| Spread::of(&good.iter().map(|run| figure(run)).collect::<Vec<_>>());
+        let others: Vec<&Timeline> = kinds.iter().filter(|other| other.task == kind.task).copied().collect();
+        let differs =
+            |name: &&String| others.iter().any(|other| other.parameters.get(*name) != kind.parameters.get(*name));
         Repeated {
-            task: task.to_owned(),
-            mode,
+            task: kind.task.clone(),
+            with: kind
+                .parameters
+                .keys()
+                .filter(differs)
+                .map(|name| format!("{name}={}", kind.parameters[name]))
+                .collect(),
+            mode: kind.mode,
             runs: all.len(),
             successes: good.len(),
             makespan_s: spread(|run| run.makespan_s),
@@ -117,12 +129,23 @@ pub fn repeated(runs: &[Statistics]) -> Vec<Repeated> {
             planning_waited_for_s: spread(|run| run.time.planning_waited_for_s),
         }
     };
-    kinds.into_iter().map(of).collect()
+    kinds.iter().map(of).collect()
+}
+
+fn is_alike(a: &Timeline, b: &Timeline) -> bool {
+    (&a.task, a.mode, &a.parameters) == (&b.task, b.mode, &b.parameters)
+}
+
+impl Repeated {
+    /// `fetch_boxes`, and with which parameters where there are runs with others.
+    fn name(&self) -> String {
+        if self.with.is_empty() { self.task.clone() } else { format!("{} ({})", self.task, self.with.join(", ")) }
+    }
 }
 
 /// As a table for people, with how much shorter CDTN is where there are both.
 pub fn table(all: &[Repeated]) -> String {
-    let width = all.iter().map(|one| one.task.chars().count()).max().unwrap_or(0).max(10);
+    let width = all.iter().map(|one| one.name().chars().count()).max().unwrap_or(0).max(10);
     let spread = |spread: Spread| format!("{:.1} ± {:.1}", spread.mean, spread.deviation);
     let mut text = format!(
         "{:<width$} mode  runs  makespan s        least  largest  two at once s   planning awaited s\n",
@@ -133,7 +156,7 @@ pub fn table(all: &[Repeated]) -> String {
             if one.successes == one.runs { one.runs.to_string() } else { format!("{}/{}", one.successes, one.runs) };
         text.push_str(&format!(
             "{:<width$} {:<4} {runs:>5}  {:<15} {:>7.1} {:>8.1}  {:<14}  {}\n",
-            one.task,
+            one.name(),
             mode_name(one.mode),
             spread(one.makespan_s),
             one.makespan_s.least,
@@ -143,10 +166,10 @@ pub fn table(all: &[Repeated]) -> String {
         ));
     }
     for cdtn in all.iter().filter(|one| one.mode == Mode::Cdtn && one.successes > 0) {
-        let hsm = all.iter().find(|one| one.mode == Mode::Hsm && one.task == cdtn.task && one.successes > 0);
+        let hsm = all.iter().find(|one| one.mode == Mode::Hsm && one.name() == cdtn.name() && one.successes > 0);
         if let Some(hsm) = hsm.filter(|hsm| hsm.makespan_s.mean > 0.0) {
             let shorter = 100.0 * (1.0 - cdtn.makespan_s.mean / hsm.makespan_s.mean);
-            text.push_str(&format!("{}: CDTN is {shorter:.1} % shorter than HSM\n", cdtn.task));
+            text.push_str(&format!("{}: CDTN is {shorter:.1} % shorter than HSM\n", cdtn.name()));
         }
     }
     text

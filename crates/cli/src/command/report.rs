@@ -8,7 +8,6 @@ use ratn_event_log as log;
 use ratn_executive::protocol::Mode;
 use ratn_report::gantt::{self, By};
 use ratn_report::report::{Report, repeated, table};
-use ratn_report::statistics::Statistics;
 use ratn_report::timeline::Timeline;
 use std::path::Path;
 
@@ -36,8 +35,7 @@ pub(crate) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
         output::result(text.trim_end())?;
         return Ok(());
     }
-    let each: Vec<Statistics> = runs.iter().map(Statistics::of).collect();
-    let together = repeated(&each);
+    let together = repeated(&runs);
     if arguments.json {
         let document = serde_json::json!({
             "together": together,

@@ -96,10 +96,10 @@ impl<W: Write> File<W> {
     }
 
     fn close_chunk(&mut self) -> io::Result<()> {
-        let chunk = std::mem::take(&mut self.chunk);
-        if chunk.records.is_empty() {
+        if self.chunk.records.is_empty() {
             return Ok(());
         }
+        let mut chunk = std::mem::take(&mut self.chunk);
         let size = chunk.records.len() as u64;
         let (start, times) = (self.written, Fields::default().u64(chunk.first_ns).u64(chunk.last_ns));
         // Without a checksum, and without compression.
@@ -111,14 +111,18 @@ impl<W: Write> File<W> {
         let length = self.written - start;
         let mut offsets = Fields::default();
         let indexes_start = self.written;
-        for (channel, messages) in &chunk.messages {
+        for (channel, messages) in chunk.messages.iter().filter(|(_, messages)| !messages.is_empty()) {
             offsets = offsets.u16(*channel).u64(self.written);
             let entries = messages.iter().fold(Fields::default(), |all, (at, offset)| all.u64(*at).u64(*offset));
             self.record(Op::MessageIndex, &Fields::default().u16(*channel).bytes(&entries.0).0)?;
         }
         let indexes = self.written - indexes_start;
+        // Its memory serves the next one.
+        chunk.records.clear();
+        chunk.messages.values_mut().for_each(Vec::clear);
         let index = Fields::default().u64(chunk.first_ns).u64(chunk.last_ns).u64(start).u64(length);
         self.chunks.push(index.bytes(&offsets.0).u64(indexes).text("").u64(size).u64(size).0);
+        self.chunk = chunk;
         Ok(())
     }
 
