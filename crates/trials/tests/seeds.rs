@@ -2,11 +2,14 @@
 
 use ratn_trials::{Dice, Features, listing, program};
 
+/// What a program without guards had no words for when the fingerprints were taken.
+const NO_GUARDS: &str = ", again: None, finally: None";
+
 /// FNV-1a over what the programs of the first seeds look like.
 fn fingerprint(features: &Features) -> u64 {
     let mut sum = Dice(0);
     for seed in 0..300 {
-        for byte in format!("{:?}", program(seed, features)).bytes() {
+        for byte in format!("{:?}", program(seed, features)).replace(NO_GUARDS, "").bytes() {
             sum.0 = (sum.0 ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3);
         }
     }
