@@ -49,6 +49,14 @@ fn a_worker_that_the_catalogue_does_not_know_so_is_told_at_its_start_and_what_no
     let checked = place.ratn(&["check", text(&task)?, "--runtime-dir", text(&directory)?]).output()?;
     let (out, err) = texts(&checked);
     ensure!(err.contains(MISMATCH) && err.contains(LACKING), "{out}{err}");
+    let scaled = place.ratn(&["pool", "scale", "mistaken", "--max", "1"]).output()?;
+    let (out, err) = texts(&scaled);
+    ensure!(out.starts_with("mistaken: 1 to 1"), "{out}{err}");
+    ensure!(err.contains(&format!("warning: mistaken-1@compute: {MISMATCH}")), "{out}{err}");
+    let other = ["check", text(&task)?, "--robot", "panda", "--runtime-dir", text(&directory)?];
+    let refused = place.ratn(&other).output()?;
+    let (out, err) = texts(&refused);
+    ensure!(refused.status.code() == Some(2) && err.contains("'--robot <ROBOT>' cannot be used with"), "{out}{err}");
 
     let mut run = place.start_as("run", &["run", text(&task)?, "--runtime-dir", text(&directory)?])?;
     wait_for("what nobody offers", || Ok(run.said().contains(LACKING).then_some(()))).with_context(|| run.said())?;
@@ -95,6 +103,27 @@ fn a_run_that_waits_for_a_worker_which_never_becomes_ready_says_why_in_its_line(
     run.signal(nix::sys::signal::Signal::SIGINT)?;
     run.finish()?;
     Ok(())
+}
+
+#[test]
+fn the_demo_refuses_a_robot_of_ones_own_that_cannot_do_it_before_anything_is_started() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    for file in ["panda.urdf", "panda.srdf", "panda.toml"] {
+        std::fs::copy(repository("crates/motion/robots").join(file), place.path().join(file))?;
+    }
+    let robot = place.path().join("panda.toml");
+    let whole = std::fs::read_to_string(&robot)?;
+    let bare = whole.split("[workplace]").next().context("a text")?;
+    for (described, boxes, why) in
+        [(bare, "1", "it has no [workplace]: add one"), (&whole, "7", "its [workplace] has 6 places: ask for so many")]
+    {
+        std::fs::write(&robot, described)?;
+        let refused = place.ratn(&["demo", "--robot", text(&robot)?, "--boxes", boxes]).output()?;
+        let (out, err) = texts(&refused);
+        ensure!(refused.status.code() == Some(2) && err.contains(why), "{out}{err}");
+        ensure!(err.contains(&format!("--robot {}", robot.display())), "{err}");
+    }
+    place.wait_until_empty()
 }
 
 #[test]
