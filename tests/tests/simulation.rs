@@ -87,32 +87,7 @@ fn a_check_without_simulation_says_only_what_is_wrong() -> anyhow::Result<()> {
 }
 
 /// Five activities that need up to two of the units of one resource, and one of another's; 9 s is the best that there is.
-const PROJECT: &str = "\
-jobs (incl. supersource/sink ):  5
-  - renewable                 :  2   R
-  - nonrenewable              :  0   N
-  - doubly constrained        :  0   D
-PRECEDENCE RELATIONS:
-jobnr.    #modes  #successors   successors
-   1        1          2           2   3
-   2        1          1           4
-   3        1          1           5
-   4        1          1           5
-   5        1          0
-****
-REQUESTS/DURATIONS:
-jobnr. mode duration  R 1  R 2
-----
-  1      1     0       0    0
-  2      1     3       1    0
-  3      1     4       2    1
-  4      1     2       1    1
-  5      1     0       0    0
-****
-RESOURCEAVAILABILITIES:
-  R 1  R 2
-    2    1
-";
+const PROJECT: &str = include_str!("../projects/small.sm");
 
 #[test]
 fn projects_are_simulated_and_compared_with_a_table() -> anyhow::Result<()> {
@@ -156,6 +131,6 @@ fn what_is_no_project_is_refused_with_its_line() -> anyhow::Result<()> {
     let output = place.ratn(&["simulate", "--project", file.to_str().context("a path")?]).output()?;
     let (out, err) = texts(&output);
     ensure!(output.status.code() == Some(2) && out.is_empty(), "{:?}, {out}", output.status);
-    ensure!(err.contains("bad.sm: no project: line 18: job 3 needs 2 of R1, and line 24 has 1"), "{err}");
+    ensure!(err.contains("bad.sm: no project: line 22: job 3 needs 2 of R1, and line 28 has 1"), "{err}");
     Ok(())
 }

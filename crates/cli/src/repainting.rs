@@ -5,7 +5,7 @@ use std::io::IsTerminal;
 use std::time::Duration;
 
 /// How often it is looked at.
-pub(crate) const PERIOD: Duration = Duration::from_millis(500);
+const PERIOD: Duration = Duration::from_millis(500);
 
 /// Shows what `look` says: once, or again whenever it is another text, until nobody reads it any more. On a terminal a text takes the place of
 /// the one before; elsewhere a blank line is between two, and none between lines of JSON.

@@ -92,15 +92,7 @@ impl Findings {
     }
 
     fn add(&mut self, severity: Severity, rule: &str, location: Location, path: &str, message: String, help: String) {
-        // What stands in the file once and in the program several times ([`crate::guard`]) is said once.
-        let is_copy = |other: &Diagnostic| {
-            other.location == location
-                && other.rule == rule
-                && other.message == message
-                && other.path != path
-                && path.contains("finally_")
-        };
-        if self.list.len() < MAX_DIAGNOSTICS && !self.list.iter().any(is_copy) {
+        if self.list.len() < MAX_DIAGNOSTICS {
             let (rule, path, file) = (rule.to_owned(), path.to_owned(), String::new());
             self.list.push(Diagnostic { rule, severity, file, location, path, message, help });
         }

@@ -1,5 +1,5 @@
-//! States that are tried again and states with something to do on every way out, said with the transitions, scoped variables and
-//! conditions that every program has. So both modes execute them by what they have for these, and so does a routine.
+//! States that are tried again and states with something to do on every way out, in terms of the transitions, scoped variables and
+//! conditions that every program has. Both modes and routines execute them as they execute those.
 //!
 //! ```text
 //! grasp: retry {times: 2, on: [aborted], before: [open]}       finally: [tuck]
@@ -12,6 +12,9 @@
 //!
 //! The state that was written is `try` or `body`; with both, `body` is what holds `try`. From outside, the state of its name is seen, with
 //! the same ports. Names of variables that are made here cannot be written in a task file.
+//!
+//! Task files have `retry`. `finally` is for programs that are made in code (random programs are): a task file refuses it, because a
+//! deadline and a lost race do not run it yet.
 
 use crate::expression::{BinaryOperator, Expr};
 use crate::id::StateId;

@@ -224,13 +224,13 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
         match guard::unfold(&mut program, &out.guards) {
             Ok(places) => out.places.move_to(&places),
             Err(guard::TooManyStates) => {
-                let message = "what is done on every way out is there once for each outcome: more than 20,000 states";
+                let message = "with what retries are made of there are more than 20,000 states";
                 out.findings.error(
                     "invalid-state",
                     root.at,
                     "",
                     message,
-                    "put fewer states with `finally` into one another",
+                    "retry fewer states, or the state around them",
                 );
             }
         }

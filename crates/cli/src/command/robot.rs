@@ -3,17 +3,37 @@
 use crate::arguments::{RobotArguments, RobotCommand};
 use crate::failure::Failure;
 use crate::output;
+use ratn_motion::description::DescriptionError;
 use ratn_motion::robot::Robot;
 use ratn_motion::survey::survey;
 
 /// Runs the command.
 pub(crate) fn run(arguments: &RobotArguments) -> Result<(), Failure> {
     let RobotCommand::Check { robot } = &arguments.command;
-    let robot = Robot::named_or_file(robot).map_err(|error| Failure::Refused(format!("ratn: {error}")))?;
+    let robot = Robot::named_or_file(robot).map_err(|error| match error {
+        DescriptionError::Read { .. } => Failure::Refused(format!("ratn: {error}")),
+        wrong => Failure::Failed(wrong.into()),
+    })?;
     let survey = survey(&robot);
     output::result(survey.lines.join("\n"))?;
     if survey.faults.is_empty() {
         return Ok(());
     }
     Err(anyhow::anyhow!("{}: {}", robot.name(), survey.faults.join("; ")).into())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn a_wrong_description_fails_and_one_that_cannot_be_read_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("robot.toml");
+        let check = || run(&RobotArguments { command: RobotCommand::Check { robot: file.display().to_string() } });
+        assert!(matches!(check(), Err(Failure::Refused(_))));
+        std::fs::write(&file, "name = 3").unwrap();
+        assert!(matches!(check(), Err(Failure::Failed(_))));
+    }
 }

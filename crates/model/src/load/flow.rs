@@ -233,41 +233,37 @@ pub(crate) fn annotate(fields: &mut Fields<'_, '_>, body: &Node, annotations: &m
 fn retry(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotations) {
     let Some(id) = fields.view.state else { return };
     let step = fields.task.outline.step(id);
-    let mut guard = Guard { retried: None, finally: step.finally.clone() };
-    if let Some(node) = body.get("retry") {
-        let is_long = matches!(node.content, Content::Map(_));
-        if is_long {
-            fields.keys(node, &["times", "count", "backoff", "on", "before"]);
-        }
-        let times = node.get("times").or_else(|| node.get("count")).unwrap_or(node);
-        let backoff_s = node.get("backoff").map_or(Some(0.0), |node| seconds(fields, node, "backoff"));
-        let count = fields.count(times, "retry", 1);
-        let mut on = Vec::new();
-        for node in node.get("on").into_iter().flat_map(Node::items) {
-            fields.note("retry.on", node.at);
-            on.extend(fields.word(node, "an outcome").map(str::to_owned));
-        }
-        if on.iter().any(|outcome| outcome == SUCCESS) {
-            let help = "name outcomes after which it is tried again; without `on` that is `aborted`";
-            fields.error("invalid-state", node.at, "a state that has succeeded is not tried again", help);
-        }
-        on.sort();
-        on.dedup();
-        let by_itself = on.is_empty() || on == [ABORTED];
-        if on.is_empty() {
-            on.push(ABORTED.to_owned());
-        }
-        let is_action = matches!(step.form, Form::Action { .. });
-        if let (Some(count), Some(backoff_s)) = (count, backoff_s) {
-            if is_action && by_itself && step.before.is_empty() {
-                annotations.retry = Some(Retry { count, backoff_s });
-            } else {
-                guard.retried = Some(Retried { count, backoff_s, on, before: step.before.clone() });
-            }
-        }
+    let Some(node) = body.get("retry") else { return };
+    let is_long = matches!(node.content, Content::Map(_));
+    if is_long {
+        fields.keys(node, &["times", "count", "backoff", "on", "before"]);
     }
-    if guard != Guard::default() {
-        fields.out.guards.insert(id, guard);
+    let times = node.get("times").or_else(|| node.get("count")).unwrap_or(node);
+    let backoff_s = node.get("backoff").map_or(Some(0.0), |node| seconds(fields, node, "backoff"));
+    let count = fields.count(times, "retry", 1);
+    let mut on = Vec::new();
+    for node in node.get("on").into_iter().flat_map(Node::items) {
+        fields.note("retry.on", node.at);
+        on.extend(fields.word(node, "an outcome").map(str::to_owned));
+    }
+    if on.iter().any(|outcome| outcome == SUCCESS) {
+        let help = "name outcomes after which it is tried again; without `on` that is `aborted`";
+        fields.error("invalid-state", node.at, "a state that has succeeded is not tried again", help);
+    }
+    on.sort();
+    on.dedup();
+    let by_itself = on.is_empty() || on == [ABORTED];
+    if on.is_empty() {
+        on.push(ABORTED.to_owned());
+    }
+    let is_action = matches!(step.form, Form::Action { .. });
+    if let (Some(count), Some(backoff_s)) = (count, backoff_s) {
+        if is_action && by_itself && step.before.is_empty() {
+            annotations.retry = Some(Retry { count, backoff_s });
+        } else {
+            let retried = Retried { count, backoff_s, on, before: step.before.clone() };
+            fields.out.guards.insert(id, Guard { retried: Some(retried), finally: Vec::new() });
+        }
     }
 }
 

@@ -4,37 +4,7 @@ use super::*;
 use crate::activities::Execution;
 
 /// Three jobs between source and sink, on two units of one resource and one of another.
-const SMALL: &str = "\
-************
-projects                      :  1
-jobs (incl. supersource/sink ):  5
-RESOURCES
-  - renewable                 :  2   R
-  - nonrenewable              :  0   N
-  - doubly constrained        :  0   D
-************
-PRECEDENCE RELATIONS:
-jobnr.    #modes  #successors   successors
-   1        1          2           2   3
-   2        1          1           4
-   3        1          1           5
-   4        1          1           5
-   5        1          0
-************
-REQUESTS/DURATIONS:
-jobnr. mode duration  R 1  R 2
-------------
-  1      1     0       0    0
-  2      1     3       1    0
-  3      1     4       2    1
-  4      1     2       1    1
-  5      1     0       0    0
-************
-RESOURCEAVAILABILITIES:
-  R 1  R 2
-    2    1
-************
-";
+const SMALL: &str = include_str!("../../../../tests/projects/small.sm");
 
 #[test]
 fn a_project_is_activities_with_units_of_resources() {
