@@ -296,7 +296,8 @@ class Run:
         ``path`` (``for_box[0]/move``), ``provider``, ``action``, ``attempt``, ``began_s`` and ``ended_s`` (the robot's seconds since the
         run began), ``outcome`` and ``reason``. What is under way, or was given up, has ``None`` as its end and outcome.
         """
-        return _nodes(json.loads(line) for line in self.log.read_text().splitlines())
+        # What follows the last line end is a line that is being written.
+        return _nodes(json.loads(line) for line in self.log.read_text().split("\n")[:-1])
 
 
 def _nodes(lines: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
