@@ -43,7 +43,7 @@ pub struct Method {
 }
 
 /// Every method of every service of the proto.
-pub const METHODS: &[Method] = include!(concat!(env!("OUT_DIR"), "/ratn_v1_methods.rs"));
+pub const METHODS: &[Method] = include!("generated/ratn_v1_methods.rs");
 
 /// The method of a request's path, `/ratn.v1.ResourceService/Create`, if it is one of this system's.
 pub fn method_of(path: &str) -> Option<&'static Method> {

@@ -9,14 +9,14 @@ pub mod access;
 pub mod convert;
 pub mod types;
 
-/// Generated from `proto/ratn/v1`; its documentation is that of the `.proto` files.
+/// Generated from `proto/ratn/v1` by `scripts/generate-wire`; its documentation is that of the `.proto` files.
 #[allow(missing_docs, unreachable_pub, clippy::all, clippy::allow_attributes_without_reason, reason = "generated code")]
 pub mod v1 {
-    tonic::include_proto!("ratn.v1");
+    include!("generated/ratn.v1.rs");
 }
 
 /// The encoded file descriptors of [`v1`], for gRPC reflection.
-pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/ratn_v1_descriptors.bin"));
+pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!("generated/ratn_v1_descriptors.bin");
 
 /// No message on the wire is larger than this, in bytes, both ways: a camera image with room to spare.
 pub const MAX_MESSAGE_BYTES: usize = 16 * 1024 * 1024;

@@ -7,7 +7,7 @@
 
 #[allow(unreachable_pub, dead_code, clippy::all, clippy::allow_attributes_without_reason, reason = "generated code")]
 mod wire {
-    tonic::include_proto!("etcdserverpb");
+    include!("../src/generated/etcdserverpb.rs");
 }
 
 use ratn_storage::etcd::{Bounds, Connect, Holder};

@@ -17,6 +17,7 @@
 mod support;
 
 mod fence;
+mod generated;
 mod links;
 mod shell;
 

@@ -24,10 +24,10 @@ mod silence;
 mod term;
 mod writer;
 
-/// Generated from `proto/etcd.proto`.
+/// Generated from `proto/etcd.proto` by `scripts/generate-wire`.
 #[allow(missing_docs, unreachable_pub, clippy::all, clippy::allow_attributes_without_reason, reason = "generated code")]
 mod wire {
-    tonic::include_proto!("etcdserverpb");
+    include!("../generated/etcdserverpb.rs");
 }
 
 pub use client::Connect;
