@@ -258,7 +258,12 @@ mod tests {
             at_s: 3.5,
             paused: true,
             ended: 2,
-            under_way: vec![UnderWay { path: "place[2]/plan".to_owned(), for_s: 1.5 }],
+            under_way: vec![UnderWay {
+                path: "place[2]/plan".to_owned(),
+                for_s: 1.5,
+                usually_s: Some(4.0),
+                message: "2 of 5 ways".to_owned(),
+            }],
             waits: vec!["move waits for an output of place[2]/plan".to_owned()],
         };
         let said = doing.clone();

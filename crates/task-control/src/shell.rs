@@ -23,6 +23,7 @@ use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::Lookout;
 use ratn_executive::protocol::{Command, Event, Learned, Mode, Natures, Origin};
 use ratn_model::catalogue::Catalogue;
+use ratn_model::expression::scope::NothingKnown;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{Exceptions, Nature, Program, SUCCESS, State, StateKind};
 use ratn_model::time::Timestamp;
@@ -276,6 +277,13 @@ impl Shell {
         }
     }
 
+    /// How long a state usually takes, in the robot's seconds, where its file says it in a number.
+    fn usually_s(&self, instance: InstanceId) -> Option<f64> {
+        let state = self.program.state(*self.states.get(&instance)?);
+        let seconds = state.annotations.duration_s.as_ref()?.evaluate(&NothingKnown).ok()?.as_number()?;
+        (seconds.is_finite() && seconds > 0.0).then_some(seconds)
+    }
+
     /// What the run is doing, for whoever asks.
     fn status(&self) -> RunStatus {
         let now = self.clock.now();
@@ -287,7 +295,7 @@ impl Shell {
             at_s: now.seconds(),
             paused: self.progress.is_paused(),
             ended: self.progress.retired(),
-            under_way: self.progress.under_way(now),
+            under_way: self.progress.under_way(now, |instance| self.usually_s(instance)),
             waits: self.executive.explain().into_iter().take(RunStatus::MOST_WAITS).collect(),
         }
     }

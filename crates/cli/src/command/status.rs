@@ -122,7 +122,7 @@ impl Status {
                 let head = colours.bold(task);
                 lines.push(format!("{head} in {} mode: {at_s:.1} s{paused}; {ended} {states} ended", mode_name(*mode)));
                 lines.push(format!("event log: {}", log.display()));
-                let rows = run.under_way.iter().map(|one| [one.path.clone(), format!("for {:.1} s", one.for_s)]);
+                let rows = run.under_way.iter().map(|one| [one.path.clone(), one.text()]);
                 section(&mut lines, &colours.green("under way"), rows.collect());
                 let rows = run.waits.iter().map(|sentence| [sentence.clone(), String::new()]);
                 section(&mut lines, &colours.yellow("states that wait"), rows.collect());
@@ -174,7 +174,12 @@ mod tests {
                 at_s: 12.34,
                 paused: true,
                 ended: 3,
-                under_way: vec![UnderWay { path: "place[2]/plan".to_owned(), for_s: 1.5 }],
+                under_way: vec![UnderWay {
+                    path: "place[2]/plan".to_owned(),
+                    for_s: 1.5,
+                    usually_s: Some(4.0),
+                    message: "2 of 5 ways".to_owned(),
+                }],
                 waits: vec!["place[2]/move waits for an output of place[2]/plan".to_owned()],
             }),
             held: vec![Held {
@@ -190,7 +195,7 @@ mod tests {
         sort_boxes in CDTN mode: 12.3 s, paused; 3 states have ended
         event log: log.jsonl
         under way:
-          place[2]/plan  for 1.5 s
+          place[2]/plan  for 1.5 s of about 4.0 s: 2 of 5 ways
         states that wait:
           place[2]/move waits for an output of place[2]/plan
         held:
