@@ -51,6 +51,7 @@ pub mod robot_model;
 pub mod robot_state;
 pub mod rrt_star;
 mod scalar;
+pub mod seen;
 mod simd;
 pub mod simplify;
 mod six;

@@ -245,6 +245,36 @@ async fn a_straight_way_through_way_points_is_all_or_an_error_that_says_how_far(
 }
 
 #[tokio::test]
+async fn what_a_camera_saw_is_in_the_way_and_bytes_that_are_no_points_are_refused() {
+    let system = system().await;
+    // Points all around the tool at the start, 12 cm from it: nothing gets out.
+    let tool = Robot::aimm().tool_pose(&Configuration { arm: aimm::OBSERVATION, ..Robot::aimm().at_zero() });
+    let mut points = Vec::new();
+    for i in -9..=9 {
+        for j in 0..36 {
+            let (up, around) = (f64::from(i) * 10.0_f64.to_radians(), f64::from(j) * 10.0_f64.to_radians());
+            let point = [up.cos() * around.cos(), up.cos() * around.sin(), up.sin()].map(|c| c * 0.25);
+            points.push(std::array::from_fn::<f64, 3, _>(|k| tool.position[k] + point[k]));
+        }
+    }
+    let mut cloud = format!(
+        "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA ascii\n",
+        points.len()
+    );
+    for [x, y, z] in points {
+        cloud += &format!("{x} {y} {z}\n");
+    }
+    let more = [("cloud", Value::Bytes(cloud.into_bytes())), ("cloud_radius_m", Value::Float(0.03))];
+    let outcome = system.client.execute(&system.planner, system.grasp("caged", &more), |_, _| ()).await.unwrap();
+    assert!(!outcome.is_success() && outcome.reason.contains("what was seen"), "{}", outcome.reason);
+    let outcome = system.client.execute(&system.planner, system.grasp("free", &more[1..]), |_, _| ()).await.unwrap();
+    assert!(outcome.is_success(), "{}", outcome.reason);
+    let wrong = [("cloud", Value::Bytes(b"nonsense".to_vec()))];
+    let outcome = system.client.execute(&system.planner, system.grasp("wrong", &wrong), |_, _| ()).await.unwrap();
+    assert!(outcome.reason.starts_with("input `cloud`: "), "{}", outcome.reason);
+}
+
+#[tokio::test]
 async fn what_bounds_a_motion_is_read_from_the_goal() {
     let system = system().await;
     let there = ("goal", Value::Joints(aimm::HOME.to_vec()));
