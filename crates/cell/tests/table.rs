@@ -14,7 +14,7 @@ use ratn_motion::aimm;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::pace::Control;
 use ratn_motion::plan::{Goal, Request as PlanRequest, plan};
-use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::robot::{Configuration, Robot, UNSAID};
 use ratn_motion::straight::Straight;
 use ratn_perception::calibration::{Calibration, Surface};
 use ratn_perception::detection::{Detection, ObjectClass, Region, segment};
@@ -29,7 +29,7 @@ const UPRIGHT_RAD: f64 = 0.1;
 
 /// The built-in robot with everything at zero, without reading its description again.
 fn at_zero() -> Configuration {
-    Configuration { base: [0.0; 3], arm: JointVector::zeros(7), pan: 0.0, tilt: 0.0, finger: 0.0 }
+    Configuration { base: [0.0; 3], arm: JointVector::zeros(7), pan: 0.0, tilt: 0.0, finger: 0.0, others: UNSAID }
 }
 
 fn bench(goods: Goods, seed: u64) -> Bench {

@@ -53,10 +53,19 @@ pub(super) struct Braking {
 /// What the robot follows.
 #[derive(Debug, Clone)]
 pub(super) enum Way {
-    /// With its arm.
-    Arm(Motion),
+    /// With the arm of this number.
+    Arm(usize, Motion),
     /// With its base.
     Base(Motion),
+}
+
+/// A motion that slows down, or sets out again.
+struct Along<'a> {
+    motion: &'a Motion,
+    /// How far it has come, in seconds of its own.
+    from_s: f64,
+    /// The greatest accelerations of its joints.
+    limits: JointVector,
 }
 
 /// How time goes on for what moves, from a moment on.
@@ -112,18 +121,19 @@ impl MotionClock {
         self.pace.rate(now)
     }
 
-    /// It is to go on, or to stand, as fast as what moves can, which is so far along its way.
+    /// It is to go on, or to stand, as fast as all that moves can. Each way comes with how far along it the robot is, in seconds.
     pub(super) fn change(
         &mut self,
         robot: &Robot,
         [now, motion_time]: [Timestamp; 2],
         goes_on: bool,
-        way: Option<(&Way, f64)>,
+        ways: &[(&Way, f64)],
     ) {
         let then = if goes_on { 1.0 } else { 0.0 };
-        let pace = match way {
-            Some((way, from_s)) => way.pace(robot, now, [self.rate(now), then], from_s, 1.0),
-            None => Pace::at_once(now, then),
+        let along: Vec<Along<'_>> = ways.iter().map(|(way, from_s)| way.along(robot, *from_s, 1.0)).collect();
+        let pace = match along.is_empty() {
+            false => Pace::change(now, [self.rate(now), then], &along),
+            true => Pace::at_once(now, then),
         };
         *self = MotionClock { pace, from: motion_time };
     }
@@ -158,12 +168,17 @@ impl Braking {
     pub(super) fn place(&self, now: Timestamp, configuration: &mut Configuration) {
         let at_s = self.from_s + self.pace.passed_s(now);
         match &self.way {
-            Way::Arm(motion) => configuration.arm = motion.at(at_s),
+            Way::Arm(arm, motion) => configuration.set_joints(*arm, motion.at(at_s)),
             Way::Base(motion) => {
                 let at = motion.at(at_s);
                 configuration.base = [at[0], at[1], wrapped(at[2])];
             }
         }
+    }
+
+    /// Where the joints are now and may be until they stand: on the rest of the way.
+    pub(super) fn ahead(&self, now: Timestamp) -> &[JointVector] {
+        self.way.ahead(self.from_s + self.pace.passed_s(now))
     }
 
     /// How well it followed its trajectory, as far as it has come.
@@ -175,15 +190,27 @@ impl Braking {
 impl Way {
     pub(super) fn tracking(&self, time_s: f64) -> Tracking {
         match self {
-            Way::Arm(motion) => motion.tracking(time_s),
+            Way::Arm(_, motion) => motion.tracking(time_s),
             Way::Base(motion) => motion.tracking(time_s),
         }
     }
 
-    fn pace(&self, robot: &Robot, now: Timestamp, rates: [f64; 2], from_s: f64, times: f64) -> Pace {
+    /// What slows down, where it has come so far, in seconds of its own.
+    fn along<'a>(&'a self, robot: &Robot, from_s: f64, times: f64) -> Along<'a> {
         match self {
-            Way::Arm(motion) => Pace::change(now, rates, motion, from_s, &limits(robot.arm_joints(), times)),
-            Way::Base(motion) => Pace::change(now, rates, motion, from_s, &limits(robot.base_joints(), times)),
+            Way::Arm(arm, motion) => Along { motion, from_s, limits: limits(robot.joints_of(*arm), times) },
+            Way::Base(motion) => Along { motion, from_s, limits: limits(robot.base_joints(), times) },
+        }
+    }
+
+    fn pace(&self, robot: &Robot, now: Timestamp, rates: [f64; 2], from_s: f64, times: f64) -> Pace {
+        Pace::change(now, rates, &[self.along(robot, from_s, times)])
+    }
+
+    /// Where the joints are `time_s` after the start and at every later [`STEP`] to the end.
+    pub(super) fn ahead(&self, time_s: f64) -> &[JointVector] {
+        match self {
+            Way::Arm(_, motion) | Way::Base(motion) => motion.ahead(time_s),
         }
     }
 }
@@ -194,21 +221,18 @@ impl Pace {
         Pace { since, course: vec![[0.0, rate]] }
     }
 
-    /// From a rate to another, where the motion has come to `from_s` of its time: as fast as joints of these greatest accelerations can.
-    fn change(
-        since: Timestamp,
-        [mut rate, then]: [f64; 2],
-        motion: &Motion,
-        from_s: f64,
-        limits: &JointVector,
-    ) -> Pace {
+    /// From a rate to another: as fast as the joints of all that moves can.
+    fn change(since: Timestamp, [mut rate, then]: [f64; 2], along: &[Along<'_>]) -> Pace {
         let (dt, brakes) = (STEP.as_secs_f64(), then < rate);
         let mut passed = 0.0;
         let mut course = vec![[passed, rate]];
         while rate != then {
             // What the joints do in the middle of the step.
-            let (velocity, acceleration) = motion.derivatives(from_s + passed + 0.5 * rate * dt);
-            let slope = greatest_slope(&velocity, &acceleration, rate, brakes, limits);
+            let slope = |one: &Along<'_>| {
+                let (velocity, acceleration) = one.motion.derivatives(one.from_s + passed + 0.5 * rate * dt);
+                greatest_slope(&velocity, &acceleration, rate, brakes, &one.limits)
+            };
+            let slope = along.iter().map(slope).fold(f64::INFINITY, f64::min);
             let given_up = course.len() == MAX_STEPS;
             let next = match brakes {
                 _ if given_up => then,
@@ -351,7 +375,7 @@ mod tests {
             std::array::from_fn(|j| anyway.iter().fold(joints[j].acceleration, |most, a| most.max(a[j].abs())));
         for from_s in (0..24).map(|i| 5.0 + f64::from(i) * fastest / 6.0) {
             let limits = limits(joints, 1.0);
-            let pace = Pace::change(Timestamp::default(), [1.0, 0.0], &motion, from_s, &limits);
+            let pace = Pace::change(Timestamp::default(), [1.0, 0.0], &[Along { motion: &motion, from_s, limits }]);
             let lasts_s = pace.settles().since(Timestamp::default()).as_secs_f64();
             assert!(lasts_s < 3.0 * fastest, "{lasts_s} s from {from_s} s on");
             let dt = STEP.as_secs_f64();

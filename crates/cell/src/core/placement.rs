@@ -64,6 +64,16 @@ pub enum PlacementError {
         /// What it lacks, and what next.
         reason: &'static str,
     },
+    /// An arm that cannot do what a cell is for.
+    #[error("the arm `{arm}` of the robot `{robot}` cannot be in a cell: {reason}")]
+    UnfitArm {
+        /// Which arm.
+        arm: String,
+        /// Of which robot.
+        robot: String,
+        /// What is wrong with it, and what next.
+        reason: &'static str,
+    },
 }
 
 /// Tables tried.
@@ -152,7 +162,7 @@ pub fn fit(robot: &Robot, config: &CellConfig) -> Result<Pads, PlacementError> {
         check_opening(robot, config)?;
         return Ok(pads);
     } else {
-        "it needs a [gripper] whose finger is a box in the URDF"
+        "it needs a [gripper] whose finger is a box in the URDF that lies along the tool's axes"
     };
     Err(PlacementError::Unfit { robot: robot.name().to_owned(), reason: lacks })
 }

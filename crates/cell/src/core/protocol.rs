@@ -1,6 +1,7 @@
 //! Events that go into the cell's core, and commands that come out of it.
 
 pub use super::activity::{Module, Ticket};
+use super::arms::FIRST;
 use super::contacts::Contact;
 use super::faults::Fault;
 pub use super::motion::Tracking;
@@ -22,6 +23,9 @@ pub enum Event {
     Start {
         /// The goal's id, by which commands name it.
         ticket: Ticket,
+        /// The number of the arm that does it, or whose gripper; 0 unless said. A request for another module does not look at it.
+        #[serde(default, skip_serializing_if = "is_first")]
+        arm: usize,
         /// What to do.
         request: Request,
     },
@@ -69,7 +73,7 @@ pub enum Request {
         /// Points in x, y (metres) and heading (radians), beginning where the base is.
         trajectory: Trajectory,
     },
-    /// Moves the arm along a trajectory.
+    /// Moves an arm along a trajectory.
     Follow {
         /// Beginning where the arm is; positions in radians.
         trajectory: Trajectory,
@@ -212,13 +216,17 @@ pub enum Product {
     },
 }
 
+fn is_first(arm: &usize) -> bool {
+    *arm == FIRST
+}
+
 impl Request {
-    /// The module that does it.
-    pub fn module(&self) -> Module {
+    /// The module that does it, where it is meant for the arm of this number.
+    pub fn module(&self, arm: usize) -> Module {
         match self {
             Request::Drive { .. } | Request::SenseBase => Module::Base,
-            Request::Follow { .. } | Request::MoveTo { .. } | Request::SenseArm => Module::Arm,
-            Request::Grasp { .. } | Request::Release | Request::SenseGripper => Module::Gripper,
+            Request::Follow { .. } | Request::MoveTo { .. } | Request::SenseArm => Module::Arm(arm),
+            Request::Grasp { .. } | Request::Release | Request::SenseGripper => Module::Gripper(arm),
             Request::LookAt { .. } => Module::PanTilt,
             Request::Capture { .. } => Module::Camera,
         }

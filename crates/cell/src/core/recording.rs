@@ -1,7 +1,7 @@
 //! What happened to a cell, line by line, and the same cell made to go through it again.
 //!
 //! ```text
-//! {"form":2,"config":{…}}                                  first: how the cell was made
+//! {"form":2,"config":{…},"robot":{…}}                      first: how the cell was made, and of which robot
 //! {"at":…,"event":{…}}                                     what came in, in the robot's nanoseconds
 //! {"at":…,"ended":…,"how":"done"}                          what a goal came to
 //! {"at":…,"contact":{…}}                                    what touched that should not have
@@ -16,6 +16,7 @@ use super::placement::PlacementError;
 use super::protocol::{Command, Ending, Event, Ticket, Tracking};
 use crate::config::CellConfig;
 use ratn_model::time::Timestamp;
+use ratn_motion::robot::RobotIdentity;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::io;
@@ -33,6 +34,9 @@ pub enum Line {
         form: u32,
         /// How the cell was made.
         config: Box<CellConfig>,
+        /// Of which robot; a recording of an earlier version does not say.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        robot: Option<RobotIdentity>,
     },
     /// Something came in.
     Event {
@@ -108,6 +112,16 @@ pub enum ReplayError {
     /// The cell cannot be made.
     #[error(transparent)]
     Table(#[from] PlacementError),
+    /// The robot's description is another one now.
+    #[error(
+        "this recording is of the robot {of}, and the robot that its config names is {here} now: replay it with the description of then"
+    )]
+    AnotherRobot {
+        /// The recording's.
+        of: RobotIdentity,
+        /// The one that the config names.
+        here: RobotIdentity,
+    },
     /// Something else came of it.
     #[error("line {line}: recorded was {recorded}, and now it is {replayed}")]
     Differs {
@@ -121,9 +135,10 @@ pub enum ReplayError {
 }
 
 impl Line {
-    /// The first line of a recording.
-    pub fn header(config: &CellConfig) -> Line {
-        Line::Header { form: FORM, config: Box::new(config.clone()) }
+    /// The first line of a recording of a cell.
+    pub fn header(cell: &Cell) -> Line {
+        let (config, robot) = (Box::new(cell.config().clone()), Some(cell.robot().identity()));
+        Line::Header { form: FORM, config, robot }
     }
 
     /// What is recorded of a step of the cell: its event, what ended, and the world after it.
@@ -163,9 +178,14 @@ pub fn replay(lines: impl Iterator<Item = io::Result<String>>) -> Result<Replaye
         let read = serde_json::from_str(&text).map_err(|error| none(error.to_string()))?;
         let Some(cell) = &mut cell else {
             match read {
-                Line::Header { form: FORM, config } => {
+                Line::Header { form: FORM, config, robot } => {
                     config.check().map_err(|error| none(error.to_string()))?;
-                    cell = Some(Cell::new(*config)?);
+                    let made = Cell::new(*config)?;
+                    let here = made.robot().identity();
+                    if let Some(of) = robot.filter(|of| *of != here) {
+                        return Err(ReplayError::AnotherRobot { of, here });
+                    }
+                    cell = Some(made);
                 }
                 _ => return Err(none(format!("a recording begins with form {FORM} and a config"))),
             }
@@ -181,6 +201,9 @@ pub fn replay(lines: impl Iterator<Item = io::Result<String>>) -> Result<Replaye
         match read {
             Line::Header { .. } => return Err(none("it has a second beginning".to_owned())),
             Line::Event { at, event } => {
+                if let Event::PutBack { snapshot } = &event {
+                    snapshot.check_robot(cell.robot()).map_err(|error| none(error.to_string()))?;
+                }
                 pass(cell, at, event);
                 replayed.events += 1;
             }
