@@ -25,7 +25,7 @@ pub struct RobotDescription {
     pub packages: Vec<PathBuf>,
     /// The arm, or the first one.
     pub arm: ArmDescription,
-    /// Further arms: one arm moves at a time, and the others stand.
+    /// Further arms. The planner moves one of the arms at a time, and the others stand; a cell moves several at once.
     #[serde(default, rename = "other_arm")]
     pub other_arms: Vec<ArmDescription>,
     /// The gripper. A robot without one grasps nothing.

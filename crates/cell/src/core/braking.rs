@@ -1,11 +1,11 @@
-//! How what moves comes to rest, and sets out again: along its path, its own time slowed down, with each joint within its limits.
+//! How motions stop and go on again: along their path, by slowing down the time of the motion, with each joint within its limits.
 //!
-//! A motion is a course over a time τ of its own, which goes on as time does unless it is told to stop. Then its rate r = dτ/dt falls
-//! from 1 to 0, step by step, as fast as the joints allow: each is accelerated by q″r² + q′ṙ (Bobrow, Dubowsky and Gibson,
-//! "Time-optimal control of robotic manipulators along specified paths", IJRR 1985), and the most negative ṙ is taken with which none
-//! exceeds its limit. Where one of them slows down by itself as hard as it may, that is ṙ = 0, and there may always be one: so the rate
-//! falls by at least what `URGENT` of each limit does, and such a joint brakes by so much above its limit. To set out again the rate rises in the
-//! same way, and may wait. So nothing leaves the path that was checked. The jerk is not limited: the rate's slope steps.
+//! A motion is a function of a time τ of its own, which normally runs as fast as real time. To stop, its rate r = dτ/dt falls from 1 to 0,
+//! step by step, as fast as the joints allow. A joint is then accelerated by q″r² + q′ṙ (Bobrow, Dubowsky and Gibson, "Time-optimal control of
+//! robotic manipulators along specified paths", IJRR 1985); the most negative ṙ is taken with which no joint exceeds its limit. Where the motion
+//! itself decelerates a joint at its limit, that would be ṙ = 0, and on some motions there is always such a joint. So the rate falls at least as
+//! fast as the part `URGENT` of each limit allows, and such a joint exceeds its limit by that part. To go on, the rate rises in the same way. The
+//! robot never leaves the path that was checked. The jerk is not limited.
 //!
 //! A stop on request, a hold and a lost lease brake within the limits that motions are planned by. An emergency stop is of category 1
 //! (IEC 60204-1): the joints brake within [`EMERGENCY`] times those limits, then the brakes close. The fingers and the camera's head,
@@ -23,23 +23,23 @@ use std::time::Duration;
 
 /// How much harder than motions are planned an emergency stop brakes.
 pub const EMERGENCY: f64 = 2.0;
-/// The part of a limit that is made use of: the course is known at its steps only.
+/// The part of a limit that is used: between the steps of the course the accelerations are not known.
 const USED: f64 = 0.95;
-/// The part of a limit that braking takes at the least, whatever the course itself takes: with it what goes as fast and brakes as hard
-/// as it may stands after 2.3 times as long as it takes to brake from there alone.
+/// The part of a limit that braking uses at least, on top of what the motion itself uses. With it a joint that moves at its greatest speed and
+/// already decelerates at its limit stands after 2.3 times the time that braking alone takes.
 const URGENT: f64 = 0.2;
 /// The most steps that it takes to set out again: a minute.
 const MAX_STEPS: usize = 15_000;
 
-/// The time of what moves, which goes on as fast as time, or not at all, or changes between both.
+/// The time by which motions go on: as fast as real time, not at all, or on the way from one to the other.
 #[derive(Debug, Clone)]
 pub(super) struct MotionClock {
     pace: Pace,
-    /// The time of what moves when the pace began.
+    /// The time of motions when the pace began.
     from: Timestamp,
 }
 
-/// A motion that is coming to rest, whatever becomes of the time of what else moves.
+/// A motion that is coming to rest, independently of a hold of everything else.
 #[derive(Debug, Clone)]
 pub(super) struct Braking {
     pub(super) ticket: Ticket,
@@ -77,12 +77,12 @@ struct Pace {
 }
 
 impl MotionClock {
-    /// It goes on as time does.
+    /// A clock that goes on as fast as real time.
     pub(super) fn new(now: Timestamp) -> MotionClock {
         MotionClock { pace: Pace::at_once(now, 1.0), from: now }
     }
 
-    /// The time of what moves; `now` is not before the last change.
+    /// The time of motions at `now`, which is not before the last change.
     pub(super) fn motion_time(&self, now: Timestamp) -> Timestamp {
         let (settles, passed) = (self.pace.settles(), self.pace.whole());
         if now < settles {
@@ -91,7 +91,7 @@ impl MotionClock {
         if self.pace.then() > 0.0 { self.from + passed + now.since(settles) } else { self.from + passed }
     }
 
-    /// When the time of what moves will be that; `None`: never, unless it goes on.
+    /// When the time of motions will be that; `None` where it stands before.
     pub(super) fn real_time(&self, motion_time: Timestamp) -> Option<Timestamp> {
         let whole = self.from + self.pace.whole();
         if motion_time >= whole {
@@ -101,17 +101,17 @@ impl MotionClock {
         Some(self.pace.when(motion_time.since(self.from).as_secs_f64()))
     }
 
-    /// Whether nothing moves in this time any more.
+    /// Whether this time stands.
     pub(super) fn stands(&self, now: Timestamp) -> bool {
         self.pace.then() == 0.0 && now >= self.pace.settles()
     }
 
-    /// When it will stand, where it is to.
+    /// When it will stand, where it is told to.
     pub(super) fn comes_to_stand(&self) -> Option<Timestamp> {
         (self.pace.then() == 0.0).then(|| self.pace.settles())
     }
 
-    /// Whether it is to go on, or goes on.
+    /// Whether it goes on, or was told to.
     pub(super) fn goes_on(&self) -> bool {
         self.pace.then() > 0.0
     }
@@ -121,7 +121,8 @@ impl MotionClock {
         self.pace.rate(now)
     }
 
-    /// It is to go on, or to stand, as fast as all that moves can. Each way comes with how far along it the robot is, in seconds.
+    /// Tells it to go on or to stand. It changes as fast as every motion under way allows; each comes with how far along it the robot is, in
+    /// seconds.
     pub(super) fn change(
         &mut self,
         robot: &Robot,
@@ -140,7 +141,7 @@ impl MotionClock {
 }
 
 impl Braking {
-    /// From now on, where the way is followed at a rate and has come so far; at `times` the limits of the joints.
+    /// Begins to brake now, at `times` the limits of the joints; the motion is at a rate and has come so far along its course, in seconds.
     pub(super) fn begin(
         robot: &Robot,
         now: Timestamp,

@@ -5,8 +5,9 @@
 //!                            ├──Stop──▶ brakes ──it stands──▶ idle            (Ended: preempted)
 //!                            └──emergency stop──▶ brakes hard ──it stands──▶ idle   (Ended: stopped)
 //! ```
-//! Time is the robot's and comes in with every event; what should have happened since the last one happens first, in its
-//! order. What moves has a time of its own, which slows down to a hold, stands still, and sets out again (`braking`). [`Cell::next_wake`] says when the next thing will happen by itself.
+//! Every event comes with the robot's time. What is due between the previous event and this one happens first, in its order. Motions have a
+//! time of their own, which a hold slows down to a stop and later lets go on ([`super::braking`]). [`Cell::next_wake`] says when something is due
+//! without an event.
 
 use super::activity::{Activity, Kind, seconds};
 use super::arms::{Arms, FIRST};
@@ -39,7 +40,7 @@ pub struct Cell {
     /// Its arms, and what each holds.
     pub(super) arms: Arms,
     pub(super) now: Timestamp,
-    /// The time of what moves: as much behind `now` as everything was held.
+    /// The time by which motions go on: behind `now` by as long as a hold was in force.
     pub(super) motion_time: Timestamp,
     pub(super) clock: MotionClock,
     pub(super) safety: SafetyState,
@@ -49,7 +50,7 @@ pub struct Cell {
     /// How often the base has come to a stop.
     pub(super) stops: u64,
     pub(super) activities: BTreeMap<Module, Activity>,
-    /// What is coming to rest.
+    /// Motions that were told to stop and are coming to rest.
     pub(super) braking: BTreeMap<Module, Braking>,
     pub(super) environment: Environment,
     /// The objects' names.
@@ -74,7 +75,7 @@ impl Cell {
     /// A cell at time 0.
     ///
     /// # Errors
-    /// [`PlacementError`] when no table can be laid, or the robot is none for a cell.
+    /// [`PlacementError`] when no table can be laid, or the robot cannot stand in a cell.
     pub fn new(config: CellConfig) -> Result<Cell, PlacementError> {
         let robot = Robot::named_or_file(&config.robot)?;
         let pads = placement::fit(&robot, &config)?;
@@ -145,7 +146,7 @@ impl Cell {
         out
     }
 
-    /// When something will happen by itself.
+    /// When something is due without an event; `None` where nothing is.
     pub fn next_wake(&self) -> Option<Timestamp> {
         let ends = self.activities.values().map(|a| a.ends).min().and_then(|ends| self.clock.real_time(ends));
         let stands = self.clock.comes_to_stand().filter(|stands| *stands > self.now);
@@ -153,12 +154,13 @@ impl Cell {
         ends.into_iter().chain(self.faults.next()).chain(stands).chain(braking).min()
     }
 
-    /// Whether something moves: then every step costs time, and who waits until the last of them is due is late.
+    /// Whether something moves. Then the caller has to handle ticks often: each step takes time to compute, and steps that are left until
+    /// the end of a motion make that end late.
     pub fn is_restless(&self) -> bool {
         !self.environment.is_at_rest() || self.may_move()
     }
 
-    /// Whether what was told to stand stands: no goal is braking, and during a hold nothing moves.
+    /// Whether a stop or a hold is complete: no goal is braking, and during a hold nothing moves.
     pub fn stands(&self) -> bool {
         self.braking.is_empty() && (self.clock.goes_on() || self.clock.stands(self.now))
     }
@@ -168,7 +170,7 @@ impl Cell {
         self.errors.truth(&self.measured())
     }
 
-    /// Where the robot has them: the arm by its encoders, the base by its localisation.
+    /// Where the robot believes its joints to be: the arms by their encoders, the base by its localisation.
     pub fn measured(&self) -> Configuration {
         let mut configuration = self.resting;
         for (module, activity) in &self.activities {
@@ -192,12 +194,12 @@ impl Cell {
         standing(self.configuration().base)
     }
 
-    /// Where it believes to stand.
+    /// Where the base believes to stand, in the world frame.
     pub fn believed_base_pose(&self) -> Pose {
         standing(self.measured().base)
     }
 
-    /// What is true of every object.
+    /// The ground truth: where every object really is, and on what.
     pub fn ground_truth(&self) -> Vec<TrueObject> {
         let tools = self.arms.tools(&self.configuration());
         let truth = |i: usize| {
@@ -209,7 +211,7 @@ impl Cell {
             let on_base = self.is_delivered(&pose, &on);
             let in_place = match self.config.scene {
                 Setting::Boxes => on_base,
-                Setting::Table => on == TABLE && tableware::is_in_place(kind, &pose),
+                Setting::Table => on == TABLE && tableware::is_in_place(placement::workplace(&self.robot), kind, &pose),
             };
             let (id, size, greatest_tilt_rad) = (self.ids[i].clone(), self.size_of(i), self.tilts[i]);
             TrueObject { id, kind, size, pose, on_base, in_place, greatest_tilt_rad, held, holder, on }
@@ -227,7 +229,7 @@ impl Cell {
         self.battery.level()
     }
 
-    /// How many faults are still to come; more than [`super::faults::MAX_FAULTS`] are not taken.
+    /// How many faults are scheduled; more than [`super::faults::MAX_FAULTS`] are not taken.
     pub fn faults_to_come(&self) -> usize {
         self.faults.len()
     }
@@ -306,7 +308,7 @@ impl Cell {
         }
     }
 
-    /// What there is to be seen.
+    /// What a camera sees at this moment.
     pub fn scenery(&self) -> Scenery {
         let configuration = self.configuration();
         let tools = self.arms.tools(&configuration);

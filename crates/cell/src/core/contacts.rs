@@ -6,9 +6,9 @@
 //!                    ├─ an object stands on a link that stands, too (Stands); something was put there by a fault (PutThere)
 //!                    └─ everything else is unintended
 //! ```
-//! An episode begins when two bodies are as near as touching and ends when they have come apart. Some are judged only by what comes after: a
-//! finger may brush what it is about to grasp, but what it brushed and did not close around was hit; what is let go is set down on what it
-//! comes to stand on. No episode is forgiven for how deep it went at the worst where contact was meant: [`PRESS_M`] bounds those, too.
+//! An episode begins when two bodies touch and ends when they have come apart. Some episodes are judged only later: a finger may brush what it
+//! grasps next, but an object that it brushed and did not close around was hit; and an object is set down on what it comes to stand on. A meant
+//! contact has a bound as well: one that goes deeper than [`PRESS_M`] is unintended.
 
 use super::environment::{Environment, Thing, Touch};
 use ratn_model::time::Timestamp;
@@ -22,9 +22,9 @@ pub const TOLERANCE_M: f64 = 0.001;
 /// How deep what is held may be pressed into what it was lifted from or is set down on, and how far a finger may push what it
 /// grasps or lets go, in metres: poses are measured, with an error of millimetres.
 pub const PRESS_M: f64 = 0.015;
-/// How much of a support's normal points up at the least.
+/// A support is level where its normal points up by at least this much.
 const LEVEL: f64 = 0.7;
-/// The most contacts that are kept; the first ones are.
+/// How many contacts are kept: the first ones.
 pub const MAX_CONTACTS: usize = 64;
 
 /// An episode of two bodies in contact.
@@ -44,7 +44,7 @@ pub struct Contact {
     pub at: [f64; 3],
     /// How fast one moved as seen from the other at the most, in metres per second.
     pub speed_m_s: f64,
-    /// What for; `None`: it was not meant.
+    /// Its purpose; `None` where it was not meant.
     pub meant: Option<Purpose>,
 }
 
@@ -60,7 +60,8 @@ pub enum Purpose {
     Depart,
     /// What is held leaves what it stood on, which is below it.
     LiftOff,
-    /// What is held is let go on something, and comes to stand on it; on another object only where nothing else bears it.
+    /// An object is let go on something and comes to stand on it. Another object counts as what it stands on only where no furniture and no link
+    /// bears it.
     SetDown,
     /// An object stands on a link that the arm does not move.
     Stands,
@@ -317,7 +318,7 @@ impl Contacts {
         }
     }
 
-    /// What was not meant: those that are over, and, as it looks now, those that go on and those of which it is not known yet.
+    /// The unintended contacts: those that are over, and those that go on or are not judged yet, as it looks now.
     pub(super) fn unintended(&self) -> Vec<Contact> {
         let open = self.open.values().map(|episode| &episode.contact);
         let undecided = open.chain(self.waiting.iter().map(|(_, contact)| contact));
@@ -325,7 +326,7 @@ impl Contacts {
         self.judged.iter().chain(undecided.filter(|contact| contact.is_unintended())).cloned().collect()
     }
 
-    /// What is over, was not meant, and has not been told yet.
+    /// The unintended contacts that are over and have not been told yet.
     pub(super) fn tell(&mut self) -> Vec<Contact> {
         std::mem::take(&mut self.fresh)
     }

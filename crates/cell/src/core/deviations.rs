@@ -80,7 +80,7 @@ impl Cell {
         self.lost_until > self.now
     }
 
-    /// The controller of what moves gives up now, or in the next motion.
+    /// The controller of the motion under way gives up now; where nothing moves, that of the next motion.
     fn give_up(&mut self, out: &mut Vec<Command>) {
         let moves_the_arm = |a: &Activity| matches!(a.kind, Doing::Follow(Way::Arm(..)));
         if self.activities.values().any(|a| moves_the_arm(a) || moves_the_base(a)) {
@@ -99,7 +99,10 @@ impl Cell {
                 let workplace = placement::workplace(&self.robot);
                 (TABLE, workplace.table.top_m(), [workplace.boxes.x, workplace.boxes.y])
             }
-            Setting::Table => (tableware::RACK, tableware::RACK_HEIGHT_M, tableware::RACK_REGION),
+            Setting::Table => {
+                let Some(tableware) = &placement::workplace(&self.robot).tableware else { return };
+                (tableware::RACK, tableware::top_m(&tableware.rack), [tableware.region.x, tableware.region.y])
+            }
         };
         let movable: Vec<usize> = (0..self.ids.len())
             .filter(|i| {

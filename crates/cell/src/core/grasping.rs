@@ -25,7 +25,7 @@ pub struct Pads {
 /// A grasp.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Grip {
-    /// Which of those asked about.
+    /// The index of the cuboid that is held, among those that were given.
     pub index: usize,
     /// The opening at which the fingers stopped, in metres.
     pub width: f64,
@@ -39,7 +39,7 @@ pub enum NotGrasped {
     /// No object is there.
     #[error("nothing is between the fingers")]
     Nothing,
-    /// It would not lie flush.
+    /// It is turned too far to lie flush with the pads.
     #[error("{id} stands {degrees:.0}° askew between the fingers; at most {MAX_ASKEW_DEGREES}° is taken")]
     Askew {
         /// Which object.
@@ -47,7 +47,7 @@ pub enum NotGrasped {
         /// How much.
         degrees: f64,
     },
-    /// A finger is in it or on the wrong side of it.
+    /// A finger would close inside of it, or beside it.
     #[error("{id} is not between the fingers: it reaches {beyond_mm:.0} mm beyond one of them")]
     Beyond {
         /// Which object.
@@ -55,7 +55,7 @@ pub enum NotGrasped {
         /// How far.
         beyond_mm: f64,
     },
-    /// Only an edge of it is there.
+    /// Only an edge of it is between the pads.
     #[error("the fingers hold only an edge of {id}: {held_mm:.0} mm of it, at least {:.0} mm are needed", MIN_HOLD_M * 1e3)]
     Edge {
         /// Which object.
@@ -63,7 +63,7 @@ pub enum NotGrasped {
         /// How much.
         held_mm: f64,
     },
-    /// More than one.
+    /// Two objects are between the fingers.
     #[error("{first} and {second} are both between the fingers")]
     Several {
         /// One.
@@ -88,7 +88,7 @@ impl NotGrasped {
 pub const MAX_ASKEW_DEGREES: f64 = 15.0;
 /// How much of it the pads must hold, along x and along z.
 pub const MIN_HOLD_M: f64 = 0.008;
-/// What the pads give way, in metres.
+/// How far the pads give way, in metres.
 const PAD_GIVE_M: f64 = 0.002;
 
 impl Pads {

@@ -88,8 +88,9 @@ impl Cell {
         (parts, closed)
     }
 
-    /// The fingers of an arm have closed from `from` metres on each side of the middle. Who asked hears what fingers know: how wide what stopped them
-    /// was, and whether it still does. Why they hold nothing only the cell knows, and tells it apart from that.
+    /// The fingers of an arm have closed from `from` metres on each side of the middle. The goal's result says what fingers can measure: how wide
+    /// the thing was that stopped them, and whether it still does. Why they hold nothing only the cell knows: that is a
+    /// [`Command::Missed`].
     pub(super) fn close(
         &mut self,
         arm: usize,

@@ -1,4 +1,4 @@
-//! The objects of the cell as its ground truth tells of them, as nobody on the robot knows them.
+//! The objects of the cell as its ground truth tells of them; the robot itself does not know this.
 
 use super::environment::{Kind, Model};
 use ratn_model::pose::Pose;

@@ -11,8 +11,8 @@ use ratn_model::time::Timestamp;
 const OPEN_M: f64 = 1e-4;
 
 impl Cell {
-    /// Time goes on to `time`, step by step where something moves; to the step at which what is held was lost, where that comes first:
-    /// then something else may be due before `time`. Whether it did.
+    /// Lets time go on to `time`, step by step where something moves. Stops at a step at which a held object is lost, because that ends motions,
+    /// and something else may be due before `time`; returns whether it did.
     pub(super) fn pass_until(&mut self, time: Timestamp, out: &mut Vec<Command>) -> bool {
         while self.environment.next_step() <= time {
             if self.environment.is_at_rest() && !self.may_move() {
@@ -28,7 +28,7 @@ impl Cell {
         false
     }
 
-    /// Whether what was held was lost.
+    /// One step. Returns whether a held object was lost.
     fn step(&mut self, out: &mut Vec<Command>) -> bool {
         let configuration = self.configuration();
         let tools = self.arms.tools(&configuration);

@@ -1,4 +1,4 @@
-//! What happened to a cell, line by line, and the same cell made to go through it again.
+//! The recording of a cell, line by line, and its replay: the same cell is made again and given the same events.
 //!
 //! ```text
 //! {"form":2,"config":{…},"robot":{…}}                      first: how the cell was made, and of which robot
@@ -30,7 +30,7 @@ const FORM: u32 = 2;
 pub enum Line {
     /// The first.
     Header {
-        /// Of the lines.
+        /// The form of the lines; another one is refused.
         form: u32,
         /// How the cell was made.
         config: Box<CellConfig>,
@@ -40,16 +40,16 @@ pub enum Line {
     },
     /// Something came in.
     Event {
-        /// When.
+        /// When it came in.
         at: Timestamp,
-        /// What.
+        /// What came in.
         event: Event,
     },
     /// A goal ended.
     Ended {
-        /// When.
+        /// When it ended.
         at: Timestamp,
-        /// Which.
+        /// The goal.
         ended: Ticket,
         /// `done`, `aborted`, `preempted` or `stopped`.
         how: String,
@@ -64,24 +64,24 @@ pub enum Line {
     Contact {
         /// When it was told.
         at: Timestamp,
-        /// Which, and how.
+        /// The two bodies, how deep they were in each other, and how they moved.
         contact: Contact,
     },
     /// The environment after an event.
     World {
         /// When.
         at: Timestamp,
-        /// Its digest.
+        /// The digest of the environment.
         world: String,
     },
 }
 
-/// What came of a replay.
+/// The result of a replay in which everything happened as recorded.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Replayed {
-    /// Events that came in.
+    /// How many events came in.
     pub events: usize,
-    /// Goals that ended as they had.
+    /// How many goals ended, each as recorded.
     pub goals: usize,
     /// When the last event was, in the robot's seconds.
     pub end_s: f64,
@@ -89,10 +89,10 @@ pub struct Replayed {
     pub tracking: Tracking,
 }
 
-/// Why a recording is not replayed, or how it went otherwise.
+/// Why a recording is not replayed, or where the replay differs from it.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
-    /// It cannot be read.
+    /// A line cannot be read.
     #[error("line {line} cannot be read")]
     Unreadable {
         /// Which, from 1.
@@ -101,7 +101,7 @@ pub enum ReplayError {
         #[source]
         source: io::Error,
     },
-    /// It is none.
+    /// A line is not a line of a recording.
     #[error("line {line} is none of a recording: {reason}")]
     NoRecording {
         /// Which, from 1.
@@ -122,14 +122,14 @@ pub enum ReplayError {
         /// The one that the config names.
         here: RobotIdentity,
     },
-    /// Something else came of it.
+    /// The replay differs from what was recorded.
     #[error("line {line}: recorded was {recorded}, and now it is {replayed}")]
     Differs {
         /// Which, from 1.
         line: usize,
-        /// What was.
+        /// What the recording says.
         recorded: String,
-        /// What is.
+        /// What the replay came to.
         replayed: String,
     },
 }

@@ -1,7 +1,7 @@
-//! The cell's state as a value: what it can be put back to, or made of in another process.
+//! A snapshot: the cell's state as a value, to which the same or another process can put its cell back.
 //!
-//! No goal is part of it: who gave one is not there any more when it is restored, so every joint is where it had come to and holds.
-//! The emergency stop is not part of it either: it is about the world outside. Nor is what has touched: that is judged from there anew.
+//! Goals are not part of it, because their givers are gone when it is restored: every joint is where it had come to, and holds. Nor are the
+//! emergency stop, which concerns the real surroundings, and the contacts, which are counted anew.
 
 use super::arms::FIRST;
 use super::battery::Battery;

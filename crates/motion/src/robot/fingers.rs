@@ -26,7 +26,7 @@ impl Robot {
         let (Some(finger), Some(joint)) = (self.finger_link(), self.finger.as_ref()) else { return Vec::new() };
         let mut positions = self.neutral.clone();
         positions[joint.indices[0]] = 0.0;
-        let (in_root, tool) = self.from_shared_link(finger, &positions);
+        let (in_root, tool) = self.in_shared_link(finger, &positions);
         let in_tool = tool.inverse().compose(&in_root);
         let bodies = &self.model.links[finger].bodies;
         bodies.iter().map(|body| part(&in_tool.compose(&body.pose), &body.geometry)).collect()
@@ -34,7 +34,7 @@ impl Robot {
 
     /// A link and the tool in the frame of the last link that carries both: whatever is before that one does not matter, nor does its
     /// rounding.
-    fn from_shared_link(&self, link: usize, positions: &[f64]) -> (Pose, Pose) {
+    fn in_shared_link(&self, link: usize, positions: &[f64]) -> (Pose, Pose) {
         let links = &self.model.links;
         let above = |link: usize| std::iter::successors(Some(link), |index| links[*index].parent).collect::<Vec<_>>();
         let (of_link, of_tool) = (above(link), above(self.tool));
