@@ -70,6 +70,7 @@ mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+    use std::f64::consts::PI;
 
     fn table() -> SceneObject {
         let [x, y, z] = TABLE_CENTRE;

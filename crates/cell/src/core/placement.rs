@@ -82,10 +82,10 @@ const MAX_TABLES: usize = 3000;
 const MAX_PLACES: usize = 60;
 /// Free space between two boxes, in metres: what the detector needs to tell them apart.
 const GAP_M: f64 = 0.045;
-/// What the fingers need across a box beyond half of their opening and their thickness: room for what the detector gets wrong.
+/// Room that the fingers need at a box for what the detector gets wrong, in metres: across it beyond half of their opening and their
+/// thickness, and along it beyond half of their width.
 const FINGER_ROOM_M: f64 = 0.02;
-/// What they need along it, from its middle.
-const FINGER_HALF_WIDTH_M: f64 = 0.033;
+const FINGER_ROOM_ALONG_M: f64 = 0.0205;
 /// The table's name.
 pub const TABLE: &str = "table";
 
@@ -116,10 +116,12 @@ fn boxes(robot: &Robot, count: usize, seed: u64) -> Result<Vec<Placed>, Placemen
     if count > places {
         return Err(PlacementError::Places { count, places, robot: robot.name().to_owned() });
     }
+    let (thick, half_width) = Pads::of(robot).map_or((0.0, 0.0), |pads| (pads.thick, (pads.x[1] - pads.x[0]) / 2.0));
     let ground = Ground {
         boxes: workplace.boxes,
         height_m: workplace.table.top_m(),
-        finger_reach_m: robot.open_finger_m() + Pads::of(robot).map_or(0.0, |pads| pads.thick) + FINGER_ROOM_M,
+        finger_reach_m: robot.open_finger_m() + thick + FINGER_ROOM_M,
+        finger_half_width_m: half_width + FINGER_ROOM_ALONG_M,
     };
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     for table in 0..MAX_TABLES {
@@ -231,6 +233,8 @@ struct Ground {
     height_m: f64,
     /// What the fingers need across a box, from its middle.
     finger_reach_m: f64,
+    /// What they need along it, from its middle.
+    finger_half_width_m: f64,
 }
 
 fn footprints(random: &mut ChaCha8Rng, ground: &Ground, count: usize, crowding: f64) -> Option<Vec<Footprint>> {
@@ -264,7 +268,7 @@ impl Footprint {
     /// Whether this box keeps its distance from the other and can be grasped beside it.
     fn clear_of(&self, other: &Footprint, ground: &Ground) -> bool {
         let grown = Rectangle { half: self.base().half.map(|h| h + GAP_M), ..self.base() };
-        let fingers = Rectangle { half: [FINGER_HALF_WIDTH_M, ground.finger_reach_m], ..self.base() };
+        let fingers = Rectangle { half: [ground.finger_half_width_m, ground.finger_reach_m], ..self.base() };
         !grown.overlaps(&other.base()) && !fingers.overlaps(&other.base())
     }
 

@@ -1,4 +1,4 @@
-//! A robot with two arms for tests: two Pandas on stands of their own at one table, made of the URDF of the built-in one.
+//! A robot with two arms for tests, also for those of whole systems: two Pandas on stands of their own at one table, made of the URDF of the built-in one.
 
 use std::path::{Path, PathBuf};
 
@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 pub(crate) const SIDES: [(&str, f64); 2] = [("left", 0.35), ("right", -0.35)];
 
 fn built_in(ending: &str) -> String {
-    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../motion/robots").join(format!("panda.{ending}"));
-    std::fs::read_to_string(file).unwrap()
+    let folders = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().map(|folder| folder.join("crates/motion/robots"));
+    let robots = folders.filter(|folder| folder.is_dir()).last().unwrap();
+    std::fs::read_to_string(robots.join(format!("panda.{ending}"))).unwrap()
 }
 
 /// The same text with the names of everything that is there once per arm.
