@@ -49,7 +49,7 @@ fn each_region_moves_the_arm_that_it_holds() -> anyhow::Result<()> {
     let task = place.path().join("both_arms.yaml");
     std::fs::write(&task, TASK)?;
     let task = task.to_str().context("a path")?;
-    let rest = ["--robot", robot, "--boxes", "1", "--planners", "1", "--speed", "20", "--json"];
+    let rest = ["--robot", robot, "--speed", "20", "--seed", "3", "--json"];
     let output = place.ratn(&[&["run", task][..], &rest].concat()).output()?;
     let (document, said) = texts(&output);
     ensure!(output.status.success(), "{document}\n{said}");

@@ -60,7 +60,7 @@ fn description(name: &str) -> String {
          [postures]\nhome = {HOME}\n[[other_arm]]\n{}[other_arm.gripper]\n{}[other_arm.postures]\nhome = {HOME}\n\
          [workplace]\ntable = {{ centre = [0.60, 0, 0.675], size = [0.80, 1.40, 0.05] }}\n\
          boxes = {{ x = [0.40, 0.52], y = [-0.10, 0.50], least = [0.05, 0.04, 0.07], greatest = [0.10, 0.05, 0.10] }}\n\
-         places = {{ on = \"table\", yaw = 1.5707963267948966, at = [[0.40, -0.40, 0.70], [0.60, -0.40, 0.70]] }}\n",
+         places = {{ on = \"table\", yaw = 1.5707963267948966, at = [[0.40, -0.40, 0.70], [0.60, -0.40, 0.70], [0.50, -0.55, 0.70]] }}\n",
         arm("left"),
         gripper("left"),
         arm("right"),
