@@ -54,13 +54,17 @@ fn objects() -> Vec<SceneObject> {
 }
 
 async fn system() -> System {
+    system_of(Robot::aimm()).await
+}
+
+async fn system_of(robot: Robot) -> System {
     let temporary = tempfile::tempdir().unwrap();
     let directory = RuntimeDirectory::create(temporary.path()).unwrap();
     tokio::spawn(world_pool::run(WorldPoolConfig::default(), directory.clone(), CancellationToken::new()));
     let file = temporary.path().join("planner");
     let listen = Endpoint::Unix(temporary.path().join("planner.sock"));
     let options = WorkerOptions { listen, endpoint_file: Some(file.clone()), ..WorkerOptions::default() };
-    tokio::spawn(ratn_workers::path_planner::worker(options, Robot::aimm(), SPEED).without_leases().run());
+    tokio::spawn(ratn_workers::path_planner::worker(options, robot, SPEED).without_leases().run());
     let world_pool = directory.wait_for(world_pool::ROLE, DEADLINE).await.unwrap();
     let planner = wait_for_file(&file, "planner", DEADLINE).await.unwrap();
 
@@ -178,6 +182,23 @@ async fn what_cannot_be_planned_is_aborted_with_the_reason() {
         assert_eq!(outcome.outcome, "aborted");
         assert!(outcome.reason.contains(reason), "{}", outcome.reason);
     }
+}
+
+#[tokio::test]
+async fn where_a_part_is_that_the_robot_does_not_have_is_refused_instead_of_ignored() {
+    let system = system_of(Robot::built_in("panda").unwrap()).await;
+    let home = Value::Joints(vec![0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]);
+    let goal = |id: &str, port: &str| {
+        let inputs = [("start", home.clone()), ("goal", home.clone()), (port, Value::Float(0.05))];
+        system.client.execute(&system.planner, system.goal(id, &inputs), |_, _| {})
+    };
+    for (id, port) in [("a", "pan"), ("b", "tilt")] {
+        let outcome = goal(id, port).await.unwrap();
+        let said = format!("input `{port}` is given, but the robot `panda` has no head that turns");
+        assert!(outcome.outcome == "aborted" && outcome.reason.contains(&said), "{outcome:?}");
+    }
+    let outcome = goal("c", "width_m").await.unwrap();
+    assert!(outcome.is_success(), "it has fingers: {}", outcome.reason);
 }
 
 #[tokio::test]

@@ -2,7 +2,7 @@
 
 use crate::collision::{Checker, Collision, Contact};
 use crate::joint_vector::JointVector;
-use crate::robot::{Geometry, Robot};
+use crate::robot::Robot;
 use ratn_world::scene::{Placement, Scene, SceneObject};
 
 /// How far off the measured poses of objects are, in metres: as far as that the fingers keep away from what they need not touch, where
@@ -31,14 +31,9 @@ pub(super) fn presses_m(robot: &Robot) -> Vec<f64> {
     std::iter::once(-MEASURED_WITHIN_M).chain(steps).collect()
 }
 
-/// Half of a finger's thickness along the direction in which it closes; 0 for a robot without fingers made of boxes.
+/// Half of a finger's thickness along the direction in which it closes; 0 for a robot without fingers.
 pub(super) fn half_finger_m(robot: &Robot) -> f64 {
-    let halves = robot.finger_link().into_iter().flat_map(|link| &robot.model.links[link].bodies);
-    let thickness = halves.filter_map(|body| match body.geometry {
-        Geometry::Box { half } => Some(half[1]),
-        _ => None,
-    });
-    thickness.fold(0.0, f64::max)
+    robot.finger_parts().iter().map(|part| part.half[1]).fold(0.0, f64::max)
 }
 
 /// The scene as the tool leaves a goal where it lets go of what it holds: fingers that open there may press a neighbour, too. `None` where

@@ -53,11 +53,19 @@ impl Asked {
 impl Said {
     /// From the input ports `pan`, `tilt`, `width_m`, and that of the arm's posture.
     pub(super) fn read(goal: &GoalContext, robot: &Robot, arm_port: &str) -> Result<Said, ActionFailure> {
+        let of_part = |port: &str, is_there: bool, lacks: &str| match goal.optional_float(port)? {
+            Some(_) if !is_there => Err(ActionFailure::aborted(format!(
+                "input `{port}` is given, but the robot `{}` has no {lacks}: leave the input out",
+                robot.name()
+            ))),
+            said => Ok(said),
+        };
+        let (head, fingers) = (!robot.head_joints().is_empty(), robot.finger().is_some());
         Ok(Said {
             arm: joints(robot, arm_port, goal.input_joints(arm_port)?)?,
-            pan: goal.optional_float("pan")?,
-            tilt: goal.optional_float("tilt")?,
-            width_m: goal.optional_float("width_m")?,
+            pan: of_part("pan", head, "head that turns (its description has no `[head]`)")?,
+            tilt: of_part("tilt", head, "head that turns (its description has no `[head]`)")?,
+            width_m: of_part("width_m", fingers, "gripper on this arm (its description has none)")?,
         })
     }
 
