@@ -171,7 +171,7 @@ async fn a_run_is_told_once_and_then_what_has_changed() {
     let instances = first["instances"].as_array().unwrap();
     assert!(instances.iter().any(|one| one["path"] == "fetch[1]/move" && one["state"] == "fetch/move"), "{instances:?}");
     let waits = instances.iter().flat_map(|one| one["waits"].as_array().unwrap());
-    assert!(waits.flat_map(|wait| wait["behind"].as_array().unwrap()).any(|behind| behind.as_str().unwrap().starts_with("fetch/plan had ")));
+    assert!(waits.flat_map(|wait| wait["behind"].as_array().unwrap()).any(|behind| behind.as_str().unwrap().contains("/plan had path-planner")));
     let edges: Vec<&str> = instances.iter().flat_map(|one| one["edges"].as_array().unwrap()).filter_map(|edge| edge["kind"].as_str()).collect();
     assert!(edges.contains(&"data") && edges.contains(&"resource"), "{edges:?}");
     let (epoch, version) = (&first["epoch"], &first["version"]);
@@ -254,7 +254,7 @@ async fn names_of_users_are_told_as_text_and_never_as_a_page() {
     let file = log_of(&lines);
     let served = serve(&[file.path()], false).await;
     let log = served.log().await;
-    for path in [format!("/api/run?log={log}"), format!("/api/world?log={log}"), format!("/api/{INJECTED}").replace(' ', "%20")] {
+    for path in [format!("/api/run?log={log}"), format!("/api/world?log={log}"), "/api/%3Cscript%3E".to_owned()] {
         let answer = served.get(&path).await;
         assert!(answer.head.contains("content-type: application/json") && answer.head.contains("nosniff"), "{}", answer.head);
         if path.contains("log=") {
@@ -319,20 +319,12 @@ async fn a_browser_that_reads_nothing_is_cut_off_and_others_go_on() {
     let mut slow = TcpStream::connect(&served.address).await.unwrap();
     let (address, token) = (&served.address, &served.token);
     let question = format!("GET /api/run?log={log} HTTP/1.1\r\nHost: {address}\r\nAuthorization: Bearer {token}\r\n\r\n");
-    // Answers of a megabyte each, which it does not read.
-    for _ in 0..40 {
-        if slow.write_all(question.as_bytes()).await.is_err() {
-            break;
-        }
-    }
+    // Answers of a megabyte each, which it does not read, until nobody takes its questions any more.
     let began = Instant::now();
-    assert_eq!(served.get("/api/about").await.status, 200);
-    assert!(began.elapsed() < Duration::from_secs(5), "{:?}", began.elapsed());
-    tokio::time::sleep(2 * PATIENCE).await;
-    // What it reads now ends: not all of its answers come.
-    let (mut read, mut part) = (0, vec![0; 1 << 20]);
-    while let Ok(bytes @ 1..) = tokio::time::timeout(Duration::from_secs(5), slow.read(&mut part)).await.unwrap() {
-        read += bytes;
+    while slow.write_all(question.as_bytes()).await.is_ok() {
+        assert!(began.elapsed() < Duration::from_secs(60), "it is not cut off");
+        assert_eq!(served.get("/api/about").await.status, 200);
+        tokio::time::sleep(PATIENCE / 10).await;
     }
-    assert!(read < 30 << 20, "{read}");
+    assert!(began.elapsed() >= PATIENCE, "it was given no time: {:?}", began.elapsed());
 }

@@ -70,7 +70,12 @@ export class Gantt implements Painter {
       }
     }
     this.lanes = 0;
-    const named = [...rows].sort(([a], [b]) => (a === NONE ? 1 : b === NONE ? -1 : a.localeCompare(b, "en", { numeric: true })));
+    // States stand in the order of the program, resources and hosts by name.
+    const first = (bars: Bar[]) => bars.reduce((least, bar) => Math.min(least, bar.one.id), Infinity);
+    const named = [...rows].sort(([a, ofA], [b, ofB]) => {
+      if (this.by === "node") return first(ofA) - first(ofB);
+      return a === NONE ? 1 : b === NONE ? -1 : a.localeCompare(b, "en", { numeric: true });
+    });
     this.rows = named.map(([name, bars]) => {
       bars.sort((a, b) => a.from - b.from);
       const ends: number[] = [];
@@ -129,7 +134,7 @@ export class Gantt implements Painter {
       context.fillStyle = colour("line");
       context.fillRect(0, top + tall - 0.5, width, 0.5);
       context.fillStyle = colour("ink");
-      context.fillText(fitted(context, row.name, label - 12, true), 6, top + LANE / 2);
+      context.fillText(fitted(context, row.name, label - 12, true), 6, top + LANE / 2 + 1);
     }
     context.beginPath();
     context.rect(label, AXIS, width - label, height - AXIS);
@@ -197,7 +202,7 @@ export class Gantt implements Painter {
     context.fillRect(left, y + 2, wide, LANE - 4);
     context.globalAlpha = 1;
     if (wide < 3) return;
-    context.setLineDash(lost || one.speculative ? [4, 3] : []);
+    context.setLineDash(lost || (one.speculative && one.stage !== "retired") ? [4, 3] : []);
     context.lineWidth = failed ? 2 : 1;
     context.strokeStyle = colour(failed ? "bad" : "faint");
     context.strokeRect(left + 0.5, y + 2.5, wide - 1, LANE - 5);
@@ -211,7 +216,7 @@ export class Gantt implements Painter {
     if (wide > 34) {
       context.fillStyle = colour("ink");
       const name = this.by === "node" ? (one.path.match(/\[\d+\]/g)?.join("") ?? lastName(one.path)) : lastName(one.path);
-      context.fillText(fitted(context, name, wide - 8), left + 4, y + LANE / 2);
+      context.fillText(fitted(context, name, wide - 8), left + 4, y + LANE / 2 + 1);
     }
   }
 

@@ -253,9 +253,9 @@ function showSummary(run: Run): void {
     state,
     h("span", {}, `${count(run.retired)} of ${count(run.expanded - run.squashed)} known states have ended`),
     ahead,
-    run.parameters.length > 0 && h("span", { class: "faint" }, run.parameters.join(", ")),
     run.reason !== "" && h("span", { class: "bad" }, run.reason),
     run.from_s > 0 && h("span", { class: "warn" }, `read from ${seconds(run.from_s)} on: the log is long`),
+    run.parameters.length > 0 && h("span", { class: "faint parameters", title: run.parameters.join("\n") }, run.parameters.join(", ")),
   );
   showControls(run);
 }

@@ -57,6 +57,8 @@ export class Network implements Painter {
   private top = 0;
   private size = { width: 1, height: 1 };
   private fits = true;
+  /** What is brought into the middle at the next painting. */
+  private wanted: number | null = null;
 
   constructor(private readonly store: Store) {}
 
@@ -106,7 +108,6 @@ export class Network implements Painter {
     this.nodes = [...nodes.values()];
     this.link();
     this.placeAll();
-    if (this.fits) this.fit();
   }
 
   private link(): void {
@@ -150,10 +151,16 @@ export class Network implements Painter {
     this.rows.forEach((row, index) => rows.set(row, index));
     const columns = new Map<Node, number>();
     const last = new Map<string, number>();
+    // Of what has not depended on anything yet the place in the program is known: behind what stands before it in the same visit.
+    const siblings = new Map<string, number>();
     for (const node of this.nodes) {
       let column = (last.get(node.row) ?? -1) + 1;
-      for (const from of into.get(node) ?? []) column = Math.max(column, (columns.get(from) ?? 0) + 1);
+      const visit = this.level === "states" ? parent(node.row) : splitPath(node.members[0]?.path ?? "").slice(0, -1).join("/");
+      const before = into.get(node);
+      if (before === undefined) column = Math.max(column, (siblings.get(visit) ?? -1) + 1);
+      else for (const from of before) column = Math.max(column, (columns.get(from) ?? 0) + 1);
       columns.set(node, column);
+      siblings.set(visit, column);
       last.set(node.row, column);
       node.x = MARGIN + column * (WIDE + GAP_X);
       node.y = MARGIN + (rows.get(node.row) ?? 0) * (TALL + GAP_Y);
@@ -176,10 +183,11 @@ export class Network implements Painter {
   }
 
   paint(context: CanvasRenderingContext2D, width: number, height: number): void {
-    const resized = this.size.width !== width || this.size.height !== height;
     this.size = { width, height };
     this.layOut();
-    if (resized && this.fits) this.fit();
+    if (this.fits) this.fit();
+    if (this.wanted !== null) this.centre(this.wanted);
+    this.wanted = null;
     context.save();
     context.translate(this.left, this.top);
     context.scale(this.scale, this.scale);
@@ -291,10 +299,10 @@ export class Network implements Painter {
     context.stroke();
     context.setLineDash([]);
     if (this.scale > 0.45) {
-      const mark = some("running") ? "▶ " : waits ? "⏳ " : all("squashed") ? "✕ " : all("retired") ? "✓ " : "";
+      const mark = some("running") ? "▶ " : waits ? "… " : all("squashed") ? "✕ " : all("retired") ? "✓ " : "";
       const times = node.members.length > 1 ? ` ×${count(node.members.length)}` : "";
       context.fillStyle = colour("ink");
-      context.fillText(fitted(context, `${mark}${node.label}${times}`, WIDE - 14), node.x + 7, node.y + TALL / 2 + 0.5);
+      context.fillText(fitted(context, `${mark}${node.label}${times}`, WIDE - 14), node.x + 7, node.y + TALL / 2 + 1);
     }
     context.globalAlpha = 1;
   }
@@ -339,7 +347,10 @@ export class Network implements Painter {
 
   /** Brings an instance into the middle. */
   show(id: number): void {
-    this.layOut();
+    this.wanted = id;
+  }
+
+  private centre(id: number): void {
     const node = this.byInstance.get(id);
     if (node === undefined) return;
     this.fits = false;

@@ -121,7 +121,7 @@ export function networkPage(site: Site): Page {
   const groups = h("ul", { class: "tree" });
   tree.append(groups);
   const again = () => {
-    network.layOut();
+    network.fit();
     view.repaint();
   };
   const search = h("input", { type: "search", placeholder: "part of a path", "aria-label": "Only instances with this in their path" });
