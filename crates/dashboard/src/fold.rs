@@ -5,7 +5,7 @@
 
 use crate::world::World;
 use ratn_event_log::{Lines, LogError};
-use ratn_executive::protocol::{Command, LogEntry};
+use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_model::id::InstanceId;
 use ratn_model::time::Timestamp;
 use ratn_report::timeline::{Cause, Instance, Stage, Timeline};
@@ -29,6 +29,8 @@ pub(crate) struct Fold {
     pub(crate) run: Timeline,
     /// Its world.
     pub(crate) world: World,
+    /// The digest of the texts of its task.
+    pub(crate) digest: String,
     /// The byte and the line behind what was read.
     position: (u64, usize),
     /// How many changes there were.
@@ -93,6 +95,7 @@ impl Fold {
             from_s: if byte == 0 { 0.0 } else { from.seconds() },
             run: Timeline::following(KEPT),
             world: World::default(),
+            digest: String::new(),
             position: (byte, 0),
             version: 0,
             changed_at: BTreeMap::new(),
@@ -104,6 +107,7 @@ impl Fold {
         };
         if byte > 0 {
             let line = ratn_event_log::first(path)?;
+            fold.digest = digest(&line).unwrap_or_default();
             fold.world.apply(&line);
             fold.run.apply(&line);
             fold.run.wait_until(fold.from_s);
@@ -124,6 +128,9 @@ impl Fold {
                 return Ok(true);
             }
             self.position = lines.position();
+            if let Some(digest) = digest(&line) {
+                self.digest = digest;
+            }
             self.world.apply(&line);
             let changed = self.run.apply(&line);
             self.version += 1;
@@ -230,6 +237,13 @@ fn bonds(instance: &Instance, run: &Timeline) -> Vec<(InstanceId, Bond)> {
     found.extend(last.map(|one| (one.instance, Bond::Resource)));
     found.retain(|(of, _)| *of != instance.id);
     found
+}
+
+fn digest(line: &LogLine) -> Option<String> {
+    match &line.entry {
+        LogEntry::Event(Event::Started { digest, .. }) => Some(digest.clone()),
+        _ => None,
+    }
 }
 
 fn decides(run: &Timeline, id: InstanceId) -> bool {

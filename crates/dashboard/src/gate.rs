@@ -120,7 +120,9 @@ mod tests {
         for host in ["127.0.0.1:80", "localhost:4711", "LOCALHOST:1", "[::1]:9", "127.0.0.1"] {
             assert!(asks_here(&headers(&[("host", host)])).is_ok(), "{host}");
         }
-        for host in ["evil.example:80", "127.0.0.1.evil.example:80", "localhost.evil.example", "", "10.0.0.1:80", "127.0.0.1:x"] {
+        for host in
+            ["evil.example:80", "127.0.0.1.evil.example:80", "localhost.evil.example", "", "10.0.0.1:80", "127.0.0.1:x"]
+        {
             assert_eq!(asks_here(&headers(&[("host", host)])), Err(Refused::Host), "{host}");
         }
         assert_eq!(asks_here(&headers(&[])), Err(Refused::Host));
@@ -131,7 +133,9 @@ mod tests {
     fn a_page_of_somebody_else_is_refused_also_on_this_machine() {
         let from = |origin: &str| asks_here(&headers(&[("host", "localhost:80"), ("origin", origin)])).map(drop);
         assert_eq!(from("http://localhost:80"), Ok(()));
-        for origin in ["http://localhost:81", "https://localhost:80", "http://evil.example", "null", "http://localhost:80.evil"] {
+        for origin in
+            ["http://localhost:81", "https://localhost:80", "http://evil.example", "null", "http://localhost:80.evil"]
+        {
             assert_eq!(from(origin), Err(Refused::Origin), "{origin}");
         }
         let site = |site: &str| asks_here(&headers(&[("host", "localhost:80"), ("sec-fetch-site", site)])).map(drop);

@@ -12,9 +12,10 @@ mod logs;
 mod patience;
 mod server;
 mod system;
+mod task;
 mod tell;
 pub mod wire;
 mod world;
 
 pub use logs::MAX_LOGS;
-pub use server::{Dashboard, DashboardError, Options};
+pub use server::{Dashboard, DashboardError, Options, Tasks};

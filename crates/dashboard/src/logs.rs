@@ -138,10 +138,16 @@ impl Logs {
         })
     }
 
+    /// The file and the digest of a log's task.
+    pub(crate) fn task(&self, id: u64) -> Result<(PathBuf, String), NotTold> {
+        self.at(id, &Asked::default(), |fold, _, _| (PathBuf::from(&fold.run.file), fold.digest.clone()))
+    }
+
     /// The world of a log at a moment.
     pub(crate) fn world(&self, id: u64, asked: &Asked, filter: &str) -> Result<wire::World, NotTold> {
         self.at(id, asked, |fold, _, _| {
-            let path = |id: InstanceId| fold.run.instance(id).map_or_else(|| id.to_string(), |one| one.path.to_string());
+            let path =
+                |id: InstanceId| fold.run.instance(id).map_or_else(|| id.to_string(), |one| one.path.to_string());
             let world = fold.world.told(filter, path);
             wire::World { at_s: fold.run.end_s, from_s: fold.from_s, ..world }
         })
@@ -153,12 +159,7 @@ impl Logs {
     }
 
     /// With the fold of a log at a moment, and whether everything until then was read.
-    fn at<T>(
-        &self,
-        id: u64,
-        asked: &Asked,
-        then: impl FnOnce(&Fold, bool, &Followed) -> T,
-    ) -> Result<T, NotTold> {
+    fn at<T>(&self, id: u64, asked: &Asked, then: impl FnOnce(&Fold, bool, &Followed) -> T) -> Result<T, NotTold> {
         let mut all = self.lock();
         let All { logs, numbers, replays } = &mut *all;
         let one = logs.iter_mut().find(|one| one.id == id).ok_or(NotTold::Unknown(id))?;

@@ -4,7 +4,7 @@ use crate::gate::{self, HEADERS, Refused, Token};
 use crate::logs::{Asked, Logs, MAX_LOGS, NotTold, absolute};
 use crate::patience::Patient;
 use crate::system::System;
-use crate::wire;
+use crate::{task, wire};
 use hyper::body::Incoming;
 use hyper::header::{ALLOW, CONTENT_TYPE, HeaderValue};
 use hyper::server::conn::http1;
@@ -13,13 +13,14 @@ use hyper::{HeaderMap, Method, Request, Response, StatusCode, Uri};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use ratn_event_log::LogError;
 use ratn_model::id::InstanceId;
+use ratn_model::program::Program;
 use ratn_task_control::control::{self, Word};
 use ratn_worker::tls::ClientTls;
 use serde::Serialize;
 use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::{TcpListener, TcpStream};
@@ -47,6 +48,28 @@ const PAGES: [(&str, &str, &str); 4] = [
     ("/icon.svg", "image/svg+xml", include_str!("../assets/icon.svg")),
 ];
 
+/// How the task file of a log is loaded. What is not the task of the run is not shown.
+#[derive(Clone)]
+pub struct Tasks(Arc<dyn Fn(&Path) -> Result<Program, String> + Send + Sync>);
+
+impl Tasks {
+    /// Loads them so; an error says in a sentence why one is not there.
+    pub fn by(load: impl Fn(&Path) -> Result<Program, String> + Send + Sync + 'static) -> Tasks {
+        Tasks(Arc::new(load))
+    }
+
+    /// Loads none.
+    pub fn none() -> Tasks {
+        Tasks::by(|_| Err("task files are not read here".to_owned()))
+    }
+}
+
+impl std::fmt::Debug for Tasks {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Tasks(…)")
+    }
+}
+
 /// What is shown, and where.
 #[derive(Debug, Clone)]
 pub struct Options {
@@ -60,6 +83,8 @@ pub struct Options {
     pub control: bool,
     /// What the clients of the system trust and show.
     pub tls: ClientTls,
+    /// How tasks are loaded.
+    pub tasks: Tasks,
     /// A browser that says or takes nothing for so long is cut off.
     pub patience: Duration,
 }
@@ -68,7 +93,7 @@ impl Options {
     /// Of a system's runtime directory, at a free port, without logs, to look at only.
     pub fn of(directory: PathBuf, tls: ClientTls) -> Options {
         let address = SocketAddr::from(([127, 0, 0, 1], 0));
-        Options { address, logs: Vec::new(), directory, control: false, tls, patience: PATIENCE }
+        Options { address, logs: Vec::new(), directory, control: false, tls, tasks: Tasks::none(), patience: PATIENCE }
     }
 }
 
@@ -76,7 +101,9 @@ impl Options {
 #[derive(Debug, thiserror::Error)]
 pub enum DashboardError {
     /// Other machines could reach it.
-    #[error("the dashboard is for this machine alone, and {address} is not a loopback address: from another machine use `ssh -L`")]
+    #[error(
+        "the dashboard is for this machine alone, and {address} is not a loopback address: from another machine use `ssh -L`"
+    )]
     Exposed {
         /// Which.
         address: SocketAddr,
@@ -127,6 +154,7 @@ struct Shown {
     logs: Arc<Logs>,
     system: System,
     control: bool,
+    tasks: Tasks,
     reading: Semaphore,
 }
 
@@ -149,7 +177,7 @@ impl Dashboard {
     /// # Errors
     /// [`DashboardError`].
     pub async fn bind(options: Options) -> Result<Dashboard, DashboardError> {
-        let Options { address, logs, directory, control, tls, patience } = options;
+        let Options { address, logs, directory, control, tls, tasks, patience } = options;
         if !address.ip().is_loopback() {
             return Err(DashboardError::Exposed { address });
         }
@@ -170,7 +198,7 @@ impl Dashboard {
         let address = listener.local_addr().map_err(refused)?;
         let (logs, system) = (Arc::new(Logs::of(&paths)), System::of(directory, &tls));
         let reading = Semaphore::new(MAX_READING);
-        let shown = Arc::new(Shown { token, logs, system, control, reading });
+        let shown = Arc::new(Shown { token, logs, system, control, tasks, reading });
         Ok(Dashboard { listener, address, shown, patience })
     }
 
@@ -203,7 +231,11 @@ async fn answer(shown: Arc<Shown>, connection: TcpStream, patience: Duration) ->
         let shown = shown.clone();
         async move {
             // Nothing stands in the body of any question.
-            let head = Head { method: request.method().clone(), uri: request.uri().clone(), headers: request.headers().clone() };
+            let head = Head {
+                method: request.method().clone(),
+                uri: request.uri().clone(),
+                headers: request.headers().clone(),
+            };
             drop(request);
             Ok::<_, Infallible>(shown.answer(&head).await)
         }
@@ -235,12 +267,15 @@ impl Shown {
         let answer = match (&head.method, path) {
             (&Method::GET, "/api/about") => self.about().await,
             (&Method::GET, "/api/run") => self.run(&query).await,
+            (&Method::GET, "/api/task") => self.task(&query).await,
             (&Method::GET, "/api/world") => self.world(&query).await,
             (&Method::GET, "/api/system") => json(&self.system.told().await),
             (&Method::GET, "/api/tail") => self.tail(&query).await,
             (&Method::POST, "/api/control") => self.control(&query).await,
             (_, "/api/control") => return not_allowed("POST"),
-            (_, "/api/about" | "/api/run" | "/api/world" | "/api/system" | "/api/tail") => return not_allowed("GET"),
+            (_, "/api/about" | "/api/run" | "/api/task" | "/api/world" | "/api/system" | "/api/tail") => {
+                return not_allowed("GET");
+            }
             _ => Answer::Refused(StatusCode::NOT_FOUND, "there is nothing of this name".to_owned()),
         };
         match answer {
@@ -291,6 +326,24 @@ impl Shown {
         .await
     }
 
+    async fn task(&self, query: &Query<'_>) -> Answer {
+        let (id, _) = match query.asked() {
+            Ok(asked) => asked,
+            Err(problem) => return Answer::Refused(StatusCode::BAD_REQUEST, problem),
+        };
+        let tasks = self.tasks.clone();
+        self.reading(move |logs| {
+            let (file, digest) = logs.task(id)?;
+            let told = match (tasks.0)(&file) {
+                Ok(program) if program.digest == digest => task::told(&program),
+                Ok(_) => task::unknown(format!("{} is not what it was when the run began", file.display())),
+                Err(problem) => task::unknown(problem),
+            };
+            Ok(serde_json::to_string(&told))
+        })
+        .await
+    }
+
     async fn world(&self, query: &Query<'_>) -> Answer {
         let (id, asked) = match query.asked() {
             Ok(asked) => asked,
@@ -314,7 +367,9 @@ impl Shown {
             Ok(Ok(Err(error))) => Answer::Refused(StatusCode::INTERNAL_SERVER_ERROR, error.to_string()),
             Ok(Err(error @ NotTold::Unknown(_))) => Answer::Refused(StatusCode::NOT_FOUND, error.to_string()),
             Ok(Err(error @ NotTold::Log(_))) => Answer::Refused(StatusCode::UNPROCESSABLE_ENTITY, chain(&error)),
-            Err(_) => Answer::Refused(StatusCode::INTERNAL_SERVER_ERROR, "reading the log ended with a panic".to_owned()),
+            Err(_) => {
+                Answer::Refused(StatusCode::INTERNAL_SERVER_ERROR, "reading the log ended with a panic".to_owned())
+            }
         }
     }
 

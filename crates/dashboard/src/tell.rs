@@ -180,7 +180,9 @@ fn kinds(run: &Timeline, held: &[wire::Held]) -> Vec<wire::Kind> {
     for one in held {
         *all.entry(&one.kind).or_default() += 1;
     }
-    all.into_iter().map(|(kind, held)| wire::Kind { kind: kind.to_owned(), total: run.resources.total(kind), held }).collect()
+    all.into_iter()
+        .map(|(kind, held)| wire::Kind { kind: kind.to_owned(), total: run.resources.total(kind), held })
+        .collect()
 }
 
 fn last<T>(mut all: Vec<T>, most: usize) -> Vec<T> {

@@ -58,7 +58,7 @@ macro_rules! wire {
 
         /// All of it as a module of TypeScript.
         pub fn typescript() -> String {
-            let mut text = String::from("// Written from crates/dashboard/src/wire.rs by scripts/build-dashboard; do not edit.\n");
+            let mut text = String::from("// Written from crates/dashboard/src/wire.rs; do not edit (RATN_WRITE_WIRE=1 and its test write it).\n");
             $(
                 $(let _ = write!(text, "\n/**{} */", $doc);)+
                 let _ = write!(text, "\nexport interface {} {{\n", stringify!($name));
@@ -320,6 +320,36 @@ wire! {
         total: usize,
         /// How many the run holds.
         held: usize,
+    }
+
+    /// A task as its author wrote it.
+    Task {
+        /// The task file is what it was when the run began, and reads.
+        known: bool,
+        /// Why not; empty where it is.
+        note: String,
+        /// The states that do or decide something, in the order of the file.
+        states: Vec<State>,
+        /// What goes from one to another.
+        flows: Vec<Flow>,
+    }
+
+    /// A state.
+    State {
+        /// Its path.
+        path: String,
+        /// `action` or `condition`.
+        kind: &'static str,
+    }
+
+    /// A dependency of one state on another, as written.
+    Flow {
+        /// Whose result it is.
+        from: String,
+        /// Whose input, or existence, depends on that.
+        to: String,
+        /// `data` or `condition`.
+        kind: &'static str,
     }
 
     /// The world of a run, as far as its log tells it.

@@ -103,8 +103,9 @@ impl World {
             revision: known.revision.0,
         });
         let fits = |text: &str| text.to_lowercase().contains(&filter);
-        let mut facts: Vec<wire::Fact> =
-            all.filter(|fact| filter.is_empty() || fits(&fact.key) || fits(&fact.value) || fits(&fact.writer)).collect();
+        let mut facts: Vec<wire::Fact> = all
+            .filter(|fact| filter.is_empty() || fits(&fact.key) || fits(&fact.value) || fits(&fact.writer))
+            .collect();
         let fitting = facts.len();
         facts.truncate(MOST_TOLD);
         let history = self.history.iter().rev();
@@ -202,10 +203,10 @@ mod tests {
     use super::*;
 
     const LOG: &str = r#"
-{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":1,"world":[[{"predicate":"count","arguments":[]},1],[{"predicate":"at","arguments":["box"]},"table"]],"revision":3}
-{"at":1000000000,"command":"project","instance":5,"attempt":1,"base":3,"changes":[{"set":{"fact":{"predicate":"at","arguments":["box"]},"value":"base"}}],"writers":["move[1]"],"reads":"everything","lease":null}
-{"at":2000000000,"command":"commit","instance":1,"writer":"move[1]","changes":[{"set":{"fact":{"predicate":"at","arguments":["box"]},"value":"base"}},{"increase":{"fact":{"predicate":"count","arguments":[]},"by":2.0}}],"revision":4}
-{"at":3000000000,"event":"world_changed","revision":5,"facts":[[{"predicate":"at","arguments":["box"]},null],[{"predicate":"door","arguments":[]},"open"]]}
+{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":1,"world":[[{"predicate":"count","arguments":[]},{"int":1}],[{"predicate":"at","arguments":["box"]},{"string":"table"}]],"revision":3}
+{"at":1000000000,"command":"project","instance":5,"attempt":1,"base":3,"changes":[{"set":{"fact":{"predicate":"at","arguments":["box"]},"value":{"string":"base"}}}],"writers":["move[1]"],"reads":"everything","lease":null}
+{"at":2000000000,"command":"commit","instance":1,"writer":"move[1]","changes":[{"set":{"fact":{"predicate":"at","arguments":["box"]},"value":{"string":"base"}}},{"increase":{"fact":{"predicate":"count","arguments":[]},"by":2.0}}],"revision":4}
+{"at":3000000000,"event":"world_changed","revision":5,"facts":[[{"predicate":"at","arguments":["box"]},null],[{"predicate":"door","arguments":[]},{"string":"open"}]]}
 "#;
 
     fn after(lines: usize) -> wire::World {
@@ -234,7 +235,8 @@ mod tests {
         let told = (projected.key.as_str(), projected.root.as_deref(), projected.change.as_str());
         assert_eq!(told, ("at(box)", Some("table"), "base"));
         let world = after(4);
-        let history: Vec<_> = world.history.iter().map(|one| (one.revision, one.key.as_str(), one.after.clone())).collect();
+        let history: Vec<_> =
+            world.history.iter().map(|one| (one.revision, one.key.as_str(), one.after.clone())).collect();
         assert_eq!(history[0], (5, "door()", Some("open".to_owned())));
         assert_eq!(history[1], (5, "at(box)", None));
         assert_eq!((world.revision, world.all, world.fitting), (5, 2, 2));

@@ -64,8 +64,10 @@ impl Served {
 
     async fn ask(&self, method: &str, path: &str) -> Answer {
         let (address, token) = (&self.address, &self.token);
-        self.say(&format!("{method} {path} HTTP/1.1\r\nHost: {address}\r\nAuthorization: Bearer {token}\r\nConnection: close\r\n\r\n"))
-            .await
+        self.say(&format!(
+            "{method} {path} HTTP/1.1\r\nHost: {address}\r\nAuthorization: Bearer {token}\r\nConnection: close\r\n\r\n"
+        ))
+        .await
     }
 
     async fn get(&self, path: &str) -> Answer {
@@ -116,7 +118,9 @@ fn visit(id: u64) -> [String; 4] {
     let at = id * 1_000_000_000;
     let then = at + 500_000_000;
     [
-        format!(r#"{{"at":{at},"command":"note","note":"expanded","instance":{id},"state":1,"path":"look[{id}]","speculative":false}}"#),
+        format!(
+            r#"{{"at":{at},"command":"note","note":"expanded","instance":{id},"state":1,"path":"look[{id}]","speculative":false}}"#
+        ),
         format!(
             r#"{{"at":{at},"command":"start","instance":{id},"attempt":1,"goal":{{"provider":"eye","action":"look","inputs":{{}},"seed":1,"lease":null,"projection":null,"expected_s":null}}}}"#
         ),
@@ -148,7 +152,12 @@ async fn pages_run_nothing_of_others_and_are_had_by_this_machines_names_only() {
 async fn nothing_is_told_without_the_token_nor_to_pages_of_others() {
     let served = serve(&[&two_boxes()], true).await;
     let (address, token) = (&served.address, &served.token);
-    for (method, path) in [("GET", "/api/about"), ("GET", "/api/run?log=1"), ("GET", "/api/system"), ("POST", "/api/control?log=1&word=abort")] {
+    for (method, path) in [
+        ("GET", "/api/about"),
+        ("GET", "/api/run?log=1"),
+        ("GET", "/api/system"),
+        ("POST", "/api/control?log=1&word=abort"),
+    ] {
         let head = format!("{method} {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n");
         assert_eq!(served.say(&format!("{head}\r\n")).await.status, 401, "{path}");
         assert_eq!(served.say(&format!("{head}Authorization: Bearer 0{token}\r\n\r\n")).await.status, 401, "{path}");
@@ -157,7 +166,9 @@ async fn nothing_is_told_without_the_token_nor_to_pages_of_others() {
         assert_eq!(served.say(&foreign).await.status, 403, "{path}");
     }
     // A question before the question: what a browser asks whether another page may.
-    let before = format!("OPTIONS /api/about HTTP/1.1\r\nHost: {address}\r\nOrigin: http://evil.example\r\nConnection: close\r\n\r\n");
+    let before = format!(
+        "OPTIONS /api/about HTTP/1.1\r\nHost: {address}\r\nOrigin: http://evil.example\r\nConnection: close\r\n\r\n"
+    );
     let answer = served.say(&before).await;
     assert!(answer.status == 403 && !answer.head.contains("access-control-"), "{}", answer.head);
 }
@@ -169,10 +180,21 @@ async fn a_run_is_told_once_and_then_what_has_changed() {
     let first = &served.frames(&format!("log={log}")).await[0];
     assert_eq!((first["fresh"].as_bool(), first["run"]["controllable"].as_bool()), (Some(true), Some(false)));
     let instances = first["instances"].as_array().unwrap();
-    assert!(instances.iter().any(|one| one["path"] == "fetch[1]/move" && one["state"] == "fetch/move"), "{instances:?}");
+    assert!(
+        instances.iter().any(|one| one["path"] == "fetch[1]/move" && one["state"] == "fetch/move"),
+        "{instances:?}"
+    );
     let waits = instances.iter().flat_map(|one| one["waits"].as_array().unwrap());
-    assert!(waits.flat_map(|wait| wait["behind"].as_array().unwrap()).any(|behind| behind.as_str().unwrap().contains("/plan had path-planner")));
-    let edges: Vec<&str> = instances.iter().flat_map(|one| one["edges"].as_array().unwrap()).filter_map(|edge| edge["kind"].as_str()).collect();
+    assert!(
+        waits
+            .flat_map(|wait| wait["behind"].as_array().unwrap())
+            .any(|behind| behind.as_str().unwrap().contains("/plan had path-planner"))
+    );
+    let edges: Vec<&str> = instances
+        .iter()
+        .flat_map(|one| one["edges"].as_array().unwrap())
+        .filter_map(|edge| edge["kind"].as_str())
+        .collect();
     assert!(edges.contains(&"data") && edges.contains(&"resource"), "{edges:?}");
     let (epoch, version) = (&first["epoch"], &first["version"]);
     let again = served.get(&format!("/api/run?log={log}&epoch={epoch}&version={version}")).await.json();
@@ -205,7 +227,8 @@ async fn a_moment_is_shown_as_it_was_then_and_goes_on_from_there() {
     let then = served.frames(&format!("log={log}&at=7.25")).await.pop().unwrap();
     assert_eq!(at(&then), (7.25, 7));
     assert_eq!(then["run"]["last_s"].as_f64(), Some(20.5));
-    let running: Vec<&Value> = then["instances"].as_array().unwrap().iter().filter(|one| one["stage"] == "running").collect();
+    let running: Vec<&Value> =
+        then["instances"].as_array().unwrap().iter().filter(|one| one["stage"] == "running").collect();
     assert_eq!(running.len(), 1);
     let (epoch, version) = (&then["epoch"], &then["version"]);
     let on = served.get(&format!("/api/run?log={log}&at=9.25&epoch={epoch}&version={version}")).await.json();
@@ -222,7 +245,8 @@ async fn of_a_long_log_what_is_shown_is_read() {
     let ballast = "x".repeat(256 << 10);
     let visits = |id: u64| {
         let at = id * 1_000_000_000 + 1;
-        let progress = format!(r#"{{"at":{at},"event":"progressed","instance":{id},"attempt":1,"message":"{ballast}"}}"#);
+        let progress =
+            format!(r#"{{"at":{at},"event":"progressed","instance":{id},"attempt":1,"message":"{ballast}"}}"#);
         visit(id).into_iter().take(2).chain([progress]).chain(visit(id).into_iter().skip(2))
     };
     let mut file = tempfile::NamedTempFile::new().unwrap();
@@ -249,14 +273,20 @@ async fn of_a_long_log_what_is_shown_is_read() {
 async fn names_of_users_are_told_as_text_and_never_as_a_page() {
     let mut lines = vec![started(INJECTED)];
     let name = serde_json::to_string(INJECTED).unwrap();
-    lines.push(format!(r#"{{"at":1,"command":"note","note":"expanded","instance":1,"state":1,"path":{name},"speculative":false}}"#));
-    lines.push(format!(r#"{{"at":2,"event":"world_changed","revision":1,"facts":[[{{"predicate":"at","arguments":[{name}]}},{name}]]}}"#));
+    lines.push(format!(
+        r#"{{"at":1,"command":"note","note":"expanded","instance":1,"state":1,"path":{name},"speculative":false}}"#
+    ));
+    lines.push(format!(r#"{{"at":2,"event":"world_changed","revision":1,"facts":[[{{"predicate":"at","arguments":[{name}]}},{{"string":{name}}}]]}}"#));
     let file = log_of(&lines);
     let served = serve(&[file.path()], false).await;
     let log = served.log().await;
     for path in [format!("/api/run?log={log}"), format!("/api/world?log={log}"), "/api/%3Cscript%3E".to_owned()] {
         let answer = served.get(&path).await;
-        assert!(answer.head.contains("content-type: application/json") && answer.head.contains("nosniff"), "{}", answer.head);
+        assert!(
+            answer.head.contains("content-type: application/json") && answer.head.contains("nosniff"),
+            "{}",
+            answer.head
+        );
         if path.contains("log=") {
             assert!(answer.body.contains(&name[1..20]), "{}", answer.body);
         }
@@ -318,7 +348,8 @@ async fn a_browser_that_reads_nothing_is_cut_off_and_others_go_on() {
     let log = served.log().await;
     let mut slow = TcpStream::connect(&served.address).await.unwrap();
     let (address, token) = (&served.address, &served.token);
-    let question = format!("GET /api/run?log={log} HTTP/1.1\r\nHost: {address}\r\nAuthorization: Bearer {token}\r\n\r\n");
+    let question =
+        format!("GET /api/run?log={log} HTTP/1.1\r\nHost: {address}\r\nAuthorization: Bearer {token}\r\n\r\n");
     // Answers of a megabyte each, which it does not read, until nobody takes its questions any more.
     let began = Instant::now();
     while slow.write_all(question.as_bytes()).await.is_ok() {

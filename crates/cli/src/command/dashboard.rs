@@ -4,10 +4,14 @@ use super::blocking;
 use crate::arguments::DashboardArguments;
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
-use crate::output;
-use crate::system::public_directory;
-use ratn_dashboard::{Dashboard, DashboardError, Options};
+use crate::system::config::SystemConfig;
+use crate::system::{CONFIG_FILE, public_directory};
+use crate::{input, output};
+use ratn_dashboard::{Dashboard, DashboardError, Options, Tasks};
+use ratn_model::catalogue::Catalogue;
+use ratn_model::load::load_with;
 use ratn_worker::tls::ClientTls;
+use std::path::Path;
 
 /// Serves the pages until the user has seen enough.
 pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(), Failure> {
@@ -16,6 +20,7 @@ pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(),
         address: arguments.listen,
         logs: arguments.logs.clone(),
         control: arguments.control,
+        tasks: tasks(catalogue(&directory)?),
         ..Options::of(directory, tls.clone())
     };
     blocking(async {
@@ -29,6 +34,29 @@ pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(),
             () = interrupt.asked_times(1) => {}
         }
         Ok(())
+    })
+}
+
+/// That of the system that runs, or ran, in a directory; else the one that is built in.
+fn catalogue(directory: &Path) -> Result<Catalogue, Failure> {
+    let file = directory.join(CONFIG_FILE);
+    let own = SystemConfig::read(&file).ok();
+    Ok(own.map_or_else(|| SystemConfig::load(None), Ok)?.catalogue)
+}
+
+/// Task files are read again whenever somebody asks: they are small, and may have been put back.
+fn tasks(catalogue: Catalogue) -> Tasks {
+    Tasks::by(move |file| {
+        if file.as_os_str().is_empty() {
+            return Err("the log does not say which task file it is of".to_owned());
+        }
+        let place = file.display();
+        let source = input::read(file).map_err(|error| format!("cannot read the task file {place}: {error}"))?;
+        let name = place.to_string();
+        let loaded = load_with(&source, &name, &catalogue, &input::Libraries);
+        loaded
+            .map(|loaded| loaded.program)
+            .map_err(|_| format!("`ratn check {place}` says what is wrong with the task file"))
     })
 }
 

@@ -1,6 +1,6 @@
 // What the pages ask the program that served them.
 
-import type { About, Frame, System, Tail, Told, World } from "./wire";
+import type { About, Frame, System, Tail, Task, Told, World } from "./wire";
 
 const TOKEN = "ratn-token";
 
@@ -43,6 +43,7 @@ export const api = {
   about: () => ask<About>("about", {}),
   run: (log: number, at: number | null, epoch: number, version: number, about: number | null) =>
     ask<Frame>("run", { log, at, epoch, version, about }),
+  task: (log: number) => ask<Task>("task", { log }),
   world: (log: number, at: number | null, epoch: number, filter: string) => ask<World>("world", { log, at, epoch, filter }),
   system: () => ask<System>("system", {}),
   tail: (worker: string) => ask<Tail>("tail", { worker }),

@@ -32,14 +32,14 @@ export function details(store: Store, choose: (id: number) => void): Child[] {
     ),
     ...list("What it waited for", waited(one)),
     ...list("Why its result did not count", one.invalidations),
-    ...(one.edges.length === 0
+    ...(store.edges(one).length === 0
       ? []
       : [
           h("h2", {}, "What it depended on"),
           h(
             "ul",
             { class: "plain" },
-            ...one.edges.map((edge) => {
+            ...store.edges(one).map((edge) => {
               const from = store.instances.get(edge.from);
               return h("li", {}, `${edge.kind}: `, from === undefined ? "one that is not kept any more" : link(edge.from, from.path));
             }),

@@ -57,7 +57,7 @@ for (const [key, text] of Object.entries(NAMES)) links.set(key as Name, h("a", {
 const logs = h("select", { "aria-label": "Event log" });
 const themeButton = h("button", { onclick: () => showTheme(nextTheme()) });
 const controls = h("span", { class: "row", role: "group", "aria-label": "Control of the run" });
-const summary = h("div", { class: "summary", role: "status" });
+const summary = h("div", { class: "summary", role: "region", "aria-label": "The run", tabindex: 0 });
 const problem = h("div", { class: "problem", role: "alert", hidden: true });
 const live = h("button", { "aria-pressed": "true", onclick: () => showAt(null) }, "Live");
 const play = h("button", { onclick: () => (playing === null ? begin() : halt()) }, "Play");
@@ -154,6 +154,7 @@ function choose(id: number): void {
   log = id;
   halt();
   moment = null;
+  taskOf = null;
   store.clear();
   page.update();
   hurry();
@@ -233,6 +234,7 @@ function confirm(word: string, text: string, question: string): void {
   dialog.showModal();
 }
 
+let saidState = "";
 function showSummary(run: Run): void {
   const badge = (text: string, kind: string) => h("span", { class: `badge ${kind}` }, text);
   const state =
@@ -245,6 +247,10 @@ function showSummary(run: Run): void {
             ? badge("paused", "paused")
             : badge("live", "live")
           : badge("ended without an outcome, or not heard of", "bad");
+  // Screen readers hear when it changes, not every time that it is looked at.
+  const now = `${run.task}: ${state.textContent ?? ""}`;
+  if (now !== saidState) say(now);
+  saidState = now;
   const ahead = run.useful + run.wasted === 0 ? null : h("span", {}, `ahead of time: ${count(run.useful)} of use (${seconds(run.useful_s)}), ${count(run.wasted)} discarded (${seconds(run.wasted_s)})`);
   fill(
     summary,
@@ -269,6 +275,8 @@ function showSlider(run: Run): void {
   live.textContent = run.live ? "Live" : "End";
 }
 
+let taskOf: number | null = null;
+
 /** One question for what has changed. Whether there is more at once. */
 async function look(): Promise<boolean> {
   if (log === null) return false;
@@ -280,10 +288,21 @@ async function look(): Promise<boolean> {
       moment = store.run?.live === true ? null : last;
     }
   }
-  const of = log;
+  const [of, isReplay] = [log, moment !== null];
   const frame = await api.run(of, moment, store.frame?.epoch ?? 0, store.frame?.version ?? 0, store.selected);
-  if (of !== log) return true;
+  // Something else was chosen meanwhile.
+  if (of !== log || isReplay !== (moment !== null)) return true;
   store.apply(frame);
+  if (store.task === null && taskOf !== of && frame.run.task !== "") {
+    // Once for each log: a task file is read, and not while something waits for the answer.
+    taskOf = of;
+    api.task(of).then(
+      (task) => {
+        if (of === log) store.setTask(task);
+      },
+      () => undefined,
+    );
+  }
   showSummary(frame.run);
   showSlider(frame.run);
   page.update();

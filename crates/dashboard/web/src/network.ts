@@ -5,7 +5,7 @@
 
 import { DASHES, count } from "./dom";
 import { hint, lastName, parent } from "./say";
-import type { Store } from "./store";
+import { type Store, splitPath } from "./store";
 import { colour } from "./theme";
 import { type Painter, fitted } from "./view";
 import type { Instance } from "./wire";
@@ -76,7 +76,7 @@ export class Network implements Painter {
 
   layOut(): void {
     const chosen = this.causes ? this.store.selected : null;
-    const key = [this.store.generation, this.level, [...this.shown], [...this.collapsed], this.search, this.stages, chosen].join("|");
+    const key = [this.store.generation, this.level, this.store.task?.known, [...this.shown], [...this.collapsed], this.search, this.stages, chosen].join("|");
     if (key === this.laidOut) return;
     this.laidOut = key;
     const instances = [...this.store.instances.values()].sort((a, b) => a.id - b.id);
@@ -105,16 +105,29 @@ export class Network implements Painter {
       node.members.push(one);
       this.byInstance.set(one.id, node);
     }
-    this.nodes = [...nodes.values()];
+    this.nodes = this.level === "states" && wanted === null ? this.asWritten(nodes, search) : [...nodes.values()];
     this.link();
     this.placeAll();
+  }
+
+  /** In the order of the task file, those that were not visited included. */
+  private asWritten(nodes: Map<string, Node>, search: string): Node[] {
+    const all = new Map<string, Node>();
+    for (const { path } of this.store.task?.states ?? []) {
+      const { state } = this.shownAs(path, path);
+      const isWanted = this.stages === "all" && path.toLowerCase().includes(search);
+      const node = nodes.get(state) ?? { key: state, label: lastName(state), row: state, members: [], x: 0, y: 0 };
+      if (nodes.has(state) || isWanted) all.set(state, node);
+    }
+    for (const [state, node] of nodes) all.set(state, node);
+    return [...all.values()];
   }
 
   private link(): void {
     const links = new Map<string, Link>();
     for (const node of this.nodes) {
       for (const one of node.members) {
-        for (const edge of one.edges) {
+        for (const edge of this.store.edges(one)) {
           const from = this.byInstance.get(edge.from);
           const kind = edge.kind as Kind;
           if (from === undefined || from === node || !this.shown.has(kind)) continue;
@@ -123,6 +136,17 @@ export class Network implements Painter {
           if (link === undefined) links.set(key, { from, to: node, kind, times: 1 });
           else link.times += 1;
         }
+      }
+    }
+    if (this.level === "states") {
+      const byRow = new Map(this.nodes.map((node) => [node.row, node]));
+      for (const flow of this.store.task?.flows ?? []) {
+        const from = byRow.get(this.shownAs(flow.from, flow.from).state);
+        const to = byRow.get(this.shownAs(flow.to, flow.to).state);
+        const kind = flow.kind as Kind;
+        if (from === undefined || to === undefined || from === to || !this.shown.has(kind)) continue;
+        const key = `${from.key}\n${to.key}\n${kind}`;
+        if (!links.has(key)) links.set(key, { from, to, kind, times: 0 });
       }
     }
     this.links = [...links.values()];
@@ -172,7 +196,8 @@ export class Network implements Painter {
     const found = new Set([id]);
     const open = [id];
     for (let next = open.pop(); next !== undefined; next = open.pop()) {
-      for (const edge of this.store.instances.get(next)?.edges ?? []) {
+      const one = this.store.instances.get(next);
+      for (const edge of one === undefined ? [] : this.store.edges(one)) {
         if (!found.has(edge.from) && this.shown.has(edge.kind as Kind)) {
           found.add(edge.from);
           open.push(edge.from);
@@ -271,13 +296,12 @@ export class Network implements Painter {
   }
 
   private paintNode(context: CanvasRenderingContext2D, node: Node, isChosen: boolean): void {
-    const one = node.members.at(-1);
-    if (one === undefined) return;
+    const none = node.members.length === 0;
     const all = (stage: string) => node.members.every((member) => member.stage === stage);
     const some = (stage: string) => node.members.some((member) => member.stage === stage);
     const activity = node.members.flatMap((member) => member.jobs.slice(-1)).at(-1)?.activity;
     const waits = some("asking") || (some("waiting") && this.store.frame?.waiting.some((wait) => this.byInstance.get(wait.id) === node));
-    context.globalAlpha = all("squashed") ? 0.35 : 1;
+    context.globalAlpha = !none && all("squashed") ? 0.35 : 1;
     context.fillStyle = colour(activity ?? "idle");
     if (this.scale < 0.25) {
       context.fillRect(node.x, node.y, WIDE, TALL);
@@ -299,7 +323,7 @@ export class Network implements Painter {
     context.stroke();
     context.setLineDash([]);
     if (this.scale > 0.45) {
-      const mark = some("running") ? "▶ " : waits ? "… " : all("squashed") ? "✕ " : all("retired") ? "✓ " : "";
+      const mark = none ? "" : some("running") ? "▶ " : waits ? "… " : all("squashed") ? "✕ " : all("retired") ? "✓ " : "";
       const times = node.members.length > 1 ? ` ×${count(node.members.length)}` : "";
       context.fillStyle = colour("ink");
       context.fillText(fitted(context, `${mark}${node.label}${times}`, WIDE - 14), node.x + 7, node.y + TALL / 2 + 1);
@@ -336,7 +360,8 @@ export class Network implements Painter {
     for (const node of this.nodes) [right, bottom] = [Math.max(right, node.x + WIDE + MARGIN), Math.max(bottom, node.y + TALL + MARGIN)];
     const whole = Math.min(this.size.width / right, this.size.height / bottom);
     // Names shall be read: of what is large the end is shown, where things happen.
-    this.scale = Math.max(Math.min(whole, 1.2), this.nodes.length > 400 ? 0.02 : 0.5);
+    const readable = Math.min(0.8, Math.max(this.size.height / bottom, 0.15));
+    this.scale = whole >= 0.45 ? Math.min(whole, 1.2) : Math.max(whole, readable);
     this.left = Math.min(0, this.size.width - right * this.scale);
     this.top = 0;
     const open = this.nodes.find((node) => node.members.some((one) => one.stage === "running" || one.stage === "asking"));
@@ -382,21 +407,6 @@ export class Network implements Painter {
 function outer(state: string): string[] {
   const parts = state.split("/");
   return parts.slice(1).map((_, index) => parts.slice(0, index + 1).join("/"));
-}
-
-/** The parts of a path; a `/` inside brackets is a key's. */
-function splitPath(path: string): string[] {
-  const parts: string[] = [];
-  let [depth, part] = [0, ""];
-  for (const letter of path) {
-    if (letter === "[") depth += 1;
-    if (letter === "]") depth = Math.max(0, depth - 1);
-    if (letter === "/" && depth === 0) {
-      parts.push(part);
-      part = "";
-    } else part += letter;
-  }
-  return [...parts, part];
 }
 
 function compare(a: number[], b: number[]): number {

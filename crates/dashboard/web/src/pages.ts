@@ -168,6 +168,8 @@ export function networkPage(site: Site): Page {
   );
   const legend = h("div", { class: "row legend" }, "depends on: ", ...edges, h("span", {}, "dashed: speculative, faded: discarded"));
   let known = "";
+  const note = h("span", { class: "warn" });
+  legend.append(note);
   const showGroups = () => {
     const text = network.groups.join("\n");
     if (text === known) return;
@@ -196,6 +198,8 @@ export function networkPage(site: Site): Page {
     update: () => {
       network.layOut();
       showGroups();
+      const unknown = store.task !== null && !store.task.known ? `only what the log tells: ${store.task.note}` : "";
+      if (note.textContent !== unknown) note.textContent = unknown;
       causes.disabled = store.selected === null;
       view.element.dataset["nodes"] = String(network.nodes.length);
       if (store.selected !== shown) {

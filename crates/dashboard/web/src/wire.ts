@@ -1,4 +1,4 @@
-// Written from crates/dashboard/src/wire.rs by scripts/build-dashboard; do not edit.
+// Written from crates/dashboard/src/wire.rs; do not edit (RATN_WRITE_WIRE=1 and its test write it).
 
 /** What there is to be looked at. */
 export interface About {
@@ -246,6 +246,36 @@ export interface Kind {
   total: number;
   /** How many the run holds. */
   held: number;
+}
+
+/** A task as its author wrote it. */
+export interface Task {
+  /** The task file is what it was when the run began, and reads. */
+  known: boolean;
+  /** Why not; empty where it is. */
+  note: string;
+  /** The states that do or decide something, in the order of the file. */
+  states: State[];
+  /** What goes from one to another. */
+  flows: Flow[];
+}
+
+/** A state. */
+export interface State {
+  /** Its path. */
+  path: string;
+  /** `action` or `condition`. */
+  kind: string;
+}
+
+/** A dependency of one state on another, as written. */
+export interface Flow {
+  /** Whose result it is. */
+  from: string;
+  /** Whose input, or existence, depends on that. */
+  to: string;
+  /** `data` or `condition`. */
+  kind: string;
 }
 
 /** The world of a run, as far as its log tells it. */
