@@ -190,6 +190,12 @@ async function control() {
     return Number(pools[6]) >= 1;
   });
   step(`worker ${id} was killed, and is seen replaced`);
+  await page.click("[aria-label='Scale the pool path-planner']");
+  await axe(page, "the question how many");
+  await page.fill("dialog label:has-text('At least') input", "3");
+  await page.click("dialog button[value=yes]");
+  await until("a third planner", async () => (await page.locator("tbody tr").filter({ hasText: "path-planner-" }).filter({ hasText: "show" }).count()) >= 3);
+  step("a pool is scaled, once that was confirmed");
   await page.locator("tbody tr", { hasText: "path-planner" }).locator("button", { hasText: "show" }).first().click();
   await page.waitForSelector("pre");
   await axe(page, "hosts and pools");
@@ -228,7 +234,7 @@ async function control() {
 }
 
 async function replay(log) {
-  const shown = await dashboard([log, "--runtime-dir", join(PLACE, "nothing")]);
+  const shown = await dashboard([log, "crates/report/src/fixtures/incidents.jsonl", "--runtime-dir", join(PLACE, "nothing")]);
   const page = await open(shown.url);
   assert.equal(await page.locator("header .danger").count(), 0, "pages only look");
   await page.waitForFunction(() => document.querySelector("footer output").textContent.length > 3);
@@ -265,6 +271,13 @@ async function replay(log) {
     await page.waitForTimeout(300);
     await shot(page, `run-by-${by}`);
   }
+  await page.click("footer >> text=End");
+  await go(page, "compare");
+  await page.waitForFunction(() => document.querySelectorAll("main h2")[1]?.textContent.includes(":") && document.querySelectorAll("main canvas").length === 2);
+  await axe(page, "two runs below each other");
+  await page.waitForTimeout(1200);
+  await shot(page, "compare");
+  step("two logs are shown below each other");
   assert.deepEqual(page.problems, []);
   await page.context().close();
 

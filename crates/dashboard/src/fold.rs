@@ -29,6 +29,8 @@ pub(crate) struct Fold {
     pub(crate) run: Timeline,
     /// Its world.
     pub(crate) world: World,
+    /// Why it cannot be read on; empty where it can.
+    pub(crate) problem: String,
     /// The digest of the texts of its task.
     pub(crate) digest: String,
     /// The byte and the line behind what was read.
@@ -95,6 +97,7 @@ impl Fold {
             from_s: if byte == 0 { 0.0 } else { from.seconds() },
             run: Timeline::following(KEPT),
             world: World::default(),
+            problem: String::new(),
             digest: String::new(),
             position: (byte, 0),
             version: 0,
@@ -123,7 +126,19 @@ impl Fold {
         let mut lines = Lines::behind(path, self.position.0, self.position.1)?;
         let stop = self.position.0.saturating_add(most_bytes);
         while let Some(line) = lines.next() {
-            let line = line?;
+            let line = match line {
+                // What was before it is shown, and that it is wrong is said.
+                Err(error @ LogError::Foreign { .. }) if self.position.0 > 0 => {
+                    let from = if self.from_s > 0.0 {
+                        format!(", counted from {:.1} s on", self.from_s)
+                    } else {
+                        String::new()
+                    };
+                    self.problem = format!("{error}{from}");
+                    return Ok(true);
+                }
+                other => other?,
+            };
             if line.at > until {
                 return Ok(true);
             }

@@ -26,7 +26,7 @@ pub(crate) const HEADERS: [(&str, &str); 7] = [
     ("permissions-policy", "camera=(), microphone=(), geolocation=()"),
 ];
 
-/// What its user was given. Nobody sees it in a log.
+/// What its user was given. No message of this crate has it.
 pub(crate) struct Token(String);
 
 /// Why somebody is not answered.

@@ -14,6 +14,7 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use ratn_event_log::LogError;
 use ratn_model::id::InstanceId;
 use ratn_model::program::Program;
+use ratn_proto::types::Scale;
 use ratn_task_control::control::{self, Word};
 use ratn_worker::tls::ClientTls;
 use serde::Serialize;
@@ -272,7 +273,8 @@ impl Shown {
             (&Method::GET, "/api/system") => json(&self.system.told().await),
             (&Method::GET, "/api/tail") => self.tail(&query).await,
             (&Method::POST, "/api/control") => self.control(&query).await,
-            (_, "/api/control") => return not_allowed("POST"),
+            (&Method::POST, "/api/scale") => self.scale(&query).await,
+            (_, "/api/control" | "/api/scale") => return not_allowed("POST"),
             (_, "/api/about" | "/api/run" | "/api/task" | "/api/world" | "/api/system" | "/api/tail") => {
                 return not_allowed("GET");
             }
@@ -381,10 +383,36 @@ impl Shown {
         }
     }
 
+    /// Whether the pages may tell anybody anything.
+    fn only_looks(&self) -> Option<Answer> {
+        let problem = "these pages only look: `ratn dashboard --control` lets them steer runs and pools";
+        (!self.control).then(|| Answer::Refused(StatusCode::FORBIDDEN, problem.to_owned()))
+    }
+
+    async fn scale(&self, query: &Query<'_>) -> Answer {
+        if let Some(refusal) = self.only_looks() {
+            return refusal;
+        }
+        let number = |name: &str| match query.text(name).as_str() {
+            "" => Ok(None),
+            text => text.parse().map(Some).map_err(|_| format!("`{name}={text}` is no number of workers")),
+        };
+        let scale = match (number("min"), number("max"), number("spares")) {
+            (Ok(min), Ok(max), Ok(spares)) => Scale { min, max, spares },
+            (Err(problem), _, _) | (_, Err(problem), _) | (_, _, Err(problem)) => {
+                return Answer::Refused(StatusCode::BAD_REQUEST, problem);
+            }
+        };
+        let template = query.text("template");
+        match self.system.scale(&query.text("host"), &template, scale).await {
+            Ok(()) => json(&wire::Told { said: format!("The pool {template} is scaled.") }),
+            Err(problem) => Answer::Refused(StatusCode::CONFLICT, problem),
+        }
+    }
+
     async fn control(&self, query: &Query<'_>) -> Answer {
-        if !self.control {
-            let problem = "these pages only look: `ratn dashboard --control` lets them pause, step and end a run";
-            return Answer::Refused(StatusCode::FORBIDDEN, problem.to_owned());
+        if let Some(refusal) = self.only_looks() {
+            return refusal;
         }
         let (word, said) = match query.text("word").as_str() {
             "pause" => (Word::Pause, "The run is paused: no further motion begins."),

@@ -7,7 +7,7 @@ use crate::wire;
 use futures::future::join_all;
 use ratn_daemon::{process_manager, resource_manager};
 use ratn_model::program::WORLD_MODEL;
-use ratn_proto::types::{HostPools, PoolStatus, Resource, SessionStatus, WaitingAcquire, WorkerStatus};
+use ratn_proto::types::{HostPools, PoolStatus, Resource, Scale, SessionStatus, WaitingAcquire, WorkerStatus};
 use ratn_task_control::control::{self, RunStatus, Word};
 use ratn_worker::client::{CallError, Channels, ProcessClient, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
@@ -106,14 +106,7 @@ impl System {
         let (resources, waiting) = tokio::try_join!(client.list(&[]), client.explain(""))?;
         // Who may not list sessions sees the rest.
         let sessions = client.sessions().await.unwrap_or_default();
-        let registered = resources.iter().filter(|one| one.kind == process_manager::HOST_KIND);
-        let mut hosts: Vec<(String, Endpoint)> =
-            registered.filter_map(|one| Some((one.host.clone(), one.endpoint().parse().ok()?))).collect();
-        if let Ok(own) = directory.find(process_manager::ROLE)
-            && hosts.iter().all(|(_, endpoint)| *endpoint != own)
-        {
-            hosts.push((String::new(), own));
-        }
+        let hosts = hosts_in(directory, &resources);
         let mut hosts = join_all(hosts.into_iter().map(|(name, endpoint)| self.host(name, endpoint))).await;
         hosts.sort_by(|a, b| a.name.cmp(&b.name));
         let expires: BTreeMap<&str, u64> = sessions.iter().map(|one| (one.id.as_str(), one.expires_in_ms)).collect();
@@ -143,18 +136,42 @@ impl System {
         wire::Host { name, problem, ..wire::Host::default() }
     }
 
+    /// Every process manager there is.
+    async fn hosts(&self, directory: &RuntimeDirectory) -> Result<Vec<(String, Endpoint)>, CallError> {
+        let listed = match directory.find(resource_manager::ROLE) {
+            Ok(manager) => {
+                ResourceClient::new(&self.channels, &manager, "")?.list(&[process_manager::HOST_KIND]).await?
+            }
+            Err(_) => Vec::new(),
+        };
+        Ok(hosts_in(directory, &listed))
+    }
+
+    /// Changes how many workers a pool has.
+    pub(crate) async fn scale(&self, host: &str, template: &str, scale: Scale) -> Result<(), String> {
+        let directory = RuntimeDirectory::at(&self.directory);
+        let scaling = async {
+            let hosts = self.hosts(&directory).await?;
+            let Some((_, endpoint)) = hosts.into_iter().find(|(name, _)| name == host) else { return Ok(false) };
+            ProcessClient::new(&self.channels, &endpoint)?.scale(template, scale).await?;
+            Ok::<bool, CallError>(true)
+        };
+        let scaled = tokio::time::timeout(PATIENCE, scaling).await;
+        // What it is now is asked at once.
+        *self.seen.lock().await = None;
+        match scaled {
+            Ok(Ok(true)) => Ok(()),
+            Ok(Ok(false)) => Err(format!("there is no host {host}")),
+            Ok(Err(error)) => Err(error.to_string()),
+            Err(_) => Err(format!("no answer from {host} within {} s", PATIENCE.as_secs())),
+        }
+    }
+
     /// The end of what a worker has written.
     pub(crate) async fn tail(&self, worker: &str) -> Result<wire::Tail, String> {
         let directory = RuntimeDirectory::at(&self.directory);
         let reading = async {
-            let mut hosts = Vec::new();
-            if let Ok(manager) = directory.find(resource_manager::ROLE) {
-                let client = ResourceClient::new(&self.channels, &manager, "")?;
-                let listed = client.list(&[process_manager::HOST_KIND]).await?;
-                hosts.extend(listed.iter().filter_map(|one| one.endpoint().parse::<Endpoint>().ok()));
-            }
-            hosts.extend(directory.find(process_manager::ROLE).ok().filter(|own| !hosts.contains(own)));
-            for endpoint in hosts {
+            for (_, endpoint) in self.hosts(&directory).await? {
                 match ProcessClient::new(&self.channels, &endpoint)?.log(worker, false).await {
                     Ok(mut pieces) => {
                         let (mut text, mut read) = (Vec::new(), 0);
@@ -185,6 +202,19 @@ impl System {
             None => Err(format!("no host has a log of {worker}")),
         }
     }
+}
+
+/// The hosts among resources, and this one, which may not have come as far as the resource manager.
+fn hosts_in(directory: &RuntimeDirectory, resources: &[Resource]) -> Vec<(String, Endpoint)> {
+    let registered = resources.iter().filter(|one| one.kind == process_manager::HOST_KIND);
+    let mut hosts: Vec<(String, Endpoint)> =
+        registered.filter_map(|one| Some((one.host.clone(), one.endpoint().parse().ok()?))).collect();
+    if let Ok(own) = directory.find(process_manager::ROLE)
+        && hosts.iter().all(|(_, endpoint)| *endpoint != own)
+    {
+        hosts.push((String::new(), own));
+    }
+    hosts
 }
 
 fn resource(one: &Resource, expires: &BTreeMap<&str, u64>) -> wire::Resource {

@@ -16,7 +16,7 @@ const MOST_DEPTH: usize = 16;
 /// As the pages know it.
 pub(crate) fn told(program: &Program) -> wire::Task {
     let shown = |state: &&State| is_shown(state);
-    let states = program.states.iter().filter(shown).take(MOST);
+    let states = program.states.iter().filter(shown).filter(|state| !is_within_routine(program, state)).take(MOST);
     let mut flows = BTreeSet::new();
     for state in &program.states {
         add_flows(program, state, &mut flows);
@@ -41,6 +41,18 @@ fn is_shown(state: &State) -> bool {
     state.is_routine() || matches!(state.kind, StateKind::Action { .. } | StateKind::Condition { .. })
 }
 
+/// It is executed as a part of a routine, which is one node.
+fn is_within_routine(program: &Program, state: &State) -> bool {
+    let mut around = state.parent.map(|id| program.state(id));
+    while let Some(outer) = around {
+        if outer.is_routine() {
+            return true;
+        }
+        around = outer.parent.map(|id| program.state(id));
+    }
+    false
+}
+
 fn kind(state: &State) -> &'static str {
     match state.kind {
         StateKind::Condition { .. } => "condition",
@@ -56,8 +68,8 @@ fn add_flows(program: &Program, state: &State, flows: &mut BTreeSet<Flow>) {
         let (to, kind) = match slot {
             // The outputs and variables of what contains others are looked up by whoever reads them.
             Slot::Output(_) | Slot::Variable(_) => continue,
-            // What it comes to decides which of those inside there are.
-            Slot::Collection | Slot::While => (inside(program, state), "condition"),
+            // What it comes to decides which of those inside there are; the others stand behind those where each visit begins.
+            Slot::Collection | Slot::While => (entries(program, state), "condition"),
             _ if is_shown(state) => (vec![state.id], "data"),
             _ => continue,
         };
@@ -81,6 +93,16 @@ fn inside(program: &Program, state: &State) -> Vec<StateId> {
         }
     }
     found
+}
+
+/// The states that are shown where what a state contains begins.
+fn entries(program: &Program, state: &State) -> Vec<StateId> {
+    let first = state.lists().into_iter().filter_map(|list| list.first().copied());
+    let entry = |id: StateId| {
+        let state = program.state(id);
+        if is_shown(state) { vec![id] } else { entries(program, state) }
+    };
+    first.flat_map(entry).collect()
 }
 
 /// The states that are shown whose results an expression in a state is made of.
@@ -141,7 +163,7 @@ mod tests {
         };
         assert!(has("for_box/plan_approach", "for_box/move_approach", "data"), "{:?}", task.flows);
         // How many boxes there are is known when the table is segmented.
-        assert!(has("segment_table", "for_box/plan_approach", "condition"), "{:?}", task.flows);
+        assert!(has("segment_table", "for_box/detect_pose", "condition"), "{:?}", task.flows);
         assert!(task.flows.iter().all(|flow| flow.from != flow.to));
     }
 }

@@ -30,7 +30,7 @@ pub(crate) fn frame(fold: &Fold, news: &News, about: Option<InstanceId>) -> wire
         version: news.version,
         fresh: news.fresh,
         more: news.more,
-        run: whole(run, fold.from_s),
+        run: wire::Run { problem: cut(&fold.problem), ..whole(run, fold.from_s) },
         instances: changed.map(|one| instance(fold, one)).collect(),
         gone: news.gone.iter().map(|id| id.0).collect(),
         waiting: waiting(run, about),

@@ -146,6 +146,8 @@ wire! {
         outcome: Option<String>,
         /// Why it ended so; empty for a success.
         reason: String,
+        /// Why the log cannot be read on; empty where it can.
+        problem: String,
         /// From which moment on the log was read: 0 unless it is long.
         from_s: f64,
         /// The moment that is shown.

@@ -240,6 +240,18 @@ async fn a_moment_is_shown_as_it_was_then_and_goes_on_from_there() {
 }
 
 #[tokio::test]
+async fn what_is_before_a_line_that_does_not_read_is_shown_and_the_line_is_named() {
+    let lines = [vec![started("torn")], visit(1).to_vec(), vec!["{}".to_owned()], visit(2).to_vec()].concat();
+    let file = log_of(&lines);
+    let served = serve(&[file.path()], false).await;
+    let log = served.log().await;
+    let frame = served.frames(&format!("log={log}")).await.pop().unwrap();
+    assert_eq!(frame["run"]["expanded"], 1);
+    let problem = frame["run"]["problem"].as_str().unwrap();
+    assert!(problem.contains(":6: not a line of an event log: it has no time `at`"), "{problem}");
+}
+
+#[tokio::test]
 async fn of_a_long_log_what_is_shown_is_read() {
     // 60 MiB; each visit has a line of 256 KiB, as trajectories are.
     let ballast = "x".repeat(256 << 10);
@@ -302,12 +314,15 @@ async fn pages_only_look_unless_their_user_said_otherwise() {
     let refused = served.ask("POST", "/api/control?log=1&word=pause").await;
     assert_eq!(refused.status, 403);
     assert!(refused.json()["problem"].as_str().unwrap().contains("--control"), "{}", refused.body);
+    assert_eq!(served.ask("POST", "/api/scale?host=h&template=t&min=0").await.status, 403);
     let served = serve(&[&two_boxes()], true).await;
     let log = served.log().await;
     for (path, status) in [
         (format!("/api/control?log={log}&word=pause"), 409),
         (format!("/api/control?log={log}&word=fly"), 400),
         ("/api/control?word=pause".to_owned(), 409),
+        ("/api/scale?host=h&template=t&min=-1".to_owned(), 400),
+        ("/api/scale?host=h&template=t&min=1".to_owned(), 409),
     ] {
         assert_eq!(served.ask("POST", &path).await.status, status, "{path}");
     }

@@ -37,6 +37,15 @@ pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(),
     })
 }
 
+/// The pages of a system that is up, to look at only; the address is said.
+pub(super) async fn of_system(directory: &Path, tls: &ClientTls) -> anyhow::Result<Dashboard> {
+    let catalogue = catalogue(directory).map_err(|failure| anyhow::anyhow!("{failure}"))?;
+    let options = Options { tasks: tasks(catalogue), ..Options::of(directory.to_owned(), tls.clone()) };
+    let dashboard = Dashboard::bind(options).await?;
+    output::progress(format_args!("its dashboard is at {}", dashboard.url()));
+    Ok(dashboard)
+}
+
 /// That of the system that runs, or ran, in a directory; else the one that is built in.
 fn catalogue(directory: &Path) -> Result<Catalogue, Failure> {
     let file = directory.join(CONFIG_FILE);

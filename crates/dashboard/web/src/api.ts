@@ -47,5 +47,7 @@ export const api = {
   world: (log: number, at: number | null, epoch: number, filter: string) => ask<World>("world", { log, at, epoch, filter }),
   system: () => ask<System>("system", {}),
   tail: (worker: string) => ask<Tail>("tail", { worker }),
+  scale: (host: string, template: string, min: string, max: string, spares: string) =>
+    ask<Told>("scale", { host, template, min, max, spares }, "POST"),
   control: (log: number, word: string) => ask<Told>("control", { log, word }, "POST"),
 };

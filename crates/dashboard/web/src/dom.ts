@@ -80,6 +80,10 @@ export function count(value: number): string {
   return WHOLE.format(value);
 }
 
+export function percent(value: number): string {
+  return `${SECONDS[1]?.format(value) ?? ""}\u00a0%`;
+}
+
 export function bytes(value: number): string {
   return `${SECONDS[1]?.format(value / (1 << 20)) ?? ""}\u00a0MiB`;
 }

@@ -42,6 +42,8 @@ export class Gantt implements Painter {
   private size = { width: 1, height: 1, label: 150 };
   /** The user has not chosen a part of the time: all of it is shown as it grows. */
   follows = true;
+  /** Another chart that shows the same time. */
+  beside: Gantt | null = null;
 
   constructor(
     private readonly store: Store,
@@ -134,7 +136,7 @@ export class Gantt implements Painter {
       context.fillStyle = colour("line");
       context.fillRect(0, top + tall - 0.5, width, 0.5);
       context.fillStyle = colour("ink");
-      context.fillText(fitted(context, row.name, label - 12, true), 6, top + LANE / 2 + 1);
+      context.fillText(this.label(context, row.name), 6, top + LANE / 2 + 1);
     }
     context.beginPath();
     context.rect(label, AXIS, width - label, height - AXIS);
@@ -146,6 +148,13 @@ export class Gantt implements Painter {
     context.fillStyle = colour("bad");
     context.fillRect(now, AXIS, 1, height);
     context.restore();
+  }
+
+  /** Where there is little room, a resource without its host. */
+  private label(context: CanvasRenderingContext2D, name: string): string {
+    const room = this.size.label - 12;
+    const short = this.by === "resource" && context.measureText(name).width > room ? name.replace(/@[^@]*$/, "") : name;
+    return fitted(context, short, room, true);
   }
 
   private paintAxis(context: CanvasRenderingContext2D): void {
@@ -250,14 +259,17 @@ export class Gantt implements Painter {
   fit(): void {
     this.follows = true;
     const from = this.store.run?.from_s ?? 0;
-    [this.from, this.to] = [from, from + Math.max((this.store.at - from) * 1.02, 1)];
+    const until = Math.max(this.store.at, this.beside?.store.at ?? 0);
+    [this.from, this.to] = [from, from + Math.max((until - from) * 1.02, 1)];
+    if (this.beside !== null) this.beside.follows = true;
   }
 
   private show(from: number, to: number): void {
-    const last = Math.max(this.store.run?.last_s ?? 0, this.store.at, 1);
+    const last = Math.max(this.store.run?.last_s ?? 0, this.store.at, this.beside?.store.at ?? 0, 1);
     const length = Math.max(Math.min(to - from, last * 4), 1e-3);
     const begin = Math.max(-length / 2, Math.min(from, last));
     [this.from, this.to] = [begin, begin + length];
+    if (this.beside !== null) [this.beside.from, this.beside.to, this.beside.follows] = [this.from, this.to, false];
   }
 
   step(direction: "left" | "right" | "up" | "down"): number | null {

@@ -1,16 +1,17 @@
 // The dashboard: which page is shown, of which log, at which moment, and asking for what has changed.
 
 import { Refused, api, takeToken } from "./api";
+import { confirm } from "./confirm";
 import { count, fill, h, seconds } from "./dom";
-import { type Page, type Site, hostsPage, networkPage, resourcesPage, runPage, worldPage } from "./pages";
+import { type Page, type Site, comparePage, hostsPage, networkPage, resourcesPage, runPage, worldPage } from "./pages";
 import { Store } from "./store";
 import { applyTheme, nextTheme, theme } from "./theme";
-import type { About, Run } from "./wire";
+import type { About, Run, Told } from "./wire";
 
 const PERIOD_MS = 300;
 const SLOW_MS = 1_000;
 const SPEEDS = [0.5, 1, 2, 5, 10, 50, 200];
-const NAMES = { run: "Run", network: "Network", resources: "Resources", hosts: "Hosts and pools", world: "World" } as const;
+const NAMES = { run: "Run", network: "Network", resources: "Resources", hosts: "Hosts and pools", world: "World", compare: "Compare" } as const;
 type Name = keyof typeof NAMES;
 
 takeToken();
@@ -30,6 +31,9 @@ let wake: (() => void) | null = null;
 const site: Site = {
   store,
   log: () => log,
+  logs: () => about?.logs ?? [],
+  controls: () => about?.control ?? false,
+  told,
   moment: () => moment,
   choose: (id) => {
     store.selected = id < 0 ? null : id;
@@ -45,8 +49,9 @@ const pages: Record<Name, Page> = {
   run: runPage(site),
   network: networkPage(site),
   resources: resourcesPage(site),
-  hosts: hostsPage(),
+  hosts: hostsPage(site),
   world: worldPage(site),
+  compare: comparePage(site),
 };
 page = pages.run;
 
@@ -195,7 +200,7 @@ function showControls(run: Run): void {
     return;
   }
   const button = (word: string, text: string, question: string, kind = "") =>
-    h("button", { class: kind, "data-key": word, onclick: () => confirm(word, text, question) }, text);
+    h("button", { class: kind, "data-key": word, onclick: () => ask(word, text, question) }, text);
   fill(
     controls,
     run.paused
@@ -207,31 +212,22 @@ function showControls(run: Run): void {
 }
 
 /** Nothing is told to a run that its user has not confirmed. */
-function confirm(word: string, text: string, question: string): void {
+function ask(word: string, text: string, question: string): void {
   const of = log;
   if (of === null) return;
-  const yes = h("button", { class: word === "abort" ? "danger" : "first", value: "yes" }, text);
-  const dialog = h(
-    "dialog",
-    { "aria-labelledby": "question" },
-    h("h2", { id: "question" }, `${text}?`),
-    h("p", {}, `${store.run?.task ?? ""}: ${question}`),
-    h("div", { class: "row" }, yes, h("button", { value: "no", onclick: () => dialog.close() }, "Cancel")),
+  confirm(`${text}?`, text, [h("p", {}, `${store.run?.task ?? ""}: ${question}`)], word === "abort", () => told(api.control(of, word)));
+}
+
+/** Says what came of it. */
+function told(answer: Promise<Told>): void {
+  answer.then(
+    ({ said }) => {
+      say(said);
+      complain("");
+      hurry();
+    },
+    (error: unknown) => complain(error instanceof Error ? error.message : String(error)),
   );
-  yes.addEventListener("click", () => {
-    dialog.close();
-    api.control(of, word).then(
-      (told) => {
-        say(told.said);
-        complain("");
-        hurry();
-      },
-      (error: unknown) => complain(error instanceof Error ? error.message : String(error)),
-    );
-  });
-  dialog.addEventListener("close", () => dialog.remove());
-  document.body.append(dialog);
-  dialog.showModal();
 }
 
 let saidState = "";
@@ -259,6 +255,7 @@ function showSummary(run: Run): void {
     state,
     h("span", {}, `${count(run.retired)} of ${count(run.expanded - run.squashed)} known states have ended`),
     ahead,
+    run.problem !== "" && h("span", { class: "bad" }, run.problem),
     run.reason !== "" && h("span", { class: "bad" }, run.reason),
     run.from_s > 0 && h("span", { class: "warn" }, `read from ${seconds(run.from_s)} on: the log is long`),
     run.parameters.length > 0 && h("span", { class: "faint parameters", title: run.parameters.join("\n") }, run.parameters.join(", ")),

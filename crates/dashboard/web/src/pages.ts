@@ -1,12 +1,13 @@
 // The pages. Each has an element that is made once, and is told when something has changed.
 
 import { Refused, api } from "./api";
+import { confirm } from "./confirm";
 import { details, waitingList } from "./details";
-import { append, bytes, count, fill, h, sample, seconds, table } from "./dom";
+import { append, bytes, count, fill, h, percent, sample, seconds, table } from "./dom";
 import { type By, Gantt } from "./gantt";
 import { KINDS, type Level, Network } from "./network";
-import type { Store } from "./store";
-import type { System, World } from "./wire";
+import { Store } from "./store";
+import type { Host, Log, Pool, System, Told, World } from "./wire";
 import { View } from "./view";
 
 export interface Page {
@@ -24,6 +25,11 @@ export interface Page {
 export interface Site {
   readonly store: Store;
   log(): number | null;
+  logs(): Log[];
+  /** The pages may tell somebody something. */
+  controls(): boolean;
+  /** Says what came of it. */
+  told(answer: Promise<Told>): void;
   moment(): number | null;
   choose(id: number): void;
   go(page: string): void;
@@ -107,6 +113,80 @@ function runningList(site: Site): Node[] {
   ];
 }
 
+/** Two runs below each other, on one time axis. */
+export function comparePage(site: Site): Page {
+  const other = new Store();
+  const [upper, lower] = [new Gantt(site.store, "resource"), new Gantt(other, "resource")];
+  [upper.beside, lower.beside] = [lower, upper];
+  let of: number | null = null;
+  let known = "";
+  const views: View[] = [];
+  const repaint = () => views.forEach((view) => view.repaint());
+  // What moves one moves the other.
+  const both = (gantt: Gantt) => ({
+    paint: gantt.paint.bind(gantt),
+    at: gantt.at.bind(gantt),
+    pan: (dx: number, dy: number) => (gantt.pan(dx, dy), repaint()),
+    zoom: (factor: number, x: number) => (gantt.zoom(factor, x), repaint()),
+    fit: () => (gantt.fit(), repaint()),
+    step: gantt.step.bind(gantt),
+  });
+  const choose = (store: Store) => (id: number) => {
+    store.selected = id < 0 ? null : id;
+    repaint();
+  };
+  views.push(
+    new View(`Gantt chart of the run. ${KEYS}`, both(upper), choose(site.store), choose(site.store)),
+    new View(`Gantt chart of the other run. ${KEYS}`, both(lower), choose(other), choose(other)),
+  );
+  const select = h("select", {});
+  select.addEventListener("change", () => {
+    of = Number(select.value);
+    other.clear();
+    void follow().catch(() => undefined);
+  });
+  const heads = [h("h2", {}), h("h2", {})] as const;
+  const head = (store: Store) => {
+    const run = store.run;
+    return run === null ? "" : `${run.task}, ${run.mode}: ${seconds(run.at_s)}${run.outcome === null ? "" : `, ${run.outcome}`}`;
+  };
+  const difference = h("p", { class: "faint" });
+  const show = () => {
+    const logs = site.logs().filter((one) => one.id !== site.log());
+    const text = JSON.stringify(logs);
+    if (text !== known) {
+      known = text;
+      if (!logs.some((one) => one.id === of)) {
+        of = logs[0]?.id ?? null;
+        other.clear();
+      }
+      fill(select, ...logs.map((one) => h("option", { value: one.id, title: one.path, selected: one.id === of }, one.name)));
+      select.disabled = logs.length === 0;
+    }
+    heads[0].textContent = head(site.store);
+    heads[1].textContent = of === null ? "There is no other log: name several to `ratn dashboard`." : head(other);
+    const [a, b] = [site.store.run, other.run];
+    const ended = a !== null && b !== null && a.outcome !== null && b.outcome !== null && b.at_s > 0;
+    const share = ended ? (1 - a.at_s / b.at_s) * 100 : 0;
+    difference.textContent = ended ? `The upper one is ${percent(Math.abs(share))} ${share >= 0 ? "shorter" : "longer"}.` : "";
+    repaint();
+  };
+  const follow = async () => {
+    if (of === null) return;
+    for (let more = true; more; ) {
+      const asked: number = of;
+      const frame = await api.run(asked, site.moment(), other.frame?.epoch ?? 0, other.frame?.version ?? 0, other.selected);
+      if (asked !== of) return;
+      other.apply(frame);
+      more = frame.more;
+    }
+    show();
+  };
+  const stage = h("div", { class: "stage two" }, h("div", { class: "row" }, h("label", {}, "Below it ", select), difference), heads[0]);
+  append(stage, [views[0]?.element, heads[1], views[1]?.element]);
+  return { element: h("main", { id: "page", tabindex: -1 }, stage), wide: true, begin: show, update: show, poll: follow };
+}
+
 export function networkPage(site: Site): Page {
   const { store } = site;
   const network = new Network(store);
@@ -166,7 +246,7 @@ export function networkPage(site: Site): Page {
     h("button", { onclick: () => (network.fit(), view.repaint()) }, "All of it"),
     tree,
   );
-  const legend = h("div", { class: "row legend" }, "depends on: ", ...edges, h("span", {}, "dashed: speculative, faded: discarded"));
+  const legend = h("div", { class: "row legend" }, "depends on: ", ...edges, h("span", { class: "more" }, "dashed: speculative, faded: discarded"));
   let known = "";
   const note = h("span", { class: "warn" });
   legend.append(note);
@@ -270,7 +350,24 @@ export function resourcesPage(site: Site): Page {
   };
 }
 
-export function hostsPage(): Page {
+/** Asks how many workers a pool shall have. */
+function scaleButton(site: Site, host: Host, pool: Pool): HTMLElement {
+  const field = (text: string, value: number) => {
+    const input = h("input", { type: "number", min: 0, max: 1000, value, size: 6 });
+    return { input, label: h("label", {}, `${text} `, input) };
+  };
+  const ask = () => {
+    const [least, most, spares] = [field("At least", pool.min), field("At most", pool.max), field("Spares", pool.spares)];
+    const text = `Until the process manager of ${host.name} ends, within what its config allows. Workers beyond that end once nobody holds them.`;
+    const content = [h("p", {}, text), h("div", { class: "row" }, least.label, most.label, spares.label)];
+    confirm(`How many workers shall ${pool.template} have?`, "Scale the pool", content, false, () =>
+      site.told(api.scale(host.name, pool.template, least.input.value, most.input.value, spares.input.value)),
+    );
+  };
+  return h("button", { "data-key": `scale ${host.name} ${pool.template}`, "aria-label": `Scale the pool ${pool.template}`, onclick: ask }, "scale");
+}
+
+export function hostsPage(site: Site): Page {
   const hosts = h("section", { "aria-label": "Hosts" });
   const log = h("section", { "aria-label": "Output of a worker", "aria-live": "polite" });
   let of: string | null = null;
@@ -298,8 +395,8 @@ export function hostsPage(): Page {
         h("p", { class: host.problem === "" ? "faint" : "bad" }, `${state}; its workers use ${seconds(cpu / 1000, 2).replace(/\u00a0s$/, "")} cores and ${bytes(memory)}`),
         table(
           `Pools of ${host.name}`,
-          ["pool", "kind", "workers", "least", "most", "spares", "restarts after crashes", "last end", "trouble"],
-          host.pools.map((pool) => [pool.template, pool.kind, count(pool.workers.length), count(pool.min), count(pool.max), count(pool.spares), count(pool.crashes), pool.last_exit, pool.failure]),
+          ["pool", "kind", "workers", "least", "most", "spares", "restarts after crashes", "last end", "trouble", ...(site.controls() ? ["size"] : [])],
+          host.pools.map((pool) => [pool.template, pool.kind, count(pool.workers.length), count(pool.min), count(pool.max), count(pool.spares), count(pool.crashes), pool.last_exit, pool.failure, ...(site.controls() ? [scaleButton(site, host, pool)] : [])]),
           [2, 3, 4, 5, 6],
         ),
         table(

@@ -72,6 +72,8 @@ export interface Run {
   outcome: string | null;
   /** Why it ended so; empty for a success. */
   reason: string;
+  /** Why the log cannot be read on; empty where it can. */
+  problem: string;
   /** From which moment on the log was read: 0 unless it is long. */
   from_s: number;
   /** The moment that is shown. */
