@@ -251,6 +251,24 @@ async function replay(log) {
   await page.click("footer >> text=Stop");
   await shot(page, "replay");
 
+  // What is pointed at says what it did and what it waited for; a click goes to its node.
+  const canvas = await page.locator("canvas").boundingBox();
+  let hint = "";
+  for (let x = 180; x < canvas.width && !hint.includes("waited"); x += 8) {
+    for (const y of [32, 52, 72]) {
+      await page.mouse.move(canvas.x + x, canvas.y + y);
+      if (await page.locator(".tip").isVisible()) hint = await page.locator(".tip").textContent();
+      if (hint.includes("waited")) break;
+    }
+  }
+  assert.match(hint, /waited [\d.]+\s?s for /, "a hint says what was waited for");
+  await page.mouse.down();
+  await page.mouse.up();
+  await page.waitForFunction(() => location.hash === "#/network");
+  assert.ok(hint.startsWith(await page.locator("[data-chosen]").textContent()), hint);
+  step(`pointed at, a bar says: ${hint.split("\n").join("; ")}`);
+  await go(page, "run");
+
   // By keys alone: the chart is reached, a bar chosen and its node opened.
   await page.locator("canvas").focus();
   await page.keyboard.press("ArrowRight");

@@ -58,12 +58,7 @@ impl System {
         }
         let status = control::status(&self.directory).await;
         *asked = Some(Instant::now());
-        let mut status = status?;
-        if let Some(status) = status.as_mut().filter(|status| status.log.is_relative()) {
-            // It is named as from where the run was started, which nobody but the run knows.
-            status.log = std::fs::canonicalize(&status.log).unwrap_or_else(|_| status.log.clone());
-        }
-        Ok(status)
+        status
     }
 
     /// Tells its run.

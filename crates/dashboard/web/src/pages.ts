@@ -166,7 +166,7 @@ export function comparePage(site: Site): Page {
     heads[0].textContent = head(site.store);
     heads[1].textContent = of === null ? "There is no other log: name several to `ratn dashboard`." : head(other);
     const [a, b] = [site.store.run, other.run];
-    const ended = a !== null && b !== null && a.outcome !== null && b.outcome !== null && b.at_s > 0;
+    const ended = a?.outcome === "success" && b?.outcome === "success" && a.task === b.task && b.at_s > 0;
     const share = ended ? (1 - a.at_s / b.at_s) * 100 : 0;
     difference.textContent = ended ? `The upper one is ${percent(Math.abs(share))} ${share >= 0 ? "shorter" : "longer"}.` : "";
     repaint();
