@@ -20,7 +20,7 @@ pub(crate) use operating::{
 pub(crate) use roles::{CellArguments, KeptRoleArguments, RoleArguments, WorkerArguments, WorkerKind};
 pub(crate) use systems::{Budget, DemoArguments, GoodsArguments, ResetArguments, SystemArguments, UpArguments};
 pub(crate) use tasks::{
-    CheckArguments, CompletionsArguments, ControlArguments, DrawingArgument, ExportArguments, FormatArgument,
+    CheckArguments, CompletionsArguments, ControlArguments, DashboardArguments, DrawingArgument, ExportArguments, FormatArgument,
     JsonArgument, ManArguments, ModeArgument, PlanArguments, ReportArguments, RobotArguments, RobotCommand,
     RowArgument, RunArguments, SimulateArguments, StatusArguments, TablesArguments, TopArguments, WordArgument,
 };
@@ -50,6 +50,8 @@ pub(crate) enum Command {
     Ps(PsArguments),
     /// Watch a whole system: its run, who holds what and who waits for what, workers, hosts with CPU and memory
     Top(TopArguments),
+    /// Show runs, live and replayed, and a whole system as pages in a browser on this machine
+    Dashboard(DashboardArguments),
     /// Print the output of a worker on any host
     Logs(LogsArguments),
     /// Start and end workers of a host's pools, and change how many there are

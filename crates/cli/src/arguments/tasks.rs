@@ -3,6 +3,7 @@
 use super::values::{at_least_one, chart, makespan, padding, setting, share, speed};
 use clap::{Args, Subcommand, ValueEnum};
 use ratn_task_control::checkpoint::EVERY_EVENTS;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 /// How tasks are executed, on the command line.
@@ -149,6 +150,22 @@ pub(crate) struct TopArguments {
     #[arg(long)]
     pub(crate) once: bool,
     /// Where the endpoint files of the system are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct DashboardArguments {
+    /// Event logs; the log of a run that is under way in the system joins them, also of one that begins later
+    #[arg(value_name = "LOG")]
+    pub(crate) logs: Vec<PathBuf>,
+    /// Let the pages pause a run, let it step and go on, and end it; without it they only look
+    #[arg(long)]
+    pub(crate) control: bool,
+    /// Where pages are served: an address of this machine alone, with port 0 at one that is free
+    #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:0")]
+    pub(crate) listen: SocketAddr,
+    /// Where the endpoint files of the system are; it need not be up
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
 }

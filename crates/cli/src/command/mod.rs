@@ -5,6 +5,7 @@ mod certs;
 mod check;
 mod completions;
 mod control;
+mod dashboard;
 mod demo;
 pub(crate) mod doctor;
 mod export;
@@ -68,6 +69,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Completions(arguments) => completions::run(&arguments),
         Command::Man(arguments) => completions::man(&arguments),
         Command::Top(arguments) => top::run(&arguments, tls),
+        Command::Dashboard(arguments) => dashboard::run(&arguments, tls),
         Command::Export(arguments) => export::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
