@@ -262,12 +262,6 @@ impl Fact {
     }
 }
 
-/// A value as task files write it: `pose(1, 0, 0.7)`, `[1, 2]`.
-#[pyfunction]
-pub(crate) fn as_written(value: &Bound<'_, PyAny>) -> PyResult<String> {
-    Ok(from_python(value)?.to_string())
-}
-
 /// A value as Python has it.
 pub(crate) fn to_python<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>> {
     Ok(match value {

@@ -14,6 +14,9 @@ pub(crate) struct UpArguments {
     /// Where the endpoint files go
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
+    /// End when standard input ends, because the process that started this one is gone
+    #[arg(long)]
+    pub(crate) exit_with_parent: bool,
     #[command(flatten)]
     pub(crate) system: SystemArguments,
 }
