@@ -86,6 +86,7 @@ impl Pose {
         Pose(self.0.compose(&other.0))
     }
 
+    /// The pose of the reference, as seen from this one.
     fn inverse(&self) -> Pose {
         Pose(self.0.inverse())
     }

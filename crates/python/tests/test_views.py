@@ -48,7 +48,8 @@ def test_why_says_what_waited_for_what(log: ratn.Log) -> None:
     why = log.why("fetch[1]/plan")
     assert len(why) == 1 and why[0]["path"] == "fetch[1]/plan"
     said = str(why)
-    assert "waiting for" in said and "was held by" in said and "fetch/plan" in said, said
+    assert "asking for 10.10 s" in said and "path-planner-1@compute was held by fetch[0]/plan" in said, said
+    assert "waiting for" in str(log.why("fetch[1]/move"))
     # By its last name, all visits.
     assert {visit["path"] for visit in log.why("plan")} >= {"fetch[1]/plan", "fetch/plan"}
     with pytest.raises(ratn.NotFound, match="no state of the run is called `mvoe`.*fetch/move"):
@@ -100,7 +101,7 @@ def test_a_task_of_python_runs_and_is_looked_at_as_it_was(system: ratn.System) -
     def look_and_open(times: int = 1) -> dict:  # type: ignore[type-arg]
         """Looks, and opens the hand."""
         for i in ratn.each(ratn.fn.range(times)):
-            pan_tilt.look_at(target=ratn.Pose(0.8, i * 0.1, 0.7), pia=True, effects=["pan_tilt_at(pan_tilt) = table"])
+            pan_tilt.look_at(target=ratn.fn.pose(0.8, i * 0.1, 0.7), pia=True, effects=["pan_tilt_at(pan_tilt) = table"])
         open = gripper.release(pia=True, effects=["hand_empty(gripper)"])
         del open
         return {"times": times}

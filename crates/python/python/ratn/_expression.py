@@ -67,7 +67,7 @@ def statements_at_work(file: str, line: int) -> list[ast.AST]:
     tree = _tree(file)
     if tree is None:
         return []
-    found = [
+    found: list[ast.AST] = [
         node for node in ast.walk(tree)
         if isinstance(node, (ast.stmt, ast.expr, ast.comprehension)) and _begins(node) <= line <= _ends(node)
     ]

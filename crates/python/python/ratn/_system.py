@@ -62,6 +62,7 @@ class Result:
 
     @property
     def is_success(self) -> bool:
+        """Whether the outcome is ``success``."""
         return self.outcome == "success"
 
 
@@ -242,9 +243,9 @@ class Run:
         manager = (self._system.runtime_dir / "resource-manager.endpoint").read_text().strip() if kinds else ""
         logs, ids = [], set()
         for number, (file, kind) in enumerate((one for one in kinds.items() for _ in range(each)), 1):
-            worker = f"{kind.lower()}-{os.getpid()}-{id(self) % 1_000_000}-{number}"
-            said = folder / f"{worker}.log"
-            command = [sys.executable, "-m", "ratn._step", file, "--id", worker, "--kind", kind, "--resource-manager", manager]
+            name = f"{kind.lower()}-{os.getpid()}-{id(self) % 1_000_000}-{number}"
+            said = folder / f"{name}.log"
+            command = [sys.executable, "-m", "ratn._step", file, "--id", name, "--kind", kind, "--resource-manager", manager]
             with said.open("wb") as output:
                 self._workers.append(
                     subprocess.Popen(
@@ -252,7 +253,7 @@ class Run:
                     )
                 )
             logs.append(said)
-            ids.add(worker)
+            ids.add(name)
         until = time.monotonic() + _READY_WITHIN_S
         try:
             while not ids <= {resource["id"] for resource in self._system.resources(*set(kinds.values()))}:
@@ -287,6 +288,7 @@ class Run:
 
     @property
     def under_way(self) -> bool:
+        """Whether it has not ended."""
         return self._process.poll() is None
 
     def messages(self) -> str:

@@ -518,6 +518,8 @@ class Loop(Block):
 
     __slots__ = ("_key", "_index")
     _FORM = "do"
+    _key: str
+    _index: str | None
 
     def test(self, condition: object) -> None:
         """The condition, said inside: it may speak of the states in the loop."""
@@ -527,7 +529,7 @@ class Loop(Block):
     def index(self) -> Value:
         """The number of the iteration, from 0."""
         if self._index is None:
-            self._index = self._node.body.setdefault("index", "iteration")
+            self._index = str(self._node.body.setdefault("index", "iteration"))
         return Value(f"${self._index}")
 
     def __exit__(self, kind: object, *exception: object) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import importlib
 import json
 import os
 import pathlib
@@ -34,7 +35,7 @@ class Records(list[dict[str, Any]]):
     def to_arrow(self) -> Any:
         """A ``pyarrow.Table`` with a column for each key."""
         try:
-            import pyarrow
+            pyarrow: Any = importlib.import_module("pyarrow")
         except ImportError:
             raise ImportError("`to_arrow` needs pyarrow: `pip install pyarrow`") from None
         return pyarrow.Table.from_pylist(list(self))

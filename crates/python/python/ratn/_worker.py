@@ -149,7 +149,21 @@ class Driver(Worker):
             raise ValueError("a driver moves something: it performs goals only for whoever holds it")
         if self._brakes is None:
             raise ValueError("the driver has no brakes: decorate a function with `@driver.brakes`, which returns when nothing moves")
-        self._serve(arguments, False, Driven(self._brakes, self._stop_file, self._standstill_s))
+        arguments = sys.argv[1:] if arguments is None else arguments
+        self._serve(_at_a_socket(arguments), False, Driven(self._brakes, self._stop_file, self._standstill_s))
+
+
+def _at_a_socket(arguments: list[str]) -> list[str]:
+    """With a Unix socket as the address, unless they say one: there the system knows who lets the driver move again."""
+    words = [word for argument in arguments for word in argument.split("=", 1)]
+    given = {name: value for name, value in zip(words, words[1:]) if name.startswith("--")}
+    manager, file = given.get("--resource-manager", ""), given.get("--endpoint-file", "")
+    socket = f"{file.removesuffix('.endpoint')}.sock" if file else ""
+    if not file and manager.startswith("unix:") and "--id" in given:
+        socket = str(pathlib.Path(manager.removeprefix("unix:")).parent / f"{given['--id']}.sock")
+    # A longer path is that of no socket.
+    is_one = bool(socket) and len(socket.encode()) < 108
+    return [*arguments, "--listen", f"unix:{socket}"] if is_one and "--listen" not in words else arguments
 
 
 def _name_of_script() -> str:
