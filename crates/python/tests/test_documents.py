@@ -13,7 +13,7 @@ import sys
 
 import pytest
 import ratn
-from conftest import ROOT, program
+from conftest import ROOT, TESTS, program
 
 NOTEBOOK = ROOT / "docs" / "python-tutorial.ipynb"
 
@@ -89,3 +89,13 @@ def test_everything_public_says_what_it_is() -> None:
             silent += [f"{name}.{key}" for key, value in members.items() if not (getattr(value, "__doc__", None) or "").strip()]
     assert not silent, silent
     assert os.path.exists(NOTEBOOK)
+
+
+def test_the_task_of_the_documentation_runs(tmp_path: pathlib.Path) -> None:
+    told = subprocess.run(
+        [sys.executable, str(TESTS / "tasks" / "visiting.py")], cwd=tmp_path, capture_output=True, text=True, timeout=200
+    )
+    assert told.returncode == 0, told.stderr
+    for part in ("Result(outcome='success', outputs={'seen': 2}", "/go (retired, success)", "waiting for"):
+        assert part in told.stdout, told.stdout
+    assert (tmp_path / "visiting.svg").read_text().startswith("<svg")
