@@ -51,7 +51,7 @@ def test_why_says_what_waited_for_what(log: ratn.Log) -> None:
     assert "asking for 10.10 s" in said and "path-planner-1@compute was held by fetch[0]/plan" in said, said
     assert "waiting for" in str(log.why("fetch[1]/move"))
     # By its last name, all visits.
-    assert {visit["path"] for visit in log.why("plan")} >= {"fetch[1]/plan", "fetch/plan"}
+    assert {visit["path"] for visit in log.why("plan")} >= {"fetch[1]/plan", "when_empty/plan"}
     with pytest.raises(ratn.NotFound, match="no state of the run is called `mvoe`.*fetch/move"):
         log.why("mvoe")
 
