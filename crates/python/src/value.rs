@@ -137,6 +137,18 @@ impl Joints {
         self.0.clone()
     }
 
+    /// What numpy makes an array of without a copy, which cannot be written to: the array keeps this alive, and nothing moves it.
+    #[getter]
+    fn __array_interface__<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let order = if cfg!(target_endian = "little") { "<" } else { ">" };
+        let told = PyDict::new(py);
+        told.set_item("version", 3)?;
+        told.set_item("shape", (self.0.len(),))?;
+        told.set_item("typestr", format!("{order}f8"))?;
+        told.set_item("data", (self.0.as_ptr() as usize, true))?;
+        Ok(told)
+    }
+
     fn __eq__(&self, other: &Joints) -> bool {
         self.0 == other.0
     }

@@ -99,3 +99,13 @@ def test_the_task_of_the_documentation_runs(tmp_path: pathlib.Path) -> None:
     for part in ("Result(outcome='success', outputs={'seen': 2}", "/go (retired, success)", "waiting for"):
         assert part in told.stdout, told.stdout
     assert (tmp_path / "visiting.svg").read_text().startswith("<svg")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("rapidocr_onnxruntime") is None, reason="no rapidocr-onnxruntime: only the newest interpreter has it, where pip does")
+def test_a_model_of_a_package_works_while_the_arm_moves(tmp_path: pathlib.Path) -> None:
+    told = subprocess.run(
+        [sys.executable, str(TESTS / "tasks" / "labels.py")], cwd=tmp_path, capture_output=True, text=True, timeout=200
+    )
+    assert told.returncode == 0, told.stderr
+    assert "SCREWS" in told.stdout, told.stdout
+    assert "'surely': 'yes'" in told.stdout, told.stdout

@@ -79,8 +79,9 @@ def test_a_resource_is_held_for_a_block_and_nobody_else_gets_it(system: ratn.Sys
     with system.acquire("Camera", holder="a test") as lease:
         assert lease.alive and [kind for _, kind, _ in lease.resources] == ["Camera"]
         assert [resource["held"] for resource in system.resources("Camera")] == [True]
-        with pytest.raises(ratn.DeadlineExceeded):
+        with pytest.raises(ratn.DeadlineExceeded) as late:
             system.acquire("Camera", timeout_s=0.2)
+        assert late.value.code == "DEADLINE_EXCEEDED" and "Camera" in str(late.value)
     assert [resource["held"] for resource in system.resources("Camera")] == [False]
     assert lease.release() is False
 
@@ -114,7 +115,7 @@ def test_errors_have_the_names_of_the_codes_and_say_what_to_do(system: ratn.Syst
         system.query("at box")
     with pytest.raises(ratn.Refused) as refused:
         system.set("on(a)", ratn.Trajectory([], []) if False else float("nan"))
-    assert isinstance(refused.value, ratn.Error)
+    assert isinstance(refused.value, ratn.InvalidArgument) and refused.value.code == "INVALID_ARGUMENT"
     with pytest.raises(ratn.Unavailable, match="ratn up"):
         from ratn import _ratn
 

@@ -289,6 +289,31 @@ def test_findings_name_the_line_of_the_python_file() -> None:
     assert "help: " in str(raised.value) and f"{__file__}:{begins + 4}: error[" in str(raised.value)
 
 
+def test_findings_of_a_file_that_was_read_name_its_lines(tmp_path: pathlib.Path) -> None:
+    file = tmp_path / "wrong.yaml"
+    file.write_text("# A comment.\n\ntask: wrong\nstates:\n\n  - open: { action: gripper/open }\n")
+    task = Task.from_yaml(file)
+    with pytest.raises(ratn.InvalidTask) as raised:
+        task.check()
+    (finding,) = [finding for finding in raised.value.findings if finding.rule == "unknown-action"]
+    assert (pathlib.Path(finding.file).name, finding.line) == ("wrong.yaml", 6)
+    # Changed in Python, it is another text.
+    task.document["states"] = [{"open": {"action": "gripper/release", "resources": ["Gripper"]}}]
+    assert task.check() == []
+
+
+def test_paths_are_valid_wherever_a_task_is_written(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "part.yaml").write_text("task: part\nstates: []\n")
+    file = tmp_path / "whole.yaml"
+    file.write_text(
+        "task: whole\nstates:\n  - one: { library: part.yaml }\n  - two: { states: [ { three: { library: part.yaml } } ], variables: { library: part } }\n"
+    )
+    document = Task.from_yaml(Task.from_yaml(file).standing_alone()).document
+    assert document["states"][0]["one"]["library"] == str(tmp_path / "part.yaml")
+    assert document["states"][1]["two"]["states"][0]["three"]["library"] == str(tmp_path / "part.yaml")
+    assert document["states"][1]["two"]["variables"] == {"library": "part"}
+
+
 def test_text_that_is_no_yaml_is_refused_with_its_line(tmp_path: pathlib.Path) -> None:
     file = tmp_path / "twice.yaml"
     file.write_text("task: a\ntask: b\n")

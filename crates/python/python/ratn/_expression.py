@@ -50,6 +50,7 @@ _TREES: dict[str, tuple[int, ast.Module | None]] = {}
 
 def _tree(file: str) -> ast.Module | None:
     """The source of a file, parsed, where there is one: also a cell of a notebook."""
+    linecache.checkcache(file)
     lines = linecache.getlines(file)
     text = "".join(lines)
     known = _TREES.get(file)

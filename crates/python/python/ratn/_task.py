@@ -463,9 +463,10 @@ class Ordered(Block):
 
 
 class Retry(Ordered):
-    """What is tried again. A block of one action is that action with a ``retry``."""
+    """What is tried again. A block of one action, without ``name=``, is that action with a ``retry``."""
 
     __slots__ = ("_is_named",)
+    _is_named: bool
 
     def before(self) -> _Before:
         """What is done before each further try: ``with attempt.before():``."""
@@ -476,7 +477,7 @@ class Retry(Ordered):
         node = self._node
         inside = node.branches["states"]
         own = node.body.keys() - {"retry", "resources"}
-        if kind is not None or own or node.body.get("resources") or len(inside) != 1:
+        if kind is not None or self._is_named or own or node.body.get("resources") or len(inside) != 1:
             return
         (single,) = inside
         is_free = single.name not in {other.name for other in node.siblings if other is not node}
@@ -570,7 +571,9 @@ def retry(
         said["backoff"] = backoff
     if on is not None:
         said["on"] = list(on)
-    return Retry("retry", name, annotations, {"retry": said}, "retry")
+    attempt = Retry("retry", name, annotations, {"retry": said}, "retry")
+    attempt._is_named = name is not None
+    return attempt
 
 
 def _condition(condition: object) -> Any:
@@ -719,13 +722,21 @@ class Task:
     """A task: the tree of a task file, traced of a Python function or read from YAML."""
 
     def __init__(
-        self, document: dict[str, Any], *, folder: pathlib.Path, file: str, catalogues: Iterable[str] = (), steps: dict[str, Any] | None = None
+        self,
+        document: dict[str, Any],
+        *,
+        folder: pathlib.Path,
+        file: str,
+        catalogues: Iterable[str] = (),
+        steps: dict[str, Any] | None = None,
+        source: str | None = None,
     ) -> None:
         #: The tree, as dicts and lists.
         self.document = document
         #: What the paths of libraries and the ontology are relative to.
         self.folder = folder
         self._file, self._catalogues, self._steps = file, list(catalogues), dict(steps or {})
+        self._source = source
 
     @property
     def name(self) -> str:
@@ -751,7 +762,7 @@ class Task:
         document = _ratn.read_yaml(text, file)
         if not isinstance(document, dict):
             raise InvalidTask(f"{file}:1: a task file is a mapping: begin it with `task: name`")
-        return Task(document, folder=folder, file=file)
+        return Task(document, folder=folder, file=file, source=text)
 
     def to_yaml(self, path: str | os.PathLike[str] | None = None) -> str:
         """The text of a task file with the same meaning, which is written to ``path``, too, where that is given.
@@ -770,7 +781,12 @@ class Task:
 
         return _source.python_of(self.document)
 
-    def _text(self) -> _yaml.Lines:
+    def _lines(self) -> _yaml.Lines:
+        """Its text, which is that of the file as long as nobody has changed what was read."""
+        if self._source is not None and _ratn.read_yaml(self._source, self._file) == self.document:
+            lines = _yaml.Lines()
+            lines.text = self._source.splitlines()
+            return lines
         return _yaml.write(self.document)
 
     def standing_alone(self) -> str:
@@ -783,14 +799,15 @@ class Task:
 
     def _rooted(self, value: Any) -> Any:
         if isinstance(value, dict):
-            rooted = {key: self._rooted(item) for key, item in value.items()}
+            # What is an expression is no path.
+            rooted = {key: item if key in ("in", "with", *_VALUES) else self._rooted(item) for key, item in value.items()}
             if isinstance(value.get("library"), str):
                 rooted["library"] = str(self.folder / value["library"])
             return rooted
         return [self._rooted(item) for item in value] if isinstance(value, list) else value
 
     def _read(self) -> tuple[list[Finding], dict[str, Any] | None]:
-        lines = self._text()
+        lines = self._lines()
         catalogues = [*self._catalogues, *(step.catalogue() for step in self._steps.values())]
         said, model = _ratn.check_task("\n".join(lines.text) + "\n", str(self.folder / pathlib.Path(self._file).name), catalogues)
         findings = [self._finding(one, lines) for one, _ in json.loads(said)]
