@@ -25,6 +25,7 @@ fn _ratn(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<client::Client>()?;
     module.add_class::<client::Lease>()?;
     module.add_class::<client::WorldWatch>()?;
+    module.add_class::<client::Projected>()?;
     module.add_class::<log::Log>()?;
     module.add_function(wrap_pyfunction!(worker::serve, module)?)?;
     module.add_function(wrap_pyfunction!(task::read_yaml, module)?)?;

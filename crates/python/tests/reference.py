@@ -10,7 +10,7 @@ from typing import Any
 import ratn
 
 GROUPS = {
-    "Systems and runs": ["System", "Run", "Result", "Lease", "WorldWatch", "Fact"],
+    "Systems and runs": ["System", "Run", "Result", "Lease", "Projected", "WorldWatch", "Fact"],
     "Views of a run": ["Log", "Nodes", "Why", "CriticalPath", "Report", "Chart", "Network"],
     "Tasks": ["task", "Task", "Finding", "State", "Doc", "output", "variable", "Annotations"],
     "What is in a task": [
@@ -22,7 +22,7 @@ GROUPS = {
     "Values": ["Pose", "Joints", "Trajectory"],
 }
 #: Classes that nobody makes but the package.
-NOT_MADE = {"Run", "Lease", "WorldWatch", "Fact", "Nodes", "Why", "CriticalPath", "Report", "Chart", "Network", "Finding", "State", "Value", "Goal", "Annotations", "Step", "Task"}
+NOT_MADE = {"Run", "Lease", "Projected", "WorldWatch", "Fact", "Nodes", "Why", "CriticalPath", "Report", "Chart", "Network", "Finding", "State", "Value", "Goal", "Annotations", "Step", "Task"}
 
 
 def text(thing: object) -> str:

@@ -2,7 +2,41 @@ from collections.abc import Callable, Iterable, Sequence
 from os import PathLike
 from typing import Any, final
 
-__all__: list[str]
+__all__ = [
+    "Aborted",
+    "AlreadyExists",
+    "Cancelled",
+    "Client",
+    "DeadlineExceeded",
+    "Error",
+    "Fact",
+    "FailedPrecondition",
+    "Goal",
+    "InvalidArgument",
+    "InvalidTask",
+    "Joints",
+    "Lease",
+    "Log",
+    "Lost",
+    "Malformed",
+    "NotFound",
+    "OutOfRange",
+    "PermissionDenied",
+    "Pose",
+    "Projected",
+    "Refused",
+    "ResourceExhausted",
+    "Trajectory",
+    "Unauthenticated",
+    "Unavailable",
+    "Unimplemented",
+    "WorldWatch",
+    "catalogue",
+    "check_task",
+    "functions",
+    "read_yaml",
+    "serve",
+]
 
 class Error(Exception): ...
 class Unavailable(Error): ...
@@ -147,6 +181,15 @@ class WorldWatch:
     def __next__(self) -> dict[str, Any]: ...
 
 @final
+class Projected:
+    @property
+    def base(self) -> int: ...
+    def query(self, *patterns: str) -> list[Fact]: ...
+    def release(self) -> bool: ...
+    def __enter__(self) -> Projected: ...
+    def __exit__(self, *_exception: object) -> bool: ...
+
+@final
 class Client:
     def __new__(cls, directory: str | PathLike[str]) -> Client: ...
     def acquire(
@@ -156,6 +199,7 @@ class Client:
     def query(self, *patterns: str) -> list[Fact]: ...
     def set(self, fact_text: str, value: Any) -> int: ...
     def watch(self, *patterns: str) -> WorldWatch: ...
+    def project(self, changes: Sequence[tuple[str, Any]], *, timeout_s: float | None = None) -> Projected: ...
     def close(self) -> None: ...
 
 def serve(

@@ -17,13 +17,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from ratn import _ratn, _views
 from ratn._expression import written
-from ratn._ratn import Error, Fact, Lease, WorldWatch
+from ratn._ratn import Error, Fact, Lease, Projected, WorldWatch
 from ratn._step import Step
 from ratn._task import Task
 
@@ -194,6 +194,13 @@ class System:
     def set(self, fact: str, value: Any) -> int:
         """Writes a fact, ``system.set("at(box_1)", ratn.Pose(1, 0, 0.7))``; ``None`` deletes it. Gives the world's revision."""
         return self._client.set(fact, value)
+
+    def project(self, changes: Mapping[str, Any], *, timeout_s: float | None = None) -> Projected:
+        """A world that might be: ``with system.project({"at(box_1)": ratn.Pose(1, 0, 0.7)}) as world: world.query("at(?)")``.
+
+        The world as it is now with changes (``None`` deletes), of which nobody else sees anything. It holds room for itself, for which it waits.
+        """
+        return self._client.project(list(changes.items()), timeout_s=timeout_s)
 
     def watch(self, *patterns: str) -> WorldWatch:
         """Iterates over what holds now and each change after it."""
