@@ -54,5 +54,5 @@ if __name__ == "__main__":
     with ratn.System(boxes=1, speed=10) as system:
         run = system.run(labels)
         print(run.result())
-        print(run.why("read"))
+        print(run.why("said"))
         print(run.report())
