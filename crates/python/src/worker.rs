@@ -83,8 +83,7 @@ pub(crate) fn serve(
     let standstill = driven.as_ref().and_then(|driven| driven.standstill_s);
     if let Some(seconds) = standstill {
         let bound = Duration::try_from_secs_f64(seconds);
-        let bound =
-            bound.map_err(|_| PyValueError::new_err(format!("standstill_s: {seconds} is no time to wait")))?;
+        let bound = bound.map_err(|_| PyValueError::new_err(format!("standstill_s: {seconds} is no time to wait")))?;
         worker = worker.standstill(bound);
     }
     let ended = py.detach(|| {
