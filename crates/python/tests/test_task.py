@@ -239,6 +239,9 @@ def test_what_cannot_be_traced_is_refused_with_its_line_and_what_to_write_instea
             look = detector.segment(region=REGION)
         pan_tilt.look_at(target=look.boxes[0].pose)
 
+    def listed(n: list) -> None:
+        print(list(ratn.each(n)))
+
     def alone(n: int) -> None:
         with ratn.otherwise():
             pass
@@ -251,7 +254,7 @@ def test_what_cannot_be_traced_is_refused_with_its_line_and_what_to_write_instea
         chained: ("(a < b) & (b < c)", 1), ternary: ("fn.if_(", 1), in_: ("ratn.isin(", 1), for_: ("for x in ratn.each(list)", 1),
         range_: ("ratn.each(fn.range(n))", 1), comprehension: ("fn.map(", 1), filtered: ("fn.filter(", 1), length: ("fn.len(", 1), whole: ("fn.floor", 1),
         posed: ("fn.pose(", 1), key: ("known now", 1), asserted: ("requires=[", 1), state: ("transitions=", 1), broken: ("`break`", 1), hidden: ("as a fact", 3),
-        alone: ("right behind", 1), unnamed: ("tries = ratn.variable(0)", 1),
+        listed: ("outside of a `for`", 1), alone: ("right behind", 1), unnamed: ("tries = ratn.variable(0)", 1),
     }
     for function, (part, line) in expected.items():
         message, said = refused(function)
@@ -366,3 +369,16 @@ def test_the_model_has_no_places_and_no_digest() -> None:
 
     text = json.dumps(small.model())
     assert "location" not in text and "digest" not in text and "release" in text
+
+
+def test_values_and_tasks_show_themselves_also_when_nothing_is_traced() -> None:
+    kept: list[ratn.Value] = []
+
+    @ratn.task
+    def small() -> None:
+        opened = gripper.release()
+        kept.append(opened.width_m)
+        assert repr(opened.width_m) == "<Value opened.width_m>"
+
+    assert repr(kept[0]) == "<Value of a task that is not being traced>"
+    assert small._repr_markdown_().startswith("```yaml\ntask: small\n") and repr(small).startswith("<Task small of ")

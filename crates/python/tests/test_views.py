@@ -172,6 +172,19 @@ def test_a_step_whose_file_does_not_load_is_told(system: ratn.System, tmp_path: 
         system.run(task)
 
 
+def test_a_program_that_would_start_itself_again_is_told_what_to_write(system: ratn.System, tmp_path: pathlib.Path) -> None:
+    script = tmp_path / "unguarded.py"
+    script.write_text(
+        "import ratn\n\n@ratn.step\ndef one() -> dict:\n    return {'a': 1}\n\n@ratn.task\ndef unguarded() -> None:\n    one()\n\n"
+        "if __name__ != 'told':\n    ratn.System().run(unguarded).result()\n"
+    )
+    import runpy
+
+    task = runpy.run_path(str(script), run_name="told")["unguarded"]
+    with pytest.raises(ratn.Error, match='unguarded.py is being read by the worker of its steps.*if __name__ == "__main__":'):
+        system.run(task)
+
+
 def test_a_system_ends_with_the_process_that_started_it(tmp_path: pathlib.Path) -> None:
     """Also where that was killed."""
     script = "import os, sys, time, ratn\ns = ratn.System(boxes=1, speed=20)\nprint(s._process.pid, flush=True)\ntime.sleep(600)\n"

@@ -149,7 +149,10 @@ class Value:
         return str(self)
 
     def __repr__(self) -> str:
-        return f"<Value {self}>"
+        try:
+            return f"<Value {self}>"
+        except Untraceable:
+            return "<Value of a task that is not being traced>"
 
     def __setattr__(self, name: str, value: object) -> None:
         refuse(f"`{name}` of a value that is known only while the task runs cannot be set", "let an effect change the world, or `assign` a variable")

@@ -16,10 +16,20 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from ratn import _expression, _ports, _task, _worker
-from ratn._ratn import Goal
+from ratn._ratn import Error, Goal
 
 #: The steps of this process, by file.
 _STEPS: dict[str, list[Step]] = {}
+#: The file that a worker is reading its steps from.
+_being_read: str | None = None
+
+
+def refuse_while_read(what: str) -> None:
+    """A program that would start itself again and again ends here."""
+    if _being_read is not None:
+        raise Error(
+            f"{_being_read} is being read by the worker of its steps, and {what}: write what the program does below `if __name__ == \"__main__\":`"
+        )
 
 
 class Step:
@@ -123,7 +133,12 @@ def serve(file: str, arguments: list[str]) -> None:
     """Serves the steps of a file."""
     path = os.path.abspath(file)
     sys.path.insert(0, os.path.dirname(path))
-    runpy.run_path(path, run_name="__ratn_steps__")
+    global _being_read
+    _being_read = path
+    try:
+        runpy.run_path(path, run_name="__ratn_steps__")
+    finally:
+        _being_read = None
     steps = _STEPS.get(path, [])
     if not steps:
         raise SystemExit(f"{file} has no steps: decorate a function with `@ratn.step`")

@@ -24,7 +24,7 @@ from typing import Any
 from ratn import _ratn, _views
 from ratn._expression import written
 from ratn._ratn import Error, Fact, Lease, Projected, WorldWatch
-from ratn._step import Step
+from ratn._step import Step, refuse_while_read
 from ratn._task import Task
 
 _READY = "the system is ready"
@@ -81,6 +81,7 @@ class System:
         runtime_dir: str | os.PathLike[str] | None = None,
         **options: object,
     ) -> None:
+        refuse_while_read("it would start a system")
         self._process: subprocess.Popen[str] | None = None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         directory = pathlib.Path(runtime_dir) if runtime_dir is not None else _default_directory()

@@ -617,6 +617,8 @@ class Each(Iterator[Any]):
             self._index: str | None = targets[0] if len(targets) == 2 else "index"
         else:
             self._index = index or None
+        if variable is None and not targets and statements_at_work(*at):
+            refuse("`ratn.each` outside of a `for`", "write `for x in ratn.each(list):`; of a list of values make another with `fn.map(list, lambda x: …)`", at)
         self._variable = variable or (targets[-1] if targets else "element")
         node = self._trace.add(name, f"for_{self._variable}", at)
         text = elements if isinstance(elements, str) else str(written(elements))
@@ -750,6 +752,9 @@ class Task:
 
     def __repr__(self) -> str:
         return f"<Task {self.name} of {self._file}>"
+
+    def _repr_markdown_(self) -> str:
+        return f"```yaml\n{self.to_yaml()}```"
 
     @staticmethod
     def from_yaml(source: str | os.PathLike[str]) -> Task:
