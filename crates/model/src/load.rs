@@ -17,6 +17,7 @@
 //! ```
 
 mod advice;
+mod document;
 mod effects;
 mod fields;
 mod flow;
@@ -29,6 +30,7 @@ mod state;
 mod tolerance;
 mod yaml;
 
+pub use document::Document;
 pub(crate) use fields::Places;
 pub use library::Files;
 pub(crate) use names::distance;
