@@ -27,6 +27,7 @@ mod outline;
 mod resources;
 mod state;
 mod tolerance;
+mod wait;
 mod yaml;
 
 pub(crate) use fields::Places;
@@ -422,6 +423,7 @@ fn ports(
             let types = declared.iter().map(|entry| (entry.key.clone(), typed(entry).unwrap_or(Type::Any)));
             Ports { types: types.collect(), open: false }
         }
+        Form::Wait { node, asks } => Ports { types: wait::ports(node, *asks), open: false },
         Form::ForEach { .. } | Form::While { .. } | Form::Condition { .. } => Ports::default(),
     };
     outline.steps.iter().enumerate().map(of_step).collect()

@@ -75,6 +75,7 @@ mod tests {
             ended: 0,
             under_way: vec![UnderWay { path: "move[1]".to_owned(), for_s: 0.5 }],
             waits: Vec::new(),
+            awaits: Vec::new(),
         };
         let pause = said(Word::Pause, Some(&run));
         assert!(pause.starts_with("fetch is paused") && pause.ends_with("under way: move[1]"), "{pause}");

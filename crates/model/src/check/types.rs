@@ -128,6 +128,12 @@ fn what(slot: Slot<'_>) -> String {
 
 fn wanted(subject: &Subject<'_>, state: &State, slot: Slot<'_>) -> Option<Type> {
     match (slot, &state.kind) {
+        (Slot::Input(port), _) if state.is_pause() => match port {
+            "for" => Some(Type::Bool),
+            "seconds" | "until" => Some(Type::Float),
+            "question" => Some(Type::String),
+            _ => None,
+        },
         (Slot::Input(port), StateKind::Action { provider, action, .. }) => {
             let signature = subject.catalogue.action(provider, action)?;
             signature.inputs.get(port).or_else(|| signature.optional.get(port)).cloned()

@@ -160,6 +160,7 @@ impl Names for NamesFrom<'_, '_> {
         if !ports.open && !ports.types.contains_key(port) {
             let none = match self.task.outline.step(id).form {
                 Form::Action { .. } => "its action has no outputs",
+                Form::Wait { .. } => "a wait for a signal has the output `value`, a question `answer`",
                 Form::Sequence { .. } | Form::Concurrency { .. } => "declare it under the state's `outputs`",
                 Form::Library { .. } => "declare it under the `outputs` of the library",
                 _ => "loops and conditions have no outputs",
