@@ -385,9 +385,9 @@ fn what_is_wrong_with_a_wait_is_said() {
     assert_snapshot!(found("wait: 5"), @"task.yaml:3:11: error[invalid-state] in wait: `wait` is a mapping, found a number. help: write `wait: { for: door_open(front) }`, or one of `seconds`, `until`, `signal` for `for`");
     assert_snapshot!(found("wait: { for: open(lid), signal: go }"), @"task.yaml:3:11: error[invalid-state] in wait: a state waits by `for` or by `signal`, not by both. help: write `wait: { for: door_open(front) }`, or one of `seconds`, `until`, `signal` for `for`");
     assert_snapshot!(found("wait: { seconds: 3, timeout: 5 }"), @"task.yaml:3:34: error[invalid-state] in wait: a wait for a time is over by itself. help: leave `timeout` out");
-    assert_snapshot!(found("ask: { question: Well?, choices: [good, bad], default: god, timeout: 3 }"), @"task.yaml:3:58: error[invalid-state] in ask: the default is none of the choices. help: did you mean `good`?");
-    assert_snapshot!(found("ask: { question: Well?, choices: [success] }"), @"task.yaml:3:38: error[invalid-name] in ask: `success` is an outcome of every state or of a wait, and no choice. help: give the choice another name");
-    assert_snapshot!(found("ask: { question: Well?, choices: [good], default: good }"), @"task.yaml:3:53: error[invalid-state] in ask: a default without a timeout is never taken. help: add `timeout: …`, in seconds: after it the default is the answer");
+    assert_snapshot!(found("ask: { question: Well?, choices: [good, bad], default: god, timeout: 3 }"), @"task.yaml:3:60: error[invalid-state] in ask: the default is none of the choices. help: did you mean `good`?");
+    assert_snapshot!(found("ask: { question: Well?, choices: [success] }"), @"task.yaml:3:39: error[invalid-name] in ask: `success` is an outcome of every state or of a wait, and no choice. help: give the choice another name");
+    assert_snapshot!(found("ask: { question: Well?, choices: [good], default: good }"), @"task.yaml:3:55: error[invalid-state] in ask: a default without a timeout is never taken. help: add `timeout: …`, in seconds: after it the default is the answer");
 }
 
 #[test]
@@ -429,7 +429,7 @@ fn what_is_wrong_with_a_function_is_said() {
     let twice = "g($x): $x + $x + $x\n  h($x): g(g(g(g(g(g(g($x)))))))";
     assert!(found(twice).contains("more than 2000 parts"), "{}", found(twice));
     let source = "task: t\nfunctions:\n  near($a): $a\nstates:\n  - a: { action: gripper/release, effects: [near(cup)], resources: [{ block: Gripper }] }\n";
-    assert_snapshot!(findings(source), @"task.yaml:5:44: error[invalid-expression] in a: `near` is a function of this file, and here a fact is wanted. help: give the function or the fact another name");
+    assert_snapshot!(findings(source), @"task.yaml:5:45: error[invalid-expression] in a: `near` is a function of this file, and here a fact is wanted. help: give the function or the fact another name");
     let source = "task: t\nfunctions:\n  near($a, $b): $a\nstates:\n  - a: { condition: near(cup), then: [] }\n";
     assert_snapshot!(findings(source), @"task.yaml:5:21: error[invalid-expression] in a: `near` takes 2 arguments, and is given 1. help: write `near($a, $b)`");
 }
