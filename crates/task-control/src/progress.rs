@@ -1,9 +1,11 @@
 //! What a run is doing, one line per node that starts or ends, for whoever reads them.
 
-use ratn_executive::protocol::{Command, Event, Note};
+use crate::control::Awaiting;
+use ratn_executive::protocol::{Awaited, Command, Event, Note};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{SUCCESS, WORLD_MODEL};
 use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 
@@ -20,6 +22,8 @@ pub(crate) struct Progress {
     /// Those that have left it, the oldest first.
     gone: VecDeque<InstanceId>,
     started: BTreeMap<InstanceId, Timestamp>,
+    /// What states wait for, and until when at the most.
+    awaiting: BTreeMap<InstanceId, (Awaited, Option<Timestamp>)>,
     /// How many states have ended for good.
     retired: u64,
     /// Whether no PIA is to begin.
@@ -72,6 +76,7 @@ impl Progress {
             self.ends(*instance);
         }
         self.hear(event);
+        self.await_things(commands.clone());
         for command in commands.clone() {
             match command {
                 Command::Note(Note::Expanded { instance, path, .. }) => {
@@ -83,6 +88,29 @@ impl Progress {
             }
         }
         self.forget(commands);
+    }
+
+    /// What states begin and cease to wait for.
+    fn await_things<'a>(&mut self, commands: impl Iterator<Item = &'a Command>) {
+        for command in commands {
+            match command {
+                Command::Note(Note::Awaiting { instance, awaited, until }) => {
+                    self.awaiting.insert(*instance, (awaited.clone(), *until));
+                }
+                Command::Note(Note::Finished { instance, .. } | Note::Squashed { instance }) => {
+                    self.awaiting.remove(instance);
+                }
+                _ => {}
+            }
+        }
+    }
+
+    /// The instances that wait by themselves, and for what.
+    pub(crate) fn awaiting(&self) -> impl Iterator<Item = (InstanceId, Awaiting)> + '_ {
+        self.awaiting.iter().map(|(id, (awaited, until))| {
+            let until_s = until.map(Timestamp::seconds);
+            (*id, Awaiting { path: self.path(*id), awaited: awaited.clone(), until_s })
+        })
     }
 
     /// It is not under way any more; since when it was.
@@ -155,6 +183,8 @@ impl Progress {
             return lines;
         }
         self.hear(event);
+        let waited: Vec<InstanceId> = self.awaiting.keys().copied().collect();
+        self.await_things(commands.iter());
         match event {
             Event::Finished { instance, outcome, reason, .. } => {
                 let path = self.path(*instance);
@@ -188,6 +218,11 @@ impl Progress {
                 }
             }
             Event::Resumed => say(&mut lines, at, "task control goes on"),
+            Event::Signalled { signal, value: Value::Null } => say(&mut lines, at, &format!("signal {signal}")),
+            Event::Signalled { signal, value } => say(&mut lines, at, &format!("signal {signal} = {value}")),
+            Event::Answered { instance, choice } => {
+                say(&mut lines, at, &format!("answer {}: {choice}", self.path(*instance)));
+            }
             Event::PauseRequested => say(&mut lines, at, "pause"),
             Event::ResumeRequested => say(&mut lines, at, "resume"),
             Event::StepRequested => say(&mut lines, at, "step"),
@@ -202,6 +237,22 @@ impl Progress {
             match command {
                 Command::Note(Note::Expanded { instance, path, .. }) => {
                     self.paths.insert(*instance, path.clone());
+                }
+                Command::Note(Note::Awaiting { instance, awaited, until }) => {
+                    self.started.insert(*instance, at);
+                    let until = until.map_or_else(String::new, |until| format!(", until {:.1} s", until.seconds()));
+                    let path = self.path(*instance);
+                    say(&mut lines, at, &format!("wait   {path}  for {awaited}{until}"));
+                    if let Awaited::Answer { choices, .. } = awaited
+                        && let Some(choice) = choices.first()
+                    {
+                        say(&mut lines, at, &format!("ask    answer with `ratn answer - {choice} --state {path}`"));
+                    }
+                }
+                Command::Note(Note::Finished { instance, outcome }) if waited.contains(instance) => {
+                    let took = self.started.remove(instance).map_or(0.0, |s| at.since(s).as_secs_f64());
+                    let how = if **outcome == *SUCCESS { "waited" } else { outcome };
+                    say(&mut lines, at, &format!("{how} {}  {took:.1} s", self.path(*instance)));
                 }
                 // What ended without its provider: a `requires` that does not hold, a timeout.
                 Command::Note(Note::Finished { instance, outcome })

@@ -80,6 +80,7 @@ mod tests {
                 message: String::new(),
             }],
             waits: Vec::new(),
+            awaits: Vec::new(),
         };
         let pause = said(Word::Pause, Some(&run));
         assert!(pause.starts_with("fetch is paused") && pause.ends_with("under way: move[1]"), "{pause}");
