@@ -1,8 +1,8 @@
 //! The tool along straight lines from pose to pose: its position along the segment, its rotation by the shortest turn, both evenly; corners
 //! sharp or rounded.
 //!
-//! The arm is solved at postures a few millimetres apart, each from the one before. The tool is exactly on the line there; where the joints
-//! go straight from one of them to the next it is at most [`STRAY_M`] beside the line, which is bounded and not sampled (`levers`). All or
+//! The arm is solved at postures a few millimetres apart (closer together where the joints go far), each from the one before. The tool is exactly
+//! on the line there; where the joints go straight from one of them to the next it is at most [`STRAY_M`] beside the line, which is bounded and not sampled (`levers`). All or
 //! an error, which says how far the arm gets and which joint ends the line. Any robot.
 
 use crate::frame::{compose, difference, norm};
@@ -19,6 +19,9 @@ pub const STRAY_M: f64 = 2.5e-4;
 /// The tool's way and turn between two solved postures, in metres and radians.
 const STEP_M: f64 = 0.0025;
 const STEP_RAD: f64 = 0.01;
+
+/// Where the joints go far, steps are halved down to this part of one.
+const FINEST: f64 = 1.0 / 16.0;
 
 /// The most solved postures of one motion.
 const MAX_STEPS: usize = 16_000;
@@ -145,17 +148,25 @@ pub(crate) fn trace(
             if answer != Control::Continue {
                 return Err(answer.into());
             }
-            let share = i as f64 / steps as f64;
-            let here = traced.postures[traced.postures.len() - 1];
-            match step(reach, &here, &piece.curve.at(share)) {
-                Ok(next) => traced.postures.push(next),
-                Err(cause) => {
-                    traced.ended = Some(cause);
-                    return Ok(traced);
+            let share = |part: f64| (i as f64 - 1.0 + part) / steps as f64;
+            // Near a singular posture the joints go far while the tool hardly moves: there the postures are closer together.
+            let (mut done, mut part) = (0.0, 1.0);
+            while done < 1.0 {
+                let here = traced.postures[traced.postures.len() - 1];
+                match step(reach, &here, &piece.curve.at(share(done + part))) {
+                    Ok(next) => {
+                        done += part;
+                        traced.postures.push(next);
+                        traced.along_m.push(before_m + share(done) * piece.length_m);
+                        traced.towards.push(piece.towards);
+                    }
+                    Err(Cause::Flip { .. }) if part > FINEST && traced.postures.len() < MAX_STEPS => part /= 2.0,
+                    Err(cause) => {
+                        traced.ended = Some(cause);
+                        return Ok(traced);
+                    }
                 }
             }
-            traced.along_m.push(before_m + share * piece.length_m);
-            traced.towards.push(piece.towards);
         }
         before_m += piece.length_m;
     }

@@ -16,7 +16,8 @@ use ratn_motion::collision::{Checker, Contact};
 use ratn_motion::geometry::Geometry;
 use ratn_motion::line::{Cause, line};
 use ratn_motion::plan::{Goal, Plan, PlanError, Request};
-use ratn_motion::robot::Joint;
+use ratn_motion::reach::Target;
+use ratn_motion::robot::{Joint, Robot};
 use ratn_motion::straight::{Frame, Straight};
 use ratn_motion::timing::{Section, timed};
 use ratn_motion::trajectory::Curve;
@@ -75,6 +76,32 @@ fn the_tool_of_any_arm_goes_straight_between_all_samples() {
     check_timed(&robots::seven(), 1);
     check_timed(&robots::six(), 2);
     check_timed(&robots::lifted(), 3);
+}
+
+#[test]
+fn most_lines_whose_poses_can_all_be_reached_are_followed_from_any_posture() {
+    let reach = arm::reach(&Robot::aimm());
+    let mut random = ChaCha8Rng::seed_from_u64(11);
+    let (mut lines, mut followed) = (0, 0);
+    while lines < 150 {
+        let start = reach.random(&mut random);
+        let from = reach.pose(&start);
+        let mut range = |most: f64| random.random_range(-most..most);
+        let way = [range(0.4), range(0.4), range(0.4)];
+        let at = |share: f64| Pose { position: std::array::from_fn(|i| from.position[i] + share * way[i]), ..from };
+        // Every pose of the line can be reached by itself.
+        let is_reached = |i: u32| {
+            let postures = reach.postures(&Target::at(at(f64::from(i) / 20.0)));
+            !reach.nearest(&postures, &start).is_empty()
+        };
+        if !(1..=20).all(is_reached) {
+            continue;
+        }
+        lines += 1;
+        followed += usize::from(line(&reach, &start, &at(1.0)).is_ok());
+    }
+    // Of the others most would need another elbow than the one that they begin with. Without shorter steps near singular postures: 92.
+    assert!(followed >= 120, "{followed} of {lines}");
 }
 
 #[test]
