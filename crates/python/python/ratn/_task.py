@@ -13,6 +13,8 @@ import inspect
 import json
 import os
 import pathlib
+import subprocess
+import tempfile
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -21,7 +23,7 @@ from typing import Any, NoReturn
 
 from ratn import _ports, _ratn, _yaml
 from ratn._expression import Untraceable, Value, refuse, statements_at_work, user_frame, user_line, written
-from ratn._ratn import InvalidTask
+from ratn._ratn import Error, InvalidTask
 from ratn._yaml import Body
 
 class Annotations(typing.TypedDict, total=False):
@@ -796,19 +798,23 @@ class Task:
 
     def standing_alone(self) -> str:
         """The text with paths that are valid everywhere."""
+        return "\n".join(self._standing_alone().text) + "\n"
+
+    def _standing_alone(self) -> _yaml.Lines:
         document = dict(self.document)
         if isinstance(document.get("ontology"), str):
             document["ontology"] = str(self.folder / document["ontology"])
         document["states"] = [self._rooted(state) for state in document.get("states") or []]
-        return "\n".join(_yaml.write(document).text) + "\n"
+        return _yaml.write(document)
 
     def _rooted(self, value: Any) -> Any:
         if isinstance(value, dict):
             # What is an expression is no path.
-            rooted = {key: item if key in ("in", "with", *_VALUES) else self._rooted(item) for key, item in value.items()}
+            rooted = Body({key: item if key in ("in", "with", *_VALUES) else self._rooted(item) for key, item in value.items()})
+            rooted.line = getattr(value, "line", None)
             if isinstance(value.get("library"), str):
                 rooted["library"] = str(self.folder / value["library"])
-            return rooted
+            return rooted if rooted.line is not None else dict(rooted)
         return [self._rooted(item) for item in value] if isinstance(value, list) else value
 
     def _read(self) -> tuple[list[Finding], dict[str, Any] | None]:
@@ -818,19 +824,49 @@ class Task:
         findings = [self._finding(one, lines) for one, _ in json.loads(said)]
         return findings, None if model is None else json.loads(model)
 
-    def _finding(self, said: dict[str, Any], lines: _yaml.Lines) -> Finding:
+    def _finding(self, said: dict[str, Any], lines: _yaml.Lines, name: str | None = None) -> Finding:
         file, line = said["file"], said["location"]["line"]
-        if pathlib.Path(file).name == pathlib.Path(self._file).name:
+        if pathlib.Path(file).name == (name or pathlib.Path(self._file).name):
             file, line = lines.origin(line) or (self._file, line)
         return Finding(said["rule"], said["severity"], file, line, said["path"], said["message"], said["help"])
 
-    def check(self) -> list[Finding]:
+    def check(self, *, system: object = None, config: str | os.PathLike[str] | None = None) -> list[Finding]:
         """What ``ratn check`` notices, with the lines of the Python file; a task that is refused raises ``ratn.InvalidTask``.
 
-        It is checked against the built-in catalogue, those of the modules of actions that it uses, and its own steps.
+        It is checked against the built-in catalogue, those of the modules of actions that it uses, and its own steps; with a ``system`` (a
+        ``ratn.System``, or a runtime directory) against what that offers and its workers say of themselves, with a ``config`` against that.
         """
+        if system is not None or config is not None:
+            return self._check_with(system, config)
         findings, model = self._read()
         if model is None:
+            raise invalid(findings)
+        return findings
+
+    def _check_with(self, system: object, config: str | os.PathLike[str] | None) -> list[Finding]:
+        """As ``ratn check`` does it, which knows what a system is."""
+        from ratn._system import _program
+
+        lines = self._standing_alone()
+        with tempfile.TemporaryDirectory(prefix="ratn-check-") as folder:
+            file = pathlib.Path(folder) / pathlib.Path(self._file).with_suffix(".yaml").name
+            file.write_text("\n".join(lines.text) + "\n")
+            command = [_program(), "check", str(file), "--no-simulation", "--json"]
+            for number, catalogue in enumerate([*self._catalogues, *(step.catalogue() for step in self._steps.values())]):
+                (pathlib.Path(folder) / f"{number}.toml").write_text(catalogue)
+                command += ["--catalogue", str(pathlib.Path(folder) / f"{number}.toml")]
+            command += ["--config", os.fspath(config)] if config is not None else []
+            command += ["--runtime-dir", str(getattr(system, "runtime_dir", system))] if system is not None else []
+            told = subprocess.run(command, capture_output=True, text=True)
+        if not told.stdout.strip():
+            raise Error(told.stderr.strip() or f"`ratn check` has ended with code {told.returncode}")
+        said = json.loads(told.stdout)
+        findings = [self._finding(one, lines, file.name) for one in said["findings"]]
+        # Whoever performs steps comes with the run.
+        kinds = [f"`{step.kind}`" for step in self._steps.values()]
+        workers = [what for what in said["workers"] if not any(kind in what for kind in kinds)]
+        findings += [Finding("worker", "warning", self._file, 1, "", what, "") for what in workers]
+        if said["task"] is None:
             raise invalid(findings)
         return findings
 
