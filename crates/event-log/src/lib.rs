@@ -4,6 +4,10 @@
 //! commands of its event are performed, and on the disk where they cannot be undone. Its writer holds a lock on it: nobody else
 //! writes it meanwhile. Reading says which line is wrong and why; a torn last line (the writer was killed) is left out and named.
 
+mod parts;
+
+pub use parts::Parts;
+
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_model::time::Timestamp;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -53,6 +57,16 @@ pub enum LogError {
         path: PathBuf,
         /// The line's number, from 1.
         line: usize,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A line that was looked at has no moment.
+    #[error("{} at byte {offset}: not a line of an event log: {reason}", path.display())]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// Where the line begins.
+        offset: u64,
         /// What is wrong with it.
         reason: String,
     },
@@ -290,6 +304,19 @@ impl Lines {
         Lines::open(path, 0, 0)
     }
 
+    /// What is behind so many bytes, which are so many lines: where a line begins.
+    ///
+    /// # Errors
+    /// Where it cannot be read.
+    pub fn behind(path: &Path, bytes: u64, lines: usize) -> Result<Lines, LogError> {
+        Lines::open(path, bytes, lines)
+    }
+
+    /// How many bytes and lines are before the next line.
+    pub fn position(&self) -> (u64, usize) {
+        (self.whole, self.read)
+    }
+
     /// The number of its last line if that is torn; known once all others were read.
     pub fn torn(&self) -> Option<usize> {
         self.torn
@@ -324,7 +351,7 @@ impl Lines {
         }
         let parsed: LogLine =
             serde_json::from_slice(&self.text).map_err(|error| foreign(explain(&self.text, &error)))?;
-        if line == 1 && !matches!(parsed.entry, LogEntry::Event(Event::Started { .. })) {
+        if self.whole == 0 && !matches!(parsed.entry, LogEntry::Event(Event::Started { .. })) {
             return Err(foreign("an event log begins with the event `started`".into()));
         }
         self.read = line;

@@ -14,6 +14,9 @@ pub(crate) struct UpArguments {
     /// Where the endpoint files go
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
+    /// Show it and its runs as pages in a browser on this machine, as `ratn dashboard` does
+    #[arg(long)]
+    pub(crate) dashboard: bool,
     /// End when standard input ends, because the process that started this one is gone
     #[arg(long)]
     pub(crate) exit_with_parent: bool,

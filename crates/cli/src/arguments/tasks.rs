@@ -3,6 +3,7 @@
 use super::values::{at_least_one, chart, makespan, padding, setting, share, speed};
 use clap::{Args, Subcommand, ValueEnum};
 use ratn_task_control::checkpoint::EVERY_EVENTS;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 /// How tasks are executed, on the command line.
@@ -131,6 +132,38 @@ pub(crate) struct ControlArguments {
 }
 
 #[derive(Debug, Clone, Args)]
+pub(crate) struct SignalArguments {
+    /// The run: its id, the name of its task, or `-` for the one that is under way
+    #[arg(value_name = "RUN")]
+    pub(crate) run: String,
+    /// The signal's name, as a state of the task waits for it
+    #[arg(value_name = "NAME")]
+    pub(crate) signal: String,
+    /// What is sent with it, written as in a task file: 3, true, left, "pose(0, 0, 1)"
+    #[arg(value_name = "VALUE", allow_hyphen_values = true)]
+    pub(crate) value: Option<String>,
+    /// Where the endpoint files of the run's system are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct AnswerArguments {
+    /// The run: its id, the name of its task, or `-` for the one that is under way
+    #[arg(value_name = "RUN")]
+    pub(crate) run: String,
+    /// One of the question's choices
+    #[arg(value_name = "CHOICE")]
+    pub(crate) choice: String,
+    /// The path of the state that asks; needed where several do
+    #[arg(long, value_name = "PATH")]
+    pub(crate) state: Option<String>,
+    /// Where the endpoint files of the run's system are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
 pub(crate) struct StatusArguments {
     /// Show it again whenever it changes, until Ctrl-C
     #[arg(long)]
@@ -149,6 +182,22 @@ pub(crate) struct TopArguments {
     #[arg(long)]
     pub(crate) once: bool,
     /// Where the endpoint files of the system are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct DashboardArguments {
+    /// Event logs; the log of a run that is under way in the system joins them, also of one that begins later
+    #[arg(value_name = "LOG")]
+    pub(crate) logs: Vec<PathBuf>,
+    /// Let the pages pause a run, let it step and go on, and end it; without it they only look
+    #[arg(long)]
+    pub(crate) control: bool,
+    /// Where pages are served: an address of this machine alone, with port 0 at one that is free
+    #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:0")]
+    pub(crate) listen: SocketAddr,
+    /// Where the endpoint files of the system are; it need not be up
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
 }

@@ -5,6 +5,7 @@ mod certs;
 mod check;
 mod completions;
 mod control;
+mod dashboard;
 mod demo;
 pub(crate) mod doctor;
 mod export;
@@ -20,6 +21,7 @@ mod robot;
 mod roles;
 mod run;
 mod safety;
+mod signal;
 mod simulate;
 mod state;
 mod status;
@@ -47,6 +49,8 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Up(arguments) => up::run(&arguments, tls),
         Command::Run(arguments) => run::run(&arguments, tls),
         Command::Control(arguments) => control::run(&arguments),
+        Command::Signal(arguments) => signal::signal(&arguments),
+        Command::Answer(arguments) => signal::answer(&arguments),
         Command::Status(arguments) => status::run(&arguments, tls),
         Command::Ps(arguments) => pool::ps(&arguments, tls),
         Command::Logs(arguments) => pool::logs(&arguments, tls),
@@ -68,6 +72,7 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Completions(arguments) => completions::run(&arguments),
         Command::Man(arguments) => completions::man(&arguments),
         Command::Top(arguments) => top::run(&arguments, tls),
+        Command::Dashboard(arguments) => dashboard::run(&arguments, tls),
         Command::Export(arguments) => export::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),

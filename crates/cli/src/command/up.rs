@@ -1,6 +1,6 @@
 //! `ratn up`: a whole system in the foreground.
 
-use super::{blocking, roles::startable, run::starting};
+use super::{blocking, dashboard, roles::startable, run::starting};
 use crate::arguments::UpArguments;
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
@@ -34,8 +34,22 @@ pub(crate) fn run(arguments: &UpArguments, tls: &ClientTls) -> Result<(), Failur
             "the system is ready in {}; Ctrl-C ends it",
             system.directory().path().display()
         ));
+        let dashboard = match arguments.dashboard {
+            true => Some(dashboard::of_system(&directory, tls).await),
+            false => None,
+        };
+        let shown = async {
+            match dashboard {
+                Some(Ok(dashboard)) => dashboard.serve().await,
+                // The system is up without pages, too.
+                Some(Err(error)) => output::progress(format_args!("there is no dashboard: {error}")),
+                None => {}
+            }
+            std::future::pending::<()>().await;
+        };
         supervisor::ready();
         let ended = tokio::select! {
+            () = shown => Ok(()),
             () = interrupt.asked_times(1) => Ok(()),
             () = parent_gone.cancelled() => Ok(()),
             error = system.one_ended() => Err(error.into()),

@@ -31,7 +31,7 @@ use workers::Offered;
 /// The environment variable that says where endpoint files are.
 const DIRECTORY_VARIABLE: &str = "RATN_RUNTIME_DIR";
 /// In a runtime directory: the config of the system that runs there.
-const CONFIG_FILE: &str = "system.toml";
+pub(crate) const CONFIG_FILE: &str = "system.toml";
 const CELL: &str = "cell";
 /// The kinds of objects that have to be carried upright.
 const UPRIGHT: [&str; 2] = ["bowl", "cup"];

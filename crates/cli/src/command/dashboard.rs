@@ -1,0 +1,78 @@
+//! `ratn dashboard [LOG…]`: runs and a system as pages in a browser.
+
+use super::blocking;
+use crate::arguments::DashboardArguments;
+use crate::failure::Failure;
+use crate::interrupt::Interrupt;
+use crate::system::config::SystemConfig;
+use crate::system::{CONFIG_FILE, public_directory};
+use crate::{input, output};
+use ratn_dashboard::{Dashboard, DashboardError, Options, Tasks};
+use ratn_model::catalogue::Catalogue;
+use ratn_model::load::load_with;
+use ratn_worker::tls::ClientTls;
+use std::path::Path;
+
+/// Serves the pages until the user has seen enough.
+pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(), Failure> {
+    let directory = public_directory(arguments.runtime_dir.as_deref())?;
+    let options = Options {
+        address: arguments.listen,
+        logs: arguments.logs.clone(),
+        control: arguments.control,
+        tasks: tasks(catalogue(&directory)?),
+        ..Options::of(directory, tls.clone())
+    };
+    blocking(async {
+        let interrupt = Interrupt::listen()?;
+        let dashboard = Dashboard::bind(options).await.map_err(refused)?;
+        output::result(dashboard.url())?;
+        let what = if arguments.control { "the pages may pause and end runs" } else { "the pages only look" };
+        output::progress(format_args!("open this address in a browser on this machine; {what}; Ctrl-C ends it"));
+        tokio::select! {
+            () = dashboard.serve() => {}
+            () = interrupt.asked_times(1) => {}
+        }
+        Ok(())
+    })
+}
+
+/// The pages of a system that is up, to look at only; the address is said.
+pub(super) async fn of_system(directory: &Path, tls: &ClientTls) -> anyhow::Result<Dashboard> {
+    let catalogue = catalogue(directory).map_err(|failure| anyhow::anyhow!("{failure}"))?;
+    let options = Options { tasks: tasks(catalogue), ..Options::of(directory.to_owned(), tls.clone()) };
+    let dashboard = Dashboard::bind(options).await?;
+    output::progress(format_args!("its dashboard is at {}", dashboard.url()));
+    Ok(dashboard)
+}
+
+/// That of the system that runs, or ran, in a directory; else the one that is built in.
+fn catalogue(directory: &Path) -> Result<Catalogue, Failure> {
+    let file = directory.join(CONFIG_FILE);
+    let own = SystemConfig::read(&file).ok();
+    Ok(own.map_or_else(|| SystemConfig::load(None), Ok)?.catalogue)
+}
+
+/// Task files are read again whenever somebody asks: they are small, and may have been put back.
+fn tasks(catalogue: Catalogue) -> Tasks {
+    Tasks::by(move |file| {
+        if file.as_os_str().is_empty() {
+            return Err("the log does not say which task file it is of".to_owned());
+        }
+        let place = file.display();
+        let source = input::read(file).map_err(|error| format!("cannot read the task file {place}: {error}"))?;
+        let name = place.to_string();
+        let loaded = load_with(&source, &name, &catalogue, &input::Libraries);
+        loaded
+            .map(|loaded| loaded.program)
+            .map_err(|_| format!("`ratn check {place}` says what is wrong with the task file"))
+    })
+}
+
+/// What was asked for cannot be, or what it needs is not there.
+fn refused(error: DashboardError) -> Failure {
+    match error {
+        DashboardError::Exposed { .. } | DashboardError::TooMany { .. } => Failure::Refused(format!("ratn: {error}")),
+        other => Failure::Failed(other.into()),
+    }
+}

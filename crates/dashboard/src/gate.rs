@@ -1,0 +1,158 @@
+//! Who is answered: only pages that this program itself has served, on this machine, with the token that its user was given.
+//!
+//! A page of somebody else's cannot ask: it does not know the token, its `Origin` is another, and a name that leads here by the DNS of
+//! others (rebinding) is not one of this machine's. Pure.
+
+use hyper::header::{AUTHORIZATION, HOST, HeaderMap, HeaderValue, ORIGIN};
+use ring::rand::{SecureRandom, SystemRandom};
+
+const TOKEN_BYTES: usize = 24;
+/// As a browser may name this machine.
+const NAMES: [&str; 3] = ["127.0.0.1", "localhost", "[::1]"];
+const SCHEME: &str = "Bearer ";
+
+/// What every answer says to the browser: run nothing that is not ours, send nothing elsewhere, be in nobody's frame, keep nothing.
+pub(crate) const HEADERS: [(&str, &str); 7] = [
+    (
+        "content-security-policy",
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; base-uri 'none'; \
+         form-action 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'; trusted-types 'none'",
+    ),
+    ("x-content-type-options", "nosniff"),
+    ("referrer-policy", "no-referrer"),
+    ("cross-origin-opener-policy", "same-origin"),
+    ("cross-origin-resource-policy", "same-origin"),
+    ("cache-control", "no-store"),
+    ("permissions-policy", "camera=(), microphone=(), geolocation=()"),
+];
+
+/// What its user was given. No message of this crate has it.
+pub(crate) struct Token(String);
+
+/// Why somebody is not answered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum Refused {
+    /// The page was asked for by a name that is not this machine's.
+    #[error("this is served as 127.0.0.1 or localhost only")]
+    Host,
+    /// Another page asks.
+    #[error("pages of others are not answered")]
+    Origin,
+    /// The token is another one, or none.
+    #[error("the token is not the one of this dashboard: open the address that `ratn dashboard` printed")]
+    Token,
+}
+
+impl std::fmt::Debug for Token {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Token(…)")
+    }
+}
+
+impl Token {
+    /// A new one; `None` where the system gives no random bytes.
+    pub(crate) fn random() -> Option<Token> {
+        let mut bytes = [0; TOKEN_BYTES];
+        SystemRandom::new().fill(&mut bytes).ok()?;
+        Some(Token(bytes.iter().map(|byte| format!("{byte:02x}")).collect()))
+    }
+
+    /// For the address that the user opens.
+    pub(crate) fn text(&self) -> &str {
+        &self.0
+    }
+
+    /// In a time that does not depend on where they differ.
+    fn is(&self, other: &[u8]) -> bool {
+        let own = self.0.as_bytes();
+        own.len() == other.len() && own.iter().zip(other).fold(0, |all, (a, b)| all | (a ^ b)) == 0
+    }
+}
+
+/// Whether the pages themselves, in which nothing of anybody is, may be had.
+pub(crate) fn asks_here(headers: &HeaderMap) -> Result<&str, Refused> {
+    let host = only(headers, &HOST).and_then(|host| host.to_str().ok()).ok_or(Refused::Host)?;
+    let name = match host.rsplit_once(':') {
+        Some((name, port)) if !port.is_empty() && port.bytes().all(|byte| byte.is_ascii_digit()) => name,
+        _ => host,
+    };
+    if !NAMES.iter().any(|own| own.eq_ignore_ascii_case(name)) {
+        return Err(Refused::Host);
+    }
+    let foreign = |value: &HeaderValue| value.as_bytes() != format!("http://{host}").as_bytes();
+    let site = headers.get("sec-fetch-site").is_some_and(|site| site != "same-origin" && site != "none");
+    if headers.get_all(ORIGIN).iter().any(foreign) || site {
+        return Err(Refused::Origin);
+    }
+    Ok(host)
+}
+
+/// Whether runs and systems may be looked at.
+pub(crate) fn may_look(headers: &HeaderMap, token: &Token) -> Result<(), Refused> {
+    asks_here(headers)?;
+    let shown = only(headers, &AUTHORIZATION).map(HeaderValue::as_bytes);
+    let shown = shown.and_then(|shown| shown.strip_prefix(SCHEME.as_bytes())).ok_or(Refused::Token)?;
+    if token.is(shown) { Ok(()) } else { Err(Refused::Token) }
+}
+
+/// The value of a header that is there once.
+fn only<'h>(headers: &'h HeaderMap, name: &hyper::header::HeaderName) -> Option<&'h HeaderValue> {
+    let mut all = headers.get_all(name).iter();
+    let first = all.next()?;
+    all.next().is_none().then_some(first)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    fn headers(all: &[(&'static str, &str)]) -> HeaderMap {
+        let mut headers = HeaderMap::new();
+        for (name, value) in all {
+            headers.append(*name, HeaderValue::from_str(value).unwrap());
+        }
+        headers
+    }
+
+    #[test]
+    fn only_this_machine_by_its_own_names_is_answered() {
+        for host in ["127.0.0.1:80", "localhost:4711", "LOCALHOST:1", "[::1]:9", "127.0.0.1"] {
+            assert!(asks_here(&headers(&[("host", host)])).is_ok(), "{host}");
+        }
+        for host in
+            ["evil.example:80", "127.0.0.1.evil.example:80", "localhost.evil.example", "", "10.0.0.1:80", "127.0.0.1:x"]
+        {
+            assert_eq!(asks_here(&headers(&[("host", host)])), Err(Refused::Host), "{host}");
+        }
+        assert_eq!(asks_here(&headers(&[])), Err(Refused::Host));
+        assert_eq!(asks_here(&headers(&[("host", "localhost"), ("host", "localhost")])), Err(Refused::Host));
+    }
+
+    #[test]
+    fn a_page_of_somebody_else_is_refused_also_on_this_machine() {
+        let from = |origin: &str| asks_here(&headers(&[("host", "localhost:80"), ("origin", origin)])).map(drop);
+        assert_eq!(from("http://localhost:80"), Ok(()));
+        for origin in
+            ["http://localhost:81", "https://localhost:80", "http://evil.example", "null", "http://localhost:80.evil"]
+        {
+            assert_eq!(from(origin), Err(Refused::Origin), "{origin}");
+        }
+        let site = |site: &str| asks_here(&headers(&[("host", "localhost:80"), ("sec-fetch-site", site)])).map(drop);
+        assert_eq!((site("same-origin"), site("none")), (Ok(()), Ok(())));
+        assert_eq!((site("cross-site"), site("same-site")), (Err(Refused::Origin), Err(Refused::Origin)));
+    }
+
+    #[test]
+    fn only_the_token_opens() {
+        let token = Token::random().unwrap();
+        assert_ne!(token.text(), Token::random().unwrap().text());
+        let with = |shown: &str| may_look(&headers(&[("host", "localhost"), ("authorization", shown)]), &token);
+        assert_eq!(with(&format!("Bearer {}", token.text())), Ok(()));
+        let short = &token.text()[1..];
+        for shown in ["", "Bearer ", token.text(), &format!("Bearer {short}"), &format!("bearer {}", token.text())] {
+            assert_eq!(with(shown), Err(Refused::Token), "{shown}");
+        }
+        assert_eq!(may_look(&headers(&[("host", "localhost")]), &token), Err(Refused::Token));
+    }
+}

@@ -1,0 +1,287 @@
+//! The logs that are looked at: which there are, how far each was read, and the moments at which pages replay them.
+//!
+//! Nothing is read unless a page asks, and all pages that look at the same share one fold, so a page that nobody looks at costs a run
+//! nothing. A long log is not read from its start: enough of it before the moment that is shown is ([`Parts`]).
+
+use crate::fold::{Bond, Fold};
+use crate::{tell, wire};
+use ratn_event_log::{LogError, Parts};
+use ratn_model::id::InstanceId;
+use ratn_model::time::Timestamp;
+use ratn_task_control::control::RunStatus;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+/// So many logs are looked at, those of the command line and those that runs write meanwhile.
+pub const MAX_LOGS: usize = 16;
+/// So much of a log is read before the moment that is shown; a shorter log is read from its start.
+const BEFORE_BYTES: u64 = 16 << 20;
+/// So much is read for one answer.
+const BUDGET_BYTES: u64 = 4 << 20;
+/// Replays that are kept, so that each goes on where it was. Of more the one that was not asked for longest begins anew.
+const MAX_REPLAYS: usize = 4;
+/// Instances in one answer.
+const MOST_INSTANCES: usize = 4_000;
+/// A log is not looked at more often.
+const LOOK_INTERVAL: Duration = Duration::from_millis(50);
+/// It has not been heard of for so long: no run writes it.
+const HEARD_WITHIN: Duration = Duration::from_secs(3);
+
+/// What a page knows of a log already, and which moment it shows.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Asked {
+    /// The moment in seconds; none for the newest.
+    pub(crate) at_s: Option<f64>,
+    /// Of which fold it knows something.
+    pub(crate) epoch: u64,
+    /// Up to which version.
+    pub(crate) version: u64,
+    /// The instance of which it wants to know in any case why it waits.
+    pub(crate) about: Option<InstanceId>,
+}
+
+/// Why a log is not told of.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum NotTold {
+    /// There is none of this number.
+    #[error("there is no log {0}: it was given up for a newer one, or never there")]
+    Unknown(u64),
+    /// It cannot be read.
+    #[error(transparent)]
+    Log(#[from] LogError),
+}
+
+/// All of them.
+#[derive(Debug, Default)]
+pub(crate) struct Logs {
+    all: Mutex<All>,
+}
+
+#[derive(Debug, Default)]
+struct All {
+    logs: Vec<Followed>,
+    /// Numbers of logs and folds, each given once.
+    numbers: u64,
+    replays: Vec<Replay>,
+}
+
+/// A log.
+#[derive(Debug)]
+struct Followed {
+    id: u64,
+    path: PathBuf,
+    /// It was named by the user: it is not given up.
+    named: bool,
+    parts: Option<Parts>,
+    live: Option<Fold>,
+    looked: Option<Instant>,
+    /// What its run last said of itself.
+    heard: Option<(Instant, RunStatus)>,
+}
+
+/// A log at a moment.
+#[derive(Debug)]
+struct Replay {
+    log: u64,
+    fold: Fold,
+    asked: Instant,
+}
+
+impl Logs {
+    /// The logs of the command line.
+    pub(crate) fn of(paths: &[PathBuf]) -> Logs {
+        let mut all = All::default();
+        for path in paths {
+            all.add(path.clone(), true);
+        }
+        Logs { all: Mutex::new(all) }
+    }
+
+    /// A run says what it is doing; its log is one of them from now on.
+    pub(crate) fn hear(&self, status: RunStatus) {
+        let mut all = self.lock();
+        let path = std::fs::canonicalize(&status.log).unwrap_or_else(|_| status.log.clone());
+        let known = all.logs.iter().position(|one| one.path == path);
+        let index = known.unwrap_or_else(|| all.add(path, false));
+        if let Some(one) = all.logs.get_mut(index) {
+            one.heard = Some((Instant::now(), status));
+        }
+    }
+
+    /// What there is.
+    pub(crate) fn told(&self) -> Vec<wire::Log> {
+        let tell = |one: &Followed| wire::Log {
+            id: one.id,
+            name: one.path.file_name().unwrap_or(one.path.as_os_str()).to_string_lossy().into_owned(),
+            path: one.path.display().to_string(),
+            live: one.status().is_some(),
+        };
+        self.lock().logs.iter().map(tell).collect()
+    }
+
+    /// Whether the run that is heard of writes this log.
+    pub(crate) fn is_live(&self, id: u64) -> bool {
+        self.lock().logs.iter().any(|one| one.id == id && one.status().is_some())
+    }
+
+    /// The run of a log at a moment.
+    pub(crate) fn frame(&self, id: u64, asked: &Asked) -> Result<wire::Frame, NotTold> {
+        self.at(id, asked, |fold, there, one| {
+            let version = if fold.epoch == asked.epoch { asked.version } else { 0 };
+            let news = fold.since(version, MOST_INSTANCES);
+            let mut frame = tell::frame(fold, &news, asked.about);
+            frame.more |= !there;
+            frame.run.live = one.status().is_some();
+            frame.run.last_s = frame.run.at_s.max(one.parts.as_ref().map_or(0.0, |parts| parts.last().seconds()));
+            frame
+        })
+    }
+
+    /// The file and the digest of a log's task.
+    pub(crate) fn task(&self, id: u64) -> Result<(PathBuf, String), NotTold> {
+        self.at(id, &Asked::default(), |fold, _, _| (PathBuf::from(&fold.run.file), fold.digest.clone()))
+    }
+
+    /// The world of a log at a moment.
+    pub(crate) fn world(&self, id: u64, asked: &Asked, filter: &str) -> Result<wire::World, NotTold> {
+        self.at(id, asked, |fold, _, _| {
+            let path =
+                |id: InstanceId| fold.run.instance(id).map_or_else(|| id.to_string(), |one| one.path.to_string());
+            let world = fold.world.told(filter, path);
+            wire::World { at_s: fold.run.end_s, from_s: fold.from_s, ..world }
+        })
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, All> {
+        // What a panic left is what was read so far.
+        self.all.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// With the fold of a log at a moment, and whether everything until then was read.
+    fn at<T>(&self, id: u64, asked: &Asked, then: impl FnOnce(&Fold, bool, &Followed) -> T) -> Result<T, NotTold> {
+        let mut all = self.lock();
+        let All { logs, numbers, replays } = &mut *all;
+        let one = logs.iter_mut().find(|one| one.id == id).ok_or(NotTold::Unknown(id))?;
+        one.look()?;
+        match asked.at_s {
+            None => {
+                let there = one.follow(numbers)?;
+                let fold = one.live.as_ref().ok_or(NotTold::Unknown(id))?;
+                Ok(then(fold, there, one))
+            }
+            Some(at_s) => {
+                let moment = Timestamp::from_seconds(at_s);
+                let index = replay(replays, numbers, one, asked.epoch, moment)?;
+                let replay = &mut replays[index];
+                replay.asked = Instant::now();
+                let there = replay.fold.read(&one.path, moment, BUDGET_BYTES)?;
+                if there {
+                    let last = one.parts.as_ref().map_or(moment, Parts::last);
+                    replay.fold.run.wait_until(moment.min(last).seconds());
+                }
+                Ok(then(&replay.fold, there, one))
+            }
+        }
+    }
+}
+
+/// The replay that a page goes on with, or a new one: where it wants an earlier moment than was read, or one far ahead.
+fn replay(
+    replays: &mut Vec<Replay>,
+    numbers: &mut u64,
+    one: &Followed,
+    epoch: u64,
+    moment: Timestamp,
+) -> Result<usize, NotTold> {
+    let begin = one.begin(moment);
+    let goes_on = |replay: &Replay| {
+        let ahead = begin.0.saturating_sub(replay.fold.position());
+        replay.log == one.id && replay.fold.epoch == epoch && replay.fold.run.end_s <= moment.seconds() && ahead == 0
+    };
+    if let Some(index) = replays.iter().position(goes_on) {
+        return Ok(index);
+    }
+    // A page has one replay of a log.
+    replays.retain(|replay| replay.fold.epoch != epoch);
+    if replays.len() >= MAX_REPLAYS
+        && let Some(oldest) = (0..replays.len()).min_by_key(|index| replays[*index].asked)
+    {
+        replays.remove(oldest);
+    }
+    *numbers += 1;
+    let fold = Fold::begin(*numbers, &one.path, begin)?;
+    replays.push(Replay { log: one.id, fold, asked: Instant::now() });
+    Ok(replays.len() - 1)
+}
+
+impl All {
+    /// Its place. Where there are as many as there may be, one that was not named by the user is given up for it.
+    fn add(&mut self, path: PathBuf, named: bool) -> usize {
+        if self.logs.len() >= MAX_LOGS {
+            let Some(oldest) = self.logs.iter().position(|one| !one.named) else { return usize::MAX };
+            let given_up = self.logs.remove(oldest).id;
+            self.replays.retain(|replay| replay.log != given_up);
+        }
+        self.numbers += 1;
+        let (id, parts) = (self.numbers, None);
+        self.logs.push(Followed { id, path, named, parts, live: None, looked: None, heard: None });
+        self.logs.len() - 1
+    }
+}
+
+impl Followed {
+    /// What its run says of itself, where one writes it.
+    fn status(&self) -> Option<&RunStatus> {
+        self.heard.as_ref().filter(|(heard, _)| heard.elapsed() < HEARD_WITHIN).map(|(_, status)| status)
+    }
+
+    /// How long the log is by now.
+    fn look(&mut self) -> Result<(), LogError> {
+        match &mut self.parts {
+            Some(_) if self.looked.is_some_and(|looked| looked.elapsed() < LOOK_INTERVAL) => return Ok(()),
+            Some(parts) => {
+                let before = parts.length();
+                parts.look()?;
+                if parts.length() < before {
+                    // Another log has its name now.
+                    self.live = None;
+                }
+            }
+            None => self.parts = Some(Parts::of(&self.path)?),
+        }
+        self.looked = Some(Instant::now());
+        Ok(())
+    }
+
+    /// Where reading begins for a moment.
+    fn begin(&self, moment: Timestamp) -> (u64, Timestamp) {
+        self.parts.as_ref().map_or((0, Timestamp(0)), |parts| parts.before(moment, BEFORE_BYTES))
+    }
+
+    /// Reads on to the end of the log. Whether it was reached.
+    fn follow(&mut self, numbers: &mut u64) -> Result<bool, LogError> {
+        let end = Timestamp(u64::MAX);
+        if self.live.is_none() {
+            *numbers += 1;
+            self.live = Some(Fold::begin(*numbers, &self.path, self.begin(end))?);
+        }
+        let now_s = self.status().map(|status| status.at_s);
+        let Some(fold) = &mut self.live else { return Ok(true) };
+        let there = fold.read(&self.path, end, BUDGET_BYTES)?;
+        if let Some(now_s) = now_s.filter(|_| there && fold.run.outcome.is_none()) {
+            fold.run.wait_until(now_s);
+        }
+        Ok(there)
+    }
+}
+
+/// Edges as the pages know them.
+pub(crate) fn edges(fold: &Fold, id: InstanceId) -> Vec<wire::Edge> {
+    fold.edges(id).map(|(from, bond): (InstanceId, Bond)| wire::Edge { from: from.0, kind: bond.name() }).collect()
+}
+
+/// As the file system names it, so that the log of a run is known by its own word, too.
+pub(crate) fn absolute(path: &Path) -> std::io::Result<PathBuf> {
+    std::fs::canonicalize(path)
+}

@@ -1,0 +1,529 @@
+//! HTTP for the pages and what they ask. Bounded: few connections, little to read, and whoever does not read is given up.
+
+use crate::gate::{self, HEADERS, Refused, Token};
+use crate::logs::{Asked, Logs, MAX_LOGS, NotTold, absolute};
+use crate::patience::Patient;
+use crate::system::System;
+use crate::{task, wire};
+use hyper::body::Incoming;
+use hyper::header::{ALLOW, CONTENT_TYPE, HeaderValue};
+use hyper::server::conn::http1;
+use hyper::service::service_fn;
+use hyper::{HeaderMap, Method, Request, Response, StatusCode, Uri};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use ratn_event_log::LogError;
+use ratn_model::id::InstanceId;
+use ratn_model::program::Program;
+use ratn_proto::types::Scale;
+use ratn_task_control::control::{self, Word};
+use ratn_worker::tls::ClientTls;
+use serde::Serialize;
+use std::convert::Infallible;
+use std::io;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Semaphore;
+
+/// Connections at the same time; more are closed at once. A browser has six.
+const MAX_CONNECTIONS: usize = 96;
+/// The head of a request has at most this many bytes …
+const MAX_REQUEST_BYTES: usize = 16 * 1024;
+/// … and this many headers …
+const MAX_HEADERS: usize = 64;
+/// … and is there in this time, unless the options say otherwise. Whoever takes nothing of an answer for so long is given up.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// After a connection that could not be had: the process is out of descriptors.
+const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
+/// Folds that are read at the same time.
+const MAX_READING: usize = 4;
+const JSON: &str = "application/json";
+
+/// The pages, as `scripts/build-dashboard` makes them of `web/`.
+const PAGES: [(&str, &str, &str); 4] = [
+    ("/", "text/html; charset=utf-8", include_str!("../assets/index.html")),
+    ("/app.js", "text/javascript; charset=utf-8", include_str!("../assets/app.js")),
+    ("/app.css", "text/css; charset=utf-8", include_str!("../assets/app.css")),
+    ("/icon.svg", "image/svg+xml", include_str!("../assets/icon.svg")),
+];
+
+/// How the task file of a log is loaded. What is not the task of the run is not shown.
+#[derive(Clone)]
+pub struct Tasks(Arc<dyn Fn(&Path) -> Result<Program, String> + Send + Sync>);
+
+impl Tasks {
+    /// Loads them so; an error says in a sentence why one is not there.
+    pub fn by(load: impl Fn(&Path) -> Result<Program, String> + Send + Sync + 'static) -> Tasks {
+        Tasks(Arc::new(load))
+    }
+
+    /// Loads none.
+    pub fn none() -> Tasks {
+        Tasks::by(|_| Err("task files are not read here".to_owned()))
+    }
+}
+
+impl std::fmt::Debug for Tasks {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Tasks(…)")
+    }
+}
+
+/// What is shown, and where.
+#[derive(Debug, Clone)]
+pub struct Options {
+    /// Where pages are served; a loopback address. Port 0 takes one that is free.
+    pub address: SocketAddr,
+    /// Event logs, at most [`MAX_LOGS`]. The log of a run that is under way in `directory` joins them.
+    pub logs: Vec<PathBuf>,
+    /// The runtime directory of a system.
+    pub directory: PathBuf,
+    /// Whether pages may tell a run to pause, step, go on and end.
+    pub control: bool,
+    /// What the clients of the system trust and show.
+    pub tls: ClientTls,
+    /// How tasks are loaded.
+    pub tasks: Tasks,
+    /// A browser that says or takes nothing for so long is cut off.
+    pub patience: Duration,
+}
+
+impl Options {
+    /// Of a system's runtime directory, at a free port, without logs, to look at only.
+    pub fn of(directory: PathBuf, tls: ClientTls) -> Options {
+        let address = SocketAddr::from(([127, 0, 0, 1], 0));
+        Options { address, logs: Vec::new(), directory, control: false, tls, tasks: Tasks::none(), patience: PATIENCE }
+    }
+}
+
+/// Why nothing is served.
+#[derive(Debug, thiserror::Error)]
+pub enum DashboardError {
+    /// Other machines could reach it.
+    #[error(
+        "the dashboard is for this machine alone, and {address} is not a loopback address: from another machine use `ssh -L`"
+    )]
+    Exposed {
+        /// Which.
+        address: SocketAddr,
+    },
+    /// More logs than are looked at.
+    #[error("{given} logs are more than the {MAX_LOGS} that are looked at at once: name fewer")]
+    TooMany {
+        /// How many were named.
+        given: usize,
+    },
+    /// A log that cannot be read.
+    #[error(transparent)]
+    Log(#[from] LogError),
+    /// A log that is not there.
+    #[error("cannot read the event log {}", path.display())]
+    NoLog {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// The address cannot be had.
+    #[error("cannot serve pages at {address}")]
+    Refused {
+        /// Which.
+        address: SocketAddr,
+        /// Why.
+        source: io::Error,
+    },
+    /// There is nothing to make a token of.
+    #[error("the system gives no random bytes for a token")]
+    NoToken,
+}
+
+/// A server that has its address and does not answer yet.
+#[derive(Debug)]
+pub struct Dashboard {
+    listener: TcpListener,
+    address: SocketAddr,
+    shown: Arc<Shown>,
+    patience: Duration,
+}
+
+/// What is shown to whoever has the token.
+#[derive(Debug)]
+struct Shown {
+    token: Token,
+    logs: Arc<Logs>,
+    system: System,
+    control: bool,
+    tasks: Tasks,
+    reading: Semaphore,
+}
+
+/// What a question is.
+struct Head {
+    method: Method,
+    uri: Uri,
+    headers: HeaderMap,
+}
+
+/// What a page is answered.
+enum Answer {
+    Json(String),
+    Refused(StatusCode, String),
+}
+
+impl Dashboard {
+    /// Takes the address, and looks whether the logs can be read.
+    ///
+    /// # Errors
+    /// [`DashboardError`].
+    pub async fn bind(options: Options) -> Result<Dashboard, DashboardError> {
+        let Options { address, logs, directory, control, tls, tasks, patience } = options;
+        if !address.ip().is_loopback() {
+            return Err(DashboardError::Exposed { address });
+        }
+        if logs.len() > MAX_LOGS {
+            return Err(DashboardError::TooMany { given: logs.len() });
+        }
+        let mut paths: Vec<PathBuf> = Vec::new();
+        for path in &logs {
+            let path = absolute(path).map_err(|source| DashboardError::NoLog { path: path.clone(), source })?;
+            ratn_event_log::first(&path)?;
+            if !paths.contains(&path) {
+                paths.push(path);
+            }
+        }
+        let token = Token::random().ok_or(DashboardError::NoToken)?;
+        let refused = |source| DashboardError::Refused { address, source };
+        let listener = TcpListener::bind(address).await.map_err(refused)?;
+        let address = listener.local_addr().map_err(refused)?;
+        let (logs, system) = (Arc::new(Logs::of(&paths)), System::of(directory, &tls));
+        let reading = Semaphore::new(MAX_READING);
+        let shown = Arc::new(Shown { token, logs, system, control, tasks, reading });
+        Ok(Dashboard { listener, address, shown, patience })
+    }
+
+    /// What its user opens. The token stands behind `#`, which browsers send nobody.
+    pub fn url(&self) -> String {
+        format!("http://{}/#token={}", self.address, self.shown.token.text())
+    }
+
+    /// Answers for as long as this is waited for.
+    pub async fn serve(self) {
+        let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+        loop {
+            let Ok((connection, _)) = self.listener.accept().await else {
+                tokio::time::sleep(ACCEPT_AGAIN).await;
+                continue;
+            };
+            let Ok(place) = Arc::clone(&places).try_acquire_owned() else { continue };
+            let (shown, patience) = (self.shown.clone(), self.patience);
+            tokio::spawn(async move {
+                // Who left, or was too slow, hears nothing.
+                let _ = answer(shown, connection, patience).await;
+                drop(place);
+            });
+        }
+    }
+}
+
+async fn answer(shown: Arc<Shown>, connection: TcpStream, patience: Duration) -> hyper::Result<()> {
+    let page = service_fn(move |request: Request<Incoming>| {
+        let shown = shown.clone();
+        async move {
+            // Nothing stands in the body of any question.
+            let head = Head {
+                method: request.method().clone(),
+                uri: request.uri().clone(),
+                headers: request.headers().clone(),
+            };
+            drop(request);
+            Ok::<_, Infallible>(shown.answer(&head).await)
+        }
+    });
+    http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(patience)
+        .max_buf_size(MAX_REQUEST_BYTES)
+        .max_headers(MAX_HEADERS)
+        .serve_connection(TokioIo::new(Patient::new(connection, patience)), page)
+        .await
+}
+
+impl Shown {
+    async fn answer(&self, head: &Head) -> Response<String> {
+        let path = head.uri.path();
+        if let Some((_, kind, page)) = PAGES.iter().find(|(name, _, _)| *name == path) {
+            return match (gate::asks_here(&head.headers), &head.method) {
+                (Err(refused), _) => refusal(StatusCode::FORBIDDEN, &refused.to_string()),
+                (Ok(_), &Method::GET) => response(StatusCode::OK, kind, (*page).to_owned()),
+                (Ok(_), _) => not_allowed("GET"),
+            };
+        }
+        if let Err(refused) = gate::may_look(&head.headers, &self.token) {
+            let status = if refused == Refused::Token { StatusCode::UNAUTHORIZED } else { StatusCode::FORBIDDEN };
+            return refusal(status, &refused.to_string());
+        }
+        let query = Query::of(head.uri.query().unwrap_or_default());
+        let answer = match (&head.method, path) {
+            (&Method::GET, "/api/about") => self.about().await,
+            (&Method::GET, "/api/run") => self.run(&query).await,
+            (&Method::GET, "/api/task") => self.task(&query).await,
+            (&Method::GET, "/api/world") => self.world(&query).await,
+            (&Method::GET, "/api/system") => json(&self.system.told().await),
+            (&Method::GET, "/api/tail") => self.tail(&query).await,
+            (&Method::POST, "/api/control") => self.control(&query).await,
+            (&Method::POST, "/api/scale") => self.scale(&query).await,
+            (_, "/api/control" | "/api/scale") => return not_allowed("POST"),
+            (_, "/api/about" | "/api/run" | "/api/task" | "/api/world" | "/api/system" | "/api/tail") => {
+                return not_allowed("GET");
+            }
+            _ => Answer::Refused(StatusCode::NOT_FOUND, "there is nothing of this name".to_owned()),
+        };
+        match answer {
+            Answer::Json(text) => response(StatusCode::OK, JSON, text),
+            Answer::Refused(status, problem) => refusal(status, &problem),
+        }
+    }
+
+    /// Asks the system for its run: its log is one of those that are looked at.
+    async fn hear(&self) -> Result<(), String> {
+        match self.system.run().await {
+            Ok(status) => {
+                if let Some(status) = status {
+                    self.logs.hear(status);
+                }
+                Ok(())
+            }
+            Err(error) => Err(format!("the run in {} does not say what it is doing: {error}", self.system.directory())),
+        }
+    }
+
+    async fn about(&self) -> Answer {
+        let problem = self.hear().await.err().unwrap_or_default();
+        json(&wire::About {
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            control: self.control,
+            directory: self.system.directory(),
+            logs: self.logs.told(),
+            problem,
+        })
+    }
+
+    async fn run(&self, query: &Query<'_>) -> Answer {
+        let (id, asked) = match query.asked() {
+            Ok(asked) => asked,
+            Err(problem) => return Answer::Refused(StatusCode::BAD_REQUEST, problem),
+        };
+        if asked.at_s.is_none() {
+            // Without an answer the log is shown as far as it is written.
+            let _ = self.hear().await;
+        }
+        let control = self.control;
+        self.reading(move |logs| {
+            let mut frame = logs.frame(id, &asked)?;
+            frame.run.controllable = control && frame.run.live && frame.run.outcome.is_none();
+            Ok(serde_json::to_string(&frame))
+        })
+        .await
+    }
+
+    async fn task(&self, query: &Query<'_>) -> Answer {
+        let (id, _) = match query.asked() {
+            Ok(asked) => asked,
+            Err(problem) => return Answer::Refused(StatusCode::BAD_REQUEST, problem),
+        };
+        let tasks = self.tasks.clone();
+        self.reading(move |logs| {
+            let (file, digest) = logs.task(id)?;
+            let told = match (tasks.0)(&file) {
+                Ok(program) if program.digest == digest => task::told(&program),
+                Ok(_) => task::unknown(format!("{} is not what it was when the run began", file.display())),
+                Err(problem) => task::unknown(problem),
+            };
+            Ok(serde_json::to_string(&told))
+        })
+        .await
+    }
+
+    async fn world(&self, query: &Query<'_>) -> Answer {
+        let (id, asked) = match query.asked() {
+            Ok(asked) => asked,
+            Err(problem) => return Answer::Refused(StatusCode::BAD_REQUEST, problem),
+        };
+        let filter = query.text("filter");
+        self.reading(move |logs| Ok(serde_json::to_string(&logs.world(id, &asked, &filter)?))).await
+    }
+
+    /// Reads a log in a thread in which that keeps nobody waiting.
+    async fn reading(
+        &self,
+        read: impl FnOnce(&Logs) -> Result<serde_json::Result<String>, NotTold> + Send + 'static,
+    ) -> Answer {
+        let Ok(_place) = self.reading.acquire().await else {
+            return Answer::Refused(StatusCode::SERVICE_UNAVAILABLE, "the dashboard ends".to_owned());
+        };
+        let logs = self.logs.clone();
+        match tokio::task::spawn_blocking(move || read(&logs)).await {
+            Ok(Ok(Ok(text))) => Answer::Json(text),
+            Ok(Ok(Err(error))) => Answer::Refused(StatusCode::INTERNAL_SERVER_ERROR, error.to_string()),
+            Ok(Err(error @ NotTold::Unknown(_))) => Answer::Refused(StatusCode::NOT_FOUND, error.to_string()),
+            Ok(Err(error @ NotTold::Log(_))) => Answer::Refused(StatusCode::UNPROCESSABLE_ENTITY, chain(&error)),
+            Err(_) => {
+                Answer::Refused(StatusCode::INTERNAL_SERVER_ERROR, "reading the log ended with a panic".to_owned())
+            }
+        }
+    }
+
+    async fn tail(&self, query: &Query<'_>) -> Answer {
+        let worker = query.text("worker");
+        match self.system.tail(&worker).await {
+            Ok(tail) => json(&tail),
+            Err(problem) => Answer::Refused(StatusCode::NOT_FOUND, problem),
+        }
+    }
+
+    /// Whether the pages may tell anybody anything.
+    fn only_looks(&self) -> Option<Answer> {
+        let problem = "these pages only look: `ratn dashboard --control` lets them steer runs and pools";
+        (!self.control).then(|| Answer::Refused(StatusCode::FORBIDDEN, problem.to_owned()))
+    }
+
+    async fn scale(&self, query: &Query<'_>) -> Answer {
+        if let Some(refusal) = self.only_looks() {
+            return refusal;
+        }
+        let number = |name: &str| match query.text(name).as_str() {
+            "" => Ok(None),
+            text => text.parse().map(Some).map_err(|_| format!("`{name}={text}` is no number of workers")),
+        };
+        let scale = match (number("min"), number("max"), number("spares")) {
+            (Ok(min), Ok(max), Ok(spares)) => Scale { min, max, spares },
+            (Err(problem), _, _) | (_, Err(problem), _) | (_, _, Err(problem)) => {
+                return Answer::Refused(StatusCode::BAD_REQUEST, problem);
+            }
+        };
+        let template = query.text("template");
+        match self.system.scale(&query.text("host"), &template, scale).await {
+            Ok(()) => json(&wire::Told { said: format!("The pool {template} is scaled.") }),
+            Err(problem) => Answer::Refused(StatusCode::CONFLICT, problem),
+        }
+    }
+
+    async fn control(&self, query: &Query<'_>) -> Answer {
+        if let Some(refusal) = self.only_looks() {
+            return refusal;
+        }
+        let (word, said) = match query.text("word").as_str() {
+            "pause" => (Word::Pause, "The run is paused: no further motion begins."),
+            "resume" => (Word::Resume, "The run goes on."),
+            "step" => (Word::Step, "One more motion may begin, then the run is paused."),
+            "abort" => (Word::Abort, "The run is told to end: what moves stops and holds."),
+            other => {
+                let problem = format!("a run can be told pause, resume, step and abort, and not `{other}`");
+                return Answer::Refused(StatusCode::BAD_REQUEST, problem);
+            }
+        };
+        // The page says which run it means: another may have begun since.
+        let _ = self.hear().await;
+        if !query.number("log").is_some_and(|id| self.logs.is_live(id)) {
+            let problem = "no run writes this log any more".to_owned();
+            return Answer::Refused(StatusCode::CONFLICT, problem);
+        }
+        match self.system.tell(word).await {
+            Ok(()) => json(&wire::Told { said: said.to_owned() }),
+            Err(error) if control::is_nobody(&error) => {
+                Answer::Refused(StatusCode::CONFLICT, "no run is under way".to_owned())
+            }
+            Err(error) => Answer::Refused(StatusCode::BAD_GATEWAY, format!("the run does not take that: {error}")),
+        }
+    }
+}
+
+/// What stands behind `?`.
+struct Query<'q>(&'q str);
+
+impl<'q> Query<'q> {
+    fn of(text: &'q str) -> Query<'q> {
+        Query(text)
+    }
+
+    /// The text of a name, decoded; empty where it is not there.
+    fn text(&self, name: &str) -> String {
+        let pairs = self.0.split('&').filter_map(|pair| pair.split_once('='));
+        let value = pairs.filter(|(key, _)| *key == name).map(|(_, value)| value).next().unwrap_or_default();
+        let (mut bytes, mut rest) = (Vec::with_capacity(value.len()), value.as_bytes());
+        while let Some((first, behind)) = rest.split_first() {
+            rest = behind;
+            let hex = behind.get(..2).and_then(|two| std::str::from_utf8(two).ok());
+            match (first, hex.and_then(|two| u8::from_str_radix(two, 16).ok())) {
+                (b'%', Some(byte)) => {
+                    bytes.push(byte);
+                    rest = &behind[2..];
+                }
+                (b'+', _) => bytes.push(b' '),
+                (byte, _) => bytes.push(*byte),
+            }
+        }
+        String::from_utf8_lossy(&bytes).into_owned()
+    }
+
+    fn number(&self, name: &str) -> Option<u64> {
+        self.text(name).parse().ok()
+    }
+
+    /// Which log, and what of it is known.
+    fn asked(&self) -> Result<(u64, Asked), String> {
+        let id = self.number("log").ok_or("say which log: `log=NUMBER`, as /api/about lists them")?;
+        let at_s = match self.text("at").as_str() {
+            "" => None,
+            text => {
+                let moment = text.parse::<f64>().ok().filter(|moment| moment.is_finite() && *moment >= 0.0);
+                Some(moment.ok_or_else(|| format!("`at={text}` is no moment in seconds"))?)
+            }
+        };
+        let epoch = self.number("epoch").unwrap_or_default();
+        let version = self.number("version").unwrap_or_default();
+        let about = self.number("about").map(InstanceId);
+        Ok((id, Asked { at_s, epoch, version, about }))
+    }
+}
+
+fn json(value: &impl Serialize) -> Answer {
+    match serde_json::to_string(value) {
+        Ok(text) => Answer::Json(text),
+        Err(error) => Answer::Refused(StatusCode::INTERNAL_SERVER_ERROR, error.to_string()),
+    }
+}
+
+fn chain(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut source = error.source();
+    while let Some(inner) = source {
+        text.push_str(&format!(": {inner}"));
+        source = inner.source();
+    }
+    text
+}
+
+fn refusal(status: StatusCode, problem: &str) -> Response<String> {
+    let refusal = wire::Refusal { problem: problem.to_owned() };
+    response(status, JSON, serde_json::to_string(&refusal).unwrap_or_default())
+}
+
+fn not_allowed(method: &'static str) -> Response<String> {
+    let mut response = refusal(StatusCode::METHOD_NOT_ALLOWED, &format!("only {method}"));
+    response.headers_mut().insert(ALLOW, HeaderValue::from_static(method));
+    response
+}
+
+fn response(status: StatusCode, kind: &'static str, body: String) -> Response<String> {
+    let mut response = Response::new(body);
+    *response.status_mut() = status;
+    let headers = response.headers_mut();
+    headers.insert(CONTENT_TYPE, HeaderValue::from_static(kind));
+    for (name, value) in HEADERS {
+        headers.insert(name, HeaderValue::from_static(value));
+    }
+    response
+}

@@ -1,0 +1,604 @@
+//! What the pages are told, in JSON: the one contract between this crate and `web/`.
+//!
+//! Each type stands here once; `web/src/wire.ts` is written from it ([`typescript`]), and a test says when it is not what this file gives.
+//! Moments and lengths are the robot's seconds since the start of the run. Every text may come from a user and is shown as text, never as
+//! anything else.
+
+use serde::Serialize;
+use std::fmt::Write as _;
+
+/// A type that the pages know.
+trait Wire {
+    /// As TypeScript writes it.
+    fn typescript() -> String;
+}
+
+macro_rules! named {
+    ($name:literal: $($kind:ty),+) => {
+        $(impl Wire for $kind {
+            fn typescript() -> String {
+                $name.to_owned()
+            }
+        })+
+    };
+}
+
+named!("number": f64, u32, u64, usize, i64);
+named!("string": String, &'static str);
+named!("boolean": bool);
+
+impl<T: Wire> Wire for Option<T> {
+    fn typescript() -> String {
+        format!("{} | null", T::typescript())
+    }
+}
+
+impl<T: Wire> Wire for Vec<T> {
+    fn typescript() -> String {
+        format!("{}[]", T::typescript())
+    }
+}
+
+/// Structs with their fields, as Rust and as TypeScript.
+macro_rules! wire {
+    ($($(#[doc = $doc:literal])+ $name:ident { $($(#[doc = $field_doc:literal])+ $field:ident: $kind:ty,)+ })+) => {
+        $(
+            $(#[doc = $doc])+
+            #[derive(Debug, Clone, Default, PartialEq, Serialize)]
+            pub(crate) struct $name {
+                $($(#[doc = $field_doc])+ pub(crate) $field: $kind,)+
+            }
+
+            impl Wire for $name {
+                fn typescript() -> String {
+                    stringify!($name).to_owned()
+                }
+            }
+        )+
+
+        /// All of it as a module of TypeScript.
+        pub fn typescript() -> String {
+            let mut text = String::from("// Written from crates/dashboard/src/wire.rs; do not edit (RATN_WRITE_WIRE=1 and its test write it).\n");
+            $(
+                $(let _ = write!(text, "\n/**{} */", $doc);)+
+                let _ = write!(text, "\nexport interface {} {{\n", stringify!($name));
+                $(
+                    $(let _ = writeln!(text, "  /**{} */", $field_doc);)+
+                    let _ = writeln!(text, "  {}: {};", stringify!($field), <$kind>::typescript());
+                )+
+                text.push_str("}\n");
+            )+
+            text
+        }
+    };
+}
+
+wire! {
+    /// What there is to be looked at.
+    About {
+        /// The version of the program.
+        version: String,
+        /// Whether the pages may tell a run something.
+        control: bool,
+        /// The runtime directory of the system that is looked at; empty without one.
+        directory: String,
+        /// The logs, those of the command line first.
+        logs: Vec<Log>,
+        /// What is wrong with looking for runs; empty while all is well.
+        problem: String,
+    }
+
+    /// An event log.
+    Log {
+        /// Its number here.
+        id: u64,
+        /// The name of its file.
+        name: String,
+        /// Where it is.
+        path: String,
+        /// A run writes it.
+        live: bool,
+    }
+
+    /// A run, as far as it is looked at: what has changed since the version that was asked for.
+    Frame {
+        /// Which fold of the log it is. Of another one than before everything is told anew.
+        epoch: u64,
+        /// Up to which change it tells.
+        version: u64,
+        /// What was known before does not count any more.
+        fresh: bool,
+        /// There is more to be told: ask again at once.
+        more: bool,
+        /// The run as a whole.
+        run: Run,
+        /// Instances that are new or otherwise than before.
+        instances: Vec<Instance>,
+        /// Instances that are kept no more.
+        gone: Vec<u64>,
+        /// Why those wait that wait; as many as are said.
+        waiting: Vec<Waiting>,
+        /// Who holds what.
+        held: Vec<Held>,
+        /// Who has asked for what and has no answer, the next one first.
+        queue: Vec<Queued>,
+        /// Of each kind how many there are, as far as the log says.
+        kinds: Vec<Kind>,
+    }
+
+    /// A run as a whole.
+    Run {
+        /// The task's name.
+        task: String,
+        /// Its id.
+        id: String,
+        /// The task file.
+        file: String,
+        /// `CDTN` or `HSM`.
+        mode: String,
+        /// What random choices are derived from.
+        seed: String,
+        /// When it began, in milliseconds since 1970; 0 where that is not said.
+        began_unix_ms: u64,
+        /// Its parameters as `name = value`.
+        parameters: Vec<String>,
+        /// How it ended; none while it goes on.
+        outcome: Option<String>,
+        /// Why it ended so; empty for a success.
+        reason: String,
+        /// Why the log cannot be read on; empty where it can.
+        problem: String,
+        /// From which moment on the log was read: 0 unless it is long.
+        from_s: f64,
+        /// The moment that is shown.
+        at_s: f64,
+        /// The last moment of the log.
+        last_s: f64,
+        /// A run writes the log.
+        live: bool,
+        /// The pages may tell it something.
+        controllable: bool,
+        /// Whether the user has paused it.
+        paused: bool,
+        /// From each request for a pause to its end.
+        pauses: Vec<Span>,
+        /// When task control was gone.
+        absences: Vec<Span>,
+        /// Instances so far.
+        expanded: usize,
+        /// Those that have become real.
+        retired: usize,
+        /// Those that were discarded.
+        squashed: usize,
+        /// Jobs ahead of time whose results are real.
+        useful: usize,
+        /// How long those took.
+        useful_s: f64,
+        /// Jobs ahead of time whose results were discarded.
+        wasted: usize,
+        /// How long those took.
+        wasted_s: f64,
+    }
+
+    /// A time.
+    Span {
+        /// When it begins.
+        from_s: f64,
+        /// When it ends.
+        to_s: f64,
+    }
+
+    /// One visit of a state.
+    Instance {
+        /// Its number in the log.
+        id: u64,
+        /// With visit numbers, `place_all[2]/plan_transfer`.
+        path: String,
+        /// Without: the state as its author wrote it.
+        state: String,
+        /// `waiting`, `asking`, `preparing`, `running`, `finished`, `retired` or `squashed`.
+        stage: &'static str,
+        /// Since when.
+        since_s: f64,
+        /// When it was expanded.
+        expanded_s: f64,
+        /// A condition on its path was undecided when it was expanded.
+        speculative: bool,
+        /// Its result was taken from an equal one.
+        reused: bool,
+        /// Its outcome.
+        outcome: Option<String>,
+        /// What it decided, where it decides.
+        decision: Option<String>,
+        /// The stages it has left, the last ones.
+        phases: Vec<Phase>,
+        /// What was done for it, by attempts.
+        jobs: Vec<Job>,
+        /// When it waited for resources.
+        waits: Vec<Wait>,
+        /// On whom it depended.
+        edges: Vec<Edge>,
+        /// Why its result did not count; once for each time.
+        invalidations: Vec<String>,
+    }
+
+    /// A stage that is over.
+    Phase {
+        /// Which.
+        stage: &'static str,
+        /// When it began.
+        from_s: f64,
+        /// When it ended.
+        to_s: f64,
+        /// What ended it, as it stands behind "waited for".
+        awaited: String,
+    }
+
+    /// From giving a provider a goal to its end.
+    Job {
+        /// The provider and what it did.
+        action: String,
+        /// `motion`, `detection`, `planning` or `other`.
+        activity: &'static str,
+        /// From 1.
+        attempt: u32,
+        /// When it began.
+        from_s: f64,
+        /// When it ended; none while it goes on.
+        to_s: Option<f64>,
+        /// Its outcome, `crashed` or `cancelled`; empty while it goes on.
+        ending: String,
+        /// Why, where it is not success.
+        reason: String,
+        /// `used`, `lost` or `open`.
+        worth: &'static str,
+        /// Ids of the resources that it held.
+        resources: Vec<String>,
+    }
+
+    /// From asking for resources to their grant.
+    Wait {
+        /// When it asked.
+        from_s: f64,
+        /// When it had them.
+        to_s: f64,
+        /// What it asked for.
+        kinds: Vec<String>,
+        /// Who held something of these kinds meanwhile, the one that held longest first.
+        behind: Vec<String>,
+    }
+
+    /// A dependency of one instance on another.
+    Edge {
+        /// The other.
+        from: u64,
+        /// `data`, `world`, `resource` or `condition`.
+        kind: &'static str,
+    }
+
+    /// An instance that does not run, and why.
+    Waiting {
+        /// Which.
+        id: u64,
+        /// In one sentence.
+        sentence: String,
+        /// Since when.
+        since_s: f64,
+    }
+
+    /// A resource in the hands of an instance.
+    Held {
+        /// The resource.
+        resource: String,
+        /// Its kind.
+        kind: String,
+        /// Who has it, by path.
+        holder: String,
+        /// Which instance that is.
+        instance: u64,
+        /// Since when.
+        from_s: f64,
+    }
+
+    /// An instance that has asked for resources.
+    Queued {
+        /// Which.
+        instance: u64,
+        /// By path.
+        path: String,
+        /// The kinds that it asked for.
+        kinds: Vec<String>,
+        /// Larger goes first.
+        priority: i64,
+        /// Since when.
+        from_s: f64,
+    }
+
+    /// A kind of resources.
+    Kind {
+        /// Its name.
+        kind: String,
+        /// How many there are.
+        total: usize,
+        /// How many the run holds.
+        held: usize,
+    }
+
+    /// A task as its author wrote it.
+    Task {
+        /// The task file is what it was when the run began, and reads.
+        known: bool,
+        /// Why not; empty where it is.
+        note: String,
+        /// The states that do or decide something, in the order of the file.
+        states: Vec<State>,
+        /// What goes from one to another.
+        flows: Vec<Flow>,
+    }
+
+    /// A state.
+    State {
+        /// Its path.
+        path: String,
+        /// `action` or `condition`.
+        kind: &'static str,
+    }
+
+    /// A dependency of one state on another, as written.
+    Flow {
+        /// Whose result it is.
+        from: String,
+        /// Whose input, or existence, depends on that.
+        to: String,
+        /// `data` or `condition`.
+        kind: &'static str,
+    }
+
+    /// The world of a run, as far as its log tells it.
+    World {
+        /// The moment.
+        at_s: f64,
+        /// The root's revision.
+        revision: u64,
+        /// The facts of the root, in their order; as many as are shown.
+        facts: Vec<Fact>,
+        /// How many fit the filter.
+        fitting: usize,
+        /// How many there are.
+        all: usize,
+        /// What was written last, the latest first.
+        history: Vec<Written>,
+        /// The projections that are being worked on.
+        projections: Vec<Projection>,
+        /// From which moment on the log was read: what is older is not known.
+        from_s: f64,
+    }
+
+    /// A fact of the root.
+    Fact {
+        /// Its key.
+        key: String,
+        /// Its value.
+        value: String,
+        /// Who wrote it, by path.
+        writer: String,
+        /// When.
+        at_s: f64,
+        /// In which revision.
+        revision: u64,
+    }
+
+    /// A change that became real.
+    Written {
+        /// When.
+        at_s: f64,
+        /// In which revision.
+        revision: u64,
+        /// Who, by path.
+        writer: String,
+        /// Which fact.
+        key: String,
+        /// Its value before; none where it had none.
+        before: Option<String>,
+        /// Its value since; none where it is gone.
+        after: Option<String>,
+    }
+
+    /// A projected world, against the root.
+    Projection {
+        /// For which instance.
+        instance: u64,
+        /// By path.
+        path: String,
+        /// The root's revision below it.
+        base: u64,
+        /// What is otherwise in it.
+        changes: Vec<Projected>,
+    }
+
+    /// What is otherwise in a projection.
+    Projected {
+        /// Which fact, or which facts.
+        key: String,
+        /// Its value in the root; none where it has none.
+        root: Option<String>,
+        /// What becomes of it.
+        change: String,
+        /// Who is going to write it, by path.
+        writer: String,
+    }
+
+    /// The system that is up.
+    System {
+        /// It is: the resource manager answers.
+        up: bool,
+        /// What is wrong; empty while all is well.
+        problem: String,
+        /// Resources, room for projections left out.
+        resources: Vec<Resource>,
+        /// Acquires that wait.
+        waiting: Vec<Acquire>,
+        /// Sessions that hold or provide something.
+        sessions: Vec<Session>,
+        /// Hosts with their pools.
+        hosts: Vec<Host>,
+    }
+
+    /// A resource of the system.
+    Resource {
+        /// Its id.
+        id: String,
+        /// Its kind.
+        kind: String,
+        /// Its host.
+        host: String,
+        /// What it is doing.
+        state: String,
+        /// How much of it can be had, and how much there is.
+        free: String,
+        /// Who has some of it.
+        holdings: Vec<Holding>,
+    }
+
+    /// A part of a resource that somebody has.
+    Holding {
+        /// Who.
+        holder: String,
+        /// The session of the lease.
+        session: String,
+        /// The lease.
+        lease: u64,
+        /// Its fencing token.
+        token: u64,
+        /// In how many milliseconds the session of the lease ends unless it is pinged; none where that is not known.
+        expires_in_ms: Option<u64>,
+    }
+
+    /// An acquire that waits.
+    Acquire {
+        /// Who asks.
+        holder: String,
+        /// Larger first.
+        priority: i64,
+        /// How many are served before it.
+        ahead: u32,
+        /// What is in the way.
+        obstacles: Vec<String>,
+    }
+
+    /// A session with the resource manager.
+    Session {
+        /// Its id.
+        id: String,
+        /// Who that is.
+        client: String,
+        /// In how many milliseconds it ends unless it is pinged.
+        expires_in_ms: u64,
+        /// How many leases it has.
+        leases: usize,
+        /// How many resources it provides.
+        resources: usize,
+    }
+
+    /// A host.
+    Host {
+        /// Its name.
+        name: String,
+        /// Why it does not answer; empty where it does.
+        problem: String,
+        /// It takes no new work.
+        draining: bool,
+        /// Its pools.
+        pools: Vec<Pool>,
+    }
+
+    /// The workers of a template.
+    Pool {
+        /// The template.
+        template: String,
+        /// The kind of resource that they are.
+        kind: String,
+        /// At least so many are kept.
+        min: u32,
+        /// At most so many are started.
+        max: u32,
+        /// So many more than are held are kept ready.
+        spares: u32,
+        /// Workers that ended without being asked to.
+        crashes: u64,
+        /// How the last of those ended.
+        last_exit: String,
+        /// Why no more are started; empty while all is well.
+        failure: String,
+        /// The oldest first.
+        workers: Vec<Worker>,
+    }
+
+    /// A worker process.
+    Worker {
+        /// Its id.
+        id: String,
+        /// What it is doing.
+        state: String,
+        /// Its process.
+        pid: u32,
+        /// Resident memory in bytes.
+        resident_bytes: u64,
+        /// Processor use, in thousandths of a core.
+        cpu_millicores: u32,
+        /// How long it has been there.
+        age_s: u64,
+        /// Whether somebody holds its resource.
+        held: bool,
+        /// What it may use of the machine; empty without limits.
+        limits: String,
+    }
+
+    /// The end of what a worker has written.
+    Tail {
+        /// The worker.
+        worker: String,
+        /// The text.
+        text: String,
+        /// There is more before it.
+        cut: bool,
+    }
+
+    /// What became of what a run was told.
+    Told {
+        /// In a sentence.
+        said: String,
+    }
+
+    /// Why something was not answered.
+    Refusal {
+        /// In a sentence.
+        problem: String,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+    /// `RATN_WRITE_WIRE=1` writes the file.
+    #[test]
+    fn the_types_of_the_pages_are_those_of_this_crate() {
+        let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("web/src/wire.ts");
+        let here = super::typescript();
+        if std::env::var_os("RATN_WRITE_WIRE").is_some() {
+            std::fs::write(&file, &here).unwrap();
+        }
+        let there = std::fs::read_to_string(&file).unwrap();
+        assert!(here == there, "{} is not what wire.rs gives: RATN_WRITE_WIRE=1 writes it anew", file.display());
+    }
+
+    #[test]
+    fn fields_are_named_and_typed_as_serde_writes_them() {
+        let edge = serde_json::to_value(super::Edge { from: 7, kind: "data" }).unwrap();
+        assert_eq!(edge, serde_json::json!({ "from": 7, "kind": "data" }));
+        let text = super::typescript();
+        assert!(text.contains("export interface Edge {"), "{text}");
+        assert!(text.contains("  outcome: string | null;") && text.contains("  edges: Edge[];"), "{text}");
+    }
+}

@@ -1,0 +1,376 @@
+//! The server as a browser meets it, over real connections, with real logs. What pages look like is `scripts/check-dashboard`'s.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_dashboard::{Dashboard, DashboardError, MAX_LOGS, Options};
+use ratn_worker::tls::ClientTls;
+use serde_json::Value;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+/// A name that would do something wherever it is taken for markup or code.
+const INJECTED: &str = "<img src=x onerror=alert(1)></script><script>alert(2)</script>";
+
+/// Whoever takes nothing for so long is cut off.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+struct Served {
+    address: String,
+    token: String,
+    _place: tempfile::TempDir,
+}
+
+struct Answer {
+    status: u16,
+    head: String,
+    body: String,
+}
+
+impl Answer {
+    fn json(&self) -> Value {
+        serde_json::from_str(&self.body).unwrap()
+    }
+}
+
+fn options(logs: &[&Path], directory: &Path) -> Options {
+    let logs = logs.iter().map(|path| path.to_path_buf()).collect();
+    Options { logs, patience: PATIENCE, ..Options::of(directory.to_owned(), ClientTls::none()) }
+}
+
+async fn serve(logs: &[&Path], control: bool) -> Served {
+    let place = tempfile::tempdir().unwrap();
+    let dashboard = Dashboard::bind(Options { control, ..options(logs, place.path()) }).await.unwrap();
+    let url = dashboard.url();
+    let (address, token) = url.strip_prefix("http://").unwrap().split_once("/#token=").unwrap();
+    let served = Served { address: address.to_owned(), token: token.to_owned(), _place: place };
+    tokio::spawn(dashboard.serve());
+    served
+}
+
+impl Served {
+    async fn say(&self, request: &str) -> Answer {
+        let mut connection = TcpStream::connect(&self.address).await.unwrap();
+        connection.write_all(request.as_bytes()).await.unwrap();
+        let mut answer = Vec::new();
+        let _ = connection.read_to_end(&mut answer).await;
+        let answer = String::from_utf8(answer).unwrap();
+        let (head, body) = answer.split_once("\r\n\r\n").unwrap_or((&answer, ""));
+        let status = head.split(' ').nth(1).and_then(|status| status.parse().ok()).unwrap_or(0);
+        Answer { status, head: head.to_lowercase(), body: body.to_owned() }
+    }
+
+    async fn ask(&self, method: &str, path: &str) -> Answer {
+        let (address, token) = (&self.address, &self.token);
+        self.say(&format!(
+            "{method} {path} HTTP/1.1\r\nHost: {address}\r\nAuthorization: Bearer {token}\r\nConnection: close\r\n\r\n"
+        ))
+        .await
+    }
+
+    async fn get(&self, path: &str) -> Answer {
+        self.ask("GET", path).await
+    }
+
+    /// The number of the only log.
+    async fn log(&self) -> u64 {
+        self.get("/api/about").await.json()["logs"][0]["id"].as_u64().unwrap()
+    }
+
+    /// Frames until there is no more.
+    async fn frames(&self, query: &str) -> Vec<Value> {
+        let (mut frames, mut epoch, mut version) = (Vec::new(), 0, 0);
+        loop {
+            let frame = self.get(&format!("/api/run?{query}&epoch={epoch}&version={version}")).await.json();
+            (epoch, version) = (frame["epoch"].as_u64().unwrap(), frame["version"].as_u64().unwrap());
+            let more = frame["more"].as_bool().unwrap();
+            frames.push(frame);
+            if !more {
+                return frames;
+            }
+        }
+    }
+}
+
+fn two_boxes() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../report/src/fixtures/two_boxes.jsonl")
+}
+
+fn log_of(lines: &[String]) -> tempfile::NamedTempFile {
+    let mut file = tempfile::NamedTempFile::new().unwrap();
+    for line in lines {
+        writeln!(file, "{line}").unwrap();
+    }
+    file
+}
+
+fn started(task: &str) -> String {
+    let task = serde_json::to_string(task).unwrap();
+    format!(
+        r#"{{"at":0,"event":"started","task":{task},"digest":"d","mode":"cdtn","parameters":{{}},"seed":1,"world":[],"revision":0,"capacity":{{"PathPlanner":1}}}}"#
+    )
+}
+
+/// An instance that is expanded, runs for half a second and becomes real; a second each.
+fn visit(id: u64) -> [String; 4] {
+    let at = id * 1_000_000_000;
+    let then = at + 500_000_000;
+    [
+        format!(
+            r#"{{"at":{at},"command":"note","note":"expanded","instance":{id},"state":1,"path":"look[{id}]","speculative":false}}"#
+        ),
+        format!(
+            r#"{{"at":{at},"command":"start","instance":{id},"attempt":1,"goal":{{"provider":"eye","action":"look","inputs":{{}},"seed":1,"lease":null,"projection":null,"expected_s":null}}}}"#
+        ),
+        format!(
+            r#"{{"at":{then},"event":"finished","instance":{id},"attempt":1,"outcome":"success","outputs":{{}},"measured":[],"reason":""}}"#
+        ),
+        format!(r#"{{"at":{then},"command":"note","note":"retired","instance":{id}}}"#),
+    ]
+}
+
+#[tokio::test]
+async fn pages_run_nothing_of_others_and_are_had_by_this_machines_names_only() {
+    let served = serve(&[&two_boxes()], false).await;
+    for path in ["/", "/app.js", "/app.css", "/icon.svg"] {
+        let page = served.get(path).await;
+        assert_eq!(page.status, 200, "{path}");
+        assert!(page.head.contains("content-security-policy: default-src 'none'; script-src 'self'"), "{}", page.head);
+        assert!(page.head.contains("x-content-type-options: nosniff") && page.head.contains("cache-control: no-store"));
+        assert!(!page.body.contains(&served.token) && !page.body.contains("unsafe-"));
+    }
+    let address = &served.address;
+    let rebound = served.say("GET / HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n\r\n").await;
+    assert_eq!(rebound.status, 403);
+    let posted = served.say(&format!("POST / HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n")).await;
+    assert_eq!(posted.status, 405);
+}
+
+#[tokio::test]
+async fn nothing_is_told_without_the_token_nor_to_pages_of_others() {
+    let served = serve(&[&two_boxes()], true).await;
+    let (address, token) = (&served.address, &served.token);
+    for (method, path) in [
+        ("GET", "/api/about"),
+        ("GET", "/api/run?log=1"),
+        ("GET", "/api/system"),
+        ("POST", "/api/control?log=1&word=abort"),
+    ] {
+        let head = format!("{method} {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n");
+        assert_eq!(served.say(&format!("{head}\r\n")).await.status, 401, "{path}");
+        assert_eq!(served.say(&format!("{head}Authorization: Bearer 0{token}\r\n\r\n")).await.status, 401, "{path}");
+        // As a page of somebody else's would, had it the token.
+        let foreign = format!("{head}Authorization: Bearer {token}\r\nOrigin: http://evil.example\r\n\r\n");
+        assert_eq!(served.say(&foreign).await.status, 403, "{path}");
+    }
+    // A question before the question: what a browser asks whether another page may.
+    let before = format!(
+        "OPTIONS /api/about HTTP/1.1\r\nHost: {address}\r\nOrigin: http://evil.example\r\nConnection: close\r\n\r\n"
+    );
+    let answer = served.say(&before).await;
+    assert!(answer.status == 403 && !answer.head.contains("access-control-"), "{}", answer.head);
+}
+
+#[tokio::test]
+async fn a_run_is_told_once_and_then_what_has_changed() {
+    let served = serve(&[&two_boxes()], false).await;
+    let log = served.log().await;
+    let first = &served.frames(&format!("log={log}")).await[0];
+    assert_eq!((first["fresh"].as_bool(), first["run"]["controllable"].as_bool()), (Some(true), Some(false)));
+    let instances = first["instances"].as_array().unwrap();
+    assert!(
+        instances.iter().any(|one| one["path"] == "fetch[1]/move" && one["state"] == "fetch/move"),
+        "{instances:?}"
+    );
+    let waits = instances.iter().flat_map(|one| one["waits"].as_array().unwrap());
+    assert!(
+        waits
+            .flat_map(|wait| wait["behind"].as_array().unwrap())
+            .any(|behind| behind.as_str().unwrap().contains("/plan had path-planner"))
+    );
+    let edges: Vec<&str> = instances
+        .iter()
+        .flat_map(|one| one["edges"].as_array().unwrap())
+        .filter_map(|edge| edge["kind"].as_str())
+        .collect();
+    assert!(edges.contains(&"data") && edges.contains(&"resource"), "{edges:?}");
+    let (epoch, version) = (&first["epoch"], &first["version"]);
+    let again = served.get(&format!("/api/run?log={log}&epoch={epoch}&version={version}")).await.json();
+    assert_eq!((again["fresh"].as_bool(), again["instances"].as_array().unwrap().len()), (Some(false), 0));
+}
+
+#[tokio::test]
+async fn a_log_that_grows_is_followed_and_tells_only_what_is_new() {
+    let mut file = log_of(&[vec![started("grows")], visit(1).to_vec()].concat());
+    let served = serve(&[file.path()], false).await;
+    let log = served.log().await;
+    let first = &served.frames(&format!("log={log}")).await[0];
+    for line in visit(2) {
+        writeln!(file, "{line}").unwrap();
+    }
+    tokio::time::sleep(Duration::from_millis(60)).await;
+    let (epoch, version) = (&first["epoch"], &first["version"]);
+    let next = served.get(&format!("/api/run?log={log}&epoch={epoch}&version={version}")).await.json();
+    let told: Vec<&str> = next["instances"].as_array().unwrap().iter().filter_map(|one| one["path"].as_str()).collect();
+    assert_eq!((told, next["fresh"].as_bool()), (vec!["look[2]"], Some(false)));
+}
+
+#[tokio::test]
+async fn a_moment_is_shown_as_it_was_then_and_goes_on_from_there() {
+    let lines: Vec<String> = [vec![started("replayed")], (1..=20).flat_map(visit).collect()].concat();
+    let file = log_of(&lines);
+    let served = serve(&[file.path()], false).await;
+    let log = served.log().await;
+    let at = |frame: &Value| (frame["run"]["at_s"].as_f64().unwrap(), frame["run"]["expanded"].as_u64().unwrap());
+    let then = served.frames(&format!("log={log}&at=7.25")).await.pop().unwrap();
+    assert_eq!(at(&then), (7.25, 7));
+    assert_eq!(then["run"]["last_s"].as_f64(), Some(20.5));
+    let running: Vec<&Value> =
+        then["instances"].as_array().unwrap().iter().filter(|one| one["stage"] == "running").collect();
+    assert_eq!(running.len(), 1);
+    let (epoch, version) = (&then["epoch"], &then["version"]);
+    let on = served.get(&format!("/api/run?log={log}&at=9.25&epoch={epoch}&version={version}")).await.json();
+    assert_eq!((at(&on), on["fresh"].as_bool()), ((9.25, 9), Some(false)));
+    let back = served.get(&format!("/api/run?log={log}&at=2&epoch={epoch}&version={}", on["version"])).await.json();
+    assert_eq!((at(&back), back["fresh"].as_bool()), ((2.0, 2), Some(true)));
+    // The newest is another fold, which no replay disturbs.
+    assert_eq!(at(served.frames(&format!("log={log}")).await.last().unwrap()), (20.5, 20));
+}
+
+#[tokio::test]
+async fn what_is_before_a_line_that_does_not_read_is_shown_and_the_line_is_named() {
+    let lines = [vec![started("torn")], visit(1).to_vec(), vec!["{}".to_owned()], visit(2).to_vec()].concat();
+    let file = log_of(&lines);
+    let served = serve(&[file.path()], false).await;
+    let log = served.log().await;
+    let frame = served.frames(&format!("log={log}")).await.pop().unwrap();
+    assert_eq!(frame["run"]["expanded"], 1);
+    let problem = frame["run"]["problem"].as_str().unwrap();
+    assert!(problem.contains(":6: not a line of an event log: it has no time `at`"), "{problem}");
+}
+
+#[tokio::test]
+async fn of_a_long_log_what_is_shown_is_read() {
+    // 60 MiB; each visit has a line of 256 KiB, as trajectories are.
+    let ballast = "x".repeat(256 << 10);
+    let visits = |id: u64| {
+        let at = id * 1_000_000_000 + 1;
+        let progress =
+            format!(r#"{{"at":{at},"event":"progressed","instance":{id},"attempt":1,"message":"{ballast}"}}"#);
+        visit(id).into_iter().take(2).chain([progress]).chain(visit(id).into_iter().skip(2))
+    };
+    let mut file = tempfile::NamedTempFile::new().unwrap();
+    writeln!(file, "{}", started("long")).unwrap();
+    for line in (1..=240).flat_map(visits) {
+        writeln!(file, "{line}").unwrap();
+    }
+    let served = serve(&[file.path()], false).await;
+    let log = served.log().await;
+    let began = Instant::now();
+    let first = served.get(&format!("/api/run?log={log}&at=200.25&epoch=0&version=0")).await.json();
+    assert!(first["run"]["from_s"].as_f64().unwrap() > 100.0, "{}", first["run"]);
+    assert_eq!((&first["run"]["task"], first["run"]["last_s"].as_f64()), (&Value::from("long"), Some(240.5)));
+    let frames = served.frames(&format!("log={log}&at=200.25")).await;
+    let run = &frames.last().unwrap()["run"];
+    assert_eq!(run["at_s"].as_f64(), Some(200.25));
+    assert!(began.elapsed() < Duration::from_secs(20), "{:?}", began.elapsed());
+    // A short moment after the start is read from the start.
+    let early = served.frames(&format!("log={log}&at=3.25")).await.pop().unwrap();
+    assert_eq!((early["run"]["from_s"].as_f64(), early["run"]["expanded"].as_u64()), (Some(0.0), Some(3)));
+}
+
+#[tokio::test]
+async fn names_of_users_are_told_as_text_and_never_as_a_page() {
+    let mut lines = vec![started(INJECTED)];
+    let name = serde_json::to_string(INJECTED).unwrap();
+    lines.push(format!(
+        r#"{{"at":1,"command":"note","note":"expanded","instance":1,"state":1,"path":{name},"speculative":false}}"#
+    ));
+    lines.push(format!(r#"{{"at":2,"event":"world_changed","revision":1,"facts":[[{{"predicate":"at","arguments":[{name}]}},{{"string":{name}}}]]}}"#));
+    let file = log_of(&lines);
+    let served = serve(&[file.path()], false).await;
+    let log = served.log().await;
+    for path in [format!("/api/run?log={log}"), format!("/api/world?log={log}"), "/api/%3Cscript%3E".to_owned()] {
+        let answer = served.get(&path).await;
+        assert!(
+            answer.head.contains("content-type: application/json") && answer.head.contains("nosniff"),
+            "{}",
+            answer.head
+        );
+        if path.contains("log=") {
+            assert!(answer.body.contains(&name[1..20]), "{}", answer.body);
+        }
+    }
+    let world = served.get(&format!("/api/world?log={log}")).await.json();
+    assert_eq!(world["facts"][0]["writer"], "somebody else");
+    assert_eq!(world["facts"][0]["value"], INJECTED);
+}
+
+#[tokio::test]
+async fn pages_only_look_unless_their_user_said_otherwise() {
+    let served = serve(&[&two_boxes()], false).await;
+    let refused = served.ask("POST", "/api/control?log=1&word=pause").await;
+    assert_eq!(refused.status, 403);
+    assert!(refused.json()["problem"].as_str().unwrap().contains("--control"), "{}", refused.body);
+    assert_eq!(served.ask("POST", "/api/scale?host=h&template=t&min=0").await.status, 403);
+    let served = serve(&[&two_boxes()], true).await;
+    let log = served.log().await;
+    for (path, status) in [
+        (format!("/api/control?log={log}&word=pause"), 409),
+        (format!("/api/control?log={log}&word=fly"), 400),
+        ("/api/control?word=pause".to_owned(), 409),
+        ("/api/scale?host=h&template=t&min=-1".to_owned(), 400),
+        ("/api/scale?host=h&template=t&min=1".to_owned(), 409),
+    ] {
+        assert_eq!(served.ask("POST", &path).await.status, status, "{path}");
+    }
+    // A link or an image cannot do it.
+    assert_eq!(served.get(&format!("/api/control?log={log}&word=pause")).await.status, 405);
+}
+
+#[tokio::test]
+async fn what_cannot_be_shown_is_said() {
+    let place = tempfile::tempdir().unwrap();
+    let exposed = Options { address: "0.0.0.0:0".parse().unwrap(), ..options(&[], place.path()) };
+    assert!(matches!(Dashboard::bind(exposed).await, Err(DashboardError::Exposed { .. })));
+    let log = two_boxes();
+    let many = Dashboard::bind(options(&vec![log.as_path(); MAX_LOGS + 1], place.path())).await.unwrap_err();
+    assert_eq!(many.to_string(), "17 logs are more than the 16 that are looked at at once: name fewer");
+    let missing = Dashboard::bind(options(&[Path::new("/nowhere/run.jsonl")], place.path())).await.unwrap_err();
+    assert!(matches!(missing, DashboardError::NoLog { .. }));
+    let foreign = log_of(&["no log".to_owned()]);
+    assert!(matches!(Dashboard::bind(options(&[foreign.path()], place.path())).await, Err(DashboardError::Log(_))));
+    let served = serve(&[&log], false).await;
+    assert_eq!(served.get("/api/run?log=99").await.status, 404);
+    assert_eq!(served.get("/api/run").await.status, 400);
+    let id = served.log().await;
+    for moment in ["soon", "-1", "inf", "NaN"] {
+        assert_eq!(served.get(&format!("/api/run?log={id}&at={moment}")).await.status, 400, "{moment}");
+    }
+    assert_eq!(served.get("/api/nothing").await.status, 404);
+    let system = served.get("/api/system").await.json();
+    assert_eq!(system["up"], false);
+    assert!(!system["problem"].as_str().unwrap().is_empty());
+}
+
+#[tokio::test]
+async fn a_browser_that_reads_nothing_is_cut_off_and_others_go_on() {
+    let lines: Vec<String> = [vec![started("wide")], (1..=3_000).flat_map(visit).collect()].concat();
+    let file = log_of(&lines);
+    let served = serve(&[file.path()], false).await;
+    let log = served.log().await;
+    let mut slow = TcpStream::connect(&served.address).await.unwrap();
+    let (address, token) = (&served.address, &served.token);
+    let question =
+        format!("GET /api/run?log={log} HTTP/1.1\r\nHost: {address}\r\nAuthorization: Bearer {token}\r\n\r\n");
+    // Answers of a megabyte each, which it does not read, until nobody takes its questions any more.
+    let began = Instant::now();
+    while slow.write_all(question.as_bytes()).await.is_ok() {
+        assert!(began.elapsed() < Duration::from_secs(60), "it is not cut off");
+        assert_eq!(served.get("/api/about").await.status, 200);
+        tokio::time::sleep(PATIENCE / 10).await;
+    }
+    assert!(began.elapsed() >= PATIENCE, "it was given no time: {:?}", began.elapsed());
+}

@@ -1,0 +1,53 @@
+// What the pages ask the program that served them.
+
+import type { About, Frame, System, Tail, Task, Told, World } from "./wire";
+
+const TOKEN = "ratn-token";
+
+/** Takes the token out of the address, where it would stay in the history. */
+export function takeToken(): void {
+  const found = /^#token=([0-9a-f]+)$/.exec(location.hash);
+  if (found?.[1] !== undefined) {
+    sessionStorage.setItem(TOKEN, found[1]);
+    history.replaceState(null, "", "#/run");
+  }
+}
+
+/** An answer that says no. */
+export class Refused extends Error {
+  constructor(
+    readonly status: number,
+    message: string,
+  ) {
+    super(message);
+  }
+}
+
+async function ask<T>(path: string, query: Record<string, string | number | null>, method = "GET"): Promise<T> {
+  const pairs = Object.entries(query).flatMap(([name, value]) => (value === null ? [] : [[name, String(value)]]));
+  const text = new URLSearchParams(pairs).toString();
+  const response = await fetch(`/api/${path}${text === "" ? "" : `?${text}`}`, {
+    method,
+    headers: { authorization: `Bearer ${sessionStorage.getItem(TOKEN) ?? ""}` },
+    cache: "no-store",
+  });
+  const body: unknown = await response.json();
+  if (!response.ok) {
+    const problem = typeof body === "object" && body !== null && "problem" in body ? String(body.problem) : response.statusText;
+    throw new Refused(response.status, problem);
+  }
+  return body as T;
+}
+
+export const api = {
+  about: () => ask<About>("about", {}),
+  run: (log: number, at: number | null, epoch: number, version: number, about: number | null) =>
+    ask<Frame>("run", { log, at, epoch, version, about }),
+  task: (log: number) => ask<Task>("task", { log }),
+  world: (log: number, at: number | null, epoch: number, filter: string) => ask<World>("world", { log, at, epoch, filter }),
+  system: () => ask<System>("system", {}),
+  tail: (worker: string) => ask<Tail>("tail", { worker }),
+  scale: (host: string, template: string, min: string, max: string, spares: string) =>
+    ask<Told>("scale", { host, template, min, max, spares }, "POST"),
+  control: (log: number, word: string) => ask<Told>("control", { log, word }, "POST"),
+};

@@ -1,0 +1,219 @@
+//! Where in a long log which moment is: of every 4 MiB the first whole line, and when that was.
+//!
+//! It reads one line of each part and the end of the log, so a log of 1 GiB is indexed by reading a few hundred lines. It keeps an
+//! offset and a moment of each part and nothing of the lines.
+
+use crate::{LogError, MAX_LINE_BYTES};
+use ratn_model::time::Timestamp;
+use serde::Deserialize;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+/// How much of a log a part is.
+const PART_BYTES: u64 = 4 << 20;
+/// So much of the end of a log is looked at first for its last line.
+const END_BYTES: u64 = 64 << 10;
+
+/// The parts of a log, as far as it was written when it was looked at.
+#[derive(Debug)]
+pub struct Parts {
+    path: PathBuf,
+    part_bytes: u64,
+    /// Of each part the byte at which its first line begins, and when that was.
+    begin: Vec<(u64, Timestamp)>,
+    length: u64,
+    last: Timestamp,
+}
+
+/// Of a line only when it was.
+#[derive(Deserialize)]
+struct Stamp {
+    at: Timestamp,
+}
+
+impl Parts {
+    /// Of a log, which may have no whole line yet.
+    ///
+    /// # Errors
+    /// Where it cannot be read, or a line that is looked at has no moment.
+    pub fn of(path: &Path) -> Result<Parts, LogError> {
+        Parts::of_size(path, PART_BYTES)
+    }
+
+    fn of_size(path: &Path, part_bytes: u64) -> Result<Parts, LogError> {
+        let (path, last) = (path.to_owned(), Timestamp(0));
+        let mut parts = Parts { path, part_bytes, begin: Vec::new(), length: 0, last };
+        parts.look()?;
+        Ok(parts)
+    }
+
+    /// Looks at what was written since. A log that is shorter than it was is indexed anew.
+    ///
+    /// # Errors
+    /// As [`Parts::of`].
+    pub fn look(&mut self) -> Result<(), LogError> {
+        let mut file = File::open(&self.path).map_err(|source| self.io(source))?;
+        let length = file.metadata().map_err(|source| self.io(source))?.len();
+        if length < self.length {
+            (self.begin, self.last) = (Vec::new(), Timestamp(0));
+        } else if length == self.length {
+            return Ok(());
+        }
+        while self.begin.len() as u64 * self.part_bytes < length {
+            let from = self.begin.len() as u64 * self.part_bytes;
+            let Some(begin) = self.first_behind(&mut file, from)? else { break };
+            self.begin.push(begin);
+        }
+        self.last = self.last_of(&mut file, length)?.unwrap_or(self.last);
+        self.length = length;
+        Ok(())
+    }
+
+    /// How many bytes it has, a torn line at its end included.
+    pub fn length(&self) -> u64 {
+        self.length
+    }
+
+    /// When its last whole line was.
+    pub fn last(&self) -> Timestamp {
+        self.last
+    }
+
+    /// Where to begin to read for what happened until a moment, so that at least `bytes` before it are read: the byte at which a line
+    /// begins, and when that was. The start of the log where there is not so much before it.
+    pub fn before(&self, moment: Timestamp, bytes: u64) -> (u64, Timestamp) {
+        let reached = self.begin.partition_point(|(_, at)| *at <= moment);
+        let back = usize::try_from(bytes.div_ceil(self.part_bytes)).unwrap_or(usize::MAX);
+        let part = reached.saturating_sub(1).saturating_sub(back);
+        if part == 0 { (0, Timestamp(0)) } else { self.begin[part] }
+    }
+
+    /// The first whole line that begins at a byte or behind it.
+    fn first_behind(&self, file: &mut File, from: u64) -> Result<Option<(u64, Timestamp)>, LogError> {
+        let mut offset = from.saturating_sub(1);
+        file.seek(SeekFrom::Start(offset)).map_err(|source| self.io(source))?;
+        let mut reader = BufReader::new(file);
+        if from > 0 {
+            // The rest of the line before; where that ends with the byte before this one, it is empty.
+            let Some(rest) = self.line(&mut reader)? else { return Ok(None) };
+            offset += rest.len() as u64;
+        }
+        let Some(line) = self.line(&mut reader)? else { return Ok(None) };
+        Ok(Some((offset, self.stamp(&line, offset)?)))
+    }
+
+    fn last_of(&self, file: &mut File, length: u64) -> Result<Option<Timestamp>, LogError> {
+        let mut bytes = END_BYTES;
+        loop {
+            let from = length.saturating_sub(bytes);
+            file.seek(SeekFrom::Start(from)).map_err(|source| self.io(source))?;
+            let mut end = Vec::new();
+            file.take(length - from).read_to_end(&mut end).map_err(|source| self.io(source))?;
+            let Some(newline) = end.iter().rposition(|byte| *byte == b'\n') else {
+                if from == 0 || bytes > MAX_LINE_BYTES as u64 {
+                    return Ok(None);
+                }
+                bytes *= 4;
+                continue;
+            };
+            match end[..newline].iter().rposition(|byte| *byte == b'\n') {
+                Some(before) => return self.stamp(&end[before + 1..newline], from + before as u64 + 1).map(Some),
+                None if from == 0 => return self.stamp(&end[..newline], 0).map(Some),
+                None if bytes > 2 * MAX_LINE_BYTES as u64 => return Ok(None),
+                None => bytes *= 4,
+            }
+        }
+    }
+
+    /// A whole line with its end; `None` where there is none.
+    fn line(&self, reader: &mut impl BufRead) -> Result<Option<Vec<u8>>, LogError> {
+        let mut line = Vec::new();
+        let limit = MAX_LINE_BYTES as u64 + 1;
+        reader.take(limit).read_until(b'\n', &mut line).map_err(|source| self.io(source))?;
+        Ok((line.last() == Some(&b'\n')).then_some(line))
+    }
+
+    fn stamp(&self, line: &[u8], offset: u64) -> Result<Timestamp, LogError> {
+        let stamp: Result<Stamp, _> = serde_json::from_slice(line);
+        stamp.map(|stamp| stamp.at).map_err(|error| LogError::Unreadable {
+            path: self.path.clone(),
+            offset,
+            reason: error.to_string(),
+        })
+    }
+
+    fn io(&self, source: std::io::Error) -> LogError {
+        LogError::Io { what: "read", path: self.path.clone(), source }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::Lines;
+    use std::io::Write;
+
+    const STARTED: &str = r#"{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":1,"world":[],"revision":0}"#;
+
+    fn log(seconds: u64) -> tempfile::NamedTempFile {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        writeln!(file, "{STARTED}").unwrap();
+        for second in 1..=seconds {
+            writeln!(file, r#"{{"at":{},"event":"woken"}}"#, second * 1_000_000_000).unwrap();
+        }
+        file.flush().unwrap();
+        file
+    }
+
+    fn first_at(file: &Path, offset: u64) -> Timestamp {
+        Lines::behind(file, offset, 0).unwrap().next().unwrap().unwrap().at
+    }
+
+    #[test]
+    fn every_part_begins_with_a_line_and_is_found_by_its_moment() {
+        let file = log(500);
+        for size in [40, 64, 257, 4096] {
+            let parts = Parts::of_size(file.path(), size).unwrap();
+            assert_eq!(parts.last(), Timestamp::from_seconds(500.0));
+            for (offset, at) in &parts.begin {
+                assert_eq!(first_at(file.path(), *offset), *at);
+            }
+            for moment in [0.0, 3.0, 250.0, 499.5, 9000.0] {
+                let moment = Timestamp::from_seconds(moment);
+                let (offset, at) = parts.before(moment, 100);
+                assert!(at <= moment, "{at:?} {moment:?}");
+                assert!(offset == 0 || first_at(file.path(), offset) == at);
+                // So much is before it, and not much more.
+                let line = moment.seconds().min(500.0) * 40.0;
+                assert!(offset as f64 <= (line - 100.0).max(0.0) + 200.0, "{offset} for {moment:?} by {size}");
+            }
+            assert_eq!(parts.before(Timestamp::from_seconds(250.0), u64::MAX).0, 0);
+        }
+    }
+
+    #[test]
+    fn a_log_that_grows_is_looked_at_again_and_a_torn_line_is_not_counted() {
+        let mut file = log(3);
+        let mut parts = Parts::of_size(file.path(), 64).unwrap();
+        assert_eq!(parts.last(), Timestamp::from_seconds(3.0));
+        write!(file, r#"{{"at":4000000000,"event":"wo"#).unwrap();
+        file.flush().unwrap();
+        parts.look().unwrap();
+        assert_eq!(parts.last(), Timestamp::from_seconds(3.0));
+        writeln!(file, "ken\"}}").unwrap();
+        file.flush().unwrap();
+        parts.look().unwrap();
+        assert_eq!(parts.last(), Timestamp::from_seconds(4.0));
+    }
+
+    #[test]
+    fn what_is_no_log_is_refused_with_the_place() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), "one\ntwo\n").unwrap();
+        let error = Parts::of(file.path()).unwrap_err().to_string();
+        assert!(error.contains("at byte 0"), "{error}");
+        assert_eq!(Parts::of(tempfile::NamedTempFile::new().unwrap().path()).unwrap().length(), 0);
+    }
+}

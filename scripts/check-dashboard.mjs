@@ -1,0 +1,463 @@
+// What `scripts/check-dashboard` does in the browser.
+
+import assert from "node:assert/strict";
+import { spawn, spawnSync } from "node:child_process";
+import { closeSync, mkdirSync, openSync, readFileSync, writeFileSync, writeSync } from "node:fs";
+import { createRequire } from "node:module";
+import { join } from "node:path";
+
+const { CHROMIUM, MODULES, PLACE, RATN, SHOTS } = process.env;
+const MIB = Number(process.env.MIB);
+const { chromium } = createRequire(join(MODULES, "x.js"))("playwright-core");
+const AXE = readFileSync(join(MODULES, "axe-core/axe.min.js"), "utf8");
+const PATIENCE_MS = 60_000;
+/** A name that would do something wherever it is taken for markup or code. */
+const INJECTED = `<img src=x onerror="window.hit=1"></script><script>window.hit=2</script>{{7*7}}'"`;
+
+const running = [];
+function start(name, args, env = {}) {
+  const child = spawn(RATN, args, { env: { ...process.env, ...env }, stdio: ["ignore", "pipe", "pipe"] });
+  const said = { out: "", error: "" };
+  child.stdout.on("data", (part) => (said.out += part));
+  child.stderr.on("data", (part) => (said.error += part));
+  const ended = new Promise((resolve) => child.on("exit", (code) => resolve(code)));
+  const one = { name, child, said, ended };
+  running.push(one);
+  return one;
+}
+
+async function until(what, look, patience = PATIENCE_MS) {
+  const end = Date.now() + patience;
+  for (;;) {
+    const found = await look();
+    if (found) return found;
+    if (Date.now() > end) throw new Error(`not within ${patience / 1000} s: ${what}`);
+    await new Promise((resolve) => setTimeout(resolve, 100));
+  }
+}
+
+async function dashboard(args) {
+  const one = start("dashboard", ["dashboard", ...args]);
+  const url = await until("the dashboard's address", () => {
+    assert.equal(one.child.exitCode, null, one.said.error);
+    return one.said.out.match(/http:\S+/)?.[0];
+  });
+  return { ...one, url };
+}
+
+function step(text) {
+  console.log(`${((performance.now() - began) / 1000).toFixed(1).padStart(6)} s  ${text}`);
+}
+const began = performance.now();
+
+const browser = await chromium.launch({ executablePath: CHROMIUM, args: ["--no-sandbox", "--disable-dev-shm-usage"] });
+
+async function open(url, options = {}) {
+  const context = await browser.newContext({ viewport: { width: 1280, height: 760 }, colorScheme: "light", ...options });
+  const page = await context.newPage();
+  page.setDefaultTimeout(PATIENCE_MS);
+  const problems = [];
+  page.on("pageerror", (error) => problems.push(String(error)));
+  page.on("console", (message) => {
+    // A refusal is told on the page; everything else that a page complains of is an error of ours.
+    if (message.type() === "error" && !message.text().includes("Failed to load resource")) problems.push(message.text());
+  });
+  page.on("dialog", (dialog) => problems.push(`a dialog: ${dialog.message()}`));
+  page.problems = problems;
+  await page.goto(url);
+  await page.waitForSelector("footer output:not(:empty), .summary:not(:empty)");
+  return page;
+}
+
+async function go(page, name) {
+  await page.click(`nav a[href="#/${name}"]`);
+  await page.waitForFunction((name) => document.querySelector(`nav a[href="#/${name}"]`)?.getAttribute("aria-current") === "page", name);
+  await page.waitForTimeout(name === "hosts" || name === "resources" || name === "world" ? 1500 : 500);
+}
+
+async function axe(page, what) {
+  // From outside of the page's own policy, as an extension would.
+  const world = await page.context().newCDPSession(page);
+  const { frameTree } = await world.send("Page.getFrameTree");
+  const { executionContextId } = await world.send("Page.createIsolatedWorld", { frameId: frameTree.frame.id, worldName: "axe" });
+  const run = (expression) => world.send("Runtime.evaluate", { expression, contextId: executionContextId, awaitPromise: true, returnByValue: true });
+  await run(AXE);
+  const { result, exceptionDetails } = await run(
+    `axe.run(document, { resultTypes: ["violations"] }).then((found) => found.violations.map((one) => one.id + ": " + one.help + ": " + one.nodes.map((node) => node.html.slice(0, 120)).join(" | ")))`,
+  );
+  await world.detach();
+  assert.equal(exceptionDetails, undefined, JSON.stringify(exceptionDetails));
+  assert.deepEqual(result.value, [], `axe on ${what}`);
+}
+
+async function shot(page, name) {
+  await page.screenshot({ path: join(SHOTS, `${name}.png`) });
+}
+
+const at = (seconds) => Math.round(seconds * 1e9);
+const line = (value) => `${JSON.stringify(value)}\n`;
+const startedLine = (task, more = {}) =>
+  line({ at: 0, event: "started", task, digest: "d", mode: "cdtn", parameters: {}, seed: 1, world: [], revision: 0, capacity: { PathPlanner: 2 }, origin: { run: "r", natures: { computes: ["place/plan"], actuating: ["Arm"] } }, ...more });
+
+/** `place[n]/plan` on one of two planners, then `place[n]/move` with the arm. */
+function visits(write, count) {
+  let id = 0;
+  const note = (when, note, more) => write(line({ at: at(when), command: "note", note, ...more }));
+  for (let n = 1; n <= count / 2; n += 1) {
+    const [plan, move] = [(id += 1), (id += 1)];
+    const t = n * 2;
+    note(t - 1.9, "expanded", { instance: plan, state: 1, path: `place[${n}]/plan`, speculative: n % 7 === 0 });
+    note(t - 1.9, "expanded", { instance: move, state: 2, path: `place[${n}]/move`, speculative: n % 7 === 0 });
+    const begin = (when, instance, lease, resource, kind, action, projection) => {
+      const resources = [{ id: resource, kind, endpoint: "" }];
+      write(line({ at: at(when - 0.1), command: "acquire", instance, requirements: [{ operation: "block", kind, class: null, attributes: {}, count: 1 }], priority: 1 }));
+      write(line({ at: at(when), event: "granted", instance, lease: { id: lease, token: lease, resources } }));
+      write(line({ at: at(when), command: "start", instance, attempt: 1, goal: { provider: kind, action, inputs: {}, seed: 1, lease: { id: lease, token: lease, resources }, projection, expected_s: null } }));
+    };
+    const end = (when, instance, lease) => {
+      write(line({ at: at(when), event: "finished", instance, attempt: 1, outcome: "success", outputs: {}, measured: [], reason: "" }));
+      note(when, "finished", { instance, outcome: "success" });
+      write(line({ at: at(when), command: "release", instance, lease, projection: null }));
+    };
+    begin(t - 1.8, plan, plan, `planner-${1 + (n % 2)}@compute`, "PathPlanner", "plan", 1);
+    end(t - 1, plan, plan);
+    begin(t - 0.9, move, move, "arm@sim", "Arm", "move", null);
+    end(t - 0.1, move, move);
+    note(t - 0.1, "retired", { instance: plan });
+    if (n % 9 === 0) note(t - 0.05, "squashed", { instance: move });
+    else note(t - 0.05, "retired", { instance: move });
+  }
+}
+
+async function control() {
+  const directory = join(PLACE, "run");
+  mkdirSync(directory);
+  const up = start("up", ["up", "--runtime-dir", directory, "--boxes", "2", "--speed", "4"]);
+  await until("the system", () => {
+    assert.equal(up.child.exitCode, null, up.said.error);
+    return up.said.error.includes("is ready");
+  });
+  const shown = await dashboard(["--runtime-dir", directory, "--control"]);
+  const page = await open(shown.url);
+  await page.waitForFunction(() => document.querySelector(".summary")?.textContent.includes("No run is under way"));
+  assert.ok(!page.url().includes("token"), "the token is out of the address");
+  step("a system without a run is shown");
+
+  const log = join(PLACE, "live.jsonl");
+  const run = start("run", ["run", "examples/fetch_boxes.yaml", "--runtime-dir", directory, "--set", "boxes=2", "--log", log, "--quiet"]);
+  await page.waitForSelector(".badge.live");
+  await page.waitForSelector("#running button");
+  step("a run is started, and seen");
+  await page.waitForFunction(() => Number.parseFloat(document.querySelector("footer output").textContent) > 8);
+  await axe(page, "the run");
+  await shot(page, "run-live");
+
+  // Nothing is told to it before it is confirmed.
+  await page.click("text=Pause");
+  await page.waitForSelector("dialog[open]");
+  await axe(page, "the question");
+  await shot(page, "question");
+  await page.click("dialog button[value=no]");
+  await page.waitForTimeout(600);
+  assert.equal(await page.locator(".badge.paused").count(), 0);
+  await page.click("text=Pause");
+  await page.click("dialog button[value=yes]");
+  await page.waitForSelector(".badge.paused");
+  step("it is paused, once that was confirmed");
+  await go(page, "network");
+  const why = await until("a sentence that says why something waits", async () => {
+    const texts = await page.locator("#waiting li").allTextContents();
+    return texts.find((text) => text.includes("the operator: the run is paused"));
+  });
+  step(`it says why something waits: ${why.trim()}`);
+  await page.locator("#waiting button").first().click();
+  await page.waitForSelector("[data-chosen]");
+  await shot(page, "network-paused");
+  await axe(page, "the network");
+
+  await go(page, "hosts");
+  const worker = await until("a worker", () => page.locator("tbody tr", { hasText: "path-planner" }).filter({ hasText: "@" }).filter({ hasText: "show" }).first().locator("td").first().textContent());
+  const id = worker.trim();
+  const row = page.locator("tbody tr", { hasText: id });
+  const pid = Number((await row.locator("td").nth(3).textContent()).trim());
+  process.kill(pid, "SIGKILL");
+  await until("the worker to be replaced", async () => {
+    const rows = await page.locator("tbody tr").filter({ hasText: "path-planner-" }).filter({ hasText: "ready" }).allTextContents();
+    return rows.length > 0 && rows.every((text) => !text.includes(String(pid)));
+  });
+  await until("the restart to be counted", async () => {
+    const pools = await page.locator("tbody tr").filter({ hasText: "path-planner" }).filter({ hasNotText: "show" }).first().locator("td").allTextContents();
+    return Number(pools[6]) >= 1;
+  });
+  step(`worker ${id} was killed, and is seen replaced`);
+  await page.click("[aria-label='Scale the pool path-planner']");
+  await axe(page, "the question how many");
+  await page.fill("dialog label:has-text('At least') input", "3");
+  await page.click("dialog button[value=yes]");
+  await until("a third planner", async () => (await page.locator("tbody tr").filter({ hasText: "path-planner-" }).filter({ hasText: "show" }).count()) >= 3);
+  step("a pool is scaled, once that was confirmed");
+  await page.locator("tbody tr", { hasText: "path-planner" }).locator("button", { hasText: "show" }).first().click();
+  await page.waitForSelector("pre");
+  await axe(page, "hosts and pools");
+  await shot(page, "hosts");
+  await go(page, "resources");
+  await page.waitForFunction(() => document.body.textContent.includes("Resources of the system"));
+  await axe(page, "resources");
+  await shot(page, "resources");
+  await go(page, "world");
+  await page.waitForFunction(() => document.querySelectorAll("tbody tr").length > 5);
+  await axe(page, "the world");
+  await shot(page, "world");
+  await go(page, "run");
+
+  await page.click("text=Step");
+  await page.click("dialog button[value=yes]");
+  await page.waitForTimeout(1500);
+  assert.ok(readFileSync(log, "utf8").includes("step_requested"));
+  await page.click("text=Go on");
+  await page.click("dialog button[value=yes]");
+  await page.waitForFunction(() => document.querySelector(".badge.live") !== null);
+  step("it did a step, and goes on");
+  await page.click("text=End the run");
+  await page.click("dialog button[value=yes]");
+  await run.ended;
+  await page.waitForFunction(() => document.querySelector(".summary .badge.bad")?.textContent === "preempted");
+  assert.equal(await page.locator("header .danger").count(), 0, "an ended run cannot be told anything");
+  step("it is ended");
+  await shot(page, "run-ended");
+  assert.deepEqual(page.problems, []);
+  await page.context().close();
+  shown.child.kill("SIGTERM");
+  up.child.kill("SIGTERM");
+  await Promise.all([shown.ended, up.ended]);
+  return log;
+}
+
+async function replay(log) {
+  const shown = await dashboard([log, "crates/report/src/fixtures/incidents.jsonl", "--runtime-dir", join(PLACE, "nothing")]);
+  const page = await open(shown.url);
+  assert.equal(await page.locator("header .danger").count(), 0, "pages only look");
+  await page.waitForFunction(() => document.querySelector("footer output").textContent.length > 3);
+  await page.locator("footer input[type=range]").evaluate((slider) => {
+    slider.value = String(Number(slider.max) * 0.4);
+    slider.dispatchEvent(new Event("input"));
+  });
+  await page.waitForSelector(".badge:has-text('replayed')");
+  const before = await page.locator("footer output").textContent();
+  await page.selectOption("footer select", "10");
+  await page.click("footer >> text=Play");
+  await until("the replay to go on", async () => (await page.locator("footer output").textContent()) !== before);
+  step(`a log is replayed: from ${before} on`);
+  await page.click("footer >> text=Stop");
+  await shot(page, "replay");
+
+  // What is pointed at says what it did and what it waited for; a click goes to its node.
+  const canvas = await page.locator("canvas").boundingBox();
+  let hint = "";
+  for (let x = 180; x < canvas.width && !hint.includes("waited"); x += 8) {
+    for (const y of [32, 52, 72]) {
+      await page.mouse.move(canvas.x + x, canvas.y + y);
+      if (await page.locator(".tip").isVisible()) hint = await page.locator(".tip").textContent();
+      if (hint.includes("waited")) break;
+    }
+  }
+  assert.match(hint, /waited [\d.]+\s?s for /, "a hint says what was waited for");
+  await page.mouse.down();
+  await page.mouse.up();
+  await page.waitForFunction(() => location.hash === "#/network");
+  assert.ok(hint.startsWith(await page.locator("[data-chosen]").textContent()), hint);
+  step(`pointed at, a bar says: ${hint.split("\n").join("; ")}`);
+  await go(page, "run");
+
+  // By keys alone: the chart is reached, a bar chosen and its node opened.
+  await page.locator("canvas").focus();
+  await page.keyboard.press("ArrowRight");
+  await page.keyboard.press("Enter");
+  await page.waitForFunction(() => location.hash === "#/network");
+  await page.waitForSelector("[data-chosen]");
+  await page.click("text=Only its causes");
+  await page.waitForTimeout(500);
+  await shot(page, "network-causes");
+  await page.selectOption("label:has-text('Show') select", "states");
+  await page.click("text=Only its causes");
+  await page.waitForTimeout(500);
+  await shot(page, "network-states");
+  step("a bar is chosen by keys, its node opened, its causes shown");
+  for (const by of ["node", "host"]) {
+    await go(page, "run");
+    await page.selectOption("label:has-text('A row is') select", by);
+    await page.waitForTimeout(300);
+    await shot(page, `run-by-${by}`);
+  }
+  await page.click("footer >> text=End");
+  await go(page, "compare");
+  await page.waitForFunction(() => document.querySelectorAll("main h2")[1]?.textContent.includes(":") && document.querySelectorAll("main canvas").length === 2);
+  await axe(page, "two runs below each other");
+  await page.waitForTimeout(1200);
+  await shot(page, "compare");
+  step("two logs are shown below each other");
+  assert.deepEqual(page.problems, []);
+  await page.context().close();
+
+  const dark = await open(shown.url, { colorScheme: "dark", locale: "de-DE", viewport: { width: 844, height: 390 } });
+  await dark.waitForFunction(() => /\d,\d/.test(document.querySelector("footer output").textContent));
+  for (const name of ["run", "network", "resources", "world"]) {
+    await go(dark, name);
+    await axe(dark, `${name}, dark, on a phone`);
+    await shot(dark, `dark-phone-${name}`);
+    const wide = await dark.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+    assert.ok(wide <= 0, `${name} is ${wide} px wider than the phone`);
+    const tall = await dark.evaluate(() => document.querySelector("main").clientHeight);
+    assert.ok(tall >= 220, `${name} has ${tall} px for itself`);
+  }
+  assert.deepEqual(dark.problems, []);
+  await dark.context().close();
+  step("dark, in German, on a phone in landscape: axe finds nothing, and nothing is wider than it");
+  shown.child.kill("SIGTERM");
+  await shown.ended;
+}
+
+async function injected() {
+  const log = join(PLACE, "injected.jsonl");
+  const key = { predicate: INJECTED, arguments: [INJECTED] };
+  writeFileSync(
+    log,
+    startedLine(INJECTED, { world: [[key, { string: INJECTED }]] }) +
+      line({ at: 1, command: "note", note: "expanded", instance: 1, state: 1, path: `${INJECTED}/${INJECTED}`, speculative: true }) +
+      line({ at: 1, command: "acquire", instance: 1, requirements: [{ operation: "block", kind: INJECTED, class: null, attributes: {}, count: 1 }], priority: 1 }) +
+      line({ at: at(1), event: "granted", instance: 1, lease: { id: 1, token: 1, resources: [{ id: INJECTED, kind: INJECTED, endpoint: "" }] } }) +
+      line({ at: at(1), command: "start", instance: 1, attempt: 1, goal: { provider: INJECTED, action: INJECTED, inputs: {}, seed: 1, lease: { id: 1, token: 1, resources: [{ id: INJECTED, kind: INJECTED, endpoint: "" }] }, projection: 1, expected_s: null } }) +
+      line({ at: at(2), event: "finished", instance: 1, attempt: 1, outcome: INJECTED, outputs: {}, measured: [], reason: INJECTED }) +
+      line({ at: at(2), command: "note", note: "invalidated", instance: 1, reason: INJECTED }) +
+      line({ at: at(3), command: "end", outcome: INJECTED, outputs: {}, reason: INJECTED }),
+  );
+  const shown = await dashboard([log, "--runtime-dir", join(PLACE, "nothing")]);
+  const page = await open(shown.url);
+  await page.waitForFunction(() => document.querySelector(".summary b") !== null);
+  for (const name of ["run", "network", "resources", "hosts", "world"]) {
+    await go(page, name);
+    if (name === "run" || name === "network") {
+      await page.locator("canvas").focus();
+      await page.keyboard.press("ArrowRight");
+      await page.mouse.move(600, 300);
+    }
+    assert.equal(await page.evaluate(() => window.hit), undefined, `a name did something on ${name}`);
+    assert.equal(await page.locator("img").count(), 0, `a name is markup on ${name}`);
+    assert.ok((await page.textContent("body")).includes(INJECTED), `the name is shown as it is on ${name}`);
+  }
+  assert.deepEqual(page.problems, []);
+  await page.context().close();
+  shown.child.kill("SIGTERM");
+  await shown.ended;
+  step("names that would do something are text on every page");
+}
+
+async function large() {
+  const log = join(PLACE, "large.jsonl");
+  const file = openSync(log, "w");
+  writeSync(file, startedLine("large"));
+  const parts = [];
+  visits((text) => parts.push(text), 10_000);
+  writeSync(file, parts.join(""));
+  closeSync(file);
+  const shown = await dashboard([log, "--runtime-dir", join(PLACE, "nothing")]);
+  const page = await open(shown.url);
+  await page.waitForFunction(() => document.querySelector("footer output").textContent.startsWith("10,000"));
+  await page.waitForTimeout(1000);
+  const frames = await page.evaluate(async () => {
+    const view = document.querySelector(".canvas");
+    const box = view.getBoundingClientRect();
+    const times = [];
+    let last = performance.now();
+    for (let n = 0; n < 90; n += 1) {
+      view.querySelector("canvas").dispatchEvent(new WheelEvent("wheel", { deltaY: n < 45 ? -20 : 20, ctrlKey: true, clientX: box.left + 500, clientY: box.top + 80, cancelable: true, bubbles: true }));
+      await new Promise(requestAnimationFrame);
+      times.push(performance.now() - last);
+      last = performance.now();
+    }
+    return { painted: Number(view.querySelector("canvas").dataset.paintedMs), median: times.sort((a, b) => a - b)[45], slow: times[85] };
+  });
+  step(`10,000 bars are zoomed at ${(1000 / frames.median).toFixed(0)} frames a second (the slowest of twenty: ${frames.slow.toFixed(1)} ms); painting takes ${frames.painted} ms`);
+  assert.ok(frames.median < 34, "10,000 bars are zoomed without waiting");
+  await shot(page, "large-run");
+  const before = Date.now();
+  await page.click('nav a[href="#/network"]');
+  await page.waitForFunction(() => Number(document.querySelector(".canvas")?.dataset.nodes) >= 9_999 && document.querySelector("canvas").dataset.paintedMs !== undefined);
+  const took = Date.now() - before;
+  step(`a network of 10,000 instances is laid out and painted in ${took} ms`);
+  assert.ok(took < 2_000, `${took} ms`);
+  const painted = await page.evaluate(() => {
+    const canvas = document.querySelector("canvas");
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    let [inked, all] = [0, 0];
+    for (let index = 3; index < data.length; index += 4) [inked, all] = [inked + (data[index] > 60 ? 1 : 0), all + 1];
+    return inked / all;
+  });
+  assert.ok(painted > 0.02, `${(painted * 100).toFixed(2)} % of the network is painted`);
+  await shot(page, "large-network");
+  assert.deepEqual(page.problems, []);
+  await page.context().close();
+  shown.child.kill("SIGTERM");
+  await shown.ended;
+}
+
+async function long() {
+  const log = join(PLACE, "long.jsonl");
+  const file = openSync(log, "w");
+  writeSync(file, startedLine("long"));
+  let [bytes, id, parts] = [0, 0, []];
+  const ballast = "x".repeat(3000);
+  while (bytes < MIB * (1 << 20)) {
+    parts = [];
+    for (let n = 0; n < 300; n += 1) {
+      id += 1;
+      const t = id * 0.1;
+      parts.push(line({ at: at(t), command: "note", note: "expanded", instance: id, state: 1, path: `look[${id}]`, speculative: false }));
+      parts.push(line({ at: at(t), command: "start", instance: id, attempt: 1, goal: { provider: "eye", action: "look", inputs: {}, seed: 1, lease: null, projection: null, expected_s: null } }));
+      parts.push(line({ at: at(t), event: "progressed", instance: id, attempt: 1, message: ballast }));
+      parts.push(line({ at: at(t + 0.05), event: "finished", instance: id, attempt: 1, outcome: "success", outputs: {}, measured: [], reason: "" }));
+      parts.push(line({ at: at(t + 0.05), command: "note", note: "retired", instance: id }));
+    }
+    bytes += writeSync(file, parts.join(""));
+  }
+  closeSync(file);
+  const before = Date.now();
+  const shown = await dashboard([log, "--runtime-dir", join(PLACE, "nothing")]);
+  const page = await open(shown.url);
+  await page.waitForFunction(() => document.querySelector(".summary .warn") !== null);
+  const took = Date.now() - before;
+  step(`a log of ${MIB} MiB is open in ${(took / 1000).toFixed(1)} s, from the start of the program on`);
+  assert.ok(took < 5_000, `${took} ms`);
+  const jump = Date.now();
+  await page.locator("footer input[type=range]").evaluate((slider) => {
+    slider.value = String(Number(slider.max) / 2);
+    slider.dispatchEvent(new Event("input"));
+  });
+  const half = Math.floor((id * 0.1) / 2 / 100);
+  await page.waitForFunction((half) => document.querySelector("footer output").textContent.replace(/\D/g, "").startsWith(String(half)), half);
+  step(`and its middle is shown ${((Date.now() - jump) / 1000).toFixed(1)} s after it was asked for`);
+  await shot(page, "long");
+  assert.deepEqual(page.problems, []);
+  await page.context().close();
+  shown.child.kill("SIGTERM");
+  await shown.ended;
+}
+
+const only = process.env.ONLY?.split(",");
+try {
+  const wants = (name) => only === undefined || only.includes(name);
+  const live = wants("control") ? await control() : "crates/report/src/fixtures/two_boxes.jsonl";
+  if (wants("replay")) await replay(live);
+  if (wants("injected")) await injected();
+  if (wants("large")) await large();
+  if (wants("long")) await long();
+  step("the dashboard is as it should be");
+} catch (error) {
+  for (const context of browser.contexts()) for (const page of context.pages()) await page.screenshot({ path: join(SHOTS, "failed.png") }).catch(() => {});
+  console.error(error);
+  for (const { name, said } of running) console.error(`--- ${name}: ${said.error.slice(-1500)}`);
+  process.exitCode = 1;
+} finally {
+  await browser.close();
+  for (const { child } of running) if (child.exitCode === null) child.kill("SIGTERM");
+}
