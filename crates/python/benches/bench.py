@@ -118,6 +118,7 @@ def ours(goals: int) -> dict[str, Any]:
 
 SERVER = """
 import sys, grpc
+from concurrent import futures
 
 def add(request, context):
     return str(int(request) + 1).encode()

@@ -14,10 +14,10 @@ GROUPS = {
     "Views of a run": ["Log", "Nodes", "Why", "CriticalPath", "Report", "Chart", "Network"],
     "Tasks": ["task", "Task", "Finding", "State", "Doc", "output", "variable", "Annotations"],
     "What is in a task": [
-        "sequence", "when", "otherwise", "each", "while_", "do_while", "until", "retry", "concurrently", "action", "library", "leave", "block", "consume",
+        "sequence", "when", "otherwise", "each", "while_", "do_while", "until", "retry", "concurrently", "action", "wait", "ask", "library", "leave", "block", "consume",
         "create", "delete",
     ],
-    "Expressions": ["Value", "fn", "expr", "fact", "exists", "isin"],
+    "Expressions": ["Value", "fn", "expr", "fact", "exists", "isin", "function"],
     "Steps, workers and drivers": ["step", "Step", "Worker", "Driver", "Outcome", "Goal"],
     "Values": ["Pose", "Joints", "Trajectory"],
 }

@@ -382,3 +382,51 @@ def test_values_and_tasks_show_themselves_also_when_nothing_is_traced() -> None:
 
     assert repr(kept[0]) == "<Value of a task that is not being traced>"
     assert small._repr_markdown_().startswith("```yaml\ntask: small\n") and repr(small).startswith("<Task small of ")
+
+
+def test_waiting_asking_and_functions_are_traced() -> None:
+    @ratn.function
+    def above(pose: object, by_m: object) -> object:
+        return fn.compose(pose, fn.pose(0, 0, by_m))
+
+    @ratn.function
+    def is_free(thing: object) -> object:
+        return ~ratn.exists(ratn.fact("tidied", thing))
+
+    @ratn.task(outcomes=["nobody"], variables={"order": None})
+    def hand_over(pose: ratn.Pose = TABLE) -> dict:
+        lid = ratn.wait(ratn.fact("open", "lid"), timeout=60, transitions={"timeout": "nobody"})
+        order = ratn.wait(signal="order", assign={"order": ratn.expr("value")})
+        ratn.wait(seconds=0.5)
+        ratn.wait(until=30)
+        pan_tilt.look_at(target=above(pose, 0.1), requires=[is_free("cup")])
+        go_on = ratn.ask("May it move?", ["now", "never"], default="now", timeout=120, transitions={"never": "nobody"})
+        sure = ratn.ask(fn.concat("Box ", order.value, "?"), ["yes_it_is"])
+        ratn.ask("$5 a piece?", ["fine"])
+        del lid, sure
+        return {"answer": go_on.answer}
+
+    text = hand_over.to_yaml()
+    for part in (
+        'wait: { for: "open(lid)", timeout: 60 }', "wait: { signal: order }", "wait: { seconds: 0.5 }", "wait: { until: 30 }",
+        '"is_free($thing)": "not (exists tidied($thing))"', '"above($pose, $by_m)": "compose($pose, pose(0, 0, $by_m))"', 'target: "above($pose, 0.1)"',
+        'ask: { question: "May it move?", choices: [now, never], default: now, timeout: 120 }', "question: \"concat(\\\"Box \\\", order.value, \\\"?\\\")\"",
+    ):
+        assert part in text, text
+    same(hand_over, traced(hand_over.to_python()))
+    (one,) = [state for state in hand_over.model()["states"] if "$5 a piece?" in json.dumps(state)]
+    assert one["name"] == "ask_operator"
+
+    def twice() -> None:
+        ratn.wait(seconds=1, until=2)
+
+    @ratn.function
+    def endless(n: object) -> object:
+        return endless(n)
+
+    def recursive(n: int) -> None:
+        ratn.wait(seconds=endless(n))
+
+    for function, part in ((twice, "waits for one thing"), (recursive, "`endless` uses itself")):
+        with pytest.raises(ratn.Untraceable, match=part):
+            ratn.task(function)

@@ -118,6 +118,35 @@ def test_a_task_of_python_runs_and_is_looked_at_as_it_was(system: ratn.System) -
     assert "look_at" in str(network) and network._repr_markdown_().startswith("```mermaid\n")
 
 
+def test_a_run_is_sent_signals_and_answered(system: ratn.System) -> None:
+    @ratn.task
+    def hand_over() -> dict:  # type: ignore[type-arg]
+        order = ratn.wait(signal="order")
+        go_on = ratn.ask("May it open?", ["now", "never"])
+        return {"order": order.value, "answer": go_on.answer}
+
+    run = system.run(hand_over)
+    end = time.monotonic() + 30
+    while True:
+        try:
+            # It is refused as long as the run does not listen, and kept from then on.
+            run.signal("order", {"boxes": [1, 2]})
+            break
+        except ratn.Error:
+            assert time.monotonic() < end, run.messages()
+            time.sleep(0.05)
+    with pytest.raises(ratn.Error, match="nowhere"):
+        run.signal("nowhere")
+    while run.under_way:
+        try:
+            run.answer("now")
+        except ratn.Error:
+            assert time.monotonic() < end, run.messages()
+            time.sleep(0.05)
+    result = run.result(30)
+    assert result.outputs == {"order": {"boxes": [1, 2]}, "answer": "now"}, run.messages()
+
+
 def test_pools_are_shown(system: ratn.System) -> None:
     pools = system.pools()
     (planners,) = [pool for pool in pools if pool["kind"] == "PathPlanner"]

@@ -197,3 +197,50 @@ def test_joints_are_an_array_without_a_copy() -> None:
     gc.collect()
     assert array.sum() == 1.5
     assert numpy.asarray(ratn.Joints([])).shape == (0,)
+
+
+def test_a_task_is_checked_against_what_workers_say_of_themselves(tester: Place) -> None:
+    @ratn.task
+    def halves() -> dict:
+        half = ratn.action("tester/halve", {"number": 8}, computes=True, reads=[], resources=["Tester"])
+        return {"half": half.half}
+
+    with pytest.raises(ratn.InvalidTask, match="unknown-provider"):
+        halves.check()
+    assert halves.check(system=tester.runtime) == []
+
+    @ratn.task
+    def wrong() -> None:
+        ratn.action("tester/halve", {"nmber": 8}, computes=True, reads=[], resources=["Tester"])
+
+    with pytest.raises(ratn.InvalidTask) as raised:
+        wrong.check(system=tester.runtime)
+    finding = next(finding for finding in raised.value.findings if finding.rule == "unknown-port")
+    assert finding.file == __file__ and "number" in finding.help, finding
+    with pytest.raises(ratn.Error, match="no system runs in"):
+        halves.check(system=tester.folder / "nowhere")
+
+
+def test_actions_of_a_running_system_are_a_module(tester: Place) -> None:
+    import runpy
+    import sys
+
+    robot = tester.folder / "robot.py"
+    told = subprocess.run(
+        [sys.executable, "-m", "ratn", "stubs", "--runtime-dir", str(tester.runtime), str(robot)], capture_output=True, text=True
+    )
+    assert told.returncode == 0, told.stderr
+    module = runpy.run_path(str(robot))
+    worker, arm = module["__getattr__"]("tester"), module["__getattr__"]("arm")
+
+    @ratn.task
+    def halves(number: int = 8) -> dict:
+        arm.where()
+        half = worker.halve(number=number, computes=True, reads=[])
+        return {"half": half.half}
+
+    assert halves.check() == [], "what the module says is known without the system"
+    with ratn.System(runtime_dir=tester.runtime) as system:
+        result = system.run(halves, number=10).result(60)
+        assert result.is_success and result.outputs == {"half": 5}, result
+    assert "def halve(" in robot.with_suffix(".pyi").read_text()

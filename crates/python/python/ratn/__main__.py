@@ -22,6 +22,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     stubs = commands.add_parser("stubs", help="write a module with the actions of a catalogue, and its stubs")
     stubs.add_argument("--catalogue", type=pathlib.Path, metavar="FILE", help="a catalogue, TOML, that extends the built-in one")
+    stubs.add_argument("--runtime-dir", type=pathlib.Path, metavar="DIR", help="where a running system is, whose workers and config are asked instead")
     stubs.add_argument("module", type=pathlib.Path, nargs="?", help="`robot.py`; robot.pyi is written beside it. The stubs alone to standard output without it")
     python = commands.add_parser("python", help="print a task file as Python")
     python.add_argument("task", type=pathlib.Path, metavar="TASK")
@@ -30,6 +31,11 @@ def main() -> None:
         sys.stdout.write(Task.from_yaml(given.task).to_python())
         return
     catalogue = given.catalogue.read_text() if given.catalogue else None
+    if given.runtime_dir is not None:
+        if catalogue is not None:
+            parser.error("--catalogue or --runtime-dir, not both")
+        catalogue = _stubs.catalogue_of_system(given.runtime_dir)
+        given.catalogue = given.runtime_dir
     what = f"the built-in catalogue and {given.catalogue.name}" if given.catalogue else "the built-in catalogue"
     text = _stubs.stubs(catalogue, what)
     if given.module is None:

@@ -12,7 +12,7 @@ from typing import Any
 _INDENT = "    "
 _ACTION_KEYS = ("action", "in")
 _NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?\Z")
-_TASK_KEYS = ("description", "horizon", "speculation_width", "deadline", "exceptions", "ontology", "tolerance", "world", "outcomes", "variables")
+_TASK_KEYS = ("description", "horizon", "speculation_width", "deadline", "exceptions", "ontology", "tolerance", "world", "outcomes", "variables", "functions")
 #: Keys whose values are expressions: what is text there is one.
 _EXPRESSIONS = ("variables", "assign", "outputs", "decide", "duration")
 
@@ -95,7 +95,7 @@ class _Source:
         name, body = None, item
         if len(item) == 1:
             ((key, value),) = item.items()
-            if isinstance(value, dict):
+            if isinstance(value, dict) and not _is_form(key, value):
                 name, body = key, value
         called = [] if name is None else [f"name={name!r}"]
         retry = body.get("retry")
@@ -105,6 +105,8 @@ class _Source:
         elif "action" in body:
             inputs = "{" + ", ".join(f"{port!r}: {_expression(value)}" for port, value in (body.get("in") or {}).items()) + "}"
             self.call("action", [repr(body["action"]), inputs, *called, *_annotations(body, _ACTION_KEYS)])
+        elif "wait" in body or "ask" in body:
+            self.own(called, body)
         elif "library" in body:
             given = "parameters={" + ", ".join(f"{name!r}: {_expression(value)}" for name, value in (body.get("with") or {}).items()) + "}"
             self.call("library", [repr(body["library"]), given, *called, *_annotations(body, ("library", "with"))])
@@ -124,6 +126,20 @@ class _Source:
             self.block("concurrently", arguments, body.get("regions"))
         else:
             self.loop_or_sequence(called, body)
+
+    def own(self, called: list[str], body: dict[str, Any]) -> None:
+        """A state that waits or asks."""
+        key = "wait" if "wait" in body else "ask"
+        said = dict(body[key])
+        if key == "ask":
+            question = said.pop("question")
+            is_text = isinstance(question, str) and not question.startswith(("'", '"', "$", "concat("))
+            arguments = [repr(question) if is_text else _expression(question), repr(said.pop("choices"))]
+            arguments += [f"{name}={value!r}" for name, value in said.items()]
+        else:
+            arguments = [repr(said.pop("for"))] if "for" in said else []
+            arguments += [f"{name}={value!r}" for name, value in said.items()]
+        self.call(key, [*arguments, *called, *_annotations(body, (key,))])
 
     def loop_or_sequence(self, called: list[str], body: dict[str, Any]) -> None:
         for key, function in (("while", "while_"), ("do_while", "do_while"), ("until", "until")):
@@ -164,6 +180,17 @@ class _Source:
         for argument in arguments:
             self.line(f"{_INDENT}{argument},")
         self.line(")")
+
+
+_FORMS = ("action", "for", "condition", "states", "while", "do_while", "until", "concurrency", "library", "wait", "ask")
+
+
+def _is_form(key: str, value: dict[str, Any]) -> bool:
+    """Whether it is a state without a name that waits or asks: states may be called so, too."""
+    if key not in ("wait", "ask"):
+        return False
+    is_state = any(form in value for form in _FORMS)
+    return not (is_state and (key == "ask" or not ("for" in value or "until" in value) or "do" in value))
 
 
 def _test(condition: Any) -> str:

@@ -15,7 +15,7 @@ import typing
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from ratn import _expression, _ports, _task, _worker
+from ratn import _expression, _ports, _stubs, _task, _worker
 from ratn._ratn import Error, Goal
 
 #: The steps of this process, by file.
@@ -79,15 +79,11 @@ class Step:
 
     def catalogue(self) -> str:
         """What it offers, as a catalogue has it."""
-        table = f"[providers.{self.provider}.actions.{self.name}]"
-        required = {port: kind for port, kind, is_required, _ in self.action.inputs if is_required}
-        optional = {port: kind for port, kind, is_required, _ in self.action.inputs if not is_required}
-        ports = {"inputs": required, "optional": optional, "outputs": dict(self.action.outputs)}
-        lines = [f"[resources.{self.kind}]", 'class = "process"', "count = 64", "", f"[providers.{self.provider}]", f'resource = "{self.kind}"', "", table]
-        for key, kinds in ports.items():
-            lines.append(f"{key} = {{ " + ", ".join(f'{port} = "{kind}"' for port, kind in kinds.items()) + " }")
-        lines.append("outcomes = [" + ", ".join(f'"{outcome}"' for outcome in self.action.outcomes) + "]")
-        return "\n".join([*lines, ""])
+        ports: dict[str, dict[str, str]] = {"inputs": {}, "optional": {}, "outputs": dict(self.action.outputs)}
+        for port, kind, is_required, _ in self.action.inputs:
+            ports["inputs" if is_required else "optional"][port] = kind
+        name = f"{self.provider}/{self.name}"
+        return _stubs.toml([{"action": name, "resource": self.kind, **ports, "outcomes": self.action.outcomes, "description": self.action.description}])
 
 
 def _without_goal(function: Callable[..., Any]) -> Callable[..., Any]:

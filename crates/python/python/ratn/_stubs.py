@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import keyword
+import os
+import subprocess
 from typing import Any
 
 from ratn import _ratn
+from ratn._ratn import Error
 from ratn._task import Annotations
 
 _HEAD = '''"""Stubs of the actions of {what}, written by `python -m ratn stubs`."""
@@ -77,3 +80,31 @@ def _is_name(port: str) -> bool:
 def _is_port(port: str) -> bool:
     # One with the name of an annotation is given by `inputs={…}`.
     return _is_name(port) and port not in Annotations.__annotations__
+
+
+def catalogue_of_system(runtime_dir: str | os.PathLike[str]) -> str:
+    """What a running system offers beside the built-in catalogue, as a catalogue in TOML: what its config and its workers say."""
+    from ratn._system import _program
+
+    told = subprocess.run([_program(), "actions", "--json", "--runtime-dir", os.fspath(runtime_dir)], capture_output=True, text=True)
+    if told.returncode != 0:
+        raise Error(told.stderr.strip())
+    return toml([action for action in json.loads(told.stdout) if action["from"] != "built in"])
+
+
+def toml(actions: list[dict[str, Any]]) -> str:
+    """A catalogue with these actions: each with ``action`` (``provider/action``), ``resource``, and its signature."""
+    known = json.loads(_ratn.catalogue([]))
+    kinds = sorted({action["resource"] for action in actions} - known["resources"].keys())
+    lines = [line for kind in kinds for line in (f"[resources.{kind}]", 'class = "process"', "count = 64", "")]
+    for provider, resource in sorted({(action["action"].partition("/")[0], action["resource"]) for action in actions}):
+        lines += [f"[providers.{provider}]", f"resource = {json.dumps(resource)}", ""]
+    for action in actions:
+        provider, _, name = action["action"].partition("/")
+        lines.append(f"[providers.{provider}.actions.{name}]")
+        for key in ("inputs", "optional", "outputs"):
+            ports = ", ".join(f"{json.dumps(port)} = {json.dumps(kind)}" for port, kind in (action.get(key) or {}).items())
+            lines.append(f"{key} = {{ {ports} }}")
+        lines.append(f"outcomes = {json.dumps(action.get('outcomes') or [])}")
+        lines += [f"description = {json.dumps(action.get('description', ''))}", ""]
+    return "\n".join(lines)

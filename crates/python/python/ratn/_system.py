@@ -347,11 +347,22 @@ class Run:
         return Result(said["outcome"], said.get("outputs", {}), said.get("reason", ""), said.get("makespan_s", 0.0))
 
     def _control(self, word: str) -> str:
-        command = [_program(), "control", word, "--runtime-dir", str(self._system.runtime_dir)]
+        return self._tell(["control", word])
+
+    def _tell(self, words: list[str]) -> str:
+        command = [_program(), *words, "--runtime-dir", str(self._system.runtime_dir)]
         told = subprocess.run(command, capture_output=True, text=True)
         if told.returncode != 0:
-            raise Error(told.stderr.strip() or f"`ratn control {word}` has ended with code {told.returncode}")
+            raise Error(told.stderr.strip() or f"`ratn {words[0]}` has ended with code {told.returncode}")
         return told.stdout.strip()
+
+    def signal(self, name: str, value: Any = None) -> None:
+        """Sends a signal, which a state of the task waits for (``ratn.wait(signal="order")``), with a value. It is kept until one does."""
+        self._tell(["signal", "-", name, *([] if value is None else [str(written(value))])])
+
+    def answer(self, choice: str, *, state: str | None = None) -> None:
+        """Answers the question of a state (``ratn.ask``); where several ask, of that of this path."""
+        self._tell(["answer", "-", choice, *(["--state", state] if state is not None else [])])
 
     def pause(self) -> str:
         """No further state begins that acts for real; what runs goes on."""

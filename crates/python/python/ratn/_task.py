@@ -13,6 +13,8 @@ import inspect
 import json
 import os
 import pathlib
+import subprocess
+import tempfile
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -20,8 +22,8 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from ratn import _ports, _ratn, _yaml
-from ratn._expression import Untraceable, Value, refuse, statements_at_work, user_frame, user_line, written
-from ratn._ratn import InvalidTask
+from ratn._expression import Untraceable, Value, call, refuse, statements_at_work, user_frame, user_line, written
+from ratn._ratn import Error, InvalidTask
 from ratn._yaml import Body
 
 class Annotations(typing.TypedDict, total=False):
@@ -144,6 +146,7 @@ class Trace:
         self.variables: dict[str, Any] = {}
         self.catalogues: list[str] = []
         self.steps: dict[str, Any] = {}
+        self.functions: dict[str, tuple[TaskFunction, str, str]] = {}
 
     @staticmethod
     def now(what: str) -> Trace:
@@ -413,6 +416,98 @@ def leave(outcome: str, *, name: str | None = None) -> State:
     node = trace.add(name or f"leave_{outcome}", "leave")
     node.body.update({"states": [], "transitions": {"success": outcome}})
     return State(node)
+
+
+def wait(
+    condition: object = None,
+    *,
+    seconds: object = None,
+    until: object = None,
+    signal: str | None = None,
+    timeout: float | None = None,
+    name: str | None = None,
+    **annotations: Any,
+) -> AnyState:
+    """Waits for a condition on the world, for a time, or for a signal; nothing is held meanwhile.
+
+    ``ratn.wait(ratn.fact("open", "lid"), timeout=60)``, ``ratn.wait(seconds=0.5)``, ``ratn.wait(until=30)`` (seconds since the run began), and
+    ``order = ratn.wait(signal="order")``, of which ``order.value`` is what ``run.signal("order", 2)`` has sent. After ``timeout`` seconds the
+    outcome is ``timeout``.
+    """
+    given = {"for": condition, "seconds": seconds, "until": until, "signal": signal}
+    said = {key: value for key, value in given.items() if value is not None}
+    if len(said) != 1:
+        refuse("a state waits for one thing", "say a condition, `seconds=`, `until=` or `signal=`")
+    ((key, value),) = said.items()
+    body = {key: value if isinstance(value, str) else entry(value)}
+    if timeout is not None:
+        body["timeout"] = timeout
+    return _own("wait", name, f"wait_{'condition' if key == 'for' else key}", body, annotations)
+
+
+def ask(
+    question: object, choices: Iterable[str], *, default: str | None = None, timeout: float | None = None, name: str | None = None, **annotations: Any
+) -> AnyState:
+    """Asks an operator, who answers with ``ratn answer`` or ``run.answer("now")``: ``go_on = ratn.ask("May the arm move?", ["now", "never"])``.
+
+    ``go_on.answer`` is the choice. One that ``transitions`` name is an outcome. After ``timeout`` seconds the answer is ``default``, or the outcome
+    ``timeout`` without one.
+    """
+    text = str(question)
+    if isinstance(question, Value) and not text.startswith(("'", '"', "$", "concat(")):
+        text = f"concat({text})"
+    elif not isinstance(question, Value) and text.startswith(("'", '"', "$", "concat(")):
+        # As a sentence, and not as an expression.
+        text = json.dumps(text, ensure_ascii=False)
+    body: dict[str, Any] = {"question": text, "choices": list(choices)}
+    if default is not None:
+        body["default"] = default
+    if timeout is not None:
+        body["timeout"] = timeout
+    return _own("ask", name, "ask_operator", body, annotations)
+
+
+def _own(function: str, name: str | None, default: str, body: dict[str, Any], annotations: dict[str, Any]) -> AnyState:
+    """A state that task control executes itself."""
+    at = user_line()
+    trace = Trace.now(f"`ratn.{function}`")
+    node = trace.add(name or _assigned(function, at) or default, default, at)
+    node.body[function] = body
+    annotate(node.body, annotations)
+    return AnyState(node)
+
+
+class TaskFunction:
+    """A function of expressions, of a task: see :func:`function`."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function, self._name = function, function.__name__
+        self._parameters = list(inspect.signature(function).parameters)
+        self._is_traced = False
+
+    def __call__(self, *arguments: Any) -> Value:
+        trace = Trace.now(f"`{self._name}`")
+        if len(arguments) != len(self._parameters):
+            raise TypeError(f"`{self._name}` takes {len(self._parameters)} arguments ({', '.join(self._parameters)}), and is given {len(arguments)}")
+        if self._is_traced:
+            refuse(f"`{self._name}` uses itself", "write it without: a function is what would stand there if it were written out")
+        known = trace.functions.get(self._name)
+        if known is None or known[0] is not self:
+            if known is not None:
+                refuse(f"there are two functions `{self._name}`", "give one another name")
+            self._is_traced = True
+            try:
+                body = str(written(self._function(*(Value(f"${parameter}") for parameter in self._parameters))))
+            finally:
+                self._is_traced = False
+            head = f"{self._name}({', '.join(f'${parameter}' for parameter in self._parameters)})"
+            trace.functions[self._name] = (self, head, body)
+        return call(self._name, *arguments)
+
+
+def function(function: Callable[..., Any]) -> TaskFunction:
+    """Makes a function one of the task file: written once, used in expressions, ``near(box.pose, table)``. It sees its parameters and facts only."""
+    return TaskFunction(function)
 
 
 class Block(AnyState):
@@ -796,19 +891,23 @@ class Task:
 
     def standing_alone(self) -> str:
         """The text with paths that are valid everywhere."""
+        return "\n".join(self._standing_alone().text) + "\n"
+
+    def _standing_alone(self) -> _yaml.Lines:
         document = dict(self.document)
         if isinstance(document.get("ontology"), str):
             document["ontology"] = str(self.folder / document["ontology"])
         document["states"] = [self._rooted(state) for state in document.get("states") or []]
-        return "\n".join(_yaml.write(document).text) + "\n"
+        return _yaml.write(document)
 
     def _rooted(self, value: Any) -> Any:
         if isinstance(value, dict):
             # What is an expression is no path.
-            rooted = {key: item if key in ("in", "with", *_VALUES) else self._rooted(item) for key, item in value.items()}
+            rooted = Body({key: item if key in ("in", "with", *_VALUES) else self._rooted(item) for key, item in value.items()})
+            rooted.line = getattr(value, "line", None)
             if isinstance(value.get("library"), str):
                 rooted["library"] = str(self.folder / value["library"])
-            return rooted
+            return rooted if rooted.line is not None else dict(rooted)
         return [self._rooted(item) for item in value] if isinstance(value, list) else value
 
     def _read(self) -> tuple[list[Finding], dict[str, Any] | None]:
@@ -818,19 +917,49 @@ class Task:
         findings = [self._finding(one, lines) for one, _ in json.loads(said)]
         return findings, None if model is None else json.loads(model)
 
-    def _finding(self, said: dict[str, Any], lines: _yaml.Lines) -> Finding:
+    def _finding(self, said: dict[str, Any], lines: _yaml.Lines, name: str | None = None) -> Finding:
         file, line = said["file"], said["location"]["line"]
-        if pathlib.Path(file).name == pathlib.Path(self._file).name:
+        if pathlib.Path(file).name == (name or pathlib.Path(self._file).name):
             file, line = lines.origin(line) or (self._file, line)
         return Finding(said["rule"], said["severity"], file, line, said["path"], said["message"], said["help"])
 
-    def check(self) -> list[Finding]:
+    def check(self, *, system: object = None, config: str | os.PathLike[str] | None = None) -> list[Finding]:
         """What ``ratn check`` notices, with the lines of the Python file; a task that is refused raises ``ratn.InvalidTask``.
 
-        It is checked against the built-in catalogue, those of the modules of actions that it uses, and its own steps.
+        It is checked against the built-in catalogue, those of the modules of actions that it uses, and its own steps; with a ``system`` (a
+        ``ratn.System``, or a runtime directory) against what that offers and its workers say of themselves, with a ``config`` against that.
         """
+        if system is not None or config is not None:
+            return self._check_with(system, config)
         findings, model = self._read()
         if model is None:
+            raise invalid(findings)
+        return findings
+
+    def _check_with(self, system: object, config: str | os.PathLike[str] | None) -> list[Finding]:
+        """As ``ratn check`` does it, which knows what a system is."""
+        from ratn._system import _program
+
+        lines = self._standing_alone()
+        with tempfile.TemporaryDirectory(prefix="ratn-check-") as folder:
+            file = pathlib.Path(folder) / pathlib.Path(self._file).with_suffix(".yaml").name
+            file.write_text("\n".join(lines.text) + "\n")
+            command = [_program(), "check", str(file), "--no-simulation", "--json"]
+            for number, catalogue in enumerate([*self._catalogues, *(step.catalogue() for step in self._steps.values())]):
+                (pathlib.Path(folder) / f"{number}.toml").write_text(catalogue)
+                command += ["--catalogue", str(pathlib.Path(folder) / f"{number}.toml")]
+            command += ["--config", os.fspath(config)] if config is not None else []
+            command += ["--runtime-dir", str(getattr(system, "runtime_dir", system))] if system is not None else []
+            told = subprocess.run(command, capture_output=True, text=True)
+        if not told.stdout.strip():
+            raise Error(told.stderr.strip() or f"`ratn check` has ended with code {told.returncode}")
+        said = json.loads(told.stdout)
+        findings = [self._finding(one, lines, file.name) for one in said["findings"]]
+        # Whoever performs steps comes with the run.
+        kinds = [f"`{step.kind}`" for step in self._steps.values()]
+        workers = [what for what in said["workers"] if not any(kind in what for kind in kinds)]
+        findings += [Finding("worker", "warning", self._file, 1, "", what, "") for what in workers]
+        if said["task"] is None:
             raise invalid(findings)
         return findings
 
@@ -862,14 +991,14 @@ def task(
 
     Its parameters are the task's, typed by their annotations (a default makes one optional); the dict that it returns is the task's outputs; the
     first paragraph of its docstring is the description. Keyword arguments are keys of a task file: ``horizon``, ``speculation_width``,
-    ``deadline``, ``exceptions``, ``ontology``, ``tolerance``, ``world``, ``outcomes``, ``variables``, ``description``.
+    ``deadline``, ``exceptions``, ``ontology``, ``tolerance``, ``world``, ``outcomes``, ``variables``, ``functions``, ``description``.
     """
     if function is None:
         return lambda function: task(function, name=name, **said)
     return _traced(function, name or function.__name__, said)
 
 
-_TASK_KEYS = ("description", "horizon", "speculation_width", "deadline", "exceptions", "ontology", "tolerance", "world", "outcomes", "variables")
+_TASK_KEYS = ("description", "horizon", "speculation_width", "deadline", "exceptions", "ontology", "tolerance", "world", "outcomes", "variables", "functions")
 
 
 def _traced(function: Callable[..., Any], name: str, said: dict[str, Any]) -> Task:
@@ -897,6 +1026,8 @@ def _traced(function: Callable[..., Any], name: str, said: dict[str, Any]) -> Ta
             trace.unfinished(trace.open[-1][1])
         outputs = _returned(function, returned, hints.get("return"))
         document.update({key: _said(key, said[key]) for key in _TASK_KEYS if said.get(key) is not None})
+        if trace.functions:
+            document["functions"] = {**document.get("functions", {}), **{head: body for _, head, body in trace.functions.values()}}
         if trace.variables:
             document["variables"] = {**document.get("variables", {}), **trace.variables}
         if parameters:
