@@ -132,11 +132,13 @@ function visits(write, count) {
 async function control() {
   const directory = join(PLACE, "run");
   mkdirSync(directory);
-  const up = start("up", ["up", "--runtime-dir", directory, "--boxes", "2", "--speed", "4"]);
+  const up = start("up", ["up", "--runtime-dir", directory, "--boxes", "2", "--speed", "4", "--dashboard"]);
   await until("the system", () => {
     assert.equal(up.child.exitCode, null, up.said.error);
     return up.said.error.includes("is ready");
   });
+  const own = await until("the address of its own dashboard", () => up.said.error.match(/its dashboard is at (http:\S+)/)?.[1]);
+  assert.equal((await fetch(own)).status, 200);
   const shown = await dashboard(["--runtime-dir", directory, "--control"]);
   const page = await open(shown.url);
   await page.waitForFunction(() => document.querySelector(".summary")?.textContent.includes("No run is under way"));

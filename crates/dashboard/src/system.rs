@@ -86,7 +86,7 @@ impl System {
             Ok(manager) => manager,
             Err(error) => return wire::System { problem: error.to_string(), ..wire::System::default() },
         };
-        match tokio::time::timeout(PATIENCE, self.ask(&directory, &manager)).await {
+        match tokio::time::timeout(PATIENCE, Box::pin(self.ask(&directory, &manager))).await {
             Ok(Ok(system)) => system,
             Ok(Err(error)) => wire::System { problem: error.to_string(), ..wire::System::default() },
             Err(_) => {
@@ -102,7 +102,7 @@ impl System {
         // Who may not list sessions sees the rest.
         let sessions = client.sessions().await.unwrap_or_default();
         let hosts = hosts_in(directory, &resources);
-        let mut hosts = join_all(hosts.into_iter().map(|(name, endpoint)| self.host(name, endpoint))).await;
+        let mut hosts = join_all(hosts.into_iter().map(|(name, endpoint)| Box::pin(self.host(name, endpoint)))).await;
         hosts.sort_by(|a, b| a.name.cmp(&b.name));
         let expires: BTreeMap<&str, u64> = sessions.iter().map(|one| (one.id.as_str(), one.expires_in_ms)).collect();
         let things = resources.iter().filter(|one| one.kind != WORLD_MODEL);
@@ -151,7 +151,7 @@ impl System {
             ProcessClient::new(&self.channels, &endpoint)?.scale(template, scale).await?;
             Ok::<bool, CallError>(true)
         };
-        let scaled = tokio::time::timeout(PATIENCE, scaling).await;
+        let scaled = tokio::time::timeout(PATIENCE, Box::pin(scaling)).await;
         // What it is now is asked at once.
         *self.seen.lock().await = None;
         match scaled {
@@ -186,7 +186,7 @@ impl System {
             }
             Ok(None)
         };
-        let read: Result<_, CallError> = tokio::time::timeout(PATIENCE, reading)
+        let read: Result<_, CallError> = tokio::time::timeout(PATIENCE, Box::pin(reading))
             .await
             .map_err(|_| format!("the log of {worker} was not there within {} s", PATIENCE.as_secs()))?;
         match read.map_err(|error| error.to_string())? {

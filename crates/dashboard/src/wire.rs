@@ -5,7 +5,6 @@
 //! anything else.
 
 use serde::Serialize;
-use std::fmt::Write as _;
 
 /// A type that the pages know.
 trait Wire {
@@ -60,11 +59,13 @@ macro_rules! wire {
         pub fn typescript() -> String {
             let mut text = String::from("// Written from crates/dashboard/src/wire.rs; do not edit (RATN_WRITE_WIRE=1 and its test write it).\n");
             $(
-                $(let _ = write!(text, "\n/**{} */", $doc);)+
-                let _ = write!(text, "\nexport interface {} {{\n", stringify!($name));
+                $(text.push_str(concat!("\n/**", $doc, " */"));)+
+                text.push_str(concat!("\nexport interface ", stringify!($name), " {\n"));
                 $(
-                    $(let _ = writeln!(text, "  /**{} */", $field_doc);)+
-                    let _ = writeln!(text, "  {}: {};", stringify!($field), <$kind>::typescript());
+                    $(text.push_str(concat!("  /**", $field_doc, " */\n"));)+
+                    text.push_str(concat!("  ", stringify!($field), ": "));
+                    text.push_str(&<$kind as Wire>::typescript());
+                    text.push_str(";\n");
                 )+
                 text.push_str("}\n");
             )+
