@@ -3,6 +3,8 @@
 mod support;
 
 use anyhow::{Context, ensure};
+use std::fs::File;
+use std::process::Stdio;
 use support::{Place, repository, wait_for};
 
 /// A task that waits for what never comes.
@@ -29,6 +31,25 @@ fn a_run_that_waits_for_what_never_comes_says_so_and_why() -> anyhow::Result<()>
     let (code, _, said) = run.finish()?;
     ensure!(code == Some(1), "{code:?}\n{said}");
     Ok(())
+}
+
+/// A program that starts a system of its own may be killed: the pipe ends then, and nothing outlives it.
+#[test]
+fn a_system_ends_with_its_parent_when_it_is_told_to() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let (directory, said) = (place.path().join("run"), place.path().join("up.log"));
+    let directory = directory.to_str().context("a path")?;
+    let mut up = place
+        .ratn(&["up", "--exit-with-parent", "--runtime-dir", directory, "--speed", "20", "--boxes", "1"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(File::create(&said)?)
+        .spawn()?;
+    wait_for("the system", || Ok(std::fs::read_to_string(&said)?.contains("is ready").then_some(())))?;
+    ensure!(place.processes().len() > 3, "{:?}", place.processes());
+    drop(up.stdin.take());
+    wait_for("its end", || Ok(up.try_wait()?))?;
+    place.wait_until_empty()
 }
 
 #[test]

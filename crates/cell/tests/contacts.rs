@@ -12,7 +12,7 @@ use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::plan::Goal;
-use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::robot::{Configuration, Robot, UNSAID};
 use std::f64::consts::{FRAC_PI_2, PI};
 
 mod bench;
@@ -20,7 +20,7 @@ use bench::{Bench, grasp};
 
 /// The built-in robot with everything at zero, without reading its description again.
 fn at_zero() -> Configuration {
-    Configuration { base: [0.0; 3], arm: JointVector::zeros(7), pan: 0.0, tilt: 0.0, finger: 0.0 }
+    Configuration { base: [0.0; 3], arm: JointVector::zeros(7), pan: 0.0, tilt: 0.0, finger: 0.0, others: UNSAID }
 }
 
 fn at(x: f64, arm: JointVector) -> Configuration {

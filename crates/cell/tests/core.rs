@@ -137,7 +137,7 @@ fn an_arm_that_is_to_stop_in_mid_motion_is_held_where_it_was() {
     assert!(distance(&held, &aimm::HOME) > 0.1 && distance(&held, &aimm::OBSERVATION) > 0.1);
     assert_eq!(bench.pass(60.0), vec![]);
     assert_eq!(bench.arm(), held);
-    assert!(!bench.cell.is_active(Module::Arm));
+    assert!(!bench.cell.is_active(Module::Arm(0)));
     bench.done(Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.3 });
 }
 

@@ -6,7 +6,7 @@ use ratn_cell::core::environment::{Environment, FLOOR, Furniture, Kind, Model, S
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::joint_vector::JointVector;
-use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::robot::{Configuration, Robot, UNSAID};
 use std::f64::consts::FRAC_PI_2;
 use std::time::Instant;
 
@@ -14,7 +14,7 @@ const BOX: Model = Model { kind: Kind::Box, size: [0.12, 0.08, 0.10] };
 
 /// The built-in robot with everything at zero, without reading its description again.
 fn at_zero() -> Configuration {
-    Configuration { base: [0.0; 3], arm: JointVector::zeros(7), pan: 0.0, tilt: 0.0, finger: 0.0 }
+    Configuration { base: [0.0; 3], arm: JointVector::zeros(7), pan: 0.0, tilt: 0.0, finger: 0.0, others: UNSAID }
 }
 
 fn table() -> Furniture {

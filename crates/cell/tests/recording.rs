@@ -12,6 +12,7 @@ use ratn_cell::core::recording::{Line, ReplayError, replay};
 use ratn_cell::core::snapshot::{Snapshot, SnapshotError};
 use ratn_motion::aimm;
 use ratn_motion::plan::Goal;
+use ratn_motion::robot::Robot;
 use std::time::Duration;
 
 /// A box is grasped, lifted and lost, and the camera is blind for a while: as lines.
@@ -24,7 +25,7 @@ fn eventful_with(slips: &str, tick: Option<Duration>) -> Vec<String> {
     let faults = [slips, "sensor_dropout~0.5"].iter().map(|text| text.parse().unwrap()).collect();
     let mut bench = Bench::of(CellConfig { boxes: 3, seed: 4, faults, ..CellConfig::default() });
     bench.tick = tick;
-    bench.lines.push(Line::header(bench.cell.config()));
+    bench.lines.push(Line::header(&bench.cell));
     bench.reach_for(0);
     bench.done(grasp());
     let lift = bench.plan(&bench.cell.scene(), vec![Goal::Joints(aimm::OBSERVATION)], 0.10, 0.0);
@@ -134,7 +135,20 @@ fn a_goal_under_way_ends_when_the_cell_is_put_back() {
 fn what_is_no_snapshot_is_refused_with_the_reason() {
     let text = saved(&mut Bench::new(1, 4)).to_json();
     let refused = |from: &str, to: &str| Snapshot::from_json(&text.replace(from, to)).unwrap_err();
-    let six = Snapshot::from_json(&text).unwrap().check_joints(6).unwrap_err();
+    let [here, other] = [Robot::aimm(), Robot::built_in("ur5").unwrap()];
+    let whole = Snapshot::from_json(&text).unwrap();
+    assert_eq!(whole.check_robot(&here), Ok(()));
+    let another = whole.check_robot(&other).unwrap_err().to_string();
+    assert!(
+        another.contains("of the robot `aimm` (digest ") && another.contains("the robot `ur5` (digest "),
+        "{another}"
+    );
+    // One of an earlier version says no robot.
+    let mut earlier: serde_json::Value = serde_json::from_str(&text).unwrap();
+    earlier.as_object_mut().unwrap().remove("robot");
+    let earlier = Snapshot::from_json(&earlier.to_string()).unwrap();
+    assert_eq!(earlier.check_robot(&here), Ok(()));
+    let six = earlier.check_robot(&other).unwrap_err();
     assert_eq!(six, SnapshotError::OtherRobot { of: 7, here: 6 });
     assert!(six.to_string().contains("7 joints") && six.to_string().contains("6, so"), "{six}");
     assert!(matches!(refused("{", "["), SnapshotError::Unreadable(_)));

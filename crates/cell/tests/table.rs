@@ -7,19 +7,19 @@ use ratn_cell::core::environment::{Environment, Kind, Model};
 use ratn_cell::core::objects::TrueObject;
 use ratn_cell::core::picture::develop;
 use ratn_cell::core::protocol::{Ending, Event, Product, Request};
-use ratn_cell::core::tableware::{RACK_HEIGHT_M, places};
 use ratn_model::grasp;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::pace::Control;
 use ratn_motion::plan::{Goal, Request as PlanRequest, plan};
-use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::robot::{Configuration, Robot, UNSAID};
 use ratn_motion::straight::Straight;
 use ratn_perception::calibration::{Calibration, Surface};
 use ratn_perception::detection::{Detection, ObjectClass, Region, segment};
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::TAU;
+use std::sync::LazyLock;
 
 mod bench;
 use bench::Bench;
@@ -27,9 +27,15 @@ use bench::Bench;
 /// How far a bowl may lean on its way, in radians.
 const UPRIGHT_RAD: f64 = 0.1;
 
+/// The places on the table for things of a kind.
+fn places(kind: Kind) -> Vec<Pose> {
+    static AIMM: LazyLock<Robot> = LazyLock::new(Robot::aimm);
+    ratn_cell::core::tableware::places(AIMM.workplace().unwrap(), kind)
+}
+
 /// The built-in robot with everything at zero, without reading its description again.
 fn at_zero() -> Configuration {
-    Configuration { base: [0.0; 3], arm: JointVector::zeros(7), pan: 0.0, tilt: 0.0, finger: 0.0 }
+    Configuration { base: [0.0; 3], arm: JointVector::zeros(7), pan: 0.0, tilt: 0.0, finger: 0.0, others: UNSAID }
 }
 
 fn bench(goods: Goods, seed: u64) -> Bench {
@@ -46,6 +52,9 @@ const ALL: Goods = Goods { boxes: 0, bowls: 3, forks: 3, cups: 3, plates: 3 };
 const NONE: Goods = Goods { bowls: 0, forks: 0, cups: 0, plates: 0, ..ALL };
 
 /// Where the rack is, and what of the table is to be set: the middle, and the edges.
+/// The height of the rack's top, in metres.
+const RACK_HEIGHT_M: f64 = 0.75;
+
 const ON_RACK: ([f64; 3], [f64; 2]) = ([0.72, -0.29, RACK_HEIGHT_M], [0.44, 0.62]);
 const ON_TABLE: ([f64; 3], [f64; 2]) = ([0.80, 0.31, aimm::TABLE_HEIGHT_M], [0.60, 0.58]);
 

@@ -20,9 +20,10 @@ pub(crate) use operating::{
 pub(crate) use roles::{CellArguments, KeptRoleArguments, RoleArguments, WorkerArguments, WorkerKind};
 pub(crate) use systems::{Budget, DemoArguments, GoodsArguments, ResetArguments, SystemArguments, UpArguments};
 pub(crate) use tasks::{
-    CheckArguments, CompletionsArguments, ControlArguments, DashboardArguments, DrawingArgument, ExportArguments, FormatArgument,
-    JsonArgument, ManArguments, ModeArgument, PlanArguments, ReportArguments, RobotArguments, RobotCommand,
-    RowArgument, RunArguments, SimulateArguments, StatusArguments, TablesArguments, TopArguments, WordArgument,
+    AnswerArguments, CheckArguments, CompletionsArguments, ControlArguments, DashboardArguments, DrawingArgument,
+    ExportArguments, FormatArgument, JsonArgument, ManArguments, ModeArgument, PlanArguments, ReportArguments,
+    RobotArguments, RobotCommand, RowArgument, RunArguments, SignalArguments, SimulateArguments, StatusArguments,
+    TablesArguments, TopArguments, WordArgument,
 };
 
 /// Runs robot tasks, written as sequential state machines, as fast as their real dependencies allow.
@@ -44,6 +45,10 @@ pub(crate) enum Command {
     Run(RunArguments),
     /// Pause a run, let it go on, let it do one step, or end it
     Control(ControlArguments),
+    /// Send a run a signal that one of its states waits for, or will
+    Signal(SignalArguments),
+    /// Answer a question that a state of a run asks
+    Answer(AnswerArguments),
     /// Show which states run, which resources are held, and what waits for what
     Status(StatusArguments),
     /// Show the worker processes of all hosts

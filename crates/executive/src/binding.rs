@@ -142,11 +142,6 @@ pub(crate) fn expected_s(state: &State, scope: &dyn Scope) -> Option<f64> {
     (seconds.is_finite() && seconds >= 0.0).then_some(seconds)
 }
 
-/// How long a pause is, by its inputs; `None` where the state is another one.
-pub(crate) fn pause_s(state: &State, inputs: &Outputs) -> Option<f64> {
-    state.is_pause().then(|| inputs.get("seconds").and_then(Value::as_number).unwrap_or_default())
-}
-
 /// A seed for one try of one visit, the same in every mode and on every host: FNV-1a over the run's seed, the path, part by
 /// part, and, from the second on, the number of the try.
 pub(crate) struct Seed(u64);

@@ -2,6 +2,7 @@
 
 use crate::plan::Plan;
 use crate::protocol::{Command, Note};
+use crate::signals::Signals;
 use ratn_model::fact::Change;
 use ratn_model::id::InstanceId;
 use ratn_model::measurement::Evidence;
@@ -23,6 +24,8 @@ pub(crate) struct Context<'a> {
     pub(crate) last_instance: &'a mut u64,
     /// The run's seed.
     pub(crate) seed: u64,
+    /// The signals that no wait has taken.
+    pub(crate) signals: &'a mut Signals,
     /// What the shell shall do.
     pub(crate) commands: &'a mut Vec<Command>,
 }

@@ -9,6 +9,7 @@ use crate::interpreter::{Interpreter, Progress};
 use crate::lookahead::Problem;
 use crate::plan::Plan;
 use crate::protocol::{Command, Event, Mode};
+use crate::signals::Signals;
 use crate::window::{End, Window};
 use ratn_model::expression::EffectExpr;
 use ratn_model::fact::FactKey;
@@ -37,6 +38,7 @@ pub struct Executive {
     root: World,
     last_instance: u64,
     seed: u64,
+    signals: Signals,
     /// Of HSM mode.
     deadline: Option<Timestamp>,
     state: State,
@@ -62,6 +64,7 @@ impl Executive {
             root: World::default(),
             last_instance: 0,
             seed: 0,
+            signals: Signals::default(),
             deadline: None,
             state: State::Fresh,
         }
@@ -94,6 +97,11 @@ impl Executive {
     /// Whether [`Command::End`] was given.
     pub fn has_ended(&self) -> bool {
         matches!(self.state, State::Ended)
+    }
+
+    /// How many signals no state has taken yet; more than [`crate::MOST_SIGNALS_KEPT`] are not kept.
+    pub fn signals_kept(&self) -> usize {
+        self.signals.count()
     }
 
     /// What every instance that has not begun waits for, as sentences; empty in HSM mode.
@@ -133,6 +141,7 @@ impl Executive {
             now,
             last_instance: &mut self.last_instance,
             seed: self.seed,
+            signals: &mut self.signals,
             commands: &mut commands,
         };
         match &mut self.state {
@@ -152,6 +161,7 @@ impl Executive {
             now,
             last_instance: &mut self.last_instance,
             seed: self.seed,
+            signals: &mut self.signals,
             commands: &mut commands,
         };
         match &self.state {
@@ -175,6 +185,7 @@ impl Executive {
             now,
             last_instance: &mut self.last_instance,
             seed: self.seed,
+            signals: &mut self.signals,
             commands,
         };
         if let Err(reason) = commit_initial(&mut context, parameters) {
@@ -212,6 +223,9 @@ impl Executive {
             let fact = |(fact, value): &(FactKey, Option<Value>)| (fact.clone(), value.clone());
             self.root.overwrite(facts.iter().map(fact));
         }
+        if let Event::Signalled { signal, value } = &event {
+            self.signals.came(signal.clone(), value.clone());
+        }
         let program = self.program.clone();
         let mut context = Context {
             program: &program,
@@ -220,6 +234,7 @@ impl Executive {
             now,
             last_instance: &mut self.last_instance,
             seed: self.seed,
+            signals: &mut self.signals,
             commands,
         };
         let end = match &mut self.state {

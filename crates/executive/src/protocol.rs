@@ -9,6 +9,7 @@ use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::fmt;
 use std::sync::Arc;
 
 /// How a task is executed.
@@ -105,6 +106,21 @@ pub enum Event {
     Resumed,
     /// The moment of a [`Command::Wake`] has come. Logged, as every event.
     Woken,
+    /// A client sends a signal: the state that waits for one of this name goes on, or the next one that will.
+    Signalled {
+        /// Its name.
+        signal: String,
+        /// What is sent with it; null where nothing is.
+        #[serde(default = "nothing")]
+        value: Value,
+    },
+    /// An operator answers a question.
+    Answered {
+        /// Of which instance.
+        instance: InstanceId,
+        /// One of its choices.
+        choice: String,
+    },
     /// No PIA shall begin until further notice; what runs goes on, and what only computes or senses begins as ever.
     PauseRequested,
     /// PIAs may begin again.
@@ -197,6 +213,10 @@ pub enum Event {
         /// Why.
         reason: String,
     },
+}
+
+fn nothing() -> Value {
+    Value::Null
 }
 
 /// What the shell shall do. Performed in order: commits and projections reach the world pool, acquires and releases the
@@ -334,6 +354,17 @@ pub enum Note {
         /// In which attempt.
         attempt: u32,
     },
+    /// It waits, and what it waits for is not there yet.
+    Awaiting {
+        /// Its id.
+        instance: InstanceId,
+        /// What it waits for.
+        #[serde(flatten)]
+        awaited: Awaited,
+        /// Until then at the most.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        until: Option<Timestamp>,
+    },
     /// Its result is known.
     Finished {
         /// Its id.
@@ -370,6 +401,45 @@ pub enum Note {
         /// Its id.
         instance: InstanceId,
     },
+}
+
+/// What a state waits for in which the executive waits itself.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "awaits", rename_all = "snake_case")]
+pub enum Awaited {
+    /// Nothing but the time.
+    Time,
+    /// A condition on the actual world.
+    Condition {
+        /// As it is written.
+        condition: String,
+    },
+    /// [`Event::Signalled`].
+    Signal {
+        /// The signal's name.
+        signal: String,
+    },
+    /// [`Event::Answered`].
+    Answer {
+        /// What is asked.
+        question: String,
+        /// What may be answered.
+        choices: Vec<String>,
+        /// The answer when nobody answers in time.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        default: Option<String>,
+    },
+}
+
+impl fmt::Display for Awaited {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Awaited::Time => f.write_str("its time"),
+            Awaited::Condition { condition } => write!(f, "`{condition}`"),
+            Awaited::Signal { signal } => write!(f, "the signal `{signal}`"),
+            Awaited::Answer { question, choices, .. } => write!(f, "an answer: {question} ({})", choices.join(", ")),
+        }
+    }
 }
 
 /// A goal for a provider.

@@ -45,19 +45,25 @@ pub(crate) struct Subject<'a> {
     /// The task says what holds at the start.
     pub(crate) declares_world: bool,
     pub(crate) places: &'a Places,
+    /// The functions of the file: name, how it is called, with how many arguments.
+    pub(crate) functions: &'a [(String, String, usize)],
     pub(crate) control: &'a ControlFlow,
 }
 
+/// What of a file is not in its program.
+pub(crate) struct Said<'a> {
+    /// The task says what holds at the start.
+    pub(crate) declares_world: bool,
+    pub(crate) places: &'a Places,
+    /// As in [`Subject`].
+    pub(crate) functions: &'a [(String, String, usize)],
+}
+
 /// Applies every rule.
-pub(crate) fn check(
-    program: &Program,
-    catalogue: &Catalogue,
-    declares_world: bool,
-    places: &Places,
-    findings: &mut Findings,
-) {
+pub(crate) fn check(program: &Program, catalogue: &Catalogue, said: &Said<'_>, findings: &mut Findings) {
     let control = ControlFlow::of(program);
-    let subject = Subject { program, catalogue, declares_world, places, control: &control };
+    let Said { declares_world, places, functions } = *said;
+    let subject = Subject { program, catalogue, declares_world, places, functions, control: &control };
     actions::check(&subject, findings);
     types::check(&subject, findings);
     flows::check(&subject, findings);

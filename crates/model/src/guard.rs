@@ -20,9 +20,10 @@ use crate::expression::{BinaryOperator, Expr};
 use crate::id::StateId;
 use crate::program::{
     ABORTED, Again, Annotations, CLOCK, Finally, Nature, PREEMPTED, Program, SUCCESS, State, StateKind, Target,
-    TaskOutput, WAIT,
+    TaskOutput,
 };
 use crate::value::{Type, Value};
+use crate::wait::PAUSE;
 use std::collections::BTreeMap;
 
 /// More states than this are not made.
@@ -212,7 +213,7 @@ impl Unfolding<'_> {
         let mut last = again;
         if retried.backoff_s > 0.0 {
             let seconds = vec![("seconds".to_owned(), variable(&pause_s))];
-            let (provider, action) = (CLOCK.to_owned(), WAIT.to_owned());
+            let (provider, action) = (CLOCK.to_owned(), PAUSE.to_owned());
             let kind = StateKind::Action { provider, action, inputs: seconds, outputs: BTreeMap::new() };
             let pause = self.made(id, around, "pause", kind, scope)?;
             let nothing = |outcome: &str| (outcome.to_owned(), Vec::new());

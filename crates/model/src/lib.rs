@@ -26,3 +26,4 @@ pub mod time;
 pub mod tolerance;
 pub mod value;
 pub mod versioned;
+pub mod wait;

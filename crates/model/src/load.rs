@@ -17,9 +17,11 @@
 //! ```
 
 mod advice;
+mod document;
 mod effects;
 mod fields;
 mod flow;
+mod functions;
 mod graft;
 mod library;
 mod names;
@@ -27,8 +29,10 @@ mod outline;
 mod resources;
 mod state;
 mod tolerance;
+mod wait;
 mod yaml;
 
+pub use document::Document;
 pub(crate) use fields::Places;
 pub use library::Files;
 pub(crate) use names::distance;
@@ -55,7 +59,7 @@ use yaml::{Content, Node};
 /// The horizon of a task that names none.
 pub const DEFAULT_HORIZON: usize = 120;
 
-const TASK_KEYS: [&str; 14] = [
+const TASK_KEYS: [&str; 15] = [
     "task",
     "description",
     "horizon",
@@ -64,6 +68,7 @@ const TASK_KEYS: [&str; 14] = [
     "exceptions",
     "parameters",
     "variables",
+    "functions",
     "ontology",
     "tolerance",
     "world",
@@ -122,7 +127,8 @@ pub(crate) fn load_within(source: &str, loading: &Loading<'_>) -> Result<Loaded,
     if let Some(program) = &program
         && !out.findings.has_errors()
     {
-        check::check(program, loading.catalogue, out.declares_world, &out.places, &mut out.findings);
+        let said = check::Said { declares_world: out.declares_world, places: &out.places, functions: &out.functions };
+        check::check(program, loading.catalogue, &said, &mut out.findings);
     }
     let refused = out.findings.has_errors();
     // The warnings of a library have been given with its own name.
@@ -174,7 +180,9 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     let parameters = parameters.iter().map(|entry| entry.key.clone()).collect();
     let described = root.get("ontology").and_then(|node| ontology(node, loading, &mut out.findings));
     let (ontology, ontology_text) = described.unzip();
-    let task = Task { source, catalogue, outline, ports, parameters, libraries, ontology };
+    let functions = functions::functions(source, &root, &mut out.findings);
+    out.functions = functions.usages();
+    let task = Task { source, catalogue, outline, ports, parameters, libraries, functions, ontology };
     let mut fields = Fields { task: &task, view: View::default(), path: String::new(), out };
     fields.keys(&root, &TASK_KEYS);
     let horizon = match root.get("horizon") {
@@ -422,6 +430,7 @@ fn ports(
             let types = declared.iter().map(|entry| (entry.key.clone(), typed(entry).unwrap_or(Type::Any)));
             Ports { types: types.collect(), open: false }
         }
+        Form::Wait { node, asks } => Ports { types: wait::ports(node, *asks), open: false },
         Form::ForEach { .. } | Form::While { .. } | Form::Condition { .. } => Ports::default(),
     };
     outline.steps.iter().enumerate().map(of_step).collect()

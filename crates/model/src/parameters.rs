@@ -79,6 +79,15 @@ impl Program {
     }
 }
 
+/// A value that is written as in a task file: `3`, `true`, `left`, `pose(0, 0, 1)`, `[1, 2]`.
+///
+/// # Errors
+/// Why the text is none.
+pub fn constant(text: &str) -> Result<Value, String> {
+    let expression = parse_expression(text, &mut NoNames).map_err(|error| error.message)?;
+    expression.evaluate(&NothingKnown).map_err(|error| error.to_string())
+}
+
 fn read(text: &str, parameter: &Parameter) -> Result<Value, ParameterError> {
     let wrong = || ParameterError::NotOfItsType {
         name: parameter.name.clone(),

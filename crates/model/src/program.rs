@@ -22,10 +22,8 @@ pub const PREEMPTED: &str = "preempted";
 /// The outcome of a goal that an emergency stop ended. It is `preempted` to a state whose action has none of this name.
 pub const STOPPED: &str = "stopped";
 
-/// The provider of what the executive does itself. No task file can name it.
+/// The provider of what the executive does itself: it waits ([`crate::wait`]). No task file can name it.
 pub const CLOCK: &str = "(clock)";
-/// Its action: after so many `seconds` of the robot's time it has succeeded.
-pub const WAIT: &str = "wait";
 
 /// A loaded task program.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -430,7 +428,7 @@ impl Program {
 }
 
 impl State {
-    /// Whether it is a pause, which the executive does itself: no provider gets a goal.
+    /// Whether it waits, which the executive does itself: no provider gets a goal.
     pub fn is_pause(&self) -> bool {
         matches!(&self.kind, StateKind::Action { provider, .. } if provider == CLOCK)
     }

@@ -9,7 +9,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Rules that the folder must have a task for.
-const RULES: [&str; 40] = [
+const RULES: [&str; 41] = [
     "branch-may-not-have-written",
     "computes-actuates",
     "conflicting-annotations",
@@ -31,6 +31,7 @@ const RULES: [&str; 40] = [
     "outside-domain",
     "outside-range",
     "provider-not-blocked",
+    "recursive-function",
     "region-conflict",
     "too-many-resources",
     "type-mismatch",

@@ -84,7 +84,7 @@ states:
   - 3
 ";
     assert_snapshot!(check(source), @r#"
-    task.yaml:3:1: error[unknown-key]: there is no key `colour` here. help: there is `deadline`, `description`, `exceptions`, `horizon`, `ontology`, `outcomes`, `outputs`, `parameters`, `speculation_width`, `states`, `task`, `tolerance`, `variables`, `world`
+    task.yaml:3:1: error[unknown-key]: there is no key `colour` here. help: there is `deadline`, `description`, `exceptions`, `functions`, `horizon`, `ontology`, `outcomes`, `outputs`, `parameters`, `speculation_width`, `states`, `task`, `tolerance`, `variables`, `world`
     task.yaml:4:40: error[type-mismatch]: the default of `n` is string, not int
     task.yaml:7:5: error[invalid-state] in while: there is no `do`. help: list its states there
     task.yaml:8:51: error[type-mismatch] in release: `attempts` is a whole number of at least 1

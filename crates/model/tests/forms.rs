@@ -346,3 +346,94 @@ fn what_is_no_condition_on_an_attribute_is_refused_with_its_place() {
     let source = "task: t\nstates:\n  - a: { action: eye/look, resources: [{ block: Gripper }, { create: P, class: task, where: [a < 1] }] }\n";
     assert!(findings(source).contains("what is created is not chosen by conditions"), "{}", findings(source));
 }
+
+#[test]
+fn waits_and_questions_become_states_that_the_executive_waits_in() {
+    use ratn_model::wait::{Question, Wait};
+    let source = "
+task: t
+states:
+  - wait: { action: eye/look, resources: [{ block: Gripper }] }
+  - wait: { for: open(lid) and level(tank) = 3, timeout: 5 }
+    transitions: { timeout: go_on }
+  - go: { wait: { signal: go }, transitions: { success: again } }
+  - go_on:
+      ask: { question: Go on?, choices: [yes, no, later], default: later, timeout: 7 }
+      transitions: { no: aborted }
+  - again: { wait: { seconds: 2 } }
+  - late: { wait: { until: 9.5 }, description: then }
+";
+    let program = program(source);
+    let lid = state(&program, "wait_2");
+    let Some(Wait::Condition(condition)) = lid.wait() else { panic!("{:?}", lid.kind) };
+    assert_eq!(condition.to_string(), "open(lid) and level(tank) = 3");
+    assert_eq!((lid.outcomes.as_slice(), lid.annotations.timeout_s), (&["timeout".to_owned()][..], Some(5.0)));
+    let foreseen: Vec<String> = lid.annotations.effects["success"].iter().map(ToString::to_string).collect();
+    assert_eq!(foreseen, ["set open(lid) = true", "set level(tank) = 3"]);
+    assert!(!state(&program, "wait").is_pause(), "a state that is called so and does something else");
+    assert_eq!(state(&program, "go").wait(), Some(Wait::Signal("go")));
+    let Some(Wait::Answer(Question { choices, default, .. })) = state(&program, "go_on").wait() else { panic!() };
+    assert_eq!((choices, default), (vec!["yes", "no", "later"], Some("later")));
+    assert_eq!(
+        state(&program, "go_on").outcomes,
+        ["no"],
+        "only what is connected, and no timeout where there is a default"
+    );
+    assert!(matches!(state(&program, "again").wait(), Some(Wait::Seconds(_))));
+    assert!(matches!(state(&program, "late").wait(), Some(Wait::Until(_))));
+}
+
+#[test]
+fn what_is_wrong_with_a_wait_is_said() {
+    let found = |state: &str| findings(&format!("task: t\nstates:\n  - {state}\n"));
+    assert_snapshot!(found("wait: 5"), @"task.yaml:3:11: error[invalid-state] in wait: `wait` is a mapping, found a number. help: write `wait: { for: door_open(front) }`, or one of `seconds`, `until`, `signal` for `for`");
+    assert_snapshot!(found("wait: { for: open(lid), signal: go }"), @"task.yaml:3:11: error[invalid-state] in wait: a state waits by `for` or by `signal`, not by both. help: write `wait: { for: door_open(front) }`, or one of `seconds`, `until`, `signal` for `for`");
+    assert_snapshot!(found("wait: { seconds: 3, timeout: 5 }"), @"task.yaml:3:34: error[invalid-state] in wait: a wait for a time is over by itself. help: leave `timeout` out");
+    assert_snapshot!(found("ask: { question: Well?, choices: [good, bad], default: god, timeout: 3 }"), @"task.yaml:3:60: error[invalid-state] in ask: the default is none of the choices. help: did you mean `good`?");
+    assert_snapshot!(found("ask: { question: Well?, choices: [success] }"), @"task.yaml:3:39: error[invalid-name] in ask: `success` is an outcome of every state or of a wait, and no choice. help: give the choice another name");
+    assert_snapshot!(found("ask: { question: Well?, choices: [good], default: good }"), @"task.yaml:3:55: error[invalid-state] in ask: a default without a timeout is never taken. help: add `timeout: …`, in seconds: after it the default is the answer");
+}
+
+#[test]
+fn a_call_of_a_function_of_the_file_is_what_would_stand_there() {
+    let source = "
+task: t
+functions:
+  double($x): 2 * $x
+  both($a, $b): double($a) + double($b)
+  free($thing): not exists held($thing)
+  some($list, $least): len(filter($each in $list, $each > $least)) > 0
+  any_at($place): 'exists (at(?thing) = ?where, ?where = $place)'
+states:
+  - total: { condition: 'both(1, double(3)) = 14', then: [] }
+  - held: { condition: free(cup), then: [] }
+  - inner: { condition: 'len(filter($each in [1, 2], some([1, 2, 3], $each))) = 2', then: [] }
+  - outer: { condition: 'exists (at(?thing) = ?p, any_at(?p))', then: [] }
+";
+    let program = program(source);
+    let predicate = |path: &str| match &state(&program, path).kind {
+        StateKind::Condition { predicate, .. } => predicate.clone(),
+        _ => panic!("{path} is no condition"),
+    };
+    assert_eq!(predicate("total").evaluate(&NothingKnown), Ok(Value::Bool(true)));
+    assert_eq!(predicate("held").to_string(), "not exists held(cup)");
+    // Elements of the function and of its argument are not taken for each other.
+    assert_eq!(predicate("inner").evaluate(&NothingKnown), Ok(Value::Bool(true)));
+    assert_eq!(predicate("outer").to_string().matches("?thing of any_at").count(), 1);
+}
+
+#[test]
+fn what_is_wrong_with_a_function_is_said() {
+    let found = |function: &str| findings(&format!("task: t\nfunctions:\n  {function}\nstates: []\n"));
+    assert_snapshot!(found("near: 3"), @"task.yaml:3:3: error[invalid-state]: `near` is no function with its parameters. help: write `near($a, $b): distance($a, $b) < 0.1` below `functions`");
+    assert_snapshot!(found("len($a): 3"), @"task.yaml:3:3: error[invalid-name]: the function `len` is built in. help: give it another name");
+    assert_snapshot!(found("f($a, $a): 3"), @"task.yaml:3:3: error[duplicate-name]: `f` has two parameters `$a`. help: rename one of them");
+    assert_snapshot!(found("f($a): $b + 1"), @"task.yaml:3:10: error[unknown-variable]: a function sees its own parameters, and `$b` is none of them. help: did you mean `$a`?");
+    assert_snapshot!(found("f($a): f($a) + 1"), @"task.yaml:3:10: error[recursive-function]: the function `f` uses itself: f → f. help: say what is done over and over as a loop, or with `map`");
+    let twice = "g($x): $x + $x + $x\n  h($x): g(g(g(g(g(g(g($x)))))))";
+    assert!(found(twice).contains("more than 2000 parts"), "{}", found(twice));
+    let source = "task: t\nfunctions:\n  near($a): $a\nstates:\n  - a: { action: gripper/release, effects: [near(cup)], resources: [{ block: Gripper }] }\n";
+    assert_snapshot!(findings(source), @"task.yaml:5:45: error[invalid-expression] in a: `near` is a function of this file, and here a fact is wanted. help: give the function or the fact another name");
+    let source = "task: t\nfunctions:\n  near($a, $b): $a\nstates:\n  - a: { condition: near(cup), then: [] }\n";
+    assert_snapshot!(findings(source), @"task.yaml:5:21: error[invalid-expression] in a: `near` takes 2 arguments, and is given 1. help: write `near($a, $b)`");
+}

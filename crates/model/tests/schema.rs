@@ -13,6 +13,7 @@ const SCHEMA: &str = include_str!("../../../docs/task-file.schema.json");
 const DOCUMENT: &str = include_str!("../../../docs/task-files.md");
 /// Where the loader lists the keys that it knows, as `const …_KEYS`.
 const LOADER: [&str; 2] = [include_str!("../src/load.rs"), include_str!("../src/load/state.rs")];
+const ASK: &str = "task: t\nstates:\n- a:\n    ask: { question: Well?, choices: [fine] }\n";
 
 fn schema() -> Value {
     serde_json::from_str(SCHEMA).unwrap()
@@ -143,6 +144,8 @@ fn what_is_misspelt_or_of_another_kind_does_not_fit() {
             "/states/0/do/0/a: there is no `timeout`",
         ),
         ("task: t\nhorizon: 0\nstates: []\n", "/horizon"),
+        ("task: t\nstates:\n  - wait: { fore: open(door) }\n", "/states/0/wait: there is no `fore`"),
+        ("task: t\nstates:\n  - go: { ask: { question: Go? } }\n", "/states/0/go/ask"),
     ] {
         let misfits = misfits(task);
         assert!(misfits.iter().any(|misfit| misfit.starts_with(place)), "{misfits:#?}\n{task}");
@@ -179,6 +182,8 @@ fn the_schema_has_the_keys_of_the_loader_and_no_others() {
         ("condition", "task: t\nstates:\n- a:\n    condition: true\n    then: []\n"),
         ("concurrency", "task: t\nstates:\n- a:\n    concurrency: barrier\n    regions: []\n"),
         ("library", "task: t\nstates:\n- a:\n    library: part.yaml\n"),
+        ("wait", "task: t\nstates:\n- a:\n    wait: { seconds: 1 }\n"),
+        ("ask", ASK),
     ];
     let mut candidates: BTreeSet<String> = listed().into_iter().map(str::to_owned).collect();
     forms.iter().for_each(|(form, _)| candidates.extend(of(form)));

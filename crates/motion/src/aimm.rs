@@ -6,8 +6,9 @@
 //! every place below can be reached from above, with a straight approach of [`APPROACH_M`].
 
 use crate::joint_vector::JointVector;
+pub use crate::top_grasp::{APPROACH_M, GRASP_DEPTH_M, grasp_poses};
 use ratn_model::pose::Pose;
-use std::f64::consts::{FRAC_PI_2, PI};
+use std::f64::consts::FRAC_PI_2;
 
 /// Height of the base's top, which is its load deck, in metres.
 pub const DECK_HEIGHT_M: f64 = 0.60;
@@ -29,12 +30,6 @@ pub const BOX_LEAST: [f64; 3] = [0.06, 0.06, 0.08];
 
 /// Greatest edges of a box.
 pub const BOX_GREATEST: [f64; 3] = [0.16, 0.09, 0.12];
-
-/// How far above the grasp a straight approach begins, and how far a straight departure goes, in metres.
-pub const APPROACH_M: f64 = 0.10;
-
-/// How far below a box's top the tool frame is when it grasps, in metres; half of the box's height if that is less.
-pub const GRASP_DEPTH_M: f64 = 0.03;
 
 /// The widest that the fingers open, in metres.
 pub const GRIPPER_OPENING_M: f64 = 0.11;
@@ -60,15 +55,6 @@ pub fn slots() -> [Pose; SLOT_COUNT] {
     })
 }
 
-/// The two ways to grasp an upright box from above: tool z down, y along the shorter horizontal edge; half a turn apart.
-pub fn grasp_poses(pose: &Pose, size: [f64; 3]) -> [Pose; 2] {
-    let edge = pose.rotate(if size[0] <= size[1] { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] });
-    let yaw = edge[1].atan2(edge[0]) + FRAC_PI_2;
-    let top = pose.position[2] + size[2] / 2.0;
-    let position = [pose.position[0], pose.position[1], top - GRASP_DEPTH_M.min(size[2] / 2.0)];
-    [Pose::from_rpy(position, PI, 0.0, yaw), Pose::from_rpy(position, PI, 0.0, yaw + PI)]
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
@@ -84,6 +70,7 @@ mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+    use std::f64::consts::PI;
 
     fn table() -> SceneObject {
         let [x, y, z] = TABLE_CENTRE;

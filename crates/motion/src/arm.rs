@@ -12,6 +12,7 @@ use crate::reach::Reach;
 use crate::robot::{Body, Configuration, Geometry, Link, Robot};
 use crate::space::{Obstacle, Space, State};
 use crate::spheres::cover_within;
+use crate::surroundings::Surroundings;
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene, Shape};
 
@@ -22,8 +23,8 @@ pub const OVERHANG_M: f64 = 0.01;
 pub const CLEARANCE_M: f64 = 0.002;
 
 /// The arm in a scene; motions that the space finds free are free also between their postures.
-pub fn space(mechanism: &Mechanism, obstacles: &[Obstacle]) -> Space {
-    let mut space = Space::new(mechanism, obstacles);
+pub fn space<'s>(mechanism: &Mechanism, surroundings: impl Into<Surroundings<'s>>) -> Space {
+    let mut space = Space::new(mechanism, surroundings);
     space.set_swept(true);
     space
 }

@@ -6,6 +6,7 @@
 //! vector checks of `arm` and `space`. Shapes that move are grown by a padding. Between two postures no further apart than [`Checker::steps`]
 //! allows, no point is further than the padding from its place in the nearer one: where both are free, the way between is.
 
+use crate::cloud::Cloud;
 use crate::frame::compose;
 use crate::joint_vector::JointVector;
 use crate::levers::Levers;
@@ -16,6 +17,7 @@ use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene};
 use std::fmt;
+use std::sync::Arc;
 
 /// How much room the planner keeps around the moving shapes where it begins and ends, in metres.
 pub const PADDING_M: f64 = crate::arm::OVERHANG_M;
@@ -38,6 +40,8 @@ pub struct Checker<'a> {
     moving: Vec<Moving>,
     /// Pairs of moving shapes that can meet.
     pairs: Vec<(usize, usize)>,
+    /// Balls that stand around, in the world frame.
+    cloud: Option<Arc<Cloud>>,
     /// How far a point moves at the most per radian of each arm joint (per metre of one that slides), in metres.
     reach: JointVector,
     poses: Vec<Pose>,
@@ -123,6 +127,7 @@ impl<'a> Checker<'a> {
             obstacles: Vec::new(),
             moving: Vec::new(),
             pairs: Vec::new(),
+            cloud: None,
             reach: JointVector::zeros(robot.arm_joints().len()),
             poses,
             placed: Vec::new(),
@@ -141,6 +146,11 @@ impl<'a> Checker<'a> {
             obstacle.open = obstacle.link.is_none() && objects.contains(&obstacle.name);
         }
         self
+    }
+
+    /// The same beside the balls of a cloud in the world frame, too.
+    pub fn beside(self, cloud: Option<Arc<Cloud>>) -> Checker<'a> {
+        Checker { cloud, ..self }
     }
 
     fn add_robot(&mut self) {
@@ -267,6 +277,7 @@ impl<'a> Checker<'a> {
         let other = match other {
             Other::Obstacle(o) => self.obstacles[o].name.clone(),
             Other::Moving(j) => self.moving[j].name.clone(),
+            Other::Cloud => self.cloud.as_ref().map(|cloud| cloud.name.clone()).unwrap_or_default(),
         };
         Some(Collision { moving: self.moving[i].name.clone(), other, depth_m: depth })
     }
@@ -291,6 +302,10 @@ impl<'a> Checker<'a> {
         for &(i, j) in &self.pairs {
             room = room.min(self.room_between(i, Other::Moving(j), contact, room));
         }
+        for i in 0..self.moving.len() {
+            let may_press = self.may_press(i, contact);
+            room = room.min((self.gap_to_cloud(i, room - may_press) + may_press).max(0.0));
+        }
         Ok(room)
     }
 
@@ -303,6 +318,7 @@ impl<'a> Checker<'a> {
                 (obstacle.centre, obstacle.radius, &obstacle.pose, &obstacle.shape)
             }
             Other::Moving(j) => (self.centres[j], self.moving[j].radius, &self.placed[j], &self.moving[j].shape),
+            Other::Cloud => return up_to,
         };
         let reach = moving.radius + radius + up_to as f32;
         if self.centres[i].distance_squared(centre) >= reach * reach {
@@ -312,8 +328,7 @@ impl<'a> Checker<'a> {
             (Contact::Gripper(_), Other::Obstacle(o)) if moving.role == Role::Finger && self.obstacles[o].open => {
                 return up_to;
             }
-            (Contact::Gripper(tolerance), _) if matches!(moving.role, Role::Finger | Role::Held) => tolerance,
-            _ => 0.0,
+            _ => self.may_press(i, contact),
         };
         match query::contact(&self.placed[i], &*moving.shape, pose, &**shape, up_to as f32) {
             Ok(None) => up_to,
@@ -368,6 +383,13 @@ impl<'a> Checker<'a> {
                     return Some((i, Other::Obstacle(o)));
                 }
             }
+            let room = match contact {
+                Contact::Gripper(press) if self.can_press(i) => -press,
+                _ => self.padding,
+            };
+            if self.gap_to_cloud(i, room) < room {
+                return Some((i, Other::Cloud));
+            }
         }
         for &(i, j) in &self.pairs {
             let reach = self.moving[i].radius + self.moving[j].radius;
@@ -387,8 +409,41 @@ impl<'a> Checker<'a> {
         {
             return true;
         }
+        self.can_press(i) && self.depth(i, other).is_some_and(|depth| depth <= tolerance)
+    }
+
+    /// Whether a moving shape may touch something at all.
+    fn can_press(&self, i: usize) -> bool {
         matches!(self.moving[i].role, Role::Finger | Role::Held)
-            && self.depth(i, other).is_some_and(|depth| depth <= tolerance)
+    }
+
+    /// How deep a moving shape may be in what it touches, in metres.
+    fn may_press(&self, i: usize, contact: Contact) -> f64 {
+        match contact {
+            Contact::Gripper(press) if self.can_press(i) => press,
+            _ => 0.0,
+        }
+    }
+
+    /// How far a moving shape, unpadded, is from the next ball of the cloud in the posture checked last, in metres, or `up_to` where that is
+    /// less; negative: how deep one is in the other.
+    fn gap_to_cloud(&self, i: usize, up_to: f64) -> f64 {
+        let Some(cloud) = &self.cloud else { return up_to };
+        let (pose, shape) = (&self.placed[i], &self.moving[i].shape);
+        let radius = cloud.radius_m() as f32;
+        // A ball that is wholly inside reaches no further out than its centre.
+        let reach = (radius + up_to as f32).max(0.0);
+        let around = shape.compute_aabb(pose);
+        let (least, greatest) = (around.mins - Vector::splat(reach), around.maxs + Vector::splat(reach));
+        let mut gap = up_to;
+        cloud.visit(least.into(), greatest.into(), &mut |_, [x, y, z]| {
+            let at = pose.inverse_transform_point(Vector::new(x, y, z));
+            let projection = shape.project_local_point(at, false);
+            let distance = (projection.point - at).length() * if projection.is_inside { -1.0 } else { 1.0 };
+            gap = gap.min(f64::from(distance - radius));
+            true
+        });
+        gap
     }
 
     /// How deep the unpadded shapes are inside each other, in metres, in the posture checked last.
@@ -396,6 +451,7 @@ impl<'a> Checker<'a> {
         let (pose, shape) = match other {
             Other::Obstacle(o) => (&self.obstacles[o].pose, &self.obstacles[o].shape),
             Other::Moving(j) => (&self.placed[j], &self.moving[j].shape),
+            Other::Cloud => return Some(-self.gap_to_cloud(i, 2.0 * self.padding)),
         };
         let prediction = 2.0 * self.padding as f32;
         let contact = query::contact(&self.placed[i], &*self.moving[i].shape, pose, &**shape, prediction).ok()??;
@@ -407,6 +463,7 @@ impl<'a> Checker<'a> {
 enum Other {
     Obstacle(usize),
     Moving(usize),
+    Cloud,
 }
 
 /// The posture a fraction of the way from one to another.

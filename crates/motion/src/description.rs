@@ -2,8 +2,10 @@
 //!
 //! The built-in robots are read the same way. [`Robot::of`](crate::robot::Robot::of) holds the names against the URDF.
 
+use crate::mechanism::MechanismError;
+use crate::mesh::MeshError;
 use crate::mesh_files::MeshFiles;
-use crate::robot::{Robot, RobotFault};
+use crate::robot::{Robot, RobotError, RobotFault};
 use crate::workplace::Workplace;
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -25,7 +27,7 @@ pub struct RobotDescription {
     pub packages: Vec<PathBuf>,
     /// The arm, or the first one.
     pub arm: ArmDescription,
-    /// Further arms: one arm moves at a time, and the others stand.
+    /// Further arms. The planner moves one of the arms at a time, and the others stand; a cell moves several at once.
     #[serde(default, rename = "other_arm")]
     pub other_arms: Vec<ArmDescription>,
     /// The gripper. A robot without one grasps nothing.
@@ -153,6 +155,20 @@ pub enum DescriptionError {
 
 /// The most of a file that is read, in bytes.
 const MAX_BYTES: u64 = 16 << 20;
+
+impl DescriptionError {
+    /// Whether a file is missing or cannot be read, a mesh included; else a file says something wrong.
+    pub fn is_unreadable(&self) -> bool {
+        match self {
+            DescriptionError::Read { .. } => true,
+            DescriptionError::Form { .. } => false,
+            DescriptionError::Fault { fault, .. } => matches!(
+                **fault,
+                RobotFault::Model(MechanismError::Robot(RobotError::Mesh { source: MeshError::Read { .. }, .. }))
+            ),
+        }
+    }
+}
 
 impl RobotDescription {
     /// Reads the text of a `robot.toml`.

@@ -74,7 +74,7 @@ pub fn plan(
 ) -> Result<Plan, PlanError> {
     request.check(robot, scene)?;
     let mut pace = Pace::new(control);
-    let mut arm = ArmInScene::new(robot, scene, request);
+    let mut arm = ArmInScene::new(robot, scene, request)?;
     let depart = departure(&mut arm)?;
     arm.keep_from(&depart)?;
     if let Some(way) = &request.straight {

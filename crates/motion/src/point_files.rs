@@ -49,6 +49,14 @@ pub fn points(name: &str, bytes: &[u8]) -> Result<Vec<[f32; 3]>, PointsError> {
     Ok(points.iter().filter(is_seen).map(|point| point.map(|c| c as f32)).collect())
 }
 
+/// The points of a PCD or PLY file that has no name, by how it begins.
+///
+/// # Errors
+/// [`PointsError`] names the line, or the byte.
+pub fn points_by_content(bytes: &[u8]) -> Result<Vec<[f32; 3]>, PointsError> {
+    points(if bytes.starts_with(b"ply") { "it.ply" } else { "it.pcd" }, bytes)
+}
+
 /// Three numbers at the beginning of each line, between semicolons, commas or spaces, the first of these that is there.
 fn columns(bytes: &[u8]) -> Result<Vec<[f64; 3]>, PointsError> {
     let (mut points, mut fields_before) = (Vec::new(), 0);

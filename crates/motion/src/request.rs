@@ -1,10 +1,12 @@
 //! A request to the planner.
 
+use crate::cloud::MAX_RADIUS_M;
 use crate::constrained::LEAST_TOLERANCE;
 use crate::joint_vector::JointVector;
 use crate::keep::Keep;
 use crate::plan::PlanError;
 use crate::robot::{Configuration, Joint, Robot, on_floor};
+use crate::seen::Seen;
 use crate::straight::Straight;
 use crate::tool_speed::ToolSpeed;
 use crate::way_points::WayPoints;
@@ -42,6 +44,8 @@ pub struct Request {
     pub keep: Keep,
     /// Names, in the scene, of hollow objects that the fingers may reach into on the straight parts, although their shapes are filled.
     pub reaches_into: Vec<String>,
+    /// What a depth camera saw beside the scene.
+    pub seen: Option<Seen>,
     /// Fraction of the joints' velocity and acceleration limits, [`MIN_SPEED`] to 1.
     pub speed: f64,
     /// Fractions of the joints' limits of velocity (beside `speed`), acceleration (beside `speed`) and jerk, joint by joint.
@@ -75,6 +79,7 @@ impl Request {
             upright_rad: None,
             keep: Keep::default(),
             reaches_into: Vec::new(),
+            seen: None,
             speed: 1.0,
             scales: [JointVector::all(start.arm.len(), 1.0); 3],
             tool_speed: ToolSpeed::default(),
@@ -137,6 +142,11 @@ impl Request {
         if self.upright_rad.is_some() && self.keep.axis.is_some() {
             let expected = "one of them: both say which direction the tool keeps";
             return malformed("upright_rad", "there beside keep_axis".to_owned(), expected);
+        }
+        if let Some(within) = self.seen.as_ref().map(|seen| seen.known_within_m)
+            && !(0.0..=MAX_RADIUS_M).contains(&within)
+        {
+            return malformed("cloud_known_within_m", within.to_string(), &format!("0 to {MAX_RADIUS_M} m"));
         }
         self.keep.check()?;
         self.tool_speed.check()?;

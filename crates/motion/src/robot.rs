@@ -5,6 +5,8 @@
 //! Planning moves the arm; the others are where a configuration has them, joints of no part at zero or at the limit next to it.
 
 mod arms;
+mod fingers;
+mod identity;
 mod parts;
 
 use crate::description::RobotDescription;
@@ -19,6 +21,9 @@ pub use crate::urdf::RobotError;
 pub use crate::urdf_faults::UrdfFault;
 use crate::workplace::Workplace;
 use arms::OtherArm;
+pub use arms::{ArmPosition, MAX_ARMS, OtherArms, UNSAID};
+pub use fingers::FingerPart;
+pub use identity::RobotIdentity;
 use parry3d::math::{Pose as Pose32, Rotation, Vector};
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
@@ -74,6 +79,8 @@ pub struct Configuration {
     pub tilt: f64,
     /// The distance of each finger from the middle, in metres: half of the opening.
     pub finger: f64,
+    /// Where the other arms and their fingers are, of a robot that has several.
+    pub others: OtherArms,
 }
 
 /// Why a description and a URDF make no robot.
@@ -95,6 +102,12 @@ pub enum RobotFault {
         joint: String,
         /// The tool.
         tool: String,
+    },
+    /// Too many arms.
+    #[error("{count} arms: at most {MAX_ARMS} are supported")]
+    Arms {
+        /// How many there are.
+        count: usize,
     },
     /// Two arms have one name.
     #[error("two arms are called `{arm}`")]
@@ -214,9 +227,14 @@ impl Configuration {
         Configuration { base: on_floor(base), ..self }
     }
 
-    /// All positions: of the base, the arm, pan, tilt and finger.
+    /// All positions: of the base, the arm, pan, tilt and finger; then of each other arm whose position is said its joints and its finger.
     pub fn values(&self) -> Vec<f64> {
-        [&self.base[..], &self.arm[..], &[self.pan, self.tilt, self.finger]].concat()
+        let mut values = [&self.base[..], &self.arm[..], &[self.pan, self.tilt, self.finger]].concat();
+        for other in self.others.iter().flatten() {
+            values.extend(&other.joints);
+            values.push(other.finger);
+        }
+        values
     }
 }
 
@@ -338,19 +356,28 @@ impl Robot {
             pan: at(&self.head, 0),
             tilt: at(&self.head, 1),
             finger: at(&self.finger, 0),
+            others: UNSAID,
         }
     }
 
-    /// The inverse of [`Configuration::values`]; `None` where the number of values is another.
+    /// The inverse of [`Configuration::values`], with the other arms or without; `None` where the number of values is another.
     pub fn configuration(&self, values: &[f64]) -> Option<Configuration> {
-        let arm = self.arm.joints.len();
-        if values.len() != arm + 6 {
+        let (own, of_others) = (self.arm.joints.len() + 6, self.other_arms.iter().map(OtherArm::values).sum::<usize>());
+        if values.len() != own && values.len() != own + of_others {
             return None;
         }
-        let (arm, rest) = values[3..].split_at(arm);
+        let (values, mut left) = values.split_at(own);
+        let (arm, rest) = values[3..].split_at(self.arm.joints.len());
         let arm = JointVector::read(arm).ok()?;
         let base = [values[0], values[1], values[2]];
-        Some(Configuration { base, arm, pan: rest[0], tilt: rest[1], finger: rest[2] })
+        let mut others = UNSAID;
+        for (at, other) in others.iter_mut().zip(&self.other_arms).filter(|_| !left.is_empty()) {
+            let (of_arm, behind) = left.split_at(other.values());
+            let (finger, joints) = of_arm.split_last()?;
+            *at = Some(ArmPosition { joints: JointVector::read(joints).ok()?, finger: *finger });
+            left = behind;
+        }
+        Some(Configuration { base, arm, pan: rest[0], tilt: rest[1], finger: rest[2], others })
     }
 
     /// A posture of the description by its name.
@@ -366,7 +393,7 @@ impl Robot {
     /// Positions of the model's joints.
     fn positions(&self, configuration: &Configuration) -> Vec<f64> {
         let mut positions = self.neutral.clone();
-        let Configuration { base, arm, pan, tilt, finger } = configuration;
+        let Configuration { base, arm, pan, tilt, finger, others } = configuration;
         let mut put = |part: Option<&Part>, values: &[f64]| {
             for (index, value) in part.into_iter().flat_map(|part| &part.indices).zip(values) {
                 positions[*index] = *value;
@@ -376,6 +403,9 @@ impl Robot {
         put(Some(&self.arm), arm);
         put(self.head.as_ref(), &[*pan, *tilt]);
         put(self.finger.as_ref(), &[*finger]);
+        for (other, at) in self.other_arms.iter().zip(others) {
+            at.iter().for_each(|at| other.put(at, &mut positions));
+        }
         positions
     }
 

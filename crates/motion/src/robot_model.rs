@@ -131,7 +131,7 @@ impl Link {
 
     /// Where it is in its parent's frame.
     #[inline]
-    fn in_parent(&self, positions: &[f64]) -> Pose {
+    pub(crate) fn in_parent(&self, positions: &[f64]) -> Pose {
         match self.drive {
             None => self.origin,
             Some(drive) => compose(&self.origin, &drive.moved(positions[drive.joint])),

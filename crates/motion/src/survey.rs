@@ -1,12 +1,12 @@
 //! What a robot's description is good for, for people: what it has, how far it reaches, what of it collides, and whether boxes in its
 //! workplace can be taken from above wherever they may stand.
 
-use crate::aimm::{APPROACH_M, grasp_poses};
 use crate::arm::{self, line};
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Contact, PADDING_M};
 use crate::joint_vector::JointVector;
 use crate::reach::Target;
 use crate::robot::{Joint, Robot};
+use crate::top_grasp::{APPROACH_M, grasp_poses};
 use crate::workplace::{HOME, Surface, Workplace};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -32,38 +32,35 @@ pub struct Survey {
 
 /// Looks at a robot.
 pub fn survey(robot: &Robot) -> Survey {
-    let mut faults = Vec::new();
-    let joints: Vec<&str> = robot.arm_joints().iter().map(|joint| joint.name.as_str()).collect();
-    let tool = &robot.model.links[robot.tool].name;
-    let [below, above, away] = extent(robot);
     let has = |it: bool| if it { "yes" } else { "no" };
-    let opening = match robot.finger() {
-        Some(_) => format!("opens to {:.0} mm", 2e3 * robot.open_finger_m()),
-        None => "none: it grasps nothing".to_owned(),
-    };
-    let mut lines = vec![
-        format!("robot     {}", robot.name()),
-        format!("arm       {} joints to the link `{tool}`: {}", joints.len(), joints.join(", ")),
-        format!("reach     {away:.2} m from the arm's first joint; the tool's height from {below:.2} to {above:.2} m"),
-        format!("gripper   {opening}"),
+    let mut survey = Survey { lines: vec![format!("robot     {}", robot.name())], faults: Vec::new() };
+    survey.add_arm(robot, "");
+    survey.lines.extend([
         format!("base      {}", has(!robot.base_joints().is_empty())),
         format!("head      {}", has(!robot.head_joints().is_empty())),
         format!("camera    {}", has(robot.camera_pose(&robot.at_zero()).is_some())),
-    ];
+    ]);
     let scene = scene(robot.workplace(), None);
-    let mut checker = Checker::new(robot, &scene, &arm::assumed(robot, &scene), PADDING_M);
-    for (name, posture) in robot.postures() {
-        let [x, y, z] = arm::reach(robot).pose(posture).position;
-        let touch = checker.collision(posture, Contact::None);
-        let state = touch.as_ref().map_or_else(|| "free".to_owned(), |touch| format!("COLLIDES: {touch}"));
-        lines.push(format!("posture   {name}: {state}; the tool is at ({x:.3}, {y:.3}, {z:.3})"));
-        faults.extend(touch.map(|touch| format!("the posture `{name}` collides: {touch}")));
+    survey.add_postures(robot, &scene, "");
+    // A name that the robot has itself told is one of its arms.
+    let others: Vec<Robot> = robot.other_arms().filter_map(|name| robot.with_arm(name).ok()).collect();
+    for other in &others {
+        let whose = format!(" of the arm `{}`", other.arm_name());
+        survey.add_arm(other, &whose);
+        survey.add_postures(other, &scene, &whose);
     }
+    let Survey { mut lines, mut faults } = survey;
     match robot.workplace() {
         None => lines.push("workplace none: the simulated cell does not take it".to_owned()),
         Some(workplace) => {
             for (what, points) in [("boxes", region(workplace)), ("places", workplace.places.poses())] {
-                let beyond: Vec<String> = points.iter().filter_map(|point| beyond(robot, workplace, point)).collect();
+                // Boxes stand where the first arm takes them; it may be another one that brings them away.
+                let others = if what == "places" { &others[..] } else { &[] };
+                let able = others.iter().filter(|other| other.posture(HOME).is_some());
+                let serves = |point: &Pose| able.clone().any(|other| beyond(other, workplace, point).is_none());
+                let beyond =
+                    points.iter().filter_map(|point| beyond(robot, workplace, point).filter(|_| !serves(point)));
+                let beyond: Vec<String> = beyond.collect();
                 let (all, good) = (points.len(), points.len() - beyond.len());
                 lines.push(format!("{what:<10}{good} of {all} points can be served from above"));
                 faults.extend(beyond.into_iter().map(|why| format!("{what}: {why}")));
@@ -71,6 +68,40 @@ pub fn survey(robot: &Robot) -> Survey {
         }
     }
     Survey { lines, faults }
+}
+
+impl Survey {
+    /// What an arm is, of the robot seen from it.
+    fn add_arm(&mut self, robot: &Robot, whose: &str) {
+        let joints: Vec<&str> = robot.arm_joints().iter().map(|joint| joint.name.as_str()).collect();
+        let tool = &robot.model.links[robot.tool].name;
+        let [below, above, away] = extent(robot);
+        let opening = match robot.finger() {
+            Some(_) => format!("opens to {:.0} mm", 2e3 * robot.open_finger_m()),
+            None => "none: it grasps nothing".to_owned(),
+        };
+        let arm = if whose.is_empty() { String::new() } else { format!("`{}`, ", robot.arm_name()) };
+        self.lines.extend([
+            format!("arm       {arm}{} joints to the link `{tool}`: {}", joints.len(), joints.join(", ")),
+            format!(
+                "reach     {away:.2} m from the arm's first joint; the tool's height from {below:.2} to {above:.2} m"
+            ),
+            format!("gripper   {opening}"),
+        ]);
+    }
+
+    /// Where the postures of that arm bring its tool, and whether they collide with the table or the robot itself, whose other arms stand in
+    /// their postures `home`.
+    fn add_postures(&mut self, robot: &Robot, scene: &Scene, whose: &str) {
+        let mut checker = Checker::new(robot, scene, &arm::assumed(robot, scene), PADDING_M);
+        for (name, posture) in robot.postures() {
+            let [x, y, z] = arm::reach(robot).pose(posture).position;
+            let touch = checker.collision(posture, Contact::None);
+            let state = touch.as_ref().map_or_else(|| "free".to_owned(), |touch| format!("COLLIDES: {touch}"));
+            self.lines.push(format!("posture   {name}: {state}; the tool is at ({x:.3}, {y:.3}, {z:.3})"));
+            self.faults.extend(touch.map(|touch| format!("the posture `{name}`{whose} collides: {touch}")));
+        }
+    }
 }
 
 /// The tool's least and greatest height, and how far it gets from the arm's first joint.

@@ -4,6 +4,7 @@
 //! Metres and radians in the world frame; places on the base are seen from the base.
 
 use crate::robot::Robot;
+use crate::tableware::Tableware;
 use ratn_model::pose::Pose;
 use serde::Deserialize;
 
@@ -22,6 +23,9 @@ pub struct Workplace {
     pub boxes: Boxes,
     /// Where they are brought to.
     pub places: Places,
+    /// The rack and the places of tableware, for the scene `table` of a cell.
+    #[serde(default)]
+    pub tableware: Option<Tableware>,
 }
 
 /// A flat cuboid.
@@ -77,7 +81,7 @@ impl Slab {
         self.centre[2] + self.size[2] / 2.0
     }
 
-    fn holds(&self, x: f64, y: f64) -> bool {
+    pub(crate) fn holds(&self, x: f64, y: f64) -> bool {
         [x, y].into_iter().zip(self.centre).zip(self.size).all(|((at, centre), size)| (at - centre).abs() <= size / 2.0)
     }
 }
@@ -92,7 +96,7 @@ impl Places {
 impl Workplace {
     /// What is wrong with it for this robot, if anything.
     pub(crate) fn fault(&self, robot: &Robot) -> Option<String> {
-        let Workplace { table, boxes, places } = self;
+        let Workplace { table, boxes, places, tableware } = self;
         let ordered = |[low, high]: [f64; 2]| low.is_finite() && high.is_finite() && low <= high;
         let positive = |size: &[f64; 3]| size.iter().all(|edge| edge.is_finite() && *edge > 0.0);
         let corners = [(0, 0), (0, 1), (1, 0), (1, 1)].map(|(i, j)| (boxes.x[i], boxes.y[j]));
@@ -127,7 +131,7 @@ impl Workplace {
         } else if robot.posture(HOME).is_none() {
             Some(format!("the robot begins in the posture `{HOME}`: add it to [postures]"))
         } else {
-            None
+            tableware.as_ref().and_then(|tableware| tableware.fault(table))
         }
     }
 }

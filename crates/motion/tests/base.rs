@@ -6,12 +6,13 @@ use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::base::{DriveError, DrivePlan, DriveRequest, DriveViolation, check_drive, plan_drive, riding};
 use ratn_motion::pace::Control;
-use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::robot::{Configuration, Robot, UNSAID};
 use ratn_motion::trajectory::Curve;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::{FRAC_PI_2, PI};
 
-const STANDING: Configuration = Configuration { base: [0.0; 3], arm: aimm::STOWED, pan: 0.0, tilt: 0.0, finger: 0.055 };
+const STANDING: Configuration =
+    Configuration { base: [0.0; 3], arm: aimm::STOWED, pan: 0.0, tilt: 0.0, finger: 0.055, others: UNSAID };
 
 fn block(name: &str, pose: Pose, size: [f64; 3]) -> SceneObject {
     SceneObject { name: name.to_owned(), shape: Shape::Box { size }, placement: Placement::World(pose) }

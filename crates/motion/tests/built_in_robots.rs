@@ -126,7 +126,7 @@ fn every_place_can_be_served_from_above_while_all_others_are_full() {
 #[test]
 fn the_workplace_of_the_mobile_robot_is_the_one_that_its_constants_say() {
     let robot = Robot::aimm();
-    let Workplace { table, boxes, places } = robot.workplace().unwrap();
+    let Workplace { table, boxes, places, .. } = robot.workplace().unwrap();
     assert_eq!((table.centre, table.size), (aimm::TABLE_CENTRE, aimm::TABLE_SIZE));
     assert!((table.top_m() - aimm::TABLE_HEIGHT_M).abs() < 1e-12);
     assert_eq!(

@@ -371,6 +371,8 @@ pub struct WorldChange {
     pub written: Vec<FactRecord>,
     /// What is gone, in the order of keys.
     pub gone: Vec<FactKey>,
+    /// The node that committed it, by the path of its instance.
+    pub writer: Option<Arc<str>>,
 }
 
 /// A fact in two revisions; `None` where it does not hold.
@@ -408,6 +410,8 @@ pub struct FactVersion {
     pub commit: String,
     /// `None` where it does not hold.
     pub fact: Option<FactRecord>,
+    /// The node that wrote or deleted it, by the path of its instance.
+    pub writer: Option<Arc<str>>,
 }
 
 /// What a worker process is doing.

@@ -5,10 +5,13 @@ use crate::value::{Fact, from_python};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use ratn_model::fact::{Change, FactPattern};
+use ratn_model::fact::{Change, FactPattern, Footprint};
+use ratn_model::id::ProjectionId;
 use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_proto::types::WorldUpdate;
-use ratn_worker::client::{AcquireOptions, CallError, Channels, ResourceClient, WorldClient, fact, fresh_id, pattern};
+use ratn_worker::client::{
+    AcquireOptions, CallError, Channels, Projection, ResourceClient, WorldClient, fact, fresh_id, pattern,
+};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::{DEFAULT_TTL, Session};
@@ -23,6 +26,8 @@ use tokio::sync::mpsc;
 const SESSION_PATIENCE: Duration = Duration::from_secs(5);
 /// How often Python is asked for a signal (Ctrl-C) while something is waited for.
 const SIGNALS: Duration = Duration::from_millis(100);
+/// The kind of the room for a projection.
+const WORLD_MODEL: &str = "WorldModel";
 const MAX_WAIT_S: f64 = 1e9;
 /// Revisions that Python has not asked for yet; more wait in the world pool.
 const MAX_UPDATES: usize = 64;
@@ -73,6 +78,15 @@ fn wait_for<T: Send>(
             Err(_) => py.check_signals()?,
         }
     }
+}
+
+/// A fact with its value; without one it is gone.
+fn change(fact_text: &str, value: &Bound<'_, PyAny>) -> PyResult<Change> {
+    let key = fact(fact_text).map_err(PyValueError::new_err)?;
+    Ok(match value.is_none() {
+        true => Change::Delete { pattern: FactPattern::of(&key) },
+        false => Change::Set { fact: key, value: from_python(value)? },
+    })
 }
 
 fn patterns_of(texts: &[String]) -> PyResult<Vec<FactPattern>> {
@@ -145,13 +159,42 @@ impl Client {
 
     /// Writes a fact to the root world; the world's revision with it. `None` deletes it.
     fn set(&self, py: Python<'_>, fact_text: &str, value: &Bound<'_, PyAny>) -> PyResult<u64> {
-        let key = fact(fact_text).map_err(PyValueError::new_err)?;
-        let change = match value.is_none() {
-            true => Change::Delete { pattern: FactPattern::of(&key) },
-            false => Change::Set { fact: key, value: from_python(value)? },
-        };
-        let commit = fresh_id("python");
+        let (commit, change) = (fresh_id("python"), change(fact_text, value)?);
         Ok(wait_for(py, &self.runtime, self.world.commit(&commit, vec![change], None))?.0)
+    }
+
+    /// A projection: the world as it is now with changes, a fact and its value each, of which nobody else sees anything. `None` deletes. It
+    /// holds room for itself (a `WorldModel`), for which it waits, until the end of the `with` block or `release()`.
+    #[pyo3(signature = (changes, *, timeout_s=None))]
+    fn project(
+        &self,
+        py: Python<'_>,
+        changes: Vec<(String, Bound<'_, PyAny>)>,
+        timeout_s: Option<f64>,
+    ) -> PyResult<Projected> {
+        let changes = changes.iter().map(|(text, value)| change(text, value)).collect::<PyResult<Vec<_>>>()?;
+        let lease = self.acquire(py, vec![WORLD_MODEL.to_owned()], 0, timeout_s, "python")?;
+        let made = || {
+            // A pattern that nothing matches: only the revision is asked for.
+            let nothing = [FactPattern { predicate: "ratn_nothing".to_owned(), arguments: Vec::new() }];
+            let base = wait_for(py, &self.runtime, self.world.root_at(None, &nothing))?.0;
+            let projection = Projection {
+                request: fresh_id("python"),
+                base,
+                changes,
+                writers: Vec::new(),
+                reads: Footprint::Everything,
+                lease: Some((lease.granted.id, lease.granted.token)),
+            };
+            Ok((base, wait_for(py, &self.runtime, self.world.project(projection))?))
+        };
+        match made() {
+            Ok((base, id)) => Ok(Projected { base: base.0, id, lease, world: self.world.clone() }),
+            Err(error) => {
+                lease.release(py)?;
+                Err(error)
+            }
+        }
     }
 
     /// What holds now, then what changes, of the patterns; of everything without one.
@@ -232,6 +275,52 @@ impl Lease {
     fn __repr__(&self) -> String {
         let ids: Vec<&str> = self.granted.resources.iter().map(|held| held.id.as_str()).collect();
         format!("<Lease {} of {}>", self.granted.id.0, ids.join(", "))
+    }
+}
+
+/// A world that might be: that of a revision, with changes. Nobody else sees it.
+#[pyclass(frozen, module = "ratn")]
+pub(crate) struct Projected {
+    base: u64,
+    id: ProjectionId,
+    lease: Lease,
+    world: WorldClient,
+}
+
+#[pymethods]
+impl Projected {
+    /// The revision of the world that it stands on.
+    #[getter]
+    fn base(&self) -> u64 {
+        self.base
+    }
+
+    /// The facts of the projection that match any of the patterns; all of them without one.
+    #[pyo3(signature = (*patterns))]
+    fn query(&self, py: Python<'_>, patterns: Vec<String>) -> PyResult<Vec<Fact>> {
+        let patterns = patterns_of(&patterns)?;
+        Ok(Fact::all(wait_for(py, &self.lease.runtime, self.world.query(Some(self.id), &patterns))?))
+    }
+
+    /// Ends it, and gives its room back; false where it had ended before.
+    fn release(&self, py: Python<'_>) -> PyResult<bool> {
+        let released = wait_for(py, &self.lease.runtime, self.world.release(self.id));
+        self.lease.release(py)?;
+        released
+    }
+
+    fn __enter__(slf: PyRef<'_, Self>) -> PyRef<'_, Self> {
+        slf
+    }
+
+    #[pyo3(signature = (*_exception))]
+    fn __exit__(&self, py: Python<'_>, _exception: &Bound<'_, pyo3::types::PyTuple>) -> PyResult<bool> {
+        self.release(py)?;
+        Ok(false)
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<Projection {} on revision {}>", self.id.0, self.base)
     }
 }
 

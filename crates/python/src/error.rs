@@ -19,6 +19,10 @@ create_exception!(_ratn, FailedPrecondition, Refused, "It cannot be as things ar
 create_exception!(_ratn, PermissionDenied, Refused, "The caller's roles do not allow it (PERMISSION_DENIED).");
 create_exception!(_ratn, ResourceExhausted, Refused, "There is no more of it (RESOURCE_EXHAUSTED).");
 create_exception!(_ratn, DeadlineExceeded, Refused, "It did not come in time (DEADLINE_EXCEEDED).");
+create_exception!(_ratn, OutOfRange, Refused, "A number is beyond what there is (OUT_OF_RANGE).");
+create_exception!(_ratn, Unauthenticated, Refused, "Nobody knows who asks (UNAUTHENTICATED).");
+create_exception!(_ratn, Unimplemented, Refused, "The server does not have that (UNIMPLEMENTED).");
+create_exception!(_ratn, InvalidTask, Error, "A task file that is refused; `findings` says what is wrong where.");
 create_exception!(_ratn, Cancelled, Error, "The goal shall stop: let it through, after putting things in order.");
 create_exception!(
     _ratn,
@@ -41,6 +45,10 @@ pub(crate) fn add_to(py: Python<'_>, module: &Bound<'_, PyModule>) -> PyResult<(
     module.add("PermissionDenied", py.get_type::<PermissionDenied>())?;
     module.add("ResourceExhausted", py.get_type::<ResourceExhausted>())?;
     module.add("DeadlineExceeded", py.get_type::<DeadlineExceeded>())?;
+    module.add("OutOfRange", py.get_type::<OutOfRange>())?;
+    module.add("Unauthenticated", py.get_type::<Unauthenticated>())?;
+    module.add("Unimplemented", py.get_type::<Unimplemented>())?;
+    module.add("InvalidTask", py.get_type::<InvalidTask>())?;
     module.add("Cancelled", py.get_type::<Cancelled>())?;
     module.add("Aborted", py.get_type::<Aborted>())?;
     module.add("Lost", py.get_type::<Lost>())
@@ -57,8 +65,26 @@ pub(crate) fn line(error: &(dyn StdError + 'static)) -> String {
     line
 }
 
-/// What a call without an answer is in Python.
+/// What a call without an answer is in Python: with the code and the reason of whoever refused as `code` and `reason`.
 pub(crate) fn of_call(error: &CallError) -> PyErr {
+    let raised = by_code(error);
+    let code = error.code().map(|code| format!("{code:?}")).unwrap_or_default();
+    // `NotFound` → `NOT_FOUND`, as the protocol has it.
+    let mut said = String::new();
+    for (index, character) in code.char_indices() {
+        said.extend((index > 0 && character.is_uppercase()).then_some('_'));
+        said.extend(character.to_uppercase());
+    }
+    Python::attach(|py| {
+        let value = raised.value(py);
+        // An exception takes any attribute.
+        let _ = value.setattr("code", said);
+        let _ = value.setattr("reason", error.reason());
+    });
+    raised
+}
+
+fn by_code(error: &CallError) -> PyErr {
     let message = line(error);
     // The names of gRPC's codes; the crate that has them is not among those that are used here.
     let code = error.code().map(|code| format!("{code:?}")).unwrap_or_default();
@@ -72,6 +98,9 @@ pub(crate) fn of_call(error: &CallError) -> PyErr {
         (_, "PermissionDenied") => PermissionDenied::new_err(message),
         (_, "ResourceExhausted") => ResourceExhausted::new_err(message),
         (_, "DeadlineExceeded") => DeadlineExceeded::new_err(message),
+        (_, "OutOfRange") => OutOfRange::new_err(message),
+        (_, "Unauthenticated") => Unauthenticated::new_err(message),
+        (_, "Unimplemented") => Unimplemented::new_err(message),
         (_, "Unavailable") => Unavailable::new_err(message),
         _ => Refused::new_err(message),
     }

@@ -78,6 +78,12 @@ impl Goal {
         py.detach(|| self.runtime.block_on(slept)).map_err(of_failure)
     }
 
+    /// Waits while a hold is in force at the driver, or the goal is suspended; raises `ratn.Cancelled` as soon as the goal shall stop. What
+    /// moves something calls it between two steps.
+    fn while_held(&self, py: Python<'_>) -> PyResult<()> {
+        py.detach(|| self.runtime.block_on(self.context.while_held())).map_err(of_failure)
+    }
+
     /// The facts of the goal's world that match any of the patterns: `goal.facts("at(?)", "on(?, table)")`.
     #[pyo3(signature = (*patterns))]
     fn facts(&self, py: Python<'_>, patterns: Vec<String>) -> PyResult<Vec<Fact>> {

@@ -7,6 +7,8 @@
 mod client;
 mod error;
 mod goal;
+mod log;
+mod task;
 mod value;
 mod worker;
 
@@ -23,7 +25,12 @@ fn _ratn(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<client::Client>()?;
     module.add_class::<client::Lease>()?;
     module.add_class::<client::WorldWatch>()?;
+    module.add_class::<client::Projected>()?;
+    module.add_class::<log::Log>()?;
     module.add_function(wrap_pyfunction!(worker::serve, module)?)?;
-    module.add_function(wrap_pyfunction!(value::as_written, module)?)?;
+    module.add_function(wrap_pyfunction!(task::read_yaml, module)?)?;
+    module.add_function(wrap_pyfunction!(task::check_task, module)?)?;
+    module.add_function(wrap_pyfunction!(task::catalogue, module)?)?;
+    module.add_function(wrap_pyfunction!(task::functions, module)?)?;
     error::add_to(py, module)
 }

@@ -86,6 +86,7 @@ impl Pose {
         Pose(self.0.compose(&other.0))
     }
 
+    /// The pose of the reference, as seen from this one.
     fn inverse(&self) -> Pose {
         Pose(self.0.inverse())
     }
@@ -134,6 +135,18 @@ impl Joints {
     /// As a list of floats.
     fn tolist(&self) -> Vec<f64> {
         self.0.clone()
+    }
+
+    /// What numpy makes an array of without a copy, which cannot be written to: the array keeps this alive, and nothing moves it.
+    #[getter]
+    fn __array_interface__<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let order = if cfg!(target_endian = "little") { "<" } else { ">" };
+        let told = PyDict::new(py);
+        told.set_item("version", 3)?;
+        told.set_item("shape", (self.0.len(),))?;
+        told.set_item("typestr", format!("{order}f8"))?;
+        told.set_item("data", (self.0.as_ptr() as usize, true))?;
+        Ok(told)
     }
 
     fn __eq__(&self, other: &Joints) -> bool {
@@ -260,12 +273,6 @@ impl Fact {
     fn __repr__(&self) -> String {
         format!("<Fact {} = {}>", self.0.key, self.0.value)
     }
-}
-
-/// A value as task files write it: `pose(1, 0, 0.7)`, `[1, 2]`.
-#[pyfunction]
-pub(crate) fn as_written(value: &Bound<'_, PyAny>) -> PyResult<String> {
-    Ok(from_python(value)?.to_string())
 }
 
 /// A value as Python has it.

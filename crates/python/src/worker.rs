@@ -12,7 +12,9 @@ use ratn_proto::types::GoalOutcome;
 use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, Signature};
 use ratn_worker::arguments::Arguments;
 use ratn_worker::prelude::async_trait;
+use ratn_worker::safety::{Brakes, Safety, SafetyState};
 use ratn_worker::worker::WorkerError;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::runtime::{Builder, Handle};
@@ -37,12 +39,26 @@ pub(crate) struct Described {
     senses: Vec<String>,
     requires: Vec<String>,
     effects: Vec<String>,
+    /// It stands still while its goal is suspended.
+    suspends: bool,
     /// Called with the goal and its inputs as a dict; gives an outcome, its outputs as a dict and a reason.
     perform: Py<PyAny>,
 }
 
+/// What a driver says beside its actions.
+#[derive(FromPyObject)]
+pub(crate) struct Driven {
+    /// Called with `ready`, `held` or `stopped`, and why.
+    brakes: Py<PyAny>,
+    /// Where a stop is kept.
+    stop_file: Option<PathBuf>,
+    /// Within which everything stands still after a lease has ended.
+    standstill_s: Option<f64>,
+}
+
 /// Serves until a signal or the parent's end says otherwise. `arguments` are those of the process, as a template passes them.
 #[pyfunction]
+#[pyo3(signature = (arguments, provider, kind, actions, without_leases, driven=None))]
 pub(crate) fn serve(
     py: Python<'_>,
     arguments: Vec<String>,
@@ -50,6 +66,7 @@ pub(crate) fn serve(
     kind: &str,
     actions: Vec<Described>,
     without_leases: bool,
+    driven: Option<Driven>,
 ) -> PyResult<()> {
     let pooled = std::env::var_os("RATN_PROVIDER_SESSION").is_some_and(|session| !session.is_empty());
     let arguments = Arguments::of(arguments, pooled).and_then(Arguments::worker);
@@ -63,17 +80,66 @@ pub(crate) fn serve(
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
     // Where a program has one already, that one is told.
     let _ = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(false).try_init();
+    let standstill = driven.as_ref().and_then(|driven| driven.standstill_s);
+    if let Some(seconds) = standstill {
+        let bound = Duration::try_from_secs_f64(seconds);
+        let bound = bound.map_err(|_| PyValueError::new_err(format!("standstill_s: {seconds} is no time to wait")))?;
+        worker = worker.standstill(bound);
+    }
     let ended = py.detach(|| {
         let runtime = Builder::new_multi_thread().worker_threads(2).enable_all().build();
         let runtime = runtime.map_err(|source| WorkerError::System { what: "start its runtime".to_owned(), source })?;
-        let ended = runtime.block_on(worker.run());
+        let ended = runtime.block_on(async {
+            let worker = match driven {
+                Some(driven) => worker.safety(driven.safety().await?),
+                None => worker,
+            };
+            worker.run().await
+        });
         runtime.shutdown_timeout(LAST_THREADS);
         ended
     });
     ended.map_err(|error| Error::new_err(line(&error)))
 }
 
+impl Driven {
+    async fn safety(self) -> Result<Safety, WorkerError> {
+        let brakes = PythonBrakes { apply: Arc::new(self.brakes) };
+        let Some(file) = self.stop_file else { return Ok(Safety::new(brakes)) };
+        let what = format!("keep a stop in {}", file.display());
+        Safety::kept_in(file, brakes).await.map_err(|source| WorkerError::System { what, source })
+    }
+}
+
+/// Brakes that are a Python function. A stop does not wait for an earlier call: it is made in another thread then.
+struct PythonBrakes {
+    apply: Arc<Py<PyAny>>,
+}
+
+#[async_trait]
+impl Brakes for PythonBrakes {
+    async fn apply(&self, state: &SafetyState) -> Result<(), String> {
+        let (word, reason) = match state {
+            SafetyState::Ready => ("ready", String::new()),
+            SafetyState::Held { reason } => ("held", reason.clone()),
+            SafetyState::Stopped { reason } => ("stopped", reason.clone()),
+        };
+        let apply = Arc::clone(&self.apply);
+        let called = move || {
+            Python::attach(|py| {
+                let failed = |error: PyErr| {
+                    error.print(py);
+                    format!("the brakes raised {error}")
+                };
+                apply.call1(py, (word, reason)).map(drop).map_err(failed)
+            })
+        };
+        tokio::task::spawn_blocking(called).await.unwrap_or_else(|error| Err(line(&error)))
+    }
+}
+
 struct PythonAction {
+    suspends: bool,
     name: String,
     description: String,
     signature: Signature,
@@ -109,7 +175,7 @@ impl PythonAction {
         signature = described.senses.iter().fold(signature, |signature, pattern| signature.senses(pattern));
         signature = described.requires.iter().fold(signature, |signature, condition| signature.requires(condition));
         signature = described.effects.iter().fold(signature, |signature, effect| signature.effect(effect));
-        Ok(PythonAction { name, description, signature, perform: Arc::new(perform) })
+        Ok(PythonAction { suspends: described.suspends, name, description, signature, perform: Arc::new(perform) })
     }
 }
 
@@ -125,6 +191,10 @@ impl Action for PythonAction {
 
     fn signature(&self) -> Option<Signature> {
         Some(self.signature.clone())
+    }
+
+    fn can_be_suspended(&self) -> bool {
+        self.suspends
     }
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {

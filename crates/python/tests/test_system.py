@@ -79,8 +79,9 @@ def test_a_resource_is_held_for_a_block_and_nobody_else_gets_it(system: ratn.Sys
     with system.acquire("Camera", holder="a test") as lease:
         assert lease.alive and [kind for _, kind, _ in lease.resources] == ["Camera"]
         assert [resource["held"] for resource in system.resources("Camera")] == [True]
-        with pytest.raises(ratn.DeadlineExceeded):
+        with pytest.raises(ratn.DeadlineExceeded) as late:
             system.acquire("Camera", timeout_s=0.2)
+        assert late.value.code == "DEADLINE_EXCEEDED" and "Camera" in str(late.value)
     assert [resource["held"] for resource in system.resources("Camera")] == [False]
     assert lease.release() is False
 
@@ -109,12 +110,28 @@ def test_the_world_is_read_written_and_watched(system: ratn.System) -> None:
     assert next(watch)["gone"] == ["at(probe)"] and system.query("at(probe)") == []
 
 
+def test_a_projection_is_a_world_that_nobody_else_sees(system: ratn.System) -> None:
+    system.set("at(probe)", ratn.Pose(1, 2, 3))
+    with system.project({"at(probe)": ratn.Pose(4, 5, 6), "at(other)": ratn.Pose(), "on(probe, table)": None}, timeout_s=10) as world:
+        assert [fact.value for fact in world.query("at(probe)")] == [ratn.Pose(4, 5, 6)]
+        assert len(world.query("at(other)")) == 1 and {fact.predicate for fact in world.query()} >= {"at"}
+        assert system.query("at(other)") == [] and system.query("at(probe)")[0].value == ratn.Pose(1, 2, 3)
+        assert world.base > 0
+    with pytest.raises(ratn.NotFound):
+        world.query("at(probe)")
+    # The room is given back.
+    assert not any(resource["held"] for resource in system.resources("WorldModel"))
+    with pytest.raises(ValueError, match="expected `predicate"):
+        system.project({"at probe": None})
+    system.set("at(probe)", None)
+
+
 def test_errors_have_the_names_of_the_codes_and_say_what_to_do(system: ratn.System, tmp_path: pathlib.Path) -> None:
     with pytest.raises(ValueError, match="expected `predicate"):
         system.query("at box")
     with pytest.raises(ratn.Refused) as refused:
         system.set("on(a)", ratn.Trajectory([], []) if False else float("nan"))
-    assert isinstance(refused.value, ratn.Error)
+    assert isinstance(refused.value, ratn.InvalidArgument) and refused.value.code == "INVALID_ARGUMENT"
     with pytest.raises(ratn.Unavailable, match="ratn up"):
         from ratn import _ratn
 

@@ -182,3 +182,18 @@ def test_a_pose_is_a_pose() -> None:
     with pytest.raises(ValueError, match="not both"):
         ratn.Pose(roll=1, quaternion=(0, 0, 0, 1))
     assert list(ratn.Joints([1, 2.5])) == [1.0, 2.5] and ratn.Joints([1])[-1] == 1
+
+
+def test_joints_are_an_array_without_a_copy() -> None:
+    import gc
+
+    numpy = pytest.importorskip("numpy")
+    joints = ratn.Joints([0.5, -1.0, 2.0])
+    array = numpy.asarray(joints)
+    assert array.dtype == float and array.tolist() == [0.5, -1.0, 2.0]
+    assert array.ctypes.data == joints.__array_interface__["data"][0] and not array.flags.writeable
+    # The array keeps what it is a view of.
+    del joints
+    gc.collect()
+    assert array.sum() == 1.5
+    assert numpy.asarray(ratn.Joints([])).shape == (0,)

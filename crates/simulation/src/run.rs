@@ -34,6 +34,12 @@ const GLANCE_PART: usize = 10;
 pub trait Oracle {
     /// How a goal goes. `world` is its projection, or the actual world where it has none.
     fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, world: &World) -> Performance;
+
+    /// What comes of a state that waits, and so many virtual seconds later; nothing unless said.
+    fn awaited(&mut self, path: &str, instance: InstanceId) -> Option<(f64, Event)> {
+        let _ = (path, instance);
+        None
+    }
 }
 
 /// How a goal goes.
@@ -243,6 +249,7 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
     let mut executive = Executive::new(setup.program.clone(), setup.tolerance);
     let mut lookout = Lookout::default();
     let mut memory = Memory::default();
+    simulation.send_before(&mut executive)?;
     simulation.at(
         Duration::ZERO,
         Event::Started {
@@ -332,6 +339,21 @@ impl Simulation<'_> {
     fn at(&mut self, delay: Duration, event: Event) {
         self.next_entry += 1;
         self.agenda.insert((self.now + delay, self.next_entry), Entry::Event(event));
+    }
+
+    /// What comes before the run begins: the executive keeps it, and has nothing to say to it.
+    fn send_before(&mut self, executive: &mut Executive) -> Result<(), RunError> {
+        let events = std::mem::take(&mut self.circumstances.events);
+        let (before, later): (Vec<_>, Vec<_>) =
+            events.into_iter().partition(|(trigger, _)| *trigger == Trigger::Before);
+        self.circumstances.events = later;
+        for (_, event) in before {
+            self.log.push(LogLine { at: self.now, entry: LogEntry::Event(event.clone()) });
+            if let Some(command) = executive.handle(self.now, event).first() {
+                return Err(self.broken(format!("{command:?} before the run has begun")));
+            }
+        }
+        Ok(())
     }
 
     /// A message about an attempt, which may come late or twice.
@@ -436,6 +458,12 @@ impl Simulation<'_> {
         match command {
             Command::Note(ratn_executive::protocol::Note::Expanded { instance, path, .. }) => {
                 self.paths.insert(instance, path);
+            }
+            Command::Note(ratn_executive::protocol::Note::Awaiting { instance, .. }) => {
+                let path = self.paths.get(&instance).cloned().unwrap_or_default();
+                if let Some((after_s, event)) = self.oracle.awaited(&path, instance) {
+                    self.at(Duration::from_secs_f64(after_s.max(0.0)), event);
+                }
             }
             Command::Note(_) => {}
             Command::Acquire { instance, .. } if self.is_refused(instance) => {

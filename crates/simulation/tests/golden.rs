@@ -93,6 +93,10 @@ fn transcript(run: &Run, script: &Script) -> String {
                     Some(("invalidate", format!("{} ({reason})", path(instance))))
                 }
                 Note::Preempted { instance, by } => Some(("preempt", format!("{} for {}", path(instance), path(by)))),
+                Note::Awaiting { instance, awaited, until } => {
+                    let until = until.map_or_else(String::new, |until| format!(", until {}", until.seconds()));
+                    Some(("wait", format!("{} for {awaited}{until}", path(instance))))
+                }
                 Note::Running { .. } | Note::Finished { .. } => None,
             },
             LogEntry::Command(Command::Start { instance, goal, .. }) => {
@@ -113,6 +117,8 @@ fn transcript(run: &Run, script: &Script) -> String {
                 Event::Finished { instance, outcome, .. } if outcome == "success" => Some(("end", path(instance))),
                 Event::Finished { instance, outcome, .. } => Some(("end", format!("{} by {outcome}", path(instance)))),
                 Event::Crashed { instance, .. } => Some(("crash", path(instance))),
+                Event::Signalled { signal, value } => Some(("signal", format!("{signal} = {value}"))),
+                Event::Answered { instance, choice } => Some(("answer", format!("{}: {choice}", path(instance)))),
                 Event::PauseRequested => Some(("pause", String::new())),
                 Event::ResumeRequested => Some(("resume", String::new())),
                 Event::StepRequested => Some(("step", String::new())),
@@ -221,6 +227,17 @@ fn every_scenario_goes_the_same_from_checkpoints() {
         }
     }
     assert!(different.is_empty(), "{} runs differ:\n{}", different.len(), different.join("\n"));
+}
+
+#[test]
+fn a_loop_of_waits_that_are_over_at_once_goes_in_circles() {
+    let task = "task: t\nworld: [open(door)]\nstates:\n  - again:\n      while: open(door)\n      do:\n        - nothing: { wait: \
+                { seconds: 0 } }\n        - open: { wait: { for: open(door) } }\n";
+    let program = load(task, "task.yaml", &NoFiles);
+    for mode in [Mode::Hsm, Mode::Cdtn] {
+        let run = Script::default().run(&program, mode).unwrap();
+        assert!(run.outcome == "aborted" && run.reason.contains("goes in circles"), "{mode:?}: {}", run.reason);
+    }
 }
 
 #[test]

@@ -1,9 +1,11 @@
 //! A run's ear: a Unix socket in the runtime directory of its system, over which `ratn control` pauses it, lets it go on, lets
-//! one PIA begin, or ends it, and `ratn status` asks what it is doing. One word per line; each is answered by one line.
+//! one PIA begin, or ends it, `ratn status` asks what it is doing, `ratn signal` and `ratn answer` send it what its states wait for. One
+//! word or [`Message`] (in JSON) per line; each is answered by one line.
 
 use super::progress::UnderWay;
 use crate::messages::Messages;
-use ratn_executive::protocol::{Event, Mode};
+use ratn_executive::protocol::{Awaited, Event, Mode};
+use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
 use std::io::{Error, ErrorKind};
 use std::path::{Path, PathBuf};
@@ -19,6 +21,8 @@ const SOCKET: &str = "run.control";
 const MAX_PENDING: usize = 16;
 /// Longer lines are no words of control.
 const MAX_LINE_BYTES: u64 = 64;
+/// Longer lines are no messages.
+const MAX_MESSAGE_BYTES: u64 = 64 << 10;
 /// A run that does not answer for so long does not listen.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
 const DONE: &str = "ok";
@@ -49,7 +53,50 @@ pub struct RunStatus {
     /// What the states wait for that have not begun, a sentence each; none in HSM mode. As many as are said at most.
     #[serde(default)]
     pub waits: Vec<String>,
+    /// The states that wait by themselves, and for what.
+    #[serde(default)]
+    pub awaits: Vec<Awaiting>,
 }
+
+/// A state that waits for a time, a condition, a signal or an answer.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Awaiting {
+    /// Its path with visits.
+    pub path: String,
+    /// What it waits for.
+    #[serde(flatten)]
+    pub awaited: Awaited,
+    /// Until then at the most, in the robot's seconds since the run began.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub until_s: Option<f64>,
+}
+
+/// What the states of a run wait for, from somebody else.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "message", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Message {
+    /// A signal. It ends the wait of one state: of one that waits for a signal of this name, else of the next that will.
+    Signal {
+        /// The run: its id, the name of its task, or [`ANY_RUN`].
+        run: String,
+        /// The signal's name.
+        signal: String,
+        /// What is sent with it.
+        value: Value,
+    },
+    /// An answer.
+    Answer {
+        /// The run: its id, the name of its task, or [`ANY_RUN`].
+        run: String,
+        /// The path of the state that asks, with or without visits; needed where several do.
+        state: Option<String>,
+        /// One of its choices.
+        choice: String,
+    },
+}
+
+/// Whichever run is under way.
+pub const ANY_RUN: &str = "-";
 
 impl RunStatus {
     /// More sentences are not said.
@@ -63,6 +110,8 @@ pub(crate) enum Asked {
     Told(Box<Event>),
     /// It shall say what it is doing.
     Status(oneshot::Sender<RunStatus>),
+    /// Something that its states wait for, or may. It says what becomes of it once that is in its log, or why nothing does.
+    Message(Message, oneshot::Sender<Result<String, String>>),
 }
 
 /// What a run can be told.
@@ -163,7 +212,12 @@ async fn accept(listener: UnixListener, tell: mpsc::Sender<Asked>) {
 async fn hear(mut stream: UnixStream, tell: &mpsc::Sender<Asked>) -> std::io::Result<()> {
     let (reader, mut writer) = stream.split();
     let mut line = String::new();
-    BufReader::new(reader.take(MAX_LINE_BYTES)).read_line(&mut line).await?;
+    let mut lines = BufReader::new(reader.take(MAX_LINE_BYTES));
+    lines.read_line(&mut line).await?;
+    if line.starts_with('{') && !line.ends_with('\n') {
+        lines.get_mut().set_limit(MAX_MESSAGE_BYTES - MAX_LINE_BYTES);
+        lines.read_line(&mut line).await?;
+    }
     const BEHIND: &str = "the run is too far behind";
     let word = Word::ALL.into_iter().find(|word| word.text() == line.trim());
     let answer = match word {
@@ -176,6 +230,19 @@ async fn hear(mut stream: UnixStream, tell: &mpsc::Sender<Asked>) -> std::io::Re
                 Err(_) => BEHIND.to_owned(),
             }
         }
+        None if line.starts_with('{') => match serde_json::from_str(&line) {
+            Ok(message) => {
+                let (say, said) = oneshot::channel();
+                match tell.try_send(Asked::Message(message, say)) {
+                    Ok(()) => match said.await.map_err(Error::other)? {
+                        Ok(said) => format!("{DONE} {}", one_line(&said)),
+                        Err(why) => one_line(&why),
+                    },
+                    Err(_) => BEHIND.to_owned(),
+                }
+            }
+            Err(error) => format!("that is no message of at most {MAX_MESSAGE_BYTES} bytes: {error}"),
+        },
         None => "expected pause, resume, step, abort or status".to_owned(),
     };
     writer.write_all(format!("{answer}\n").as_bytes()).await
@@ -189,6 +256,27 @@ pub async fn tell(directory: &Path, word: Word) -> std::io::Result<()> {
     match ask(directory, word.text(), MAX_LINE_BYTES).await?.as_str() {
         DONE => Ok(()),
         other => Err(Error::other(other.to_owned())),
+    }
+}
+
+fn one_line(text: &str) -> String {
+    text.replace(['\n', '\r'], " ")
+}
+
+/// Sends the run of the system in `directory` something that its states wait for, or may; what becomes of it. It is in the run's log,
+/// on the disk, when this returns. Where it fails on the way, the run may have got it all the same.
+///
+/// # Errors
+/// Where no run listens, or it does not take that.
+pub async fn send(directory: &Path, message: &Message) -> std::io::Result<String> {
+    let line = serde_json::to_string(message)?;
+    if line.len() as u64 >= MAX_MESSAGE_BYTES {
+        return Err(Error::new(ErrorKind::InvalidInput, format!("it has more than {MAX_MESSAGE_BYTES} bytes")));
+    }
+    let answer = ask(directory, &line, MAX_MESSAGE_BYTES).await?;
+    match answer.strip_prefix(DONE) {
+        Some(said) => Ok(said.trim().to_owned()),
+        None => Err(Error::other(answer)),
     }
 }
 
@@ -258,8 +346,18 @@ mod tests {
             at_s: 3.5,
             paused: true,
             ended: 2,
-            under_way: vec![UnderWay { path: "place[2]/plan".to_owned(), for_s: 1.5 }],
+            under_way: vec![UnderWay {
+                path: "place[2]/plan".to_owned(),
+                for_s: 1.5,
+                usually_s: Some(4.0),
+                message: "2 of 5 ways".to_owned(),
+            }],
             waits: vec!["move waits for an output of place[2]/plan".to_owned()],
+            awaits: vec![Awaiting {
+                path: "wait_for_lid".to_owned(),
+                awaited: Awaited::Signal { signal: "lid".to_owned() },
+                until_s: Some(20.0),
+            }],
         };
         let said = doing.clone();
         let answering = tokio::spawn(async move {
@@ -272,6 +370,31 @@ mod tests {
         // The socket of a run that was killed.
         std::fs::write(place.path().join(SOCKET), "")?;
         assert_eq!(status(place.path()).await?, None);
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn a_message_is_answered_with_what_became_of_it() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        let mut control = Control::listen(place.path())?;
+        let signal = |name: &str, value| Message::Signal { run: ANY_RUN.to_owned(), signal: name.to_owned(), value };
+        let long = signal("go", Value::String("x".repeat(10_000)));
+        let expected = long.clone();
+        let answering = tokio::spawn(async move {
+            let mut said = vec![Ok("it goes\non".to_owned()), Err("no state waits for that".to_owned())].into_iter();
+            while let Some(said) = said.next() {
+                let Asked::Message(message, say) = control.asked().await else { break };
+                assert!(said.is_err() || message == expected);
+                let _ = say.send(said);
+            }
+            control
+        });
+        assert_eq!(send(place.path(), &long).await?, "it goes on");
+        let refused = send(place.path(), &signal("stop", Value::Null)).await;
+        assert_eq!(refused.map_err(|error| error.to_string()), Err("no state waits for that".to_owned()));
+        let huge = send(place.path(), &signal("go", Value::String("x".repeat(70_000)))).await;
+        assert!(huge.is_err_and(|error| error.kind() == ErrorKind::InvalidInput));
+        drop(answering.await?);
         Ok(())
     }
 

@@ -109,7 +109,7 @@ mod tests {
         fn commits(&mut self, (id, changes): (String, Vec<Change>)) -> Vec<String> {
             let written = self.pool.written_by(None, &changes).unwrap_or_default();
             let revision = self.pool.write(&written);
-            let mut change = WorldChange { revision, commit: id, written: Vec::new(), gone: Vec::new() };
+            let mut change = WorldChange { revision, commit: id, written: Vec::new(), gone: Vec::new(), writer: None };
             for (key, fact) in &written {
                 match fact {
                     Some(fact) => change.written.push(FactRecord {

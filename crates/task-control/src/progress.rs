@@ -1,9 +1,11 @@
 //! What a run is doing, one line per node that starts or ends, for whoever reads them.
 
-use ratn_executive::protocol::{Command, Event, Note};
+use crate::control::Awaiting;
+use ratn_executive::protocol::{Awaited, Command, Event, Note};
 use ratn_model::id::InstanceId;
 use ratn_model::program::{SUCCESS, WORLD_MODEL};
 use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 
@@ -20,10 +22,15 @@ pub(crate) struct Progress {
     /// Those that have left it, the oldest first.
     gone: VecDeque<InstanceId>,
     started: BTreeMap<InstanceId, Timestamp>,
+    /// What states wait for, and until when at the most.
+    awaiting: BTreeMap<InstanceId, (Awaited, Option<Timestamp>)>,
     /// How many states have ended for good.
     retired: u64,
     /// Whether no PIA is to begin.
     paused: bool,
+    /// What those that are under way have said last of how far they are. Lost when task control is killed.
+    #[serde(skip)]
+    messages: BTreeMap<InstanceId, String>,
     #[serde(skip)]
     quiet: bool,
 }
@@ -35,6 +42,21 @@ pub struct UnderWay {
     pub path: String,
     /// Since when, in the robot's seconds.
     pub for_s: f64,
+    /// How long it usually takes, where its `duration` says so.
+    #[serde(default)]
+    pub usually_s: Option<f64>,
+    /// What it has said last of how far it is; empty where nothing.
+    #[serde(default)]
+    pub message: String,
+}
+
+impl UnderWay {
+    /// `for 1.5 s of about 4.0 s: planned 2 of 5`.
+    pub fn text(&self) -> String {
+        let usually = self.usually_s.map_or_else(String::new, |usually| format!(" of about {usually:.1} s"));
+        let message = if self.message.is_empty() { String::new() } else { format!(": {}", self.message) };
+        format!("for {:.1} s{usually}{message}", self.for_s)
+    }
 }
 
 impl Progress {
@@ -51,15 +73,16 @@ impl Progress {
         commands: impl Iterator<Item = &'a Command> + Clone,
     ) {
         if let Event::Finished { instance, .. } = event {
-            self.started.remove(instance);
+            self.ends(*instance);
         }
         self.hear(event);
+        self.await_things(commands.clone());
         for command in commands.clone() {
             match command {
                 Command::Note(Note::Expanded { instance, path, .. }) => {
                     self.paths.insert(*instance, path.clone());
                 }
-                Command::Note(Note::Invalidated { instance, .. }) => drop(self.started.remove(instance)),
+                Command::Note(Note::Invalidated { instance, .. }) => drop(self.ends(*instance)),
                 Command::Start { instance, .. } => drop(self.started.insert(*instance, at)),
                 _ => {}
             }
@@ -67,9 +90,41 @@ impl Progress {
         self.forget(commands);
     }
 
-    /// Whether PIAs may begin after an event.
+    /// What states begin and cease to wait for.
+    fn await_things<'a>(&mut self, commands: impl Iterator<Item = &'a Command>) {
+        for command in commands {
+            match command {
+                Command::Note(Note::Awaiting { instance, awaited, until }) => {
+                    self.awaiting.insert(*instance, (awaited.clone(), *until));
+                }
+                Command::Note(Note::Finished { instance, .. } | Note::Squashed { instance }) => {
+                    self.awaiting.remove(instance);
+                }
+                _ => {}
+            }
+        }
+    }
+
+    /// The instances that wait by themselves, and for what.
+    pub(crate) fn awaiting(&self) -> impl Iterator<Item = (InstanceId, Awaiting)> + '_ {
+        self.awaiting.iter().map(|(id, (awaited, until))| {
+            let until_s = until.map(Timestamp::seconds);
+            (*id, Awaiting { path: self.path(*id), awaited: awaited.clone(), until_s })
+        })
+    }
+
+    /// It is not under way any more; since when it was.
+    fn ends(&mut self, instance: InstanceId) -> Option<Timestamp> {
+        self.messages.remove(&instance);
+        self.started.remove(&instance)
+    }
+
+    /// Whether PIAs may begin after an event, and how far the one is that it tells of.
     fn hear(&mut self, event: &Event) {
         match event {
+            Event::Progressed { instance, message, .. } if self.started.contains_key(instance) => {
+                self.messages.insert(*instance, message.clone());
+            }
             Event::PauseRequested | Event::StepRequested => self.paused = true,
             Event::ResumeRequested => self.paused = false,
             _ => {}
@@ -86,11 +141,17 @@ impl Progress {
         self.retired
     }
 
-    /// The states that are under way, those that began first first.
-    pub(crate) fn under_way(&self, now: Timestamp) -> Vec<UnderWay> {
+    /// The states that are under way, those that began first first; `usually_s` is how long an instance usually takes.
+    pub(crate) fn under_way(&self, now: Timestamp, usually_s: impl Fn(InstanceId) -> Option<f64>) -> Vec<UnderWay> {
         let mut all: Vec<(Timestamp, InstanceId)> = self.started.iter().map(|(id, at)| (*at, *id)).collect();
         all.sort_unstable();
-        all.into_iter().map(|(at, id)| UnderWay { path: self.path(id), for_s: now.since(at).as_secs_f64() }).collect()
+        let one = |(at, id): (Timestamp, InstanceId)| UnderWay {
+            path: self.path(id),
+            for_s: now.since(at).as_secs_f64(),
+            usually_s: usually_s(id),
+            message: self.messages.get(&id).cloned().unwrap_or_default(),
+        };
+        all.into_iter().map(one).collect()
     }
 
     /// The paths of the instances that are known.
@@ -102,7 +163,7 @@ impl Progress {
     fn forget<'a>(&mut self, commands: impl Iterator<Item = &'a Command>) {
         for command in commands {
             if let Command::Note(Note::Retired { instance } | Note::Squashed { instance }) = command {
-                self.started.remove(instance);
+                self.ends(*instance);
                 self.retired += u64::from(matches!(command, Command::Note(Note::Retired { .. })));
                 self.gone.push_back(*instance);
                 if self.gone.len() > MOST_GONE
@@ -122,10 +183,12 @@ impl Progress {
             return lines;
         }
         self.hear(event);
+        let waited: Vec<InstanceId> = self.awaiting.keys().copied().collect();
+        self.await_things(commands.iter());
         match event {
             Event::Finished { instance, outcome, reason, .. } => {
                 let path = self.path(*instance);
-                let took = self.started.remove(instance).map_or(0.0, |s| at.since(s).as_secs_f64());
+                let took = self.ends(*instance).map_or(0.0, |s| at.since(s).as_secs_f64());
                 if outcome == SUCCESS {
                     say(&mut lines, at, &format!("done   {path}  {took:.1} s"));
                 } else {
@@ -155,6 +218,11 @@ impl Progress {
                 }
             }
             Event::Resumed => say(&mut lines, at, "task control goes on"),
+            Event::Signalled { signal, value: Value::Null } => say(&mut lines, at, &format!("signal {signal}")),
+            Event::Signalled { signal, value } => say(&mut lines, at, &format!("signal {signal} = {value}")),
+            Event::Answered { instance, choice } => {
+                say(&mut lines, at, &format!("answer {}: {choice}", self.path(*instance)));
+            }
             Event::PauseRequested => say(&mut lines, at, "pause"),
             Event::ResumeRequested => say(&mut lines, at, "resume"),
             Event::StepRequested => say(&mut lines, at, "step"),
@@ -170,25 +238,41 @@ impl Progress {
                 Command::Note(Note::Expanded { instance, path, .. }) => {
                     self.paths.insert(*instance, path.clone());
                 }
+                Command::Note(Note::Awaiting { instance, awaited, until }) => {
+                    self.started.insert(*instance, at);
+                    let until = until.map_or_else(String::new, |until| format!(", until {:.1} s", until.seconds()));
+                    let path = self.path(*instance);
+                    say(&mut lines, at, &format!("wait   {path}  for {awaited}{until}"));
+                    if let Awaited::Answer { choices, .. } = awaited
+                        && let Some(choice) = choices.first()
+                    {
+                        say(&mut lines, at, &format!("ask    answer with `ratn answer - {choice} --state {path}`"));
+                    }
+                }
+                Command::Note(Note::Finished { instance, outcome }) if waited.contains(instance) => {
+                    let took = self.started.remove(instance).map_or(0.0, |s| at.since(s).as_secs_f64());
+                    let how = if **outcome == *SUCCESS { "waited" } else { outcome };
+                    say(&mut lines, at, &format!("{how} {}  {took:.1} s", self.path(*instance)));
+                }
                 // What ended without its provider: a `requires` that does not hold, a timeout.
                 Command::Note(Note::Finished { instance, outcome })
                     if **outcome != *SUCCESS && !told(event, *instance) =>
                 {
                     let path = self.path(*instance);
-                    let took = self.started.remove(instance).map_or(0.0, |s| at.since(s).as_secs_f64());
+                    let took = self.ends(*instance).map_or(0.0, |s| at.since(s).as_secs_f64());
                     say(&mut lines, at, &format!("{outcome} {path}  {took:.1} s, not by its provider"));
                 }
                 Command::Note(Note::Decided { path, decision, .. }) => {
                     say(&mut lines, at, &format!("decide {path}: {decision}"))
                 }
                 Command::Note(Note::Invalidated { instance, reason }) => {
-                    self.started.remove(instance);
+                    self.ends(*instance);
                     say(&mut lines, at, &format!("again  {}: {reason}", self.path(*instance)));
                 }
                 Command::Note(Note::Reused { instance }) => {
                     say(&mut lines, at, &format!("reuse  {}", self.path(*instance)))
                 }
-                Command::Note(Note::Squashed { instance }) if self.started.remove(instance).is_some() => {
+                Command::Note(Note::Squashed { instance }) if self.ends(*instance).is_some() => {
                     say(&mut lines, at, &format!("squash {}", self.path(*instance)));
                 }
                 Command::Start { instance, attempt, goal } => {
@@ -230,4 +314,30 @@ fn told(event: &Event, instance: InstanceId) -> bool {
 
 fn say(lines: &mut Vec<String>, at: Timestamp, what: &str) {
     lines.push(format!("{:>8.1} s  {what}", at.seconds()));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_model::id::StateId;
+
+    #[test]
+    fn what_a_worker_has_said_is_shown_while_its_state_is_under_way() {
+        let instance = InstanceId(1);
+        let expanded = Note::Expanded { instance, state: StateId(1), path: "plan[1]".to_owned(), speculative: false };
+        let said = |message: &str| Event::Progressed { instance, attempt: 1, message: message.to_owned() };
+        let mut progress = Progress::new(true);
+        progress.follow(Timestamp(0), &said("too early"), &[Command::Note(expanded)]);
+        progress.started.insert(instance, Timestamp(0));
+        progress.follow(Timestamp(0), &said("1 of 2"), &[]);
+        progress.follow(Timestamp(0), &said("2 of 2"), &[]);
+        let text = |progress: &Progress| -> Vec<String> {
+            progress.under_way(Timestamp::from_seconds(1.5), |_| Some(3.0)).iter().map(UnderWay::text).collect()
+        };
+        assert_eq!(text(&progress), ["for 1.5 s of about 3.0 s: 2 of 2"]);
+        progress.follow(Timestamp(0), &Event::Woken, &[Command::Note(Note::Retired { instance })]);
+        assert_eq!(text(&progress), [""; 0]);
+        progress.started.insert(instance, Timestamp(0));
+        assert_eq!(text(&progress), ["for 1.5 s of about 3.0 s"], "what it said before is not said of it again");
+    }
 }

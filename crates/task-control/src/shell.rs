@@ -10,7 +10,7 @@ pub use resume::{Resumption, resume};
 use super::Endpoints;
 use super::advisor::{self, Advisor};
 use super::checkpoint::Checkpointer;
-use super::control::{Asked, Control, RunStatus};
+use super::control::{ANY_RUN, Asked, Control, Message, RunStatus};
 use super::ledger::Ledger;
 use super::messages::Messages;
 use super::performer::{self, Performer};
@@ -18,16 +18,20 @@ use super::progress::Progress;
 use super::replay::{self, VERSION};
 use crate::interrupt::Interrupt;
 use anyhow::{Context, bail};
-use ratn_event_log::LogWriter;
+use ratn_event_log::{LogWriter, without_visits};
+use ratn_executive::MOST_SIGNALS_KEPT;
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::Lookout;
-use ratn_executive::protocol::{Command, Event, Learned, Mode, Natures, Origin};
+use ratn_executive::protocol::{Awaited, Command, Event, Learned, Mode, Natures, Origin};
 use ratn_model::catalogue::Catalogue;
+use ratn_model::expression::scope::NothingKnown;
 use ratn_model::id::{InstanceId, StateId};
+use ratn_model::load::suggestion;
 use ratn_model::program::{Exceptions, Nature, Program, SUCCESS, State, StateKind};
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
+use ratn_model::wait::Wait;
 use ratn_worker::client::fresh_id;
 use ratn_worker::robot_clock::RobotClock;
 use ratn_worker::tls::ClientTls;
@@ -35,7 +39,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 
 /// Answers that the executive has not been given yet.
 pub(super) const MAX_PENDING_EVENTS: usize = 1024;
@@ -124,6 +128,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
         lookout: Lookout::default(),
         ask_at: None,
         look_at: Instant::now() + LOOK,
+        confirm: Vec::new(),
         performer,
         answers,
     };
@@ -179,6 +184,8 @@ struct Shell {
     ask_at: Option<Instant>,
     /// When what waits is looked at again.
     look_at: Instant,
+    /// Who is to be told that what was sent is in the log, and what becomes of it.
+    confirm: Vec<(oneshot::Sender<Result<String, String>>, String)>,
     performer: Performer,
     answers: mpsc::Receiver<performer::Answer>,
 }
@@ -233,8 +240,13 @@ impl Shell {
         let commands = self.executive.handle(now, event.clone());
         commands.iter().for_each(|command| replay::follow(&mut self.states, command));
         self.log.append(now, event, &commands)?;
-        if replay::must_be_durable(&self.program, &self.states, &commands) {
+        let is_sent = !self.confirm.is_empty();
+        if is_sent || replay::must_be_durable(&self.program, &self.states, &commands) {
             self.log.make_durable()?;
+        }
+        for (say, said) in self.confirm.drain(..) {
+            // Whoever sent it may have gone.
+            let _ = say.send(Ok(said));
         }
         if let Some(checkpointer) = &mut self.checkpointer {
             checkpointer.follow(now, event, &commands);
@@ -276,6 +288,13 @@ impl Shell {
         }
     }
 
+    /// How long a state usually takes, in the robot's seconds, where its file says it in a number.
+    fn usually_s(&self, instance: InstanceId) -> Option<f64> {
+        let state = self.program.state(*self.states.get(&instance)?);
+        let seconds = state.annotations.duration_s.as_ref()?.evaluate(&NothingKnown).ok()?.as_number()?;
+        (seconds.is_finite() && seconds > 0.0).then_some(seconds)
+    }
+
     /// What the run is doing, for whoever asks.
     fn status(&self) -> RunStatus {
         let now = self.clock.now();
@@ -287,9 +306,73 @@ impl Shell {
             at_s: now.seconds(),
             paused: self.progress.is_paused(),
             ended: self.progress.retired(),
-            under_way: self.progress.under_way(now),
+            under_way: self.progress.under_way(now, |instance| self.usually_s(instance)),
+            awaits: self.progress.awaiting().map(|(_, awaiting)| awaiting).collect(),
             waits: self.executive.explain().into_iter().take(RunStatus::MOST_WAITS).collect(),
         }
+    }
+
+    /// The event that a message is, and what becomes of it.
+    ///
+    /// # Errors
+    /// Why it is none for this run as it stands.
+    fn event_of(&self, message: Message) -> Result<(Event, String), String> {
+        let (Message::Signal { run, .. } | Message::Answer { run, .. }) = &message;
+        let (id, task) = (self.performer.run(), self.program.name.as_str());
+        if ![id, task, ANY_RUN].contains(&run.as_str()) {
+            return Err(format!("no run `{run}` is under way here, but {id} of the task {task}"));
+        }
+        match message {
+            Message::Signal { signal, value, .. } => self.signalled(signal, value),
+            Message::Answer { state, choice, .. } => self.answered(state.as_deref(), choice),
+        }
+    }
+
+    fn signalled(&self, signal: String, value: Value) -> Result<(Event, String), String> {
+        let waits = self.program.states.iter().filter_map(|state| match state.wait() {
+            Some(Wait::Signal(name)) => Some(name),
+            _ => None,
+        });
+        let known: Vec<&str> = waits.collect();
+        if !known.contains(&signal.as_str()) {
+            let help = suggestion(&signal, known.into_iter(), "", "it waits for no signal at all");
+            return Err(format!("no state of {} waits for a signal `{signal}`: {help}", self.program.name));
+        }
+        if self.executive.signals_kept() >= MOST_SIGNALS_KEPT {
+            return Err(format!(
+                "{MOST_SIGNALS_KEPT} signals are kept already for states that have yet to wait for them"
+            ));
+        }
+        let is_it = |awaited: &Awaited| matches!(awaited, Awaited::Signal { signal: name } if *name == signal);
+        let waiting = self.progress.awaiting().find(|(_, awaiting)| is_it(&awaiting.awaited));
+        let said = match waiting {
+            Some((_, awaiting)) => format!("{} has waited for it and goes on", awaiting.path),
+            None => format!("it is kept for the next state that waits for `{signal}`"),
+        };
+        Ok((Event::Signalled { signal, value }, said))
+    }
+
+    fn answered(&self, state: Option<&str>, choice: String) -> Result<(Event, String), String> {
+        let questions = self.progress.awaiting().filter_map(|(id, awaiting)| match awaiting.awaited {
+            Awaited::Answer { question, choices, .. } => Some((id, awaiting.path, question, choices)),
+            _ => None,
+        });
+        let open: Vec<_> = questions.collect();
+        let listed =
+            || open.iter().map(|(_, path, question, _)| format!("{path} ({question})")).collect::<Vec<_>>().join(", ");
+        let is_meant = |path: &str| state.is_none_or(|state| state == path || state == without_visits(path));
+        let meant: Vec<_> = open.iter().filter(|(_, path, ..)| is_meant(path)).collect();
+        let (instance, path, _, choices) = match meant.as_slice() {
+            [one] => one,
+            _ if open.is_empty() => return Err("no state asks anything now".to_owned()),
+            [] => return Err(format!("{} asks nothing now; these do: {}", state.unwrap_or_default(), listed())),
+            _ => return Err(format!("several states ask: say which by `--state`: {}", listed())),
+        };
+        if !choices.contains(&choice) {
+            return Err(format!("`{choice}` is no answer to {path}: there is {}", choices.join(", ")));
+        }
+        let said = format!("{path} is answered: {choice}");
+        Ok((Event::Answered { instance: *instance, choice }, said))
     }
 
     /// Whoever resumes this run begins here. Between two events all that was logged has been performed.
@@ -346,6 +429,16 @@ impl Shell {
                         let _ = say.send(self.status());
                         continue;
                     }
+                    Asked::Message(message, say) => match self.event_of(message) {
+                        Ok((event, said)) => {
+                            self.confirm.push((say, said));
+                            return Ok(event);
+                        }
+                        Err(why) => {
+                            let _ = say.send(Err(why));
+                            continue;
+                        }
+                    },
                 },
                 event = advised => return Ok(event),
                 () = to_ask => {

@@ -50,6 +50,8 @@ pub struct Features {
     pub lists: bool,
     /// States that are tried again, with something done before; something that is done on every way out.
     pub guards: bool,
+    /// States that wait: for a time, a condition, a signal, an answer.
+    pub waits: bool,
 }
 
 impl Features {
@@ -78,6 +80,7 @@ impl Features {
         weak: false,
         lists: false,
         guards: false,
+        waits: false,
     };
 
     /// Sequences, hierarchies, loops over lists, conditions, routines and actions alone.
@@ -105,6 +108,7 @@ impl Features {
         weak: false,
         lists: false,
         guards: false,
+        waits: false,
     };
 
     /// [`Features::ALL`], without those assumptions.
@@ -130,6 +134,9 @@ impl Features {
 
     /// [`Features::EVERYTHING`], with retries of composites and what is done on every way out.
     pub const GUARDS: Features = Features { guards: true, ..Features::EVERYTHING };
+
+    /// [`Features::GUARDS`], with states that wait.
+    pub const WAITS: Features = Features { waits: true, ..Features::GUARDS };
 
     /// Imprecise motions that fail, in programs that never look at the world: where a failure leads is then the same in both
     /// modes, whatever younger motions have done meanwhile.

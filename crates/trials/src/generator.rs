@@ -46,6 +46,7 @@ mod regions;
 mod supplies;
 pub(super) mod tolerance;
 mod variables;
+mod waits;
 
 /// No program has many more states.
 const MAX_STATES: usize = 26;

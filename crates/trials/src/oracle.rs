@@ -9,10 +9,10 @@
 use super::generator::tolerance::{OFF, TOLERANT};
 use super::{AGAIN, ARGUMENTS, FOUND, PREDICATES, is_preemptive, plain, state_of};
 use super::{Dice, Hash};
-use ratn_executive::protocol::Goal;
+use ratn_executive::protocol::{Event, Goal};
 use ratn_model::expression::{EffectExpr, Expr, FactExpr, Lookup, Scope};
 use ratn_model::fact::{FactKey, FactPattern, Footprint, Term};
-use ratn_model::id::StateId;
+use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, STOPPED, SUCCESS, State, StateKind};
 use ratn_model::value::Value;
 use ratn_simulation::run::{Answer, Oracle, Performance};
@@ -86,6 +86,10 @@ impl Oracle for HashOracle<'_> {
         let outputs = BTreeMap::from([("x".to_owned(), Value::Int(x)), ("list".to_owned(), Value::List(list))]);
         let measured = self.measured(&mut dice, state, goal, (&outcome, x));
         Performance { duration_s, answer: Answer::Finished { outcome, outputs, measured } }
+    }
+
+    fn awaited(&mut self, path: &str, instance: InstanceId) -> Option<(f64, Event)> {
+        self.comes(path, instance)
     }
 }
 

@@ -2,6 +2,7 @@
 //!
 //! A log is in the order of events, so what is checked of every start of a PIA in it holds at every moment of the run.
 
+use super::awaited::early_signals;
 use super::blind;
 use super::reference::{self, Fail, Given, ReferenceResult};
 use super::replay::replayed;
@@ -209,6 +210,7 @@ fn should_be(
         units: task_resources.map(|(kind, _, n)| ((*kind).to_owned(), Quantity::whole(*n).thousandths())).collect(),
         refused: refused(program, conditions),
         outside: outside.to_vec(),
+        signals: early_signals(program, conditions.seed),
         oracle: &mut oracle(program, conditions),
     })
 }
@@ -291,6 +293,8 @@ fn run_as(
         tolerance: Tolerance::EXACT,
         latency: Duration::from_secs_f64(conditions.latency_s),
     };
+    let early = early_signals(program, conditions.seed).into_iter();
+    outside.extend(early.map(|(signal, value)| (Trigger::Before, Event::Signalled { signal, value })));
     outside.append(&mut circumstances.events);
     circumstances.events = outside;
     run_under(setup, &mut oracle(program, conditions), circumstances)

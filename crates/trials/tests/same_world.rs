@@ -129,8 +129,11 @@ fn random_programs_leave_the_same_world_in_both_modes() {
         Ok("imprecise") => Features::IMPRECISE,
         Ok("lists") => Features::LISTS,
         Ok("guards") => Features::GUARDS,
+        Ok("waits") => Features::WAITS,
         Ok("all") | Err(_) => Features::ALL,
-        Ok(other) => panic!("RATN_FEATURES: basic, all, everything, lists, guards, weak or imprecise, not {other}"),
+        Ok(other) => {
+            panic!("RATN_FEATURES: basic, all, everything, lists, guards, waits, weak or imprecise, not {other}")
+        }
     };
     let by = match std::env::var("RATN_TRIAL").as_deref() {
         Ok("outside") => trial_from_outside,
@@ -167,6 +170,14 @@ fn random_programs_with_retries_of_composites_leave_the_same_world_in_both_modes
     none_fails(trial, FURTHER, 200, &Features::GUARDS);
     none_fails(trial_from_outside, FURTHER, 60, &Features::GUARDS);
     none_fails(trial_interrupted, FURTHER, 60, &Features::GUARDS);
+}
+
+/// What is waited for comes, or does not, by the path of the state: a condition that somebody else makes hold, signals before and
+/// while they are waited for, answers.
+#[test]
+fn random_programs_that_wait_leave_the_same_world_in_both_modes() {
+    none_fails(trial, FURTHER, 120, &Features::WAITS);
+    none_fails(trial_from_outside, FURTHER, 40, &Features::WAITS);
 }
 
 /// A pause asked for what a state around it blocks.

@@ -224,10 +224,11 @@ impl Worker {
         self
     }
 
-    /// Adds an action. Where the action names a resource of its own ([`Action::resource`]), its goals need a lease of that.
+    /// Adds an action. Where the action names resources of its own ([`Action::resource`], [`Action::resources`]), its goals need a lease of
+    /// one of those.
     #[must_use]
     pub fn action(mut self, action: impl Action) -> Worker {
-        self.resources.extend(action.resource().map(str::to_owned));
+        self.resources.extend(action.resources().into_iter().map(str::to_owned));
         self.actions = self.actions.action(action);
         self
     }

@@ -54,13 +54,17 @@ fn objects() -> Vec<SceneObject> {
 }
 
 async fn system() -> System {
+    system_of(Robot::aimm()).await
+}
+
+async fn system_of(robot: Robot) -> System {
     let temporary = tempfile::tempdir().unwrap();
     let directory = RuntimeDirectory::create(temporary.path()).unwrap();
     tokio::spawn(world_pool::run(WorldPoolConfig::default(), directory.clone(), CancellationToken::new()));
     let file = temporary.path().join("planner");
     let listen = Endpoint::Unix(temporary.path().join("planner.sock"));
     let options = WorkerOptions { listen, endpoint_file: Some(file.clone()), ..WorkerOptions::default() };
-    tokio::spawn(ratn_workers::path_planner::worker(options, Robot::aimm(), SPEED).without_leases().run());
+    tokio::spawn(ratn_workers::path_planner::worker(options, robot, SPEED).without_leases().run());
     let world_pool = directory.wait_for(world_pool::ROLE, DEADLINE).await.unwrap();
     let planner = wait_for_file(&file, "planner", DEADLINE).await.unwrap();
 
@@ -181,6 +185,23 @@ async fn what_cannot_be_planned_is_aborted_with_the_reason() {
 }
 
 #[tokio::test]
+async fn where_a_part_is_that_the_robot_does_not_have_is_refused_instead_of_ignored() {
+    let system = system_of(Robot::built_in("panda").unwrap()).await;
+    let home = Value::Joints(vec![0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]);
+    let goal = |id: &str, port: &str| {
+        let inputs = [("start", home.clone()), ("goal", home.clone()), (port, Value::Float(0.05))];
+        system.client.execute(&system.planner, system.goal(id, &inputs), |_, _| {})
+    };
+    for (id, port) in [("a", "pan"), ("b", "tilt")] {
+        let outcome = goal(id, port).await.unwrap();
+        let said = format!("input `{port}` is given, but the robot `panda` has no head that turns");
+        assert!(outcome.outcome == "aborted" && outcome.reason.contains(&said), "{outcome:?}");
+    }
+    let outcome = goal("c", "width_m").await.unwrap();
+    assert!(outcome.is_success(), "it has fingers: {}", outcome.reason);
+}
+
+#[tokio::test]
 async fn a_straight_part_goes_along_the_axes_that_the_goal_names() {
     let system = system().await;
     let direction = |xyz: &[f64]| Value::List(xyz.iter().map(|c| Value::Float(*c)).collect());
@@ -242,6 +263,36 @@ async fn a_straight_way_through_way_points_is_all_or_an_error_that_says_how_far(
         assert_eq!(outcome.outcome, "aborted", "{id}");
         assert!(outcome.reason.contains(reason), "{}", outcome.reason);
     }
+}
+
+#[tokio::test]
+async fn what_a_camera_saw_is_in_the_way_and_bytes_that_are_no_points_are_refused() {
+    let system = system().await;
+    // Points all around the tool at the start, 12 cm from it: nothing gets out.
+    let tool = Robot::aimm().tool_pose(&Configuration { arm: aimm::OBSERVATION, ..Robot::aimm().at_zero() });
+    let mut points = Vec::new();
+    for i in -9..=9 {
+        for j in 0..36 {
+            let (up, around) = (f64::from(i) * 10.0_f64.to_radians(), f64::from(j) * 10.0_f64.to_radians());
+            let point = [up.cos() * around.cos(), up.cos() * around.sin(), up.sin()].map(|c| c * 0.25);
+            points.push(std::array::from_fn::<f64, 3, _>(|k| tool.position[k] + point[k]));
+        }
+    }
+    let mut cloud = format!(
+        "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA ascii\n",
+        points.len()
+    );
+    for [x, y, z] in points {
+        cloud += &format!("{x} {y} {z}\n");
+    }
+    let more = [("cloud", Value::Bytes(cloud.into_bytes())), ("cloud_radius_m", Value::Float(0.03))];
+    let outcome = system.client.execute(&system.planner, system.grasp("caged", &more), |_, _| ()).await.unwrap();
+    assert!(!outcome.is_success() && outcome.reason.contains("what was seen"), "{}", outcome.reason);
+    let outcome = system.client.execute(&system.planner, system.grasp("free", &more[1..]), |_, _| ()).await.unwrap();
+    assert!(outcome.is_success(), "{}", outcome.reason);
+    let wrong = [("cloud", Value::Bytes(b"nonsense".to_vec()))];
+    let outcome = system.client.execute(&system.planner, system.grasp("wrong", &wrong), |_, _| ()).await.unwrap();
+    assert!(outcome.reason.starts_with("input `cloud`: "), "{}", outcome.reason);
 }
 
 #[tokio::test]

@@ -1,5 +1,6 @@
 //! What a module is doing, and where that has brought it at a moment.
 
+use super::arms::FIRST;
 use super::braking::Way;
 use super::motion::Tracking;
 use super::picture::Exposure;
@@ -21,10 +22,10 @@ pub struct Ticket(pub u64);
 pub enum Module {
     /// What everything else stands on.
     Base,
-    /// Its joints.
-    Arm,
-    /// The two fingers.
-    Gripper,
+    /// The joints of an arm, by the arm's number.
+    Arm(usize),
+    /// The two fingers of an arm, by the arm's number.
+    Gripper(usize),
     /// The camera's head.
     PanTilt,
     /// The camera.
@@ -52,27 +53,39 @@ pub(crate) enum Kind {
 }
 
 impl Module {
-    /// All of them.
-    pub const ALL: [Module; 5] = [Module::Base, Module::Arm, Module::Gripper, Module::PanTilt, Module::Camera];
+    /// Those of a robot with one arm and everything else.
+    pub const ALL: [Module; 5] =
+        [Module::Base, Module::Arm(FIRST), Module::Gripper(FIRST), Module::PanTilt, Module::Camera];
 
     /// Those that a robot has.
     pub fn of(robot: &Robot) -> Vec<Module> {
-        let has = |module: &Module| match module {
-            Module::Base => !robot.base_joints().is_empty(),
-            Module::Arm => true,
-            Module::Gripper => robot.finger().is_some(),
-            Module::PanTilt => !robot.head_joints().is_empty(),
-            Module::Camera => robot.camera_pose(&robot.at_zero()).is_some(),
-        };
-        Module::ALL.into_iter().filter(has).collect()
+        let arms = 0..robot.arm_names().count();
+        let grippers = arms.clone().filter(|arm| !robot.finger_links_of(*arm).is_empty());
+        let base = (!robot.base_joints().is_empty()).then_some(Module::Base);
+        let head = (!robot.head_joints().is_empty()).then_some(Module::PanTilt);
+        let camera = robot.camera_pose(&robot.at_zero()).map(|_| Module::Camera);
+        base.into_iter()
+            .chain(arms.map(Module::Arm))
+            .chain(grippers.map(Module::Gripper))
+            .chain(head)
+            .chain(camera)
+            .collect()
+    }
+
+    /// The number of the arm that it is, or whose gripper it is.
+    pub fn arm(self) -> Option<usize> {
+        match self {
+            Module::Arm(arm) | Module::Gripper(arm) => Some(arm),
+            Module::Base | Module::PanTilt | Module::Camera => None,
+        }
     }
 
     /// The kind of the resource that it is.
     pub fn kind(self) -> &'static str {
         match self {
             Module::Base => "Base",
-            Module::Arm => "Arm",
-            Module::Gripper => "Gripper",
+            Module::Arm(_) => "Arm",
+            Module::Gripper(_) => "Gripper",
             Module::PanTilt => "PanTilt",
             Module::Camera => "Camera",
         }
@@ -113,7 +126,7 @@ impl Activity {
     /// Where the arm is, if it moves the arm.
     pub(crate) fn arm(&self, now: Timestamp) -> Option<JointVector> {
         match &self.kind {
-            Kind::Follow(Way::Arm(motion)) => Some(motion.at(self.elapsed_s(now))),
+            Kind::Follow(Way::Arm(_, motion)) => Some(motion.at(self.elapsed_s(now))),
             _ => None,
         }
     }

@@ -1,11 +1,11 @@
-//! How what moves comes to rest, and sets out again: along its path, its own time slowed down, with each joint within its limits.
+//! How motions stop and go on again: along their path, by slowing down the time of the motion, with each joint within its limits.
 //!
-//! A motion is a course over a time τ of its own, which goes on as time does unless it is told to stop. Then its rate r = dτ/dt falls
-//! from 1 to 0, step by step, as fast as the joints allow: each is accelerated by q″r² + q′ṙ (Bobrow, Dubowsky and Gibson,
-//! "Time-optimal control of robotic manipulators along specified paths", IJRR 1985), and the most negative ṙ is taken with which none
-//! exceeds its limit. Where one of them slows down by itself as hard as it may, that is ṙ = 0, and there may always be one: so the rate
-//! falls by at least what `URGENT` of each limit does, and such a joint brakes by so much above its limit. To set out again the rate rises in the
-//! same way, and may wait. So nothing leaves the path that was checked. The jerk is not limited: the rate's slope steps.
+//! A motion is a function of a time τ of its own, which normally runs as fast as real time. To stop, its rate r = dτ/dt falls from 1 to 0,
+//! step by step, as fast as the joints allow. A joint is then accelerated by q″r² + q′ṙ (Bobrow, Dubowsky and Gibson, "Time-optimal control of
+//! robotic manipulators along specified paths", IJRR 1985); the most negative ṙ is taken with which no joint exceeds its limit. Where the motion
+//! itself decelerates a joint at its limit, that would be ṙ = 0, and on some motions there is always such a joint. So the rate falls at least as
+//! fast as the part `URGENT` of each limit allows, and such a joint exceeds its limit by that part. To go on, the rate rises in the same way. The
+//! robot never leaves the path that was checked. The jerk is not limited.
 //!
 //! A stop on request, a hold and a lost lease brake within the limits that motions are planned by. An emergency stop is of category 1
 //! (IEC 60204-1): the joints brake within [`EMERGENCY`] times those limits, then the brakes close. The fingers and the camera's head,
@@ -23,23 +23,23 @@ use std::time::Duration;
 
 /// How much harder than motions are planned an emergency stop brakes.
 pub const EMERGENCY: f64 = 2.0;
-/// The part of a limit that is made use of: the course is known at its steps only.
+/// The part of a limit that is used: between the steps of the course the accelerations are not known.
 const USED: f64 = 0.95;
-/// The part of a limit that braking takes at the least, whatever the course itself takes: with it what goes as fast and brakes as hard
-/// as it may stands after 2.3 times as long as it takes to brake from there alone.
+/// The part of a limit that braking uses at least, on top of what the motion itself uses. With it a joint that moves at its greatest speed and
+/// already decelerates at its limit stands after 2.3 times the time that braking alone takes.
 const URGENT: f64 = 0.2;
 /// The most steps that it takes to set out again: a minute.
 const MAX_STEPS: usize = 15_000;
 
-/// The time of what moves, which goes on as fast as time, or not at all, or changes between both.
+/// The time by which motions go on: as fast as real time, not at all, or on the way from one to the other.
 #[derive(Debug, Clone)]
 pub(super) struct MotionClock {
     pace: Pace,
-    /// The time of what moves when the pace began.
+    /// The time of motions when the pace began.
     from: Timestamp,
 }
 
-/// A motion that is coming to rest, whatever becomes of the time of what else moves.
+/// A motion that is coming to rest, independently of a hold of everything else.
 #[derive(Debug, Clone)]
 pub(super) struct Braking {
     pub(super) ticket: Ticket,
@@ -53,10 +53,19 @@ pub(super) struct Braking {
 /// What the robot follows.
 #[derive(Debug, Clone)]
 pub(super) enum Way {
-    /// With its arm.
-    Arm(Motion),
+    /// With the arm of this number.
+    Arm(usize, Motion),
     /// With its base.
     Base(Motion),
+}
+
+/// A motion that slows down, or sets out again.
+struct Along<'a> {
+    motion: &'a Motion,
+    /// How far it has come, in seconds of its own.
+    from_s: f64,
+    /// The greatest accelerations of its joints.
+    limits: JointVector,
 }
 
 /// How time goes on for what moves, from a moment on.
@@ -68,12 +77,12 @@ struct Pace {
 }
 
 impl MotionClock {
-    /// It goes on as time does.
+    /// A clock that goes on as fast as real time.
     pub(super) fn new(now: Timestamp) -> MotionClock {
         MotionClock { pace: Pace::at_once(now, 1.0), from: now }
     }
 
-    /// The time of what moves; `now` is not before the last change.
+    /// The time of motions at `now`, which is not before the last change.
     pub(super) fn motion_time(&self, now: Timestamp) -> Timestamp {
         let (settles, passed) = (self.pace.settles(), self.pace.whole());
         if now < settles {
@@ -82,7 +91,7 @@ impl MotionClock {
         if self.pace.then() > 0.0 { self.from + passed + now.since(settles) } else { self.from + passed }
     }
 
-    /// When the time of what moves will be that; `None`: never, unless it goes on.
+    /// When the time of motions will be that; `None` where it stands before.
     pub(super) fn real_time(&self, motion_time: Timestamp) -> Option<Timestamp> {
         let whole = self.from + self.pace.whole();
         if motion_time >= whole {
@@ -92,17 +101,17 @@ impl MotionClock {
         Some(self.pace.when(motion_time.since(self.from).as_secs_f64()))
     }
 
-    /// Whether nothing moves in this time any more.
+    /// Whether this time stands.
     pub(super) fn stands(&self, now: Timestamp) -> bool {
         self.pace.then() == 0.0 && now >= self.pace.settles()
     }
 
-    /// When it will stand, where it is to.
+    /// When it will stand, where it is told to.
     pub(super) fn comes_to_stand(&self) -> Option<Timestamp> {
         (self.pace.then() == 0.0).then(|| self.pace.settles())
     }
 
-    /// Whether it is to go on, or goes on.
+    /// Whether it goes on, or was told to.
     pub(super) fn goes_on(&self) -> bool {
         self.pace.then() > 0.0
     }
@@ -112,25 +121,27 @@ impl MotionClock {
         self.pace.rate(now)
     }
 
-    /// It is to go on, or to stand, as fast as what moves can, which is so far along its way.
+    /// Tells it to go on or to stand. It changes as fast as every motion under way allows; each comes with how far along it the robot is, in
+    /// seconds.
     pub(super) fn change(
         &mut self,
         robot: &Robot,
         [now, motion_time]: [Timestamp; 2],
         goes_on: bool,
-        way: Option<(&Way, f64)>,
+        ways: &[(&Way, f64)],
     ) {
         let then = if goes_on { 1.0 } else { 0.0 };
-        let pace = match way {
-            Some((way, from_s)) => way.pace(robot, now, [self.rate(now), then], from_s, 1.0),
-            None => Pace::at_once(now, then),
+        let along: Vec<Along<'_>> = ways.iter().map(|(way, from_s)| way.along(robot, *from_s, 1.0)).collect();
+        let pace = match along.is_empty() {
+            false => Pace::change(now, [self.rate(now), then], &along),
+            true => Pace::at_once(now, then),
         };
         *self = MotionClock { pace, from: motion_time };
     }
 }
 
 impl Braking {
-    /// From now on, where the way is followed at a rate and has come so far; at `times` the limits of the joints.
+    /// Begins to brake now, at `times` the limits of the joints; the motion is at a rate and has come so far along its course, in seconds.
     pub(super) fn begin(
         robot: &Robot,
         now: Timestamp,
@@ -158,12 +169,17 @@ impl Braking {
     pub(super) fn place(&self, now: Timestamp, configuration: &mut Configuration) {
         let at_s = self.from_s + self.pace.passed_s(now);
         match &self.way {
-            Way::Arm(motion) => configuration.arm = motion.at(at_s),
+            Way::Arm(arm, motion) => configuration.set_joints(*arm, motion.at(at_s)),
             Way::Base(motion) => {
                 let at = motion.at(at_s);
                 configuration.base = [at[0], at[1], wrapped(at[2])];
             }
         }
+    }
+
+    /// Where the joints are now and may be until they stand: on the rest of the way.
+    pub(super) fn ahead(&self, now: Timestamp) -> &[JointVector] {
+        self.way.ahead(self.from_s + self.pace.passed_s(now))
     }
 
     /// How well it followed its trajectory, as far as it has come.
@@ -175,15 +191,27 @@ impl Braking {
 impl Way {
     pub(super) fn tracking(&self, time_s: f64) -> Tracking {
         match self {
-            Way::Arm(motion) => motion.tracking(time_s),
+            Way::Arm(_, motion) => motion.tracking(time_s),
             Way::Base(motion) => motion.tracking(time_s),
         }
     }
 
-    fn pace(&self, robot: &Robot, now: Timestamp, rates: [f64; 2], from_s: f64, times: f64) -> Pace {
+    /// What slows down, where it has come so far, in seconds of its own.
+    fn along<'a>(&'a self, robot: &Robot, from_s: f64, times: f64) -> Along<'a> {
         match self {
-            Way::Arm(motion) => Pace::change(now, rates, motion, from_s, &limits(robot.arm_joints(), times)),
-            Way::Base(motion) => Pace::change(now, rates, motion, from_s, &limits(robot.base_joints(), times)),
+            Way::Arm(arm, motion) => Along { motion, from_s, limits: limits(robot.joints_of(*arm), times) },
+            Way::Base(motion) => Along { motion, from_s, limits: limits(robot.base_joints(), times) },
+        }
+    }
+
+    fn pace(&self, robot: &Robot, now: Timestamp, rates: [f64; 2], from_s: f64, times: f64) -> Pace {
+        Pace::change(now, rates, &[self.along(robot, from_s, times)])
+    }
+
+    /// Where the joints are `time_s` after the start and at every later [`STEP`] to the end.
+    pub(super) fn ahead(&self, time_s: f64) -> &[JointVector] {
+        match self {
+            Way::Arm(_, motion) | Way::Base(motion) => motion.ahead(time_s),
         }
     }
 }
@@ -194,21 +222,18 @@ impl Pace {
         Pace { since, course: vec![[0.0, rate]] }
     }
 
-    /// From a rate to another, where the motion has come to `from_s` of its time: as fast as joints of these greatest accelerations can.
-    fn change(
-        since: Timestamp,
-        [mut rate, then]: [f64; 2],
-        motion: &Motion,
-        from_s: f64,
-        limits: &JointVector,
-    ) -> Pace {
+    /// From a rate to another: as fast as the joints of all that moves can.
+    fn change(since: Timestamp, [mut rate, then]: [f64; 2], along: &[Along<'_>]) -> Pace {
         let (dt, brakes) = (STEP.as_secs_f64(), then < rate);
         let mut passed = 0.0;
         let mut course = vec![[passed, rate]];
         while rate != then {
             // What the joints do in the middle of the step.
-            let (velocity, acceleration) = motion.derivatives(from_s + passed + 0.5 * rate * dt);
-            let slope = greatest_slope(&velocity, &acceleration, rate, brakes, limits);
+            let slope = |one: &Along<'_>| {
+                let (velocity, acceleration) = one.motion.derivatives(one.from_s + passed + 0.5 * rate * dt);
+                greatest_slope(&velocity, &acceleration, rate, brakes, &one.limits)
+            };
+            let slope = along.iter().map(slope).fold(f64::INFINITY, f64::min);
             let given_up = course.len() == MAX_STEPS;
             let next = match brakes {
                 _ if given_up => then,
@@ -351,7 +376,7 @@ mod tests {
             std::array::from_fn(|j| anyway.iter().fold(joints[j].acceleration, |most, a| most.max(a[j].abs())));
         for from_s in (0..24).map(|i| 5.0 + f64::from(i) * fastest / 6.0) {
             let limits = limits(joints, 1.0);
-            let pace = Pace::change(Timestamp::default(), [1.0, 0.0], &motion, from_s, &limits);
+            let pace = Pace::change(Timestamp::default(), [1.0, 0.0], &[Along { motion: &motion, from_s, limits }]);
             let lasts_s = pace.settles().since(Timestamp::default()).as_secs_f64();
             assert!(lasts_s < 3.0 * fastest, "{lasts_s} s from {from_s} s on");
             let dt = STEP.as_secs_f64();

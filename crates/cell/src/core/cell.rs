@@ -5,10 +5,12 @@
 //!                            ├──Stop──▶ brakes ──it stands──▶ idle            (Ended: preempted)
 //!                            └──emergency stop──▶ brakes hard ──it stands──▶ idle   (Ended: stopped)
 //! ```
-//! Time is the robot's and comes in with every event; what should have happened since the last one happens first, in its
-//! order. What moves has a time of its own, which slows down to a hold, stands still, and sets out again (`braking`). [`Cell::next_wake`] says when the next thing will happen by itself.
+//! Every event comes with the robot's time. What is due between the previous event and this one happens first, in its order. Motions have a
+//! time of their own, which a hold slows down to a stop and later lets go on ([`super::braking`]). [`Cell::next_wake`] says when something is due
+//! without an event.
 
 use super::activity::{Activity, Kind, seconds};
+use super::arms::{Arms, FIRST};
 use super::battery::Battery;
 use super::braking::{Braking, EMERGENCY, MotionClock, Way};
 use super::contacts::{Contact, Contacts};
@@ -16,8 +18,6 @@ use super::deviations::LOST;
 use super::environment::Environment;
 use super::errors::Errors;
 use super::faults::Faults;
-use super::grasping::Pads;
-use super::holding::Held;
 use super::objects::{Placed, TrueObject};
 use super::picture::{Exposure, Scenery};
 use super::placement::{self, PlacementError, TABLE};
@@ -34,11 +34,13 @@ use std::collections::BTreeMap;
 
 /// The simulated robot and its table.
 pub struct Cell {
+    /// The robot, seen from its first arm.
     pub(super) robot: Robot,
     pub(super) config: CellConfig,
-    pub(super) pads: Pads,
+    /// Its arms, and what each holds.
+    pub(super) arms: Arms,
     pub(super) now: Timestamp,
-    /// The time of what moves: as much behind `now` as everything was held.
+    /// The time by which motions go on: behind `now` by as long as a hold was in force.
     pub(super) motion_time: Timestamp,
     pub(super) clock: MotionClock,
     pub(super) safety: SafetyState,
@@ -48,14 +50,13 @@ pub struct Cell {
     /// How often the base has come to a stop.
     pub(super) stops: u64,
     pub(super) activities: BTreeMap<Module, Activity>,
-    /// What is coming to rest.
+    /// Motions that were told to stop and are coming to rest.
     pub(super) braking: BTreeMap<Module, Braking>,
     pub(super) environment: Environment,
     /// The objects' names.
     pub(super) ids: Vec<String>,
     /// How far each object leaned at the most while it was held, in radians.
     pub(super) tilts: Vec<f64>,
-    pub(super) held: Option<Held>,
     pub(super) contacts: Contacts,
     pub(super) faults: Faults,
     /// Until when the camera is blind.
@@ -74,17 +75,18 @@ impl Cell {
     /// A cell at time 0.
     ///
     /// # Errors
-    /// [`PlacementError`] when no table can be laid, or the robot is none for a cell.
+    /// [`PlacementError`] when no table can be laid, or the robot cannot stand in a cell.
     pub fn new(config: CellConfig) -> Result<Cell, PlacementError> {
         let robot = Robot::named_or_file(&config.robot)?;
         let pads = placement::fit(&robot, &config)?;
         let objects = placement::objects(&robot, config.scene, config.goods(), config.seed)?;
-        let resting = first_posture(&robot, &config);
-        let errors = Errors::new(config.errors, robot.arm_joints().len(), config.seed, 0);
+        let arms = Arms::of(&robot, pads, &config)?;
+        let resting = arms.first_posture();
+        let errors = Errors::new(config.errors, &joint_counts(&robot), config.seed, 0);
         let (environment, ids) = environment(&robot, &errors.truth(&resting), config.scene, &objects);
         let now = Timestamp::default();
         Ok(Cell {
-            pads,
+            arms,
             now,
             motion_time: now,
             clock: MotionClock::new(now),
@@ -97,7 +99,6 @@ impl Cell {
             environment,
             tilts: vec![0.0; ids.len()],
             ids,
-            held: None,
             contacts: Contacts::of(&robot),
             faults: Faults::new(&config.faults, config.seed),
             blind_until: now,
@@ -115,10 +116,10 @@ impl Cell {
         let mut out = Vec::new();
         self.advance(now, &mut out);
         match event {
-            Event::Start { ticket, request } => {
+            Event::Start { ticket, arm, request } => {
                 let refused = match &self.safety {
                     SafetyState::Stopped { reason } => Some(Ending::Stopped(reason.clone())),
-                    _ => self.start(ticket, request).err().map(Ending::Aborted),
+                    _ => self.start(ticket, arm, request).err().map(Ending::Aborted),
                 };
                 out.extend(refused.map(|ending| Command::Ended { ticket, ending, tracking: None }));
             }
@@ -145,7 +146,7 @@ impl Cell {
         out
     }
 
-    /// When something will happen by itself.
+    /// When something is due without an event; `None` where nothing is.
     pub fn next_wake(&self) -> Option<Timestamp> {
         let ends = self.activities.values().map(|a| a.ends).min().and_then(|ends| self.clock.real_time(ends));
         let stands = self.clock.comes_to_stand().filter(|stands| *stands > self.now);
@@ -153,12 +154,13 @@ impl Cell {
         ends.into_iter().chain(self.faults.next()).chain(stands).chain(braking).min()
     }
 
-    /// Whether something moves: then every step costs time, and who waits until the last of them is due is late.
+    /// Whether something moves. Then the caller has to handle ticks often: each step takes time to compute, and steps that are left until
+    /// the end of a motion make that end late.
     pub fn is_restless(&self) -> bool {
         !self.environment.is_at_rest() || self.may_move()
     }
 
-    /// Whether what was told to stand stands: no goal is braking, and during a hold nothing moves.
+    /// Whether a stop or a hold is complete: no goal is braking, and during a hold nothing moves.
     pub fn stands(&self) -> bool {
         self.braking.is_empty() && (self.clock.goes_on() || self.clock.stands(self.now))
     }
@@ -168,13 +170,18 @@ impl Cell {
         self.errors.truth(&self.measured())
     }
 
-    /// Where the robot has them: the arm by its encoders, the base by its localisation.
+    /// Where the robot believes its joints to be: the arms by their encoders, the base by its localisation.
     pub fn measured(&self) -> Configuration {
         let mut configuration = self.resting;
-        for activity in self.activities.values() {
+        for (module, activity) in &self.activities {
             configuration.base = activity.base(self.motion_time).unwrap_or(configuration.base);
-            configuration.arm = activity.arm(self.motion_time).unwrap_or(configuration.arm);
-            configuration.finger = activity.finger(self.motion_time).unwrap_or(configuration.finger);
+            let arm = module.arm().unwrap_or(FIRST);
+            if let Some(joints) = activity.arm(self.motion_time) {
+                configuration.set_joints(arm, joints);
+            }
+            if let Some(finger) = activity.finger(self.motion_time) {
+                configuration.set_finger(arm, finger);
+            }
             [configuration.pan, configuration.tilt] =
                 activity.head(self.motion_time).unwrap_or([configuration.pan, configuration.tilt]);
         }
@@ -187,26 +194,27 @@ impl Cell {
         standing(self.configuration().base)
     }
 
-    /// Where it believes to stand.
+    /// Where the base believes to stand, in the world frame.
     pub fn believed_base_pose(&self) -> Pose {
         standing(self.measured().base)
     }
 
-    /// What is true of every object.
+    /// The ground truth: where every object really is, and on what.
     pub fn ground_truth(&self) -> Vec<TrueObject> {
-        let tool = self.robot.tool_pose(&self.configuration());
+        let tools = self.arms.tools(&self.configuration());
         let truth = |i: usize| {
-            let held = self.held.is_some_and(|held| held.object == i);
+            let holder = self.arms.holder_of(i).map(|(arm, _)| self.arms.name(arm).to_owned());
+            let held = holder.is_some();
             let on = if held { String::new() } else { self.support_of(i) };
-            let pose = self.pose_of(i, &tool);
+            let pose = self.pose_of(i, &tools);
             let kind = self.environment.model(i).kind;
             let on_base = self.is_delivered(&pose, &on);
             let in_place = match self.config.scene {
                 Setting::Boxes => on_base,
-                Setting::Table => on == TABLE && tableware::is_in_place(kind, &pose),
+                Setting::Table => on == TABLE && tableware::is_in_place(placement::workplace(&self.robot), kind, &pose),
             };
             let (id, size, greatest_tilt_rad) = (self.ids[i].clone(), self.size_of(i), self.tilts[i]);
-            TrueObject { id, kind, size, pose, on_base, in_place, greatest_tilt_rad, held, on }
+            TrueObject { id, kind, size, pose, on_base, in_place, greatest_tilt_rad, held, holder, on }
         };
         (0..self.ids.len()).map(truth).collect()
     }
@@ -221,7 +229,7 @@ impl Cell {
         self.battery.level()
     }
 
-    /// How many faults are still to come; more than [`super::faults::MAX_FAULTS`] are not taken.
+    /// How many faults are scheduled; more than [`super::faults::MAX_FAULTS`] are not taken.
     pub fn faults_to_come(&self) -> usize {
         self.faults.len()
     }
@@ -237,14 +245,27 @@ impl Cell {
         active.or(self.braking.get(&module).map(|braking| braking.ticket))
     }
 
-    /// How far each finger is from the middle when the gripper is open, in metres.
-    pub(super) fn open_finger_m(&self) -> f64 {
-        open_finger(&self.robot, &self.config)
-    }
-
-    /// The robot.
+    /// The robot, seen from its first arm.
     pub fn robot(&self) -> &Robot {
         &self.robot
+    }
+
+    /// The number of the arm of this name.
+    pub fn arm(&self, name: &str) -> Option<usize> {
+        self.arms.numbers().find(|arm| self.arms.name(*arm) == name)
+    }
+
+    /// The robot seen from one of its arms, by that arm's number.
+    ///
+    /// # Panics
+    /// Where the robot has no arm of this number.
+    pub fn robot_of(&self, arm: usize) -> &Robot {
+        self.arms.view(arm)
+    }
+
+    /// Where the robot has its joints, as the robot seen from one of its arms has them.
+    pub fn measured_of(&self, arm: usize) -> Configuration {
+        self.arms.seen_from(arm, &self.measured())
     }
 
     /// The configuration that it was made with.
@@ -257,14 +278,21 @@ impl Cell {
         self.seed
     }
 
-    /// What collides: the furniture and the parts of all objects, held ones in the gripper.
+    /// What collides: the furniture and the parts of all objects, those that the first arm holds in its gripper.
     pub fn scene(&self) -> Scene {
+        self.scene_of(FIRST)
+    }
+
+    /// What collides for one of the arms, by its number: what that arm holds is in its gripper, what others hold is where it is.
+    pub fn scene_of(&self, arm: usize) -> Scene {
+        let tools = self.arms.tools(&self.configuration());
+        let held = self.arms.held(arm);
         let parts = (0..self.ids.len()).flat_map(|i| {
-            let place = match self.held {
+            let place = match held {
                 Some(held) if held.object == i => None,
-                _ => Some(self.environment.state(i).pose),
+                _ => Some(self.pose_of(i, &tools)),
             };
-            let in_tool = self.held.map_or(Pose::IDENTITY, |held| held.in_tool);
+            let in_tool = held.map_or(Pose::IDENTITY, |held| held.in_tool);
             self.environment.model(i).parts().into_iter().map(move |(part, shape)| SceneObject {
                 name: self.ids[i].clone(),
                 shape,
@@ -280,11 +308,11 @@ impl Cell {
         }
     }
 
-    /// What there is to be seen.
+    /// What a camera sees at this moment.
     pub fn scenery(&self) -> Scenery {
         let configuration = self.configuration();
-        let tool = self.robot.tool_pose(&configuration);
-        let object = |i| (self.environment.model(i).clone(), self.pose_of(i, &tool));
+        let tools = self.arms.tools(&configuration);
+        let object = |i| (self.environment.model(i).clone(), self.pose_of(i, &tools));
         let eye = self.robot.camera_pose(&configuration).map_or(Pose::IDENTITY, |pose| self.errors.eye(&pose));
         let measured = self.measured();
         Scenery {
@@ -332,6 +360,7 @@ impl Cell {
         let Some(activity) = self.activities.remove(&module) else { return };
         let tracking = activity.tracking(self.motion_time);
         let followed = tracking.unwrap_or_default();
+        let arm = module.arm().unwrap_or(FIRST);
         let ending = match activity.kind {
             Kind::Follow(Way::Base(ref motion)) => match motion.end() {
                 Ok(end) => {
@@ -344,10 +373,10 @@ impl Cell {
                     return self.brake(module, activity, ending, 1.0);
                 }
             },
-            Kind::Follow(Way::Arm(ref motion)) => match motion.end() {
+            Kind::Follow(Way::Arm(_, ref motion)) => match motion.end() {
                 Ok(end) => {
-                    self.resting.arm = end;
-                    self.contacts.parted();
+                    self.resting.set_joints(arm, end);
+                    self.contacts.parted(arm);
                     Ending::Done(Product::Moved { end, tracking: followed })
                 }
                 Err(reason) => {
@@ -355,16 +384,17 @@ impl Cell {
                     return self.brake(module, activity, ending, 1.0);
                 }
             },
-            Kind::Close { from, object, expected, .. } => self.close(from, object, expected.as_ref(), out),
+            Kind::Close { from, object, expected, .. } => self.close(arm, from, object, expected.as_ref(), out),
             Kind::Open { to, .. } => {
-                self.resting.finger = to;
+                self.resting.set_finger(arm, to);
                 Ending::Done(Product::Released)
             }
             Kind::SenseBase if self.is_lost() => Ending::Aborted(LOST.to_owned()),
             Kind::SenseBase => Ending::Done(Product::BaseSensed { pose: self.believed_base_pose() }),
-            Kind::SenseArm => Ending::Done(Product::ArmSensed { joints: self.resting.arm }),
+            Kind::SenseArm => Ending::Done(Product::ArmSensed { joints: self.arms.seen_from(arm, &self.resting).arm }),
             Kind::SenseGripper => {
-                let (width, holding) = (2.0 * self.resting.finger, self.held.is_some());
+                let finger = self.arms.seen_from(arm, &self.resting).finger;
+                let (width, holding) = (2.0 * finger, self.arms.held(arm).is_some());
                 Ending::Done(Product::GripperSensed { width, holding })
             }
             Kind::Look { to: [pan, tilt], .. } => {
@@ -442,11 +472,12 @@ impl Cell {
         if goes_on == self.clock.goes_on() {
             return;
         }
-        let way = self.activities.values().find_map(|activity| match &activity.kind {
+        let ways = self.activities.values().filter_map(|activity| match &activity.kind {
             Kind::Follow(way) => Some((way, activity.elapsed_s(self.motion_time))),
             _ => None,
         });
-        self.clock.change(&self.robot, [self.now, self.motion_time], goes_on, way);
+        let ways: Vec<(&Way, f64)> = ways.collect();
+        self.clock.change(&self.robot, [self.now, self.motion_time], goes_on, &ways);
     }
 
     /// Everything ends and is where it is, as nothing real can: for when the world is made anew.
@@ -460,18 +491,20 @@ impl Cell {
         }
         // A hold that was about to be one is one.
         let goes_on = self.clock.goes_on();
-        self.clock.change(&self.robot, [self.now, self.motion_time], goes_on, None);
+        self.clock.change(&self.robot, [self.now, self.motion_time], goes_on, &[]);
     }
 
     fn reset(&mut self, seed: u64, goods: Goods, out: &mut Vec<Command>) {
         self.freeze("the cell was reset", out);
-        self.resting = first_posture(&self.robot, &self.config);
+        self.resting = self.arms.first_posture();
         self.seed = seed;
         self.stops = 0;
-        self.errors = Errors::new(self.config.errors, self.robot.arm_joints().len(), seed, 0);
+        self.errors = Errors::new(self.config.errors, &joint_counts(&self.robot), seed, 0);
         // The request was checked before it became an event; a table that cannot be laid is an empty one.
         let objects = placement::objects(&self.robot, self.config.scene, goods, seed).unwrap_or_default();
-        self.held = None;
+        for arm in self.arms.numbers() {
+            self.arms.hold(arm, None);
+        }
         self.contacts = Contacts::of(&self.robot);
         self.tilts = vec![0.0; objects.len()];
         (self.environment, self.ids) = environment(&self.robot, &self.configuration(), self.config.scene, &objects);
@@ -523,11 +556,7 @@ fn standing([x, y, heading]: [f64; 3]) -> Pose {
     Pose::from_rpy([x, y, 0.0], 0.0, 0.0, heading)
 }
 
-fn first_posture(robot: &Robot, config: &CellConfig) -> Configuration {
-    Configuration { arm: placement::home(robot), finger: open_finger(robot, config), ..robot.at_zero() }
-}
-
-/// As the config says, else as wide as the fingers can.
-fn open_finger(robot: &Robot, config: &CellConfig) -> f64 {
-    config.gripper.opening_m.map_or(robot.open_finger_m(), |opening_m| opening_m / 2.0)
+/// How many joints each arm has.
+pub(super) fn joint_counts(robot: &Robot) -> Vec<usize> {
+    (0..robot.arm_names().count()).map(|arm| robot.joints_of(arm).len()).collect()
 }

@@ -6,9 +6,9 @@
 //!                    ├─ an object stands on a link that stands, too (Stands); something was put there by a fault (PutThere)
 //!                    └─ everything else is unintended
 //! ```
-//! An episode begins when two bodies are as near as touching and ends when they have come apart. Some are judged only by what comes after: a
-//! finger may brush what it is about to grasp, but what it brushed and did not close around was hit; what is let go is set down on what it
-//! comes to stand on. No episode is forgiven for how deep it went at the worst where contact was meant: [`PRESS_M`] bounds those, too.
+//! An episode begins when two bodies touch and ends when they have come apart. Some episodes are judged only later: a finger may brush what it
+//! grasps next, but an object that it brushed and did not close around was hit; and an object is set down on what it comes to stand on. A meant
+//! contact has a bound as well: one that goes deeper than [`PRESS_M`] is unintended.
 
 use super::environment::{Environment, Thing, Touch};
 use ratn_model::time::Timestamp;
@@ -22,9 +22,9 @@ pub const TOLERANCE_M: f64 = 0.001;
 /// How deep what is held may be pressed into what it was lifted from or is set down on, and how far a finger may push what it
 /// grasps or lets go, in metres: poses are measured, with an error of millimetres.
 pub const PRESS_M: f64 = 0.015;
-/// How much of a support's normal points up at the least.
+/// A support is level where its normal points up by at least this much.
 const LEVEL: f64 = 0.7;
-/// The most contacts that are kept; the first ones are.
+/// How many contacts are kept: the first ones.
 pub const MAX_CONTACTS: usize = 64;
 
 /// An episode of two bodies in contact.
@@ -44,7 +44,7 @@ pub struct Contact {
     pub at: [f64; 3],
     /// How fast one moved as seen from the other at the most, in metres per second.
     pub speed_m_s: f64,
-    /// What for; `None`: it was not meant.
+    /// Its purpose; `None` where it was not meant.
     pub meant: Option<Purpose>,
 }
 
@@ -60,7 +60,8 @@ pub enum Purpose {
     Depart,
     /// What is held leaves what it stood on, which is below it.
     LiftOff,
-    /// What is held is let go on something, and comes to stand on it; on another object only where nothing else bears it.
+    /// An object is let go on something and comes to stand on it. Another object counts as what it stands on only where no furniture and no link
+    /// bears it.
     SetDown,
     /// An object stands on a link that the arm does not move.
     Stands,
@@ -84,13 +85,13 @@ pub(super) struct Contacts {
     fingers: Fingers,
     open: BTreeMap<[Thing; 2], Episode>,
     /// Fingers at objects, over before it is known what for.
-    waiting: Vec<(usize, Contact)>,
-    /// What the fingers have let go, or closed around in vain, until they are away from it.
-    parting: Option<Parting>,
+    waiting: Vec<(AtObject, Contact)>,
+    /// The grippers, by the numbers of their arms.
+    hands: Vec<Hand>,
+    /// The names of the links that each arm moves, by the numbers of the arms.
+    arm_links: Vec<Vec<String>>,
     /// What was let go above something, until it has come to rest.
     settling: Vec<(usize, Thing, Contact)>,
-    /// Something has just been grasped.
-    grasped: bool,
     /// What a fault put somewhere since the last step.
     put: Option<usize>,
     judged: Vec<Contact>,
@@ -98,9 +99,25 @@ pub(super) struct Contacts {
     fresh: Vec<Contact>,
 }
 
-/// The names of the links that are fingers.
+/// The names of the links that are fingers, by the numbers of their arms.
 #[derive(Debug, Clone, Default)]
-struct Fingers(Vec<String>);
+struct Fingers(Vec<Vec<String>>);
+
+/// A finger of an arm at an object.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct AtObject {
+    arm: usize,
+    object: usize,
+}
+
+/// What goes on at a gripper.
+#[derive(Debug, Clone, Copy, Default)]
+struct Hand {
+    /// What its fingers have let go, or closed around in vain, until they are away from it.
+    parting: Option<Parting>,
+    /// It has just grasped something.
+    grasped: bool,
+}
 
 /// What the fingers part from.
 #[derive(Debug, Clone, Copy)]
@@ -114,14 +131,28 @@ struct Parting {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Doing<'a> {
     pub(super) now: Timestamp,
-    /// What the fingers hold.
+    /// What each arm is doing, by their numbers.
+    pub(super) arms: &'a [ArmDoing],
+}
+
+/// What an arm and its gripper are doing at a step.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ArmDoing {
+    /// What its fingers hold.
     pub(super) held: Option<usize>,
-    /// The arm or the base is on its way.
+    /// It is on its way itself.
     pub(super) moves: bool,
-    /// The robot whose arm moves its links; `None` where the arm stands.
-    pub(super) arm_of: Option<&'a Robot>,
-    /// The fingers push what they meet; while they close they do not.
+    /// It is on its way, or the base that carries it is.
+    pub(super) is_moved: bool,
+    /// Its fingers push what they meet; while they close they do not.
     pub(super) fingers_solid: bool,
+}
+
+impl Doing<'_> {
+    /// The arm that holds an object.
+    fn holder_of(&self, object: usize) -> Option<usize> {
+        self.arms.iter().position(|arm| arm.held == Some(object))
+    }
 }
 
 impl Purpose {
@@ -164,72 +195,82 @@ impl std::fmt::Display for Contact {
 }
 
 impl Fingers {
-    /// The object at which one of them is.
-    fn at(&self, things: &[Thing; 2]) -> Option<usize> {
-        match things {
-            [Thing::Link(link), Thing::Object(object)] if self.0.contains(link) => Some(*object),
-            _ => None,
-        }
+    /// The finger that one of the two things is, and the object at which it is.
+    fn at(&self, things: &[Thing; 2]) -> Option<AtObject> {
+        let [Thing::Link(link), Thing::Object(object)] = things else { return None };
+        let arm = self.0.iter().position(|of_arm| of_arm.contains(link))?;
+        Some(AtObject { arm, object: *object })
     }
 }
 
 impl Contacts {
     /// Of this robot, nothing touched yet.
     pub(super) fn of(robot: &Robot) -> Contacts {
-        let names = robot.finger_links().into_iter().map(|link| robot.model.links[link].name.clone());
-        Contacts { fingers: Fingers(names.collect()), ..Contacts::default() }
+        let arms = 0..robot.arm_names().count();
+        let names = |links: Vec<usize>| links.into_iter().map(|link| robot.model.links[link].name.clone()).collect();
+        Contacts {
+            fingers: Fingers(arms.clone().map(|arm| names(robot.finger_links_of(arm))).collect()),
+            arm_links: arms.clone().map(|arm| names(robot.links_of(arm))).collect(),
+            hands: vec![Hand::default(); arms.len()],
+            ..Contacts::default()
+        }
     }
 
     /// After a step: what touches what.
     pub(super) fn observe(&mut self, touches: &[Touch], doing: Doing<'_>, environment: &Environment, ids: &[String]) {
         let fingers = self.fingers.clone();
-        if doing.fingers_solid {
-            // They have opened after a grasp in vain: what they are in from now on they push.
-            let in_vain = |things: &[Thing; 2], e: &Episode| {
-                e.contact.meant == Some(Purpose::Grasp) && fingers.at(things) != doing.held
-            };
-            self.end(in_vain);
-        }
+        // They have opened after a grasp in vain: what they are in from now on they push.
+        let in_vain = |things: &[Thing; 2], e: &Episode| {
+            let opened = |at: AtObject| doing.arms[at.arm].fingers_solid && doing.arms[at.arm].held != Some(at.object);
+            e.contact.meant == Some(Purpose::Grasp) && fingers.at(things).is_some_and(opened)
+        };
+        self.end(in_vain);
         for touch in touches {
             self.see(touch, doing, environment, ids);
         }
         for (things, episode) in self.take(|things, _| touches.iter().all(|touch| touch.things != *things)) {
             match fingers.at(&things) {
-                Some(object) if episode.contact.meant.is_none() && (doing.moves || !doing.fingers_solid) => {
-                    self.waiting.push((object, episode.contact));
+                Some(at)
+                    if episode.contact.meant.is_none()
+                        && (doing.arms[at.arm].is_moved || !doing.arms[at.arm].fingers_solid) =>
+                {
+                    self.waiting.push((at, episode.contact));
                 }
                 _ => self.judge(episode.contact),
             }
         }
         self.settle(|object| environment.state(object).at_rest, environment);
-        (self.put, self.grasped) = (None, false);
+        self.put = None;
+        self.hands.iter_mut().for_each(|hand| hand.grasped = false);
     }
 
-    /// The fingers begin to close: what they touch already they came to.
-    pub(super) fn closing(&mut self) {
+    /// The fingers of an arm begin to close: what they touch already they came to.
+    pub(super) fn closing(&mut self, arm: usize) {
         let fingers = self.fingers.clone();
-        let came = self.take(|things, episode| fingers.at(things).is_some() && episode.contact.meant.is_none());
+        let of_arm = |things: &[Thing; 2]| fingers.at(things).is_some_and(|at| at.arm == arm);
+        let came = self.take(|things, episode| of_arm(things) && episode.contact.meant.is_none());
         self.waiting.extend(came.into_iter().filter_map(|(things, e)| Some((fingers.at(&things)?, e.contact))));
     }
 
-    /// The fingers have closed around an object, in vain or not; `None`: around nothing.
-    pub(super) fn closed(&mut self, around: Option<usize>, environment: &Environment) {
+    /// The fingers of an arm have closed around an object, in vain or not; `None`: around nothing.
+    pub(super) fn closed(&mut self, arm: usize, around: Option<usize>, environment: &Environment) {
         self.settle(|object| Some(object) == around, environment);
         let Contacts { fingers, open, .. } = self;
+        let closed = around.map(|object| AtObject { arm, object });
         for (things, episode) in open {
-            if fingers.at(things).is_some() && fingers.at(things) == around {
+            if closed.is_some() && fingers.at(things) == closed {
                 episode.contact.meant = Some(Purpose::Grasp);
             }
         }
-        for (object, contact) in std::mem::take(&mut self.waiting) {
-            let meant = (Some(object) == around).then_some(Purpose::Approach);
+        for (at, contact) in self.waiting_of(arm) {
+            let meant = (Some(at) == closed).then_some(Purpose::Approach);
             self.judge(Contact { meant, ..contact });
         }
-        (self.parting, self.grasped) = (around.map(|object| Parting { object, set_out: false }), true);
+        self.hands[arm] = Hand { parting: around.map(|object| Parting { object, set_out: false }), grasped: true };
     }
 
-    /// The fingers have let go of an object, on purpose or not.
-    pub(super) fn let_go(&mut self, object: usize, on_purpose: bool) {
+    /// The fingers of an arm have let go of an object, on purpose or not.
+    pub(super) fn let_go(&mut self, arm: usize, object: usize, on_purpose: bool) {
         for ([below, _], Episode { mut contact, up, .. }) in self.take(|things, _| things[1] == Thing::Object(object)) {
             // The normal leads from what it stands on to what is held.
             if contact.meant.is_none() && on_purpose && up >= LEVEL {
@@ -239,33 +280,34 @@ impl Contacts {
                 self.judge(contact);
             }
         }
-        self.parting = Some(Parting { object, set_out: false });
+        self.hands[arm].parting = Some(Parting { object, set_out: false });
     }
 
-    /// The arm or the base begins to move, with an object in the fingers or without. A grasp in vain is over then: what the fingers
-    /// touch of it from now on is another contact.
-    pub(super) fn sets_out(&mut self, held: Option<usize>) {
-        for (_, contact) in std::mem::take(&mut self.waiting) {
+    /// An arm, or the base that carries it, begins to move, with an object in the arm's fingers or without. A grasp in vain is over then:
+    /// what the fingers touch of it from now on is another contact.
+    pub(super) fn sets_out(&mut self, arm: usize, held: Option<usize>) {
+        for (_, contact) in self.waiting_of(arm) {
             self.judge(contact);
         }
         let fingers = self.fingers.clone();
         let in_vain = |things: &[Thing; 2], episode: &Episode| {
-            episode.contact.meant == Some(Purpose::Grasp) && fingers.at(things) != held
+            let not_held = |at: AtObject| at.arm == arm && Some(at.object) != held;
+            episode.contact.meant == Some(Purpose::Grasp) && fingers.at(things).is_some_and(not_held)
         };
         self.end(in_vain);
-        if let Some(parting) = &mut self.parting {
+        if let Some(parting) = &mut self.hands[arm].parting {
             parting.set_out = true;
         }
     }
 
-    /// From what a motion is about to part.
-    pub(super) fn parts_from(&self) -> Option<usize> {
-        self.parting.filter(|parting| parting.set_out).map(|parting| parting.object)
+    /// From what the fingers of an arm part in the motion that is under way.
+    pub(super) fn parts_from(&self, arm: usize) -> Option<usize> {
+        self.hands[arm].parting.filter(|parting| parting.set_out).map(|parting| parting.object)
     }
 
-    /// The arm has come to the end of a motion, or the fingers are away from what they part from.
-    pub(super) fn parted(&mut self) {
-        self.parting = None;
+    /// An arm has come to the end of a motion, or its fingers are away from what they part from.
+    pub(super) fn parted(&mut self, arm: usize) {
+        self.hands[arm].parting = None;
     }
 
     /// Somebody puts an object somewhere.
@@ -276,7 +318,7 @@ impl Contacts {
         }
     }
 
-    /// What was not meant: those that are over, and, as it looks now, those that go on and those of which it is not known yet.
+    /// The unintended contacts: those that are over, and those that go on or are not judged yet, as it looks now.
     pub(super) fn unintended(&self) -> Vec<Contact> {
         let open = self.open.values().map(|episode| &episode.contact);
         let undecided = open.chain(self.waiting.iter().map(|(_, contact)| contact));
@@ -284,7 +326,7 @@ impl Contacts {
         self.judged.iter().chain(undecided.filter(|contact| contact.is_unintended())).cloned().collect()
     }
 
-    /// What is over, was not meant, and has not been told yet.
+    /// The unintended contacts that are over and have not been told yet.
     pub(super) fn tell(&mut self) -> Vec<Contact> {
         std::mem::take(&mut self.fresh)
     }
@@ -292,7 +334,7 @@ impl Contacts {
     fn see(&mut self, touch: &Touch, doing: Doing<'_>, environment: &Environment, ids: &[String]) {
         if !self.open.contains_key(&touch.things) {
             let loose = touch.things.iter().find_map(|thing| match thing {
-                Thing::Object(object) if doing.held != Some(*object) => Some(*object),
+                Thing::Object(object) if doing.holder_of(*object).is_none() => Some(*object),
                 _ => None,
             });
             let contact = Contact {
@@ -312,7 +354,7 @@ impl Contacts {
             self.open.insert(touch.things.clone(), Episode { contact, from, up: 0.0 });
         }
         let Some(Episode { contact, from, up }) = self.open.get_mut(&touch.things) else { return };
-        if contact.meant == Some(Purpose::Stands) && is_moved(touch, doing) {
+        if contact.meant == Some(Purpose::Stands) && is_moved(&self.arm_links, touch, doing) {
             // The link leaves, with what stood on it: from here on it is the link that pushes.
             contact.meant = None;
             *from = from.map(|(object, _)| (object, environment.state(object).pose.position));
@@ -327,7 +369,7 @@ impl Contacts {
             }
         }
         if let Some((object, from)) = from
-            && doing.held != Some(*object)
+            && doing.holder_of(*object).is_none()
         {
             let at = environment.state(*object).pose.position;
             let pushed = (0..3).map(|i| (at[i] - from[i]).powi(2)).sum::<f64>().sqrt();
@@ -337,23 +379,28 @@ impl Contacts {
 
     /// What a contact is for, where that is known as it begins.
     fn known(&self, touch: &Touch, doing: Doing<'_>) -> Option<Purpose> {
-        let lifts = ((self.grasped || !doing.moves) && touch.normal[2] >= LEVEL).then_some(Purpose::LiftOff);
+        let just_held = |arm: usize| self.hands[arm].grasped || !doing.arms[arm].is_moved;
+        let lifts = |object: usize| {
+            let is_lifted = doing.holder_of(object).is_some_and(just_held) && touch.normal[2] >= LEVEL;
+            is_lifted.then_some(Purpose::LiftOff)
+        };
         match &touch.things {
             things if things.iter().any(|thing| self.put.map(Thing::Object).as_ref() == Some(thing)) => {
                 Some(Purpose::PutThere)
             }
             [Thing::Link(_), Thing::Object(object)] if self.fingers.at(&touch.things).is_some() => {
-                if doing.held == Some(*object) {
+                let AtObject { arm, .. } = self.fingers.at(&touch.things)?;
+                if doing.arms[arm].held == Some(*object) {
                     return Some(Purpose::Grasp);
                 }
-                let parting = self.parting.filter(|parting| parting.object == *object)?;
-                let leaves = doing.fingers_solid || parting.set_out;
+                let parting = self.hands[arm].parting.filter(|parting| parting.object == *object)?;
+                let leaves = doing.arms[arm].fingers_solid || parting.set_out;
                 Some(if leaves { Purpose::Depart } else { Purpose::Grasp })
             }
-            [Thing::Link(_), Thing::Object(object)] if doing.held != Some(*object) => {
-                (touch.normal[2] >= LEVEL && !is_moved(touch, doing)).then_some(Purpose::Stands)
+            [Thing::Link(_), Thing::Object(object)] if doing.holder_of(*object).is_none() => {
+                (touch.normal[2] >= LEVEL && !is_moved(&self.arm_links, touch, doing)).then_some(Purpose::Stands)
             }
-            [_, Thing::Object(_)] => lifts,
+            [_, Thing::Object(object)] => lifts(*object),
             _ => None,
         }
     }
@@ -370,6 +417,13 @@ impl Contacts {
             contact.meant = stands.then_some(Purpose::SetDown);
             self.judge(contact);
         }
+    }
+
+    /// What fingers of an arm have touched of which it is not known yet what for; it is taken out.
+    fn waiting_of(&mut self, arm: usize) -> Vec<(AtObject, Contact)> {
+        let (of_arm, rest) = std::mem::take(&mut self.waiting).into_iter().partition(|(at, _)| at.arm == arm);
+        self.waiting = rest;
+        of_arm
     }
 
     /// These episodes are over.
@@ -395,10 +449,10 @@ impl Contacts {
     }
 }
 
-/// Whether it is a link that the arm moves.
-fn is_moved(touch: &Touch, doing: Doing<'_>) -> bool {
-    let (Thing::Link(link), Some(robot)) = (&touch.things[0], doing.arm_of) else { return false };
-    robot.link(link).is_some_and(|link| robot.arm_links.contains(&link))
+/// Whether it is a link that an arm moves which is on its way.
+fn is_moved(arm_links: &[Vec<String>], touch: &Touch, doing: Doing<'_>) -> bool {
+    let Thing::Link(link) = &touch.things[0] else { return false };
+    doing.arms.iter().zip(arm_links).any(|(arm, links)| arm.moves && links.contains(link))
 }
 
 #[cfg(test)]
@@ -421,16 +475,16 @@ mod tests {
             speed_m_s: 0.1,
             meant: None,
         };
-        let mut contacts = Contacts { waiting: vec![(0, hit.clone())], ..Contacts::default() };
+        let waiting = vec![(AtObject { arm: 0, object: 0 }, hit.clone())];
+        let mut contacts = Contacts { waiting, ..Contacts::of(&Robot::aimm()) };
         assert_eq!(contacts.unintended(), [hit]);
         // It was what the fingers came to.
-        contacts.closed(Some(0), &Watched::new().environment);
+        contacts.closed(0, Some(0), &Watched::new().environment);
         assert_eq!(contacts.unintended().len(), 1, "it was pushed too far for that");
     }
 
     /// A box in a room of its own, and what watches it.
     struct Watched {
-        robot: Robot,
         environment: Environment,
         contacts: Contacts,
     }
@@ -442,7 +496,7 @@ mod tests {
             let stands = Configuration { finger: 0.055, ..robot.at_zero() };
             let environment = Environment::new(&robot, &stands, &[], &[(model, Pose::at(2.0, 0.0, 0.5))]);
             let contacts = Contacts::of(&robot);
-            Watched { robot, environment, contacts }
+            Watched { environment, contacts }
         }
 
         /// A step in which the box is `x` metres from where it was and a link is so deep in it, or none is.
@@ -456,8 +510,8 @@ mod tests {
                 speed_m_s: 0.1,
             };
             let touches: Vec<Touch> = link.map(touch).into_iter().collect();
-            let arm_of = arm_moves.then_some(&self.robot);
-            let doing = Doing { now: Timestamp::default(), held: None, moves: arm_moves, arm_of, fingers_solid };
+            let arms = [ArmDoing { held: None, moves: arm_moves, is_moved: arm_moves, fingers_solid }];
+            let doing = Doing { now: Timestamp::default(), arms: &arms };
             self.contacts.observe(&touches, doing, &self.environment, &["box_1".to_owned()]);
         }
 
@@ -479,7 +533,8 @@ mod tests {
         let robot = Robot::of(read, &urdf, Some(&srdf), &mut |_| unreachable!("it has no meshes")).unwrap();
         let fingers = Contacts::of(&robot).fingers;
         let at = |link: &str| fingers.at(&[Thing::Link(link.to_owned()), Thing::Object(3)]);
-        assert_eq!((at("jaw_a"), at("jaw_b"), at("finger_like")), (Some(3), Some(3), None));
+        let finger = Some(AtObject { arm: 0, object: 3 });
+        assert_eq!((at("jaw_a"), at("jaw_b"), at("finger_like")), (finger, finger, None));
     }
 
     #[test]
@@ -509,15 +564,15 @@ mod tests {
     fn a_grasp_in_vain_excuses_the_fingers_until_the_next_motion_sets_out() {
         for (moves, excused) in [(false, true), (true, false)] {
             let mut watched = Watched::new();
-            watched.contacts.closing();
+            watched.contacts.closing(0);
             watched.step(0.0, Some(("finger_left", 0.03)), false, false);
-            watched.contacts.closed(Some(0), &watched.environment);
+            watched.contacts.closed(0, Some(0), &watched.environment);
             if moves {
-                watched.contacts.sets_out(None);
+                watched.contacts.sets_out(0, None);
             }
             watched.step(0.0, Some(("finger_left", 0.03)), moves, false);
             watched.step(0.0, None, moves, false);
-            watched.contacts.sets_out(None);
+            watched.contacts.sets_out(0, None);
             assert_eq!(watched.contacts.unintended().is_empty(), excused, "{:?}", watched.contacts.unintended());
         }
     }
@@ -532,13 +587,14 @@ mod tests {
             normal,
             speed_m_s: 0.1,
         };
-        let doing =
-            |moves| Doing { now: Timestamp::default(), held: Some(0), moves, arm_of: None, fingers_solid: true };
-        watched.contacts.closed(Some(0), &watched.environment);
+        let doing = |is_moved| [ArmDoing { held: Some(0), moves: false, is_moved, fingers_solid: true }];
+        watched.contacts.closed(0, Some(0), &watched.environment);
         for (depth_m, moves) in [(0.0004, false), (0.006, true)] {
-            watched.contacts.observe(&[touch(depth_m)], doing(moves), &watched.environment, &["box_1".to_owned()]);
+            let doing = Doing { now: Timestamp::default(), arms: &doing(moves) };
+            watched.contacts.observe(&[touch(depth_m)], doing, &watched.environment, &["box_1".to_owned()]);
         }
-        watched.contacts.observe(&[], doing(true), &watched.environment, &["box_1".to_owned()]);
+        let doing = Doing { now: Timestamp::default(), arms: &doing(true) };
+        watched.contacts.observe(&[], doing, &watched.environment, &["box_1".to_owned()]);
         watched.contacts.unintended()
     }
 
@@ -551,9 +607,9 @@ mod tests {
     #[test]
     fn fingers_that_have_opened_inside_of_what_they_closed_around_in_vain_push_it() {
         let mut watched = Watched::new();
-        watched.contacts.closing();
+        watched.contacts.closing(0);
         watched.step(0.0, Some(("finger_left", 0.03)), false, false);
-        watched.contacts.closed(Some(0), &watched.environment);
+        watched.contacts.closed(0, Some(0), &watched.environment);
         watched.step(0.0, Some(("finger_left", 0.03)), false, false);
         assert_eq!(watched.contacts.unintended(), [], "they closed in it");
         watched.step(0.0, Some(("finger_left", 0.02)), false, true);

@@ -28,9 +28,7 @@ impl Cell {
         for fault in self.faults.due(self.now) {
             match fault.kind {
                 Kind::GraspSlips => {
-                    if let Some(held) = &mut self.held {
-                        held.set_friction(SLIPPERY);
-                    }
+                    self.arms.held_mut().for_each(|held| held.set_friction(SLIPPERY));
                 }
                 Kind::ObjectMoved => self.move_something(),
                 Kind::SensorDropout => self.blind_until = self.now + seconds(OUTAGE_S),
@@ -82,9 +80,9 @@ impl Cell {
         self.lost_until > self.now
     }
 
-    /// The controller of what moves gives up now, or in the next motion.
+    /// The controller of the motion under way gives up now; where nothing moves, that of the next motion.
     fn give_up(&mut self, out: &mut Vec<Command>) {
-        let moves_the_arm = |a: &Activity| matches!(a.kind, Doing::Follow(Way::Arm(_)));
+        let moves_the_arm = |a: &Activity| matches!(a.kind, Doing::Follow(Way::Arm(..)));
         if self.activities.values().any(|a| moves_the_arm(a) || moves_the_base(a)) {
             let why = |a: &Activity| if moves_the_base(a) { BASE_GAVE_UP } else { GAVE_UP };
             self.halt(|a| moves_the_arm(a) || moves_the_base(a), |a| Ending::Aborted(why(a).to_owned()), 1.0, out);
@@ -101,12 +99,15 @@ impl Cell {
                 let workplace = placement::workplace(&self.robot);
                 (TABLE, workplace.table.top_m(), [workplace.boxes.x, workplace.boxes.y])
             }
-            Setting::Table => (tableware::RACK, tableware::RACK_HEIGHT_M, tableware::RACK_REGION),
+            Setting::Table => {
+                let Some(tableware) = &placement::workplace(&self.robot).tableware else { return };
+                (tableware::RACK, tableware::top_m(&tableware.rack), [tableware.region.x, tableware.region.y])
+            }
         };
         let movable: Vec<usize> = (0..self.ids.len())
             .filter(|i| {
                 let on = self.support_of(*i);
-                let held = self.held.is_some_and(|held| held.object == *i);
+                let held = self.arms.holder_of(*i).is_some();
                 on == support && !held && !self.is_delivered(&self.environment.state(*i).pose, &on)
             })
             .collect();
@@ -120,13 +121,14 @@ impl Cell {
             .map(|i| (self.environment.state(i).pose.position, radius(i)))
             .collect();
         let (mine, height) = (radius(object), height + self.size_of(object)[2] / 2.0);
-        let tool = self.robot.tool_pose(&self.configuration()).position;
+        let tools: Vec<[f64; 3]> = self.arms.tools(&self.configuration()).iter().map(|tool| tool.position).collect();
         let random = self.faults.random();
         let place = (0..MAX_PLACES).find_map(|_| {
             let (x, y) = (random.random_range(x_low..=x_high), random.random_range(y_low..=y_high));
             let yaw = random.random_range(-PI..PI);
             let apart = |at: &[f64; 3], radius: f64| (at[0] - x).hypot(at[1] - y) > mine + radius + APART_M;
-            let free = others.iter().all(|(at, radius)| apart(at, *radius)) && apart(&tool, 0.0);
+            let free =
+                others.iter().all(|(at, radius)| apart(at, *radius)) && tools.iter().all(|tool| apart(tool, 0.0));
             free.then(|| Pose::from_rpy([x, y, height], 0.0, 0.0, yaw))
         });
         if let Some(pose) = place {

@@ -16,32 +16,60 @@ use std::f64::consts::TAU;
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Errors {
     config: ErrorsConfig,
-    /// What each encoder of the arm reads at its joint's zero, in radians.
-    offsets: JointVector,
-    /// What it reads too much once a turn: amplitude and phase, in radians.
-    waves: PerJoint<[f64; 2]>,
+    /// The encoders of each arm, in the order of the arms' numbers.
+    arms: Vec<Encoders>,
     /// The true optical frame as seen from where it is said to be.
     camera: Pose,
     /// Where the base truly stands, as seen from where it believes to: x, y and heading.
     base: [f64; 3],
 }
 
+/// The encoders of an arm.
+#[derive(Debug, Clone, PartialEq)]
+struct Encoders {
+    /// What each reads at its joint's zero, in radians.
+    offsets: JointVector,
+    /// What each reads too much once a turn: amplitude and phase, in radians.
+    waves: PerJoint<[f64; 2]>,
+}
+
 /// Streams of the seed's generator; faults have the first.
 const CALIBRATION: u64 = 2;
 const LOCALISATION: u64 = 3;
+/// The encoders of the arm with the number 1; those of further arms have the streams behind it.
+const OTHER_ENCODERS: u64 = 4;
+
+impl Encoders {
+    fn new(config: &ErrorsConfig, joints: usize, random: &mut ChaCha8Rng) -> Encoders {
+        let offsets = JointVector::from_fn(joints, |_| config.encoder_rad * normal(random));
+        let wave = |_| [config.encoder_wave_rad * normal(random), random.random_range(0.0..TAU)];
+        Encoders { offsets, waves: PerJoint::from_fn(joints, wave) }
+    }
+
+    fn truth(&self, measured: &JointVector) -> JointVector {
+        JointVector::from_fn(self.offsets.len(), |j| {
+            let [amplitude, phase] = self.waves[j];
+            measured[j] - self.offsets[j] - amplitude * (measured[j] + phase).sin()
+        })
+    }
+}
 
 impl Errors {
-    /// Of a cell with this seed and an arm of so many joints, whose base has come to a stop so many times.
-    pub(super) fn new(config: ErrorsConfig, joints: usize, seed: u64, stops: u64) -> Errors {
+    /// Of a cell with this seed and arms of so many joints each, whose base has come to a stop so many times.
+    pub(super) fn new(config: ErrorsConfig, joints: &[usize], seed: u64, stops: u64) -> Errors {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         random.set_stream(CALIBRATION);
-        let offsets = JointVector::from_fn(joints, |_| config.encoder_rad * normal(&mut random));
-        let wave = |_| [config.encoder_wave_rad * normal(&mut random), random.random_range(0.0..TAU)];
-        let waves = PerJoint::from_fn(joints, wave);
+        let first = joints.iter().take(1).map(|joints| Encoders::new(&config, *joints, &mut random));
+        let mut arms: Vec<Encoders> = first.collect();
         let place = std::array::from_fn(|_| config.camera_m * normal(&mut random));
         let [roll, pitch, yaw] = std::array::from_fn(|_| config.camera_rad * normal(&mut random));
         let camera = Pose::from_rpy(place, roll, pitch, yaw);
-        let mut errors = Errors { config, offsets, waves, camera, base: [0.0; 3] };
+        for (stream, joints) in (OTHER_ENCODERS..).zip(joints.iter().skip(1)) {
+            let mut random = ChaCha8Rng::seed_from_u64(seed);
+            random.set_stream(stream);
+            arms.push(Encoders::new(&config, *joints, &mut random));
+        }
+        let mut errors = Errors { config, arms, camera, base: [0.0; 3] };
         errors.localise(seed, stops);
         errors
     }
@@ -60,11 +88,13 @@ impl Errors {
         let [ahead, left, turn] = self.base;
         let (sin, cos) = heading.sin_cos();
         let base = [x + cos * ahead - sin * left, y + sin * ahead + cos * left, heading + turn];
-        let arm = JointVector::from_fn(self.offsets.len(), |j| {
-            let [amplitude, phase] = self.waves[j];
-            measured.arm[j] - self.offsets[j] - amplitude * (measured.arm[j] + phase).sin()
-        });
-        Configuration { base, arm, ..*measured }
+        let mut truth = Configuration { base, ..*measured };
+        for (arm, encoders) in self.arms.iter().enumerate() {
+            if let Some(at) = measured.of_arm(arm) {
+                truth.set_joints(arm, encoders.truth(&at.joints));
+            }
+        }
+        truth
     }
 
     /// Where the base believes to be when it truly is there.
@@ -111,7 +141,7 @@ mod tests {
     #[test]
     fn errors_have_the_sizes_that_the_configuration_says() {
         let config = ErrorsConfig::REALISTIC;
-        let all: Vec<Errors> = (0..SEEDS).map(|seed| Errors::new(config, 7, seed, 0)).collect();
+        let all: Vec<Errors> = (0..SEEDS).map(|seed| Errors::new(config, &[7], seed, 0)).collect();
         let here = Configuration { base: [0.3, -0.2, 1.0], ..at_zero() };
         let truths: Vec<Configuration> = all.iter().map(|errors| errors.truth(&here)).collect();
         assert!(about(rms(truths.iter().map(|t| t.base[2] - 1.0)), config.localisation_rad));
@@ -130,16 +160,16 @@ mod tests {
 
     #[test]
     fn the_same_seed_has_the_same_errors_and_every_stop_its_own() {
-        let of = |seed, stop| Errors::new(ErrorsConfig::REALISTIC, 7, seed, stop);
+        let of = |seed, stop| Errors::new(ErrorsConfig::REALISTIC, &[7], seed, stop);
         assert_eq!(of(3, 0), of(3, 0));
         assert_ne!(of(3, 0).camera, of(4, 0).camera);
         let (first, second) = (of(3, 0), of(3, 1));
-        assert!(first.camera == second.camera && first.offsets == second.offsets && first.base != second.base);
+        assert!(first.camera == second.camera && first.arms == second.arms && first.base != second.base);
     }
 
     #[test]
     fn what_is_believed_of_where_the_base_truly_stands_is_what_leads_there() {
-        let errors = Errors::new(ErrorsConfig::REALISTIC, 7, 5, 2);
+        let errors = Errors::new(ErrorsConfig::REALISTIC, &[7], 5, 2);
         let measured = Configuration { base: [1.5, 0.2, 3.0], ..at_zero() };
         let back = errors.believed(errors.truth(&measured).base);
         assert!((0..3).all(|i| (back[i] - measured.base[i]).abs() < 1e-12), "{back:?}");
@@ -147,7 +177,7 @@ mod tests {
 
     #[test]
     fn without_errors_what_is_measured_is_true() {
-        let errors = Errors::new(ErrorsConfig::NONE, 7, 5, 2);
+        let errors = Errors::new(ErrorsConfig::NONE, &[7], 5, 2);
         let measured = Configuration { base: [1.5, 0.2, 3.0], arm: JointVector::all(7, 0.3), ..at_zero() };
         assert_eq!(errors.truth(&measured), measured);
         assert_eq!((errors.believed(measured.base), errors.eye(&Pose::IDENTITY)), (measured.base, Pose::IDENTITY));

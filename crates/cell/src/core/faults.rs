@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// The most faults that a cell has before it at once.
+/// The most faults that can be scheduled in a cell at once.
 pub const MAX_FAULTS: usize = 64;
 
 /// What goes wrong.
@@ -46,9 +46,9 @@ pub enum When {
 /// Something that goes wrong.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fault {
-    /// What.
+    /// What goes wrong.
     pub kind: Kind,
-    /// When.
+    /// When it goes wrong.
     pub when: When,
 }
 
@@ -59,7 +59,7 @@ pub struct Fault {
     Kind::ALL.map(Kind::name).join(", ")
 )]
 pub struct FaultError {
-    /// The text.
+    /// The text that names no fault.
     pub text: String,
 }
 
@@ -75,7 +75,7 @@ impl Kind {
     pub const ALL: [Kind; 5] =
         [Kind::GraspSlips, Kind::ObjectMoved, Kind::SensorDropout, Kind::ControllerAbort, Kind::LocalisationLost];
 
-    /// As in a text.
+    /// The name of the kind in the text of a fault.
     pub fn name(self) -> &'static str {
         match self {
             Kind::GraspSlips => "grasp_slips",

@@ -7,13 +7,13 @@
 //! fingers do that, so a pose that was off by millimetres ends exactly in the middle.
 
 use ratn_model::pose::Pose;
-use ratn_motion::robot::{Geometry, Robot};
+use ratn_motion::robot::{FingerPart, Robot};
 
 /// The fingers' pads, in the tool frame, in metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pads {
-    /// They reach from -x to x.
-    pub x: f64,
+    /// Their least and greatest x.
+    pub x: [f64; 2],
     /// From here along z (the palm's side)
     pub z_from: f64,
     /// to here (the tips).
@@ -25,7 +25,7 @@ pub struct Pads {
 /// A grasp.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Grip {
-    /// Which of those asked about.
+    /// The index of the cuboid that is held, among those that were given.
     pub index: usize,
     /// The opening at which the fingers stopped, in metres.
     pub width: f64,
@@ -39,7 +39,7 @@ pub enum NotGrasped {
     /// No object is there.
     #[error("nothing is between the fingers")]
     Nothing,
-    /// It would not lie flush.
+    /// It is turned too far to lie flush with the pads.
     #[error("{id} stands {degrees:.0}° askew between the fingers; at most {MAX_ASKEW_DEGREES}° is taken")]
     Askew {
         /// Which object.
@@ -47,7 +47,7 @@ pub enum NotGrasped {
         /// How much.
         degrees: f64,
     },
-    /// A finger is in it or on the wrong side of it.
+    /// A finger would close inside of it, or beside it.
     #[error("{id} is not between the fingers: it reaches {beyond_mm:.0} mm beyond one of them")]
     Beyond {
         /// Which object.
@@ -55,7 +55,7 @@ pub enum NotGrasped {
         /// How far.
         beyond_mm: f64,
     },
-    /// Only an edge of it is there.
+    /// Only an edge of it is between the pads.
     #[error("the fingers hold only an edge of {id}: {held_mm:.0} mm of it, at least {:.0} mm are needed", MIN_HOLD_M * 1e3)]
     Edge {
         /// Which object.
@@ -63,7 +63,7 @@ pub enum NotGrasped {
         /// How much.
         held_mm: f64,
     },
-    /// More than one.
+    /// Two objects are between the fingers.
     #[error("{first} and {second} are both between the fingers")]
     Several {
         /// One.
@@ -88,18 +88,17 @@ impl NotGrasped {
 pub const MAX_ASKEW_DEGREES: f64 = 15.0;
 /// How much of it the pads must hold, along x and along z.
 pub const MIN_HOLD_M: f64 = 0.008;
-/// What the pads give way, in metres.
+/// How far the pads give way, in metres.
 const PAD_GIVE_M: f64 = 0.002;
 
 impl Pads {
-    /// The pads of a robot's gripper: the inner faces of its fingers.
+    /// The pads of a robot's gripper: of the boxes of its finger the one that is nearest to the other finger where both meet. `None` where
+    /// no box of the finger lies along the tool's axes.
     pub fn of(robot: &Robot) -> Option<Pads> {
-        let finger = &robot.model.links[robot.finger_link()?];
-        let body = finger.bodies.first()?;
-        let Geometry::Box { half } = body.geometry else { return None };
-        let tool = &robot.model.links[robot.tool];
-        let middle = finger.origin.position[2] + body.pose.position[2] - tool.origin.position[2];
-        Some(Pads { x: half[0], z_from: middle - half[2], z_to: middle + half[2], thick: 2.0 * half[1] })
+        let inner_m = |part: &FingerPart| part.middle[1].abs() - part.half[1];
+        let boxes = robot.finger_parts().into_iter().filter(|part| part.is_flat);
+        let FingerPart { middle: [x, _, z], half, .. } = boxes.min_by(|a, b| inner_m(a).total_cmp(&inner_m(b)))?;
+        Some(Pads { x: [x - half[0], x + half[0]], z_from: z - half[2], z_to: z + half[2], thick: 2.0 * half[1] })
     }
 
     /// What the fingers hold when they close from `finger` metres on each side of the middle.
@@ -127,7 +126,7 @@ impl Pads {
     pub fn patch(&self, in_tool: &Pose, size: &[f64; 3]) -> Option<[[f64; 2]; 2]> {
         let axes = axes(in_tool);
         let across = (0..3).max_by(|a, b| axes[*a][1].abs().total_cmp(&axes[*b][1].abs())).unwrap_or(1);
-        let [x, z] = [(0, [-self.x, self.x]), (2, [self.z_from, self.z_to])].map(|(axis, [from, to])| {
+        let [x, z] = [(0, self.x), (2, [self.z_from, self.z_to])].map(|(axis, [from, to])| {
             let reach: f64 = (0..3).filter(|k| *k != across).map(|k| axes[k][axis].abs() * size[k] / 2.0).sum();
             [(in_tool.position[axis] - reach).max(from), (in_tool.position[axis] + reach).min(to)]
         });
@@ -142,8 +141,10 @@ impl Pads {
 
     /// Whether a cuboid is in the one that the pads sweep: whether no axis of either separates the two.
     fn meets(&self, finger: f64, in_tool: &Pose, size: &[f64; 3]) -> bool {
-        let half = [self.x, finger, (self.z_to - self.z_from) / 2.0];
-        let offset = [in_tool.position[0], in_tool.position[1], in_tool.position[2] - (self.z_to + self.z_from) / 2.0];
+        let [x_from, x_to] = self.x;
+        let half = [(x_to - x_from) / 2.0, finger, (self.z_to - self.z_from) / 2.0];
+        let middle = [(x_to + x_from) / 2.0, 0.0, (self.z_to + self.z_from) / 2.0];
+        let offset: [f64; 3] = std::array::from_fn(|i| in_tool.position[i] - middle[i]);
         let axes = axes(in_tool);
         let along_tool = |i: usize| {
             let reach: f64 = (0..3).map(|k| axes[k][i].abs() * size[k] / 2.0).sum();
@@ -174,7 +175,7 @@ impl Pads {
             let reach: f64 = (0..3).filter(|k| *k != across).map(|k| axes[k][axis].abs() * size[k] / 2.0).sum();
             (in_tool.position[axis] + reach).min(to) - (in_tool.position[axis] - reach).max(from)
         };
-        let held = held(0, -self.x, self.x).min(held(2, self.z_from, self.z_to));
+        let held = held(0, self.x[0], self.x[1]).min(held(2, self.z_from, self.z_to));
         if held < MIN_HOLD_M {
             return Err(NotGrasped::Edge { id: id(), held_mm: held.max(0.0) * 1e3 });
         }
@@ -230,7 +231,7 @@ mod tests {
     use super::*;
     use std::f64::consts::PI;
 
-    const PADS: Pads = Pads { x: 0.0125, z_from: -0.055, z_to: 0.015, thick: 0.014 };
+    const PADS: Pads = Pads { x: [-0.0125, 0.0125], z_from: -0.055, z_to: 0.015, thick: 0.014 };
     const SIZE: [f64; 3] = [0.12, 0.07, 0.10];
 
     /// The tool looks down from 3 cm below the top of a box at the origin.

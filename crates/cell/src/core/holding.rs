@@ -54,39 +54,64 @@ impl Held {
 }
 
 impl Cell {
-    /// How far each finger is from the middle when something between them stops them, if something does.
-    pub(super) fn closes_to(&self, from: f64) -> f64 {
-        let tool = self.robot.tool_pose(&self.configuration());
-        self.between(from, &tool).1.map_or(0.0, |grip| grip.width / 2.0)
+    /// How far each finger of an arm is from the middle when something between them stops them, if something does.
+    ///
+    /// # Errors
+    /// Where that is held by another arm.
+    pub(super) fn closes_to(&self, arm: usize, from: f64) -> Result<f64, String> {
+        let tools = self.arms.tools(&self.configuration());
+        let (_, closed) = self.between(arm, from, &tools);
+        self.held_by_another(&closed).map_or(Ok(closed.map_or(0.0, |grip| grip.width / 2.0)), Err)
     }
 
-    /// Of every object the part that fingers could close around, and what they hold when they close from `from`.
-    fn between(&self, from: f64, tool: &Pose) -> (Vec<Cuboid>, Result<GripOf, NotGrasped>) {
+    /// Why fingers do not close around what is between them where another arm holds it: what two grippers do to one object is not simulated.
+    fn held_by_another(&self, closed: &Result<GripOf, NotGrasped>) -> Option<String> {
+        let grip = closed.as_ref().ok()?;
+        let (holder, _) = self.arms.holder_of(grip.index)?;
+        Some(format!(
+            "nothing is grasped: {} is between the fingers, and the arm `{}` holds it; this cell does not simulate that two arms hold one \
+             object, so have it put down first",
+            self.ids[grip.index],
+            self.arms.name(holder)
+        ))
+    }
+
+    /// Of every object the part that fingers of an arm could close around, and what they hold when they close from `from`.
+    fn between(&self, arm: usize, from: f64, tools: &[Pose]) -> (Vec<Cuboid>, Result<GripOf, NotGrasped>) {
+        let tool = &tools[arm];
         let parts: Vec<Cuboid> =
-            (0..self.ids.len()).map(|i| self.grip_part(i, &tool.inverse().compose(&self.pose_of(i, tool)))).collect();
+            (0..self.ids.len()).map(|i| self.grip_part(i, &tool.inverse().compose(&self.pose_of(i, tools)))).collect();
         let there: Vec<(String, Pose, [f64; 3])> = (parts.iter().enumerate())
-            .map(|(i, (part, size))| (self.ids[i].clone(), self.pose_of(i, tool).compose(part), *size))
+            .map(|(i, (part, size))| (self.ids[i].clone(), self.pose_of(i, tools).compose(part), *size))
             .collect();
-        let closed = self.pads.close(tool, from, &there);
+        let closed = self.arms.pads(arm).map_or(Err(NotGrasped::Nothing), |pads| pads.close(tool, from, &there));
         (parts, closed)
     }
 
-    /// The fingers have closed from `from` metres on each side of the middle. Who asked hears what fingers know: how wide what stopped them
-    /// was, and whether it still does. Why they hold nothing only the cell knows, and tells it apart from that.
+    /// The fingers of an arm have closed from `from` metres on each side of the middle. The goal's result says what fingers can measure: how wide
+    /// the thing was that stopped them, and whether it still does. Why they hold nothing only the cell knows: that is a
+    /// [`Command::Missed`].
     pub(super) fn close(
         &mut self,
+        arm: usize,
         from: f64,
         object: String,
         expected: Option<&Pose>,
         out: &mut Vec<Command>,
     ) -> Ending {
-        let tool = self.robot.tool_pose(&self.configuration());
-        let (parts, closed) = self.between(from, &tool);
+        let tools = self.arms.tools(&self.configuration());
+        let tool = tools[arm];
+        let (parts, closed) = self.between(arm, from, &tools);
+        if let Some(reason) = self.held_by_another(&closed) {
+            self.contacts.closed(arm, None, &self.environment);
+            self.resting.set_finger(arm, from);
+            return Ending::Aborted(reason);
+        }
         let around = match &closed {
             Ok(grip) => Some(grip.index),
             Err(reason) => reason.object().and_then(|id| self.ids.iter().position(|known| known == id)),
         };
-        self.contacts.closed(around, &self.environment);
+        self.contacts.closed(arm, around, &self.environment);
         let held = closed.map_err(|reason| (None, reason.to_string())).and_then(|grip| {
             let slips = |reason: String| Err((Some(grip.width), reason));
             let id = &self.ids[grip.index];
@@ -102,7 +127,7 @@ impl Cell {
         let grip = match held {
             Ok(grip) => grip,
             Err((stopped, reason)) => {
-                self.resting.finger = 0.0;
+                self.resting.set_finger(arm, 0.0);
                 let felt = stopped.map_or("nothing stopped the fingers".to_owned(), |width| {
                     format!("something {:.0} mm wide slipped out of the fingers", width * 1e3)
                 });
@@ -110,26 +135,26 @@ impl Cell {
                 return Ending::Aborted(format!("{object} is not grasped: {felt}, they are closed fully"));
             }
         };
-        self.resting.finger = grip.width / 2.0;
+        self.resting.set_finger(arm, grip.width / 2.0);
         let friction = self.environment.model(grip.index).kind.friction();
         let in_tool = grip.in_tool.compose(&parts[grip.index].0.inverse());
-        self.held = Some(Held::new(grip.index, in_tool, friction));
+        self.arms.hold(arm, Some(Held::new(grip.index, in_tool, friction)));
         self.environment.carry(grip.index, &tool.compose(&in_tool));
         let in_gripper = expected.map(|believed| felt(believed, grip.width));
         Ending::Done(Product::Grasped { object, width: grip.width, in_gripper })
     }
 
-    /// The fingers open: what they held is left to itself.
-    pub(super) fn let_go(&mut self) {
-        let Some(held) = self.held.take() else { return };
-        self.contacts.let_go(held.object, true);
-        let tool = self.robot.tool_pose(&self.configuration());
+    /// The fingers of an arm open: what they held is left to itself.
+    pub(super) fn let_go(&mut self, arm: usize) {
+        let Some(held) = self.arms.hold(arm, None) else { return };
+        self.contacts.let_go(arm, held.object, true);
+        let tool = self.arms.tools(&self.configuration())[arm];
         self.environment.let_go(held.object, &tool.compose(&held.in_tool), [0.0; 3]);
     }
 
-    /// One step of holding, with the tool where it is now; the object that was lost.
-    pub(super) fn keep_hold(&mut self, tool: &Pose) -> Option<usize> {
-        let mut held = self.held?;
+    /// One step in which an arm holds what it holds, with its tool where it is now; the object that was lost.
+    pub(super) fn keep_hold(&mut self, arm: usize, tool: &Pose) -> Option<usize> {
+        let mut held = self.arms.held(arm)?;
         let dt = STEP.as_secs_f64();
         let at = tool.position;
         let acceleration = match held.trail {
@@ -144,7 +169,7 @@ impl Cell {
         let (model, size) = (self.environment.model(held.object), self.size_of(held.object));
         let patch = |in_tool: &Pose| {
             let (part, size) = self.grip_part(held.object, in_tool);
-            self.pads.patch(&in_tool.compose(&part), &size)
+            self.arms.pads(arm)?.patch(&in_tool.compose(&part), &size)
         };
         if let Some(patch) = patch(&held.in_tool) {
             let mass_kg = model.mass_kg();
@@ -159,21 +184,22 @@ impl Cell {
         if patch(&held.in_tool).is_some() {
             self.tilts[held.object] = self.tilts[held.object].max(lean);
             self.environment.carry(held.object, &pose);
-            self.held = Some(held);
+            self.arms.hold(arm, Some(held));
             return None;
         }
         let slid = tool.rotate([held.slip.along[0], 0.0, held.slip.along[1]]);
         self.environment.let_go(held.object, &pose, std::array::from_fn(|i| velocity[i] + slid[i]));
-        self.held = None;
-        self.contacts.let_go(held.object, false);
+        self.arms.hold(arm, None);
+        self.contacts.let_go(arm, held.object, false);
         // Nothing is left to stop the fingers.
-        self.resting.finger = 0.0;
+        self.resting.set_finger(arm, 0.0);
         Some(held.object)
     }
 
-    /// Whether an object is between the fingers, or in one of them, with the tool at `tool`.
-    pub(super) fn fingers_are_at(&self, object: usize, tool: &Pose, finger: f64) -> bool {
-        self.pads.are_at(finger, &tool.inverse().compose(&self.pose_of(object, tool)), &self.size_of(object))
+    /// Whether an object is between the fingers of an arm, or in one of them, with the tools at `tools`.
+    pub(super) fn fingers_are_at(&self, arm: usize, object: usize, tools: &[Pose], finger: f64) -> bool {
+        let in_tool = tools[arm].inverse().compose(&self.pose_of(object, tools));
+        self.arms.pads(arm).is_some_and(|pads| pads.are_at(finger, &in_tool, &self.size_of(object)))
     }
 
     /// What the fingers can close around of an object that is there in the tool frame.
@@ -186,11 +212,11 @@ impl Cell {
         self.environment.model(object).size
     }
 
-    /// Where an object is, with the tool at `tool`.
-    pub(super) fn pose_of(&self, object: usize, tool: &Pose) -> Pose {
-        match self.held {
-            Some(held) if held.object == object => tool.compose(&held.in_tool),
-            _ => self.environment.state(object).pose,
+    /// Where an object is, with the tools of all arms at `tools`.
+    pub(super) fn pose_of(&self, object: usize, tools: &[Pose]) -> Pose {
+        match self.arms.holder_of(object) {
+            Some((arm, held)) => tools[arm].compose(&held.in_tool),
+            None => self.environment.state(object).pose,
         }
     }
 

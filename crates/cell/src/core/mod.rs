@@ -1,5 +1,6 @@
 //! The cell as a pure machine: events in, commands out, time as an argument.
 
+pub mod arms;
 pub mod braking;
 pub mod cell;
 pub mod contacts;
@@ -17,6 +18,7 @@ pub mod tableware;
 
 mod activity;
 mod battery;
+mod clearance;
 mod deviations;
 mod holding;
 mod motion;

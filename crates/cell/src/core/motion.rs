@@ -123,6 +123,12 @@ impl Motion {
         })
     }
 
+    /// Where the joints are at the last [`STEP`] before so many seconds, and at every one from there to the end.
+    pub(crate) fn ahead(&self, time_s: f64) -> &[JointVector] {
+        let index = (time_s / STEP.as_secs_f64()).max(0.0) as usize;
+        &self.course[index.min(self.course.len() - 1)..]
+    }
+
     /// How fast the joints are after so many seconds, and how fast that changes, per second and per second squared.
     pub(crate) fn derivatives(&self, time_s: f64) -> (JointVector, JointVector) {
         let dt = STEP.as_secs_f64();

@@ -1,4 +1,4 @@
-//! The objects of the cell as its ground truth tells of them, as nobody on the robot knows them.
+//! The objects of the cell as its ground truth tells of them; the robot itself does not know this.
 
 use super::environment::{Kind, Model};
 use ratn_model::pose::Pose;
@@ -31,8 +31,10 @@ pub struct TrueObject {
     pub in_place: bool,
     /// How far it leaned at the most while the gripper held it, in radians.
     pub greatest_tilt_rad: f64,
-    /// The gripper holds it.
+    /// A gripper holds it.
     pub held: bool,
+    /// The name of the arm whose gripper holds it.
+    pub holder: Option<String>,
     /// On what it rests; empty while held, and in the air.
     pub on: String,
 }

@@ -1,8 +1,9 @@
 //! Time that passes: the environment's steps, what is held, the battery.
 
 use super::activity::{Activity, Kind};
+use super::braking::Way;
 use super::cell::Cell;
-use super::contacts::Doing;
+use super::contacts::{ArmDoing, Doing};
 use super::protocol::{Command, Ending, Module};
 use ratn_model::time::Timestamp;
 
@@ -10,8 +11,8 @@ use ratn_model::time::Timestamp;
 const OPEN_M: f64 = 1e-4;
 
 impl Cell {
-    /// Time goes on to `time`, step by step where something moves; to the step at which what is held was lost, where that comes first:
-    /// then something else may be due before `time`. Whether it did.
+    /// Lets time go on to `time`, step by step where something moves. Stops at a step at which a held object is lost, because that ends motions,
+    /// and something else may be due before `time`; returns whether it did.
     pub(super) fn pass_until(&mut self, time: Timestamp, out: &mut Vec<Command>) -> bool {
         while self.environment.next_step() <= time {
             if self.environment.is_at_rest() && !self.may_move() {
@@ -27,49 +28,62 @@ impl Cell {
         false
     }
 
-    /// Whether what was held was lost.
+    /// One step. Returns whether a held object was lost.
     fn step(&mut self, out: &mut Vec<Command>) -> bool {
         let configuration = self.configuration();
-        let tool = self.robot.tool_pose(&configuration);
-        let lost = self.keep_hold(&tool);
-        if let Some(lost) = lost {
+        let tools = self.arms.tools(&configuration);
+        let mut is_lost = false;
+        for arm in self.arms.numbers() {
+            let Some(lost) = self.keep_hold(arm, &tools[arm]) else { continue };
+            is_lost = true;
             let holds = if self.is_active(Module::Base) { "base" } else { "arm" };
             let reason = format!("{} slipped out of the fingers; the {holds} holds", self.ids[lost]);
-            let moves = |a: &Activity| matches!(a.kind, Kind::Follow(_));
-            self.halt(moves, |_| Ending::Aborted(reason.clone()), 1.0, out);
+            let carries = |a: &Activity| match &a.kind {
+                Kind::Follow(Way::Arm(of, _)) => *of == arm,
+                Kind::Follow(Way::Base(_)) => true,
+                _ => false,
+            };
+            self.halt(carries, |_| Ending::Aborted(reason.clone()), 1.0, out);
         }
-        let open = self.open_finger_m() - configuration.finger < OPEN_M;
-        // Closed around something, they stand at its faces.
-        let solid = open || self.held.is_some();
-        self.environment.set_fingers_solid(solid);
+        let finger = |arm: usize| configuration.of_arm(arm).map_or(0.0, |at| at.finger);
+        let solid = self.arms.numbers().map(|arm| {
+            let open = self.arms.open_finger_m(arm) - finger(arm) < OPEN_M;
+            // Closed around something, they stand at its faces.
+            open || self.arms.held(arm).is_some()
+        });
+        let solid: Vec<bool> = solid.collect();
+        solid.iter().enumerate().for_each(|(arm, solid)| self.environment.set_fingers_solid(arm, *solid));
         self.environment.step(&self.robot, &configuration);
-        if self.contacts.parts_from().is_some_and(|object| !self.fingers_are_at(object, &tool, configuration.finger)) {
-            self.contacts.parted();
+        for arm in self.arms.numbers() {
+            let parts_from = self.contacts.parts_from(arm);
+            if parts_from.is_some_and(|object| !self.fingers_are_at(arm, object, &tools, finger(arm))) {
+                self.contacts.parted(arm);
+            }
         }
-        let doing = Doing {
-            now: self.environment.now(),
-            held: self.held.map(|held| held.object),
-            moves: self.is_active(Module::Arm) || self.is_active(Module::Base),
-            arm_of: self.is_active(Module::Arm).then_some(&self.robot),
-            fingers_solid: solid,
-        };
+        let drives = self.is_active(Module::Base);
+        let doing = self.arms.all_held().into_iter().zip(&solid).enumerate().map(|(arm, (held, solid))| {
+            let moves = self.is_active(Module::Arm(arm));
+            ArmDoing { held, moves, is_moved: moves || drives, fingers_solid: *solid }
+        });
+        let arms: Vec<ArmDoing> = doing.collect();
+        let doing = Doing { now: self.environment.now(), arms: &arms };
         self.contacts.observe(&self.environment.touches(), doing, &self.environment, &self.ids);
-        lost.is_some()
+        is_lost
     }
 
     /// Whether something may move that the environment does not know of: the robot, or what it holds.
     pub(super) fn may_move(&self) -> bool {
-        let modules = [Module::Base, Module::Arm, Module::Gripper, Module::PanTilt];
-        let moves = modules.into_iter().any(|module| self.activities.contains_key(&module));
+        let moves = self.activities.keys().any(|module| *module != Module::Camera);
         let moves = (moves && !self.clock.stands(self.now)) || !self.braking.is_empty();
-        moves || self.held.is_some_and(|held| !held.is_steady())
+        moves || self.arms.holds_unsteadily()
     }
 
     fn drain_until(&mut self, time: Timestamp) {
         let passed = time.since(self.now);
         let stands = self.clock.stands(self.now);
         let moves = |module| self.braking.contains_key(&module) || (self.activities.contains_key(&module) && !stands);
-        let (moving, driving) = (moves(Module::Arm), moves(Module::Base));
+        let moving = self.arms.numbers().any(|arm| moves(Module::Arm(arm)));
+        let driving = moves(Module::Base);
         self.battery.drain(passed, moving, driving);
         self.now = self.now.max(time);
         self.motion_time = self.motion_time.max(self.clock.motion_time(self.now));

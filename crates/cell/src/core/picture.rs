@@ -17,7 +17,7 @@ use ratn_world::scene::Shape;
 pub struct Scenery {
     /// Where the robot truly is.
     pub configuration: Configuration,
-    /// Where it has itself.
+    /// Where it believes to be.
     pub measured: Configuration,
     /// The camera's true optical frame, in the world.
     pub eye: Pose,
@@ -34,7 +34,7 @@ pub struct Exposure {
     pub scenery: Scenery,
     /// The number of the first frame since the cell began.
     pub first_frame: u64,
-    /// How many frames.
+    /// How many frames were taken of it.
     pub frames: u32,
 }
 

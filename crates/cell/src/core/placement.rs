@@ -1,16 +1,15 @@
-//! What stands there is random, but so that the task can be done: apart from each other, within reach, and each object graspable
-//! from above while all others still stand there. The same seed gives the same scene.
+//! Lays a random scene in which the task can be done: objects stand apart from each other and within reach, and each can be grasped from above
+//! while all others still stand there. The same seed gives the same scene.
 
 use super::environment::{Furniture, Kind, Model};
 use super::grasping::Pads;
 use super::objects::Placed;
 use super::tableware;
-use crate::config::{AIMM, CellConfig, Goods, Setting};
+use crate::config::{CellConfig, Goods, Setting};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::grasp;
 use ratn_model::pose::Pose;
-use ratn_motion::aimm;
 use ratn_motion::arm;
 use ratn_motion::arm::line;
 use ratn_motion::collision::{CONTACT_TOLERANCE_M, Checker, Contact, PADDING_M};
@@ -18,6 +17,7 @@ use ratn_motion::description::DescriptionError;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::reach::Target;
 use ratn_motion::robot::Robot;
+use ratn_motion::top_grasp::{APPROACH_M, grasp_poses};
 use ratn_motion::workplace::{Boxes, HOME, Slab, Workplace};
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::FRAC_PI_2;
@@ -25,7 +25,7 @@ use std::f64::consts::FRAC_PI_2;
 /// No scene was laid.
 #[derive(Debug, thiserror::Error)]
 pub enum PlacementError {
-    /// None was found in which the task could be done.
+    /// No scene was found in which the task could be done.
     #[error(
         "no feasible scene with {count} objects was found from seed {seed} in {MAX_TABLES} tries; try another seed"
     )]
@@ -48,7 +48,7 @@ pub enum PlacementError {
     /// The robot's description.
     #[error(transparent)]
     Robot(#[from] DescriptionError),
-    /// A gripper that opens to something else than the config says.
+    /// The gripper cannot open as far as the config says, or would not open around every box.
     #[error("`gripper.opening_m` of the cell is {opening_m}: {reason}")]
     Opening {
         /// What the config says, in metres.
@@ -64,6 +64,16 @@ pub enum PlacementError {
         /// What it lacks, and what next.
         reason: &'static str,
     },
+    /// An arm that cannot do what a cell is for.
+    #[error("the arm `{arm}` of the robot `{robot}` cannot be in a cell: {reason}")]
+    UnfitArm {
+        /// Which arm.
+        arm: String,
+        /// Of which robot.
+        robot: String,
+        /// What is wrong with it, and what next.
+        reason: &'static str,
+    },
 }
 
 /// Tables tried.
@@ -72,9 +82,10 @@ const MAX_TABLES: usize = 3000;
 const MAX_PLACES: usize = 60;
 /// Free space between two boxes, in metres: what the detector needs to tell them apart.
 const GAP_M: f64 = 0.045;
-/// What the fingers need across a box beyond half of their opening, and along it: with room for what the detector gets wrong.
-const FINGER_ROOM_M: f64 = 0.034;
-const FINGER_HALF_WIDTH_M: f64 = 0.033;
+/// Room that the fingers need at a box for what the detector gets wrong, in metres: across it beyond half of their opening and their
+/// thickness, and along it beyond half of their width.
+const FINGER_ROOM_M: f64 = 0.02;
+const FINGER_ROOM_ALONG_M: f64 = 0.0205;
 /// The table's name.
 pub const TABLE: &str = "table";
 
@@ -92,7 +103,8 @@ pub fn objects(robot: &Robot, setting: Setting, goods: Goods, seed: u64) -> Resu
 /// Tableware on the rack.
 fn dishes(robot: &Robot, goods: Goods, seed: u64) -> Result<Vec<Placed>, PlacementError> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let mut tables = (0..MAX_TABLES).map(|_| tableware::lay(goods, &mut random));
+    let workplace = workplace(robot);
+    let mut tables = (0..MAX_TABLES).map(|_| tableware::lay(workplace, goods, &mut random));
     let feasible = tables.find(|placed| tableware::are_apart(placed) && all_graspable(robot, Setting::Table, placed));
     feasible.ok_or(PlacementError::Crowded { count: goods.count(Setting::Table), seed })
 }
@@ -104,10 +116,12 @@ fn boxes(robot: &Robot, count: usize, seed: u64) -> Result<Vec<Placed>, Placemen
     if count > places {
         return Err(PlacementError::Places { count, places, robot: robot.name().to_owned() });
     }
+    let (thick, half_width) = Pads::of(robot).map_or((0.0, 0.0), |pads| (pads.thick, (pads.x[1] - pads.x[0]) / 2.0));
     let ground = Ground {
         boxes: workplace.boxes,
         height_m: workplace.table.top_m(),
-        finger_reach_m: robot.open_finger_m() + FINGER_ROOM_M,
+        finger_reach_m: robot.open_finger_m() + thick + FINGER_ROOM_M,
+        finger_half_width_m: half_width + FINGER_ROOM_ALONG_M,
     };
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     for table in 0..MAX_TABLES {
@@ -146,18 +160,19 @@ pub fn fit(robot: &Robot, config: &CellConfig) -> Result<Pads, PlacementError> {
         "its robot.toml has no [workplace], so nobody knows where the table and the boxes are: add one (docs/robots.md)"
     } else if robot.camera_pose(&robot.at_zero()).is_none() {
         "its robot.toml has no [camera]"
-    } else if config.scene == Setting::Table && config.robot != AIMM {
-        "the scene `table` is made for `aimm`; use the scene `boxes`"
+    } else if config.scene == Setting::Table && robot.workplace().is_some_and(|place| place.tableware.is_none()) {
+        "its robot.toml has no [workplace.tableware], so nobody knows where the rack and the places are: add it (docs/robots.md), or use \
+         the scene `boxes`"
     } else if let Some(pads) = pads {
         check_opening(robot, config)?;
         return Ok(pads);
     } else {
-        "it needs a [gripper] whose finger is a box in the URDF"
+        "it needs a [gripper] whose finger is a box in the URDF that lies along the tool's axes"
     };
     Err(PlacementError::Unfit { robot: robot.name().to_owned(), reason: lacks })
 }
 
-/// The gripper opens as far as the config says, and then around every box.
+/// Checks that the gripper can open as far as the config says, and that every box fits in between then.
 fn check_opening(robot: &Robot, config: &CellConfig) -> Result<(), PlacementError> {
     let Some(opening_m) = config.gripper.opening_m else { return Ok(()) };
     let (most, name, widest) = (2.0 * robot.open_finger_m(), robot.name(), workplace(robot).boxes.greatest[1]);
@@ -192,7 +207,7 @@ pub fn furniture(robot: &Robot, setting: Setting) -> Vec<Furniture> {
     let table = Furniture { name: TABLE.to_owned(), parts: vec![(Pose::at(x, y, z), size)] };
     match setting {
         Setting::Boxes => vec![table],
-        Setting::Table => vec![table, tableware::rack()],
+        Setting::Table => std::iter::once(table).chain(tableware::rack(workplace(robot))).collect(),
     }
 }
 
@@ -218,6 +233,8 @@ struct Ground {
     height_m: f64,
     /// What the fingers need across a box, from its middle.
     finger_reach_m: f64,
+    /// What they need along it, from its middle.
+    finger_half_width_m: f64,
 }
 
 fn footprints(random: &mut ChaCha8Rng, ground: &Ground, count: usize, crowding: f64) -> Option<Vec<Footprint>> {
@@ -251,7 +268,7 @@ impl Footprint {
     /// Whether this box keeps its distance from the other and can be grasped beside it.
     fn clear_of(&self, other: &Footprint, ground: &Ground) -> bool {
         let grown = Rectangle { half: self.base().half.map(|h| h + GAP_M), ..self.base() };
-        let fingers = Rectangle { half: [FINGER_HALF_WIDTH_M, ground.finger_reach_m], ..self.base() };
+        let fingers = Rectangle { half: [ground.finger_half_width_m, ground.finger_reach_m], ..self.base() };
         !grown.overlaps(&other.base()) && !fingers.overlaps(&other.base())
     }
 
@@ -296,7 +313,7 @@ fn all_graspable(robot: &Robot, setting: Setting, placed: &[Placed]) -> bool {
     placed.iter().filter(|object| object.model.slips_off().is_none()).all(|object| {
         grasps(object).iter().any(|grasp| {
             reach.solutions(&Target::at(*grasp), &home, 6, 20, &mut random).iter().any(|posture| {
-                line(&reach, posture, [0.0, 0.0, aimm::APPROACH_M]).is_ok_and(|postures| {
+                line(&reach, posture, [0.0, 0.0, APPROACH_M]).is_ok_and(|postures| {
                     postures.iter().all(|p| checker.is_free(p, Contact::Gripper(CONTACT_TOLERANCE_M)))
                 })
             })
@@ -313,7 +330,7 @@ pub fn home(robot: &Robot) -> JointVector {
 fn grasps(object: &Placed) -> Vec<Pose> {
     match object.model.kind {
         Kind::Bowl | Kind::Plate => grasp::at_rim(&object.pose, object.model.size),
-        Kind::Box => aimm::grasp_poses(&object.pose, object.model.size).to_vec(),
+        Kind::Box => grasp_poses(&object.pose, object.model.size).to_vec(),
         Kind::Cup => grasp::around(&object.pose, object.model.size),
         Kind::Fork => grasp::from_above(&object.pose, object.model.size).to_vec(),
     }
@@ -359,9 +376,9 @@ mod tests {
         let goods = Goods { bowls: 3, forks: 3, cups: 3, plates: 3, ..Goods::default() };
         let mut placed = objects(&robot, Setting::Table, goods, 1).unwrap();
         for (i, object) in placed.iter_mut().enumerate() {
-            let place = tableware::places(object.model.kind)[i % 3];
+            let place = tableware::places(workplace(&robot), object.model.kind)[i % 3];
             object.pose = place.compose(&Pose::at(0.0, 0.0, object.model.size[2] / 2.0));
-            assert!(tableware::is_in_place(object.model.kind, &object.pose));
+            assert!(tableware::is_in_place(workplace(&robot), object.model.kind, &object.pose));
         }
         assert!(all_graspable(&robot, Setting::Table, &placed));
     }

@@ -1,6 +1,7 @@
 //! Events that go into the cell's core, and commands that come out of it.
 
 pub use super::activity::{Module, Ticket};
+use super::arms::FIRST;
 use super::contacts::Contact;
 use super::faults::Fault;
 pub use super::motion::Tracking;
@@ -22,38 +23,41 @@ pub enum Event {
     Start {
         /// The goal's id, by which commands name it.
         ticket: Ticket,
+        /// The number of the arm that does it, or whose gripper; 0 unless said. A request for another module does not look at it.
+        #[serde(default, skip_serializing_if = "is_first")]
+        arm: usize,
         /// What to do.
         request: Request,
     },
     /// A goal is to stop: its giver wants that or is gone, or its lease has ended.
     Stop {
-        /// Which goal.
+        /// The goal.
         ticket: Ticket,
-        /// Why.
+        /// Why it is to stop.
         reason: String,
     },
     /// An emergency stop or a hold is in force from now on, or neither is any more.
     Safety {
-        /// Which.
+        /// What is in force now.
         state: SafetyState,
     },
     /// A new table; the robot goes back to its first posture.
     Reset {
-        /// From which seed.
+        /// The seed that sizes and places of the objects are derived from.
         seed: u64,
         /// The objects on it.
         goods: Goods,
     },
     /// A fault is injected.
     Fault {
-        /// What and when.
+        /// What goes wrong, and when.
         fault: Fault,
     },
     /// Asks for the whole state (a snapshot).
     Save,
     /// Back to a state; goals under way end aborted.
     PutBack {
-        /// Which.
+        /// The state.
         snapshot: Box<Snapshot>,
     },
     /// Only time has passed.
@@ -69,21 +73,21 @@ pub enum Request {
         /// Points in x, y (metres) and heading (radians), beginning where the base is.
         trajectory: Trajectory,
     },
-    /// Moves the arm along a trajectory.
+    /// Moves an arm along a trajectory.
     Follow {
         /// Beginning where the arm is; positions in radians.
         trajectory: Trajectory,
     },
     /// Moves the arm to a posture, in a straight line of joint positions.
     MoveTo {
-        /// Where to.
+        /// The posture that the arm ends in.
         joints: JointVector,
         /// The fraction of its greatest speed, above 0 and at most 1.
         speed: f64,
     },
     /// Closes the fingers around something.
     Grasp {
-        /// How the giver calls it.
+        /// The name that the goal's giver has for the object; it comes back in [`Product::Grasped`].
         object: String,
         /// The pose in the tool frame that the object is expected to have then.
         expected: Option<Pose>,
@@ -113,26 +117,26 @@ pub enum Request {
 pub enum Command {
     /// A goal has ended.
     Ended {
-        /// Which.
+        /// The goal.
         ticket: Ticket,
-        /// How.
+        /// How it has ended.
         ending: Ending,
         /// How well it followed a trajectory, to its end or as far as it came.
         tracking: Option<Tracking>,
     },
-    /// The state, as wanted.
+    /// The state that [`Event::Save`] asked for.
     Saved {
-        /// All of it.
+        /// The whole state.
         snapshot: Box<Snapshot>,
     },
     /// Two bodies touched that should not have.
     Touched {
-        /// Which, and how.
+        /// The two bodies, how deep they were in each other, and how they moved.
         contact: Contact,
     },
     /// The fingers closed and hold nothing: the reason, which only the cell knows. For the cell's log, not for the task.
     Missed {
-        /// Why.
+        /// Why they hold nothing.
         reason: String,
     },
 }
@@ -140,27 +144,27 @@ pub enum Command {
 /// How a goal ends.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Ending {
-    /// As it should.
+    /// It was done.
     Done(Product),
     /// It was not done, or not to its end. The module holds.
     Aborted(String),
     /// It was stopped. The module holds.
     Preempted(String),
-    /// By an emergency stop, before or after it began. The module holds.
+    /// An emergency stop ended it, before or after it began. The module holds.
     Stopped(String),
 }
 
 /// What comes of a goal.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Product {
-    /// The base is there.
+    /// The base has come to the end of its trajectory.
     Driven {
-        /// Its frame, in the world frame.
+        /// Where it believes to stand, in the world frame.
         end: Pose,
         /// How well it followed.
         tracking: Tracking,
     },
-    /// The arm is there.
+    /// The arm has come to the end of its trajectory.
     Moved {
         /// Its posture.
         end: JointVector,
@@ -169,7 +173,7 @@ pub enum Product {
     },
     /// Something is in the gripper.
     Grasped {
-        /// How the giver calls it.
+        /// The name that the goal gave the object.
         object: String,
         /// The opening of the fingers around it, in metres.
         width: f64,
@@ -193,32 +197,36 @@ pub enum Product {
     GripperSensed {
         /// Their opening, in metres.
         width: f64,
-        /// They are closed around something.
+        /// Whether they are closed around something.
         holding: bool,
     },
-    /// The camera looks there.
+    /// The camera looks at the point that was asked for.
     Looking {
-        /// Radians.
+        /// Pan, in radians.
         pan: f64,
-        /// Radians.
+        /// Tilt, in radians.
         tilt: f64,
     },
     /// A picture to be developed.
     Captured {
-        /// From where.
+        /// The camera as the robot has it, by its own kinematics.
         camera: Camera,
         /// What was there, frame by frame.
         exposures: Vec<Exposure>,
     },
 }
 
+fn is_first(arm: &usize) -> bool {
+    *arm == FIRST
+}
+
 impl Request {
-    /// The module that does it.
-    pub fn module(&self) -> Module {
+    /// The module that does it, where it is meant for the arm of this number.
+    pub fn module(&self, arm: usize) -> Module {
         match self {
             Request::Drive { .. } | Request::SenseBase => Module::Base,
-            Request::Follow { .. } | Request::MoveTo { .. } | Request::SenseArm => Module::Arm,
-            Request::Grasp { .. } | Request::Release | Request::SenseGripper => Module::Gripper,
+            Request::Follow { .. } | Request::MoveTo { .. } | Request::SenseArm => Module::Arm(arm),
+            Request::Grasp { .. } | Request::Release | Request::SenseGripper => Module::Gripper(arm),
             Request::LookAt { .. } => Module::PanTilt,
             Request::Capture { .. } => Module::Camera,
         }

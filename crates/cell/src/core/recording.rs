@@ -1,7 +1,7 @@
-//! What happened to a cell, line by line, and the same cell made to go through it again.
+//! The recording of a cell, line by line, and its replay: the same cell is made again and given the same events.
 //!
 //! ```text
-//! {"form":2,"config":{…}}                                  first: how the cell was made
+//! {"form":2,"config":{…},"robot":{…}}                      first: how the cell was made, and of which robot
 //! {"at":…,"event":{…}}                                     what came in, in the robot's nanoseconds
 //! {"at":…,"ended":…,"how":"done"}                          what a goal came to
 //! {"at":…,"contact":{…}}                                    what touched that should not have
@@ -16,6 +16,7 @@ use super::placement::PlacementError;
 use super::protocol::{Command, Ending, Event, Ticket, Tracking};
 use crate::config::CellConfig;
 use ratn_model::time::Timestamp;
+use ratn_motion::robot::RobotIdentity;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::io;
@@ -29,23 +30,26 @@ const FORM: u32 = 2;
 pub enum Line {
     /// The first.
     Header {
-        /// Of the lines.
+        /// The form of the lines; another one is refused.
         form: u32,
         /// How the cell was made.
         config: Box<CellConfig>,
+        /// Of which robot; a recording of an earlier version does not say.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        robot: Option<RobotIdentity>,
     },
     /// Something came in.
     Event {
-        /// When.
+        /// When it came in.
         at: Timestamp,
-        /// What.
+        /// What came in.
         event: Event,
     },
     /// A goal ended.
     Ended {
-        /// When.
+        /// When it ended.
         at: Timestamp,
-        /// Which.
+        /// The goal.
         ended: Ticket,
         /// `done`, `aborted`, `preempted` or `stopped`.
         how: String,
@@ -60,24 +64,24 @@ pub enum Line {
     Contact {
         /// When it was told.
         at: Timestamp,
-        /// Which, and how.
+        /// The two bodies, how deep they were in each other, and how they moved.
         contact: Contact,
     },
     /// The environment after an event.
     World {
         /// When.
         at: Timestamp,
-        /// Its digest.
+        /// The digest of the environment.
         world: String,
     },
 }
 
-/// What came of a replay.
+/// The result of a replay in which everything happened as recorded.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Replayed {
-    /// Events that came in.
+    /// How many events came in.
     pub events: usize,
-    /// Goals that ended as they had.
+    /// How many goals ended, each as recorded.
     pub goals: usize,
     /// When the last event was, in the robot's seconds.
     pub end_s: f64,
@@ -85,10 +89,10 @@ pub struct Replayed {
     pub tracking: Tracking,
 }
 
-/// Why a recording is not replayed, or how it went otherwise.
+/// Why a recording is not replayed, or where the replay differs from it.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
-    /// It cannot be read.
+    /// A line cannot be read.
     #[error("line {line} cannot be read")]
     Unreadable {
         /// Which, from 1.
@@ -97,7 +101,7 @@ pub enum ReplayError {
         #[source]
         source: io::Error,
     },
-    /// It is none.
+    /// A line is not a line of a recording.
     #[error("line {line} is none of a recording: {reason}")]
     NoRecording {
         /// Which, from 1.
@@ -108,22 +112,33 @@ pub enum ReplayError {
     /// The cell cannot be made.
     #[error(transparent)]
     Table(#[from] PlacementError),
-    /// Something else came of it.
+    /// The robot's description is another one now.
+    #[error(
+        "this recording is of the robot {of}, and the robot that its config names is {here} now: replay it with the description of then"
+    )]
+    AnotherRobot {
+        /// The recording's.
+        of: RobotIdentity,
+        /// The one that the config names.
+        here: RobotIdentity,
+    },
+    /// The replay differs from what was recorded.
     #[error("line {line}: recorded was {recorded}, and now it is {replayed}")]
     Differs {
         /// Which, from 1.
         line: usize,
-        /// What was.
+        /// What the recording says.
         recorded: String,
-        /// What is.
+        /// What the replay came to.
         replayed: String,
     },
 }
 
 impl Line {
-    /// The first line of a recording.
-    pub fn header(config: &CellConfig) -> Line {
-        Line::Header { form: FORM, config: Box::new(config.clone()) }
+    /// The first line of a recording of a cell.
+    pub fn header(cell: &Cell) -> Line {
+        let (config, robot) = (Box::new(cell.config().clone()), Some(cell.robot().identity()));
+        Line::Header { form: FORM, config, robot }
     }
 
     /// What is recorded of a step of the cell: its event, what ended, and the world after it.
@@ -163,9 +178,14 @@ pub fn replay(lines: impl Iterator<Item = io::Result<String>>) -> Result<Replaye
         let read = serde_json::from_str(&text).map_err(|error| none(error.to_string()))?;
         let Some(cell) = &mut cell else {
             match read {
-                Line::Header { form: FORM, config } => {
+                Line::Header { form: FORM, config, robot } => {
                     config.check().map_err(|error| none(error.to_string()))?;
-                    cell = Some(Cell::new(*config)?);
+                    let made = Cell::new(*config)?;
+                    let here = made.robot().identity();
+                    if let Some(of) = robot.filter(|of| *of != here) {
+                        return Err(ReplayError::AnotherRobot { of, here });
+                    }
+                    cell = Some(made);
                 }
                 _ => return Err(none(format!("a recording begins with form {FORM} and a config"))),
             }
@@ -181,6 +201,9 @@ pub fn replay(lines: impl Iterator<Item = io::Result<String>>) -> Result<Replaye
         match read {
             Line::Header { .. } => return Err(none("it has a second beginning".to_owned())),
             Line::Event { at, event } => {
+                if let Event::PutBack { snapshot } = &event {
+                    snapshot.check_robot(cell.robot()).map_err(|error| none(error.to_string()))?;
+                }
                 pass(cell, at, event);
                 replayed.events += 1;
             }

@@ -1,10 +1,11 @@
-//! The cell's state as a value: what it can be put back to, or made of in another process.
+//! A snapshot: the cell's state as a value, to which the same or another process can put its cell back.
 //!
-//! No goal is part of it: who gave one is not there any more when it is restored, so every joint is where it had come to and holds.
-//! The emergency stop is not part of it either: it is about the world outside. Nor is what has touched: that is judged from there anew.
+//! Goals are not part of it, because their givers are gone when it is restored: every joint is where it had come to, and holds. Nor are the
+//! emergency stop, which concerns the real surroundings, and the contacts, which are counted anew.
 
+use super::arms::FIRST;
 use super::battery::Battery;
-use super::cell::Cell;
+use super::cell::{Cell, joint_counts};
 use super::contacts::Contacts;
 use super::environment::{Environment, Saved};
 use super::errors::Errors;
@@ -15,7 +16,7 @@ use super::protocol::Command;
 use ratn_model::pose::Pose;
 use ratn_model::time::Timestamp;
 use ratn_motion::joint_vector::JointVector;
-use ratn_motion::robot::Configuration;
+use ratn_motion::robot::{ArmPosition, Configuration, Robot, RobotIdentity};
 use serde::{Deserialize, Serialize};
 
 /// The form of what is written; another one is refused.
@@ -27,6 +28,9 @@ pub const FORM: u32 = 1;
 pub struct Snapshot {
     /// [`FORM`].
     form: u32,
+    /// Of which robot; a snapshot of an earlier version does not say.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    robot: Option<RobotIdentity>,
     seed: u64,
     ids: Vec<String>,
     tilts: Vec<f64>,
@@ -53,6 +57,18 @@ struct Posture {
     pan: f64,
     tilt: f64,
     finger: f64,
+    /// The arms from number 1 on.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    other_arms: Vec<ArmPosture>,
+}
+
+/// An arm beside the first one.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct ArmPosture {
+    joints: JointVector,
+    finger: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    held: Option<SavedHold>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -81,6 +97,16 @@ pub enum SnapshotError {
         /// Of the cell's.
         here: usize,
     },
+    /// Of another robot, as it says itself.
+    #[error(
+        "this snapshot is of the robot {of}, and this cell has the robot {here}: put it back to a cell of its own robot"
+    )]
+    AnotherRobot {
+        /// The snapshot's.
+        of: RobotIdentity,
+        /// The cell's.
+        here: RobotIdentity,
+    },
     /// Parts that do not fit each other.
     #[error("this snapshot contradicts itself: {0}")]
     Inconsistent(&'static str),
@@ -107,8 +133,12 @@ impl Snapshot {
         if snapshot.ids.len() != objects || snapshot.tilts.len() != objects {
             return Err(SnapshotError::Inconsistent("its objects and their names are not as many"));
         }
-        if snapshot.held.as_ref().is_some_and(|held| held.object >= objects) {
+        let held: Vec<usize> = snapshot.all_held().flatten().map(|held| held.object).collect();
+        if held.iter().any(|object| *object >= objects) {
             return Err(SnapshotError::Inconsistent("what is held is none of its objects"));
+        }
+        if held.iter().enumerate().any(|(i, object)| held[..i].contains(object)) {
+            return Err(SnapshotError::Inconsistent("two arms hold the same object"));
         }
         if !(0.0..=1.0).contains(&snapshot.battery) {
             return Err(SnapshotError::Inconsistent("its battery is fuller than full or emptier than empty"));
@@ -116,33 +146,62 @@ impl Snapshot {
         Ok(snapshot)
     }
 
-    /// Whether a cell whose arm has so many joints can be put back to it.
+    /// Whether a cell with this robot can be put back to it. A snapshot that does not say of which robot it is needs as many joints.
     ///
     /// # Errors
-    /// [`SnapshotError::OtherRobot`].
-    pub fn check_joints(&self, here: usize) -> Result<(), SnapshotError> {
-        let of = self.posture.arm.len();
-        if of == here { Ok(()) } else { Err(SnapshotError::OtherRobot { of, here }) }
+    /// [`SnapshotError::AnotherRobot`] and [`SnapshotError::OtherRobot`].
+    pub fn check_robot(&self, here: &Robot) -> Result<(), SnapshotError> {
+        if let Some(of) = self.robot.as_ref() {
+            let here = here.identity();
+            if *of != here {
+                return Err(SnapshotError::AnotherRobot { of: of.clone(), here });
+            }
+        }
+        let others = self.posture.other_arms.iter().map(|arm| arm.joints.len());
+        let mut joints = std::iter::once(self.posture.arm.len()).chain(others).zip(joint_counts(here));
+        if let Some((of, here)) = joints.find(|(of, here)| of != here) {
+            return Err(SnapshotError::OtherRobot { of, here });
+        }
+        if self.posture.other_arms.len() + 1 != here.arm_names().count() {
+            return Err(SnapshotError::Inconsistent("it has postures of another number of arms than its robot"));
+        }
+        Ok(())
+    }
+
+    /// What each arm holds, in the order of their numbers.
+    fn all_held(&self) -> impl Iterator<Item = Option<&SavedHold>> {
+        let others = self.posture.other_arms.iter().map(|arm| arm.held.as_ref());
+        std::iter::once(self.held.as_ref()).chain(others)
     }
 }
 
 impl Cell {
     /// The state now. What goes on here and what goes on from it do so alike.
     pub(super) fn save(&mut self) -> Snapshot {
-        let Configuration { base, arm, pan, tilt, finger } = self.measured();
+        let measured = self.measured();
+        let Configuration { base, arm, pan, tilt, finger, .. } = measured;
+        let held = |arm: usize| {
+            self.arms.held(arm).map(|held| {
+                let (object, in_tool, friction) = held.save();
+                SavedHold { object, in_tool, friction }
+            })
+        };
+        let other_arms = self.arms.others(&measured).into_iter().enumerate();
+        let other_arms = other_arms
+            .map(|(i, ArmPosition { joints, finger })| ArmPosture { joints, finger, held: held(i + 1) })
+            .collect();
+        let first_held = held(FIRST);
         let (faults, drawn) = self.faults.save();
         self.battery = Battery::at(self.config.battery, self.battery.level());
         Snapshot {
             form: FORM,
+            robot: Some(self.robot.identity()),
             seed: self.seed,
             ids: self.ids.clone(),
             tilts: self.tilts.clone(),
             environment: self.environment.save(&self.robot, &self.configuration()),
-            posture: Posture { base, arm, pan, tilt, finger },
-            held: self.held.map(|held| {
-                let (object, in_tool, friction) = held.save();
-                SavedHold { object, in_tool, friction }
-            }),
+            posture: Posture { base, arm, pan, tilt, finger, other_arms },
+            held: first_held,
             battery: self.battery.level(),
             frames_taken: self.frames_taken,
             faults,
@@ -153,13 +212,21 @@ impl Cell {
         }
     }
 
-    /// Back to a state; goals under way end aborted.
+    /// Back to a state; goals under way end aborted. A snapshot of another robot changes nothing: who asks is refused before
+    /// ([`Snapshot::check_robot`]).
     pub(super) fn put_back(&mut self, snapshot: &Snapshot, out: &mut Vec<Command>) {
+        if snapshot.check_robot(&self.robot).is_err() {
+            return;
+        }
         self.freeze("the cell was put back to a snapshot", out);
-        let Posture { base, arm, pan, tilt, finger } = snapshot.posture.clone();
-        self.resting = Configuration { base, arm, pan, tilt, finger };
+        let Posture { base, arm, pan, tilt, finger, other_arms } = snapshot.posture.clone();
+        self.resting = Configuration { base, arm, pan, tilt, finger, ..self.arms.first_posture() };
+        for (i, other) in other_arms.into_iter().enumerate() {
+            self.resting.set_joints(i + 1, other.joints);
+            self.resting.set_finger(i + 1, other.finger);
+        }
         (self.seed, self.stops) = (snapshot.seed, snapshot.stops);
-        self.errors = Errors::new(self.config.errors, self.robot.arm_joints().len(), self.seed, self.stops);
+        self.errors = Errors::new(self.config.errors, &joint_counts(&self.robot), self.seed, self.stops);
         self.environment = Environment::restore(
             &self.robot,
             &self.configuration(),
@@ -167,7 +234,9 @@ impl Cell {
             &snapshot.environment,
         );
         self.environment.set_time(self.now);
-        self.held = snapshot.held.as_ref().map(|held| Held::new(held.object, held.in_tool, held.friction));
+        for (arm, held) in snapshot.all_held().enumerate() {
+            self.arms.hold(arm, held.map(|held| Held::new(held.object, held.in_tool, held.friction)));
+        }
         self.contacts = Contacts::of(&self.robot);
         self.ids.clone_from(&snapshot.ids);
         self.tilts.clone_from(&snapshot.tilts);

@@ -3,6 +3,7 @@
 use super::activity::{Activity, Kind, Module, Ticket, seconds};
 use super::braking::Way;
 use super::cell::Cell;
+use super::clearance::{APART_M, Ahead, too_close};
 use super::deviations::LOST;
 use super::motion::{Controller, Motion};
 use super::protocol::Request;
@@ -20,6 +21,8 @@ const NO_HEAD: &str = "the robot has no head that turns: its description has no 
 const NO_BASE: &str = "the robot has no base that drives: its description has no `[base]`";
 /// Why there is no picture.
 const NO_CAMERA: &str = "the robot has no camera: its description has no `[camera]`";
+/// Why nothing is grasped.
+const NO_GRIPPER: &str = "the arm has no gripper: its description has none";
 /// How far the camera may look past its target, in radians.
 const MAX_LOOK_ERROR_RAD: f64 = 0.02;
 
@@ -32,10 +35,14 @@ const HEAD: &str =
     "a motion of the arm is checked with the head where it is, so let one of both states block `Arm` and `PanTilt`";
 
 impl Cell {
-    pub(super) fn start(&mut self, ticket: Ticket, request: Request) -> Result<(), String> {
-        let module = request.module();
+    /// Starts a goal, of the arm of this number where it is one for an arm or its gripper.
+    pub(super) fn start(&mut self, ticket: Ticket, arm: usize, request: Request) -> Result<(), String> {
+        if arm >= self.arms.count() {
+            return Err(format!("the robot has {} arms, numbered from 0: there is no arm {arm}", self.arms.count()));
+        }
+        let module = request.module(arm);
         if let Some(other) = self.busy_with(module) {
-            return Err(format!("the {} is busy with goal {}", module.kind(), other.0));
+            return Err(format!("the {} is busy with goal {}", self.called(module), other.0));
         }
         if self.battery.level() <= 0.0 {
             return Err("the battery is empty".to_owned());
@@ -44,7 +51,8 @@ impl Cell {
         let (kind, lasts_s) = match request {
             Request::Drive { .. } if self.robot.base_joints().is_empty() => return Err(NO_BASE.to_owned()),
             Request::Drive { trajectory } => {
-                for other in [Module::Arm, Module::Gripper, Module::PanTilt, Module::Camera] {
+                let of_arms = self.arms.numbers().flat_map(|arm| [Module::Arm(arm), Module::Gripper(arm)]);
+                for other in of_arms.chain([Module::PanTilt, Module::Camera]) {
                     self.no_motion_of(other, BASE)?;
                 }
                 if self.is_lost() {
@@ -54,40 +62,43 @@ impl Cell {
                 self.driving(trajectory)
             }
             Request::Follow { trajectory } => {
-                self.no_motion_of(Module::Base, BASE)?;
-                self.no_motion_of(Module::Gripper, HAND)?;
-                self.no_motion_of(Module::PanTilt, HEAD)?;
-                let trajectory = trajectory::check(&self.robot, &here, &trajectory)?;
-                self.following(trajectory)
+                self.may_move_arm(arm)?;
+                let seen = self.room_for(arm, &here);
+                let trajectory = trajectory::check(self.arms.view(arm), &seen, &trajectory)?;
+                self.following(arm, trajectory)?
             }
             Request::MoveTo { joints, speed } => {
-                self.no_motion_of(Module::Base, BASE)?;
-                self.no_motion_of(Module::Gripper, HAND)?;
-                self.no_motion_of(Module::PanTilt, HEAD)?;
-                let expected = self.robot.arm_joints().len();
+                self.may_move_arm(arm)?;
+                let seen = self.room_for(arm, &here);
+                let robot = self.arms.view(arm);
+                let expected = robot.arm_joints().len();
                 if joints.len() != expected {
                     return Err(format!("input `joints` has {} values: the arm has {expected}", joints.len()));
                 }
-                let line = trajectory::straight(&self.robot, &here.arm, &joints, speed)?;
-                let trajectory = trajectory::check(&self.robot, &here, &line)?;
-                self.following(trajectory)
+                let line = trajectory::straight(robot, &seen.arm, &joints, speed)?;
+                let trajectory = trajectory::check(robot, &seen, &line)?;
+                self.following(arm, trajectory)?
+            }
+            Request::Grasp { .. } | Request::Release if self.arms.pads(arm).is_none() => {
+                return Err(NO_GRIPPER.to_owned());
             }
             Request::Grasp { object, expected } => {
                 self.no_motion_of(Module::Base, BASE)?;
-                self.no_motion_of(Module::Arm, HAND)?;
-                if let Some(held) = self.held {
+                self.no_motion_of(Module::Arm(arm), HAND)?;
+                if let Some(held) = self.arms.held(arm) {
                     return Err(format!("the gripper holds {} already", self.ids[held.object]));
                 }
-                self.contacts.closing();
-                let to = self.closes_to(here.finger);
-                (Kind::Close { from: here.finger, to, object, expected }, self.config.gripper.close_s)
+                let from = self.arms.seen_from(arm, &here).finger;
+                let to = self.closes_to(arm, from)?;
+                self.contacts.closing(arm);
+                (Kind::Close { from, to, object, expected }, self.config.gripper.close_s)
             }
             Request::Release => {
                 self.no_motion_of(Module::Base, BASE)?;
-                self.no_motion_of(Module::Arm, HAND)?;
-                self.let_go();
-                let to = self.open_finger_m();
-                (Kind::Open { from: here.finger, to }, self.config.gripper.open_s)
+                self.no_motion_of(Module::Arm(arm), HAND)?;
+                self.let_go(arm);
+                let (from, to) = (self.arms.seen_from(arm, &here).finger, self.arms.open_finger_m(arm));
+                (Kind::Open { from, to }, self.config.gripper.open_s)
             }
             Request::SenseBase => (Kind::SenseBase, 0.0),
             Request::SenseArm => (Kind::SenseArm, 0.0),
@@ -95,7 +106,7 @@ impl Cell {
             Request::LookAt { target } => {
                 self.no_motion_of(Module::Base, BASE)?;
                 self.no_motion_of(Module::Camera, PICTURE)?;
-                self.no_motion_of(Module::Arm, HEAD)?;
+                self.arms.numbers().try_for_each(|arm| self.no_motion_of(Module::Arm(arm), HEAD))?;
                 let to = self.aim(target)?;
                 let from = [here.pan, here.tilt];
                 let lasts_s = self.turning_s(from, to) + self.config.pan_tilt.settle_s;
@@ -115,29 +126,86 @@ impl Cell {
                 (kind, period * f64::from(frames))
             }
         };
-        if matches!(kind, Kind::Follow(_)) {
-            self.contacts.sets_out(self.held.map(|held| held.object));
+        let (held, of_arm) = (self.arms.all_held(), module.arm());
+        for (arm, held) in held.into_iter().enumerate().filter(|(arm, _)| of_arm.is_none_or(|moves| moves == *arm)) {
+            if matches!(kind, Kind::Follow(_)) {
+                self.contacts.sets_out(arm, held);
+            }
         }
         let (started, ends) = (self.motion_time, self.motion_time + seconds(lasts_s));
         self.activities.insert(module, Activity { ticket, started, ends, kind });
         Ok(())
     }
 
-    /// What the arm does, and for how long.
-    fn following(&mut self, trajectory: Curve) -> (Kind, f64) {
+    /// What does not move while an arm does.
+    fn may_move_arm(&self, arm: usize) -> Result<(), String> {
+        self.no_motion_of(Module::Base, BASE)?;
+        self.no_motion_of(Module::Gripper(arm), HAND)?;
+        self.no_motion_of(Module::PanTilt, HEAD)
+    }
+
+    /// The robot as it is seen from an arm that is to move: with the fingers of the other arms open, which they may become meanwhile.
+    fn room_for(&self, arm: usize, here: &Configuration) -> Configuration {
+        self.arms.seen_from(arm, &self.arms.with_others_open(arm, here))
+    }
+
+    /// Whether an arm that is to go so keeps apart from the other arms that are on their ways.
+    fn keeps_apart(&self, arm: usize, motion: &Motion) -> Result<(), String> {
+        let here = self.arms.with_others_open(arm, &self.measured());
+        let ours = Ahead { arm, postures: motion.ahead(0.0) };
+        let under_way = self.activities.iter().filter_map(|(module, activity)| match &activity.kind {
+            Kind::Follow(way @ Way::Arm(..)) => {
+                Some((*module, activity.ticket, way.ahead(activity.elapsed_s(self.motion_time))))
+            }
+            _ => None,
+        });
+        let braking = self.braking.iter().map(|(module, braking)| (*module, braking.ticket, braking.ahead(self.now)));
+        for (module, ticket, postures) in under_way.chain(braking) {
+            let Some(other) = module.arm() else { continue };
+            if let Some(close) = too_close(&self.robot, &here, &ours, &Ahead { arm: other, postures }) {
+                let (ours, theirs) = (self.arms.name(arm), self.arms.name(other));
+                return Err(format!(
+                    "the trajectory is refused: on the way {} of the arm `{ours}` comes nearer than {:.0} mm to {} of the arm `{theirs}`, which \
+                     is under way with goal {}. Either may be stopped anywhere, so the ways of two arms that move at once must not cross: \
+                     move one after the other, or plan another way",
+                    close.link,
+                    APART_M * 1e3,
+                    close.other,
+                    ticket.0
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether another arm is on its way, or comes to rest.
+    fn another_arm_moves(&self, arm: usize) -> bool {
+        let others = self.arms.numbers().filter(|other| *other != arm);
+        others.into_iter().any(|other| self.busy_with(Module::Arm(other)).is_some())
+    }
+
+    /// What an arm does, and for how long.
+    ///
+    /// # Errors
+    /// Where it would come too close to another arm that is on its way.
+    fn following(&mut self, arm: usize, trajectory: Curve) -> Result<(Kind, f64), String> {
         let lasts_s = trajectory.duration_s();
         let config = self.config.controllers;
-        let slides = self.robot.arm_slides();
+        let slides = self.arms.view(arm).arm_slides();
         let controller = Controller {
             of: "arm",
             stiffness: config.arm_stiffness,
             most_off: config.arm_most_off_rad,
             slides: PerJoint::from_fn(slides.len(), |j| slides[j]),
         };
+        let from = self.arms.seen_from(arm, &self.measured()).arm;
+        if self.another_arm_moves(arm) {
+            self.keeps_apart(arm, &Motion::new(trajectory.clone(), from, controller, None))?;
+        }
         let breaks = self.arm_breaks_off(lasts_s);
-        let motion = Motion::new(trajectory, self.measured().arm, controller, breaks);
+        let motion = Motion::new(trajectory, from, controller, breaks);
         let lasts_s = motion.lasts_s();
-        (Kind::Follow(Way::Arm(motion)), lasts_s)
+        Ok((Kind::Follow(Way::Arm(arm, motion)), lasts_s))
     }
 
     /// What the base does, and for how long.
@@ -162,7 +230,15 @@ impl Cell {
     fn no_motion_of(&self, module: Module, why: &str) -> Result<(), String> {
         match self.busy_with(module) {
             None => Ok(()),
-            Some(other) => Err(format!("the {} is under way with goal {}: {why}", module.kind(), other.0)),
+            Some(other) => Err(format!("the {} is under way with goal {}: {why}", self.called(module), other.0)),
+        }
+    }
+
+    /// A module for people: of a robot with several arms with the name of its arm.
+    fn called(&self, module: Module) -> String {
+        match module.arm() {
+            Some(arm) if self.arms.count() > 1 => format!("{} of the arm `{}`", module.kind(), self.arms.name(arm)),
+            _ => module.kind().to_owned(),
         }
     }
 

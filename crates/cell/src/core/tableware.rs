@@ -9,8 +9,8 @@
 //! ```
 //! The rack is a board on the right half of the table. On it, as on the left half, there is a row of bowls and, nearer to the robot, a
 //! row of forks that point away from it, with cups in between. Plates lie behind the bowls' places from the beginning: their rims
-//! are too flat for fingers that come from above ([`Model::slips_off`]). The places are known; where on them things stand is random, and so
-//! are their sizes. The same seed lays the same.
+//! are too flat for fingers that come from above ([`Model::slips_off`]). Where the rack and the rows are, the robot's description says
+//! (`[workplace.tableware]`). The places are known; where on them things stand is random, and so are their sizes. The same seed lays the same.
 
 use super::environment::{Furniture, Kind, Model};
 use super::objects::Placed;
@@ -18,40 +18,12 @@ use crate::config::{Goods, MAX_TABLEWARE};
 use rand::seq::SliceRandom;
 use rand::{Rng, RngExt};
 use ratn_model::pose::Pose;
-use ratn_motion::aimm;
+use ratn_motion::tableware::{Rows, Tableware};
+use ratn_motion::workplace::{Slab, Workplace};
 use ratn_perception::model::Model as Seen;
 
 /// The rack's name.
 pub const RACK: &str = "rack";
-/// The height of its top, in metres.
-pub const RACK_HEIGHT_M: f64 = 0.75;
-/// The rack: a board, its middle and its edges.
-const RACK_CENTRE: [f64; 3] = [0.72, -0.29, 0.725];
-const RACK_SIZE: [f64; 3] = [0.44, 0.62, 0.05];
-/// Where somebody puts what is moved on the rack: least and greatest x, least and greatest y.
-pub const RACK_REGION: [[f64; 2]; 2] = [[0.62, 0.84], [-0.40, -0.10]];
-
-/// A row of places for things of a kind.
-struct Row {
-    /// Where it is along x, on the rack and on the table.
-    x: f64,
-    /// Where it begins on the rack, from where it goes on to the right.
-    rack_y: f64,
-    /// Where it begins on the table, from where it goes on to the left.
-    table_y: f64,
-    /// From one place to the next.
-    between: f64,
-}
-
-/// An open finger fits between two bowls.
-const BOWLS: Row = Row { x: 0.83, rack_y: -0.06, table_y: 0.10, between: 0.19 };
-const FORKS: Row = Row { x: 0.62, ..BOWLS };
-/// Between bowls and forks, so far from the forks' middles that the hand fits in between.
-const CUPS: Row = Row { x: 0.735, rack_y: -0.155, ..BOWLS };
-/// On the table nearer to their bowls' left sides, which leaves the last one on it.
-const CUPS_ON_TABLE: Row = Row { x: 0.73, table_y: 0.175, ..CUPS };
-/// As far apart as the table is long enough for, so that the camera tells them apart.
-const PLATES: Row = Row { x: 1.0, rack_y: f64::NAN, table_y: 0.115, between: 0.195 };
 
 /// How far from its place on the rack something stands at the most, in metres, and how far a fork is turned, in radians.
 const SPREAD_M: f64 = 0.008;
@@ -77,24 +49,36 @@ const MAX_OFF_PLACE_M: f64 = 0.02;
 const MAX_LEAN_RAD: f64 = 0.1;
 const MAX_TURNED_RAD: f64 = 0.15;
 
-/// The rack as something that stands there.
-pub fn rack() -> Furniture {
-    let [x, y, z] = RACK_CENTRE;
-    Furniture { name: RACK.to_owned(), parts: vec![(Pose::at(x, y, z), RACK_SIZE)] }
+/// The rack as something that stands there; `None` where the workplace has none.
+pub fn rack(workplace: &Workplace) -> Option<Furniture> {
+    let Slab { centre: [x, y, z], size } = workplace.tableware.as_ref()?.rack;
+    Some(Furniture { name: RACK.to_owned(), parts: vec![(Pose::at(x, y, z), size)] })
 }
 
-/// The places on the table for things of a kind, on its surface; a fork's x axis points to its tips.
-pub fn places(kind: Kind) -> [Pose; MAX_TABLEWARE] {
-    let Row { x, table_y, between, .. } = if kind == Kind::Cup { CUPS_ON_TABLE } else { row(kind) };
-    std::array::from_fn(|i| Pose::at(x, table_y + between * i as f64, aimm::TABLE_HEIGHT_M))
+/// The height of an upper face, in metres: rounded, because it is the sum of what people wrote with fewer digits.
+pub fn top_m(slab: &Slab) -> f64 {
+    (slab.top_m() * 1e9).round() / 1e9
+}
+
+/// The places on the table for things of a kind, on its surface; a fork's x axis points to its tips. None where the workplace has no
+/// tableware.
+pub fn places(workplace: &Workplace, kind: Kind) -> Vec<Pose> {
+    let Some(tableware) = &workplace.tableware else { return Vec::new() };
+    let (first, between) = match rows(tableware, kind) {
+        Some(rows) => (rows.table, tableware.between),
+        None => (tableware.plates.table, tableware.plates.between),
+    };
+    row(first, between, top_m(&workplace.table))
 }
 
 /// Whether something stands, or lies, at a place of its kind on the table.
-pub fn is_in_place(kind: Kind, pose: &Pose) -> bool {
+pub fn is_in_place(workplace: &Workplace, kind: Kind, pose: &Pose) -> bool {
     let upright = pose.rotate([0.0, 0.0, 1.0])[2] >= MAX_LEAN_RAD.cos();
     let ahead = pose.rotate([1.0, 0.0, 0.0])[0] >= MAX_TURNED_RAD.cos();
     let off = |place: &Pose| (place.position[0] - pose.position[0]).hypot(place.position[1] - pose.position[1]);
-    upright && (ahead || kind != Kind::Fork) && places(kind).iter().any(|place| off(place) <= MAX_OFF_PLACE_M)
+    upright
+        && (ahead || kind != Kind::Fork)
+        && places(workplace, kind).iter().any(|place| off(place) <= MAX_OFF_PLACE_M)
 }
 
 /// Whether the camera tells things from each other: every round one from all others.
@@ -117,12 +101,12 @@ pub(super) fn are_apart(placed: &[Placed]) -> bool {
 }
 
 /// A random rack, and plates on the table.
-pub(super) fn lay(goods: Goods, random: &mut impl Rng) -> Vec<Placed> {
+pub(super) fn lay(workplace: &Workplace, goods: Goods, random: &mut impl Rng) -> Vec<Placed> {
     let mut placed = Vec::new();
     let kinds =
         [(Kind::Bowl, goods.bowls), (Kind::Fork, goods.forks), (Kind::Cup, goods.cups), (Kind::Plate, goods.plates)];
     for (kind, count) in kinds.into_iter().filter(|(_, count)| *count > 0) {
-        let mut places = if kind == Kind::Plate { places(kind) } else { on_rack(kind) };
+        let mut places = if kind == Kind::Plate { places(workplace, kind) } else { on_rack(workplace, kind) };
         places.shuffle(random);
         for (i, place) in places.into_iter().take(count).enumerate() {
             let model = model(kind, random);
@@ -138,17 +122,23 @@ pub(super) fn lay(goods: Goods, random: &mut impl Rng) -> Vec<Placed> {
 }
 
 /// The places on the rack for things of a kind, on its surface.
-fn on_rack(kind: Kind) -> [Pose; MAX_TABLEWARE] {
-    let Row { x, rack_y, between, .. } = row(kind);
-    std::array::from_fn(|i| Pose::at(x, rack_y - between * i as f64, RACK_HEIGHT_M))
+fn on_rack(workplace: &Workplace, kind: Kind) -> Vec<Pose> {
+    let Some(tableware) = &workplace.tableware else { return Vec::new() };
+    let first = rows(tableware, kind).map(|rows| rows.rack);
+    first.map_or_else(Vec::new, |first| row(first, -tableware.between, top_m(&tableware.rack)))
 }
 
-fn row(kind: Kind) -> Row {
+fn row([x, y]: [f64; 2], between: f64, height: f64) -> Vec<Pose> {
+    (0..MAX_TABLEWARE).map(|i| Pose::at(x, y + between * i as f64, height)).collect()
+}
+
+/// The rows of a kind; plates have one on the table alone.
+fn rows(tableware: &Tableware, kind: Kind) -> Option<Rows> {
     match kind {
-        Kind::Fork => FORKS,
-        Kind::Cup => CUPS,
-        Kind::Plate => PLATES,
-        Kind::Bowl | Kind::Box => BOWLS,
+        Kind::Fork => Some(tableware.forks),
+        Kind::Cup => Some(tableware.cups),
+        Kind::Plate => None,
+        Kind::Bowl | Kind::Box => Some(tableware.bowls),
     }
 }
 

@@ -2,13 +2,15 @@
 
 use super::cell_actor::CellHandle;
 use crate::config::CellConfig;
+use crate::core::arms::FIRST;
 use crate::core::protocol::{Ending, Module, Product, Request};
 use ratn_model::fact::{FactKey, Term};
+use ratn_model::resource::Lease;
 use ratn_model::value::Value;
 use ratn_motion::joint_vector::JointVector;
-use ratn_motion::robot::Configuration;
+use ratn_motion::robot::{Configuration, Robot};
 use ratn_perception::noise::MAX_FRAMES;
-use ratn_worker::action::{Action, ActionFailure, ActionResult, ActionServer, GoalContext, GoalOutcome};
+use ratn_worker::action::{Action, ActionFailure, ActionResult, ActionServer, Goal, GoalContext, GoalOutcome};
 use ratn_worker::client::Channels;
 use ratn_worker::lease_watch::LeaseWatch;
 use ratn_worker::safety::Safety;
@@ -16,21 +18,30 @@ use ratn_worker::safety::Safety;
 /// How fast `move_to` goes unless told otherwise, as a fraction of the limits: a line that nobody planned is taken with care.
 const MOVE_TO_SPEED: f64 = 0.2;
 
-/// The id of a module's resource on a host, `pan-tilt@sim`.
-pub(crate) fn resource_id(module: Module, host: &str) -> String {
+/// The id of a module's resource on a host, `pan-tilt@sim`; of a robot with several arms `arm_right@sim` and `gripper_right@sim`.
+pub(crate) fn resource_id(module: Module, robot: &Robot, host: &str) -> String {
     let name = match module {
         Module::Base => "base",
-        Module::Arm => "arm",
-        Module::Gripper => "gripper",
+        Module::Arm(_) => "arm",
+        Module::Gripper(_) => "gripper",
         Module::PanTilt => "pan-tilt",
         Module::Camera => "camera",
     };
-    format!("{name}@{host}")
+    match arm_of(module, robot) {
+        Some(arm) => format!("{name}_{arm}@{host}"),
+        None => format!("{name}@{host}"),
+    }
+}
+
+/// The name of the arm that a module is, or whose gripper it is, of a robot with several arms: its resource says it as the attribute `arm`.
+pub(crate) fn arm_of(module: Module, robot: &Robot) -> Option<&str> {
+    let arm = module.arm().filter(|_| robot.arm_names().count() > 1)?;
+    robot.arm_names().nth(arm)
 }
 
 /// The watch of who holds the modules.
-pub(crate) fn leases(modules: &[Module], config: &CellConfig) -> LeaseWatch {
-    LeaseWatch::of(modules.iter().map(|module| resource_id(*module, &config.host)))
+pub(crate) fn leases(handle: &CellHandle, config: &CellConfig) -> LeaseWatch {
+    LeaseWatch::of(handle.modules().iter().map(|module| resource_id(*module, handle.robot(), &config.host)))
 }
 
 /// The server of all modules. Each takes one goal at a time, under a lease of its own resource.
@@ -43,11 +54,22 @@ pub(crate) fn server(
 ) -> ActionServer {
     let mut builder = ActionServer::builder("").one_at_a_time().channels(channels).safety(safety).leases(leases);
     let modules = handle.modules();
-    for (module, name, description, read) in ACTIONS.into_iter().filter(|(module, ..)| modules.contains(module)) {
+    for (kind, name, description, read) in ACTIONS {
+        let of_kind = modules.iter().filter(|module| module.kind() == kind.kind());
+        let resources: Vec<Performer> = of_kind
+            .map(|module| Performer {
+                arm: module.arm().unwrap_or(FIRST),
+                arm_name: arm_of(*module, handle.robot()).map(str::to_owned),
+                resource: resource_id(*module, handle.robot(), &config.host),
+            })
+            .collect();
+        if resources.is_empty() {
+            continue;
+        }
         builder = builder.action(ModuleAction {
             name,
             description,
-            resource: resource_id(module, &config.host),
+            performers: resources,
             handle: handle.clone(),
             seed: config.seed,
             calibration: config.errors.camera_covariance(),
@@ -59,28 +81,28 @@ pub(crate) fn server(
 
 type Read = fn(&GoalContext) -> Result<Request, ActionFailure>;
 
-/// All modules are behind one server: no two actions have the same name.
+/// All modules are behind one server: no two actions have the same name. An action of the arm is one of every arm.
 const ACTIONS: [(Module, &str, &str, Read); 10] = [
     (Module::Base, "drive", "moves the base along a trajectory", |goal| {
         Ok(Request::Drive { trajectory: goal.input_trajectory("trajectory")?.clone() })
     }),
     (Module::Base, "localise", "says where the base stands", |_| Ok(Request::SenseBase)),
-    (Module::Arm, "follow", "moves the arm along a trajectory", |goal| {
+    (Module::Arm(FIRST), "follow", "moves the arm along a trajectory", |goal| {
         Ok(Request::Follow { trajectory: goal.input_trajectory("trajectory")?.clone() })
     }),
-    (Module::Arm, "move_to", "moves the arm on a straight line of joint space", |goal| {
+    (Module::Arm(FIRST), "move_to", "moves the arm on a straight line of joint space", |goal| {
         let joints = JointVector::read(goal.input_joints("joints")?);
         let joints = joints.map_err(|wrong| ActionFailure::aborted(format!("input `joints` has {wrong}")))?;
         let speed = goal.optional_float("speed")?.unwrap_or(MOVE_TO_SPEED);
         Ok(Request::MoveTo { joints, speed })
     }),
-    (Module::Gripper, "grasp", "closes the fingers around an object", |goal| {
+    (Module::Gripper(FIRST), "grasp", "closes the fingers around an object", |goal| {
         let expected = goal.port("expected").optional().map(|port| port.pose()).transpose()?;
         Ok(Request::Grasp { object: goal.input_string("object")?.to_owned(), expected })
     }),
-    (Module::Gripper, "release", "opens the fingers", |_| Ok(Request::Release)),
-    (Module::Arm, "where", "says where the arm's joints are", |_| Ok(Request::SenseArm)),
-    (Module::Gripper, "feel", "says whether the fingers hold something", |_| Ok(Request::SenseGripper)),
+    (Module::Gripper(FIRST), "release", "opens the fingers", |_| Ok(Request::Release)),
+    (Module::Arm(FIRST), "where", "says where the arm's joints are", |_| Ok(Request::SenseArm)),
+    (Module::Gripper(FIRST), "feel", "says whether the fingers hold something", |_| Ok(Request::SenseGripper)),
     (Module::PanTilt, "look_at", "turns the camera to a point of the world", |goal| {
         Ok(Request::LookAt { target: goal.input_pose("target")?.position })
     }),
@@ -91,7 +113,7 @@ const ACTIONS: [(Module, &str, &str, Read); 10] = [
     }),
 ];
 
-/// All degrees of freedom in their order: base x, y, yaw, the arm, pan, tilt, finger.
+/// All degrees of freedom in their order: base x, y, yaw, the arm, pan, tilt, finger; then each other arm and its finger.
 fn configuration_value(at: &Configuration) -> Value {
     Value::List(at.values().into_iter().map(Value::Float).collect())
 }
@@ -101,10 +123,21 @@ fn stands() -> FactKey {
     FactKey { predicate: "at".to_owned(), arguments: vec![Term::Name("base".to_owned())] }
 }
 
+/// A module that performs an action.
+struct Performer {
+    /// The number of its arm.
+    arm: usize,
+    /// The name of its arm, of a robot with several.
+    arm_name: Option<String>,
+    /// The id of its resource.
+    resource: String,
+}
+
 struct ModuleAction {
     name: &'static str,
     description: &'static str,
-    resource: String,
+    /// The modules that can do it, at least one: of a robot with several arms one for each.
+    performers: Vec<Performer>,
     handle: CellHandle,
     seed: u64,
     /// The variances of the camera's pose.
@@ -123,7 +156,18 @@ impl Action for ModuleAction {
     }
 
     fn resource(&self) -> Option<&str> {
-        Some(&self.resource)
+        match &self.performers[..] {
+            [only] => Some(&only.resource),
+            _ => None,
+        }
+    }
+
+    fn resources(&self) -> Vec<&str> {
+        self.performers.iter().map(|performer| performer.resource.as_str()).collect()
+    }
+
+    fn resource_for(&self, goal: &Goal) -> Result<Option<&str>, String> {
+        Ok(Some(&self.performer(goal.inputs.get("arm"), goal.lease.as_ref())?.resource))
     }
 
     fn can_be_suspended(&self) -> bool {
@@ -132,9 +176,10 @@ impl Action for ModuleAction {
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let request = (self.read)(&goal)?;
+        let arm = self.performer(goal.inputs.get("arm"), goal.lease.as_ref()).map_err(ActionFailure::aborted)?.arm;
         goal.while_held().await?;
         let mut suspended = goal.suspended();
-        let mut motion = self.handle.perform(request)?;
+        let mut motion = self.handle.perform_with(arm, request)?;
         let ending = loop {
             motion.suspend(*suspended.borrow_and_update());
             tokio::select! {
@@ -159,6 +204,54 @@ impl Action for ModuleAction {
 }
 
 impl ModuleAction {
+    /// The module that a goal is for: that of the arm which the input `arm` names; without this input the one whose resource the lease holds.
+    ///
+    /// # Errors
+    /// A sentence where there is no such arm, or the lease holds none or several of the resources.
+    fn performer(&self, arm: Option<&Value>, lease: Option<&Lease>) -> Result<&Performer, String> {
+        let named = match arm {
+            None | Some(Value::Null) => None,
+            Some(Value::String(name)) => Some(name),
+            Some(other) => {
+                return Err(format!("input `arm` has a {}: expected the name of an arm, a string", other.type_name()));
+            }
+        };
+        let arms = || {
+            let names = self.handle.robot().arm_names().map(|name| format!("`{name}`"));
+            names.collect::<Vec<_>>().join(", ")
+        };
+        if let [only] = &self.performers[..] {
+            let is_its = |name: &&String| self.handle.robot().arm_names().nth(only.arm) == Some(name.as_str());
+            return match named.filter(|name| !is_its(name)) {
+                Some(name) => Err(format!("input `arm` is `{name}`: `{}` is for the arm {}", self.name, arms())),
+                None => Ok(only),
+            };
+        }
+        if let Some(name) = named {
+            let found = self.performers.iter().find(|performer| performer.arm_name.as_ref() == Some(name));
+            return found.ok_or_else(|| format!("input `arm` is `{name}`: `{}` is for the arms {}", self.name, arms()));
+        }
+        let is_leased = |performer: &&Performer| {
+            lease.is_some_and(|lease| lease.resources.iter().any(|leased| leased.id == performer.resource))
+        };
+        let leased: Vec<&Performer> = self.performers.iter().filter(is_leased).collect();
+        match leased[..] {
+            [only] => Ok(only),
+            [] => Err(format!(
+                "the goal has no lease of any of {}: acquire one and send the lease along",
+                self.resources().join(", ")
+            )),
+            [..] => {
+                let held: Vec<&str> = leased.iter().map(|performer| performer.resource.as_str()).collect();
+                Err(format!(
+                    "the goal's lease holds {}, so the goal has to say which arm it is for: give it the input `arm`, one of {}",
+                    held.join(" and "),
+                    arms()
+                ))
+            }
+        }
+    }
+
     async fn outcome(&self, product: Product) -> ActionResult {
         let success = GoalOutcome::success();
         Ok(match product {

@@ -99,7 +99,7 @@ struct QueuedMessage {
 }
 
 enum Message {
-    Start { ticket: Ticket, request: Request, ended: oneshot::Sender<Ending> },
+    Start { ticket: Ticket, arm: usize, request: Request, ended: oneshot::Sender<Ending> },
     Happened(Event),
     Safety { state: SafetyState, applied: oneshot::Sender<()> },
     Suspend { ticket: Ticket, suspended: bool },
@@ -132,11 +132,22 @@ impl CellHandle {
         Module::of(&self.optics.robot)
     }
 
-    /// Starts a goal.
+    /// The robot, seen from its first arm.
+    pub(crate) fn robot(&self) -> &Robot {
+        &self.optics.robot
+    }
+
+    /// Starts a goal of the first arm, or one that is for no arm.
+    #[cfg(test)]
     pub(crate) fn perform(&self, request: Request) -> Result<Motion, CellActorError> {
+        self.perform_with(crate::core::arms::FIRST, request)
+    }
+
+    /// Starts a goal, of the arm of this number where it is one for an arm or its gripper.
+    pub(crate) fn perform_with(&self, arm: usize, request: Request) -> Result<Motion, CellActorError> {
         let ticket = Ticket(self.tickets.fetch_add(1, Ordering::Relaxed) + 1);
         let (ended, ending) = oneshot::channel();
-        self.ask(Message::Start { ticket, request, ended })?;
+        self.ask(Message::Start { ticket, arm, request, ended })?;
         Ok(Motion { ticket, ending, messages: self.messages.clone(), suspended: false, over: false })
     }
 
@@ -291,9 +302,9 @@ fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Recei
                 holds.suspend(ticket, suspended);
                 (Event::Safety { state: holds.state() }, None)
             }
-            Some(Message::Start { ticket, request, ended }) => {
+            Some(Message::Start { ticket, arm, request, ended }) => {
                 waiting.insert(ticket, ended);
-                (Event::Start { ticket, request }, None)
+                (Event::Start { ticket, arm, request }, None)
             }
             Some(Message::Happened(event)) => (event, None),
             Some(Message::Reset { seed, goods, state }) => (Event::Reset { seed, goods }, Some(state)),

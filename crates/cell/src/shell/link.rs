@@ -1,7 +1,7 @@
 //! The link to the resource manager: a session, the modules and the battery as resources under it, the watch of leases.
 //! Follows the manager when it comes back somewhere else.
 
-use super::actions::resource_id;
+use super::actions::{arm_of, resource_id};
 use super::cell_actor::CellHandle;
 use crate::config::CellConfig;
 use crate::core::protocol::Module;
@@ -94,11 +94,14 @@ impl Link {
         let watching = self.leases.follow_session(&self.channels, manager, session, patience)?;
         let offering = async {
             for module in self.handle.modules() {
-                let id = resource_id(module, &self.config.host);
+                let id = resource_id(module, self.handle.robot(), &self.config.host);
                 let mut resource =
                     Resource::new(id, ResourceClass::Module, module.kind()).with_endpoint(&self.endpoint);
                 if module != Module::Camera {
                     resource = resource.with_standstill(self.config.standstill());
+                }
+                if let Some(arm) = arm_of(module, self.handle.robot()) {
+                    resource = resource.with_attribute("arm", Value::String(arm.to_owned()));
                 }
                 provider.offer(resource.on_host(&self.config.host)).await?;
             }

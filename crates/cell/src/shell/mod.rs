@@ -60,7 +60,7 @@ pub async fn run_as(
     let laid = config.clone();
     let cell = tokio::task::spawn_blocking(move || Cell::new(laid)).await.context("cannot lay the scene")??;
     let recorder = match &config.record {
-        Some(file) => Recorder::begin(file, &config)?,
+        Some(file) => Recorder::begin(file, &cell)?,
         None => Recorder::none(),
     };
     let handle = cell_actor::start(cell, recorder, RobotClock::start(config.speed), serving.vitals.clone())
@@ -70,7 +70,7 @@ pub async fn run_as(
     let endpoint = bound.endpoint().clone();
     let channels = Channels::new(&tls);
     let safety = safety(&config, &directory, &handle).await?;
-    let leases = actions::leases(&handle.modules(), &config);
+    let leases = actions::leases(&handle, &config);
     // A simulated robot ends with its process: this one has not moved yet.
     leases.brought_to_rest();
     let server = actions::server(&handle, &config, channels.clone(), safety.clone(), &leases);

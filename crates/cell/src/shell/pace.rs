@@ -50,8 +50,9 @@ async fn a_cell_at_fifty_times_and_one_as_fast_as_possible_come_to_the_same_to_t
     let file = place.path().join("live.jsonl");
     // Boxes that are put down elsewhere, and a camera that is blind by chance: physics, and draws.
     let config = config(3, &["object_moved@1", "object_moved@6.3", "sensor_dropout~0.5"]);
-    let recorder = Recorder::begin(&file, &config).unwrap();
-    let handle = live(Cell::new(config.clone()).unwrap(), recorder, 50.0);
+    let cell = Cell::new(config.clone()).unwrap();
+    let recorder = Recorder::begin(&file, &cell).unwrap();
+    let handle = live(cell, recorder, 50.0);
     for joints in [aimm::OBSERVATION, aimm::HOME] {
         assert!(matches!(perform(&handle, Request::MoveTo { joints, speed: 0.5 }).await, Ending::Done(_)));
         perform(&handle, Request::Capture { frames: 2 }).await;
@@ -142,7 +143,7 @@ async fn how_well_the_cell_keeps_pace_with_nine_boxes() {
         for (i, request) in requests.iter().cycle().take(20).enumerate() {
             let started = now;
             let ticket = Ticket(i as u64);
-            let mut commands = cell.handle(now, Event::Start { ticket, request: request.clone() });
+            let mut commands = cell.handle(now, Event::Start { ticket, arm: 0, request: request.clone() });
             while commands.is_empty() {
                 now = cell.next_wake().unwrap();
                 commands = cell.handle(now, Event::Tick);

@@ -3,7 +3,7 @@
 //! A line that cannot be written ends the recording, not the cell. A cell that is started again leaves the recordings of before as they
 //! are.
 
-use crate::config::CellConfig;
+use crate::core::cell::Cell;
 use crate::core::recording::Line;
 use anyhow::Context;
 use std::fs::File;
@@ -23,11 +23,11 @@ impl Recorder {
     }
 
     /// Begins a recording in a new file: `file`, or `file.2`, `file.3` and so on after others.
-    pub(crate) fn begin(file: &Path, config: &CellConfig) -> anyhow::Result<Recorder> {
+    pub(crate) fn begin(file: &Path, cell: &Cell) -> anyhow::Result<Recorder> {
         let (made, file) = new_file(file).with_context(|| format!("cannot record to {}", file.display()))?;
         tracing::info!(file = %file.display(), "what happens is recorded");
         let mut recorder = Recorder(Some(BufWriter::new(made)));
-        recorder.write(&[Line::header(config)]);
+        recorder.write(&[Line::header(cell)]);
         Ok(recorder)
     }
 
@@ -72,18 +72,20 @@ fn write(file: &mut BufWriter<File>, lines: &[Line]) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::CellConfig;
 
     #[test]
     fn a_cell_that_is_started_again_leaves_the_recordings_of_before() -> anyhow::Result<()> {
+        let cell = Cell::new(CellConfig::default())?;
         let place = tempfile::tempdir()?;
         let file = place.path().join("cell.jsonl");
         for _ in 0..3 {
-            assert!(Recorder::begin(&file, &CellConfig::default())?.is_on());
+            assert!(Recorder::begin(&file, &cell)?.is_on());
         }
         for name in ["cell.jsonl", "cell.jsonl.2", "cell.jsonl.3"] {
             assert!(std::fs::read_to_string(place.path().join(name))?.starts_with("{\"form\":2"), "{name}");
         }
-        let nowhere = Recorder::begin(&place.path().join("no/cell.jsonl"), &CellConfig::default());
+        let nowhere = Recorder::begin(&place.path().join("no/cell.jsonl"), &cell);
         assert!(nowhere.is_err_and(|error| error.to_string().starts_with("cannot record to")));
         Ok(())
     }

@@ -26,9 +26,8 @@ impl Service {
     }
 
     async fn put_back_to(&self, snapshot: &str) -> Result<Vec<v1::TrueObject>, Status> {
-        let arm = self.handle.state().await.map_err(status)?.arm;
-        let read =
-            Snapshot::from_json(snapshot).and_then(|snapshot| snapshot.check_joints(arm.len()).map(|()| snapshot));
+        let robot = self.handle.robot();
+        let read = Snapshot::from_json(snapshot).and_then(|snapshot| snapshot.check_robot(robot).map(|()| snapshot));
         let snapshot = read.map_err(|error| Status::invalid_argument(error.to_string()))?;
         self.handle.tell(Event::PutBack { snapshot: Box::new(snapshot) }).await.map_err(status)?;
         Ok(objects(self.handle.state().await.map_err(status)?))

@@ -41,9 +41,19 @@ impl Bench {
     }
 
     pub(crate) fn start(&mut self, request: Request) -> (Ticket, Vec<Command>) {
+        self.start_with(0, request)
+    }
+
+    /// Starts a goal of the arm of this number.
+    pub(crate) fn start_with(&mut self, arm: usize, request: Request) -> (Ticket, Vec<Command>) {
         self.tickets += 1;
         let ticket = Ticket(self.tickets);
-        (ticket, self.handle(Event::Start { ticket, request }))
+        (ticket, self.handle(Event::Start { ticket, arm, request }))
+    }
+
+    /// Something else happens.
+    pub(crate) fn event(&mut self, event: Event) -> Vec<Command> {
+        self.handle(event)
     }
 
     pub(crate) fn pass(&mut self, seconds: f64) -> Vec<Command> {
@@ -65,7 +75,12 @@ impl Bench {
 
     /// Performs a request to its end.
     pub(crate) fn perform(&mut self, request: Request) -> Ending {
-        let (ticket, mut commands) = self.start(request);
+        self.perform_with(0, request)
+    }
+
+    /// Performs a request of the arm of this number to its end.
+    pub(crate) fn perform_with(&mut self, arm: usize, request: Request) -> Ending {
+        let (ticket, mut commands) = self.start_with(arm, request);
         while commands.is_empty() {
             let wakes = self.cell.next_wake().expect("the goal is under way");
             self.now = self.tick.map_or(wakes, |tick| wakes.min(self.now + tick));

@@ -17,6 +17,9 @@ pub(crate) struct UpArguments {
     /// Show it and its runs as pages in a browser on this machine, as `ratn dashboard` does
     #[arg(long)]
     pub(crate) dashboard: bool,
+    /// End when standard input ends, because the process that started this one is gone
+    #[arg(long)]
+    pub(crate) exit_with_parent: bool,
     #[command(flatten)]
     pub(crate) system: SystemArguments,
 }

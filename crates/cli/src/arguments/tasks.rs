@@ -132,6 +132,38 @@ pub(crate) struct ControlArguments {
 }
 
 #[derive(Debug, Clone, Args)]
+pub(crate) struct SignalArguments {
+    /// The run: its id, the name of its task, or `-` for the one that is under way
+    #[arg(value_name = "RUN")]
+    pub(crate) run: String,
+    /// The signal's name, as a state of the task waits for it
+    #[arg(value_name = "NAME")]
+    pub(crate) signal: String,
+    /// What is sent with it, written as in a task file: 3, true, left, "pose(0, 0, 1)"
+    #[arg(value_name = "VALUE", allow_hyphen_values = true)]
+    pub(crate) value: Option<String>,
+    /// Where the endpoint files of the run's system are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct AnswerArguments {
+    /// The run: its id, the name of its task, or `-` for the one that is under way
+    #[arg(value_name = "RUN")]
+    pub(crate) run: String,
+    /// One of the question's choices
+    #[arg(value_name = "CHOICE")]
+    pub(crate) choice: String,
+    /// The path of the state that asks; needed where several do
+    #[arg(long, value_name = "PATH")]
+    pub(crate) state: Option<String>,
+    /// Where the endpoint files of the run's system are
+    #[arg(long, value_name = "DIR")]
+    pub(crate) runtime_dir: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Args)]
 pub(crate) struct StatusArguments {
     /// Show it again whenever it changes, until Ctrl-C
     #[arg(long)]

@@ -73,8 +73,14 @@ mod tests {
             at_s: 1.0,
             paused: true,
             ended: 0,
-            under_way: vec![UnderWay { path: "move[1]".to_owned(), for_s: 0.5 }],
+            under_way: vec![UnderWay {
+                path: "move[1]".to_owned(),
+                for_s: 0.5,
+                usually_s: None,
+                message: String::new(),
+            }],
             waits: Vec::new(),
+            awaits: Vec::new(),
         };
         let pause = said(Word::Pause, Some(&run));
         assert!(pause.starts_with("fetch is paused") && pause.ends_with("under way: move[1]"), "{pause}");

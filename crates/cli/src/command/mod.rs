@@ -21,6 +21,7 @@ mod robot;
 mod roles;
 mod run;
 mod safety;
+mod signal;
 mod simulate;
 mod state;
 mod status;
@@ -48,6 +49,8 @@ pub(crate) fn run(command: Command) -> Result<(), Failure> {
         Command::Up(arguments) => up::run(&arguments, tls),
         Command::Run(arguments) => run::run(&arguments, tls),
         Command::Control(arguments) => control::run(&arguments),
+        Command::Signal(arguments) => signal::signal(&arguments),
+        Command::Answer(arguments) => signal::answer(&arguments),
         Command::Status(arguments) => status::run(&arguments, tls),
         Command::Ps(arguments) => pool::ps(&arguments, tls),
         Command::Logs(arguments) => pool::logs(&arguments, tls),

@@ -1,7 +1,7 @@
 //! `ratn stop`, `ratn hold`, `ratn go-on`: emergency stop and hold of every driver of a system.
 //!
-//! Drivers are the cell of this machine, which is asked at once, and whoever offers a resource of class module, as the resource
-//! manager tells: without it the cell is stopped all the same. Exit code 0 only where everybody has confirmed.
+//! Drivers are the cell of this machine, which is asked at once, and whoever offers a resource of class module, or a process with a bound for
+//! its standstill, as the resource manager tells: without it the cell is stopped all the same. Exit code 0 only where everybody has confirmed.
 
 use super::blocking_on;
 use crate::arguments::{GoOnArguments, HoldArguments, SafetyArguments, StopArguments};
@@ -93,15 +93,21 @@ fn ask_all(arguments: &SafetyArguments, tls: &ClientTls, question: &Question) ->
     })
 }
 
-/// Where the modules of the system are served.
+/// Where what moves is served: modules, and processes that are offered with a bound for their standstill.
 async fn drivers(channels: &Channels, directory: &RuntimeDirectory) -> Result<BTreeSet<Endpoint>, String> {
     let manager = directory.find(resource_manager::ROLE).map_err(|error| error.to_string())?;
     let client = ResourceClient::new(channels, &manager, "").map_err(|error| error.to_string())?;
-    let modules = ResourceFilter { class: Some(ResourceClass::Module), ..ResourceFilter::default() };
-    let listed = timeout(ANSWER_DEADLINE, client.list_where(modules)).await;
-    let listed = listed.map_err(|_| "the resource manager does not answer".to_owned())?;
-    let listed = listed.map_err(|error| error.to_string())?;
-    Ok(listed.iter().filter_map(|resource| resource.endpoint().parse().ok()).collect())
+    let of = |class| ResourceFilter { class: Some(class), ..ResourceFilter::default() };
+    let both = async {
+        let modules = client.list_where(of(ResourceClass::Module));
+        tokio::try_join!(modules, client.list_where(of(ResourceClass::Process)))
+    };
+    let listed = timeout(ANSWER_DEADLINE, both).await;
+    let (modules, mut processes) = listed
+        .map_err(|_| "the resource manager does not answer".to_owned())?
+        .map_err(|error: CallError| error.to_string())?;
+    processes.retain(|process| process.standstill().is_some());
+    Ok(modules.iter().chain(&processes).filter_map(|resource| resource.endpoint().parse().ok()).collect())
 }
 
 async fn ask(channels: &Channels, question: &Question, drivers: &BTreeSet<Endpoint>) -> Answers {

@@ -17,7 +17,7 @@ use ratn_model::resource::Quantity;
 use ratn_proto::types::{Resource, WaitingAcquire};
 use ratn_report::statistics::mode_name;
 use ratn_task_control::RUN_KIND;
-use ratn_task_control::control::{self, RunStatus};
+use ratn_task_control::control::{self, Awaiting, RunStatus};
 use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
@@ -122,8 +122,13 @@ impl Status {
                 let head = colours.bold(task);
                 lines.push(format!("{head} in {} mode: {at_s:.1} s{paused}; {ended} {states} ended", mode_name(*mode)));
                 lines.push(format!("event log: {}", log.display()));
-                let rows = run.under_way.iter().map(|one| [one.path.clone(), format!("for {:.1} s", one.for_s)]);
+                let rows = run.under_way.iter().map(|one| [one.path.clone(), one.text()]);
                 section(&mut lines, &colours.green("under way"), rows.collect());
+                let until =
+                    |one: &Awaiting| one.until_s.map_or_else(String::new, |until| format!(", until {until:.1} s"));
+                let rows =
+                    run.awaits.iter().map(|one| [one.path.clone(), format!("for {}{}", one.awaited, until(one))]);
+                section(&mut lines, &colours.yellow("waiting by themselves"), rows.collect());
                 let rows = run.waits.iter().map(|sentence| [sentence.clone(), String::new()]);
                 section(&mut lines, &colours.yellow("states that wait"), rows.collect());
             }
@@ -159,7 +164,7 @@ fn section(lines: &mut Vec<String>, head: &str, mut rows: Vec<[String; 2]>) {
 mod tests {
     use super::*;
     use insta::assert_snapshot;
-    use ratn_executive::protocol::Mode;
+    use ratn_executive::protocol::{Awaited, Mode};
     use ratn_model::resource::ResourceClass;
     use ratn_task_control::progress::UnderWay;
 
@@ -174,8 +179,18 @@ mod tests {
                 at_s: 12.34,
                 paused: true,
                 ended: 3,
-                under_way: vec![UnderWay { path: "place[2]/plan".to_owned(), for_s: 1.5 }],
+                under_way: vec![UnderWay {
+                    path: "place[2]/plan".to_owned(),
+                    for_s: 1.5,
+                    usually_s: Some(4.0),
+                    message: "2 of 5 ways".to_owned(),
+                }],
                 waits: vec!["place[2]/move waits for an output of place[2]/plan".to_owned()],
+                awaits: vec![Awaiting {
+                    path: "check".to_owned(),
+                    awaited: Awaited::Signal { signal: "lid_closed".to_owned() },
+                    until_s: Some(20.0),
+                }],
             }),
             held: vec![Held {
                 resource: "path-planner-1@compute".to_owned(),
@@ -190,7 +205,9 @@ mod tests {
         sort_boxes in CDTN mode: 12.3 s, paused; 3 states have ended
         event log: log.jsonl
         under way:
-          place[2]/plan  for 1.5 s
+          place[2]/plan  for 1.5 s of about 4.0 s: 2 of 5 ways
+        waiting by themselves:
+          check  for the signal `lid_closed`, until 20.0 s
         states that wait:
           place[2]/move waits for an output of place[2]/plan
         held:

@@ -7,10 +7,13 @@ use crate::interrupt::Interrupt;
 use crate::output;
 use crate::system::config::SystemConfig;
 use crate::system::{System, public_directory, running};
+use anyhow::Context;
 use ratn_daemon::supervisor;
+use ratn_worker::shutdown;
 use ratn_worker::tls::ClientTls;
+use tokio_util::sync::CancellationToken;
 
-/// Starts it and keeps it running until the user or one of its processes ends it.
+/// Starts it and keeps it running until the user or one of its processes ends it, or the parent is gone that it shall end with.
 pub(crate) fn run(arguments: &UpArguments, tls: &ClientTls) -> Result<(), Failure> {
     let mut config = SystemConfig::load_for(arguments.config.as_deref(), arguments.system.robot.as_deref())?;
     config.apply(&arguments.system);
@@ -18,6 +21,10 @@ pub(crate) fn run(arguments: &UpArguments, tls: &ClientTls) -> Result<(), Failur
     let tls = &config.client_tls(tls)?;
     blocking(async {
         let interrupt = Interrupt::listen()?;
+        let parent_gone = CancellationToken::new();
+        if arguments.exit_with_parent {
+            shutdown::exit_with_parent(&parent_gone).context("cannot watch standard input")?;
+        }
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
         if running(&directory, tls).await?.is_some() {
             return Err(Failure::Refused(format!("ratn: a system runs in {} already", directory.display())));
@@ -44,6 +51,7 @@ pub(crate) fn run(arguments: &UpArguments, tls: &ClientTls) -> Result<(), Failur
         let ended = tokio::select! {
             () = shown => Ok(()),
             () = interrupt.asked_times(1) => Ok(()),
+            () = parent_gone.cancelled() => Ok(()),
             error = system.one_ended() => Err(error.into()),
         };
         supervisor::stopping();

@@ -79,15 +79,25 @@ impl Default for SystemConfig {
 #[derive(Debug, Clone, PartialEq)]
 struct Parts {
     modules: Vec<Module>,
-    /// Of its arm; as the catalogue says unless given.
-    joints: Option<u32>,
+    joints: ArmJoints,
     /// Which those are.
     chain: Option<JointChain>,
 }
 
+/// How many joints an arm of the robot has.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum ArmJoints {
+    /// As the catalogue says.
+    AsSaid,
+    /// So many.
+    Count(u32),
+    /// One arm has more than another: what a goal gives is not checked.
+    Various,
+}
+
 impl Default for Parts {
     fn default() -> Self {
-        Parts { modules: Module::ALL.to_vec(), joints: None, chain: None }
+        Parts { modules: Module::ALL.to_vec(), joints: ArmJoints::AsSaid, chain: None }
     }
 }
 
@@ -105,9 +115,19 @@ impl Parts {
         let Catalogue { providers, resources, .. } = catalogue;
         let provided = |kind: &str| providers.values().any(|provider| provider.resource == kind);
         resources.retain(|kind, _| !lacks(kind) || started(kind) || provided(kind));
+        for (kind, offer) in resources.iter_mut().filter(|(kind, offer)| standard.resources.get(*kind) == Some(offer)) {
+            let many = self.modules.iter().filter(|module| module.kind() == kind).count() as u32;
+            if many > 1 && !started(kind) {
+                offer.count = many.into();
+            }
+        }
         let of_the_robot = providers.iter_mut().filter(|(name, _)| standard.providers.contains_key(*name));
         for (_, provider) in of_the_robot.filter(|(_, provider)| provider.joints.is_some()) {
-            provider.joints = self.joints.or(provider.joints);
+            provider.joints = match self.joints {
+                ArmJoints::AsSaid => provider.joints,
+                ArmJoints::Count(count) => Some(count),
+                ArmJoints::Various => None,
+            };
             let has = |chain: &&JointChain| u32::try_from(chain.joints.len()).ok() == provider.joints;
             provider.chain = self.chain.as_ref().filter(has).cloned();
         }
@@ -234,13 +254,19 @@ impl SystemConfig {
                 }
                 error => error.into(),
             })?;
-            let chain = JointChain {
+            let counts: BTreeSet<usize> =
+                robot.arm_names().enumerate().map(|(arm, _)| robot.joints_of(arm).len()).collect();
+            let joints = match counts.first() {
+                Some(count) if counts.len() == 1 => ArmJoints::Count(u32::try_from(*count)?),
+                _ => ArmJoints::Various,
+            };
+            // Of several arms nobody knows here which one a goal is for.
+            let chain = robot.other_arms().next().is_none().then(|| JointChain {
                 robot: robot.name().to_owned(),
                 arm: robot.arm_name().to_owned(),
                 joints: robot.arm_joints().iter().map(|joint| joint.name.clone()).collect(),
-            };
-            let joints = Some(u32::try_from(chain.joints.len())?);
-            self.parts = Parts { modules: Module::of(&robot), joints, chain: Some(chain) };
+            });
+            self.parts = Parts { modules: Module::of(&robot), joints, chain };
         }
         self.parts.fit(&mut self.catalogue, &self.process_manager.templates);
         self.process_manager_config().templates.iter().try_for_each(|template| self.check_told(template))

@@ -225,7 +225,7 @@ impl WorldPool {
         let Ok(since) = self.history.after(request.base) else { return (None, effects) };
         for kept in since {
             let changes: Vec<Change> = kept.changes().collect();
-            let writer = kept.writer();
+            let writer = kept.writer.as_deref();
             let found = alone.contradicted(before, &kept.world, writer, &changes, &tolerance);
             let found = found.into_iter().map(|found| wire(found, kept.world.revision()));
             first = first.or(found.into_iter().next());

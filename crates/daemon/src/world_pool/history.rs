@@ -6,7 +6,7 @@
 use super::WorldPoolConfig;
 use super::fingerprint::Fingerprint;
 use super::memory::{Memory, Reused};
-use super::record::{CommitRecord, EntryRecord, FactRecord, Names, PatternRecord, SnapshotRecord, encode};
+use super::record::{CommitRecord, EntryRecord, FactRecord, Names, PatternRecord, SnapshotRecord, encode, writer_name};
 use crate::access::Caller;
 use crate::durable_actor::Journaled;
 use bytes::Bytes;
@@ -73,8 +73,16 @@ impl Between {
     }
 }
 
-/// A fact from one revision on: the revision, the commit's id, the fact.
-pub(super) type Version = (Revision, Arc<str>, Option<Arc<Fact>>);
+/// A fact from one revision on.
+#[derive(Debug, PartialEq)]
+pub(super) struct Version {
+    pub(super) revision: Revision,
+    /// The commit's id; empty where it is not kept any more.
+    pub(super) commit: Arc<str>,
+    pub(super) fact: Option<Arc<Fact>>,
+    /// Who wrote or deleted it.
+    pub(super) writer: Option<Arc<str>>,
+}
 
 /// A revision, and what makes it another than the one before.
 #[derive(Debug)]
@@ -82,7 +90,16 @@ pub(super) struct Kept {
     pub(super) world: World,
     /// The id of the commit that made it.
     pub(super) commit: Arc<str>,
+    /// The node that made it.
+    pub(super) writer: Option<Arc<str>>,
     pub(super) written: Written,
+}
+
+impl Kept {
+    /// A revision that is as it is for reasons that are not kept.
+    fn given(world: World) -> Arc<Kept> {
+        Arc::new(Kept { world, commit: Arc::default(), writer: None, written: Written::new() })
+    }
 }
 
 /// A commit that was not made; the root is as it was.
@@ -129,9 +146,8 @@ impl History {
     }
 
     fn of(world: World, config: &WorldPoolConfig) -> History {
-        let oldest = Kept { world, commit: Arc::from(""), written: Written::new() };
         History {
-            revisions: VecDeque::from([Arc::new(oldest)]),
+            revisions: VecDeque::from([Kept::given(world)]),
             written: 0,
             commits: Memory::new(config.remembered()),
             records: EntryRecord::default(),
@@ -149,8 +165,9 @@ impl History {
             let snapshot = SnapshotRecord::decode(&snapshot.payload).map_err(RestoreError::Snapshot)?;
             let facts = snapshot.facts.into_iter().map(|fact| fact.into_fact(&mut names));
             history = History::of(World::of(facts, Revision(snapshot.revision)), config);
+            let mut writers = snapshot.writers.into_iter();
             for commit in snapshot.commits {
-                history.make_again(commit, &mut names)?;
+                history.make_again(commit, writers.next(), &mut names)?;
             }
             let mut callers = snapshot.callers.into_iter();
             for (id, fingerprint, revision) in snapshot.remembered {
@@ -158,14 +175,14 @@ impl History {
             }
         }
         for entry in recovered.records {
-            let EntryRecord { commits, callers } = EntryRecord::decode(&entry.payload)
+            let EntryRecord { commits, callers, writers } = EntryRecord::decode(&entry.payload)
                 .map_err(|source| RestoreError::Entry { position: entry.position, source })?;
-            let mut callers = callers.into_iter();
+            let (mut callers, mut writers) = (callers.into_iter(), writers.into_iter());
             for commit in commits {
                 let caller = callers.next().unwrap_or_default();
                 let (id, fingerprint, revision) = (commit.id.clone(), commit.fingerprint, Revision(commit.revision));
                 let is_leap = commit.is_leap();
-                history.make_again(commit, &mut names)?;
+                history.make_again(commit, writers.next(), &mut names)?;
                 if !is_leap {
                     history.commits.insert(&caller, &id, fingerprint, revision);
                 }
@@ -179,19 +196,21 @@ impl History {
     pub(super) fn with_revisions_above(mut self, floor: Revision) -> History {
         if self.root().revision() < floor {
             self.go_on_from(floor);
-            self.put_down(&Arc::default(), CommitRecord { revision: floor.0, ..CommitRecord::default() });
+            let record = CommitRecord { revision: floor.0, ..CommitRecord::default() };
+            self.put_down(&Arc::default(), None, record);
         }
         self
     }
 
-    fn put_down(&mut self, caller: &Arc<str>, record: CommitRecord) {
+    fn put_down(&mut self, caller: &Arc<str>, writer: Option<&Arc<str>>, record: CommitRecord) {
         self.records.commits.push(record);
         self.records.callers.push(caller.clone());
+        self.records.writers.push(writer_name(writer));
     }
 
     fn go_on_from(&mut self, revision: Revision) {
         let world = self.root().clone().numbered(revision);
-        self.revisions = VecDeque::from([Arc::new(Kept { world, commit: Arc::from(""), written: Written::new() })]);
+        self.revisions = VecDeque::from([Kept::given(world)]);
         self.written = 0;
     }
 
@@ -234,8 +253,9 @@ impl History {
             deleted: deleted.collect(),
             written: facts_of(&written),
         };
-        self.put_down(&by.name, record);
-        let revision = self.push(id, written);
+        let writer = writer.as_deref().map(Arc::<str>::from);
+        self.put_down(&by.name, writer.as_ref(), record);
+        let revision = self.push(id, writer, written);
         self.news.extend(self.revisions.back().cloned());
         self.commits.insert(&by.name, id, fingerprint, revision);
         Ok(revision)
@@ -278,20 +298,25 @@ impl History {
     /// What a fact was, the newest first, and the oldest revision that is kept.
     pub(super) fn versions(&self, key: &FactKey, limit: usize) -> (Vec<Version>, Revision) {
         let oldest = &self.revisions[0].world;
-        let written =
-            self.revisions.iter().rev().filter_map(|kept| {
-                Some((kept.world.revision(), Arc::clone(&kept.commit), kept.written.get(key)?.clone()))
-            });
+        let written = self.revisions.iter().rev().filter_map(|kept| {
+            let (revision, commit) = (kept.world.revision(), Arc::clone(&kept.commit));
+            Some(Version { revision, commit, fact: kept.written.get(key)?.clone(), writer: kept.writer.clone() })
+        });
         let before = oldest.fact(key).filter(|_| !self.revisions[0].written.contains_key(key));
-        let before = before.map(|fact| (fact.revision, Arc::from(""), Some(Arc::new(fact.clone()))));
+        let before = before.map(|fact| Version {
+            revision: fact.revision,
+            commit: Arc::default(),
+            writer: fact.writer.clone(),
+            fact: Some(Arc::new(fact.clone())),
+        });
         (written.chain(before).take(limit).collect(), oldest.revision())
     }
 
-    fn push(&mut self, commit: &str, written: Written) -> Revision {
+    fn push(&mut self, commit: &str, writer: Option<Arc<str>>, written: Written) -> Revision {
         let mut world = self.root().clone();
         let revision = world.write(&written);
         self.written += written.len();
-        self.revisions.push_back(Arc::new(Kept { world, commit: Arc::from(commit), written }));
+        self.revisions.push_back(Arc::new(Kept { world, commit: Arc::from(commit), writer, written }));
         let too_much = |history: &History| {
             history.revisions.len() > history.revisions_kept || history.written > history.changes_kept
         };
@@ -302,7 +327,12 @@ impl History {
         revision
     }
 
-    fn make_again(&mut self, commit: CommitRecord, names: &mut Names) -> Result<(), RestoreError> {
+    fn make_again(
+        &mut self,
+        commit: CommitRecord,
+        writer: Option<Arc<str>>,
+        names: &mut Names,
+    ) -> Result<(), RestoreError> {
         let expected = self.root().revision().0 + 1;
         if commit.is_leap() && commit.revision > expected {
             self.go_on_from(Revision(commit.revision));
@@ -320,7 +350,10 @@ impl History {
             let (key, fact) = fact.into_fact(names);
             (key, Some(fact))
         }));
-        self.push(&commit.id, written);
+        // Before records named writers, only facts did.
+        let of_facts = || written.values().flatten().next()?.writer.clone();
+        let writer = writer.map_or_else(of_facts, |name| (!name.is_empty()).then(|| names.share(name)));
+        self.push(&commit.id, writer, written);
         Ok(())
     }
 }
@@ -345,6 +378,7 @@ impl Journaled for History {
                 commits: later.iter().map(|kept| kept.record()).collect(),
                 remembered,
                 callers,
+                writers: later.iter().map(|kept| writer_name(kept.writer.as_ref())).collect(),
             }))
         })
     }
@@ -357,11 +391,6 @@ impl Kept {
             Some(fact) => Change::Set { fact: key.as_ref().clone(), value: fact.value.clone() },
             None => Change::Delete { pattern: FactPattern::of(key) },
         })
-    }
-
-    /// Who committed it, where it wrote anything.
-    pub(super) fn writer(&self) -> Option<&str> {
-        self.written.values().flatten().next()?.writer.as_deref()
     }
 
     /// As it was written down; its fingerprint is among what is remembered, if it still is.
@@ -487,8 +516,8 @@ mod tests {
                     let (versions, oldest) = history.versions(&key(n), 100);
                     prop_assert_eq!(oldest, history.revisions[0].world.revision());
                     for (at, world) in worlds.iter().enumerate().skip(oldest.0 as usize) {
-                        let then = versions.iter().find(|(revision, ..)| revision.0 as usize <= at);
-                        prop_assert_eq!(then.and_then(|(.., fact)| fact.as_deref()), world.fact(&key(n)));
+                        let then = versions.iter().find(|version| version.revision.0 as usize <= at);
+                        prop_assert_eq!(then.and_then(|version| version.fact.as_deref()), world.fact(&key(n)));
                     }
                 }
                 for (id, changes, revision) in made.iter().rev().take(7) {
@@ -512,8 +541,8 @@ mod tests {
         history.commit(&commit_as("a", "r", &changes), None).unwrap();
         let entry = history.take_entry().unwrap();
         let snapshot = history.snapshot()().to_vec();
-        // An earlier version ends where the list of callers would begin.
-        let earlier = |bytes: &[u8]| [&[2], &bytes.strip_suffix(&[1, 1, b'a']).unwrap()[1..]].concat();
+        // An earlier version ends where the lists of callers and writers would begin.
+        let earlier = |bytes: &[u8]| [&[2], &bytes.strip_suffix(&[1, 1, b'a', 1, 0]).unwrap()[1..]].concat();
         let of_entry = |entry: Vec<u8>| Kept { entries: vec![entry], snapshot: None };
         let of_snapshot = |bytes: Vec<u8>| Kept { entries: Vec::new(), snapshot: Some(bytes) };
         for kept in [of_entry(entry.clone()), of_snapshot(snapshot.clone())] {
@@ -525,6 +554,38 @@ mod tests {
             let mut again = History::restore(kept.recovered(), &config()).unwrap();
             assert_eq!(again.commit(&commit_as("b", "r", &changes), None), Ok(Revision(1)), "whoever asks the same");
             assert_eq!(again.commit(&commit_as("b", "r", &[]), None), Ok(Revision(2)), "something else");
+        }
+    }
+
+    #[test]
+    fn whose_a_revision_is_that_only_deletes_is_known_after_a_restart_too() {
+        let as_node = |id: &str, changes: &[Change], writer: Option<&str>| Commit {
+            writer: writer.map(str::to_owned),
+            ..commit(id, changes)
+        };
+        let delete = [Change::Delete { pattern: FactPattern::of(&key(1)) }];
+        let mut history = History::new(&config());
+        history.commit(&as_node("r", &[Change::Set { fact: key(1), value: Value::Int(1) }], Some("n")), None).unwrap();
+        history.commit(&as_node("d", &delete, Some("m")), None).unwrap();
+        history.commit(&as_node("e", &delete, None), None).unwrap();
+        let writers = |history: &History| -> Vec<Option<String>> {
+            history.revisions.iter().map(|kept| kept.writer.as_deref().map(str::to_owned)).collect()
+        };
+        let made = vec![None, Some("n".to_owned()), Some("m".to_owned()), None];
+        assert_eq!(writers(&history), made);
+        let gone = &history.versions(&key(1), 9).0[0];
+        assert_eq!((gone.revision, gone.writer.as_deref()), (Revision(2), Some("m")));
+        let (entry, snapshot) = (history.take_entry().unwrap(), history.snapshot()().to_vec());
+        let of_entry = |entry: Vec<u8>| Kept { entries: vec![entry], snapshot: None };
+        let of_snapshot = |bytes: Vec<u8>| Kept { entries: Vec::new(), snapshot: Some(bytes) };
+        for kept in [of_entry(entry.clone()), of_snapshot(snapshot.clone())] {
+            assert_eq!(writers(&History::restore(kept.recovered(), &config()).unwrap()), made);
+        }
+        // Version 3 ends where the list of writers would begin: only facts said whose they were.
+        let earlier = |bytes: &[u8]| [&[3], &bytes.strip_suffix(&[3, 1, b'n', 1, b'm', 0]).unwrap()[1..]].concat();
+        for kept in [of_entry(earlier(&entry)), of_snapshot(earlier(&snapshot))] {
+            let again = History::restore(kept.recovered(), &config()).unwrap();
+            assert_eq!(writers(&again), [None, Some("n".to_owned()), None, None]);
         }
     }
 

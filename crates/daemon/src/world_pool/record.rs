@@ -16,7 +16,9 @@ use std::sync::Arc;
 
 /// The version that is written, the first byte. Only variants of enums are ever added to one, at their end; whatever else changes takes
 /// a new number, and the older ones are still read.
-const FORMAT: u8 = 3;
+const FORMAT: u8 = 4;
+/// The last version that does not say whose a commit is that only deletes.
+const WITHOUT_WRITERS: u8 = 3;
 /// The last version that does not say who committed.
 const WITHOUT_CALLERS: u8 = 2;
 /// The fingerprints are of the debug text of changes, which says nothing to a later version.
@@ -40,6 +42,8 @@ pub(super) struct CommitRecord {
 pub(super) struct EntryRecord {
     pub(super) commits: Vec<CommitRecord>,
     pub(super) callers: Vec<Arc<str>>,
+    /// The node that made each, in the same order; empty where nobody said.
+    pub(super) writers: Vec<Arc<str>>,
 }
 
 /// The oldest revision that is kept, the commits since, and the answers that are remembered, the oldest first.
@@ -51,6 +55,8 @@ pub(super) struct SnapshotRecord {
     pub(super) remembered: Vec<(String, Fingerprint, u64)>,
     /// To whom those answers were given, in the same order; to nobody knows whom where they are not there.
     pub(super) callers: Vec<Arc<str>>,
+    /// The nodes that made `commits`, in the same order; empty where nobody said.
+    pub(super) writers: Vec<Arc<str>>,
 }
 
 /// A fact with who wrote it when.
@@ -85,11 +91,13 @@ pub(super) fn encode<T: Serialize>(value: &T) -> Vec<u8> {
 /// A record of this version or an earlier one, and which: each is the one before with one more list at its end.
 fn decode<T: for<'a> Deserialize<'a>>(bytes: &[u8]) -> Result<(T, u8), DecodeError> {
     let version = versioned::version(DEBUG_FINGERPRINTS, FORMAT, RECORDS, bytes)?;
-    let record = match version {
-        // An empty list, as postcard writes it.
-        ..=WITHOUT_CALLERS => versioned::decode(version, RECORDS, &[bytes, &[0]].concat())?,
-        _ => versioned::decode(version, RECORDS, bytes)?,
+    // Empty lists, as postcard writes them.
+    let missing: &[u8] = match version {
+        ..=WITHOUT_CALLERS => &[0, 0],
+        WITHOUT_WRITERS => &[0],
+        _ => &[],
     };
+    let record = versioned::decode(version, RECORDS, &[bytes, missing].concat())?;
     Ok((record, version))
 }
 
@@ -118,6 +126,11 @@ impl CommitRecord {
     pub(super) fn is_leap(&self) -> bool {
         self.id.is_empty() && self.deleted.is_empty() && self.written.is_empty()
     }
+}
+
+/// What a record says of a writer.
+pub(super) fn writer_name(writer: Option<&Arc<str>>) -> Arc<str> {
+    writer.cloned().unwrap_or_default()
 }
 
 impl FactRecord {
@@ -178,7 +191,8 @@ impl TermRecord {
 pub(super) struct Names(BTreeSet<Arc<str>>);
 
 impl Names {
-    fn share(&mut self, name: Arc<str>) -> Arc<str> {
+    /// The name that all who say this one share.
+    pub(super) fn share(&mut self, name: Arc<str>) -> Arc<str> {
         if let Some(known) = self.0.get(&name) {
             return Arc::clone(known);
         }

@@ -294,10 +294,11 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let asked = key.clone();
         let message = |answer| Message::Versions { key: asked, limit: MOST_VERSIONS, answer };
         let (versions, oldest) = self.actor.request(message).await?;
-        let versions = versions.into_iter().map(|(revision, commit, fact)| FactVersion {
-            revision,
-            commit: commit.to_string(),
-            fact: fact.map(|fact| record((key.clone(), fact.as_ref().clone()))),
+        let versions = versions.into_iter().map(|version| FactVersion {
+            revision: version.revision,
+            commit: version.commit.to_string(),
+            fact: version.fact.map(|fact| record((key.clone(), fact.as_ref().clone()))),
+            writer: version.writer,
         });
         Ok(Response::new(v1::GetFactHistoryResponse {
             versions: paging::first(all(versions)),
@@ -348,8 +349,8 @@ fn told(update: &Update, patterns: &[FactPattern]) -> Option<WorldUpdate> {
                 }
             }
             let nothing = written.is_empty() && gone.is_empty() && !patterns.is_empty();
-            let (revision, commit) = (kept.world.revision(), kept.commit.to_string());
-            (!nothing).then_some(WorldUpdate::Changed(WorldChange { revision, commit, written, gone }))
+            let (revision, commit, writer) = (kept.world.revision(), kept.commit.to_string(), kept.writer.clone());
+            (!nothing).then_some(WorldUpdate::Changed(WorldChange { revision, commit, written, gone, writer }))
         }
     }
 }

@@ -9,6 +9,7 @@
 //! | forecasts, with what readers were shown of them before, and their users | a forecast that changed within its tolerance is not made again: who is told of what, and what is predicted, follows from what it *was* |
 //! | what facts were before somebody changed them within their tolerance | as above, of changes from outside |
 //! | estimated durations and paths | they are made when the window has grown enough, and stand until then |
+//! | signals that no wait has taken | the next wait of their name takes them |
 //! | results that were discarded | they serve again |
 //! | the queue, timers, cursors, branches, lines, the interpreters with their threads | where everything is |
 //!
@@ -26,6 +27,7 @@
 
 use super::{Executive, State};
 use crate::plan::Plan;
+use crate::signals::Signals;
 use crate::window::Beside;
 use ratn_model::fact::FactKey;
 use ratn_model::id::Revision;
@@ -39,7 +41,7 @@ use std::fmt::{self, Write};
 use std::sync::Arc;
 
 /// The version of the form. Any change of what is written takes a new number: no version reads another's.
-const FORMAT: u8 = 2;
+const FORMAT: u8 = 3;
 
 type Hash = [u8; blake3::OUT_LEN];
 
@@ -72,6 +74,7 @@ struct Form<F, S, B> {
     facts: Vec<F>,
     last_instance: u64,
     seed: u64,
+    signals: Signals,
     deadline: Option<Timestamp>,
     state: S,
     beside: Option<B>,
@@ -115,6 +118,7 @@ impl Executive {
             root: World::default(),
             last_instance: 0,
             seed: 0,
+            signals: Signals::default(),
             deadline: None,
             state: State::Fresh,
         };
@@ -126,10 +130,11 @@ impl Executive {
             State::Cdtn(window) => Some(window.beside(&self.root)),
             State::Fresh | State::Hsm(_) | State::Ended => None,
         };
-        let Executive { last_instance, seed, deadline, state, .. } = self;
+        let Executive { last_instance, seed, signals, deadline, state, .. } = self;
         let (program, revision) = (self.fingerprint(), self.root.revision());
         let (last_instance, seed, deadline) = (*last_instance, *seed, *deadline);
-        let form = Form { program, revision, facts, last_instance, seed, deadline, state, beside };
+        let signals = signals.clone();
+        let form = Form { program, revision, facts, last_instance, seed, signals, deadline, state, beside };
         // Everything has a form that can be written; there is no I/O.
         postcard::to_extend(&form, Vec::new()).unwrap_or_default()
     }
@@ -150,11 +155,12 @@ impl Executive {
         if !rest.is_empty() {
             return Err(broken("there are bytes behind it"));
         }
-        let Form { revision, facts, last_instance, seed, deadline, state, beside, .. } = form;
+        let Form { revision, facts, last_instance, seed, signals, deadline, state, beside, .. } = form;
         let fact =
             |(key, value, revision)| (Arc::new(key), Arc::new(Fact { value, revision, writer: None, measured: None }));
         self.root = root(facts.into_iter().map(fact).collect(), revision);
-        (self.last_instance, self.seed, self.deadline, self.state) = (last_instance, seed, deadline, state);
+        (self.last_instance, self.seed, self.signals) = (last_instance, seed, signals);
+        (self.deadline, self.state) = (deadline, state);
         match (&mut self.state, beside) {
             (State::Cdtn(window), Some(beside)) => {
                 window.restore(&self.plan, &self.root, self.tolerance, beside).map_err(broken)?;

@@ -22,7 +22,7 @@ impl Interpreter {
                 Phase::Backoff(until) if until <= context.now => self.try_now(context, thread),
                 Phase::Running if current.timeout.is_some_and(|at| at <= context.now) => {
                     if context.program.state(current.state).is_pause() {
-                        self.has_waited(context, thread);
+                        self.waited_long_enough(context, thread);
                         continue;
                     }
                     let limit = context.program.state(current.state).annotations.timeout_s.unwrap_or_default();
@@ -88,7 +88,7 @@ impl Interpreter {
         match self.threads.get(&thread).and_then(|thread| thread.routine) {
             Some(_) if !self.may_try(context, thread) => {}
             // In a race who waits loses: the others keep the lease, and what is left of it has to do.
-            Some(routine) if self.uses_lease(routine) && is_in_race(context.program, id) => {
+            Some(routine) if self.uses_lease(context.program, routine) && is_in_race(context.program, id) => {
                 self.project_or_run(context, thread);
             }
             Some(_) => {}
@@ -106,7 +106,7 @@ impl Interpreter {
     }
 
     fn renew_lease(&mut self, context: &mut Context<'_>, routine: u64) {
-        if self.uses_lease(routine) {
+        if self.uses_lease(context.program, routine) {
             return;
         }
         let Some(thread) = self.stalled(routine).first().copied() else { return };
@@ -133,9 +133,14 @@ impl Interpreter {
     }
 
     /// Whether anything of a routine moves under its lease, or asks for it.
-    fn uses_lease(&self, routine: u64) -> bool {
-        let uses = |phase| matches!(phase, Some(Phase::Acquiring | Phase::Projecting | Phase::Running));
-        self.threads_of(routine).any(|thread| uses(self.phase(thread)))
+    fn uses_lease(&self, program: &Program, routine: u64) -> bool {
+        let uses = |current: &Current| match current.phase {
+            // Whoever waits holds nothing, and may wait for what the others do.
+            Phase::Running => !program.state(current.state).is_pause(),
+            phase => matches!(phase, Phase::Acquiring | Phase::Projecting),
+        };
+        let mut threads = self.threads_of(routine).filter_map(|thread| self.threads.get(&thread)?.current.as_ref());
+        threads.any(uses)
     }
 
     fn stalled(&self, routine: u64) -> Vec<u64> {

@@ -7,6 +7,7 @@
 //!
 //! A thread of control has a stack of frames (the lists it is in) and does one thing at a time: [`walk`] says what is next,
 //! [`node`] lives the life of one action, [`again`] tries it anew, [`exit`] does what composite states do at their ends,
+//! [`waits`] lives that of one that waits,
 //! [`routine`] holds what a routine needs from its entry to its end, [`regions`] forks and joins, [`stop`] ends what is under way.
 
 mod again;
@@ -16,6 +17,7 @@ mod node;
 mod regions;
 mod routine;
 mod stop;
+mod waits;
 mod walk;
 
 use crate::binding::{Bindings, Names, Outputs};
@@ -236,7 +238,7 @@ impl Interpreter {
         if let Some(main) = self.threads.get_mut(&MAIN) {
             main.todo = Todo::Enter(state, Some(path.to_owned()));
         }
-        self.advance(context)
+        self.go_on_with(context)
     }
 
     /// Whether an instance is one of those under way.
@@ -322,6 +324,11 @@ impl Interpreter {
                     self.goal_ended(context, thread, end);
                 }
             }
+            Event::Answered { instance, choice } => {
+                if let Some(thread) = of(self, instance, None) {
+                    self.answered(context, thread, &choice);
+                }
+            }
             Event::PauseRequested => self.hold = Hold::Paused(0),
             Event::ResumeRequested => {
                 self.hold = Hold::Running;
@@ -333,7 +340,7 @@ impl Interpreter {
             }
             _ => {}
         }
-        let progress = self.advance(context);
+        let progress = self.go_on_with(context);
         if progress == Progress::Busy {
             self.renew_leases(context);
         }

@@ -171,11 +171,13 @@ impl Interpreter {
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let state = program.state(current.state);
         let StateKind::Action { provider, action, inputs, .. } = &state.kind else { return };
+        if state.is_pause() {
+            return self.begin_waiting(context, thread);
+        }
         let inputs = match self.with_scope(context, thread, None, |scope| binding::inputs(state, inputs, scope)) {
             Ok(inputs) => inputs,
             Err(error) => return self.end_node(context, thread, error.reason()),
         };
-        let pause_s = binding::pause_s(state, &inputs);
         let (instance, attempt) = (current.instance, current.attempt);
         let tries = if state.annotations.deterministic { 1 } else { current.tries };
         let mut seed = binding::Seed::of(context.seed);
@@ -190,7 +192,7 @@ impl Interpreter {
             expected_s: self.with_scope(context, thread, None, |scope| binding::expected_s(state, scope)),
             timeout_s: state.annotations.timeout_s,
         };
-        let timeout = pause_s.or(state.annotations.timeout_s).map(|seconds| context.now + duration(seconds));
+        let timeout = state.annotations.timeout_s.map(|seconds| context.now + duration(seconds));
         if self.routine_of(thread).is_none() && self.is_pia(context, thread) {
             self.hold.has_begun();
         }
@@ -201,19 +203,7 @@ impl Interpreter {
         self.has_begun_something(thread);
         context.commands.extend(timeout.map(|at| Command::Wake { at }));
         context.note(Note::Running { instance, attempt });
-        if pause_s.is_none() {
-            context.commands.push(Command::Start { instance, attempt, goal: Box::new(goal) });
-        }
-    }
-
-    /// A pause is over.
-    pub(super) fn has_waited(&mut self, context: &mut Context<'_>, thread: u64) {
-        let (outputs, measured, evidence) = Default::default();
-        self.finish(
-            context,
-            thread,
-            GoalEnd { outcome: SUCCESS.to_owned(), outputs, measured, evidence, reason: String::new() },
-        );
+        context.commands.push(Command::Start { instance, attempt, goal: Box::new(goal) });
     }
 
     /// It ends `aborted` without having done anything (more).
@@ -264,7 +254,8 @@ impl Interpreter {
         }
         context.note(Note::Finished { instance, outcome: outcome.as_str().into() });
         let nature = context.plan.state(id).nature;
-        let declared = effects::declared(state, nature, &outcome);
+        // What a wait foresees is somebody else's doing.
+        let declared = if state.is_pause() { Some(&[][..]) } else { effects::declared(state, nature, &outcome) };
         let changes =
             self.with_scope(context, thread, Some(&outputs), |s| effects::actual(declared, &outcome, &measured, s));
         let made = changes.map(|changes| Made { changes, evidence }).map_err(|e| e.to_string());

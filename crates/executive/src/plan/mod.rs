@@ -56,6 +56,8 @@ pub(crate) struct StatePlan {
     pub(crate) is_region: bool,
     /// Younger PIAs may run beside it.
     pub(crate) imprecise: bool,
+    /// It waits, or something that it contains does.
+    pub(crate) waits: bool,
     /// Of an action: its provider and its name there.
     pub(crate) action: Option<(Arc<str>, Arc<str>)>,
 
@@ -177,12 +179,14 @@ impl StatePlan {
         let exits = if subject.is_node { 0 } else { outcomes::exits(state, &ends, &resources.operations) };
         let around = state.parent.map(|parent| &program.state(parent).kind);
         let exceptions = state.annotations.exceptions.unwrap_or(program.exceptions);
+        let waits = subject.is_node && subject.contained.iter().any(|state| state.is_pause());
         StatePlan {
             nature,
             is_node: subject.is_node,
             is_routine: subject.is_routine(),
             is_region: matches!(around, Some(StateKind::Concurrency { .. })),
-            imprecise: nature == NodeNature::Irreversible && exceptions == Exceptions::Imprecise,
+            imprecise: nature == NodeNature::Irreversible && exceptions == Exceptions::Imprecise && !waits,
+            waits,
             action: match &state.kind {
                 StateKind::Action { provider, action, .. } => Some((Arc::from(&**provider), Arc::from(&**action))),
                 _ => None,

@@ -314,6 +314,9 @@ impl Window {
         let Some(instance) = self.graph.get(id) else { return };
         let state = context.program.state(instance.state);
         let StateKind::Action { inputs, .. } = &state.kind else { return };
+        if state.is_pause() {
+            return self.begin_waiting(context, id);
+        }
         let Some((provider, action)) = context.plan.state(instance.state).action.clone() else { return };
         let looked = self.look(context, id, None, |_, view| {
             let bound = match &known {
@@ -331,7 +334,6 @@ impl Window {
         let Some(node) = self.graph.node(id) else { return };
         let Status::Granted(held) = &node.status else { return };
         let attempt = node.attempt;
-        let pause_s = binding::pause_s(state, &inputs);
         let goal = Goal {
             provider,
             action,
@@ -342,14 +344,12 @@ impl Window {
             expected_s,
             timeout_s: state.annotations.timeout_s,
         };
-        if let Some(timeout_s) = pause_s.or(state.annotations.timeout_s) {
+        if let Some(timeout_s) = state.annotations.timeout_s {
             self.set_timer(context, timeout_s, Timer::Timeout(id, attempt));
         }
         self.graph.run(id);
         context.note(Note::Running { instance: id, attempt });
-        if pause_s.is_none() {
-            context.commands.push(Command::Start { instance: id, attempt, goal: Box::new(goal) });
-        }
+        context.commands.push(Command::Start { instance: id, attempt, goal: Box::new(goal) });
     }
 
     /// Each change with the path of who makes it.

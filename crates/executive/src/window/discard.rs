@@ -40,6 +40,7 @@ impl Window {
         let is_node = instance.role().is_none();
         if let Some(node) = instance.node()
             && instance.is_pia()
+            && !context.program.state(instance.state).is_pause()
             && !self.is_ending
         {
             match node.status {

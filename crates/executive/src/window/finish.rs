@@ -4,7 +4,7 @@ use super::Window;
 use super::graph::instance::{Changed, Ended, Held, Instance, Status};
 use super::growth::environment::assigned;
 use super::waits::{Timer, Wait};
-use crate::binding::{self, Outputs};
+use crate::binding;
 use crate::context::Context;
 use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
 use crate::plan::gives_outputs;
@@ -59,7 +59,7 @@ impl Window {
                         continue;
                     }
                     if context.program.state(instance.state).is_pause() {
-                        self.finish(context, id, Ended::success(Outputs::new()));
+                        self.waited_long_enough(context, id);
                         continue;
                     }
                     let limit = context.program.state(instance.state).annotations.timeout_s.unwrap_or_default();
@@ -239,7 +239,8 @@ impl Window {
             | Event::Refused { instance, .. }
             | Event::Projected { instance, .. }
             | Event::Finished { instance, .. }
-            | Event::Crashed { instance, .. } => *instance,
+            | Event::Crashed { instance, .. }
+            | Event::Answered { instance, .. } => *instance,
             _ => return,
         };
         let mut active = self.dispatch.active();
@@ -269,7 +270,7 @@ impl Window {
         }
     }
 
-    fn tell_routine(&mut self, context: &mut Context<'_>, id: InstanceId, event: Event) {
+    pub(super) fn tell_routine(&mut self, context: &mut Context<'_>, id: InstanceId, event: Event) {
         let Some(interpreter) = self.graph.interpreter(id) else { return };
         let progress = interpreter.handle(context, event);
         self.routine_progressed(context, id, progress);

@@ -15,6 +15,7 @@
 //! | what happens | |
 //! |---|---|
 //! | `ready`, `begin` | a node may begin, asks for its resources, gets its projection, runs |
+//! | `waiting` | a state waits, without a provider |
 //! | `finish` | its goal ends, its worker dies, it is tried again |
 //! | `decide` | conditions, lists of loops, deciders, ends of composite states |
 //! | `retire` | what becomes real, in program order per line |
@@ -40,6 +41,7 @@ mod ready;
 mod results;
 mod retire;
 mod revise;
+mod waiting;
 mod waits;
 
 use crate::binding::Outputs;
@@ -86,6 +88,9 @@ pub(crate) struct Window {
     hold: Hold,
     end: Option<End>,
     is_ending: bool,
+    /// The root has changed or a signal has come since the waits under way were looked at.
+    #[serde(skip)]
+    may_end_waits: bool,
     /// So many commands of the event have been looked through for commits.
     #[serde(skip)]
     followed: usize,
@@ -112,6 +117,7 @@ impl Window {
             hold: Hold::default(),
             end: None,
             is_ending: false,
+            may_end_waits: false,
             followed: 0,
         }
     }
@@ -149,7 +155,12 @@ impl Window {
                 self.hold_back(context, &held);
                 self.ask_again(context);
             }
-            Event::WorldChanged { facts, .. } => self.world_changed(context, facts.iter().map(|(fact, _)| fact)),
+            Event::WorldChanged { facts, .. } => {
+                self.may_end_waits = true;
+                self.world_changed(context, facts.iter().map(|(fact, _)| fact));
+            }
+            Event::Signalled { .. } => self.may_end_waits = true,
+            Event::Answered { instance, choice } => self.answer(context, instance, choice),
             Event::Woken => self.wake_routines(context),
             Event::Started { .. } | Event::Progressed { .. } | Event::Resumed => {}
         }
@@ -172,6 +183,10 @@ impl Window {
                 return self.end.take();
             }
             self.follow_root(context);
+            let changed = changed | self.look_at_waits(context);
+            if self.end.is_some() {
+                return self.end.take();
+            }
             if !changed && !self.waits.is_due(&self.graph) {
                 return None;
             }
@@ -279,6 +294,7 @@ impl Window {
             }
         }
         if has_changed {
+            self.may_end_waits = true;
             self.waits.environment_changed(&mut self.graph);
         }
         self.followed = context.commands.len();
@@ -317,6 +333,7 @@ impl Window {
             }
             let before = context.commands.len();
             self.waits.enqueue(&mut self.graph, id);
+            self.may_end_waits = true;
             let end = self.go_on(context);
             if let Some(command) = context.commands.get(before) {
                 let path = self.path(context.program, id);

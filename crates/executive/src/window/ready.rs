@@ -65,6 +65,11 @@ impl Window {
         if let Some(writer) = view.operator_of(&own.kinds) {
             return Readiness::Waits(Wait::TaskResource(writer));
         }
+        if own.waits
+            && let Some(beside) = self.older_beside(instance)
+        {
+            return Readiness::Waits(Wait::World(beside));
+        }
         if is_pia && let Some(beside) = self.conflict_beside(context, instance) {
             return Readiness::Waits(Wait::World(beside));
         }
@@ -154,6 +159,12 @@ impl Window {
         })
     }
 
+    /// An imprecise PIA that still runs, and is older. A wait does not begin beside it: a signal that it took would be lost if that one
+    /// fails and its path is left.
+    fn older_beside(&self, instance: &Instance) -> Option<InstanceId> {
+        self.graph.detached().iter().copied().find(|id| *id < instance.id)
+    }
+
     /// An imprecise PIA that still runs beside an instance and whose outputs it is made of, its effects included.
     pub(super) fn producer_beside<'a>(&self, sight: Sight<'a>, instance: &'a Instance) -> Option<InstanceId> {
         if self.graph.detached().is_empty() {
@@ -188,6 +199,8 @@ impl Window {
                     (0..own.outcomes.len().min(MAX_OUTCOMES)).filter(|n| ahead & (1 << n) != 0).collect()
                 }
             };
+            // What a wait foresees it does not do.
+            let outcomes = if state.is_pause() { Vec::new() } else { outcomes };
             let link = |outcome| Link { writer: instance.id, outcome, vague: false };
             let each = outcomes.into_iter().map(|outcome| view.sight.may_write_along(view, link(outcome)));
             Touches { reads, writes: each.fold(Footprint::NOTHING, Footprint::union) }

@@ -227,6 +227,11 @@ impl Window {
             }
             real.changes = changes;
         }
+        if let Some(Changed::Foreseen(changes)) =
+            self.graph.get(id).and_then(Instance::ended).map(|ended| &ended.changes)
+        {
+            real.changes.clone_from(changes);
+        }
         match operations {
             Ok(operations) if operations.is_empty() => {}
             Ok(operations) => context.commands.push(Command::Operate { instance: id, operations }),
@@ -290,6 +295,7 @@ impl Window {
         let is_routine = own.is_routine && instance.role().is_none();
         let made = match &ended.changes {
             Changed::Exactly(made) => Ok(made.clone()),
+            Changed::Foreseen(_) => Ok(Made::default()),
             Changed::Declared(..) if is_routine => Ok(Made::default()),
             Changed::Declared(measured, _) if declared.is_some_and(<[_]>::is_empty) && measured.is_empty() => {
                 Ok(Made::default())
@@ -377,8 +383,9 @@ impl Window {
         self.waits.wake(&mut self.graph, id);
         let Some(instance) = self.graph.remove(id) else { return };
         self.forget(id);
+        let is_wait = context.program.state(instance.state).is_pause();
         let started = instance.node().is_some_and(|node| match &node.status {
-            Status::Finished(ended) => node.has_acted || ended.reason.is_empty(),
+            Status::Finished(ended) => node.has_acted || (ended.reason.is_empty() && !is_wait),
             _ => false,
         });
         self.graph.count_visits(instance.line, instance.visits_before, started);

@@ -129,6 +129,13 @@ fn said(line: &LogLine, run: &Timeline) -> Option<(Level, String)> {
         }
         LogEntry::Event(Event::PauseRequested) => (Level::Info, "paused".to_owned()),
         LogEntry::Event(Event::ResumeRequested) => (Level::Info, "goes on".to_owned()),
+        LogEntry::Event(Event::Signalled { signal, .. }) => (Level::Info, format!("the signal `{signal}`")),
+        LogEntry::Event(Event::Answered { instance, choice }) => {
+            (Level::Info, format!("{} is answered: {choice}", path(*instance)))
+        }
+        LogEntry::Command(Command::Note(Note::Awaiting { instance, awaited, .. })) => {
+            (Level::Info, format!("{} waits for {awaited}", path(*instance)))
+        }
         LogEntry::Event(Event::AbortRequested { reason }) => (Level::Warning, format!("is aborted: {reason}")),
         LogEntry::Command(Command::Start { instance, goal, .. }) => {
             (Level::Info, format!("{} begins: {}/{}", path(*instance), goal.provider, goal.action))

@@ -59,14 +59,14 @@ const OF_OTHER_LANGUAGES: [(&str, &str); 36] = [
 ];
 
 /// Why a fact that is about what no fact can be about is a function that is not there.
-pub(super) fn no_fact(program: &Program, fact: &FactExpr, about: &Type) -> Wrong {
+pub(super) fn no_fact(subject: &Subject<'_>, fact: &FactExpr, about: &Type) -> Wrong {
     let name = fact.predicate.as_str();
-    let whole = named(program, &Expr::Fact(fact.clone()));
+    let whole = named(subject.program, &Expr::Fact(fact.clone()));
     let article = if matches!(about, Type::Record(_)) { "a map" } else { &format!("{about}") };
     let message = format!(
         "`{whole}`: there is no function `{name}`, and it is no fact: those are about individuals and ints, not about {article}"
     );
-    let help = match (meant(name, fact.arguments.len()), elsewhere(name)) {
+    let help = match (meant(name, fact.arguments.len(), subject.functions), elsewhere(name)) {
         (Some((_, usage, _)), _) => format!("did you mean `{usage}`?"),
         (None, Some(here)) if !here.is_empty() => format!("write `{here}`"),
         _ => "the functions that there are stand in docs/task-files.md".to_owned(),
@@ -98,7 +98,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
                 let whole = named(program, &Expr::Fact(fact.clone()));
                 let message = format!("`{whole}` is read as a fact, and nothing in the task says that there is one");
                 let declare = "name it in `reads`, `world` or the effects of a state";
-                let function = meant(name, fact.arguments.len());
+                let function = meant(name, fact.arguments.len(), subject.functions);
                 let near = nearest(name, &known);
                 match (function, near) {
                     (Some((function, usage, takes)), _) => {
@@ -172,10 +172,16 @@ fn nearest<'a>(name: &str, known: &BTreeSet<&'a str>) -> Option<&'a str> {
 }
 
 /// The function that a name is almost the name of, how it is called, and whether so many arguments fit.
-fn meant(predicate: &str, arguments: usize) -> Option<(&'static str, &'static str, bool)> {
+fn meant<'o>(
+    predicate: &str,
+    arguments: usize,
+    own: &'o [(String, String, usize)],
+) -> Option<(&'o str, &'o str, bool)> {
     let functions = Function::ALL.into_iter().map(|f| (f.name(), f.usage(), f.takes(arguments)));
     let comprehensions = Comprehension::ALL.into_iter().map(|c| (c.name(), c.usage(), arguments == 2));
     let all = functions.chain(comprehensions).chain([("exists", "exists fact(…)", arguments == 1)]);
+    let own = own.iter().map(|(name, usage, count)| (name.as_str(), usage.as_str(), arguments == *count));
+    let all = own.chain(all);
     let allowed = if predicate.len() >= LONG_NAME { 2 } else { 1 };
     let near = all.map(|function| (edits(predicate, function.0), function)).min_by_key(|(edits, _)| *edits)?;
     (near.0 <= allowed).then_some(near.1)
@@ -229,9 +235,9 @@ mod tests {
         for (word, arguments, name) in
             [("graps_pose", 1, "grasp_pose"), ("exist", 1, "exists"), ("jonits", 7, "joints"), ("lenn", 1, "len")]
         {
-            assert_eq!(meant(word, arguments).map(|m| m.0), Some(name));
+            assert_eq!(meant(word, arguments, &[]).map(|m| m.0), Some(name));
         }
-        assert!(meant("taken", 1).is_some_and(|(_, _, takes)| !takes));
+        assert!(meant("taken", 1, &[]).is_some_and(|(_, _, takes)| !takes));
     }
 
     #[test]
@@ -239,7 +245,7 @@ mod tests {
         for word in
             ["at", "on", "open", "held", "holding", "in_gripper", "hand_empty", "shape", "on_table", "has", "visible"]
         {
-            assert_eq!(meant(word, 1), None, "{word}");
+            assert_eq!(meant(word, 1, &[]), None, "{word}");
         }
     }
 }

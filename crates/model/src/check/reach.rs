@@ -125,7 +125,8 @@ fn touched(program: &Program, region: &State) -> Touched {
         }
         let all = |f: Footprint, more: Footprint| f.union(more);
         touched.reads = all(touched.reads, FactExpr::footprint(&facts, &NothingKnown));
-        for effects in annotations.effects.values() {
+        // What a wait foresees somebody else does.
+        for effects in annotations.effects.values().filter(|_| !state.is_pause()) {
             touched.writes = all(touched.writes, EffectExpr::footprint(effects, &NothingKnown));
         }
     }

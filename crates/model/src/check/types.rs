@@ -15,7 +15,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     let program = subject.program;
     for state in &program.states {
         let types =
-            Types { program, state, variables: variables(subject, state), elements: Variables::new(), indirection: 0 };
+            Types { subject, state, variables: variables(subject, state), elements: Variables::new(), indirection: 0 };
         let quantified = quantified(state);
         for (slot, expr) in expressions(program, state) {
             // Quantified effects bind variables of their own; their elements are checked at run time.
@@ -128,6 +128,12 @@ fn what(slot: Slot<'_>) -> String {
 
 fn wanted(subject: &Subject<'_>, state: &State, slot: Slot<'_>) -> Option<Type> {
     match (slot, &state.kind) {
+        (Slot::Input(port), _) if state.is_pause() => match port {
+            "for" => Some(Type::Bool),
+            "seconds" | "until" => Some(Type::Float),
+            "question" => Some(Type::String),
+            _ => None,
+        },
         (Slot::Input(port), StateKind::Action { provider, action, .. }) => {
             let signature = subject.catalogue.action(provider, action)?;
             signature.inputs.get(port).or_else(|| signature.optional.get(port)).cloned()
@@ -170,7 +176,7 @@ fn variables(subject: &Subject<'_>, state: &State) -> Variables {
         }
         if let StateKind::ForEach { variable, index, collection, .. } = &outer.kind {
             let types = Types {
-                program,
+                subject,
                 state: outer,
                 variables: variables.clone(),
                 elements: Variables::new(),
@@ -188,7 +194,7 @@ fn variables(subject: &Subject<'_>, state: &State) -> Variables {
 }
 
 struct Types<'a> {
-    program: &'a Program,
+    subject: &'a Subject<'a>,
     state: &'a State,
     variables: Variables,
     /// The elements of the comprehensions around.
@@ -208,7 +214,7 @@ pub(super) struct Wrong {
 impl Types<'_> {
     fn of(&self, expr: &Expr) -> Found {
         let wrong = |message: String| {
-            let message = format!("`{}`: {message}", named(self.program, expr));
+            let message = format!("`{}`: {message}", named(self.subject.program, expr));
             let operands: Vec<&Expr> = match expr {
                 Expr::Unary(_, a) | Expr::Field(a, _) => vec![a],
                 Expr::Binary(_, a, b) | Expr::Index(a, b) => vec![a, b],
@@ -222,7 +228,7 @@ impl Types<'_> {
             Expr::Literal(value) => of_value(value),
             Expr::Variable(name) => self.variables.get(name).cloned().unwrap_or(Type::Any),
             Expr::Output(name) => self.port(self.state, name),
-            Expr::Port { state, port } => self.port(self.program.state(*state), port),
+            Expr::Port { state, port } => self.port(self.subject.program.state(*state), port),
             Expr::Field(of, name) => match (self.of(of)?, name.as_str()) {
                 (Type::Record(fields), _) => match fields.get(name) {
                     Some(ty) => ty.clone(),
@@ -270,7 +276,7 @@ impl Types<'_> {
                 for argument in fact.arguments.iter().flatten() {
                     let found = self.of(argument)?;
                     if !(Type::String.accepts_type(&found) || Type::Int.accepts_type(&found) || found == Type::Any) {
-                        return Err(functions::no_fact(self.program, fact, &found));
+                        return Err(functions::no_fact(self.subject, fact, &found));
                     }
                 }
                 if matches!(expr, Expr::Exists(_)) { Type::Bool } else { Type::Any }
@@ -349,8 +355,8 @@ impl Types<'_> {
         if output.ty != Type::Any || self.indirection >= MAX_INDIRECTION {
             return output.ty.clone();
         }
-        let (program, variables, indirection) = (self.program, self.variables.clone(), self.indirection + 1);
-        Types { program, state, variables, elements: Variables::new(), indirection }
+        let (subject, variables, indirection) = (self.subject, self.variables.clone(), self.indirection + 1);
+        Types { subject, state, variables, elements: Variables::new(), indirection }
             .of(&output.value)
             .unwrap_or(Type::Any)
     }

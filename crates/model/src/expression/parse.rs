@@ -75,6 +75,21 @@ pub trait Names {
     /// # Errors
     /// No such port can be used here.
     fn port(&mut self, state: &str, port: &str) -> Result<Expr, NameError>;
+
+    /// Whether `name(…)` is a function of the file.
+    fn has_function(&self, name: &str) -> bool {
+        let _ = name;
+        false
+    }
+
+    /// What a call of a function of the file comes to.
+    ///
+    /// # Errors
+    /// It is called with another number of arguments, or comes to too much.
+    fn call(&mut self, name: &str, arguments: Vec<Expr>) -> Result<Expr, NameError> {
+        let (message, _) = (format!("there is no function `{name}`"), arguments);
+        Err(NameError { rule: "unknown-function", message, help: String::new() })
+    }
 }
 
 impl ParseError {
@@ -430,6 +445,13 @@ impl Parser<'_> {
             if let Some(what) = Comprehension::named(word) {
                 return self.comprehension(at, what);
             }
+            if self.names.has_function(word) {
+                self.next += 2;
+                let (arguments, _) = self.list(")")?;
+                let expr = self.names.call(word, arguments).map_err(|error| ParseError::name(at, error))?;
+                let below = height(&expr) - 1;
+                return self.node(expr, below);
+            }
             let Some(function) = Function::named(word) else {
                 let (fact, below) = self.fact()?;
                 return self.node(Expr::Fact(fact), below);
@@ -564,6 +586,10 @@ impl Parser<'_> {
             let message = format!("`{predicate}` is built in and cannot be a predicate");
             return Err(ParseError::syntax(at, message));
         }
+        if self.names.has_function(&predicate) {
+            let message = format!("`{predicate}` is a function of this file, and here a fact is wanted");
+            return Err(ParseError::syntax(at, message).with_help("give the function or the fact another name"));
+        }
         self.expects("(").map_err(|error| {
             let help = match predicate.as_str() {
                 "none" | "nothing" | "empty" => "write `[]` for no fact".to_owned(),
@@ -625,6 +651,13 @@ impl Parser<'_> {
         }
         Ok(effect)
     }
+}
+
+/// How deep an expression is.
+fn height(expr: &Expr) -> usize {
+    let mut below = 0;
+    expr.parts(&mut |part| below = below.max(height(part)));
+    below + 1
 }
 
 #[cfg(test)]

@@ -49,6 +49,8 @@ pub(crate) struct Output {
     pub(crate) declares_world: bool,
     /// The paths of the states that use a library.
     pub(crate) libraries: Vec<String>,
+    /// The functions of the file: name, how it is called, with how many arguments.
+    pub(crate) functions: Vec<(String, String, usize)>,
     /// What stands around states.
     pub(crate) guards: BTreeMap<StateId, Guard>,
 }

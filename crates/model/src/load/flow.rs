@@ -24,6 +24,7 @@ pub(crate) fn outcomes(fields: &mut Fields<'_, '_>, id: StateId) -> Vec<String> 
             signature.map(|signature| signature.outcomes.clone()).unwrap_or_default()
         }
         Form::Library { .. } => task.libraries.get(&id).map(|l| l.states[0].outcomes.clone()).unwrap_or_default(),
+        Form::Wait { node, asks } => super::wait::outcomes(step, node, *asks),
         Form::Concurrency { .. } => {
             let decided = step.body.get("decide").map(Node::entries).unwrap_or_default();
             decided.iter().map(|entry| entry.key.clone()).collect()
@@ -97,7 +98,9 @@ pub(crate) fn outcomes_exist(task: &Task<'_>, program: &Program, out: &mut Outpu
     // What a state contains comes after it; an action that is not in the catalogue may have any outcome.
     for state in program.states.iter().rev() {
         let unknown = match &state.kind {
-            StateKind::Action { provider, action, .. } => task.catalogue.action(provider, action).is_none(),
+            StateKind::Action { provider, action, .. } => {
+                !state.is_pause() && task.catalogue.action(provider, action).is_none()
+            }
             _ => task.outline.steps.get(state.id.0 as usize).is_some_and(|step| {
                 matches!(step.form, Form::Library { .. }) && !task.libraries.contains_key(&state.id)
             }),
@@ -175,7 +178,7 @@ pub(crate) fn assign(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) -> V
     let mut assign = Vec::new();
     let inside = fields.view.inside;
     fields.view.own_outputs = true;
-    fields.view.inside = !matches!(fields.task.outline.step(id).form, Form::Action { .. });
+    fields.view.inside = !matches!(fields.task.outline.step(id).form, Form::Action { .. } | Form::Wait { .. });
     for entry in fields.mapping(body, "assign", "{ tries: $tries + 1 }") {
         fields.note(format!("assign.{}", entry.key), entry.at);
         if !fields.task.scoped_variables(id, false).any(|known| known == entry.key) {

@@ -3,6 +3,7 @@
 //! A state's name is looked for among the siblings of this state and of those around it, inside out; then anywhere. That
 //! the state found can really have written its port by then is a rule of `check`.
 
+use super::functions::Functions;
 use super::outline::{Form, Outline};
 use crate::catalogue::Catalogue;
 use crate::expression::Expr;
@@ -34,6 +35,8 @@ pub(crate) struct Task<'a> {
     pub(crate) parameters: Vec<String>,
     /// Libraries that states use, loaded, by state.
     pub(crate) libraries: BTreeMap<StateId, Program>,
+    /// Its own functions.
+    pub(crate) functions: Functions,
     /// What its facts may say; `None`: anything.
     pub(crate) ontology: Option<Ontology>,
 }
@@ -160,6 +163,7 @@ impl Names for NamesFrom<'_, '_> {
         if !ports.open && !ports.types.contains_key(port) {
             let none = match self.task.outline.step(id).form {
                 Form::Action { .. } => "its action has no outputs",
+                Form::Wait { .. } => "a wait for a signal has the output `value`, a question `answer`",
                 Form::Sequence { .. } | Form::Concurrency { .. } => "declare it under the state's `outputs`",
                 Form::Library { .. } => "declare it under the `outputs` of the library",
                 _ => "loops and conditions have no outputs",
@@ -175,13 +179,21 @@ impl Names for NamesFrom<'_, '_> {
         }
         Ok(Expr::Port { state: id, port: port.to_owned() })
     }
+
+    fn has_function(&self, name: &str) -> bool {
+        self.task.functions.has(name)
+    }
+
+    fn call(&mut self, name: &str, arguments: Vec<Expr>) -> Result<Expr, NameError> {
+        self.task.functions.call(name, &arguments)
+    }
 }
 
 /// For a name that is none of those that are known: "did you mean" the nearest, or what there is, or `otherwise`. `prefix` stands before
 /// each name.
 pub fn suggestion<'n>(name: &str, known: impl Iterator<Item = &'n str>, prefix: &str, otherwise: &str) -> String {
     /// More names than this are not listed.
-    const MAX_LISTED: usize = 14;
+    const MAX_LISTED: usize = 15;
     let mut known: Vec<&str> = known.collect();
     known.sort_unstable();
     known.dedup();

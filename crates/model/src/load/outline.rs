@@ -14,11 +14,13 @@ const MAX_STATES: usize = 10_000;
 const MAX_DEPTH: usize = 32;
 
 /// Keys that say what a step is.
-const FORMS: [&str; 9] =
-    ["action", "for", "condition", "states", "while", "do_while", "until", "concurrency", "library"];
+const FORMS: [&str; 11] =
+    ["action", "for", "condition", "states", "while", "do_while", "until", "concurrency", "library", "wait", "ask"];
+/// Those that are names that people give to states, too.
+const NAMES: [&str; 2] = ["wait", "ask"];
 
 /// Keys that say in other languages what a step is, and how it is written here.
-const FOREIGN_FORMS: [(&str, &str); 8] = [
+const FOREIGN_FORMS: [(&str, &str); 9] = [
     ("if", CONDITION),
     ("when", CONDITION),
     ("repeat", COUNTED),
@@ -26,10 +28,23 @@ const FOREIGN_FORMS: [(&str, &str); 8] = [
     ("foreach", "write `- for: x in list`, with `do: […]`"),
     ("sequence", "write `- name:`, with `states: […]`"),
     ("parallel", "write `- name:`, with `concurrency: barrier` and `regions: […]`"),
+    ("sleep", "write `- wait: { seconds: 1 }`"),
     ("call", "write `- name:`, with `action: provider/action` and `in: {…}`"),
 ];
 const CONDITION: &str = "write `- condition: …`, with `then: […]` and `else: […]`";
 const COUNTED: &str = "write `- for: i in range(n)`, with `do: […]`";
+
+/// Whether a key of a list item says what the state is. `wait: { action: … }` is a state that is called `wait`.
+fn is_form(entry: &Entry) -> bool {
+    let is_state = |entry: &Entry| entry.value.entries().iter().any(|inner| FORMS.contains(&inner.key.as_str()));
+    FORMS.contains(&entry.key.as_str()) && !(NAMES.contains(&entry.key.as_str()) && is_named(entry, is_state))
+}
+
+/// Whether what stands below `wait` or `ask` is a state. `for`, `until` and `signal` say what is waited for.
+fn is_named(entry: &Entry, is_state: impl Fn(&Entry) -> bool) -> bool {
+    let has = |key: &str| entry.value.get(key).is_some();
+    is_state(entry) && (entry.key == "ask" || !(has("for") || has("until")) || has("do"))
+}
 
 /// The key of a form that there is in other languages, and how it is written here.
 fn foreign_form(entries: &[Entry]) -> Option<(&Entry, &'static str)> {
@@ -73,13 +88,41 @@ pub(crate) enum Branch {
 /// What a step is.
 #[derive(Debug)]
 pub(crate) enum Form<'a> {
-    Action { action: &'a Node },
-    Sequence { children: Vec<StateId> },
-    ForEach { variable: String, collection: Header<'a>, index: Option<String>, body: Vec<StateId> },
-    Condition { predicate: &'a Node, then: Vec<StateId>, otherwise: Vec<StateId> },
-    While { predicate: &'a Node, tests: Tests, index: Option<String>, body: Vec<StateId> },
-    Concurrency { kind: &'a Node, regions: Vec<StateId> },
-    Library { file: &'a Node },
+    Action {
+        action: &'a Node,
+    },
+    Sequence {
+        children: Vec<StateId>,
+    },
+    ForEach {
+        variable: String,
+        collection: Header<'a>,
+        index: Option<String>,
+        body: Vec<StateId>,
+    },
+    Condition {
+        predicate: &'a Node,
+        then: Vec<StateId>,
+        otherwise: Vec<StateId>,
+    },
+    While {
+        predicate: &'a Node,
+        tests: Tests,
+        index: Option<String>,
+        body: Vec<StateId>,
+    },
+    Concurrency {
+        kind: &'a Node,
+        regions: Vec<StateId>,
+    },
+    Library {
+        file: &'a Node,
+    },
+    /// The executive waits itself; or it asks an operator.
+    Wait {
+        node: &'a Node,
+        asks: bool,
+    },
 }
 
 /// When the predicate of a loop is looked at, and what ends the loop.
@@ -152,7 +195,7 @@ impl Form<'_> {
     /// The children, or those of `then`.
     pub(crate) fn first_branch(&self) -> &[StateId] {
         match self {
-            Form::Action { .. } | Form::Library { .. } => &[],
+            Form::Action { .. } | Form::Library { .. } | Form::Wait { .. } => &[],
             Form::Sequence { children } => children,
             Form::ForEach { body, .. } | Form::While { body, .. } => body,
             Form::Concurrency { regions, .. } => regions,
@@ -245,7 +288,6 @@ impl<'a> Builder<'a, '_> {
     /// The name of a step, if it has one, and its mapping.
     fn named(&mut self, item: &'a Node, path: &str) -> Option<(Option<String>, Location, &'a Node)> {
         let entries = item.entries();
-        let is_form = |entry: &Entry| FORMS.contains(&entry.key.as_str());
         // `- tuck:` with what belongs to it in the same column: the name is a key without a value.
         if let [name, rest @ ..] = entries
             && rest.iter().any(is_form)
@@ -258,7 +300,7 @@ impl<'a> Builder<'a, '_> {
             self.findings.error("invalid-state", name.at, path, message, help);
             return None;
         }
-        if let Some(form) = entries.iter().find(|e| is_form(e)) {
+        if let Some(form) = entries.iter().find(|entry| is_form(entry)) {
             if matches!(form.key.as_str(), "action" | "library" | "concurrency") {
                 let message = "this state has no name";
                 let help = format!("write `- name: {{ {}: … }}`", form.key);
@@ -354,6 +396,7 @@ impl<'a> Builder<'a, '_> {
             "action" => Form::Action { action: &form.value },
             "states" => Form::Sequence { children: self.list(&form.value, id, Branch::First, depth + 1) },
             "library" => Form::Library { file: &form.value },
+            key @ ("wait" | "ask") => Form::Wait { node: &form.value, asks: key == "ask" },
             "concurrency" => {
                 let regions = self.branch(body, "regions", id, Branch::First, depth, at);
                 Form::Concurrency { kind: &form.value, regions }

@@ -4,7 +4,7 @@ use super::fields::{Fields, Output};
 use super::names::{Task, View};
 use super::outline::{Form, Step, Tests};
 use super::yaml::{Content, Node};
-use super::{effects, flow, library, resources};
+use super::{effects, flow, library, resources, wait};
 use crate::expression::parse::parse_expression;
 use crate::expression::{Expr, FactExpr, UnaryOperator};
 use crate::fact::SCENE_PREDICATES;
@@ -19,6 +19,9 @@ const WHILE_KEYS: [&str; 5] = ["while", "do_while", "until", "index", "do"];
 const CONDITION_KEYS: [&str; 3] = ["condition", "then", "else"];
 const CONCURRENCY_KEYS: [&str; 4] = ["concurrency", "regions", "decide", "outputs"];
 const LIBRARY_KEYS: [&str; 2] = ["library", "with"];
+const WAIT_KEYS: [&str; 2] = ["wait", "ask"];
+/// A state that waits reads what it says, holds nothing and changes nothing.
+const WAITING_KEYS: [&str; 7] = ["retry", "duration", "description", "transitions", "exceptional", "assign", "shared"];
 const NODE_KEYS: [&str; 11] = [
     "retry",
     "reads",
@@ -49,14 +52,17 @@ pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
             Form::Condition { .. } => &CONDITION_KEYS,
             Form::Concurrency { .. } => &CONCURRENCY_KEYS,
             Form::Library { .. } => &LIBRARY_KEYS,
+            Form::Wait { asks, .. } => std::slice::from_ref(&WAIT_KEYS[usize::from(asks)]),
         };
-        let mut known = [own, &NODE_KEYS].concat();
+        let of_all: &[&str] = if matches!(step.form, Form::Wait { .. }) { &WAITING_KEYS } else { &NODE_KEYS };
+        let mut known = [own, of_all].concat();
         match step.form {
             Form::Action { .. } => known.extend(NATURE_KEYS.into_iter().chain(BOUNDARY_KEYS)),
             Form::Library { .. } => known.extend(BOUNDARY_KEYS),
             Form::Sequence { .. } | Form::Concurrency { .. } => {
                 known.extend(BOUNDARY_KEYS.into_iter().chain(["outcomes"]))
             }
+            Form::Wait { .. } => {}
             _ => known.push("outcomes"),
         }
         fields.keys(step.body, &known);
@@ -153,6 +159,7 @@ fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
             fields.view.inside = false;
             StateKind::Concurrency { regions: regions.clone(), preemptive, decide, outputs }
         }
+        Form::Wait { node, asks } => wait::kind(fields, node, *asks),
         // Its states are put below it when all states are there.
         Form::Library { .. } => StateKind::Sequence { children: Vec::new(), outputs: Vec::new() },
         Form::Condition { predicate, then, otherwise } => {
@@ -241,7 +248,12 @@ fn boundary(reads: Vec<FactExpr>) -> Annotations {
 fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -> Annotations {
     let body = step.body;
     let is_action = matches!(kind, StateKind::Action { .. });
-    let mut annotations = if is_action { Annotations::default() } else { boundary(Vec::new()) };
+    let mut annotations = match step.form {
+        Form::Wait { node, asks } => wait::annotations(fields, step, (node, asks), kind),
+        _ if is_action => Annotations::default(),
+        _ => boundary(Vec::new()),
+    };
+    let waits_s = annotations.timeout_s;
     annotations.nature = nature(fields, body);
     if let Some(node) = body.get("reads") {
         fields.note("reads", node.at);
@@ -295,6 +307,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
         }
     }
     flow::annotate(fields, body, &mut annotations);
+    annotations.timeout_s = annotations.timeout_s.or(waits_s);
     let holds = body.get("resources").into_iter().flat_map(Node::items).filter_map(|item| item.get("hold"));
     for node in holds {
         if is_action {

@@ -6,6 +6,7 @@
 use super::contact;
 use super::error::PlanError;
 use crate::arm::{self, joints};
+use crate::cloud::Cloud;
 use crate::collision::{Checker, Collision, Contact, PADDING_M};
 use crate::connect::{Budget, ConnectError, Route, connect};
 use crate::constrained::{self, Constraint};
@@ -21,6 +22,7 @@ use crate::robot::{Configuration, Robot};
 use crate::simplify::shortened;
 use crate::space::{Space, State, state};
 use crate::straight::Straight;
+use crate::surroundings::Surroundings;
 use crate::timing::rough::Rough;
 use crate::timing::{Section, timed_while};
 use crate::trajectory::Curve;
@@ -29,6 +31,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_world::scene::Scene;
+use std::sync::Arc;
 
 /// The padding, in metres, where the start is too close to something for the usual padding. A free path keeps at least this distance. A
 /// controller that aborts on such a path stops a little beside it, so planning may also begin at a start with less room that touches nothing.
@@ -41,6 +44,18 @@ pub(super) const PADDINGS_M: [f64; 3] = [PADDING_M, TIGHT_PADDING_M, 0.0];
 const WAYS_OUT: usize = 100;
 const WAY_OUT_RAD: f64 = 0.4;
 
+/// The exact shapes of a request in a scene.
+fn checker<'a>(
+    robot: &'a Robot,
+    scene: &Scene,
+    request: &Request,
+    here: &Configuration,
+    seen: Option<&Arc<Cloud>>,
+    padding_m: f64,
+) -> Checker<'a> {
+    Checker::new(robot, scene, here, padding_m).reaching_into(&request.reaches_into).beside(seen.cloned())
+}
+
 /// The arm of a request in its scene.
 pub(super) struct ArmInScene<'a> {
     robot: &'a Robot,
@@ -50,6 +65,8 @@ pub(super) struct ArmInScene<'a> {
     mechanism: Mechanism,
     checker: Checker<'a>,
     space: Space,
+    /// What a camera saw that is nothing known, in the world frame.
+    seen: Option<Arc<Cloud>>,
     /// The tool, in the frame of the base, which is at `base`.
     reach: Reach,
     base: Pose,
@@ -60,23 +77,29 @@ pub(super) struct ArmInScene<'a> {
 }
 
 impl<'a> ArmInScene<'a> {
-    pub(super) fn new(robot: &'a Robot, scene: &'a Scene, request: &'a Request) -> ArmInScene<'a> {
+    pub(super) fn new(robot: &'a Robot, scene: &'a Scene, request: &'a Request) -> Result<ArmInScene<'a>, PlanError> {
         let here = request.start.with_base(&scene.base);
         let (mechanism, obstacles) = arm::in_scene(robot, scene, &here);
-        ArmInScene {
+        let base = arm::on_floor(robot, &scene.base);
+        let seen = request.seen.as_ref().map(|seen| seen.unknown(robot, scene, &here)).transpose()?;
+        let clouds = seen.as_ref().map(|cloud| cloud.moved(&base.inverse())).transpose()?;
+        let surroundings = Surroundings { obstacles: &obstacles, clouds: clouds.as_slice(), meshes: &[] };
+        let seen = seen.map(Arc::new);
+        Ok(ArmInScene {
             robot,
             scene,
             request,
-            checker: Checker::new(robot, scene, &here, PADDING_M).reaching_into(&request.reaches_into),
-            space: arm::space(&mechanism, &obstacles),
+            checker: checker(robot, scene, request, &here, seen.as_ref(), PADDING_M),
+            space: arm::space(&mechanism, surroundings),
             reach: Reach::new(&mechanism, robot.tool, Pose::IDENTITY),
-            base: arm::on_floor(robot, &scene.base),
+            base,
+            seen,
             constraint: None,
             rough: Rough::new(&request.joints(robot), request.speed),
             random: ChaCha8Rng::seed_from_u64(request.seed),
             here,
             mechanism,
-        }
+        })
     }
 
     pub(super) fn request(&self) -> &'a Request {
@@ -103,8 +126,7 @@ impl<'a> ArmInScene<'a> {
     /// Has the exact shapes checked with another padding from now on.
     pub(super) fn pad(&mut self, padding_m: f64) {
         if self.checker.padding() != padding_m {
-            let checker = Checker::new(self.robot, self.scene, &self.here, padding_m);
-            self.checker = checker.reaching_into(&self.request.reaches_into);
+            self.checker = checker(self.robot, self.scene, self.request, &self.here, self.seen.as_ref(), padding_m);
         }
     }
 
@@ -117,7 +139,9 @@ impl<'a> ArmInScene<'a> {
 
     /// The exact shapes as the tool leaves a goal where it lets go of what it holds; `None` where it holds nothing.
     pub(super) fn with_open_fingers(&self) -> Option<Checker<'a>> {
-        contact::with_open_fingers(self.robot, self.scene, self.request, self.checker.padding())
+        let scene = contact::let_go(self.scene)?;
+        let opened = Configuration { finger: self.robot.open_finger_m(), ..self.request.start };
+        Some(checker(self.robot, &scene, self.request, &opened, self.seen.as_ref(), self.checker.padding()))
     }
 
     /// What touches what, or has less room than the padding.

@@ -2,8 +2,7 @@
 
 use crate::collision::{Checker, Collision, Contact};
 use crate::joint_vector::JointVector;
-use crate::request::Request;
-use crate::robot::{Configuration, Geometry, Robot};
+use crate::robot::Robot;
 use ratn_world::scene::{Placement, Scene, SceneObject};
 
 /// How far off the measured poses of objects are, in metres: as far as that the fingers keep away from what they need not touch, where
@@ -32,30 +31,18 @@ pub(super) fn presses_m(robot: &Robot) -> Vec<f64> {
     std::iter::once(-MEASURED_WITHIN_M).chain(steps).collect()
 }
 
-/// Half of a finger's thickness along the direction in which it closes; 0 for a robot without fingers made of boxes.
+/// Half of a finger's thickness along the direction in which it closes; 0 for a robot without fingers.
 pub(super) fn half_finger_m(robot: &Robot) -> f64 {
-    let halves = robot.finger_link().into_iter().flat_map(|link| &robot.model.links[link].bodies);
-    let thickness = halves.filter_map(|body| match body.geometry {
-        Geometry::Box { half } => Some(half[1]),
-        _ => None,
-    });
-    thickness.fold(0.0, f64::max)
+    robot.finger_parts().iter().map(|part| part.half[1]).fold(0.0, f64::max)
 }
 
-/// The tool as it leaves a goal where it lets go of what it holds: fingers that open there may press a neighbour, too. `None` where it
-/// holds nothing.
-pub(super) fn with_open_fingers<'a>(
-    robot: &'a Robot,
-    scene: &Scene,
-    request: &Request,
-    padding: f64,
-) -> Option<Checker<'a>> {
+/// The scene as the tool leaves a goal where it lets go of what it holds: fingers that open there may press a neighbour, too. `None` where
+/// it holds nothing.
+pub(super) fn let_go(scene: &Scene) -> Option<Scene> {
     let is_held = |object: &SceneObject| matches!(object.placement, Placement::Gripper(_));
     if !scene.objects.iter().any(is_held) {
         return None;
     }
     let left = scene.objects.iter().filter(|object| !is_held(object)).cloned().collect();
-    let scene = Scene { objects: left, ..scene.clone() };
-    let opened = Configuration { finger: robot.open_finger_m(), ..request.start };
-    Some(Checker::new(robot, &scene, &opened, padding).reaching_into(&request.reaches_into))
+    Some(Scene { objects: left, ..scene.clone() })
 }

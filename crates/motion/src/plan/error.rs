@@ -1,5 +1,6 @@
 //! Why there is no plan.
 
+use crate::cloud::CloudError;
 use crate::collision::Collision;
 use crate::pace::Stop;
 
@@ -19,6 +20,9 @@ pub enum PlanError {
         /// What it should be.
         expected: String,
     },
+    /// What was seen is too far away.
+    #[error("`cloud`: {0}")]
+    Seen(#[from] CloudError),
     /// The arm touches something where it stands.
     #[error("at the start {collision}")]
     StartInCollision {

@@ -270,6 +270,7 @@ proptest! {
             commit: "run/i1".to_owned(),
             written: vec![record.clone()],
             gone: vec![key.clone()],
+            writer: Some("place[1]".into()),
         };
         check::<_, v1::WorldPoolServiceWatchResponse>(&WorldUpdate::Changed(told))?;
         let snapshot = WorldUpdate::Snapshot { revision: Revision(7), facts: vec![record.clone()] };
@@ -280,7 +281,12 @@ proptest! {
         let contradiction =
             Contradiction { projection: ProjectionId(3), fact: key.clone(), was, is, revision: Revision(7) };
         check::<_, v1::Contradiction>(&contradiction)?;
-        check::<_, v1::FactVersion>(&FactVersion { revision: Revision(7), commit: String::new(), fact: Some(record) })?;
+        check::<_, v1::FactVersion>(&FactVersion {
+            revision: Revision(7),
+            commit: String::new(),
+            fact: Some(record),
+            writer: Some("place[1]".into()),
+        })?;
         check::<_, v1::Value>(&value)?;
         check::<_, v1::FactKey>(&key)?;
         check::<_, v1::Footprint>(&footprint)?;

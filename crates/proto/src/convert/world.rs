@@ -6,6 +6,7 @@ use crate::v1;
 use crate::v1::world_pool_service_watch_response::Kind;
 use ratn_model::id::{ProjectionId, Revision};
 use ratn_model::value::Value;
+use std::sync::Arc;
 
 impl From<WorldUpdate> for v1::WorldPoolServiceWatchResponse {
     fn from(update: WorldUpdate) -> v1::WorldPoolServiceWatchResponse {
@@ -18,6 +19,7 @@ impl From<WorldUpdate> for v1::WorldPoolServiceWatchResponse {
                 commit_id: change.commit,
                 written: all(change.written),
                 gone: all(change.gone),
+                writer: said(change.writer),
             }),
         };
         v1::WorldPoolServiceWatchResponse { kind: Some(kind) }
@@ -40,6 +42,7 @@ impl TryFrom<v1::WorldPoolServiceWatchResponse> for WorldUpdate {
                     commit: change.commit_id,
                     written: each(change.written, "change.written")?,
                     gone: each(change.gone, "change.gone")?,
+                    writer: named(&change.writer, "change.writer")?,
                 })
             }
         })
@@ -74,6 +77,7 @@ impl From<FactVersion> for v1::FactVersion {
             revision: version.revision.0,
             commit_id: version.commit,
             fact: version.fact.map(v1::Fact::from),
+            writer: said(version.writer),
         }
     }
 }
@@ -87,6 +91,7 @@ impl TryFrom<v1::FactVersion> for FactVersion {
             revision: Revision(version.revision),
             commit: version.commit_id,
             fact: maybe(version.fact, "fact")?,
+            writer: named(&version.writer, "writer")?,
         })
     }
 }
@@ -118,6 +123,16 @@ impl TryFrom<v1::Contradiction> for Contradiction {
             revision: Revision(contradiction.revision),
         })
     }
+}
+
+/// A writer as the wire says it: empty is nobody.
+fn said(writer: Option<Arc<str>>) -> String {
+    writer.map_or_else(String::new, |writer| writer.to_string())
+}
+
+fn named(writer: &str, field: &str) -> Result<Option<Arc<str>>, Malformed> {
+    label(writer, field)?;
+    Ok(Some(writer).filter(|writer| !writer.is_empty()).map(Arc::from))
 }
 
 fn maybe(fact: Option<v1::Fact>, field: &str) -> Result<Option<FactRecord>, Malformed> {

@@ -3383,6 +3383,9 @@ pub struct WorldChange {
     /// The facts that are gone, in the order of keys.
     #[prost(message, repeated, tag = "4")]
     pub gone: ::prost::alloc::vec::Vec<FactKey>,
+    /// The node that committed it, by the path of its instance; empty where nobody said, and where facts were too old.
+    #[prost(string, tag = "5")]
+    pub writer: ::prost::alloc::string::String,
 }
 /// Asks what differs.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -3458,6 +3461,9 @@ pub struct FactVersion {
     /// What it says; unset where it does not hold.
     #[prost(message, optional, tag = "3")]
     pub fact: ::core::option::Option<Fact>,
+    /// Who wrote or deleted it, as in WorldChange.
+    #[prost(string, tag = "4")]
+    pub writer: ::prost::alloc::string::String,
 }
 /// Asks for the scene of a world.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]

@@ -19,9 +19,22 @@ A system and a run::
 
     with ratn.System() as system:
         result = system.run("fetch_boxes.yaml", boxes=2).result()
+
+A task is a function, which is called once and makes the same model as a task file::
+
+    from ratn.actions import detector, pan_tilt
+
+    @ratn.task
+    def look() -> None:
+        pan_tilt.look_at(target=ratn.Pose(0.8, 0, 0.7))
+        seen = detector.segment(region={"pose": ratn.Pose(0.8, 0, 0.7), "size": [0.6, 1.2]}, resources=["Detector", "Camera"])
+        with ratn.when(ratn.fn.len(seen.boxes) > 0):
+            ...
 """
 
 import pkgutil
+
+from ratn._expression import Functions, Untraceable, Value, exists, expr, fact, fn, isin
 
 from ratn._ratn import (
     Aborted,
@@ -33,21 +46,54 @@ from ratn._ratn import (
     FailedPrecondition,
     Goal,
     InvalidArgument,
+    InvalidTask,
     Joints,
     Lease,
     Lost,
     Malformed,
     NotFound,
+    OutOfRange,
     PermissionDenied,
     Pose,
+    Projected,
     Refused,
     ResourceExhausted,
     Trajectory,
+    Unauthenticated,
     Unavailable,
+    Unimplemented,
     WorldWatch,
 )
+from ratn._step import Step, step
 from ratn._system import Result, Run, System
-from ratn._worker import Outcome, Worker
+from ratn._task import (
+    Annotations,
+    Doc,
+    Finding,
+    State,
+    Task,
+    action,
+    block,
+    concurrently,
+    consume,
+    create,
+    delete,
+    do_while,
+    each,
+    leave,
+    library,
+    otherwise,
+    output,
+    retry,
+    sequence,
+    task,
+    until,
+    variable,
+    when,
+    while_,
+)
+from ratn._views import Chart, CriticalPath, Log, Network, Nodes, Report, Why
+from ratn._worker import Driver, Outcome, Worker
 
 # What `protoc` makes of the protocol's files is `ratn.v1`, in a folder of its own.
 __path__ = pkgutil.extend_path(__path__, __name__)
@@ -55,28 +101,75 @@ __path__ = pkgutil.extend_path(__path__, __name__)
 __all__ = [
     "Aborted",
     "AlreadyExists",
+    "Annotations",
     "Cancelled",
+    "Chart",
+    "CriticalPath",
     "DeadlineExceeded",
+    "Doc",
+    "Driver",
     "Error",
     "Fact",
     "FailedPrecondition",
+    "Finding",
+    "Functions",
     "Goal",
     "InvalidArgument",
+    "InvalidTask",
     "Joints",
     "Lease",
+    "Log",
     "Lost",
     "Malformed",
+    "Network",
+    "Nodes",
     "NotFound",
+    "OutOfRange",
     "Outcome",
     "PermissionDenied",
     "Pose",
+    "Projected",
     "Refused",
+    "Report",
     "ResourceExhausted",
     "Result",
     "Run",
+    "State",
+    "Step",
     "System",
+    "Task",
     "Trajectory",
+    "Unauthenticated",
     "Unavailable",
+    "Unimplemented",
+    "Untraceable",
+    "Value",
+    "Why",
     "Worker",
     "WorldWatch",
+    "action",
+    "block",
+    "concurrently",
+    "consume",
+    "create",
+    "delete",
+    "do_while",
+    "each",
+    "exists",
+    "expr",
+    "fact",
+    "fn",
+    "isin",
+    "leave",
+    "library",
+    "otherwise",
+    "output",
+    "retry",
+    "sequence",
+    "step",
+    "task",
+    "until",
+    "variable",
+    "when",
+    "while_",
 ]

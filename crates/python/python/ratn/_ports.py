@@ -57,6 +57,7 @@ class Action:
     requires: list[str]
     effects: list[str]
     perform: Callable[..., tuple[str, dict[str, Any], str]]
+    suspends: bool = False
     arrays: set[str] = field(default_factory=set)
 
 

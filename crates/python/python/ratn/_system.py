@@ -13,14 +13,19 @@ import pathlib
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
+import threading
 import time
-from collections.abc import AsyncIterator, Iterable, Iterator
+from collections.abc import AsyncIterator, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ratn import _ratn
-from ratn._ratn import Error, Fact, Lease, WorldWatch
+from ratn import _ratn, _views
+from ratn._expression import written
+from ratn._ratn import Error, Fact, Lease, Projected, WorldWatch
+from ratn._step import Step, refuse_while_read
+from ratn._task import Task
 
 _READY = "the system is ready"
 _READY_WITHIN_S = 60.0
@@ -57,6 +62,7 @@ class Result:
 
     @property
     def is_success(self) -> bool:
+        """Whether the outcome is ``success``."""
         return self.outcome == "success"
 
 
@@ -75,6 +81,7 @@ class System:
         runtime_dir: str | os.PathLike[str] | None = None,
         **options: object,
     ) -> None:
+        refuse_while_read("it would start a system")
         self._process: subprocess.Popen[str] | None = None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         directory = pathlib.Path(runtime_dir) if runtime_dir is not None else _default_directory()
@@ -92,15 +99,16 @@ class System:
         self._folder = tempfile.TemporaryDirectory(prefix="ratn-")
         folder = pathlib.Path(self._folder.name)
         self.runtime_dir = pathlib.Path(str(runtime_dir)) if runtime_dir is not None else folder / "run"
-        command = [_program(), "up", "--runtime-dir", str(self.runtime_dir)]
+        command = [_program(), "up", "--exit-with-parent", "--runtime-dir", str(self.runtime_dir)]
         command += ["--config", str(config)] if config is not None else []
         for name, value in options.items():
             command += [f"--{name.replace('_', '-')}", str(value)]
         said = folder / "up.log"
         with said.open("w") as output:
-            # A group of its own: Ctrl-C is for this process, which then ends the system in order.
+            # A group of its own: Ctrl-C is for this process, which then ends the system in order. The pipe ends with this process,
+            # however that ended, and the system with it.
             self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, text=True, start_new_session=True
+                command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, text=True, start_new_session=True
             )
         until = time.monotonic() + _READY_WITHIN_S
         try:
@@ -136,6 +144,8 @@ class System:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()
         self._process = None
         if self._folder is not None:
             self._folder.cleanup()
@@ -143,15 +153,19 @@ class System:
 
     def run(
         self,
-        task: str | os.PathLike[str],
+        task: str | os.PathLike[str] | Task,
         *,
         mode: str = "cdtn",
         seed: int | None = None,
         log: str | os.PathLike[str] | None = None,
+        step_workers: int = 1,
         **parameters: Any,
     ) -> Run:
-        """Begins a run of a task file; its parameters are keyword arguments. ``mode`` is ``cdtn`` or ``hsm``."""
-        return Run(self, task, mode, seed, log, parameters)
+        """Begins a run of a task, or of a task file; its parameters are keyword arguments. ``mode`` is ``cdtn`` or ``hsm``.
+
+        The steps of a task (``@ratn.step``) are performed by workers that live as long as the run: ``step_workers`` processes for each file.
+        """
+        return Run(self, task, mode, seed, log, parameters, step_workers)
 
     def acquire(
         self, *kinds: str, priority: int = 0, timeout_s: float | None = None, holder: str = "python"
@@ -166,6 +180,14 @@ class System:
         """The resources, of these kinds where any is given."""
         return self._client.resources(*kinds)
 
+    def pools(self) -> list[dict[str, Any]]:
+        """The pools of worker processes of all hosts, as ``ratn ps --json`` has them."""
+        told = subprocess.run([_program(), "ps", "--json", "--runtime-dir", str(self.runtime_dir)], capture_output=True, text=True)
+        if not told.stdout.strip():
+            raise Error(told.stderr.strip() or f"`ratn ps` has ended with code {told.returncode}")
+        said = json.loads(told.stdout)
+        return [{"host": host["host"], **pool} for host in said["hosts"] for pool in host.get("pools", [])]
+
     def query(self, *patterns: str) -> list[Fact]:
         """The facts of the world that match any of the patterns (``"at(?)"``); all of them without one."""
         return self._client.query(*patterns)
@@ -173,6 +195,13 @@ class System:
     def set(self, fact: str, value: Any) -> int:
         """Writes a fact, ``system.set("at(box_1)", ratn.Pose(1, 0, 0.7))``; ``None`` deletes it. Gives the world's revision."""
         return self._client.set(fact, value)
+
+    def project(self, changes: Mapping[str, Any], *, timeout_s: float | None = None) -> Projected:
+        """A world that might be: ``with system.project({"at(box_1)": ratn.Pose(1, 0, 0.7)}) as world: world.query("at(?)")``.
+
+        The world as it is now with changes (``None`` deletes), of which nobody else sees anything. It holds room for itself, for which it waits.
+        """
+        return self._client.project(list(changes.items()), timeout_s=timeout_s)
 
     def watch(self, *patterns: str) -> WorldWatch:
         """Iterates over what holds now and each change after it."""
@@ -185,31 +214,89 @@ class Run:
     def __init__(
         self,
         system: System,
-        task: str | os.PathLike[str],
+        task: str | os.PathLike[str] | Task,
         mode: str,
         seed: int | None,
         log: str | os.PathLike[str] | None,
         parameters: dict[str, Any],
+        step_workers: int = 1,
     ) -> None:
         self._system = system
         self._folder = tempfile.TemporaryDirectory(prefix="ratn-run-")
         folder = pathlib.Path(self._folder.name)
         #: The event log, which ``ratn report`` reads.
         self.log = pathlib.Path(log) if log is not None else folder / "run.jsonl"
+        self._workers: list[subprocess.Popen[bytes]] = []
+        if isinstance(task, Task):
+            file = folder / f"{task.name or 'task'}.yaml"
+            file.write_text(task.standing_alone())
+            self._start_steps(list(task._steps.values()), step_workers, folder)
+            task = file
         command = [_program(), "run", os.fspath(task), "--json", "--mode", mode]
         command += ["--runtime-dir", str(system.runtime_dir), "--log", str(self.log)]
         command += ["--seed", str(seed)] if seed is not None else []
         for name, value in parameters.items():
-            command += ["--set", f"{name}={_ratn.as_written(value)}"]
+            # Texts are taken as they are.
+            command += ["--set", f"{name}={value if isinstance(value, str) else written(value)}"]
         self._said, self._told = folder / "result.json", folder / "messages"
         with self._said.open("w") as output, self._told.open("w") as messages:
             self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=messages, start_new_session=True)
+        if self._workers:
+            # They end with the run, also where nobody asks for its result.
+            threading.Thread(target=self._end_with_run, daemon=True).start()
+
+    def _start_steps(self, steps: list[Step], each: int, folder: pathlib.Path) -> None:
+        """Workers for the steps, one or more for each file, which offer themselves to the system."""
+        kinds = {step.file: step.kind for step in steps}
+        manager = (self._system.runtime_dir / "resource-manager.endpoint").read_text().strip() if kinds else ""
+        logs, ids = [], set()
+        for number, (file, kind) in enumerate((one for one in kinds.items() for _ in range(each)), 1):
+            name = f"{kind.lower()}-{os.getpid()}-{id(self) % 1_000_000}-{number}"
+            said = folder / f"{name}.log"
+            command = [sys.executable, "-m", "ratn._step", file, "--id", name, "--kind", kind, "--resource-manager", manager]
+            with said.open("wb") as output:
+                self._workers.append(
+                    subprocess.Popen(
+                        [*command, "--exit-with-parent"], stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+                    )
+                )
+            logs.append(said)
+            ids.add(name)
+        until = time.monotonic() + _READY_WITHIN_S
+        try:
+            while not ids <= {resource["id"] for resource in self._system.resources(*set(kinds.values()))}:
+                for worker, said in zip(self._workers, logs):
+                    if worker.poll() is not None:
+                        raise Error(f"the worker of the steps has ended: {said.read_text().strip()}")
+                if time.monotonic() > until:
+                    raise Error(f"the worker of the steps was not ready within {_READY_WITHIN_S:.0f} s: {logs[0].read_text().strip()}")
+                time.sleep(_LOOK_S)
+        except BaseException:
+            self._end_steps()
+            raise
+
+    def _end_with_run(self) -> None:
+        self._process.wait()
+        self._end_steps()
+
+    def _end_steps(self) -> None:
+        for worker in self._workers:
+            if worker.stdin is not None:
+                worker.stdin.close()
+            worker.terminate()
+        for worker in self._workers:
+            try:
+                worker.wait(_ENDED_WITHIN_S)
+            except subprocess.TimeoutExpired:
+                worker.kill()
+                worker.wait()
 
     def __repr__(self) -> str:
         return f"<Run {'under way' if self._process.poll() is None else 'ended'}, log {self.log}>"
 
     @property
     def under_way(self) -> bool:
+        """Whether it has not ended."""
         return self._process.poll() is None
 
     def messages(self) -> str:
@@ -282,46 +369,43 @@ class Run:
         """Ends the run: motions stop, everything is given back."""
         return self._control("abort")
 
-    def report(self) -> dict[str, Any]:
-        """What ``ratn report --json`` tells of the log so far."""
-        told = subprocess.run([_program(), "report", str(self.log), "--json"], capture_output=True, text=True)
+    def _read(self) -> _views.Log:
+        # A run that has just begun has not written its first line.
+        until = time.monotonic() + _ENDED_WITHIN_S
+        while not (self.log.exists() and b"\n" in self.log.read_bytes()[:1_000_000]):
+            if not self.under_way and not self.log.exists():
+                raise Error(self.messages().strip() or f"the run has ended with code {self._process.returncode}, without a log")
+            if time.monotonic() > until:
+                raise Error(f"the run has written nothing within {_ENDED_WITHIN_S:.0f} s: {self.messages().strip()}")
+            time.sleep(_LOOK_S)
+        return _views.Log(self.log)
+
+    def report(self) -> _views.Report:
+        """What ``ratn report --json`` tells of the log so far, as a dict that shows itself as the table for people."""
+        return self._read().report()
+
+    def nodes(self) -> _views.Nodes:
+        """A record of each attempt to perform a node, in the order in which they began: see :meth:`Log.nodes`."""
+        return self._read().nodes()
+
+    def why(self, name: str) -> _views.Why:
+        """What waited for what, of each visit of the state of this path or name: ``print(run.why("move_2"))``."""
+        return self._read().why(name)
+
+    def critical_path(self) -> _views.CriticalPath:
+        """What the run waited for, from its start to its end. Empty where it has not ended."""
+        return self._read().critical_path()
+
+    def gantt(self, by: str = "resource") -> _views.Chart:
+        """The Gantt chart so far, as SVG; a row is a ``resource`` or a ``node``."""
+        return self._read().gantt(by)
+
+    def network(self) -> _views.Network:
+        """What each instance of a state waited for, as a graph."""
+        told = subprocess.run([_program(), "export", "mermaid", str(self.log)], capture_output=True, text=True)
         if told.returncode != 0:
             raise Error(told.stderr.strip())
-        report: dict[str, Any] = json.loads(told.stdout)
-        return report
+        return _views.Network(told.stdout.strip())
 
-    def nodes(self) -> list[dict[str, Any]]:
-        """A record of each attempt to perform a node, in the order in which they began.
-
-        ``path`` (``for_box[0]/move``), ``provider``, ``action``, ``attempt``, ``began_s`` and ``ended_s`` (the robot's seconds since the
-        run began), ``outcome`` and ``reason``. What is under way, or was given up, has ``None`` as its end and outcome.
-        """
-        # What follows the last line end is a line that is being written.
-        return _nodes(json.loads(line) for line in self.log.read_text().split("\n")[:-1])
-
-
-def _nodes(lines: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    began_ns: int | None = None
-    paths: dict[int, str] = {}
-    nodes: dict[tuple[int, int], dict[str, Any]] = {}
-    for line in lines:
-        began_ns = line["at"] if began_ns is None else began_ns
-        at_s = (line["at"] - began_ns) / 1e9
-        if line.get("note") == "expanded":
-            paths[line["instance"]] = line["path"]
-        elif line.get("command") == "start":
-            goal, key = line["goal"], (line["instance"], line["attempt"])
-            nodes[key] = {
-                "path": paths.get(line["instance"], ""),
-                "provider": goal["provider"],
-                "action": goal["action"],
-                "attempt": line["attempt"],
-                "began_s": at_s,
-                "ended_s": None,
-                "outcome": None,
-                "reason": "",
-            }
-        elif line.get("event") == "finished" and (line["instance"], line["attempt"]) in nodes:
-            ended = {"ended_s": at_s, "outcome": line["outcome"], "reason": line["reason"]}
-            nodes[line["instance"], line["attempt"]].update(ended)
-    return list(nodes.values())
+    def _repr_html_(self) -> str:
+        return self._read()._repr_html_()

@@ -50,10 +50,13 @@ class Worker:
         senses: Iterable[str] = (),
         requires: Iterable[str] = (),
         effects: Iterable[str] = (),
+        suspends: bool = False,
     ) -> Any:
         """Makes a function (also an ``async def``) an action. Its first parameter is the goal, the others are the input ports.
 
-        It returns its outputs as a ``dict``, or an ``Outcome``. ``computes`` is true where it neither senses nor changes anything.
+        It returns its outputs as a ``dict``, or an ``Outcome``. ``computes`` is true where it neither senses nor changes anything. One that
+        ``suspends`` stands still while its goal is suspended, because the resource manager is not heard (``goal.while_held()`` between its steps);
+        the others end then.
         """
 
         def known(function: _Function) -> _Function:
@@ -70,6 +73,7 @@ class Worker:
                 senses=senses_,
                 requires=list(requires),
                 effects=effects_,
+                suspends=suspends,
                 perform=lambda *_: ("aborted", {}, "not ready"),
                 arrays=arrays,
             )
@@ -87,13 +91,79 @@ class Worker:
         ``arguments`` are those that a template passes: the process's own unless given. What is logged with ``logging`` is in the
         worker's log (``ratn logs``). Without leases whoever may call it has it perform goals: for trying it out.
         """
+        self._serve(arguments, without_leases, None)
+
+    def _serve(self, arguments: list[str] | None, without_leases: bool, driven: Driven | None) -> None:
         if not self._actions:
             raise ValueError("the worker has no actions: decorate a function with `@worker.action`")
         if not logging.getLogger().handlers:
             logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
         arguments = sys.argv[1:] if arguments is None else arguments
         kind = self.kind or "".join(part.capitalize() for part in self.provider.split("_"))
-        _ratn.serve(arguments, self.provider, kind, list(self._actions.values()), without_leases)
+        _ratn.serve(arguments, self.provider, kind, list(self._actions.values()), without_leases, driven)
+
+
+@dataclass
+class Driven:
+    """What a driver says beside its actions, as the native part takes it."""
+
+    brakes: Callable[[str, str], object]
+    stop_file: pathlib.Path | None
+    standstill_s: float | None
+
+
+class Driver(Worker):
+    """A worker that moves something: with emergency stop, hold and standstill.
+
+    ``brakes`` says how it comes to rest, and lets go again. ``standstill_s`` is the time within which everything stands still after a lease has ended: the
+    next one is granted when the driver has confirmed that, or after it; a template needs a ``standstill_ms`` of at least that. A
+    ``stop_file`` keeps an emergency stop beyond the end of the process; it belongs into a state directory.
+    """
+
+    def __init__(
+        self,
+        provider: str | None = None,
+        *,
+        kind: str | None = None,
+        standstill_s: float | None = None,
+        stop_file: str | pathlib.Path | None = None,
+    ) -> None:
+        super().__init__(provider, kind=kind)
+        self._standstill_s, self._stop_file = standstill_s, None if stop_file is None else pathlib.Path(stop_file)
+        self._brakes: Callable[[str, str], object] | None = None
+
+    def brakes(self, function: Callable[[str, str], object]) -> Callable[[str, str], object]:
+        """Makes a function the brakes: ``@d.brakes`` above ``def brake(state, reason): …``.
+
+        It is called with ``"held"``, ``"stopped"`` or ``"ready"`` and with whoever asked for it and why, from another thread than the goals.
+        For the first two it returns when nothing moves; where it raises, the stop is in force and not confirmed. It is called for ``"stopped"`` at the
+        start, too, because the process before may have begun a motion, and may be called for a state that it has carried out already; an
+        emergency stop does not wait for an earlier call to return.
+        """
+        self._brakes = function
+        return function
+
+    def run(self, arguments: list[str] | None = None, *, without_leases: bool = False) -> None:
+        """Serves goals until the process is told to end. A driver asks for leases always."""
+        if without_leases:
+            raise ValueError("a driver moves something: it performs goals only for whoever holds it")
+        if self._brakes is None:
+            raise ValueError("the driver has no brakes: decorate a function with `@driver.brakes`, which returns when nothing moves")
+        arguments = sys.argv[1:] if arguments is None else arguments
+        self._serve(_at_a_socket(arguments), False, Driven(self._brakes, self._stop_file, self._standstill_s))
+
+
+def _at_a_socket(arguments: list[str]) -> list[str]:
+    """With a Unix socket as the address, unless they say one: there the system knows who lets the driver move again."""
+    words = [word for argument in arguments for word in argument.split("=", 1)]
+    given = {name: value for name, value in zip(words, words[1:]) if name.startswith("--")}
+    manager, file = given.get("--resource-manager", ""), given.get("--endpoint-file", "")
+    socket = f"{file.removesuffix('.endpoint')}.sock" if file else ""
+    if not file and manager.startswith("unix:") and "--id" in given:
+        socket = str(pathlib.Path(manager.removeprefix("unix:")).parent / f"{given['--id']}.sock")
+    # A longer path is that of no socket.
+    is_one = bool(socket) and len(socket.encode()) < 108
+    return [*arguments, "--listen", f"unix:{socket}"] if is_one and "--listen" not in words else arguments
 
 
 def _name_of_script() -> str:

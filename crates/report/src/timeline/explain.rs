@@ -17,7 +17,10 @@ impl Timeline {
             Stage::Waiting if self.is_paused() && self.hints.is_pia(&instance.path) => {
                 "the operator: the run is paused".to_owned()
             }
-            Stage::Waiting => self.older(id)?,
+            Stage::Waiting => match &instance.awaits {
+                Some(awaits) => awaits.clone(),
+                None => self.older(id)?,
+            },
             Stage::Preparing => "its projection".to_owned(),
             Stage::Finished => format!("{}, to become real", self.older(id)?),
             Stage::Running | Stage::Retired | Stage::Squashed => return None,

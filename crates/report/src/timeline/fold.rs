@@ -154,9 +154,12 @@ impl Timeline {
             Event::Woken => Cause::Time,
             Event::Advised { .. } => Cause::Advice,
             Event::Resumed => Cause::Resumed,
-            Event::PauseRequested | Event::ResumeRequested | Event::StepRequested | Event::AbortRequested { .. } => {
-                Cause::Operator
-            }
+            Event::PauseRequested
+            | Event::ResumeRequested
+            | Event::StepRequested
+            | Event::Answered { .. }
+            | Event::AbortRequested { .. } => Cause::Operator,
+            Event::Signalled { signal, .. } => Cause::Signal(signal.as_str().into()),
             // It changes nothing.
             Event::Progressed { .. } => return,
         };
@@ -201,6 +204,8 @@ impl Timeline {
             | Event::WorldChanged { .. }
             | Event::RetirementFailed { .. }
             | Event::AbortRequested { .. }
+            | Event::Signalled { .. }
+            | Event::Answered { .. }
             | Event::Resumed
             | Event::Woken
             | Event::Advised { .. } => {}
@@ -262,6 +267,7 @@ impl Timeline {
             Note::Expanded { instance, .. }
             | Note::Decided { instance, .. }
             | Note::Running { instance, .. }
+            | Note::Awaiting { instance, .. }
             | Note::Finished { instance, .. }
             | Note::Retired { instance }
             | Note::Invalidated { instance, .. }
@@ -283,8 +289,10 @@ impl Timeline {
                 }
             }
             Note::Running { .. } => {}
+            Note::Awaiting { awaited, .. } => self.known(id, at).awaits = Some(awaited.to_string()),
             Note::Finished { outcome, .. } => {
                 let instance = self.known(id, at);
+                instance.awaits = None;
                 (instance.finished, instance.outcome) = (true, Some(outcome.clone()));
                 self.enter(id, Stage::Finished, at);
                 self.open.remove(&id);
@@ -414,6 +422,7 @@ fn instance_of(event: &Event) -> Option<InstanceId> {
         | Event::Progressed { instance, .. }
         | Event::Finished { instance, .. }
         | Event::Crashed { instance, .. }
+        | Event::Answered { instance, .. }
         | Event::RetirementFailed { instance, .. } => Some(*instance),
         Event::Started { .. }
         | Event::Resumed
@@ -423,6 +432,7 @@ fn instance_of(event: &Event) -> Option<InstanceId> {
         | Event::StepRequested
         | Event::Advised { .. }
         | Event::WorldChanged { .. }
+        | Event::Signalled { .. }
         | Event::AbortRequested { .. } => None,
     }
 }

@@ -66,6 +66,8 @@ pub enum Cause {
     Time,
     /// The operator said so.
     Operator,
+    /// A client sent this signal.
+    Signal(Arc<str>),
     /// A look ahead found a better order.
     Advice,
     /// Task control came back.
@@ -77,7 +79,13 @@ impl Cause {
     pub fn instance(&self) -> Option<InstanceId> {
         match self {
             Cause::Result(id, _) | Cause::Answer(id, _) | Cause::Projected(id, _) => Some(*id),
-            Cause::Start | Cause::World | Cause::Time | Cause::Operator | Cause::Advice | Cause::Resumed => None,
+            Cause::Start
+            | Cause::World
+            | Cause::Time
+            | Cause::Operator
+            | Cause::Signal(_)
+            | Cause::Advice
+            | Cause::Resumed => None,
         }
     }
 
@@ -91,6 +99,7 @@ impl Cause {
             Cause::World => "a change of the world from outside".to_owned(),
             Cause::Time => "a moment: a next try or a timeout".to_owned(),
             Cause::Operator => "the operator".to_owned(),
+            Cause::Signal(signal) => format!("the signal `{signal}`"),
             Cause::Advice => "a better order".to_owned(),
             Cause::Resumed => "task control".to_owned(),
         }
@@ -145,6 +154,8 @@ pub struct Instance {
     pub retired: bool,
     /// Whether it was discarded.
     pub squashed: bool,
+    /// What it waits for by itself: a condition, a time, a signal, an answer.
+    pub awaits: Option<String>,
     /// Its result was taken from an equal one.
     pub reused: bool,
     /// Why its result, or what it was at, did not count; once for each time.
@@ -170,6 +181,7 @@ impl Instance {
             outcome: None,
             retired: false,
             squashed: false,
+            awaits: None,
             reused: false,
             invalidations: Vec::new(),
         }

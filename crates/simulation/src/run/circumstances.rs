@@ -62,6 +62,8 @@ impl Default for Circumstances {
 /// When something comes from outside.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Trigger {
+    /// Before the run begins.
+    Before,
     /// So many seconds after the start.
     At(f64),
     /// When a goal of this path starts.

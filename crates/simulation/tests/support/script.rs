@@ -34,6 +34,13 @@
 //! gone = ["at(box)"]
 //! ends = "look"
 //! [[events]]
+//! event = "signal"                        # a client sends it
+//! signal = "go"
+//! value = 3
+//! at = 1.0
+//! [choices]
+//! ask = { choice = "yes", after = 2.0 }    # what an operator answers, and so many seconds after the question
+//! [[events]]
 //! event = "lease_lost"                    # what the instance of this path holds, before it has begun
 //! path = "move"
 //! at = 2.0
@@ -42,7 +49,7 @@
 use super::fact;
 use ratn_executive::protocol::{Event, Goal, LogEntry};
 use ratn_model::fact::FactKey;
-use ratn_model::id::Revision;
+use ratn_model::id::{InstanceId, Revision};
 use ratn_model::pose::Pose;
 use ratn_model::program::Program;
 use ratn_model::resource::Quantity;
@@ -68,6 +75,7 @@ pub(crate) struct Script {
     measured: BTreeMap<String, BTreeMap<String, toml::Value>>,
     answers: BTreeMap<String, Vec<Reply>>,
     crashes: BTreeMap<String, u32>,
+    choices: BTreeMap<String, Choice>,
     events: Vec<Outside>,
     /// The executive is made anew from a checkpoint after every so many events.
     #[serde(skip)]
@@ -99,12 +107,21 @@ struct Reply {
 
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
+struct Choice {
+    choice: String,
+    after: f64,
+}
+
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
 struct Outside {
     event: String,
     at: Option<f64>,
     starts: Option<String>,
     ends: Option<String>,
     path: Option<String>,
+    signal: Option<String>,
+    value: Option<toml::Value>,
     #[serde(default)]
     facts: BTreeMap<String, toml::Value>,
     #[serde(default)]
@@ -174,6 +191,10 @@ impl Outside {
                 let facts = set.chain(self.gone.iter().map(|key| (fact(key), None))).collect();
                 Event::WorldChanged { revision: Revision(99), facts }
             }
+            "signal" => {
+                let signal = self.signal.clone().unwrap_or_else(|| panic!("a signal has a name"));
+                Event::Signalled { signal, value: self.value.as_ref().map_or(Value::Null, value) }
+            }
             "lease_lost" => {
                 let path = self.path.as_deref().unwrap_or_else(|| panic!("a lease is lost by a path"));
                 let run = undisturbed.unwrap();
@@ -186,7 +207,7 @@ impl Outside {
                 let instance = holders.find(|instance| paths[instance] == path).unwrap();
                 Event::Crashed { instance, attempt: 1, reason: "its lease was lost".to_owned() }
             }
-            other => panic!("event: pause, resume, step, abort, world or lease_lost, not {other}"),
+            other => panic!("event: pause, resume, step, abort, world, signal or lease_lost, not {other}"),
         }
     }
 }
@@ -215,6 +236,11 @@ impl Oracle for Script {
         let measured = self.measured.get(path).into_iter().flatten();
         let measured: Vec<(FactKey, Value)> = measured.map(|(key, v)| (fact(key), value(v))).collect();
         Performance { duration_s, answer: Answer::Finished { outcome, outputs, measured } }
+    }
+
+    fn awaited(&mut self, path: &str, instance: InstanceId) -> Option<(f64, Event)> {
+        let Choice { choice, after } = self.choices.get(path)?.clone();
+        Some((after, Event::Answered { instance, choice }))
     }
 }
 

@@ -107,6 +107,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         lookout: Lookout::default(),
         ask_at: None,
         look_at: Instant::now() + LOOK,
+        confirm: Vec::new(),
         performer: performer.context("cannot go on with the run")?,
         answers,
     };

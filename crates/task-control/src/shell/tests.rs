@@ -87,3 +87,84 @@ async fn a_run_is_told_to_end_over_its_socket() -> anyhow::Result<()> {
     assert!(tell(&bench.place.directory, Word::Abort).await.is_err());
     Ok(())
 }
+
+const WAITING: &str = "
+task: hand_over
+variables: { order: null }
+outputs: { order: $order, answer: really.answer }
+states:
+  - next: { wait: { signal: order }, assign: { order: value } }
+  - really: { ask: { question: Really?, choices: [so, not_so] } }
+  - later: { wait: { signal: later } }
+";
+
+/// Sends a message as soon as somebody listens; what becomes of it.
+async fn sent(place: &Place, message: Message) -> Result<String, String> {
+    loop {
+        match crate::control::send(&place.directory, &message).await {
+            Err(error) if crate::control::is_nobody(&error) => tokio::task::yield_now().await,
+            sent => return sent.map_err(|error| error.to_string()),
+        }
+    }
+}
+
+fn signal(name: &str, value: Value) -> Message {
+    Message::Signal { run: ANY_RUN.to_owned(), signal: name.to_owned(), value }
+}
+
+fn answer(run: &str, state: Option<&str>, choice: &str) -> Message {
+    Message::Answer { run: run.to_owned(), state: state.map(str::to_owned), choice: choice.to_owned() }
+}
+
+/// Whether the run says that this state waits.
+async fn waits(place: &Place, path: &str) {
+    let is_it = |status: &RunStatus| status.awaits.iter().any(|awaiting| awaiting.path == path);
+    while !crate::control::status(&place.directory).await.ok().flatten().is_some_and(|status| is_it(&status)) {
+        tokio::task::yield_now().await;
+    }
+}
+
+#[tokio::test]
+async fn a_run_that_waits_has_what_it_was_sent_also_after_it_was_killed() -> anyhow::Result<()> {
+    let mut bench = Bench::new(|waiting| *waiting = program(WAITING)).await?;
+    bench.run.checkpoint_every = 1;
+    let place = &bench.place;
+    let (_asks, interrupt) = Interrupt::new();
+    let killed = async {
+        waits(place, "next").await;
+        let said = sent(place, signal("later", Value::Null)).await;
+        assert_eq!(said, Ok("it is kept for the next state that waits for `later`".to_owned()));
+        let refused = sent(place, signal("odrer", Value::Null)).await;
+        let help = "no state of hand_over waits for a signal `odrer`: did you mean `order`?";
+        assert_eq!(refused, Err(help.to_owned()));
+        assert_eq!(sent(place, answer("-", None, "so")).await, Err("no state asks anything now".to_owned()));
+        let said = sent(place, signal("order", Value::Int(7))).await;
+        assert_eq!(said, Ok("next has waited for it and goes on".to_owned()));
+    };
+    tokio::select! {
+        ended = run(bench.run.clone(), place, &interrupt) => panic!("it ended: {ended:?}"),
+        () = killed => {}
+    }
+    let log = LogWriter::go_on(&bench.run.log)?;
+    let history = crate::history::History::of(&log, Messages::nowhere())?;
+    let resumption = Resumption::new((*bench.run.program).clone(), history, log, 1)?;
+    let resumed = resume(resumption, place, &interrupt);
+    let asked = async {
+        waits(place, "really").await;
+        let wrong = sent(place, answer("hand_over", None, "maybe")).await;
+        assert_eq!(wrong, Err("`maybe` is no answer to really: there is so, not_so".to_owned()));
+        let wrong = sent(place, answer("-", Some("next"), "so")).await;
+        assert_eq!(wrong, Err("next asks nothing now; these do: really (Really?)".to_owned()));
+        let other = sent(place, answer("fetch", None, "so")).await;
+        assert!(other.is_err_and(|why| why.starts_with("no run `fetch` is under way here")));
+        let said = sent(place, answer("hand_over", Some("really"), "so")).await;
+        assert_eq!(said, Ok("really is answered: so".to_owned()));
+    };
+    let (ended, ()) = tokio::join!(resumed, asked);
+    let ended = ended?;
+    assert_eq!(ended.outcome, "success", "{ended:?}");
+    let outputs: BTreeMap<String, Value> =
+        [("answer".to_owned(), Value::String("so".to_owned())), ("order".to_owned(), Value::Int(7))].into();
+    assert_eq!(ended.outputs, outputs, "the signal that was kept before it was killed has ended the last wait");
+    Ok(())
+}

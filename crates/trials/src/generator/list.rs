@@ -2,6 +2,7 @@
 
 use super::*;
 use ratn_model::program::STOPPED;
+use ratn_model::wait::TIMEOUT;
 
 impl Maker {
     /// A list of states; with what is visible behind it, and the custom outcomes by which it is left.
@@ -26,8 +27,9 @@ impl Maker {
             }
             let id = self.state(parent, path, number, depth, room, &visible);
             children.push(id);
+            let waits = self.at(id).is_pause();
             let writes = match &self.at(id).kind {
-                StateKind::Action { .. } => true,
+                StateKind::Action { .. } => !waits,
                 StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } => !outputs.is_empty(),
                 _ => false,
             };
@@ -57,7 +59,7 @@ impl Maker {
                     None => Some(outcome.clone()),
                 };
                 if let Some(name) = left
-                    && [FOUND, EMPTY, AGAIN, STOPPED].contains(&name.as_str())
+                    && [FOUND, EMPTY, AGAIN, STOPPED, TIMEOUT].contains(&name.as_str())
                     && !leaving.contains(&name)
                 {
                     leaving.push(name);
@@ -108,7 +110,11 @@ impl Maker {
         if !self.features.variables || !self.dice.percent(40) {
             return;
         }
-        let actions: Vec<StateId> = children.iter().copied().filter(|id| self.is_action(*id)).collect();
+        let actions: Vec<StateId> = children
+            .iter()
+            .copied()
+            .filter(|id| self.is_action(*id) && !self.states[id.0 as usize].is_pause())
+            .collect();
         let [first, .., last] = actions.as_slice() else { return };
         self.at(*last).defaults.insert("x".to_owned(), Value::Int(1));
         if let StateKind::Action { inputs, .. } = &mut self.at(*first).kind {
@@ -128,6 +134,14 @@ impl Maker {
         let name = format!("s{}_{number}", self.states.len());
         let path = if around.is_empty() { name.clone() } else { format!("{around}/{name}") };
         let id = self.push(name, path.clone(), Some(parent));
+        if self.features.waits && !room.is_preemptive && self.dice.percent(14) {
+            let kind = self.wait(id, room, visible);
+            self.at(id).kind = kind;
+            if depth < 3 && self.dice.percent(10) {
+                self.guard(id, &path, depth, room, visible);
+            }
+            return id;
+        }
         let composite = depth < 3 && self.dice.percent(38);
         let kinds = if room.is_preemptive { 1 } else { 9 };
         if composite && self.features.blind && !room.is_preemptive && self.dice.percent(40) {

@@ -18,7 +18,7 @@
 //! | facts and effects | `facts`, `effects` |
 //! | expressions | `evaluate`, `function`, `query` |
 //! | what is known of a run's log alone | `preconditions` |
-//! | what runs | `walk` (states that contain others), `goal` (one action), `shown` (what its provider sees), `resources` |
+//! | what runs | `walk` (states that contain others), `goal` (one action), `waits` (a state that waits), `shown` (what its provider sees), `resources` |
 
 mod compare;
 mod comprehension;
@@ -31,6 +31,7 @@ mod preconditions;
 mod query;
 mod resources;
 mod shown;
+mod waits;
 mod walk;
 
 #[cfg(test)]
@@ -95,6 +96,8 @@ pub(super) struct Given<'a> {
     pub(super) refused: BTreeSet<String>,
     /// What changes from outside when a goal starts.
     pub(super) outside: Vec<(Trigger, Event)>,
+    /// What is sent before the run begins, the oldest first.
+    pub(super) signals: Vec<(String, Value)>,
     pub(super) oracle: &'a mut dyn Oracle,
 }
 
@@ -105,6 +108,8 @@ struct Reference<'a> {
     oracle: &'a mut dyn Oracle,
     refused: BTreeSet<String>,
     outside: Vec<(Trigger, Event)>,
+    /// Signals that nobody has waited for yet, the oldest first.
+    signals: Vec<(String, Value)>,
     /// Of all states, what their latest visits wrote.
     outputs: BTreeMap<StateId, Outputs>,
     /// How regions ended.
@@ -118,13 +123,14 @@ struct Reference<'a> {
 /// # Errors
 /// [`Fail::NotMine`].
 pub(super) fn evaluate(given: Given<'_>) -> Result<ReferenceResult, Fail> {
-    let Given { program, seed, parameters, facts, units, refused, outside, oracle } = given;
+    let Given { program, seed, parameters, facts, units, refused, outside, signals, oracle } = given;
     let mut reference = Reference {
         program,
         seed,
         oracle,
         refused,
         outside,
+        signals,
         outputs: BTreeMap::new(),
         regions: BTreeMap::new(),
         steps: 0,

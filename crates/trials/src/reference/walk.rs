@@ -26,6 +26,9 @@ impl Reference<'_> {
             return Err(Fail::NotMine("a run without an end"));
         }
         if let StateKind::Action { .. } = state.kind {
+            if state.is_pause() {
+                return self.wait(state, path, variables, in_routine);
+            }
             return self.action(state, path, variables, in_routine);
         }
         if fails(self.meets(state, variables))?.is_err() {
@@ -183,7 +186,7 @@ impl Reference<'_> {
             if number > again.count || !again.on.contains(&outcome) {
                 return Ok(outcome);
             }
-            if around.children().any(|child| self.program.state(child).is_pause()) {
+            if around.children().any(|child| self.program.state(child).is_between_tries()) {
                 self.tell(&below(path, &visit("pause")), in_routine, SUCCESS, (Outputs::new(), Outputs::new()));
             }
             if let Some(before) = again.before {

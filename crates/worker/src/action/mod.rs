@@ -60,6 +60,20 @@ pub trait Action: Send + Sync + 'static {
         None
     }
 
+    /// The ids of all resources that goals of this action can need a lease of: one, unless several resources share the action.
+    fn resources(&self) -> Vec<&str> {
+        self.resource().into_iter().collect()
+    }
+
+    /// The id of the resource whose lease this goal needs, for an action that several resources share, as the arms of a robot do. It is asked
+    /// whenever the goal is given, and has to answer the same every time. Whatever it answers, the lease is confirmed for that resource.
+    ///
+    /// # Errors
+    /// Why the goal is for none of the resources, or which of them it is for cannot be told: the goal is refused with that sentence.
+    fn resource_for(&self, _goal: &Goal) -> Result<Option<&str>, String> {
+        Ok(self.resource())
+    }
+
     /// Whether a goal is stopped when the last client that listens to it has gone.
     fn cancel_when_abandoned(&self) -> bool {
         true

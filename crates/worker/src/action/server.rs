@@ -1,7 +1,7 @@
 //! A server of actions: how it is built, and its requests.
 
 use super::admission::{Admission, Limits, State};
-use super::authority::Authority;
+use super::authority::{Authority, refusal};
 use super::goal::{Ending, Fingerprint, GoalEntry, LeaseKey, StopCause};
 use super::run::run;
 use super::service::{Messages, described};
@@ -24,7 +24,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
-use tonic::Status;
+use tonic::{Code, Status};
 use tracing::Instrument;
 
 /// Of each resource so many results are remembered unless said otherwise.
@@ -163,7 +163,10 @@ impl ActionServerBuilder {
     /// Makes the server. An action whose resource the [`LeaseWatch`] does not watch refuses every goal; a log line says so.
     pub fn build(self) -> ActionServer {
         if let Some(watch) = self.authority.watch() {
-            let named = self.actions.values().map(|action| action.resource().unwrap_or(&self.resource));
+            let named = self.actions.values().flat_map(|action| match action.resources() {
+                none if none.is_empty() => vec![self.resource.as_str()],
+                named => named,
+            });
             for resource in named.filter(|named| !named.is_empty() && watch.resources().iter().all(|of| of != named)) {
                 tracing::error!(
                     resource,
@@ -246,7 +249,7 @@ impl ActionServer {
     /// NOT_FOUND where it was never given under a lease that lives; FAILED_PRECONDITION where only its result has been forgotten;
     /// ALREADY_EXISTS where another goal has its id; PERMISSION_DENIED where somebody else gave it.
     pub(super) fn join(&self, caller: &Caller, goal: &Goal, inputs: Fingerprint) -> Result<Messages, Status> {
-        let (action, resource) = self.inner.performer(&goal.action)?;
+        let (action, resource) = self.inner.performer(goal)?;
         let entry = GoalEntry::new(caller, goal, inputs, resource, action.cancel_when_abandoned());
         match self.inner.state().known(&self.inner.limits, caller, &entry)? {
             Some(entry) => Ok(Messages::of(&entry, true)),
@@ -262,7 +265,7 @@ impl ActionServer {
     /// # Errors
     /// A status that says why not.
     pub(super) async fn admit(&self, caller: &Caller, goal: Goal, inputs: Fingerprint) -> Result<Messages, Status> {
-        let (action, resource) = self.inner.performer(&goal.action)?;
+        let (action, resource) = self.inner.performer(&goal)?;
         let entry = GoalEntry::new(caller, &goal, inputs, resource, action.cancel_when_abandoned());
         let heard_by = Instant::now() + GRANT_WAIT;
         let mut waiting = None;
@@ -328,14 +331,16 @@ async fn changed(heard: Option<watch::Receiver<u64>>) {
 }
 
 impl Inner {
-    /// The action of a name, and the resource of which its goals need a lease.
-    pub(super) fn performer(&self, action: &str) -> Result<(&Arc<dyn Action>, &str), Status> {
+    /// The action of a goal, and the resource of which the goal needs a lease.
+    pub(super) fn performer(&self, goal: &Goal) -> Result<(&Arc<dyn Action>, &str), Status> {
+        let action = &goal.action;
         let Some(found) = self.actions.get(action) else {
             let known: Vec<&str> = self.actions.keys().map(String::as_str).collect();
             let message = format!("no action `{action}`: there are {}", known.join(", "));
             return Err(Status::invalid_argument(message));
         };
-        Ok((found, found.resource().unwrap_or(&self.resource)))
+        let resource = found.resource_for(goal).map_err(|why| refusal(Code::FailedPrecondition, "NO_LEASE", why))?;
+        Ok((found, resource.unwrap_or(&self.resource)))
     }
 
     fn stop_where(&self, which: impl Fn(&GoalEntry) -> bool, cause: &StopCause) {

@@ -26,6 +26,8 @@ pub enum CallError {
         endpoint: Endpoint,
         /// The gRPC status code.
         code: Code,
+        /// The reason of its `google.rpc.ErrorInfo`, `NOT_AT_REST`; empty where the server gave none.
+        reason: String,
         /// The server's message.
         message: String,
     },
@@ -54,6 +56,14 @@ impl CallError {
         }
     }
 
+    /// The reason of a refusal, as the servers name it; empty for other errors.
+    pub fn reason(&self) -> &str {
+        match self {
+            CallError::Refused { reason, .. } => reason,
+            _ => "",
+        }
+    }
+
     /// What a status that `endpoint` answered (or that stands for its silence) means.
     pub fn from_status(endpoint: &Endpoint, status: &Status) -> CallError {
         let endpoint = endpoint.clone();
@@ -66,7 +76,9 @@ impl CallError {
             _ => status.source().is_none(),
         };
         if refused {
-            return CallError::Refused { endpoint, code: status.code(), message: status.message().to_owned() };
+            let reason = status.get_details_error_info().map(|info| info.reason).unwrap_or_default();
+            let (code, message) = (status.code(), status.message().to_owned());
+            return CallError::Refused { endpoint, code, reason, message };
         }
         let reason = match status.source() {
             Some(source) => chain(source),

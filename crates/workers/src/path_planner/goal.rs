@@ -1,23 +1,30 @@
 //! A goal of the path planner, read from its input ports: `start`, `goal` (joints, a pose, or a list of these); optional `depart_m`,
 //! `approach_m` (straight parts; with `…_direction` and `…_frame`, else straight up and straight down), `straight`, `way_points`, `blend_m`
 //! (between them straight lines of the tool, too), `upright_rad` (what points up in the tool stays so, at most this far off), `reaches_into`
-//! (names of hollow objects whose insides the fingers may enter on the straight parts), `speed`, `budget_s`; `pan`, `tilt` and `width_m`
+//! (names of hollow objects whose insides the fingers may enter on the straight parts), `cloud` (what a depth camera saw), `speed`, `budget_s`; `pan`, `tilt` and `width_m`
 //! (where head and fingers are, as `pan_tilt` and `gripper` say; what is not said is [`assumed`]: the head looks straight ahead, the fingers
 //! are around what is held, else open). What bounds the motion: `bounds`.
 
 use super::bounds;
 use ratn_model::value::Value;
 use ratn_motion::arm::assumed;
+use ratn_motion::cloud::Cloud;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::plan::{Goal, Request};
+use ratn_motion::point_files::points_by_content;
 use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::seen::{KNOWN_WITHIN_M, Seen};
 use ratn_motion::straight::{Frame, Straight};
 use ratn_motion::way_points::WayPoints;
 use ratn_worker::action::{ActionFailure, GoalContext};
 use ratn_world::scene::Scene;
+use std::sync::Arc;
 
 /// The fraction of the joints' limits where the goal says none.
 const DEFAULT_SPEED: f64 = 0.3;
+
+/// The radius of the ball about a point that was seen, in metres, where the goal says none.
+const POINT_RADIUS_M: f64 = 0.01;
 
 /// Where head and fingers are, as far as it is said.
 #[derive(Debug, Clone, Copy)]
@@ -46,11 +53,19 @@ impl Asked {
 impl Said {
     /// From the input ports `pan`, `tilt`, `width_m`, and that of the arm's posture.
     pub(super) fn read(goal: &GoalContext, robot: &Robot, arm_port: &str) -> Result<Said, ActionFailure> {
+        let of_part = |port: &str, is_there: bool, lacks: &str| match goal.optional_float(port)? {
+            Some(_) if !is_there => Err(ActionFailure::aborted(format!(
+                "input `{port}` is given, but the robot `{}` has no {lacks}: leave the input out",
+                robot.name()
+            ))),
+            said => Ok(said),
+        };
+        let (head, fingers) = (!robot.head_joints().is_empty(), robot.finger().is_some());
         Ok(Said {
             arm: joints(robot, arm_port, goal.input_joints(arm_port)?)?,
-            pan: goal.optional_float("pan")?,
-            tilt: goal.optional_float("tilt")?,
-            width_m: goal.optional_float("width_m")?,
+            pan: of_part("pan", head, "head that turns (its description has no `[head]`)")?,
+            tilt: of_part("tilt", head, "head that turns (its description has no `[head]`)")?,
+            width_m: of_part("width_m", fingers, "gripper on this arm (its description has none)")?,
         })
     }
 
@@ -84,6 +99,7 @@ pub(super) fn asked(goal: &GoalContext, robot: &Robot) -> Result<(Asked, Option<
         scales: bounds::scales(goal, robot.arm_joints().len())?,
         tool_speed: bounds::tool_speed(goal)?,
         reaches_into: names(goal)?,
+        seen: seen(goal)?,
         speed: goal.optional_float("speed")?.unwrap_or(DEFAULT_SPEED),
         seed: goal.seed,
         // The clock says when improvement ends.
@@ -128,6 +144,17 @@ fn way_points(goal: &GoalContext) -> Result<Option<WayPoints>, ActionFailure> {
             Ok(Some(WayPoints { through: through.unwrap_or_default(), blend_m }))
         }
     }
+}
+
+/// What a depth camera saw: `cloud`, a PCD or PLY file with points in the world frame, with `cloud_radius_m` and `cloud_known_within_m`.
+fn seen(goal: &GoalContext) -> Result<Option<Seen>, ActionFailure> {
+    let radius_m = goal.optional_float("cloud_radius_m")?.unwrap_or(POINT_RADIUS_M);
+    let known_within_m = goal.optional_float("cloud_known_within_m")?.unwrap_or(KNOWN_WITHIN_M);
+    let Some(port) = goal.port("cloud").optional() else { return Ok(None) };
+    let wrong = |reason: String| ActionFailure::aborted(format!("input `cloud`: {reason}"));
+    let points = points_by_content(port.bytes()?).map_err(|error| wrong(error.to_string()))?;
+    let cloud = Cloud::new("what was seen", &points, radius_m).map_err(|error| wrong(error.to_string()))?;
+    Ok(Some(Seen { cloud: Arc::new(cloud), known_within_m }))
 }
 
 fn names(goal: &GoalContext) -> Result<Vec<String>, ActionFailure> {

@@ -65,6 +65,7 @@ impl Joined {
             finger: robot.open_finger_m(),
             ..robot.at_zero()
         };
+        // The other arms are in their postures `home` with open fingers, where the robot has them.
         let shapes = robot.shapes(&home);
         let mut joined = Joined::default();
         for (i, (a, pose_a, shape_a)) in shapes.iter().enumerate() {

@@ -103,7 +103,8 @@ pub struct Environment {
     links: Vec<RobotBody>,
     /// Where the robot's base was at the last step.
     pub(super) base: [f64; 3],
-    fingers_solid: bool,
+    /// Of each gripper, by the number of its arm: whether its fingers push what they meet.
+    fingers_solid: Vec<bool>,
     objects: Vec<Body>,
     pub(super) riding: Riding,
     /// The names of the robot's links, and which of them are made to touch.
@@ -118,7 +119,8 @@ pub struct Environment {
 struct RobotBody {
     body: RigidBodyHandle,
     collider: ColliderHandle,
-    finger: bool,
+    /// It is a finger of the arm of this number.
+    finger_of: Option<usize>,
     link: usize,
     /// As seen from its link.
     pose: Pose,
@@ -194,7 +196,7 @@ impl Environment {
             supports: Vec::new(),
             links: Vec::new(),
             base: configuration.base,
-            fingers_solid: true,
+            fingers_solid: vec![true; robot.arm_names().count()],
             objects: Vec::new(),
             riding: Riding::restored(riders(saved)),
             link_names: robot.model.links.iter().map(|link| link.name.clone()).collect(),
@@ -223,9 +225,9 @@ impl Environment {
 
     /// What stands there becomes what was saved; nothing else of it changes.
     pub(super) fn make_again(&mut self, robot: &Robot, configuration: &Configuration, saved: &Saved) {
-        let (solid, joined) = (self.fingers_solid, std::mem::take(&mut self.joined));
+        let (solid, joined) = (std::mem::take(&mut self.fingers_solid), std::mem::take(&mut self.joined));
         *self = Environment::made(robot, configuration, &self.furniture, saved, joined);
-        self.set_fingers_solid(solid);
+        solid.into_iter().enumerate().for_each(|(arm, solid)| self.set_fingers_solid(arm, solid));
     }
 
     /// The time of the last step.
@@ -360,14 +362,14 @@ impl Environment {
         }
     }
 
-    /// Whether fingers push what they meet. While they close they do not: `grip` decides what comes of that.
-    pub fn set_fingers_solid(&mut self, solid: bool) {
-        if self.fingers_solid == solid {
-            return;
+    /// Whether the fingers of an arm push what they meet. While they close they do not: `grip` decides what comes of that.
+    pub fn set_fingers_solid(&mut self, arm: usize, solid: bool) {
+        match self.fingers_solid.get_mut(arm) {
+            Some(known) if *known != solid => *known = solid,
+            _ => return,
         }
-        self.fingers_solid = solid;
         let groups = if solid { robot_groups() } else { InteractionGroups::none() };
-        for link in self.links.iter().filter(|link| link.finger) {
+        for link in self.links.iter().filter(|link| link.finger_of == Some(arm)) {
             self.colliders[link.collider].set_collision_groups(groups);
         }
     }
@@ -484,15 +486,15 @@ impl Environment {
 
     fn add_robot(&mut self, robot: &Robot, configuration: &Configuration) {
         let bodies = robot.model.links.iter().flat_map(|link| &link.bodies);
-        let fingers = robot.finger_links();
+        let fingers: Vec<Vec<usize>> = (0..robot.arm_names().count()).map(|arm| robot.finger_links_of(arm)).collect();
         for ((link, pose, shape), of_link) in robot.shapes(configuration).into_iter().zip(bodies) {
             let name = &robot.model.links[link].name;
             let body = self.bodies.insert(RigidBodyBuilder::new(LINK).pose(pose));
             let collider = ColliderBuilder::new(shape).friction(ROBOT_FRICTION).collision_groups(robot_groups());
             let collider = self.colliders.insert_with_parent(collider, body, &mut self.bodies);
             self.supports.push((collider, name.clone()));
-            let finger = fingers.contains(&link);
-            self.links.push(RobotBody { body, collider, finger, link, pose: of_link.pose, at: pose, stands: false });
+            let finger_of = fingers.iter().position(|of_arm| of_arm.contains(&link));
+            self.links.push(RobotBody { body, collider, finger_of, link, pose: of_link.pose, at: pose, stands: false });
         }
     }
 

@@ -44,7 +44,7 @@ pub(super) fn at(text: &str, workplace: &Workplace) -> anyhow::Result<String> {
 
 /// What in the task follows from a workplace, as the task has it.
 fn parts(workplace: &Workplace) -> [String; 6] {
-    let Workplace { table, boxes, places } = workplace;
+    let Workplace { table, boxes, places, .. } = workplace;
     let top = number(table.top_m());
     let mut lines = String::new();
     for (index, [x, y, z]) in places.at.iter().enumerate() {

@@ -62,7 +62,7 @@ pub(super) fn versions(key: &FactKey, oldest: Revision, versions: &[FactVersion]
         [
             version.revision.0.to_string(),
             fact.map_or_else(|| "(gone)".to_owned(), |fact| said(&fact.value)),
-            fact.and_then(|fact| fact.writer.as_deref()).unwrap_or("-").to_owned(),
+            version.writer.as_deref().unwrap_or("-").to_owned(),
             if version.commit.is_empty() { "-".to_owned() } else { version.commit.clone() },
         ]
     });
@@ -75,7 +75,7 @@ pub(super) fn versions_json(oldest: Revision, versions: &[FactVersion]) -> serde
         .iter()
         .map(|version| {
             let fact = version.fact.as_ref().map(dump::fact);
-            json!({ "revision": version.revision.0, "commit": version.commit, "fact": fact })
+            json!({ "revision": version.revision.0, "commit": version.commit, "writer": version.writer, "fact": fact })
         })
         .collect();
     json!({ "oldest": oldest.0, "versions": versions })
@@ -84,9 +84,7 @@ pub(super) fn versions_json(oldest: Revision, versions: &[FactVersion]) -> serde
 /// A revision, and below what it wrote.
 pub(super) fn change(change: &WorldChange) -> String {
     let commit = if change.commit.is_empty() { "too old" } else { &change.commit };
-    // One commit has one writer, which its facts name.
-    let writer = change.written.iter().find_map(|fact| fact.writer.as_deref());
-    let by = writer.map_or_else(String::new, |writer| format!(" by {writer}"));
+    let by = change.writer.as_deref().map_or_else(String::new, |writer| format!(" by {writer}"));
     let mut lines = vec![format!("revision {}{by} ({commit})", change.revision.0)];
     lines.extend(change.written.iter().map(|fact| format!("  {} = {}", task_text::key(&fact.key), said(&fact.value))));
     lines.extend(change.gone.iter().map(|key| format!("  {} is gone", task_text::key(key))));
@@ -103,7 +101,13 @@ pub(super) fn update_json(update: &WorldUpdate) -> serde_json::Value {
                 .iter()
                 .map(|key| json!({ "predicate": key.predicate, "arguments": key.arguments }))
                 .collect();
-            json!({ "revision": change.revision.0, "commit": change.commit, "written": written, "gone": gone })
+            json!({
+                "revision": change.revision.0,
+                "commit": change.commit,
+                "writer": change.writer,
+                "written": written,
+                "gone": gone,
+            })
         }
     }
 }
@@ -221,12 +225,22 @@ mod tests {
         FACT       BEFORE  AFTER               WRITER
         full(box)  -       pose(0.5, 0, 1.25)  fill[2]
         ");
-        let gone = FactVersion { revision: Revision(9), commit: String::new(), fact: None };
-        let was = FactVersion { revision: Revision(3), commit: "run/i1".to_owned(), fact: Some(fact("box", 1)) };
+        let gone = FactVersion {
+            revision: Revision(9),
+            commit: "run/i4".to_owned(),
+            fact: None,
+            writer: Some("empty[4]".into()),
+        };
+        let was = FactVersion {
+            revision: Revision(3),
+            commit: "run/i1".to_owned(),
+            fact: Some(fact("box", 1)),
+            writer: Some("fill[2]".into()),
+        };
         assert_snapshot!(versions(&key, Revision(2), &[gone, was]), @r"
-        REVISION  VALUE   WRITER   COMMIT
-        9         (gone)  -        -
-        3         1       fill[2]  run/i1
+        REVISION  VALUE   WRITER    COMMIT
+        9         (gone)  empty[4]  run/i4
+        3         1       fill[2]   run/i1
         kept since revision 2
         ");
     }
@@ -234,15 +248,33 @@ mod tests {
     #[test]
     fn a_revision_says_which_state_made_it_and_values_as_a_task_file_does() {
         let written = vec![FactRecord { value: Value::Pose(Pose::at(0.5, 0.0, 1.25)), ..fact("box", 1) }];
-        let made = WorldChange { revision: Revision(3), commit: "run/i1".to_owned(), written, gone: Vec::new() };
+        let made = WorldChange {
+            revision: Revision(3),
+            commit: "run/i1".to_owned(),
+            written,
+            gone: Vec::new(),
+            writer: Some("fill[2]".into()),
+        };
         assert_snapshot!(change(&made), @r"
         revision 3 by fill[2] (run/i1)
           full(box) = pose(0.5, 0, 1.25)
         ");
         let gone = vec![FactKey { predicate: "full".to_owned(), arguments: vec![Term::Name("box 2".to_owned())] }];
-        let made = WorldChange { revision: Revision(4), commit: String::new(), written: Vec::new(), gone };
+        let made = WorldChange {
+            revision: Revision(4),
+            commit: "run/i2".to_owned(),
+            written: Vec::new(),
+            gone: gone.clone(),
+            writer: Some("empty[3]".into()),
+        };
         assert_snapshot!(change(&made), @r#"
-        revision 4 (too old)
+        revision 4 by empty[3] (run/i2)
+          full("box 2") is gone
+        "#);
+        let made =
+            WorldChange { revision: Revision(5), commit: String::new(), written: Vec::new(), gone, writer: None };
+        assert_snapshot!(change(&made), @r#"
+        revision 5 (too old)
           full("box 2") is gone
         "#);
     }

@@ -293,6 +293,35 @@ fn a_commit_says_which_projections_it_contradicts_in_which_fact() {
     assert!(pool.take_contradictions().iter().all(|found| found.projection == late), "the other has ended");
 }
 
+#[test]
+fn a_projection_made_late_knows_that_a_deletion_predicted_of_its_writer_came_true() {
+    let mut pool = WorldPool::new(WorldPoolConfig::default(), None, History::new(&WorldPoolConfig::default()), 0);
+    commit(&mut pool, "a", &[set("box", 1)], None).unwrap();
+    let gone = Change::Delete { pattern: FactPattern::of(&key("box")) };
+    let by_node = Commit {
+        id: "b".to_owned(),
+        changes: vec![gone.clone()],
+        writer: Some("take[1]".to_owned()),
+        ..Commit::default()
+    };
+    pool.commit(Timestamp(0), &by_node).unwrap();
+    let late = ProjectRequest {
+        by: operator(),
+        request_id: "late".to_owned(),
+        base: Revision(1),
+        changes: vec![gone],
+        writers: vec!["take[1]".into()],
+        reads: Footprint::Everything,
+        held_by: HeldBy::Until(Timestamp(9)),
+    };
+    let late = pool.project(late).unwrap();
+    assert_eq!(pool.contradiction(late), Ok(None), "it came as predicted");
+    // What comes true does not come again: that the box is there once more is a difference.
+    commit(&mut pool, "c", &[set("box", 1)], None).unwrap();
+    let found: Vec<_> = pool.take_contradictions().into_iter().map(|found| (found.projection, found.is)).collect();
+    assert_eq!(found, [(late, Some(Value::Int(1)))]);
+}
+
 /// A projection that nothing but time ends.
 fn project_as(pool: &mut WorldPool, by: &Caller, request: &str) -> Result<ProjectionId, ProjectError> {
     pool.project(ProjectRequest {

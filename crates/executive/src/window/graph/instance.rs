@@ -9,7 +9,7 @@ use crate::window::dispatch::DispatchCell;
 use crate::window::growth::environment::{Environment, Producer};
 use crate::window::memory::{MemoryCell, Seen};
 use crate::window::waits::WaitCell;
-use ratn_model::fact::FactKey;
+use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::{InstanceId, ProjectionId, StateId};
 use ratn_model::measurement::Evidence;
 use ratn_model::program::{ABORTED, SUCCESS};
@@ -175,6 +175,8 @@ pub(crate) enum Changed {
     /// Exactly this: a routine on a projection (or nothing: a routine in the actual world has made its changes already,
     /// and what was never executed has none).
     Exactly(Made),
+    /// Nothing: it waited. What it was taken to change, as the root shows it.
+    Foreseen(Vec<Change>),
 }
 
 /// One continuation.

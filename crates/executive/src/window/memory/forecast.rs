@@ -295,6 +295,7 @@ impl<'a> Sight<'a> {
         };
         match &ended.changes {
             Changed::Exactly(made) => Declared::Exactly(&made.changes),
+            Changed::Foreseen(changes) => Declared::Exactly(changes),
             Changed::Declared(measured, _) => match &own.effects[self.outcome_of(writer, ended, outcome)] {
                 Effects::Unknown => Declared::Effects(&[], measured),
                 Effects::Declared(effects) => Declared::Effects(effects, measured),

@@ -1,0 +1,165 @@
+//! The arms of the cell's robot: each has joints of its own, a gripper or none, and holds what is between its own fingers.
+//!
+//! An arm has a number: 0 is the arm of the description's `[arm]`, the others follow in the order of `[[other_arm]]`. Everything that is
+//! specific to one arm is computed with the robot *seen from* that arm ([`Robot::with_arm`]). A robot with one arm has the number 0 alone.
+
+use super::grasping::Pads;
+use super::holding::Held;
+use super::placement::PlacementError;
+use crate::config::CellConfig;
+use ratn_model::pose::Pose;
+use ratn_motion::robot::{ArmPosition, Configuration, Robot};
+use ratn_motion::workplace::HOME;
+
+/// The number of the arm that is meant where none is named.
+pub const FIRST: usize = 0;
+
+/// The arms of one robot.
+#[derive(Debug, Clone)]
+pub(super) struct Arms(Vec<Arm>);
+
+#[derive(Debug, Clone)]
+struct Arm {
+    name: String,
+    /// The robot seen from this arm.
+    view: Robot,
+    /// The gripper's pads; `None` of an arm without a gripper.
+    pads: Option<Pads>,
+    /// How far each finger is from the middle when the gripper is open, in metres.
+    open_finger_m: f64,
+    held: Option<Held>,
+}
+
+impl Arms {
+    /// The arms of a robot that can stand in a cell; `pads` are those of the first one.
+    ///
+    /// # Errors
+    /// [`PlacementError`] where an arm cannot be in a cell.
+    pub(super) fn of(robot: &Robot, pads: Pads, config: &CellConfig) -> Result<Arms, PlacementError> {
+        let mut arms = Vec::new();
+        for (number, name) in robot.arm_names().enumerate() {
+            let unfit =
+                |reason| PlacementError::UnfitArm { arm: name.to_owned(), robot: robot.name().to_owned(), reason };
+            let named = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
+            if number > FIRST && (name.is_empty() || !name.chars().all(named)) {
+                return Err(unfit("its name becomes part of a resource's id: use letters, digits, `_`, `-` and `.`"));
+            }
+            // A name that the robot has itself told is one of its arms.
+            let view = if number == FIRST {
+                robot.clone()
+            } else {
+                robot.with_arm(name).map_err(|_| unfit("it is not read"))?
+            };
+            let pads = if number == FIRST { Some(pads) } else { Pads::of(&view) };
+            if pads.is_none() && view.finger().is_some() {
+                return Err(unfit("the finger of its gripper is no box in the URDF that lies along the tool's axes"));
+            }
+            let most = view.open_finger_m();
+            let open_finger_m = config.gripper.opening_m.map_or(most, |opening_m| match number {
+                FIRST => opening_m / 2.0,
+                _ => most.min(opening_m / 2.0),
+            });
+            arms.push(Arm { name: name.to_owned(), view, pads, open_finger_m, held: None });
+        }
+        Ok(Arms(arms))
+    }
+
+    /// How many there are.
+    pub(super) fn count(&self) -> usize {
+        self.0.len()
+    }
+
+    /// The numbers of all arms.
+    pub(super) fn numbers(&self) -> std::ops::Range<usize> {
+        0..self.0.len()
+    }
+
+    /// The name of an arm.
+    pub(super) fn name(&self, arm: usize) -> &str {
+        &self.0[arm].name
+    }
+
+    /// The robot seen from an arm.
+    pub(super) fn view(&self, arm: usize) -> &Robot {
+        &self.0[arm].view
+    }
+
+    /// The pads of an arm's gripper; `None` where it has no gripper.
+    pub(super) fn pads(&self, arm: usize) -> Option<&Pads> {
+        self.0[arm].pads.as_ref()
+    }
+
+    /// How far each finger of an arm is from the middle when its gripper is open, in metres.
+    pub(super) fn open_finger_m(&self, arm: usize) -> f64 {
+        self.0[arm].open_finger_m
+    }
+
+    /// What an arm holds.
+    pub(super) fn held(&self, arm: usize) -> Option<Held> {
+        self.0[arm].held
+    }
+
+    /// What every arm holds, in the order of their numbers.
+    pub(super) fn all_held(&self) -> Vec<Option<usize>> {
+        self.0.iter().map(|arm| arm.held.map(|held| held.object)).collect()
+    }
+
+    /// An arm holds something from now on, or nothing; what it held before.
+    pub(super) fn hold(&mut self, arm: usize, held: Option<Held>) -> Option<Held> {
+        std::mem::replace(&mut self.0[arm].held, held)
+    }
+
+    /// What arms hold, to be changed.
+    pub(super) fn held_mut(&mut self) -> impl Iterator<Item = &mut Held> {
+        self.0.iter_mut().filter_map(|arm| arm.held.as_mut())
+    }
+
+    /// The arm that holds an object, and how.
+    pub(super) fn holder_of(&self, object: usize) -> Option<(usize, Held)> {
+        let mut held = self.0.iter().enumerate().filter_map(|(number, arm)| Some((number, arm.held?)));
+        held.find(|(_, held)| held.object == object)
+    }
+
+    /// Whether something is held that may still slip.
+    pub(super) fn holds_unsteadily(&self) -> bool {
+        self.0.iter().any(|arm| arm.held.is_some_and(|held| !held.is_steady()))
+    }
+
+    /// The tools of all arms in the world frame, of the robot as seen from the first arm.
+    pub(super) fn tools(&self, configuration: &Configuration) -> Vec<Pose> {
+        let poses = self.0[FIRST].view.poses(configuration);
+        self.0.iter().map(|arm| poses[arm.view.tool]).collect()
+    }
+
+    /// The configuration of the robot seen from an arm.
+    pub(super) fn seen_from(&self, arm: usize, configuration: &Configuration) -> Configuration {
+        self.0[FIRST].view.seen_from(arm, configuration)
+    }
+
+    /// Every arm in its posture `home` (else where the robot has it) with open fingers.
+    pub(super) fn first_posture(&self) -> Configuration {
+        let robot = &self.0[FIRST].view;
+        let mut first = robot.with_all_arms(&robot.at_zero());
+        for (number, arm) in self.0.iter().enumerate() {
+            first.set_finger(number, arm.open_finger_m);
+            if let Some(home) = arm.view.posture(HOME) {
+                first.set_joints(number, home);
+            }
+        }
+        first
+    }
+
+    /// The same configuration with open fingers of all arms but one: as much room as those may come to take.
+    pub(super) fn with_others_open(&self, arm: usize, configuration: &Configuration) -> Configuration {
+        let mut opened = *configuration;
+        for other in self.numbers().filter(|other| *other != arm) {
+            opened.set_finger(other, self.0[other].open_finger_m);
+        }
+        opened
+    }
+
+    /// The positions of the arms from number 1 on.
+    pub(super) fn others(&self, configuration: &Configuration) -> Vec<ArmPosition> {
+        configuration.others.iter().flatten().copied().collect()
+    }
+}

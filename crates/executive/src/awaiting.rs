@@ -1,0 +1,131 @@
+//! What a wait under way waits for, and how it ends. Both modes ask here; when they look is theirs.
+
+use crate::binding::{BindError, Outputs};
+use crate::protocol::Awaited;
+use crate::signals::Signals;
+use ratn_model::expression::{EffectExpr, EvaluateError, Expr, Scope};
+use ratn_model::fact::{Change, FactPattern};
+use ratn_model::program::{SUCCESS, State};
+use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
+use ratn_model::wait::{ANSWER, TIMEOUT, VALUE, Wait};
+use ratn_world::world::World;
+use std::time::Duration;
+
+/// How a wait has ended.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct WaitEnd {
+    pub(crate) outcome: String,
+    pub(crate) outputs: Outputs,
+}
+
+/// What a wait waits for that begins now, and until when at most.
+pub(crate) fn begins(
+    state: &State,
+    now: Timestamp,
+    scope: &dyn Scope,
+) -> Result<(Awaited, Option<Timestamp>), BindError> {
+    let seconds = |port: &str, expression: &Expr| {
+        let value = expression.evaluate(scope).and_then(|value| {
+            let number = value.as_number().filter(|seconds| seconds.is_finite());
+            number.ok_or_else(|| EvaluateError::Wrong {
+                expression: expression.to_string(),
+                problem: format!("expected a number of seconds, found {value}"),
+            })
+        });
+        value.map_err(BindError::at(format_args!("`{port}`"), state))
+    };
+    let timeout = state.annotations.timeout_s.map(|seconds| now + duration(seconds));
+    Ok(match state.wait() {
+        None => (Awaited::Time, Some(now)),
+        Some(Wait::Seconds(after)) => (Awaited::Time, Some(now + duration(seconds("seconds", after)?))),
+        Some(Wait::Until(at)) => {
+            let at = Timestamp(0) + duration(seconds("until", at)?);
+            (Awaited::Time, Some(at.max(now)))
+        }
+        Some(Wait::Condition(condition)) => (Awaited::Condition { condition: condition.to_string() }, timeout),
+        Some(Wait::Signal(name)) => (Awaited::Signal { signal: name.to_owned() }, timeout),
+        Some(Wait::Answer(question)) => {
+            let text = question.text.evaluate(scope).map_err(BindError::at("`question`", state))?;
+            let text = match text {
+                Value::String(text) => text,
+                other => other.to_string(),
+            };
+            let choices = question.choices.iter().map(|choice| (*choice).to_owned()).collect();
+            let default = question.default.map(str::to_owned);
+            (Awaited::Answer { question: text, choices, default }, timeout)
+        }
+    })
+}
+
+/// Whether the condition of a wait holds; one that waits for something else waits on.
+pub(crate) fn holds(state: &State, scope: &dyn Scope) -> Result<bool, BindError> {
+    match state.wait() {
+        Some(Wait::Condition(condition)) => condition.holds(scope).map_err(BindError::at("`for`", state)),
+        _ => Ok(false),
+    }
+}
+
+/// How a wait for a condition ends that holds.
+pub(crate) fn has_come() -> WaitEnd {
+    success(Outputs::new())
+}
+
+/// How a wait ends for which a signal was kept, which it takes.
+pub(crate) fn takes(state: &State, signals: &mut Signals) -> Option<WaitEnd> {
+    match state.wait() {
+        Some(Wait::Signal(name)) => Some(success([(VALUE.to_owned(), signals.take(name)?)].into())),
+        _ => None,
+    }
+}
+
+/// How a wait ends whose time is up.
+pub(crate) fn is_up(state: &State) -> WaitEnd {
+    let late = |outputs| WaitEnd { outcome: TIMEOUT.to_owned(), outputs };
+    match state.wait() {
+        None | Some(Wait::Seconds(_) | Wait::Until(_)) => success(Outputs::new()),
+        Some(Wait::Condition(_)) => late(Outputs::new()),
+        Some(Wait::Signal(_)) => late([(VALUE.to_owned(), Value::Null)].into()),
+        Some(Wait::Answer(question)) => match question.default {
+            Some(choice) => chosen(state, choice),
+            None => late([(ANSWER.to_owned(), Value::Null)].into()),
+        },
+    }
+}
+
+/// How a question ends that was answered so; `None` where that is no choice of it.
+pub(crate) fn answered(state: &State, choice: &str) -> Option<WaitEnd> {
+    match state.wait() {
+        Some(Wait::Answer(question)) if question.choices.contains(&choice) => Some(chosen(state, choice)),
+        _ => None,
+    }
+}
+
+/// A choice is an outcome where the state has it.
+fn chosen(state: &State, choice: &str) -> WaitEnd {
+    let is_outcome = state.outcomes.iter().any(|outcome| outcome == choice);
+    let outcome = if is_outcome { choice } else { SUCCESS };
+    WaitEnd { outcome: outcome.to_owned(), outputs: [(ANSWER.to_owned(), Value::String(choice.to_owned()))].into() }
+}
+
+fn success(outputs: Outputs) -> WaitEnd {
+    WaitEnd { outcome: SUCCESS.to_owned(), outputs }
+}
+
+/// What a wait that has ended so was taken to change, as the root shows it now. Nothing of it is made by the wait.
+pub(crate) fn as_it_is(foreseen: Option<&Vec<EffectExpr>>, scope: &dyn Scope, root: &World) -> Vec<Change> {
+    let bound = foreseen.and_then(|effects| EffectExpr::bind(effects, scope).ok()).unwrap_or_default();
+    let now = |pattern: FactPattern| {
+        let known = root.matching(&pattern).next().map(|(fact, known)| (fact.clone(), known.value.clone()));
+        match known {
+            Some((fact, value)) => Change::Set { fact, value },
+            None => Change::Delete { pattern },
+        }
+    };
+    bound.iter().map(Change::pattern).map(now).collect()
+}
+
+/// A span of the robot's time; what is below nothing is none.
+fn duration(seconds: f64) -> Duration {
+    Duration::try_from_secs_f64(seconds.max(0.0)).unwrap_or(Duration::MAX)
+}

@@ -1,0 +1,110 @@
+//! A state that waits: it begins as an action does, and no provider gets a goal. Where the world may have changed or a signal may have
+//! come, every wait under way is looked at.
+
+use super::node::GoalEnd;
+use super::{Interpreter, Phase, Progress};
+use crate::awaiting::{self, WaitEnd};
+use crate::context::Context;
+use crate::protocol::{Awaited, Command, Note};
+use ratn_model::id::StateId;
+
+impl Interpreter {
+    /// Goes on until everything waits: what one thread has changed may be what another one waits for.
+    pub(super) fn go_on_with(&mut self, context: &mut Context<'_>) -> Progress {
+        loop {
+            let progress = self.advance(context);
+            if progress != Progress::Busy || !self.look_at_waits(context) {
+                return progress;
+            }
+        }
+    }
+
+    pub(super) fn begin_waiting(&mut self, context: &mut Context<'_>, thread: u64) {
+        let program = context.program;
+        let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
+        let (instance, attempt, id) = (current.instance, current.attempt, current.state);
+        let state = program.state(id);
+        let now = context.now;
+        let begins = self.with_scope(context, thread, None, |scope| awaiting::begins(state, now, scope));
+        let (awaited, until) = match begins {
+            Ok(begins) => begins,
+            Err(error) => return self.end_node(context, thread, error.reason()),
+        };
+        if self.routine_of(thread).is_none() && self.is_pia(context, thread) {
+            self.hold.has_begun();
+        }
+        if let Some(current) = self.current(thread) {
+            current.phase = Phase::Running;
+            current.timeout = until;
+        }
+        context.note(Note::Running { instance, attempt });
+        // What is over at once is no action: a loop of such waits goes in circles.
+        if self.ends_waiting(context, thread, id) {
+            return;
+        }
+        if awaited == Awaited::Time && until.is_some_and(|until| until <= now) {
+            return self.has_waited(context, thread, awaiting::is_up(state));
+        }
+        self.has_begun_something(thread);
+        context.commands.extend(until.map(|at| Command::Wake { at }));
+        if !state.is_between_tries() {
+            context.note(Note::Awaiting { instance, awaited, until });
+        }
+    }
+
+    /// Looks at every wait under way; whether one was over.
+    fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
+        let waits = |(thread, current): (u64, &super::Current)| {
+            let is_wait = current.phase == Phase::Running && context.program.state(current.state).is_pause();
+            is_wait.then_some((thread, current.state))
+        };
+        let under_way = self.threads.iter().filter_map(|(id, thread)| Some((*id, thread.current.as_ref()?)));
+        let waiting: Vec<(u64, StateId)> = under_way.filter_map(waits).collect();
+        let mut any = false;
+        for (thread, state) in waiting {
+            any |= self.ends_waiting(context, thread, state);
+        }
+        any
+    }
+
+    /// Ends a wait if what it waits for is there; whether it did.
+    fn ends_waiting(&mut self, context: &mut Context<'_>, thread: u64, id: StateId) -> bool {
+        let state = context.program.state(id);
+        if let Some(end) = awaiting::takes(state, context.signals) {
+            self.has_waited(context, thread, end);
+            return true;
+        }
+        match self.with_scope(context, thread, None, |scope| awaiting::holds(state, scope)) {
+            Ok(false) => return false,
+            Ok(true) => self.has_waited(context, thread, awaiting::has_come()),
+            Err(error) => self.end_node(context, thread, error.reason()),
+        }
+        true
+    }
+
+    /// Its time is up.
+    pub(super) fn waited_long_enough(&mut self, context: &mut Context<'_>, thread: u64) {
+        let Some(id) = self.current(thread).map(|current| current.state) else { return };
+        // What was waited for may have come at this very moment.
+        if !self.ends_waiting(context, thread, id) {
+            self.has_waited(context, thread, awaiting::is_up(context.program.state(id)));
+        }
+    }
+
+    /// An operator has answered.
+    pub(super) fn answered(&mut self, context: &mut Context<'_>, thread: u64, choice: &str) {
+        if self.phase(thread) != Some(Phase::Running) {
+            return;
+        }
+        let Some(id) = self.current(thread).map(|current| current.state) else { return };
+        if let Some(end) = awaiting::answered(context.program.state(id), choice) {
+            self.has_waited(context, thread, end);
+        }
+    }
+
+    fn has_waited(&mut self, context: &mut Context<'_>, thread: u64, end: WaitEnd) {
+        let (measured, evidence) = Default::default();
+        let WaitEnd { outcome, outputs } = end;
+        self.finish(context, thread, GoalEnd { outcome, outputs, measured, evidence, reason: String::new() });
+    }
+}

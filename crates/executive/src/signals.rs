@@ -1,0 +1,69 @@
+//! Signals that were sent to the run and that no wait has taken yet.
+//!
+//! Each signal ends one wait, the oldest signal of a name first. One that comes before its wait is kept for it. Only a wait at its
+//! place in the program takes one: nothing speculative does, so none is lost with a branch that is not taken.
+
+use ratn_model::value::Value;
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, VecDeque};
+
+/// More signals than this are not kept for waits to come.
+pub const MOST_SIGNALS_KEPT: usize = 1024;
+
+/// What was sent, by name.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Signals {
+    kept: BTreeMap<String, VecDeque<Value>>,
+}
+
+impl Signals {
+    /// A signal has come. Where too many are kept it is dropped: task control refuses those before they are events.
+    pub(crate) fn came(&mut self, name: String, value: Value) {
+        if self.count() < MOST_SIGNALS_KEPT {
+            self.kept.entry(name).or_default().push_back(value);
+        }
+    }
+
+    /// A wait takes the oldest of a name.
+    pub(crate) fn take(&mut self, name: &str) -> Option<Value> {
+        let of_name = self.kept.get_mut(name)?;
+        let value = of_name.pop_front();
+        if of_name.is_empty() {
+            self.kept.remove(name);
+        }
+        value
+    }
+
+    /// How many are kept.
+    pub(crate) fn count(&self) -> usize {
+        self.kept.values().map(VecDeque::len).sum()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_signal_ends_one_wait_and_the_oldest_of_a_name_comes_first() {
+        let mut signals = Signals::default();
+        for (name, value) in [("go", 1), ("stop", 2), ("go", 3)] {
+            signals.came(name.to_owned(), Value::Int(value));
+        }
+        assert_eq!(signals.count(), 3);
+        assert_eq!(signals.take("go"), Some(Value::Int(1)));
+        assert_eq!(signals.take("go"), Some(Value::Int(3)));
+        assert_eq!(signals.take("go"), None);
+        assert_eq!(signals.take("stop"), Some(Value::Int(2)));
+        assert_eq!(signals, Signals::default());
+    }
+
+    #[test]
+    fn no_more_are_kept_than_the_bound_says() {
+        let mut signals = Signals::default();
+        for number in 0..2 * MOST_SIGNALS_KEPT as i64 {
+            signals.came("go".to_owned(), Value::Int(number));
+        }
+        assert_eq!(signals.count(), MOST_SIGNALS_KEPT);
+    }
+}

@@ -1,0 +1,135 @@
+//! States that wait: they begin as PIAs do, at the head of their line, and no provider gets a goal. Where the root has changed or a
+//! signal has come, every wait under way is looked at, those inside of routines too.
+//!
+//! While a wait for a condition is under way, younger instances see the facts that the condition says outright; when it ends, what the
+//! root shows takes their place. A wait never begins beside an imprecise PIA, and none is let pass: so no signal is taken on a path
+//! that is left.
+
+use super::Window;
+use super::graph::instance::{Changed, Ended, Instance, Status};
+use super::ready::{Readiness, not_bound};
+use super::waits::Timer;
+use crate::awaiting::{self, WaitEnd};
+use crate::context::Context;
+use crate::protocol::{Awaited, Command, Event, Note};
+use ratn_model::id::InstanceId;
+
+impl Window {
+    /// A wait has its place: it begins, unless it is over.
+    pub(super) fn begin_waiting(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.graph.get(id) else { return };
+        let Some(attempt) = instance.node().map(|node| node.attempt) else { return };
+        let state = context.program.state(instance.state);
+        let now = context.now;
+        let begins = self.look(context, id, None, |_, view| {
+            awaiting::begins(state, now, view).map_err(|error| not_bound(view, &error))
+        });
+        let (awaited, until) = match begins {
+            Some(Ok(begins)) => begins,
+            Some(Err(Readiness::Waits(wait))) => return self.step_back(context, id, wait),
+            Some(Err(Readiness::Failed(reason))) => return self.finish(context, id, Ended::aborted(reason)),
+            Some(Err(Readiness::Ready(..))) | None => return,
+        };
+        context.note(Note::Running { instance: id, attempt });
+        // What is over at once is no action: a loop of such waits goes in circles.
+        if self.ends_waiting(context, id) {
+            return;
+        }
+        if awaited == Awaited::Time && until.is_some_and(|until| until <= now) {
+            return self.has_waited(context, id, awaiting::is_up(state));
+        }
+        self.graph.run(id);
+        if let Some(until) = until {
+            self.waits.set_timer_at(until, Timer::Timeout(id, attempt));
+            context.commands.push(Command::Wake { at: until });
+        }
+        if !state.is_between_tries() {
+            context.note(Note::Awaiting { instance: id, awaited, until });
+        }
+    }
+
+    /// Looks at every wait under way, if what they wait for may have come; whether one was over.
+    pub(super) fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
+        if !std::mem::take(&mut self.may_end_waits) {
+            return false;
+        }
+        let mut active: Vec<InstanceId> = self.dispatch.active().collect();
+        active.sort_unstable();
+        let mut any = false;
+        for id in active {
+            let Some(instance) = self.graph.get(id) else { continue };
+            match instance.node().map(|node| &node.status) {
+                Some(Status::Running(_)) if context.program.state(instance.state).is_pause() => {
+                    any |= self.ends_waiting(context, id);
+                }
+                Some(Status::RunningRoutine(..)) if context.plan.state(instance.state).waits => {
+                    let before = context.commands.len();
+                    self.tell_routine(context, id, Event::Woken);
+                    any |= context.commands.len() > before;
+                }
+                _ => {}
+            }
+            if self.end.is_some() {
+                break;
+            }
+        }
+        any
+    }
+
+    /// Ends a wait if what it waits for is there; whether it did.
+    fn ends_waiting(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
+        let Some(state) = self.graph.get(id).map(|instance| context.program.state(instance.state)) else {
+            return false;
+        };
+        if let Some(end) = awaiting::takes(state, context.signals) {
+            self.has_waited(context, id, end);
+            return true;
+        }
+        let holds = self
+            .look(context, id, None, |_, view| awaiting::holds(state, view).map_err(|error| not_bound(view, &error)));
+        match holds {
+            Some(Ok(true)) => self.has_waited(context, id, awaiting::has_come()),
+            Some(Err(Readiness::Failed(reason))) => self.finish(context, id, Ended::aborted(reason)),
+            // What is not known yet will be.
+            Some(Ok(false) | Err(_)) | None => return false,
+        }
+        true
+    }
+
+    /// Its time is up.
+    pub(super) fn waited_long_enough(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        // What was waited for may have come at this very moment.
+        if !self.ends_waiting(context, id)
+            && let Some(state) = self.graph.get(id).map(|instance| context.program.state(instance.state))
+        {
+            self.has_waited(context, id, awaiting::is_up(state));
+        }
+    }
+
+    /// An operator has answered.
+    pub(super) fn answer(&mut self, context: &mut Context<'_>, id: InstanceId, choice: String) {
+        let waiting = self
+            .graph
+            .get(id)
+            .filter(|instance| instance.node().is_some_and(|node| matches!(node.status, Status::Running(_))));
+        match waiting.map(|instance| context.program.state(instance.state)) {
+            Some(state) => {
+                if let Some(end) = awaiting::answered(state, &choice) {
+                    self.has_waited(context, id, end);
+                }
+            }
+            None => self.in_routine(context, Event::Answered { instance: id, choice }),
+        }
+    }
+
+    fn has_waited(&mut self, context: &mut Context<'_>, id: InstanceId, end: WaitEnd) {
+        let WaitEnd { outcome, outputs } = end;
+        let as_it_is = self.look(context, id, None, |instance: &Instance, view| {
+            let foreseen = context.program.state(instance.state).annotations.effects.get(&outcome);
+            awaiting::as_it_is(foreseen, view, context.root)
+        });
+        let changes = Changed::Foreseen(as_it_is.unwrap_or_default());
+        let ended = Ended { changes, ..Ended::with(outcome, outputs) };
+        self.finish(context, id, ended);
+    }
+}

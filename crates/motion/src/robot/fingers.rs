@@ -1,0 +1,65 @@
+//! The shapes of a finger as they stand in the tool's frame where the fingers meet: how thick a finger is, and where its pad is.
+//!
+//! Nothing is assumed of how hand, finger and tool are mounted on each other: the description says that fingers close along the tool's y
+//! axis, and where the shapes are follows from the URDF.
+
+use super::{Geometry, Robot, to_f32};
+use ratn_model::pose::Pose;
+
+/// How far the faces of a box may be turned out of the tool's axes, as a part of a unit vector: rounding.
+const ALIGNED: f64 = 1e-6;
+
+/// One shape of a finger, as a cuboid along the axes of the tool's frame that holds it, in metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FingerPart {
+    /// The cuboid's middle, with the fingers where they meet.
+    pub middle: [f64; 3],
+    /// Half of its edges.
+    pub half: [f64; 3],
+    /// It is a box whose faces lie along the tool's axes: the cuboid is the shape itself.
+    pub is_flat: bool,
+}
+
+impl Robot {
+    /// The shapes of the finger that the description names; none of a robot without a gripper.
+    pub fn finger_parts(&self) -> Vec<FingerPart> {
+        let (Some(finger), Some(joint)) = (self.finger_link(), self.finger.as_ref()) else { return Vec::new() };
+        let mut positions = self.neutral.clone();
+        positions[joint.indices[0]] = 0.0;
+        let (in_root, tool) = self.in_shared_link(finger, &positions);
+        let in_tool = tool.inverse().compose(&in_root);
+        let bodies = &self.model.links[finger].bodies;
+        bodies.iter().map(|body| part(&in_tool.compose(&body.pose), &body.geometry)).collect()
+    }
+
+    /// A link and the tool in the frame of the last link that carries both: whatever is before that one does not matter, nor does its
+    /// rounding.
+    fn in_shared_link(&self, link: usize, positions: &[f64]) -> (Pose, Pose) {
+        let links = &self.model.links;
+        let above = |link: usize| std::iter::successors(Some(link), |index| links[*index].parent).collect::<Vec<_>>();
+        let (of_link, of_tool) = (above(link), above(self.tool));
+        let shared = of_link.iter().copied().find(|index| of_tool.contains(index));
+        let seen = |way: &[usize]| {
+            let way = way.iter().take_while(|index| Some(**index) != shared);
+            let way: Vec<usize> = way.copied().collect();
+            way.iter().rev().map(|index| links[*index].in_parent(positions)).reduce(|a, b| a.compose(&b))
+        };
+        (seen(&of_link).unwrap_or(Pose::IDENTITY), seen(&of_tool).unwrap_or(Pose::IDENTITY))
+    }
+}
+
+fn part(pose: &Pose, geometry: &Geometry) -> FingerPart {
+    let Geometry::Box { half } = geometry else {
+        let around = geometry.shape(0.0).compute_aabb(&to_f32(pose));
+        let numbers = |of: [f32; 3]| of.map(f64::from);
+        let (middle, half) = (numbers(around.center().to_array()), numbers(around.half_extents().to_array()));
+        return FingerPart { middle, half, is_flat: false };
+    };
+    let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| pose.rotate(axis));
+    let is_flat = axes.iter().flatten().all(|c| c.abs() < ALIGNED || c.abs() > 1.0 - ALIGNED);
+    let along = |i: usize| {
+        let part = |k: usize| if is_flat { axes[k][i].abs().round() } else { axes[k][i].abs() };
+        (0..3).map(|k| part(k) * half[k]).sum()
+    };
+    FingerPart { middle: pose.position, half: std::array::from_fn(along), is_flat }
+}

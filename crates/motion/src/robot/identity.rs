@@ -1,0 +1,83 @@
+//! Whether two robots are the same one: by name, and by a digest of all that moves and collides.
+
+use super::{Geometry, Part, Robot};
+use ratn_model::pose::Pose;
+use ratn_world::digest::Digester;
+use serde::{Deserialize, Serialize};
+use std::fmt;
+
+/// How many characters of a digest are shown to people.
+const SHOWN: usize = 12;
+
+/// Which robot something is of: a snapshot or a recording of a cell.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RobotIdentity {
+    /// The robot's name in its description.
+    pub name: String,
+    /// A digest of links, shapes, joints with their limits, and of which joints are arms, grippers, base and head.
+    pub digest: String,
+}
+
+impl fmt::Display for RobotIdentity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let shown: String = self.digest.chars().take(SHOWN).collect();
+        write!(f, "`{}` (digest {shown})", self.name)
+    }
+}
+
+impl Robot {
+    /// Which robot this is. The same description with the same URDF gives the same identity on every machine.
+    pub fn identity(&self) -> RobotIdentity {
+        let mut digester = Digester::default();
+        let number = |digester: &mut Digester, x: f64| digester.number(x.to_bits());
+        let count = |digester: &mut Digester, n: usize| digester.number(n as u64);
+        count(&mut digester, self.model.joints.len());
+        for joint in &self.model.joints {
+            digester.text(&joint.name);
+            let limits = [joint.lower, joint.upper, joint.velocity, joint.acceleration, joint.jerk];
+            limits.into_iter().for_each(|limit| number(&mut digester, limit));
+        }
+        count(&mut digester, self.model.links.len());
+        for link in &self.model.links {
+            digester.text(&link.name);
+            // What is not there has a number of its own.
+            count(&mut digester, link.parent.map_or(usize::MAX, |parent| parent));
+            numbers_of(&link.origin).for_each(|x| number(&mut digester, x));
+            match link.drive {
+                None => count(&mut digester, usize::MAX),
+                Some(drive) => {
+                    count(&mut digester, drive.joint);
+                    drive.axis.into_iter().chain([drive.factor]).for_each(|x| number(&mut digester, x));
+                    digester.number(u64::from(drive.slides));
+                }
+            }
+            count(&mut digester, link.bodies.len());
+            for body in &link.bodies {
+                numbers_of(&body.pose).for_each(|x| number(&mut digester, x));
+                let (kind, sizes) = match body.geometry {
+                    Geometry::Box { half } => (0, half),
+                    Geometry::Cylinder { radius, half_length } => (1, [radius, half_length, 0.0]),
+                    Geometry::Capsule { radius, half_length } => (2, [radius, half_length, 0.0]),
+                    Geometry::Sphere { radius } => (3, [radius, 0.0, 0.0]),
+                };
+                digester.number(kind);
+                sizes.into_iter().for_each(|x| number(&mut digester, x));
+            }
+        }
+        count(&mut digester, self.tool);
+        count(&mut digester, self.camera.unwrap_or(usize::MAX));
+        let parts = [Some(&self.arm), self.base.as_ref(), self.head.as_ref(), self.finger.as_ref()];
+        let of_others = self.other_arms.iter().flat_map(|arm| arm.parts());
+        for part in parts.into_iter().chain(of_others) {
+            let indices: &[usize] = part.map_or(&[], |part: &Part| &part.indices);
+            count(&mut digester, indices.len());
+            indices.iter().for_each(|index| count(&mut digester, *index));
+        }
+        RobotIdentity { name: self.name().to_owned(), digest: digester.finish().to_string() }
+    }
+}
+
+fn numbers_of(pose: &Pose) -> impl Iterator<Item = f64> {
+    pose.position.into_iter().chain(pose.quaternion_xyzw)
+}

@@ -1,0 +1,64 @@
+//! What a depth camera saw, as an obstacle of one motion.
+//!
+//! A camera sees the robot and the objects of the scene, too. These are known already, by better shapes than balls about points, so the
+//! points at them are left out. What is left is nothing that anybody knows: the motion keeps away from it.
+
+use crate::cloud::{Cloud, CloudError};
+use crate::frame::compose;
+use crate::robot::{Body, Configuration, Geometry, Robot, to_f32};
+use parry3d::math::Vector;
+use ratn_world::scene::{Placement, Scene};
+use std::sync::Arc;
+
+/// How near a point is to a known shape that it is taken to be of it, in metres: what depth cameras err by, where nobody says otherwise.
+pub const KNOWN_WITHIN_M: f64 = 0.02;
+
+/// Balls about the points that a depth camera saw.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Seen {
+    /// In the world frame.
+    pub cloud: Arc<Cloud>,
+    /// Points so near to the robot in its start posture, or to an object of the scene, are of these, in metres.
+    pub known_within_m: f64,
+}
+
+impl Seen {
+    /// What is left of it beside the robot and the scene, in the world frame.
+    ///
+    /// # Errors
+    /// None that the cloud does not have already.
+    pub(crate) fn unknown(&self, robot: &Robot, scene: &Scene, here: &Configuration) -> Result<Cloud, CloudError> {
+        let poses = robot.poses(here);
+        let on_robot = |body: &Body, link: usize| Body { pose: compose(&poses[link], &body.pose), ..*body };
+        let links = robot.model.links.iter().enumerate();
+        let own = links.flat_map(|(link, of)| of.bodies.iter().map(move |body| (link, body)));
+        let mut known: Vec<Body> = own.map(|(link, body)| on_robot(body, link)).collect();
+        known.extend(scene.objects.iter().map(|object| {
+            let geometry = Geometry::from(&object.shape);
+            match &object.placement {
+                Placement::World(pose) => geometry.at(*pose),
+                Placement::Gripper(pose) => on_robot(&geometry.at(*pose), robot.tool),
+            }
+        }));
+        let mut is_known = vec![false; self.cloud.points().len()];
+        for body in &known {
+            near(&self.cloud, body, self.known_within_m, &mut is_known);
+        }
+        let points = self.cloud.points().iter().zip(&is_known).filter(|(_, is_known)| !**is_known);
+        let points: Vec<[f32; 3]> = points.map(|(point, _)| *point).collect();
+        Cloud::new(&self.cloud.name, &points, self.cloud.radius_m())
+    }
+}
+
+/// Marks the points that come within so many metres of a body.
+fn near(cloud: &Cloud, body: &Body, within_m: f64, marks: &mut [bool]) {
+    let (shape, pose, within) = (body.geometry.shape(0.0), to_f32(&body.pose), within_m as f32);
+    let around = shape.compute_aabb(&pose);
+    let (least, greatest) = (around.mins - Vector::splat(within), around.maxs + Vector::splat(within));
+    cloud.visit(least.into(), greatest.into(), &mut |point, [x, y, z]| {
+        let at = pose.inverse_transform_point(Vector::new(x, y, z));
+        // Of a point inside the solid shape it is the point itself.
+        marks[point] |= (shape.project_local_point(at, true).point - at).length() <= within;
+        true
+    });
+}

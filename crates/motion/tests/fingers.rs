@@ -1,0 +1,113 @@
+//! Where the pads of fingers are, and how thick fingers are, follows from the URDF, however hand, finger and tool are mounted; and a
+//! configuration says where several arms with their fingers are.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_motion::description::RobotDescription;
+use ratn_motion::joint_vector::JointVector;
+use ratn_motion::robot::{ArmPosition, Configuration, Robot, UNSAID};
+
+/// A hand whose fingers slide along the hand's x axis; the tool is turned so that they close along its y. A finger is a bracket and a pad.
+fn urdf(arms: &[&str]) -> String {
+    let mut urdf = "<robot name='r'><link name='stand'/>".to_owned();
+    for (i, arm) in arms.iter().enumerate() {
+        let boxed = |xyz: &str, size: &str| {
+            format!("<collision><origin xyz='{xyz}'/><geometry><box size='{size}'/></geometry></collision>")
+        };
+        urdf += &format!(
+            "<link name='{arm}_hand'/><joint name='{arm}_turn' type='revolute'><origin xyz='0 {i} 1' rpy='0.3 0.2 0.1'/><parent link='stand'/>\
+             <child link='{arm}_hand'/><axis xyz='0 0 1'/><limit lower='-1' upper='2' velocity='1' effort='1'/></joint>\
+             <link name='{arm}_tool'/><joint name='{arm}_fixed' type='fixed'><origin xyz='0 0 0.2' rpy='0 0 -1.5707963267948966'/>\
+             <parent link='{arm}_hand'/><child link='{arm}_tool'/></joint>\
+             <link name='{arm}_a'>{}{}</link><joint name='{arm}_finger' type='prismatic'><origin xyz='0.01 0 0.1'/><parent link='{arm}_hand'/>\
+             <child link='{arm}_a'/><axis xyz='1 0 0'/><limit lower='0' upper='0.04' velocity='1' effort='1'/></joint>\
+             <link name='{arm}_b'/><joint name='{arm}_other' type='prismatic'><parent link='{arm}_hand'/><child link='{arm}_b'/>\
+             <axis xyz='-1 0 0'/><limit lower='0' upper='0.04' velocity='1' effort='1'/><mimic joint='{arm}_finger'/></joint>",
+            boxed("0.03 0 0", "0.05 0.02 0.02"),
+            boxed("-0.004 0.005 0.1", "0.012 0.03 0.06"),
+        );
+    }
+    urdf + "</robot>"
+}
+
+fn robot(arms: &[&str]) -> Robot {
+    let mut text = "name = 'r'\nurdf = 'r'\n".to_owned();
+    for (i, arm) in arms.iter().enumerate() {
+        let gripper = if i == 0 { "[gripper]" } else { "[other_arm.gripper]" };
+        text += if i == 0 { "[arm]\n" } else { "[[other_arm]]\n" };
+        text += &format!("name = '{arm}'\njoints = ['{arm}_turn']\ntool = '{arm}_tool'\n");
+        text += &format!("{gripper}\njoint = '{arm}_finger'\nhand = '{arm}_hand'\nfinger = '{arm}_a'\n");
+    }
+    let read = RobotDescription::read(&text).unwrap();
+    Robot::of(read, &urdf(arms), None, &mut |_| unreachable!("it has no meshes")).unwrap()
+}
+
+#[test]
+fn the_shapes_of_a_finger_are_told_along_the_axes_of_the_tool() {
+    let parts = robot(&["one"]).finger_parts();
+    let near = |a: [f64; 3], b: [f64; 3]| (0..3).all(|i| (a[i] - b[i]).abs() < 1e-9);
+    let [bracket, pad] = parts[..] else { panic!("{parts:?}") };
+    assert!(bracket.is_flat && pad.is_flat);
+    // The tool's y is the hand's x, its x the hand's -y.
+    assert!(near(pad.half, [0.015, 0.006, 0.03]), "{pad:?}");
+    assert!(near(pad.middle, [-0.005, 0.006, 0.0]), "where the fingers meet the pad's face is in the middle: {pad:?}");
+    assert!(near(bracket.half, [0.01, 0.025, 0.01]), "{bracket:?}");
+}
+
+#[test]
+fn the_fingers_of_the_built_in_robots_are_as_thick_as_their_urdf_says() {
+    for (name, half) in
+        [("aimm", [0.0125, 0.007, 0.035]), ("panda", [0.01, 0.007, 0.027]), ("ur5", [0.0125, 0.007, 0.035])]
+    {
+        let parts = Robot::built_in(name).unwrap().finger_parts();
+        assert!(parts.len() == 1 && parts[0].is_flat && parts[0].half == half, "{name}: {parts:?}");
+        assert!((parts[0].middle[1] - 0.007).abs() < 1e-12, "{name}: {parts:?}");
+    }
+}
+
+#[test]
+fn a_configuration_says_where_every_arm_is_and_is_seen_from_each_of_them() {
+    let robot = robot(&["one", "two", "three"]);
+    assert_eq!(robot.arm_names().collect::<Vec<_>>(), ["one", "two", "three"]);
+    let at = |q: f64, finger: f64| Some(ArmPosition { joints: JointVector::of([q]), finger });
+    let others = [at(0.2, 0.02), at(0.3, 0.03), None];
+    let here = Configuration { arm: JointVector::of([0.1]), finger: 0.01, others, ..robot.at_zero() };
+    let two = robot.with_arm("two").unwrap();
+    let seen = robot.seen_from(1, &here);
+    assert_eq!((seen.arm, seen.finger), (JointVector::of([0.2]), 0.02));
+    assert_eq!(seen.others, [at(0.1, 0.01), at(0.3, 0.03), None]);
+    assert_eq!(two.poses(&seen), robot.poses(&here), "the same robot stands there");
+
+    let values = here.values();
+    assert_eq!(values.len(), 7 + 2 + 2);
+    assert_eq!(robot.configuration(&values), Some(here));
+    assert_eq!(robot.configuration(&values[..7]), Some(Configuration { others: UNSAID, ..here }));
+    assert_eq!(robot.configuration(&values[..8]), None);
+
+    // Not said, another arm is where the robot has it, its fingers open.
+    let all = robot.with_all_arms(&robot.at_zero());
+    assert_eq!(all.others, [at(0.0, 0.04), at(0.0, 0.04), None]);
+    assert_eq!(robot.poses(&all), robot.poses(&robot.at_zero()));
+    assert_eq!(robot.finger_links_of(2).len(), 2);
+    assert_eq!((robot.joints_of(1)[0].name.as_str(), robot.joints_of(3).len()), ("two_turn", 0));
+}
+
+#[test]
+fn a_robot_is_the_same_by_what_moves_and_collides_and_its_parts_not_by_its_file() {
+    let one = Robot::aimm().identity();
+    assert_eq!(one, Robot::aimm().identity());
+    assert_ne!(one, Robot::built_in("ur5").unwrap().identity());
+    assert_ne!(robot(&["one", "two"]).identity(), robot(&["one"]).identity());
+    let two = robot(&["one", "two"]);
+    assert_ne!(two.with_arm("two").unwrap().identity(), two.identity(), "another arm is the first");
+}
+
+#[test]
+fn five_arms_are_too_many() {
+    let text =
+        ["a", "b", "c", "d", "e"].map(|arm| format!("name = '{arm}'\njoints = ['{arm}_turn']\ntool = '{arm}_tool'\n"));
+    let text = format!("name = 'r'\nurdf = 'r'\n[arm]\n{}", text.join("[[other_arm]]\n"));
+    let read = RobotDescription::read(&text).unwrap();
+    let made = Robot::of(read, &urdf(&["a", "b", "c", "d", "e"]), None, &mut |_| unreachable!("it has no meshes"));
+    assert_eq!(made.unwrap_err().to_string(), "5 arms: at most 4 are supported");
+}

@@ -1,0 +1,409 @@
+"""Expressions of a task as Python objects: values that are known only while the task runs.
+
+A ``Value`` is written down, never computed: ``look.boxes[0].size.x + 0.1`` is the text of an expression of task files, with the states in it
+named as they are seen from the place where the text is used. Whatever Python would have to know now (a truth, a length, the elements) is
+refused with the line of the user's file and with what to write instead.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import linecache
+import math
+import os
+import re
+import sys
+import types
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NoReturn
+
+from ratn import _ratn
+from ratn._ratn import Error, Joints, Pose
+
+_PACKAGE = os.path.dirname(os.path.abspath(__file__)) + os.sep
+_WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
+_KEYWORDS = {"or", "and", "not", "in", "exists", "true", "false", "null"}
+
+
+class Untraceable(Error):
+    """Python that is no task: it needs a value that is known only while the task runs. Names the line, and what to write instead."""
+
+
+def user_frame() -> types.FrameType:
+    """The frame of the user's code that is at work."""
+    frame: types.FrameType | None = sys._getframe(1)
+    while frame is not None and os.path.abspath(frame.f_code.co_filename).startswith(_PACKAGE):
+        frame = frame.f_back
+    if frame is None:
+        raise AssertionError("somebody called this")
+    return frame
+
+
+def user_line() -> tuple[str, int]:
+    frame = user_frame()
+    return frame.f_code.co_filename, frame.f_lineno
+
+
+_TREES: dict[str, tuple[int, ast.Module | None]] = {}
+
+
+def _tree(file: str) -> ast.Module | None:
+    """The source of a file, parsed, where there is one: also a cell of a notebook."""
+    linecache.checkcache(file)
+    lines = linecache.getlines(file)
+    text = "".join(lines)
+    known = _TREES.get(file)
+    if known is None or known[0] != hash(text):
+        try:
+            known = (hash(text), ast.parse(text) if lines else None)
+        except SyntaxError:
+            known = (hash(text), None)
+        _TREES[file] = known
+    return known[1]
+
+
+def statements_at_work(file: str, line: int) -> list[ast.AST]:
+    """What stands at a line, the innermost first."""
+    tree = _tree(file)
+    if tree is None:
+        return []
+    found: list[ast.AST] = [
+        node for node in ast.walk(tree)
+        if isinstance(node, (ast.stmt, ast.expr, ast.comprehension)) and _begins(node) <= line <= _ends(node)
+    ]
+    found.sort(key=lambda node: _ends(node) - _begins(node))
+    return found
+
+
+def _begins(node: ast.AST) -> int:
+    own = node.iter if isinstance(node, ast.comprehension) else node
+    return int(getattr(own, "lineno", 0))
+
+
+def _ends(node: ast.AST) -> int:
+    own = node.ifs[-1] if isinstance(node, ast.comprehension) and node.ifs else node.iter if isinstance(node, ast.comprehension) else node
+    return int(getattr(own, "end_lineno", 0) or 0)
+
+
+def refuse(what: str, instead: str, at: tuple[str, int] | None = None) -> NoReturn:
+    """Raises ``Untraceable`` for the user's line."""
+    file, line = at or user_line()
+    raise Untraceable(f"{file}:{line}: {what}: {instead}")
+
+
+def _truth_wanted() -> NoReturn:
+    """Something asks whether a value is true; what that is decides about what to write instead."""
+    file, line = user_line()
+    what, instead = "Python asks whether this is true, which is known only while the task runs", "write `with ratn.when(condition):`"
+    for node in statements_at_work(file, line):
+        if isinstance(node, ast.BoolOp):
+            word, sign = ("and", "&") if isinstance(node.op, ast.And) else ("or", "|")
+            what, instead = f"`{word}` needs to know now which side is true", f"write `(a) {sign} (b)`, with parentheses around both"
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+            what, instead = "`not` needs to know the value now", "write `~(a)`"
+        elif isinstance(node, ast.Compare) and len(node.ops) > 1:
+            what, instead = "`a < b < c` needs to know the first half now", "write `(a < b) & (b < c)`"
+        elif isinstance(node, ast.Compare) and isinstance(node.ops[0], (ast.In, ast.NotIn)):
+            what, instead = "`in` needs to know the elements now", "write `ratn.isin(a, b)`"
+        elif isinstance(node, ast.IfExp):
+            what, instead = "`a if condition else b` needs to know the condition now", "write `fn.if_(condition, a, b)`"
+        elif isinstance(node, (ast.If, ast.While)) and not node.test.lineno <= line <= (node.test.end_lineno or 0):
+            continue
+        elif isinstance(node, ast.If):
+            what = "a Python `if` on a value that is known only while the task runs"
+            instead = "write `with ratn.when(condition):`, and `with ratn.otherwise():` for the `else`"
+        elif isinstance(node, ast.While):
+            what, instead = "a Python `while` on a value that is known only while the task runs", "write `with ratn.while_(condition):`"
+        elif isinstance(node, ast.Assert):
+            what = "`assert` of a value that is known only while the task runs"
+            instead = "say `requires=[…]` at the state that needs it, or write `with ratn.when(condition):`"
+        elif isinstance(node, ast.comprehension):
+            what, instead = "the `if` of a comprehension needs to know the elements now", "write `fn.filter(list, lambda x: condition)`"
+        else:
+            continue
+        break
+    refuse(what, instead, (file, line))
+
+
+class Value:
+    """A value that is known only while the task runs: an expression. ``+ - * /``, comparisons, ``& | ~``, ``.field`` and ``[i]`` make others.
+
+    In an f-string it is its text: ``effects=[f"at({box.id}) = {box.pose}"]``.
+    """
+
+    __slots__ = ("_parts", "_is_atom")
+    _parts: tuple[object, ...]
+    _is_atom: bool
+
+    def __init__(self, *parts: object, is_atom: bool = True) -> None:
+        object.__setattr__(self, "_parts", parts)
+        object.__setattr__(self, "_is_atom", is_atom)
+
+    def __str__(self) -> str:
+        return "".join(part if isinstance(part, str) else str(part) for part in self._parts)
+
+    def __format__(self, form: str) -> str:
+        if form:
+            refuse(f"the format `{form}` needs to know the value now", "leave the format away: `{value}`")
+        return str(self)
+
+    def __repr__(self) -> str:
+        try:
+            return f"<Value {self}>"
+        except Untraceable:
+            return "<Value of a task that is not being traced>"
+
+    def __setattr__(self, name: str, value: object) -> None:
+        refuse(f"`{name}` of a value that is known only while the task runs cannot be set", "let an effect change the world, or `assign` a variable")
+
+    def __getattr__(self, name: str) -> Value:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return Value(within(self), f".{name}")
+
+    def __getitem__(self, index: object) -> Value:
+        if isinstance(index, slice):
+            if index.start in (None, 0) and index.step in (None, 1) and index.stop is not None:
+                return call("take", self, index.stop)
+            refuse("a slice", "write `fn.take(list, n)` for the first n")
+        if isinstance(index, str):
+            return Value(within(self), f".{index}")
+        return Value(within(self), "[", written(index), "]")
+
+    def _binary(self, sign: str, other: object, is_turned: bool = False) -> Value:
+        left, right = (other, self) if is_turned else (self, other)
+        return Value(within(left), f" {sign} ", within(right), is_atom=False)
+
+    def __add__(self, other: object) -> Value:
+        return self._binary("+", other)
+
+    def __radd__(self, other: object) -> Value:
+        return self._binary("+", other, True)
+
+    def __sub__(self, other: object) -> Value:
+        return self._binary("-", other)
+
+    def __rsub__(self, other: object) -> Value:
+        return self._binary("-", other, True)
+
+    def __mul__(self, other: object) -> Value:
+        return self._binary("*", other)
+
+    def __rmul__(self, other: object) -> Value:
+        return self._binary("*", other, True)
+
+    def __truediv__(self, other: object) -> Value:
+        return self._binary("/", other)
+
+    def __rtruediv__(self, other: object) -> Value:
+        return self._binary("/", other, True)
+
+    def __neg__(self) -> Value:
+        return Value("-", within(self), is_atom=False)
+
+    def __abs__(self) -> Value:
+        return call("abs", self)
+
+    def __matmul__(self, other: object) -> Value:
+        return call("compose", self, other)
+
+    def __rmatmul__(self, other: object) -> Value:
+        return call("compose", other, self)
+
+    def __eq__(self, other: object) -> Value:  # type: ignore[override]
+        return self._binary("=", other)
+
+    def __ne__(self, other: object) -> Value:  # type: ignore[override]
+        return self._binary("!=", other)
+
+    def __lt__(self, other: object) -> Value:
+        return self._binary("<", other)
+
+    def __le__(self, other: object) -> Value:
+        return self._binary("<=", other)
+
+    def __gt__(self, other: object) -> Value:
+        return self._binary(">", other)
+
+    def __ge__(self, other: object) -> Value:
+        return self._binary(">=", other)
+
+    def __and__(self, other: object) -> Value:
+        return self._binary("and", other)
+
+    def __rand__(self, other: object) -> Value:
+        return self._binary("and", other, True)
+
+    def __or__(self, other: object) -> Value:
+        return self._binary("or", other)
+
+    def __ror__(self, other: object) -> Value:
+        return self._binary("or", other, True)
+
+    def __invert__(self) -> Value:
+        return Value("not ", within(self), is_atom=False)
+
+    def __bool__(self) -> bool:
+        _truth_wanted()
+
+    def __hash__(self) -> int:
+        refuse("a key of a dict or an element of a set has to be known now", "use a list, or an expression with `fn`")
+
+    def __len__(self) -> int:
+        refuse("`len` needs to know the list now", "write `fn.len(list)`")
+
+    def __contains__(self, item: object) -> bool:
+        refuse("`in` needs to know the elements now", "write `ratn.isin(item, list)`")
+
+    def __iter__(self) -> Iterator[Value]:
+        file, line = user_line()
+        for node in statements_at_work(file, line):
+            if isinstance(node, ast.comprehension):
+                refuse("a comprehension needs to know the elements now", "write `fn.map(list, lambda x: value)` or `fn.filter(…)`")
+            if isinstance(node, ast.For):
+                break
+        refuse("a loop over a list that is known only while the task runs", "write `for x in ratn.each(list):`")
+
+    def __int__(self) -> int:
+        refuse("`int` needs to know the value now", "use the value as it is; `fn.floor(x)` rounds it down")
+
+    def __float__(self) -> float:
+        file, line = user_line()
+        for node in statements_at_work(file, line):
+            called = node.func if isinstance(node, ast.Call) else None
+            name = called.attr if isinstance(called, ast.Attribute) else called.id if isinstance(called, ast.Name) else ""
+            if name in ("Pose", "Joints"):
+                refuse(f"`{name}` needs to know the numbers now", f"write `fn.{name.lower()}(…)`", (file, line))
+        refuse("`float` needs to know the value now", "use the value as it is")
+
+    def __index__(self) -> int:
+        file, line = user_line()
+        for node in statements_at_work(file, line):
+            if isinstance(node, ast.For):
+                refuse("`range` needs to know the number now", "write `for i in ratn.each(fn.range(n)):`", (file, line))
+        refuse("the number is known only while the task runs", "write `fn.range(n)` for a range, `list[i]` of a value of the task")
+
+
+def within(part: object) -> object:
+    """An operand, in parentheses where it has to be."""
+    if isinstance(part, Value) and part._is_atom:
+        return part
+    if isinstance(part, Value):
+        return Value("(", part, ")")
+    text = written(part)
+    return Value("(", text, ")") if isinstance(text, str) and text.startswith("-") else text
+
+
+def written(value: object) -> object:
+    """A value of Python as a part of an expression."""
+    if isinstance(value, Value):
+        return value
+    if isinstance(value, str):
+        return value if _WORD.match(value) and value not in _KEYWORDS else json.dumps(value, ensure_ascii=False)
+    if isinstance(value, range) and value.step == 1:
+        return f"range({value.start}, {value.stop})" if value.start else f"range({value.stop})"
+    if isinstance(value, (list, tuple)):
+        return Value("[", *_joined(written(item) for item in value), "]")
+    if isinstance(value, dict):
+        pairs = (Value(f"{name}: ", written(item)) for name, item in value.items())
+        return Value("{", *_joined(pairs), "}")
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, Pose):
+        turned = _roll_pitch_yaw(value)
+        return f"pose({', '.join(_number(number) for number in (*value.position, *(turned if any(turned) else ())))})"
+    if isinstance(value, Joints):
+        return f"joints({', '.join(_number(number) for number in value)})"
+    if isinstance(value, (int, float)) and not hasattr(value, "tolist"):
+        if not math.isfinite(value):
+            refuse(f"{value} is no number of a task", "use finite numbers")
+        return repr(value)
+    if hasattr(value, "tolist"):
+        return written(value.tolist())
+    refuse(f"a {type(value).__name__} is no value of a task", "use numbers, texts, lists, dicts, ratn.Pose, ratn.Joints, or values of the task")
+
+
+def _number(number: float) -> str:
+    return str(int(number)) if number == int(number) and abs(number) < 1e15 else repr(number)
+
+
+def _roll_pitch_yaw(pose: Pose) -> tuple[float, float, float]:
+    """The rotation about the fixed axes x, y, z, radians."""
+    x, y, z, w = pose.quaternion
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    if abs(pitch) > math.pi / 2 - 1e-6:
+        # Only the difference of both others counts there.
+        roll, yaw = 0.0, -2 * math.copysign(1, pitch) * math.atan2(x, w)
+    return (round(roll, 15), round(pitch, 15), round(yaw, 15))
+
+
+def _joined(parts: Iterable[object]) -> list[object]:
+    joined: list[object] = []
+    for part in parts:
+        joined += [", ", part] if joined else [part]
+    return joined
+
+
+def call(function: str, *arguments: object) -> Value:
+    """A function of expressions applied to values."""
+    return Value(f"{function}(", *_joined(written(argument) for argument in arguments), ")")
+
+
+def expr(text: str) -> Value:
+    """An expression as task files have it: ``ratn.expr("grasp_pose($box)")``. An f-string may name values: ``ratn.expr(f"{box}.id")``."""
+    return Value(text, is_atom=bool(_WORD.match(text.lstrip("$"))))
+
+
+def fact(predicate: str, *arguments: object) -> Value:
+    """What the world says at the state's place: ``ratn.fact("at", "cup")`` is the pose; ``"?"`` stands for any argument."""
+    said = ("?" if isinstance(argument, str) and argument == "?" else written(argument) for argument in arguments)
+    return Value(f"{predicate}(", *_joined(said), ")")
+
+
+def exists(what: Value | str) -> Value:
+    """Whether a fact is there, whatever it says, ``ratn.exists(ratn.fact("in_gripper", "cup"))``; or a query with variables, as text."""
+    return Value("exists ", what if isinstance(what, Value) else f"({what})", is_atom=False)
+
+
+def isin(item: object, of: object) -> Value:
+    """``item in of``: an element of a list, or a name in a map."""
+    return Value(within(item), " in ", within(of), is_atom=False)
+
+
+_OF_ELEMENTS = {"map", "filter", "sort_by", "min_by", "max_by", "any", "all"}
+
+
+class Functions:
+    """The functions of expressions: ``fn.len(look.boxes)``, ``fn.compose(a, b)``, ``fn.filter(boxes, lambda b: b.size[0] > 0.1)``."""
+
+    def __getattr__(self, name: str) -> Callable[..., Value]:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        known = name.rstrip("_")
+        if known not in _functions():
+            near = ", ".join(sorted(_functions() | _OF_ELEMENTS))
+            raise AttributeError(f"there is no function `{name}` in expressions; there are {near}")
+        return lambda *arguments: _applied(known, arguments)
+
+    def __dir__(self) -> list[str]:
+        return sorted(name if name != "if" else "if_" for name in _functions())
+
+
+def _applied(name: str, arguments: tuple[object, ...]) -> Value:
+    if name not in _OF_ELEMENTS:
+        return call(name, *arguments)
+    if len(arguments) != 2 or not callable(arguments[1]):
+        raise TypeError(f"`fn.{name}` takes a list and a function of an element: `fn.{name}(list, lambda x: …)`")
+    function: Any = arguments[1]
+    variable = function.__code__.co_varnames[0]
+    return Value(f"{name}(${variable} in ", written(arguments[0]), ", ", written(function(Value(f"${variable}"))), ")")
+
+
+def _functions() -> set[str]:
+    return set(_ratn.functions()) | _OF_ELEMENTS
+
+
+fn = Functions()

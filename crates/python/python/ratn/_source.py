@@ -1,0 +1,182 @@
+"""Python of which a task file can be traced: each state as the call or block that makes it.
+
+Expressions stay in the words of task files (``ratn.expr("…")``): they mean the same there, and every name is seen as it was.
+"""
+
+from __future__ import annotations
+
+import keyword
+import re
+from typing import Any
+
+_INDENT = "    "
+_ACTION_KEYS = ("action", "in")
+_NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?\Z")
+_TASK_KEYS = ("description", "horizon", "speculation_width", "deadline", "exceptions", "ontology", "tolerance", "world", "outcomes", "variables")
+#: Keys whose values are expressions: what is text there is one.
+_EXPRESSIONS = ("variables", "assign", "outputs", "decide", "duration")
+
+
+def python_of(document: dict[str, Any]) -> str:
+    """The text of a module with the task as a function."""
+    source = _Source()
+    source.task(document)
+    head = ["from typing import Annotated", ""] if any("Annotated[" in line for line in source.lines) else []
+    return "\n".join([*head, "import ratn", "from ratn import expr", "", "", *source.lines, ""])
+
+
+def _expression(value: Any) -> str:
+    """What gives the same expression again."""
+    if isinstance(value, str):
+        return f"expr({value!r})"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{name!r}: {_expression(item)}" for name, item in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_expression, value)) + "]"
+    return repr(value)
+
+
+def _output(said: Any) -> str:
+    if not isinstance(said, dict) or "value" not in said:
+        return _expression(said)
+    more = {"type": repr, "default": _expression, "description": repr}
+    rest = "".join(f", {key}={show(said[key])}" for key, show in more.items() if key in said)
+    return f"ratn.output({_expression(said['value'])}{rest})"
+
+
+def _annotations(body: dict[str, Any], without: tuple[str, ...]) -> list[str]:
+    said = []
+    for key, value in body.items():
+        if key in without:
+            continue
+        if key == "outputs" and isinstance(value, dict):
+            said.append("outputs={" + ", ".join(f"{name!r}: {_output(item)}" for name, item in value.items()) + "}")
+        else:
+            said.append(f"{key}={_expression(value) if key in _EXPRESSIONS else repr(value)}")
+    return said
+
+
+class _Source:
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.depth = 0
+
+    def line(self, text: str) -> None:
+        self.lines.append(_INDENT * self.depth + text)
+
+    def inside(self, states: list[dict[str, Any]]) -> None:
+        self.depth += 1
+        for state in states or []:
+            self.state(state)
+        if not states:
+            self.line("pass")
+        self.depth -= 1
+
+    def task(self, document: dict[str, Any]) -> None:
+        name = str(document["task"])
+        function = name if name.isidentifier() and not keyword.iskeyword(name) else "task_" + re.sub(r"\W", "_", name)
+        said = [] if function == name else [f"name={name!r}"]
+        for key in _TASK_KEYS:
+            if key in document:
+                said.append(f"{key}={_expression(document[key]) if key == 'variables' else repr(document[key])}")
+        parameters = document.get("parameters") or {}
+        # A required parameter may stand behind one with a default.
+        shown = ", ".join(["*", *(_parameter(name, parameter) for name, parameter in parameters.items())]) if parameters else ""
+        self.line(f"@ratn.task({', '.join(said)})" if said else "@ratn.task")
+        self.line(f"def {function}({shown}):")
+        self.inside(document.get("states") or [])
+        outputs = document.get("outputs")
+        if outputs:
+            self.depth += 1
+            self.line("return {" + ", ".join(f"{name!r}: {_output(item)}" for name, item in outputs.items()) + "}")
+            self.depth -= 1
+
+    def state(self, item: dict[str, Any]) -> None:
+        name, body = None, item
+        if len(item) == 1:
+            ((key, value),) = item.items()
+            if isinstance(value, dict):
+                name, body = key, value
+        called = [] if name is None else [f"name={name!r}"]
+        retry = body.get("retry")
+        # A loop or a condition has what is done before another try in the words of task files.
+        if isinstance(retry, dict) and "before" in retry and ("action" in body or "states" in body):
+            self.retried(called, body, retry)
+        elif "action" in body:
+            inputs = "{" + ", ".join(f"{port!r}: {_expression(value)}" for port, value in (body.get("in") or {}).items()) + "}"
+            self.call("action", [repr(body["action"]), inputs, *called, *_annotations(body, _ACTION_KEYS)])
+        elif "library" in body:
+            given = "parameters={" + ", ".join(f"{name!r}: {_expression(value)}" for name, value in (body.get("with") or {}).items()) + "}"
+            self.call("library", [repr(body["library"]), given, *called, *_annotations(body, ("library", "with"))])
+        elif "for" in body:
+            variable, _, elements = str(body["for"]).partition(" in ")
+            index = [f"index={body['index']!r}"] if "index" in body else []
+            arguments = [repr(elements), f"variable={variable.strip()!r}", *index, *called, *_annotations(body, ("for", "index", "do"))]
+            self.line(f"for _ in ratn.each({', '.join(arguments)}):")
+            self.inside(body.get("do") or [])
+        elif "condition" in body:
+            self.block("when", [_test(body["condition"]), *called, *_annotations(body, ("condition", "then", "else"))], body.get("then"))
+            if "else" in body:
+                self.line("with ratn.otherwise():")
+                self.inside(body["else"])
+        elif "concurrency" in body:
+            arguments = [repr(body["concurrency"]), *called, *_annotations(body, ("concurrency", "regions"))]
+            self.block("concurrently", arguments, body.get("regions"))
+        else:
+            self.loop_or_sequence(called, body)
+
+    def loop_or_sequence(self, called: list[str], body: dict[str, Any]) -> None:
+        for key, function in (("while", "while_"), ("do_while", "do_while"), ("until", "until")):
+            if key in body:
+                index = [f"index={body['index']!r}"] if "index" in body else []
+                arguments = [_test(body[key]), *index, *called, *_annotations(body, (key, "index", "do"))]
+                return self.block(function, arguments, body.get("do"))
+        self.block("sequence", [*called, *_annotations(body, ("states",))], body.get("states"))
+
+    def retried(self, called: list[str], body: dict[str, Any], retry: dict[str, Any]) -> None:
+        """With something done before each try: of an action, the block is that action."""
+        times = [repr(retry["times"])] if "times" in retry else []
+        times += [f"{key}={value!r}" for key, value in retry.items() if key in ("on", "backoff")]
+        rest = {key: value for key, value in body.items() if key not in ("retry", "states")}
+        is_action = "action" in body
+        arguments = times if is_action else [*times, *called, *_annotations(rest, ())]
+        self.line(f"with ratn.retry({', '.join(arguments)}) as attempt:")
+        self.depth += 1
+        self.line("with attempt.before():")
+        self.inside(retry["before"])
+        if is_action:
+            name = called[0].partition("=")[2].strip("'") if called else None
+            self.state({name: rest} if name else rest)
+        else:
+            for state in body.get("states") or []:
+                self.state(state)
+        self.depth -= 1
+
+    def block(self, function: str, arguments: list[str], states: Any) -> None:
+        self.line(f"with ratn.{function}({', '.join(arguments)}):")
+        self.inside(states)
+
+    def call(self, function: str, arguments: list[str]) -> None:
+        text = f"ratn.{function}({', '.join(arguments)})"
+        if len(text) + len(_INDENT) * self.depth <= 120:
+            return self.line(text)
+        self.line(f"ratn.{function}(")
+        for argument in arguments:
+            self.line(f"{_INDENT}{argument},")
+        self.line(")")
+
+
+def _test(condition: Any) -> str:
+    return repr(condition)
+
+
+def _parameter(name: str, said: Any) -> str:
+    is_long = isinstance(said, dict) and ("type" in said or "default" in said)
+    if not is_long:
+        return f"{name}={_expression(said)}"
+    if "type" not in said:
+        return f"{name}={_expression(said['default'])}"
+    about = f", ratn.Doc({said['description']!r})" if "description" in said else ""
+    kind = f": Annotated[object, {said['type']!r}{about}]"
+    default = f" = {_expression(said['default'])}" if "default" in said else ""
+    return f"{name}{kind}{default}"

@@ -1,0 +1,155 @@
+"""Steps: functions of Python as states of a task. They run in a worker that lives as long as the run.
+
+A step is an action of a worker, made of its function as ``Worker.action`` makes one. ``python -m ratn._step FILE`` is that worker: it runs the file in
+which the steps stand (with another ``__name__`` than ``__main__``) and serves them.
+"""
+
+from __future__ import annotations
+
+import inspect
+import os
+import pathlib
+import runpy
+import sys
+import typing
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from ratn import _expression, _ports, _task, _worker
+from ratn._ratn import Error, Goal
+
+#: The steps of this process, by file.
+_STEPS: dict[str, list[Step]] = {}
+#: The file that a worker is reading its steps from.
+_being_read: str | None = None
+
+
+def refuse_while_read(what: str) -> None:
+    """A program that would start itself again and again ends here."""
+    if _being_read is not None:
+        raise Error(
+            f"{_being_read} is being read by the worker of its steps, and {what}: write what the program does below `if __name__ == \"__main__\":`"
+        )
+
+
+class Step:
+    """A function as a state. In a task a call adds the state; elsewhere it calls the function, without a goal if it takes none."""
+
+    def __init__(self, function: Callable[..., Any], name: str | None, said: dict[str, Any]) -> None:
+        self.function, self.said = function, said
+        self.name = name or function.__name__
+        self.file = os.path.abspath(function.__code__.co_filename)
+        stem = "".join(letter if letter.isalnum() else "_" for letter in pathlib.Path(self.file).stem).lower().strip("_")
+        #: What tasks call the worker, and the kind of resource that it is.
+        self.provider = f"{stem or 'steps'}_steps"
+        self.kind = "".join(part.capitalize() for part in self.provider.split("_"))
+        parameters = list(inspect.signature(function).parameters)
+        hints = typing.get_type_hints(function, include_extras=True)
+        self.takes_goal = bool(parameters) and (hints.get(parameters[0]) is Goal or parameters[0] == "goal")
+        # Refused here and now, with the line of the function.
+        _STEPS.setdefault(self.file, []).append(self)
+        self.action = self._known_to(_worker.Worker(self.provider, kind=self.kind))
+
+    def _known_to(self, worker: _worker.Worker) -> _ports.Action:
+        function = self.function
+        if not self.takes_goal:
+            function = _without_goal(function)
+        worker.action(function, name=self.name, **self.said)
+        return worker._actions[self.name]
+
+    def __call__(self, *positional: Any, **given: Any) -> Any:
+        trace = _task._tracing.get()
+        if trace is None:
+            return self.function(*positional, **given)
+        if not os.path.exists(self.file):
+            _expression.refuse(f"the step `{self.name}` stands in no file", "its worker runs the file: write it into a module and import it")
+        if positional:
+            raise TypeError(f"the step `{self.name}` takes its inputs by name: `{self.name}(port=value)`")
+        trace.steps[f"{self.provider}/{self.name}"] = self
+        ports = {port for port, *_ in self.action.inputs}
+        name = given.pop("name", None) if "name" not in ports else None
+        inputs = {key: given.pop(key) for key in list(given) if key in ports}
+        for key in given:
+            if key not in _task.ANNOTATIONS:
+                raise TypeError(f"the step `{self.name}` has no input `{key}`; it has {', '.join(sorted(ports)) or 'none'}")
+        # What it says of itself holds for the state, unless the state says otherwise.
+        said = {"computes": self.action.computes or None, "reads": self.action.reads if self.action.computes else self.action.reads or None}
+        said |= {key: getattr(self.action, key) or None for key in ("senses", "requires", "effects")}
+        return _task.perform(f"{self.provider}/{self.name}", inputs, {**said, **given}, name=name, kind=self.kind)
+
+    def catalogue(self) -> str:
+        """What it offers, as a catalogue has it."""
+        table = f"[providers.{self.provider}.actions.{self.name}]"
+        required = {port: kind for port, kind, is_required, _ in self.action.inputs if is_required}
+        optional = {port: kind for port, kind, is_required, _ in self.action.inputs if not is_required}
+        ports = {"inputs": required, "optional": optional, "outputs": dict(self.action.outputs)}
+        lines = [f"[resources.{self.kind}]", 'class = "process"', "count = 64", "", f"[providers.{self.provider}]", f'resource = "{self.kind}"', "", table]
+        for key, kinds in ports.items():
+            lines.append(f"{key} = {{ " + ", ".join(f'{port} = "{kind}"' for port, kind in kinds.items()) + " }")
+        lines.append("outcomes = [" + ", ".join(f'"{outcome}"' for outcome in self.action.outcomes) + "]")
+        return "\n".join([*lines, ""])
+
+
+def _without_goal(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same with a goal in front, as an action has it."""
+    signature = inspect.signature(function)
+    goal = inspect.Parameter("goal", inspect.Parameter.POSITIONAL_ONLY, annotation=Goal)
+    if "goal" in signature.parameters:
+        raise TypeError(f"{_ports.where(function)}: `goal` is the first parameter, or none")
+
+    def called(goal: Goal, /, **given: Any) -> Any:
+        return function(**given)
+
+    called.__wrapped__ = function  # type: ignore[attr-defined]
+    called.__signature__ = signature.replace(parameters=[goal, *signature.parameters.values()])  # type: ignore[attr-defined]
+    called.__annotations__ = {"goal": Goal, **function.__annotations__}
+    called.__name__, called.__doc__ = function.__name__, function.__doc__
+    called.__code__ = called.__code__.replace(co_filename=function.__code__.co_filename, co_firstlineno=function.__code__.co_firstlineno)
+    return called
+
+
+def step(
+    function: Callable[..., Any] | None = None,
+    *,
+    name: str | None = None,
+    outputs: dict[str, Any] | None = None,
+    outcomes: Iterable[str] = (),
+    computes: bool | None = None,
+    reads: Iterable[str] = (),
+    senses: Iterable[str] = (),
+    requires: Iterable[str] = (),
+    effects: Iterable[str] = (),
+) -> Any:
+    """Makes a function a step: in a task, its call is a state that a worker of the run performs.
+
+    It is as ``Worker.action``, but for the goal, which it may do without. Its file is run by the worker: what shall happen only in the
+    program that starts the run stands below ``if __name__ == "__main__":``.
+    """
+    said = {"outputs": outputs, "outcomes": outcomes, "computes": computes, "reads": reads, "senses": senses, "requires": requires, "effects": effects}
+    return (lambda function: Step(function, name, said)) if function is None else Step(function, name, said)
+
+
+def serve(file: str, arguments: list[str]) -> None:
+    """Serves the steps of a file."""
+    path = os.path.abspath(file)
+    sys.path.insert(0, os.path.dirname(path))
+    global _being_read
+    _being_read = path
+    try:
+        runpy.run_path(path, run_name="__ratn_steps__")
+    finally:
+        _being_read = None
+    steps = _STEPS.get(path, [])
+    if not steps:
+        raise SystemExit(f"{file} has no steps: decorate a function with `@ratn.step`")
+    worker = _worker.Worker(steps[0].provider, kind=steps[0].kind)
+    for one in steps:
+        one._known_to(worker)
+    worker.run(arguments)
+
+
+if __name__ == "__main__":
+    # The package's own module, not this one that is called `__main__`.
+    from ratn import _step
+
+    _step.serve(sys.argv[1], sys.argv[2:])

@@ -1,0 +1,79 @@
+"""Stubs of the actions of a catalogue: what editors complete, and what type checkers refuse."""
+
+from __future__ import annotations
+
+import json
+import keyword
+from typing import Any
+
+from ratn import _ratn
+from ratn._task import Annotations
+
+_HEAD = '''"""Stubs of the actions of {what}, written by `python -m ratn stubs`."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from typing_extensions import Unpack
+
+import ratn
+from ratn import Annotations, Value
+
+'''
+_KINDS = {
+    "any": "object",
+    "bool": "bool | Value",
+    "int": "int | Value",
+    "float": "float | Value",
+    "string": "str | Value",
+    "bytes": "bytes | Value",
+    "pose": "ratn.Pose | Value",
+    "joints": "ratn.Joints | Sequence[float] | Value",
+    "trajectory": "ratn.Trajectory | Value",
+}
+
+
+def _python(kind: str) -> str:
+    if kind in _KINDS:
+        return _KINDS[kind]
+    if kind.startswith("list<"):
+        return "Sequence[Any] | Value"
+    return "Mapping[str, Any] | Value"
+
+
+def stubs(catalogue: str | None, what: str) -> str:
+    """The text of a ``.pyi`` with a class for each provider."""
+    providers: dict[str, Any] = json.loads(_ratn.catalogue([] if catalogue is None else [catalogue]))["providers"]
+    parts = [_HEAD.format(what=what)]
+    for name, provider in sorted(providers.items()):
+        parts.append(_provider(name, provider))
+    return "".join(parts).rstrip() + "\n"
+
+
+def _provider(name: str, provider: dict[str, Any]) -> str:
+    states, methods = [], []
+    for action, signature in sorted(provider["actions"].items()):
+        state = "".join(part.capitalize() for part in f"{name}_{action}".split("_"))
+        outputs = [port for port in sorted(signature.get("outputs", {})) if _is_name(port)]
+        states.append(f"class _{state}(ratn.State):\n" + ("".join(f"    {port}: Value\n" for port in outputs) or "    ...\n"))
+        ports = [(port, kind, "") for port, kind in sorted(signature.get("inputs", {}).items())]
+        ports += [(port, kind, " = ...") for port, kind in sorted(signature.get("optional", {}).items())]
+        given = "".join(f"        {port}: {_python(kind)}{default},\n" for port, kind, default in ports if _is_port(port))
+        star = "        *,\n" if given else ""
+        methods.append(f"    def {action}(\n        self,\n{star}{given}        **annotations: Unpack[Annotations],\n    ) -> _{state}:{_document(signature)}\n")
+    title = "".join(part.capitalize() for part in name.split("_"))
+    return "".join(f"{state}\n" for state in states) + f"class _{title}:\n{''.join(methods)}\n{name}: _{title}\n\n"
+
+
+def _document(signature: dict[str, Any]) -> str:
+    text = str(signature.get("description", "")).replace("\\", "\\\\").replace('"""', "'''")
+    return f'\n        """{text}"""\n' if text else " ..."
+
+
+def _is_name(port: str) -> bool:
+    return port.isidentifier() and not keyword.iskeyword(port)
+
+
+def _is_port(port: str) -> bool:
+    # One with the name of an annotation is given by `inputs={…}`.
+    return _is_name(port) and port not in Annotations.__annotations__

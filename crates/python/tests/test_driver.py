@@ -1,0 +1,99 @@
+"""A driver in Python: hold, emergency stop, standstill."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+import ratn
+from conftest import PYTHON, TESTS, Place, program, template
+
+CONFIG = 'catalogues = ["built-in"]\n[process-manager]\nhost = "compute"\n'
+TASK = (
+    "task: moves\noutputs:\n  steps: { type: any, value: it.steps }\nstates:\n"
+    "  - it: { action: mover/move, in: { steps: STEPS }, pia: true, effects: ['moved(mover)'], resources: [Mover] }\n"
+)
+
+
+@pytest.fixture(scope="module")
+def mover() -> Iterator[Place]:
+    with tempfile.TemporaryDirectory(prefix="ratn-py-") as folder:
+        place = Place(pathlib.Path(folder))
+        shutil.copy(TESTS / "workers" / "mover.py", folder)
+        pool = template("mover", "Mover", python="mover.py", interpreter=PYTHON, min=1, max=1, standstill_ms=2000)
+        with place.up(place.write("system.toml", CONFIG + pool), "--speed", "1"):
+            yield place
+
+
+def until(what: Callable[[], bool], place: Place, within_s: float = 30) -> None:
+    end = time.monotonic() + within_s
+    while not what():
+        assert time.monotonic() < end, place.logs()
+        time.sleep(0.02)
+
+
+def begun(place: Place, steps: int, name: str) -> tuple[subprocess.Popen[str], pathlib.Path]:
+    """A run of which the driver has begun to move."""
+    log = place.folder / f"{name}.jsonl"
+    task = place.write(f"{name}.yaml", TASK.replace("STEPS", str(steps)))
+    command = [program(), "run", str(task), "--runtime-dir", str(place.runtime), "--log", str(log), "--json"]
+    run = subprocess.Popen(command, env=place.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    until(lambda: log.exists() and '"message":"moving"' in log.read_text(), place)
+    return run, log
+
+
+def safety(place: Place, *words: str) -> subprocess.CompletedProcess[str]:
+    return place.ratn(*words, "--runtime-dir", place.runtime)
+
+
+def test_a_hold_pauses_a_motion_which_then_goes_on(mover: Place) -> None:
+    run, log = begun(mover, 150, "held")
+    told = safety(mover, "hold")
+    assert told.returncode == 0, told.stderr
+    until(lambda: "brakes: held" in mover.logs(), mover)
+    steps = log.read_text().count('"message":"moving"')
+    time.sleep(0.4)
+    # One more may have been under way to the log.
+    assert log.read_text().count('"message":"moving"') <= steps + 2 and run.poll() is None
+    told = safety(mover, "go-on")
+    assert told.returncode == 0, told.stderr
+    said, errors = run.communicate(timeout=60)
+    assert json.loads(said)["outcome"] == "success", errors
+
+
+def test_an_emergency_stop_ends_the_goal_and_outlasts_the_driver(mover: Place) -> None:
+    run, _ = begun(mover, 3000, "stopped")
+    told = safety(mover, "stop")
+    assert told.returncode == 0, told.stderr
+    said, errors = run.communicate(timeout=60)
+    assert json.loads(said)["outcome"] != "success", errors
+    assert "brakes: stopped" in mover.logs()
+    assert (mover.folder / "stop.json").exists()
+    told = safety(mover, "stop", "--clear")
+    assert told.returncode == 0, told.stderr
+    assert not (mover.folder / "stop.json").exists()
+    ended = mover.run(mover.write("after.yaml", TASK.replace("STEPS", "2")))
+    assert ended["outcome"] == "success" and ended["outputs"]["steps"] == 2, ended
+
+
+def test_a_driver_without_brakes_or_without_leases_does_not_start() -> None:
+    driver = ratn.Driver("mover")
+    driver.action(lambda goal: {}, name="move", outputs={})
+    with pytest.raises(ValueError, match="has no brakes"):
+        driver.run([])
+    with pytest.raises(ValueError, match="only for whoever holds it"):
+        driver.run([], without_leases=True)
+
+
+def test_a_pool_without_a_bound_for_standstill_refuses_the_driver(place: Place) -> None:
+    shutil.copy(TESTS / "workers" / "mover.py", place.folder)
+    pool = template("mover", "Mover", python="mover.py", interpreter=PYTHON, min=1, max=1, crash_limit=1)
+    with pytest.raises(AssertionError, match="standstill_ms = 2000"):
+        with place.up(place.write("system.toml", CONFIG + pool), "--speed", "1"):
+            raise ValueError("it has started")
