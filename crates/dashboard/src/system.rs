@@ -8,7 +8,7 @@ use futures::future::join_all;
 use ratn_daemon::{process_manager, resource_manager};
 use ratn_model::program::WORLD_MODEL;
 use ratn_proto::types::{HostPools, PoolStatus, Resource, Scale, SessionStatus, WaitingAcquire, WorkerStatus};
-use ratn_task_control::control::{self, RunStatus, Word};
+use ratn_task_control::control::{self, Message, RunStatus, Word};
 use ratn_worker::client::{CallError, Channels, ProcessClient, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -67,6 +67,13 @@ impl System {
         // What it does now is asked at once.
         *self.run.lock().await = None;
         told
+    }
+
+    /// Sends its run what a state of it waits for; what became of that.
+    pub(crate) async fn send(&self, message: &Message) -> std::io::Result<String> {
+        let sent = control::send(&self.directory, message).await;
+        *self.run.lock().await = None;
+        sent
     }
 
     /// As the pages know it.

@@ -159,6 +159,8 @@ wire! {
         live: bool,
         /// The pages may tell it something.
         controllable: bool,
+        /// States that wait for somebody, or for something that they look at themselves; only of a run that goes on.
+        awaits: Vec<Awaits>,
         /// Whether the user has paused it.
         paused: bool,
         /// From each request for a pause to its end.
@@ -179,6 +181,20 @@ wire! {
         wasted: usize,
         /// How long those took.
         wasted_s: f64,
+    }
+
+    /// A state that waits by itself.
+    Awaits {
+        /// By path.
+        path: String,
+        /// `answer`, `signal`, or `other`: nobody has to do anything.
+        kind: &'static str,
+        /// The question, the name of the signal, or what it waits for.
+        text: String,
+        /// What may be answered.
+        choices: Vec<String>,
+        /// Until then at the most, in seconds.
+        until_s: Option<f64>,
     }
 
     /// A time.
