@@ -132,11 +132,13 @@ function visits(write, count) {
 async function control() {
   const directory = join(PLACE, "run");
   mkdirSync(directory);
-  const up = start("up", ["up", "--runtime-dir", directory, "--boxes", "2", "--speed", "4"]);
+  const up = start("up", ["up", "--runtime-dir", directory, "--boxes", "2", "--speed", "4", "--dashboard"]);
   await until("the system", () => {
     assert.equal(up.child.exitCode, null, up.said.error);
     return up.said.error.includes("is ready");
   });
+  const own = await until("the address of its own dashboard", () => up.said.error.match(/its dashboard is at (http:\S+)/)?.[1]);
+  assert.equal((await fetch(own)).status, 200);
   const shown = await dashboard(["--runtime-dir", directory, "--control"]);
   const page = await open(shown.url);
   await page.waitForFunction(() => document.querySelector(".summary")?.textContent.includes("No run is under way"));
@@ -225,6 +227,29 @@ async function control() {
   assert.equal(await page.locator("header .danger").count(), 0, "an ended run cannot be told anything");
   step("it is ended");
   await shot(page, "run-ended");
+
+  const asks = join(PLACE, "hand_over.yaml");
+  writeFileSync(
+    asks,
+    `task: hand_over
+states:
+  - lid: { wait: { signal: lid } }
+  - go_on: { ask: { question: "May the arm move <b>now</b>?", choices: [now, never] } }
+`,
+  );
+  const second = start("run", ["run", asks, "--runtime-dir", directory, "--log", join(PLACE, "asks.jsonl"), "--quiet"]);
+  await page.waitForFunction(() => document.querySelector(".questions")?.textContent.includes("waits for the signal lid"));
+  await page.click("text=Send it");
+  await page.click("dialog button[value=yes]");
+  await page.waitForFunction(() => document.querySelector(".questions")?.textContent.includes("May the arm move <b>now</b>?"));
+  await axe(page, "a question of a state");
+  await shot(page, "questions");
+  await page.click(".questions button:has-text('now')");
+  await page.click("dialog button[value=yes]");
+  assert.equal(await second.ended, 0);
+  await page.waitForFunction(() => document.querySelector(".summary .badge")?.textContent === "success");
+  assert.ok(readFileSync(join(PLACE, "asks.jsonl"), "utf8").includes('"choice":"now"'));
+  step("a run that begins is shown; its signal was sent and its question answered");
   assert.deepEqual(page.problems, []);
   await page.context().close();
   shown.child.kill("SIGTERM");

@@ -120,9 +120,9 @@ impl Logs {
         self.lock().logs.iter().map(tell).collect()
     }
 
-    /// Whether the run that is heard of writes this log.
-    pub(crate) fn is_live(&self, id: u64) -> bool {
-        self.lock().logs.iter().any(|one| one.id == id && one.status().is_some())
+    /// The id of the run that writes this log, where one does.
+    pub(crate) fn run_of(&self, id: u64) -> Option<String> {
+        self.lock().logs.iter().find(|one| one.id == id)?.status().map(|status| status.run.clone())
     }
 
     /// The run of a log at a moment.
@@ -133,6 +133,8 @@ impl Logs {
             let mut frame = tell::frame(fold, &news, asked.about);
             frame.more |= !there;
             frame.run.live = one.status().is_some();
+            let now = one.status().filter(|_| asked.at_s.is_none());
+            frame.run.awaits = now.map(tell::awaits).unwrap_or_default();
             frame.run.last_s = frame.run.at_s.max(one.parts.as_ref().map_or(0.0, |parts| parts.last().seconds()));
             frame
         })

@@ -14,8 +14,9 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use ratn_event_log::LogError;
 use ratn_model::id::InstanceId;
 use ratn_model::program::Program;
+use ratn_model::value::Value;
 use ratn_proto::types::Scale;
-use ratn_task_control::control::{self, Word};
+use ratn_task_control::control::{self, Message, Word};
 use ratn_worker::tls::ClientTls;
 use serde::Serialize;
 use std::convert::Infallible;
@@ -164,6 +165,16 @@ struct Head {
     method: Method,
     uri: Uri,
     headers: HeaderMap,
+}
+
+/// What a run is told.
+enum Told {
+    /// A word, and what that means.
+    Word(Word, &'static str),
+    /// To the question of a state.
+    Answer { state: String, choice: String },
+    /// Of this name, without a value.
+    Signal(String),
 }
 
 /// What a page is answered.
@@ -414,24 +425,34 @@ impl Shown {
         if let Some(refusal) = self.only_looks() {
             return refusal;
         }
-        let (word, said) = match query.text("word").as_str() {
-            "pause" => (Word::Pause, "The run is paused: no further motion begins."),
-            "resume" => (Word::Resume, "The run goes on."),
-            "step" => (Word::Step, "One more motion may begin, then the run is paused."),
-            "abort" => (Word::Abort, "The run is told to end: what moves stops and holds."),
+        let word = match query.text("word").as_str() {
+            "pause" => Told::Word(Word::Pause, "The run is paused: no further motion begins."),
+            "resume" => Told::Word(Word::Resume, "The run goes on."),
+            "step" => Told::Word(Word::Step, "One more motion may begin, then the run is paused."),
+            "abort" => Told::Word(Word::Abort, "The run is told to end: what moves stops and holds."),
+            "answer" => Told::Answer { state: query.text("state"), choice: query.text("choice") },
+            "signal" => Told::Signal(query.text("signal")),
             other => {
-                let problem = format!("a run can be told pause, resume, step and abort, and not `{other}`");
+                let problem =
+                    format!("a run can be told pause, resume, step, abort, answer and signal, and not `{other}`");
                 return Answer::Refused(StatusCode::BAD_REQUEST, problem);
             }
         };
         // The page says which run it means: another may have begun since.
         let _ = self.hear().await;
-        if !query.number("log").is_some_and(|id| self.logs.is_live(id)) {
+        let Some(run) = query.number("log").and_then(|id| self.logs.run_of(id)) else {
             let problem = "no run writes this log any more".to_owned();
             return Answer::Refused(StatusCode::CONFLICT, problem);
-        }
-        match self.system.tell(word).await {
-            Ok(()) => json(&wire::Told { said: said.to_owned() }),
+        };
+        let said = match word {
+            Told::Word(word, said) => self.system.tell(word).await.map(|()| said.to_owned()),
+            Told::Answer { state, choice } => {
+                self.system.send(&Message::Answer { run, state: Some(state), choice }).await
+            }
+            Told::Signal(signal) => self.system.send(&Message::Signal { run, signal, value: Value::Null }).await,
+        };
+        match said {
+            Ok(said) => json(&wire::Told { said }),
             Err(error) if control::is_nobody(&error) => {
                 Answer::Refused(StatusCode::CONFLICT, "no run is under way".to_owned())
             }

@@ -8,7 +8,7 @@ use futures::future::join_all;
 use ratn_daemon::{process_manager, resource_manager};
 use ratn_model::program::WORLD_MODEL;
 use ratn_proto::types::{HostPools, PoolStatus, Resource, Scale, SessionStatus, WaitingAcquire, WorkerStatus};
-use ratn_task_control::control::{self, RunStatus, Word};
+use ratn_task_control::control::{self, Message, RunStatus, Word};
 use ratn_worker::client::{CallError, Channels, ProcessClient, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -69,6 +69,13 @@ impl System {
         told
     }
 
+    /// Sends its run what a state of it waits for; what became of that.
+    pub(crate) async fn send(&self, message: &Message) -> std::io::Result<String> {
+        let sent = control::send(&self.directory, message).await;
+        *self.run.lock().await = None;
+        sent
+    }
+
     /// As the pages know it.
     pub(crate) async fn told(&self) -> wire::System {
         let mut seen = self.seen.lock().await;
@@ -86,7 +93,7 @@ impl System {
             Ok(manager) => manager,
             Err(error) => return wire::System { problem: error.to_string(), ..wire::System::default() },
         };
-        match tokio::time::timeout(PATIENCE, self.ask(&directory, &manager)).await {
+        match tokio::time::timeout(PATIENCE, Box::pin(self.ask(&directory, &manager))).await {
             Ok(Ok(system)) => system,
             Ok(Err(error)) => wire::System { problem: error.to_string(), ..wire::System::default() },
             Err(_) => {
@@ -102,7 +109,7 @@ impl System {
         // Who may not list sessions sees the rest.
         let sessions = client.sessions().await.unwrap_or_default();
         let hosts = hosts_in(directory, &resources);
-        let mut hosts = join_all(hosts.into_iter().map(|(name, endpoint)| self.host(name, endpoint))).await;
+        let mut hosts = join_all(hosts.into_iter().map(|(name, endpoint)| Box::pin(self.host(name, endpoint)))).await;
         hosts.sort_by(|a, b| a.name.cmp(&b.name));
         let expires: BTreeMap<&str, u64> = sessions.iter().map(|one| (one.id.as_str(), one.expires_in_ms)).collect();
         let things = resources.iter().filter(|one| one.kind != WORLD_MODEL);
@@ -151,7 +158,7 @@ impl System {
             ProcessClient::new(&self.channels, &endpoint)?.scale(template, scale).await?;
             Ok::<bool, CallError>(true)
         };
-        let scaled = tokio::time::timeout(PATIENCE, scaling).await;
+        let scaled = tokio::time::timeout(PATIENCE, Box::pin(scaling)).await;
         // What it is now is asked at once.
         *self.seen.lock().await = None;
         match scaled {
@@ -186,7 +193,7 @@ impl System {
             }
             Ok(None)
         };
-        let read: Result<_, CallError> = tokio::time::timeout(PATIENCE, reading)
+        let read: Result<_, CallError> = tokio::time::timeout(PATIENCE, Box::pin(reading))
             .await
             .map_err(|_| format!("the log of {worker} was not there within {} s", PATIENCE.as_secs()))?;
         match read.map_err(|error| error.to_string())? {

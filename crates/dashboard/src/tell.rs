@@ -3,9 +3,11 @@
 use crate::fold::{Fold, News};
 use crate::{logs, wire};
 use ratn_event_log::without_visits;
+use ratn_executive::protocol::Awaited;
 use ratn_model::id::InstanceId;
 use ratn_report::statistics::mode_name;
 use ratn_report::timeline::{Activity, Ending, Instance, Job, Stage, Timeline, Wait, Yield};
+use ratn_task_control::control::{Awaiting, RunStatus};
 use std::collections::BTreeMap;
 
 /// Sentences in one answer.
@@ -183,6 +185,19 @@ fn kinds(run: &Timeline, held: &[wire::Held]) -> Vec<wire::Kind> {
     all.into_iter()
         .map(|(kind, held)| wire::Kind { kind: kind.to_owned(), total: run.resources.total(kind), held })
         .collect()
+}
+
+/// What the states of a run wait for by themselves.
+pub(crate) fn awaits(status: &RunStatus) -> Vec<wire::Awaits> {
+    let told = |one: &Awaiting| {
+        let (kind, text, choices) = match &one.awaited {
+            Awaited::Answer { question, choices, .. } => ("answer", cut(question), choices.clone()),
+            Awaited::Signal { signal } => ("signal", signal.clone(), Vec::new()),
+            other => ("other", cut(&other.to_string()), Vec::new()),
+        };
+        wire::Awaits { path: one.path.clone(), kind, text, choices, until_s: one.until_s }
+    };
+    status.awaits.iter().take(MOST_WAITING).map(told).collect()
 }
 
 fn last<T>(mut all: Vec<T>, most: usize) -> Vec<T> {

@@ -5,7 +5,6 @@
 //! anything else.
 
 use serde::Serialize;
-use std::fmt::Write as _;
 
 /// A type that the pages know.
 trait Wire {
@@ -60,11 +59,13 @@ macro_rules! wire {
         pub fn typescript() -> String {
             let mut text = String::from("// Written from crates/dashboard/src/wire.rs; do not edit (RATN_WRITE_WIRE=1 and its test write it).\n");
             $(
-                $(let _ = write!(text, "\n/**{} */", $doc);)+
-                let _ = write!(text, "\nexport interface {} {{\n", stringify!($name));
+                $(text.push_str(concat!("\n/**", $doc, " */"));)+
+                text.push_str(concat!("\nexport interface ", stringify!($name), " {\n"));
                 $(
-                    $(let _ = writeln!(text, "  /**{} */", $field_doc);)+
-                    let _ = writeln!(text, "  {}: {};", stringify!($field), <$kind>::typescript());
+                    $(text.push_str(concat!("  /**", $field_doc, " */\n"));)+
+                    text.push_str(concat!("  ", stringify!($field), ": "));
+                    text.push_str(&<$kind as Wire>::typescript());
+                    text.push_str(";\n");
                 )+
                 text.push_str("}\n");
             )+
@@ -158,6 +159,8 @@ wire! {
         live: bool,
         /// The pages may tell it something.
         controllable: bool,
+        /// States that wait for somebody, or for something that they look at themselves; only of a run that goes on.
+        awaits: Vec<Awaits>,
         /// Whether the user has paused it.
         paused: bool,
         /// From each request for a pause to its end.
@@ -178,6 +181,20 @@ wire! {
         wasted: usize,
         /// How long those took.
         wasted_s: f64,
+    }
+
+    /// A state that waits by itself.
+    Awaits {
+        /// By path.
+        path: String,
+        /// `answer`, `signal`, or `other`: nobody has to do anything.
+        kind: &'static str,
+        /// The question, the name of the signal, or what it waits for.
+        text: String,
+        /// What may be answered.
+        choices: Vec<String>,
+        /// Until then at the most, in seconds.
+        until_s: Option<f64>,
     }
 
     /// A time.

@@ -321,6 +321,8 @@ async fn pages_only_look_unless_their_user_said_otherwise() {
         (format!("/api/control?log={log}&word=pause"), 409),
         (format!("/api/control?log={log}&word=fly"), 400),
         ("/api/control?word=pause".to_owned(), 409),
+        (format!("/api/control?log={log}&word=answer&state=a&choice=b"), 409),
+        (format!("/api/control?log={log}&word=signal&signal=a"), 409),
         ("/api/scale?host=h&template=t&min=-1".to_owned(), 400),
         ("/api/scale?host=h&template=t&min=1".to_owned(), 409),
     ] {

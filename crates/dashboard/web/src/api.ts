@@ -50,4 +50,6 @@ export const api = {
   scale: (host: string, template: string, min: string, max: string, spares: string) =>
     ask<Told>("scale", { host, template, min, max, spares }, "POST"),
   control: (log: number, word: string) => ask<Told>("control", { log, word }, "POST"),
+  answer: (log: number, state: string, choice: string) => ask<Told>("control", { log, word: "answer", state, choice }, "POST"),
+  signal: (log: number, signal: string) => ask<Told>("control", { log, word: "signal", signal }, "POST"),
 };

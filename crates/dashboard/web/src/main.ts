@@ -6,7 +6,7 @@ import { count, fill, h, seconds } from "./dom";
 import { type Page, type Site, comparePage, hostsPage, networkPage, resourcesPage, runPage, worldPage } from "./pages";
 import { Store } from "./store";
 import { applyTheme, nextTheme, theme } from "./theme";
-import type { About, Run, Told } from "./wire";
+import type { About, Awaits, Run, Told } from "./wire";
 
 const PERIOD_MS = 300;
 const SLOW_MS = 1_000;
@@ -63,6 +63,7 @@ const logs = h("select", { "aria-label": "Event log" });
 const themeButton = h("button", { onclick: () => showTheme(nextTheme()) });
 const controls = h("span", { class: "row", role: "group", "aria-label": "Control of the run" });
 const summary = h("div", { class: "summary", role: "region", "aria-label": "The run", tabindex: 0 });
+const questions = h("section", { class: "questions", hidden: true, "aria-label": "Questions and signals" });
 const problem = h("div", { class: "problem", role: "alert", hidden: true });
 const live = h("button", { "aria-pressed": "true", onclick: () => showAt(null) }, "Live");
 const play = h("button", { onclick: () => (playing === null ? begin() : halt()) }, "Play");
@@ -85,7 +86,7 @@ const header = h(
 );
 const footer = h("footer", { "aria-label": "Replay" }, live, play, pace, slider, shownAt);
 const app = document.getElementById("app");
-app?.append(header, h("div", {}, problem, summary, announcer), page.element, footer);
+app?.append(header, h("div", {}, problem, summary, questions, announcer), page.element, footer);
 
 function showTheme(now: string): void {
   themeButton.textContent = now === "auto" ? "Colours: as the system" : `Colours: ${now}`;
@@ -218,6 +219,41 @@ function ask(word: string, text: string, question: string): void {
   confirm(`${text}?`, text, [h("p", {}, `${store.run?.task ?? ""}: ${question}`)], word === "abort", () => told(api.control(of, word)));
 }
 
+let questionsOf = "";
+/** What states ask and wait for; whoever may steer the run answers. */
+function showQuestions(run: Run): void {
+  const asked = run.awaits.filter((one) => one.kind !== "other");
+  const of = JSON.stringify([asked, run.controllable]);
+  if (of === questionsOf) return;
+  questionsOf = of;
+  questions.hidden = asked.length === 0;
+  const name = store.run?.task ?? "";
+  const item = (one: Awaits) => {
+    const until = one.until_s === null ? "" : `, until ${seconds(one.until_s)}`;
+    const text = one.kind === "answer" ? one.text : `waits for the signal ${one.text}`;
+    const act = (label: string, question: string, send: (log: number) => Promise<Told>) =>
+      h(
+        "button",
+        {
+          "data-key": `${one.path} ${label}`,
+          onclick: () => {
+            const to = log;
+            if (to !== null) confirm(`${label}?`, label, [h("p", {}, `${name}, ${one.path}: ${question}`)], false, () => told(send(to)));
+          },
+        },
+        label,
+      );
+    const buttons =
+      one.kind === "answer"
+        ? one.choices.map((choice) => act(choice, one.text, (to) => api.answer(to, one.path, choice)))
+        : [act("Send it", `the signal ${one.text} ends this wait.`, (to) => api.signal(to, one.text))];
+    const rest = run.controllable ? buttons : [h("span", { class: "faint" }, one.choices.join(", "))];
+    return h("li", { class: "row" }, h("b", {}, one.path), h("span", {}, `${text}${until}`), ...rest);
+  };
+  fill(questions, h("ul", { class: "plain" }, ...asked.map(item)));
+  if (asked.length > 0) say(`${asked.length === 1 ? "a state waits" : "states wait"} for an answer or a signal`);
+}
+
 /** Says what came of it. */
 function told(answer: Promise<Told>): void {
   answer.then(
@@ -261,6 +297,7 @@ function showSummary(run: Run): void {
     run.parameters.length > 0 && h("span", { class: "faint parameters", title: run.parameters.join("\n") }, run.parameters.join(", ")),
   );
   showControls(run);
+  showQuestions(run);
 }
 
 function showSlider(run: Run): void {

@@ -177,14 +177,17 @@ export class Network implements Painter {
     const last = new Map<string, number>();
     // Of what has not depended on anything yet the place in the program is known: behind what stands before it in the same visit.
     const siblings = new Map<string, number>();
+    // What a routine does stands behind the routine.
+    const around = new Map<string, number>();
     for (const node of this.nodes) {
       let column = (last.get(node.row) ?? -1) + 1;
       const visit = this.level === "states" ? parent(node.row) : splitPath(node.members[0]?.path ?? "").slice(0, -1).join("/");
       const before = into.get(node);
-      if (before === undefined) column = Math.max(column, (siblings.get(visit) ?? -1) + 1);
+      if (before === undefined) column = Math.max(column, (siblings.get(visit) ?? around.get(visit) ?? -1) + 1);
       else for (const from of before) column = Math.max(column, (columns.get(from) ?? 0) + 1);
       columns.set(node, column);
       siblings.set(visit, column);
+      around.set(this.level === "states" ? node.row : (node.members[0]?.path ?? ""), column);
       last.set(node.row, column);
       node.x = MARGIN + column * (WIDE + GAP_X);
       node.y = MARGIN + (rows.get(node.row) ?? 0) * (TALL + GAP_Y);

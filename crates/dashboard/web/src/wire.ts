@@ -84,6 +84,8 @@ export interface Run {
   live: boolean;
   /** The pages may tell it something. */
   controllable: boolean;
+  /** States that wait for somebody, or for something that they look at themselves; only of a run that goes on. */
+  awaits: Awaits[];
   /** Whether the user has paused it. */
   paused: boolean;
   /** From each request for a pause to its end. */
@@ -104,6 +106,20 @@ export interface Run {
   wasted: number;
   /** How long those took. */
   wasted_s: number;
+}
+
+/** A state that waits by itself. */
+export interface Awaits {
+  /** By path. */
+  path: string;
+  /** `answer`, `signal`, or `other`: nobody has to do anything. */
+  kind: string;
+  /** The question, the name of the signal, or what it waits for. */
+  text: string;
+  /** What may be answered. */
+  choices: string[];
+  /** Until then at the most, in seconds. */
+  until_s: number | null;
 }
 
 /** A time. */

@@ -89,6 +89,14 @@ test("everything stands behind what it depended on, and nothing on anything else
   assert.equal(new Set(network.nodes.map((node) => `${node.x} ${node.y}`)).size, 5);
 });
 
+test("what has not depended on anything stands behind what is before it in its visit, or behind the routine that it is in", () => {
+  const store = storeOf([instance(1, "a"), instance(2, "routine", { edges: [{ from: 1, kind: "data" }] }), instance(3, "routine/x"), instance(4, "routine/y"), instance(5, "z")]);
+  const network = new Network(store);
+  network.layOut();
+  const x = new Map(network.nodes.map((node) => [node.members[0].id, node.x]));
+  for (const [before, after] of [[1, 2], [2, 3], [3, 4], [2, 5]]) assert.ok(x.get(before) < x.get(after), `${before} ${after}`);
+});
+
 test("a collapsed state stands for its visits, and only the causes of one are left", () => {
   const store = storeOf([instance(1, "a"), instance(2, "each[0]/b", { edges: [{ from: 1, kind: "data" }] }), instance(3, "each[0]/c", { edges: [{ from: 2, kind: "data" }] }), instance(4, "each[1]/b"), instance(5, "z")]);
   const network = new Network(store);
