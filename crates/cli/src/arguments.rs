@@ -20,9 +20,10 @@ pub(crate) use operating::{
 pub(crate) use roles::{CellArguments, KeptRoleArguments, RoleArguments, WorkerArguments, WorkerKind};
 pub(crate) use systems::{Budget, DemoArguments, GoodsArguments, ResetArguments, SystemArguments, UpArguments};
 pub(crate) use tasks::{
-    AnswerArguments, CheckArguments, CompletionsArguments, ControlArguments, DrawingArgument, ExportArguments, FormatArgument,
-    JsonArgument, ManArguments, ModeArgument, PlanArguments, ReportArguments, RobotArguments, RobotCommand,
-    RowArgument, RunArguments, SignalArguments, SimulateArguments, StatusArguments, TablesArguments, TopArguments, WordArgument,
+    AnswerArguments, CheckArguments, CompletionsArguments, ControlArguments, DrawingArgument, ExportArguments,
+    FormatArgument, JsonArgument, ManArguments, ModeArgument, PlanArguments, ReportArguments, RobotArguments,
+    RobotCommand, RowArgument, RunArguments, SignalArguments, SimulateArguments, StatusArguments, TablesArguments,
+    TopArguments, WordArgument,
 };
 
 /// Runs robot tasks, written as sequential state machines, as fast as their real dependencies allow.

@@ -173,7 +173,9 @@ mod tests {
             EffectExpr::Delete(fact) => format!("no {fact}"),
             _ => "?".to_owned(),
         };
-        condition.map(|condition| foreseen(&condition).iter().map(effect).collect::<Vec<_>>().join(", ")).unwrap_or_default()
+        condition
+            .map(|condition| foreseen(&condition).iter().map(effect).collect::<Vec<_>>().join(", "))
+            .unwrap_or_default()
     }
 
     #[test]
@@ -182,7 +184,8 @@ mod tests {
         assert_eq!(said("open(door) and on(cup) = $place and at(x) > 3"), "open(door) = true, on(cup) = $place");
         assert_eq!(said("not exists taken(cup) and not busy(arm)"), "no taken(cup), no busy(arm)");
         assert_eq!(said("not (not open(door))"), "open(door) = true");
-        for nothing in ["open(a) or open(b)", "exists at(cup)", "open(?)", "at(a) = at(b)", "not (open(a) and open(b))"] {
+        for nothing in ["open(a) or open(b)", "exists at(cup)", "open(?)", "at(a) = at(b)", "not (open(a) and open(b))"]
+        {
             assert_eq!(said(nothing), "", "{nothing}");
         }
     }

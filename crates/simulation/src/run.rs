@@ -344,7 +344,8 @@ impl Simulation<'_> {
     /// What comes before the run begins: the executive keeps it, and has nothing to say to it.
     fn send_before(&mut self, executive: &mut Executive) -> Result<(), RunError> {
         let events = std::mem::take(&mut self.circumstances.events);
-        let (before, later): (Vec<_>, Vec<_>) = events.into_iter().partition(|(trigger, _)| *trigger == Trigger::Before);
+        let (before, later): (Vec<_>, Vec<_>) =
+            events.into_iter().partition(|(trigger, _)| *trigger == Trigger::Before);
         self.circumstances.events = later;
         for (_, event) in before {
             self.log.push(LogLine { at: self.now, entry: LogEntry::Event(event.clone()) });

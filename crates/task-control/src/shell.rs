@@ -19,8 +19,8 @@ use super::replay::{self, VERSION};
 use crate::interrupt::Interrupt;
 use anyhow::{Context, bail};
 use ratn_event_log::{LogWriter, without_visits};
-use ratn_executive::executive::Executive;
 use ratn_executive::MOST_SIGNALS_KEPT;
+use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::Lookout;
 use ratn_executive::protocol::{Awaited, Command, Event, Learned, Mode, Natures, Origin};
 use ratn_model::catalogue::Catalogue;
@@ -331,7 +331,9 @@ impl Shell {
             return Err(format!("no state of {} waits for a signal `{signal}`: {help}", self.program.name));
         }
         if self.executive.signals_kept() >= MOST_SIGNALS_KEPT {
-            return Err(format!("{MOST_SIGNALS_KEPT} signals are kept already for states that have yet to wait for them"));
+            return Err(format!(
+                "{MOST_SIGNALS_KEPT} signals are kept already for states that have yet to wait for them"
+            ));
         }
         let is_it = |awaited: &Awaited| matches!(awaited, Awaited::Signal { signal: name } if *name == signal);
         let waiting = self.progress.awaiting().find(|(_, awaiting)| is_it(&awaiting.awaited));
@@ -348,7 +350,8 @@ impl Shell {
             _ => None,
         });
         let open: Vec<_> = questions.collect();
-        let listed = || open.iter().map(|(_, path, question, _)| format!("{path} ({question})")).collect::<Vec<_>>().join(", ");
+        let listed =
+            || open.iter().map(|(_, path, question, _)| format!("{path} ({question})")).collect::<Vec<_>>().join(", ");
         let is_meant = |path: &str| state.is_none_or(|state| state == path || state == without_visits(path));
         let meant: Vec<_> = open.iter().filter(|(_, path, ..)| is_meant(path)).collect();
         let (instance, path, _, choices) = match meant.as_slice() {

@@ -124,8 +124,10 @@ impl Status {
                 lines.push(format!("event log: {}", log.display()));
                 let rows = run.under_way.iter().map(|one| [one.path.clone(), format!("for {:.1} s", one.for_s)]);
                 section(&mut lines, &colours.green("under way"), rows.collect());
-                let until = |one: &Awaiting| one.until_s.map_or_else(String::new, |until| format!(", until {until:.1} s"));
-                let rows = run.awaits.iter().map(|one| [one.path.clone(), format!("for {}{}", one.awaited, until(one))]);
+                let until =
+                    |one: &Awaiting| one.until_s.map_or_else(String::new, |until| format!(", until {until:.1} s"));
+                let rows =
+                    run.awaits.iter().map(|one| [one.path.clone(), format!("for {}{}", one.awaited, until(one))]);
                 section(&mut lines, &colours.yellow("waiting by themselves"), rows.collect());
                 let rows = run.waits.iter().map(|sentence| [sentence.clone(), String::new()]);
                 section(&mut lines, &colours.yellow("states that wait"), rows.collect());

@@ -65,7 +65,9 @@ impl Window {
         if let Some(writer) = view.operator_of(&own.kinds) {
             return Readiness::Waits(Wait::TaskResource(writer));
         }
-        if own.waits && let Some(beside) = self.older_beside(instance) {
+        if own.waits
+            && let Some(beside) = self.older_beside(instance)
+        {
             return Readiness::Waits(Wait::World(beside));
         }
         if is_pia && let Some(beside) = self.conflict_beside(context, instance) {

@@ -227,7 +227,9 @@ impl Window {
             }
             real.changes = changes;
         }
-        if let Some(Changed::Foreseen(changes)) = self.graph.get(id).and_then(Instance::ended).map(|ended| &ended.changes) {
+        if let Some(Changed::Foreseen(changes)) =
+            self.graph.get(id).and_then(Instance::ended).map(|ended| &ended.changes)
+        {
             real.changes.clone_from(changes);
         }
         match operations {

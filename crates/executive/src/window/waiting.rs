@@ -85,9 +85,8 @@ impl Window {
             self.has_waited(context, id, end);
             return true;
         }
-        let holds = self.look(context, id, None, |_, view| {
-            awaiting::holds(state, view).map_err(|error| not_bound(view, &error))
-        });
+        let holds = self
+            .look(context, id, None, |_, view| awaiting::holds(state, view).map_err(|error| not_bound(view, &error)));
         match holds {
             Some(Ok(true)) => self.has_waited(context, id, awaiting::has_come()),
             Some(Err(Readiness::Failed(reason))) => self.finish(context, id, Ended::aborted(reason)),
@@ -109,9 +108,10 @@ impl Window {
 
     /// An operator has answered.
     pub(super) fn answer(&mut self, context: &mut Context<'_>, id: InstanceId, choice: String) {
-        let waiting = self.graph.get(id).filter(|instance| {
-            instance.node().is_some_and(|node| matches!(node.status, Status::Running(_)))
-        });
+        let waiting = self
+            .graph
+            .get(id)
+            .filter(|instance| instance.node().is_some_and(|node| matches!(node.status, Status::Running(_))));
         match waiting.map(|instance| context.program.state(instance.state)) {
             Some(state) => {
                 if let Some(end) = awaiting::answered(state, &choice) {

@@ -8,8 +8,8 @@
 use super::names::suggestion;
 use super::yaml::{Content, Entry, Node};
 use crate::diagnostic::Findings;
-use crate::expression::parse::{NameError, Names, ParseError, parse_expression};
 use crate::expression::display::is_word;
+use crate::expression::parse::{NameError, Names, ParseError, parse_expression};
 use crate::expression::{Comprehension, Expr, Function};
 use crate::value::Value;
 use std::collections::BTreeMap;
@@ -42,7 +42,8 @@ impl Functions {
 
     /// Name, how it is called, and with how many arguments.
     pub(crate) fn usages(&self) -> Vec<(String, String, usize)> {
-        let usage = |(name, defined): (&String, &Defined)| (name.clone(), defined.usage(name), defined.parameters.len());
+        let usage =
+            |(name, defined): (&String, &Defined)| (name.clone(), defined.usage(name), defined.parameters.len());
         self.all.iter().map(usage).collect()
     }
 
@@ -239,7 +240,11 @@ impl Names for Body<'_, '_, '_> {
         if let Some(first) = around.iter().position(|other| other == name) {
             let circle: Vec<&str> = around[first..].iter().map(String::as_str).chain([name]).collect();
             let message = format!("the function `{name}` uses itself: {}", circle.join(" → "));
-            return Err(wrong("recursive-function", message, "say what is done over and over as a loop, or with `map`"));
+            return Err(wrong(
+                "recursive-function",
+                message,
+                "say what is done over and over as a loop, or with `map`",
+            ));
         }
         self.reading.read(name);
         match self.reading.done.get(name) {

@@ -14,19 +14,8 @@ const MAX_STATES: usize = 10_000;
 const MAX_DEPTH: usize = 32;
 
 /// Keys that say what a step is.
-const FORMS: [&str; 11] = [
-    "action",
-    "for",
-    "condition",
-    "states",
-    "while",
-    "do_while",
-    "until",
-    "concurrency",
-    "library",
-    "wait",
-    "ask",
-];
+const FORMS: [&str; 11] =
+    ["action", "for", "condition", "states", "while", "do_while", "until", "concurrency", "library", "wait", "ask"];
 /// Those that are names that people give to states, too.
 const NAMES: [&str; 2] = ["wait", "ask"];
 
@@ -99,15 +88,41 @@ pub(crate) enum Branch {
 /// What a step is.
 #[derive(Debug)]
 pub(crate) enum Form<'a> {
-    Action { action: &'a Node },
-    Sequence { children: Vec<StateId> },
-    ForEach { variable: String, collection: Header<'a>, index: Option<String>, body: Vec<StateId> },
-    Condition { predicate: &'a Node, then: Vec<StateId>, otherwise: Vec<StateId> },
-    While { predicate: &'a Node, tests: Tests, index: Option<String>, body: Vec<StateId> },
-    Concurrency { kind: &'a Node, regions: Vec<StateId> },
-    Library { file: &'a Node },
+    Action {
+        action: &'a Node,
+    },
+    Sequence {
+        children: Vec<StateId>,
+    },
+    ForEach {
+        variable: String,
+        collection: Header<'a>,
+        index: Option<String>,
+        body: Vec<StateId>,
+    },
+    Condition {
+        predicate: &'a Node,
+        then: Vec<StateId>,
+        otherwise: Vec<StateId>,
+    },
+    While {
+        predicate: &'a Node,
+        tests: Tests,
+        index: Option<String>,
+        body: Vec<StateId>,
+    },
+    Concurrency {
+        kind: &'a Node,
+        regions: Vec<StateId>,
+    },
+    Library {
+        file: &'a Node,
+    },
     /// The executive waits itself; or it asks an operator.
-    Wait { node: &'a Node, asks: bool },
+    Wait {
+        node: &'a Node,
+        asks: bool,
+    },
 }
 
 /// When the predicate of a loop is looked at, and what ends the loop.

@@ -21,8 +21,7 @@ const CONCURRENCY_KEYS: [&str; 4] = ["concurrency", "regions", "decide", "output
 const LIBRARY_KEYS: [&str; 2] = ["library", "with"];
 const WAIT_KEYS: [&str; 2] = ["wait", "ask"];
 /// A state that waits reads what it says, holds nothing and changes nothing.
-const WAITING_KEYS: [&str; 7] =
-    ["retry", "duration", "description", "transitions", "exceptional", "assign", "shared"];
+const WAITING_KEYS: [&str; 7] = ["retry", "duration", "description", "transitions", "exceptional", "assign", "shared"];
 const NODE_KEYS: [&str; 11] = [
     "retry",
     "reads",

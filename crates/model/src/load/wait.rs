@@ -180,7 +180,9 @@ pub(crate) fn annotations(
     }
     // How long that takes is known.
     let duration_s = match kind {
-        StateKind::Action { action, inputs, .. } if action == SECONDS => inputs.first().map(|(_, seconds)| seconds.clone()),
+        StateKind::Action { action, inputs, .. } if action == SECONDS => {
+            inputs.first().map(|(_, seconds)| seconds.clone())
+        }
         _ => None,
     };
     let duration_s = duration_s.filter(|seconds| seconds.fact_expressions().is_empty());

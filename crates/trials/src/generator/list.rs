@@ -110,7 +110,11 @@ impl Maker {
         if !self.features.variables || !self.dice.percent(40) {
             return;
         }
-        let actions: Vec<StateId> = children.iter().copied().filter(|id| self.is_action(*id) && !self.states[id.0 as usize].is_pause()).collect();
+        let actions: Vec<StateId> = children
+            .iter()
+            .copied()
+            .filter(|id| self.is_action(*id) && !self.states[id.0 as usize].is_pause())
+            .collect();
         let [first, .., last] = actions.as_slice() else { return };
         self.at(*last).defaults.insert("x".to_owned(), Value::Int(1));
         if let StateKind::Action { inputs, .. } = &mut self.at(*first).kind {
