@@ -170,6 +170,6 @@ fn what_a_task_waits_for_comes_and_a_wait_is_not_said_to_lack_annotations() {
     let found = check(&task).unwrap();
     assert_eq!((found.hsm_s, found.cdtn_s, found.gains.len()), (18.0, 18.0, 0), "{:?}", found.gains);
     assert_eq!(found.unknown_durations, ["lid", "which"]);
-    let refused = check("task: t\nstates:\n  - cup: { wait: { for: at(cup) > 2 } }\n").unwrap_err();
-    assert!(refused.to_string().contains("what makes `at(cup) > 2` hold of cup is not known"), "{refused}");
+    let refused = check("task: t\nstates:\n  - cup: { wait: { for: exists at(cup) } }\n").unwrap_err();
+    assert!(refused.to_string().contains("what makes `exists at(cup)` hold of cup is not known"), "{refused}");
 }
