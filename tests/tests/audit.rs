@@ -75,6 +75,8 @@ fn record_of(path: &str) -> (&'static str, &'static str) {
         "SafetyService/ClearEmergencyStop" => ("clear_emergency_stop", ""),
         "SafetyService/Hold" => ("hold", r#""reason":"a""#),
         "SafetyService/GoOn" => ("go_on", ""),
+        "RunService/SendSignal" => ("signal", r#""signal":"a""#),
+        "RunService/SendAnswer" => ("answer", r#""choice":"a""#),
         "CellService/Reset" => ("reset", r#""seed":"#),
         "CellService/InjectFault" => ("inject_fault", r#""fault":"a""#),
         "CellService/PutBack" => ("put_back", ""),

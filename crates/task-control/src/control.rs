@@ -2,6 +2,10 @@
 //! one PIA begin, or ends it, `ratn status` asks what it is doing, `ratn signal` and `ratn answer` send it what its states wait for. One
 //! word or [`Message`] (in JSON) per line; each is answered by one line.
 
+mod service;
+
+pub use service::{ROLE, RunServer};
+
 use super::progress::UnderWay;
 use crate::messages::Messages;
 use ratn_executive::protocol::{Awaited, Event, Mode};
@@ -171,6 +175,12 @@ impl Control {
         let listener = UnixListener::bind(&path)?;
         let (tell, words) = mpsc::channel(MAX_PENDING);
         let end = CancellationToken::new();
+        let (server, to, until) = (RunServer::of(tell.clone()), directory.to_owned(), end.clone());
+        tokio::spawn(async move {
+            if let Err(error) = server.serve(&to, until).await {
+                tracing::warn!(%error, "clients cannot reach this run over gRPC");
+            }
+        });
         tokio::spawn(end.clone().run_until_cancelled_owned(accept(listener, tell)));
         Ok(Control { words, path, _end: end.drop_guard() })
     }

@@ -18,6 +18,7 @@ use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::Revision;
 use ratn_model::program::{Program, State, StateKind};
 use ratn_model::value::Value;
+use ratn_model::wait::Wait;
 use ratn_simulation::run::{Run, RunError, Trigger};
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -50,7 +51,9 @@ pub fn trial_from_outside(program: &Arc<Program>, conditions: &Conditions) -> Ve
 pub(super) fn trial_at_any_moment(program: &Arc<Program>, conditions: &Conditions, undisturbed: &Run) -> Verdict {
     let mut dice = Dice(conditions.seed ^ 0x0000_a117_03e7);
     let facts = facts(undisturbed, &mut dice);
-    if facts.is_empty() || program.states.iter().any(is_preemptive) {
+    // What a condition waits for comes from outside, too, and is no moment of its own.
+    let waits = program.states.iter().any(|state| matches!(state.wait(), Some(Wait::Condition(_))));
+    if facts.is_empty() || waits || program.states.iter().any(is_preemptive) {
         return Verdict::LeftOut;
     }
     let at = dice.below(1_000) as f64 / 1_000.0 * undisturbed.end_s * 0.9;

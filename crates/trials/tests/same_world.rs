@@ -178,6 +178,7 @@ fn random_programs_with_retries_of_composites_leave_the_same_world_in_both_modes
 fn random_programs_that_wait_leave_the_same_world_in_both_modes() {
     none_fails(trial, FURTHER, 120, &Features::WAITS);
     none_fails(trial_from_outside, FURTHER, 40, &Features::WAITS);
+    none_fails(trial_interrupted, FURTHER, 40, &Features::WAITS);
 }
 
 /// A pause asked for what a state around it blocks.

@@ -52,6 +52,9 @@ pub enum Mutation {
     ClearEmergencyStop,
     Hold { reason: String },
     GoOn,
+    // ----- a run -----
+    Signal { signal: String },
+    Answer { state: String, choice: String },
     // ----- the cell -----
     Reset { seed: u64 },
     InjectFault { fault: String },

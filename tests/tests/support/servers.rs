@@ -10,6 +10,7 @@ use ratn_worker::client::Channels;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::safety::Safety;
+use ratn_worker::server::{Services, bind};
 use ratn_worker::tls::ClientTls;
 use ratn_worker::trace::Traced;
 use ratn_worker::worker::{Worker, WorkerOptions};
@@ -133,12 +134,16 @@ pub async fn servers(place: &Path, access: &LiveAccess, end: &CancellationToken)
         ClientTls::none(),
         end.clone(),
     ));
+    let run = directory.socket(ratn_task_control::control::ROLE);
+    let services = Services::new().with(ratn_task_control::control::RunServer::of_nobody().into_service());
+    tokio::spawn(bind(&run).await.unwrap().serve_as(services, serving(), end.clone()));
     let channels = Channels::new(&ClientTls::none());
     let mut servers = Vec::new();
     for name in [resource_manager::ROLE, world_pool::ROLE, process_manager::ROLE, ratn_cell::ROLE] {
         let endpoint = directory.wait_for(name, DEADLINE).await.unwrap();
         servers.push(Server { name, channels: vec![channels.get(&endpoint).unwrap(); ROLES.len()] });
     }
+    servers.push(Server { name: "run", channels: vec![channels.get(&run).unwrap(); ROLES.len()] });
     let mut drivers = Server { name: "driver", channels: Vec::new() };
     for (i, roles) in ROLES.iter().enumerate() {
         let (file, listen) = (place.join(format!("{i}.toml")), Endpoint::Unix(place.join(format!("{i}.sock"))));

@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 /// each file.
 const SOURCES: &str = "SOURCES";
 const PACKAGE: &str = "ratn.v1";
-const FILES: [&str; 8] = ["access", "value", "resources", "world", "processes", "action", "cell", "safety"];
+const FILES: [&str; 9] = ["access", "value", "resources", "world", "processes", "action", "cell", "safety", "run"];
 /// The option of a method that says what it does, and what its values begin with.
 const OPTION: (&str, &str) = ("ratn.v1.access", "ACCESS_");
 

@@ -7970,3 +7970,566 @@ pub mod safety_service_server {
         const NAME: &'static str = SERVICE_NAME;
     }
 }
+/// Nothing.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetWaitsRequest {}
+/// What is waited for.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct GetWaitsResponse {
+    /// The run's id.
+    #[prost(string, tag = "1")]
+    pub run: ::prost::alloc::string::String,
+    /// The name of its task.
+    #[prost(string, tag = "2")]
+    pub task: ::prost::alloc::string::String,
+    /// The states that wait, those that were reached first first.
+    #[prost(message, repeated, tag = "3")]
+    pub waits: ::prost::alloc::vec::Vec<Wait>,
+}
+/// What a state waits for.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Wait {
+    /// Its path with visits.
+    #[prost(string, tag = "1")]
+    pub path: ::prost::alloc::string::String,
+    /// Until then at the most, in the robot's seconds since the run began.
+    #[prost(double, optional, tag = "2")]
+    pub until_s: ::core::option::Option<f64>,
+    /// Exactly one is set, or none: then it waits for the time.
+    #[prost(oneof = "wait::Awaited", tags = "3, 4, 5")]
+    pub awaited: ::core::option::Option<wait::Awaited>,
+}
+/// Nested message and enum types in `Wait`.
+pub mod wait {
+    /// Exactly one is set, or none: then it waits for the time.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Oneof)]
+    pub enum Awaited {
+        /// A condition on the world, as the task says it.
+        #[prost(string, tag = "3")]
+        Condition(::prost::alloc::string::String),
+        /// The name of a signal.
+        #[prost(string, tag = "4")]
+        Signal(::prost::alloc::string::String),
+        /// A question.
+        #[prost(message, tag = "5")]
+        Question(super::Question),
+    }
+}
+/// What an operator is asked.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Question {
+    /// A sentence.
+    #[prost(string, tag = "1")]
+    pub text: ::prost::alloc::string::String,
+    /// What may be answered.
+    #[prost(string, repeated, tag = "2")]
+    pub choices: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// The answer when nobody answers in time.
+    #[prost(string, optional, tag = "3")]
+    pub default: ::core::option::Option<::prost::alloc::string::String>,
+}
+/// A signal.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct SendSignalRequest {
+    /// The run: its id or the name of its task; empty for the one that is under way.
+    #[prost(string, tag = "1")]
+    pub run: ::prost::alloc::string::String,
+    /// The signal's name.
+    #[prost(string, tag = "2")]
+    pub signal: ::prost::alloc::string::String,
+    /// What is sent with it; not set is null.
+    #[prost(message, optional, tag = "3")]
+    pub value: ::core::option::Option<Value>,
+}
+/// What becomes of it.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SendSignalResponse {
+    /// A sentence.
+    #[prost(string, tag = "1")]
+    pub said: ::prost::alloc::string::String,
+}
+/// An answer.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SendAnswerRequest {
+    /// The run: its id or the name of its task; empty for the one that is under way.
+    #[prost(string, tag = "1")]
+    pub run: ::prost::alloc::string::String,
+    /// The path of the state that asks, with or without visits; needed where several do.
+    #[prost(string, tag = "2")]
+    pub state: ::prost::alloc::string::String,
+    /// One of its choices.
+    #[prost(string, tag = "3")]
+    pub choice: ::prost::alloc::string::String,
+}
+/// What becomes of it.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SendAnswerResponse {
+    /// A sentence.
+    #[prost(string, tag = "1")]
+    pub said: ::prost::alloc::string::String,
+}
+/// Generated client implementations.
+pub mod run_service_client {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    use tonic::codegen::http::Uri;
+    /// Served by task control while a run is under way; its address is in the endpoint file `run` of the runtime directory.
+    #[derive(Debug, Clone)]
+    pub struct RunServiceClient<T> {
+        inner: tonic::client::Grpc<T>,
+    }
+    impl RunServiceClient<tonic::transport::Channel> {
+        /// Attempt to create a new client by connecting to a given endpoint.
+        pub async fn connect<D>(dst: D) -> Result<Self, tonic::transport::Error>
+        where
+            D: TryInto<tonic::transport::Endpoint>,
+            D::Error: Into<StdError>,
+        {
+            let conn = tonic::transport::Endpoint::new(dst)?.connect().await?;
+            Ok(Self::new(conn))
+        }
+    }
+    impl<T> RunServiceClient<T>
+    where
+        T: tonic::client::GrpcService<tonic::body::Body>,
+        T::Error: Into<StdError>,
+        T::ResponseBody: Body<Data = Bytes> + std::marker::Send + 'static,
+        <T::ResponseBody as Body>::Error: Into<StdError> + std::marker::Send,
+    {
+        pub fn new(inner: T) -> Self {
+            let inner = tonic::client::Grpc::new(inner);
+            Self { inner }
+        }
+        pub fn with_origin(inner: T, origin: Uri) -> Self {
+            let inner = tonic::client::Grpc::with_origin(inner, origin);
+            Self { inner }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> RunServiceClient<InterceptedService<T, F>>
+        where
+            F: tonic::service::Interceptor,
+            T::ResponseBody: Default,
+            T: tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+                Response = http::Response<
+                    <T as tonic::client::GrpcService<tonic::body::Body>>::ResponseBody,
+                >,
+            >,
+            <T as tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+            >>::Error: Into<StdError> + std::marker::Send + std::marker::Sync,
+        {
+            RunServiceClient::new(InterceptedService::new(inner, interceptor))
+        }
+        /// Compress requests with the given encoding.
+        ///
+        /// This requires the server to support it otherwise it might respond with an
+        /// error.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.send_compressed(encoding);
+            self
+        }
+        /// Enable decompressing responses.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.accept_compressed(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_decoding_message_size(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_encoding_message_size(limit);
+            self
+        }
+        /// What the states of the run wait for by themselves now.
+        pub async fn get_waits(
+            &mut self,
+            request: impl tonic::IntoRequest<super::GetWaitsRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::GetWaitsResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/ratn.v1.RunService/GetWaits",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("ratn.v1.RunService", "GetWaits"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Sends a signal: it ends the wait of one state, of one that waits for it now, else of the next that will. Answered when it is in the run's
+        /// log, on the disk. FAILED_PRECONDITION where no state of the task waits for such a signal, where it is of another run, or where too many
+        /// are kept. Sent again it is another signal.
+        pub async fn send_signal(
+            &mut self,
+            request: impl tonic::IntoRequest<super::SendSignalRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::SendSignalResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/ratn.v1.RunService/SendSignal",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("ratn.v1.RunService", "SendSignal"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Answers a question. Answered when that is in the run's log, on the disk. FAILED_PRECONDITION where nothing is asked, where several states ask
+        /// and none is named, or where it is no choice.
+        pub async fn send_answer(
+            &mut self,
+            request: impl tonic::IntoRequest<super::SendAnswerRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::SendAnswerResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/ratn.v1.RunService/SendAnswer",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("ratn.v1.RunService", "SendAnswer"));
+            self.inner.unary(req, path, codec).await
+        }
+    }
+}
+/// Generated server implementations.
+pub mod run_service_server {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    /// Generated trait containing gRPC methods that should be implemented for use with RunServiceServer.
+    #[async_trait]
+    pub trait RunService: std::marker::Send + std::marker::Sync + 'static {
+        /// What the states of the run wait for by themselves now.
+        async fn get_waits(
+            &self,
+            request: tonic::Request<super::GetWaitsRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::GetWaitsResponse>,
+            tonic::Status,
+        >;
+        /// Sends a signal: it ends the wait of one state, of one that waits for it now, else of the next that will. Answered when it is in the run's
+        /// log, on the disk. FAILED_PRECONDITION where no state of the task waits for such a signal, where it is of another run, or where too many
+        /// are kept. Sent again it is another signal.
+        async fn send_signal(
+            &self,
+            request: tonic::Request<super::SendSignalRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::SendSignalResponse>,
+            tonic::Status,
+        >;
+        /// Answers a question. Answered when that is in the run's log, on the disk. FAILED_PRECONDITION where nothing is asked, where several states ask
+        /// and none is named, or where it is no choice.
+        async fn send_answer(
+            &self,
+            request: tonic::Request<super::SendAnswerRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::SendAnswerResponse>,
+            tonic::Status,
+        >;
+    }
+    /// Served by task control while a run is under way; its address is in the endpoint file `run` of the runtime directory.
+    #[derive(Debug)]
+    pub struct RunServiceServer<T> {
+        inner: Arc<T>,
+        accept_compression_encodings: EnabledCompressionEncodings,
+        send_compression_encodings: EnabledCompressionEncodings,
+        max_decoding_message_size: Option<usize>,
+        max_encoding_message_size: Option<usize>,
+    }
+    impl<T> RunServiceServer<T> {
+        pub fn new(inner: T) -> Self {
+            Self::from_arc(Arc::new(inner))
+        }
+        pub fn from_arc(inner: Arc<T>) -> Self {
+            Self {
+                inner,
+                accept_compression_encodings: Default::default(),
+                send_compression_encodings: Default::default(),
+                max_decoding_message_size: None,
+                max_encoding_message_size: None,
+            }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> InterceptedService<Self, F>
+        where
+            F: tonic::service::Interceptor,
+        {
+            InterceptedService::new(Self::new(inner), interceptor)
+        }
+        /// Enable decompressing requests with the given encoding.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.accept_compression_encodings.enable(encoding);
+            self
+        }
+        /// Compress responses with the given encoding, if the client supports it.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.send_compression_encodings.enable(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.max_decoding_message_size = Some(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.max_encoding_message_size = Some(limit);
+            self
+        }
+    }
+    impl<T, B> tonic::codegen::Service<http::Request<B>> for RunServiceServer<T>
+    where
+        T: RunService,
+        B: Body + std::marker::Send + 'static,
+        B::Error: Into<StdError> + std::marker::Send + 'static,
+    {
+        type Response = http::Response<tonic::body::Body>;
+        type Error = std::convert::Infallible;
+        type Future = BoxFuture<Self::Response, Self::Error>;
+        fn poll_ready(
+            &mut self,
+            _cx: &mut Context<'_>,
+        ) -> Poll<std::result::Result<(), Self::Error>> {
+            Poll::Ready(Ok(()))
+        }
+        fn call(&mut self, req: http::Request<B>) -> Self::Future {
+            match req.uri().path() {
+                "/ratn.v1.RunService/GetWaits" => {
+                    #[allow(non_camel_case_types)]
+                    struct GetWaitsSvc<T: RunService>(pub Arc<T>);
+                    impl<
+                        T: RunService,
+                    > tonic::server::UnaryService<super::GetWaitsRequest>
+                    for GetWaitsSvc<T> {
+                        type Response = super::GetWaitsResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::GetWaitsRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as RunService>::get_waits(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = GetWaitsSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/ratn.v1.RunService/SendSignal" => {
+                    #[allow(non_camel_case_types)]
+                    struct SendSignalSvc<T: RunService>(pub Arc<T>);
+                    impl<
+                        T: RunService,
+                    > tonic::server::UnaryService<super::SendSignalRequest>
+                    for SendSignalSvc<T> {
+                        type Response = super::SendSignalResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::SendSignalRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as RunService>::send_signal(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = SendSignalSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/ratn.v1.RunService/SendAnswer" => {
+                    #[allow(non_camel_case_types)]
+                    struct SendAnswerSvc<T: RunService>(pub Arc<T>);
+                    impl<
+                        T: RunService,
+                    > tonic::server::UnaryService<super::SendAnswerRequest>
+                    for SendAnswerSvc<T> {
+                        type Response = super::SendAnswerResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::SendAnswerRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as RunService>::send_answer(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = SendAnswerSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                _ => {
+                    Box::pin(async move {
+                        let mut response = http::Response::new(
+                            tonic::body::Body::default(),
+                        );
+                        let headers = response.headers_mut();
+                        headers
+                            .insert(
+                                tonic::Status::GRPC_STATUS,
+                                (tonic::Code::Unimplemented as i32).into(),
+                            );
+                        headers
+                            .insert(
+                                http::header::CONTENT_TYPE,
+                                tonic::metadata::GRPC_CONTENT_TYPE,
+                            );
+                        Ok(response)
+                    })
+                }
+            }
+        }
+    }
+    impl<T> Clone for RunServiceServer<T> {
+        fn clone(&self) -> Self {
+            let inner = self.inner.clone();
+            Self {
+                inner,
+                accept_compression_encodings: self.accept_compression_encodings,
+                send_compression_encodings: self.send_compression_encodings,
+                max_decoding_message_size: self.max_decoding_message_size,
+                max_encoding_message_size: self.max_encoding_message_size,
+            }
+        }
+    }
+    /// Generated gRPC service name
+    pub const SERVICE_NAME: &str = "ratn.v1.RunService";
+    impl<T> tonic::server::NamedService for RunServiceServer<T> {
+        const NAME: &'static str = SERVICE_NAME;
+    }
+}

@@ -50,4 +50,7 @@
     Method { service: "ratn.v1.SafetyService", name: "Hold", operation: Some(Operation::Perform) },
     Method { service: "ratn.v1.SafetyService", name: "GoOn", operation: Some(Operation::Administer) },
     Method { service: "ratn.v1.SafetyService", name: "GetSafety", operation: Some(Operation::Look) },
+    Method { service: "ratn.v1.RunService", name: "GetWaits", operation: Some(Operation::Look) },
+    Method { service: "ratn.v1.RunService", name: "SendSignal", operation: Some(Operation::Perform) },
+    Method { service: "ratn.v1.RunService", name: "SendAnswer", operation: Some(Operation::Perform) },
 ]

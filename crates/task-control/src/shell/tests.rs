@@ -124,6 +124,42 @@ async fn waits(place: &Place, path: &str) {
     }
 }
 
+/// A client of gRPC sees what is waited for, and is refused as everybody.
+async fn over_grpc(place: &Place) {
+    use ratn_proto::v1;
+    let runtime = RuntimeDirectory::at(&place.directory);
+    let endpoint = runtime.wait_for(crate::control::ROLE, READY).await.expect("it is served");
+    let channel = ratn_worker::client::Channels::new(&place.tls).get(&endpoint).expect("a channel");
+    let mut client = v1::run_service_client::RunServiceClient::new(channel);
+    let waits = client.get_waits(v1::GetWaitsRequest {}).await.expect("it says").into_inner();
+    let awaited = Some(v1::wait::Awaited::Signal("order".to_owned()));
+    let wait = v1::Wait { path: "next".to_owned(), until_s: None, awaited };
+    assert_eq!((waits.task.as_str(), waits.waits), ("hand_over", vec![wait]));
+    let answer = v1::SendAnswerRequest { choice: "so".to_owned(), ..Default::default() };
+    let refused = client.send_answer(answer).await.expect_err("nothing is asked");
+    assert_eq!((refused.code(), refused.message()), (tonic::Code::FailedPrecondition, "no state asks anything now"));
+    for bad in ["a\u{1b}[31m".to_owned(), "a".repeat(2_000)] {
+        let request = |run: &str, signal: &str| v1::SendSignalRequest {
+            run: run.to_owned(),
+            signal: signal.to_owned(),
+            value: None,
+        };
+        for (request, field) in [(request(&bad, "later"), "run"), (request("", &bad), "signal")] {
+            let refused = client.send_signal(request).await.expect_err("it is no name");
+            assert!(refused.code() == tonic::Code::InvalidArgument && refused.message().contains(field), "{refused}");
+        }
+        let of_state = v1::SendAnswerRequest { state: bad.clone(), ..Default::default() };
+        let of_choice = v1::SendAnswerRequest { choice: bad, ..Default::default() };
+        for (request, field) in [(of_state, "state"), (of_choice, "choice")] {
+            let refused = client.send_answer(request).await.expect_err("it is no name");
+            assert!(refused.code() == tonic::Code::InvalidArgument && refused.message().contains(field), "{refused}");
+        }
+    }
+    let again = v1::SendSignalRequest { signal: "later".to_owned(), ..Default::default() };
+    let said = client.send_signal(again).await.expect("it is kept").into_inner().said;
+    assert_eq!(said, "it is kept for the next state that waits for `later`");
+}
+
 #[tokio::test]
 async fn a_run_that_waits_has_what_it_was_sent_also_after_it_was_killed() -> anyhow::Result<()> {
     let mut bench = Bench::new(|waiting| *waiting = program(WAITING)).await?;
@@ -134,6 +170,7 @@ async fn a_run_that_waits_has_what_it_was_sent_also_after_it_was_killed() -> any
         waits(place, "next").await;
         let said = sent(place, signal("later", Value::Null)).await;
         assert_eq!(said, Ok("it is kept for the next state that waits for `later`".to_owned()));
+        over_grpc(place).await;
         let refused = sent(place, signal("odrer", Value::Null)).await;
         let help = "no state of hand_over waits for a signal `odrer`: did you mean `order`?";
         assert_eq!(refused, Err(help.to_owned()));

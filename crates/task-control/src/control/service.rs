@@ -1,0 +1,148 @@
+//! gRPC in front of a run's ear: signals and answers from clients of any language, and what is waited for.
+//!
+//! It says the same as the socket of [`super`], which it tells. Served at the Unix socket `run.sock` of the runtime directory, whose
+//! endpoint file is `run.endpoint`; who may is what the table of roles says of a process without a config of its own.
+
+use super::{ANY_RUN, Asked, Awaiting, Message, RunStatus};
+use futures::FutureExt;
+use ratn_executive::protocol::Awaited;
+use ratn_model::value::Value;
+use ratn_proto::convert::label;
+use ratn_proto::v1;
+use ratn_proto::v1::run_service_server::{RunService, RunServiceServer};
+use ratn_worker::access::Caller;
+use ratn_worker::audit::{self, Mutation};
+use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::server::{ServeError, Services, bind};
+use std::path::Path;
+use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
+use tonic::{Request, Response, Status};
+
+/// Under this name a run is found in the runtime directory.
+pub const ROLE: &str = "run";
+
+/// Serves a run's [`RunService`].
+#[derive(Debug, Clone)]
+pub struct RunServer {
+    tell: mpsc::Sender<Asked>,
+}
+
+impl RunServer {
+    /// Of no run: every call that is let in is refused. For tests of who is.
+    pub fn of_nobody() -> RunServer {
+        RunServer { tell: mpsc::channel(1).0 }
+    }
+
+    pub(super) fn of(tell: mpsc::Sender<Asked>) -> RunServer {
+        RunServer { tell }
+    }
+
+    /// For [`Services::with`].
+    pub fn into_service(self) -> RunServiceServer<RunServer> {
+        RunServiceServer::new(self)
+    }
+
+    /// Serves it in a runtime directory until `end`.
+    pub(super) async fn serve(self, directory: &Path, end: CancellationToken) -> Result<(), ServeProblem> {
+        let directory = RuntimeDirectory::at(directory);
+        let bound = bind(&directory.socket(ROLE)).await?;
+        let _published = directory.publish(ROLE, bound.endpoint())?;
+        Ok(bound.serve(Services::new().with(self.into_service()), end).boxed().await?)
+    }
+
+    async fn say(&self, message: Message) -> Result<String, Status> {
+        let (say, said) = oneshot::channel();
+        self.ask(Asked::Message(message, say))?;
+        said.await.map_err(|_| has_ended())?.map_err(Status::failed_precondition)
+    }
+
+    fn ask(&self, asked: Asked) -> Result<(), Status> {
+        self.tell.try_send(asked).map_err(|error| match error {
+            mpsc::error::TrySendError::Full(_) => Status::resource_exhausted("the run is too far behind"),
+            mpsc::error::TrySendError::Closed(_) => has_ended(),
+        })
+    }
+}
+
+/// Why a run is not served.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum ServeProblem {
+    #[error(transparent)]
+    Bind(#[from] ratn_worker::server::BindError),
+    #[error("its endpoint file cannot be written: {0}")]
+    Publish(#[from] std::io::Error),
+    #[error(transparent)]
+    Serve(#[from] ServeError),
+}
+
+fn has_ended() -> Status {
+    Status::unavailable("the run has just ended")
+}
+
+#[tonic::async_trait]
+impl RunService for RunServer {
+    async fn get_waits(&self, _: Request<v1::GetWaitsRequest>) -> Result<Response<v1::GetWaitsResponse>, Status> {
+        let (say, said) = oneshot::channel();
+        self.ask(Asked::Status(say))?;
+        let RunStatus { run, task, awaits, .. } = said.await.map_err(|_| has_ended())?;
+        let waits = awaits.into_iter().map(v1::Wait::from).collect();
+        Ok(Response::new(v1::GetWaitsResponse { run, task, waits }))
+    }
+
+    async fn send_signal(
+        &self,
+        request: Request<v1::SendSignalRequest>,
+    ) -> Result<Response<v1::SendSignalResponse>, Status> {
+        let caller = Caller::of(&request);
+        let v1::SendSignalRequest { run, signal, value } = request.into_inner();
+        label(&signal, "signal")?;
+        let value = match value {
+            Some(value) => Value::try_from(value)?,
+            None => Value::Null,
+        };
+        let run = named(run)?;
+        let pending = audit::begin(&caller, "", || Mutation::Signal { signal: signal.clone() });
+        let said = self.say(Message::Signal { run, signal, value }).await;
+        pending.ended(&said);
+        Ok(Response::new(v1::SendSignalResponse { said: said? }))
+    }
+
+    async fn send_answer(
+        &self,
+        request: Request<v1::SendAnswerRequest>,
+    ) -> Result<Response<v1::SendAnswerResponse>, Status> {
+        let caller = Caller::of(&request);
+        let v1::SendAnswerRequest { run, state, choice } = request.into_inner();
+        label(&state, "state")?;
+        label(&choice, "choice")?;
+        let run = named(run)?;
+        let answer = || Mutation::Answer { state: state.clone(), choice: choice.clone() };
+        let pending = audit::begin(&caller, "", answer);
+        let state = Some(state).filter(|state| !state.is_empty());
+        let said = self.say(Message::Answer { run, state, choice }).await;
+        pending.ended(&said);
+        Ok(Response::new(v1::SendAnswerResponse { said: said? }))
+    }
+}
+
+fn named(run: String) -> Result<String, Status> {
+    label(&run, "run")?;
+    Ok(if run.is_empty() { ANY_RUN.to_owned() } else { run })
+}
+
+impl From<Awaiting> for v1::Wait {
+    fn from(awaiting: Awaiting) -> v1::Wait {
+        use v1::wait::Awaited as Wire;
+        let Awaiting { path, awaited, until_s } = awaiting;
+        let awaited = match awaited {
+            Awaited::Time => None,
+            Awaited::Condition { condition } => Some(Wire::Condition(condition)),
+            Awaited::Signal { signal } => Some(Wire::Signal(signal)),
+            Awaited::Answer { question, choices, default } => {
+                Some(Wire::Question(v1::Question { text: question, choices, default }))
+            }
+        };
+        v1::Wait { path, until_s, awaited }
+    }
+}
