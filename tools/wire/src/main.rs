@@ -1,7 +1,7 @@
 //! Generates the Rust code of every `.proto` file of ratn, in pure Rust: no `protoc` is needed.
 //!
 //! The code is checked in, beside the crate that uses it, so that a build of ratn compiles neither a parser of `.proto` files nor a
-//! generator. Each folder of generated code has a file [`SOURCES`]: the digests of the files that it was made of. A test of the
+//! generator. The one argument is where to put it, the root of the project or a copy to compare with. Each folder of generated code has a file [`SOURCES`]: the digests of the files that it was made of. A test of the
 //! workspace compares them, and the gate generates everything again and compares that.
 
 use protox::prost_reflect::{DescriptorPool, MethodDescriptor};
@@ -22,15 +22,16 @@ type Fallible<T> = Result<T, Box<dyn Error>>;
 
 fn main() -> Fallible<()> {
     let root = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize()?;
-    ratn(&root)?;
-    etcd(&root)?;
-    exports(&root)
+    let out = std::env::args_os().nth(1).map_or_else(|| root.clone(), PathBuf::from);
+    ratn(&root, &out)?;
+    etcd(&root, &out)?;
+    exports(&root, &out)
 }
 
 /// The wire of ratn itself, with the descriptors for reflection and, as the generated code forgets the options of methods, the table of
 /// what each method does.
-fn ratn(root: &Path) -> Fallible<()> {
-    let out = folder(root, "crates/proto")?;
+fn ratn(root: &Path, out: &Path) -> Fallible<()> {
+    let out = folder(out, "crates/proto")?;
     let protos = root.join("proto");
     let files: Vec<PathBuf> = FILES.iter().map(|name| protos.join(format!("ratn/v1/{name}.proto"))).collect();
     let mut compiler = protox::Compiler::new([&protos])?;
@@ -45,8 +46,8 @@ fn ratn(root: &Path) -> Fallible<()> {
 }
 
 /// What is said to etcd.
-fn etcd(root: &Path) -> Fallible<()> {
-    let out = folder(root, "crates/storage")?;
+fn etcd(root: &Path, out: &Path) -> Fallible<()> {
+    let out = folder(out, "crates/storage")?;
     let file = root.join("crates/storage/proto/etcd.proto");
     let mut compiler = protox::Compiler::new([root.join("crates/storage/proto")])?;
     compiler.include_source_info(true).open_file(&file)?;
@@ -59,8 +60,8 @@ fn etcd(root: &Path) -> Fallible<()> {
 }
 
 /// The messages of exports, and the descriptors of Foxglove's, which an MCAP file carries with it.
-fn exports(root: &Path) -> Fallible<()> {
-    let out = folder(root, "crates/export")?;
+fn exports(root: &Path, out: &Path) -> Fallible<()> {
+    let out = folder(out, "crates/export")?;
     let protos = root.join("crates/export/proto");
     let files = [protos.join("foxglove.proto"), protos.join("perfetto.proto")];
     let mut foxglove = protox::Compiler::new([&protos])?;
