@@ -52,7 +52,9 @@ const PAGES: [(&str, &str, &str); 4] = [
 
 /// How the task file of a log is loaded. What is not the task of the run is not shown.
 #[derive(Clone)]
-pub struct Tasks(Arc<dyn Fn(&Path) -> Result<Program, String> + Send + Sync>);
+pub struct Tasks(Arc<Load>);
+
+type Load = dyn Fn(&Path) -> Result<Program, String> + Send + Sync;
 
 impl Tasks {
     /// Loads them so; an error says in a sentence why one is not there.
