@@ -98,9 +98,15 @@ impl Logs {
         Logs { all: Mutex::new(all) }
     }
 
-    /// A run says what it is doing; its log is one of them from now on.
+    /// No run is under way.
+    pub(crate) fn hear_nobody(&self) {
+        self.lock().logs.iter_mut().for_each(|one| one.heard = None);
+    }
+
+    /// A run says what it is doing; its log is one of them from now on. A system has one run at a time.
     pub(crate) fn hear(&self, status: RunStatus) {
         let mut all = self.lock();
+        all.logs.iter_mut().for_each(|one| one.heard = None);
         let path = std::fs::canonicalize(&status.log).unwrap_or_else(|_| status.log.clone());
         let known = all.logs.iter().position(|one| one.path == path);
         let index = known.unwrap_or_else(|| all.add(path, false));

@@ -3,7 +3,7 @@
 use crate::gate::{self, HEADERS, Refused, Token};
 use crate::logs::{Asked, Logs, MAX_LOGS, NotTold, absolute};
 use crate::patience::Patient;
-use crate::system::System;
+use crate::system::{Heard, System};
 use crate::{task, wire};
 use hyper::body::Incoming;
 use hyper::header::{ALLOW, CONTENT_TYPE, HeaderValue};
@@ -52,7 +52,9 @@ const PAGES: [(&str, &str, &str); 4] = [
 
 /// How the task file of a log is loaded. What is not the task of the run is not shown.
 #[derive(Clone)]
-pub struct Tasks(Arc<dyn Fn(&Path) -> Result<Program, String> + Send + Sync>);
+pub struct Tasks(Arc<Load>);
+
+type Load = dyn Fn(&Path) -> Result<Program, String> + Send + Sync;
 
 impl Tasks {
     /// Loads them so; an error says in a sentence why one is not there.
@@ -300,9 +302,11 @@ impl Shown {
     /// Asks the system for its run: its log is one of those that are looked at.
     async fn hear(&self) -> Result<(), String> {
         match self.system.run().await {
-            Ok(status) => {
-                if let Some(status) = status {
-                    self.logs.hear(status);
+            Ok(heard) => {
+                match heard {
+                    Heard::Run(status) => self.logs.hear(*status),
+                    Heard::Nobody => self.logs.hear_nobody(),
+                    Heard::JustNow => {}
                 }
                 Ok(())
             }

@@ -30,6 +30,17 @@ const TAIL_BYTES: usize = 16 << 10;
 /// More of it is not read through.
 const MOST_LOG_BYTES: usize = 64 << 20;
 
+/// What is heard of the run of a system.
+#[derive(Debug)]
+pub(crate) enum Heard {
+    /// It was asked a moment ago.
+    JustNow,
+    /// No run is under way.
+    Nobody,
+    /// This.
+    Run(Box<RunStatus>),
+}
+
 /// A system, by its runtime directory.
 #[derive(Debug)]
 pub(crate) struct System {
@@ -50,15 +61,15 @@ impl System {
         self.directory.display().to_string()
     }
 
-    /// What its run is doing; none where no run is under way, or it was asked just now.
-    pub(crate) async fn run(&self) -> std::io::Result<Option<RunStatus>> {
+    /// What its run is doing.
+    pub(crate) async fn run(&self) -> std::io::Result<Heard> {
         let mut asked = self.run.lock().await;
         if asked.is_some_and(|asked| asked.elapsed() < RUN_FRESH) {
-            return Ok(None);
+            return Ok(Heard::JustNow);
         }
         let status = control::status(&self.directory).await;
         *asked = Some(Instant::now());
-        status
+        Ok(status?.map_or(Heard::Nobody, |status| Heard::Run(Box::new(status))))
     }
 
     /// Tells its run.

@@ -166,17 +166,22 @@ function choose(id: number): void {
   hurry();
 }
 
-logs.addEventListener("change", () => choose(Number(logs.value)));
+/** The run that its user did not want to look at. */
+let declined: number | null = null;
+logs.addEventListener("change", () => {
+  const id = Number(logs.value);
+  declined = about?.logs.find((one) => one.live && one.id !== id)?.id ?? null;
+  choose(id);
+});
 
 function showLogs(now: About): void {
-  const before = about?.logs ?? [];
   about = now;
-  // A run that has just begun is what somebody wants to see who looks at none.
-  const begun = now.logs.find((one) => one.live && !before.some((old) => old.id === one.id && old.live));
+  // A run that begins is what somebody wants to see who looks at one that has ended.
+  const begun = now.logs.find((one) => one.live && one.id !== log && one.id !== declined);
   const gone = !now.logs.some((one) => one.id === log);
   const next = gone ? (now.logs.find((one) => one.live) ?? now.logs[0]) : undefined;
   if (next !== undefined) choose(next.id);
-  else if (begun !== undefined && begun.id !== log && !now.logs.some((one) => one.id === log && one.live) && moment === null && store.run?.outcome != null) {
+  else if (begun !== undefined && !now.logs.some((one) => one.id === log && one.live) && moment === null && store.run?.outcome != null) {
     choose(begun.id);
     say(`a run has begun: ${begun.name}`);
   }
