@@ -26,17 +26,21 @@ class _Arm:
         self,
         *,
         trajectory: ratn.Trajectory | Value,
+        arm: str | Value = ...,
         **annotations: Unpack[Annotations],
     ) -> _ArmFollow: ...
     def move_to(
         self,
         *,
         joints: ratn.Joints | Sequence[float] | Value,
+        arm: str | Value = ...,
         speed: float | Value = ...,
         **annotations: Unpack[Annotations],
     ) -> _ArmMoveTo: ...
     def where(
         self,
+        *,
+        arm: str | Value = ...,
         **annotations: Unpack[Annotations],
     ) -> _ArmWhere: ...
 
@@ -135,17 +139,22 @@ class _GripperRelease(ratn.State):
 class _Gripper:
     def feel(
         self,
+        *,
+        arm: str | Value = ...,
         **annotations: Unpack[Annotations],
     ) -> _GripperFeel: ...
     def grasp(
         self,
         *,
         object: str | Value,
+        arm: str | Value = ...,
         expected: ratn.Pose | Value = ...,
         **annotations: Unpack[Annotations],
     ) -> _GripperGrasp: ...
     def release(
         self,
+        *,
+        arm: str | Value = ...,
         **annotations: Unpack[Annotations],
     ) -> _GripperRelease: ...
 
