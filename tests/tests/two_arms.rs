@@ -49,6 +49,15 @@ fn each_region_moves_the_arm_that_it_holds() -> anyhow::Result<()> {
     let task = place.path().join("both_arms.yaml");
     std::fs::write(&task, TASK)?;
     let task = task.to_str().context("a path")?;
+    // What is predicted knows the arms: both move at once.
+    let output = place.ratn(&["check", task, "--robot", robot, "--json"]).output()?;
+    let (document, said) = texts(&output);
+    ensure!(output.status.success(), "{document}\n{said}");
+    let checked: Value = serde_json::from_str(&document).with_context(|| said.clone())?;
+    let predicted = |mode: &str| checked["sequential"][mode].as_f64();
+    ensure!(predicted("hsm_s").is_some_and(|seconds| seconds < 5.5), "{checked}\n{said}");
+    ensure!(checked["obstacle"].is_null(), "{checked}");
+
     let rest = ["--robot", robot, "--speed", "20", "--seed", "3", "--json"];
     let output = place.ratn(&[&["run", task][..], &rest].concat()).output()?;
     let (document, said) = texts(&output);
