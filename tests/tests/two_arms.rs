@@ -49,6 +49,23 @@ fn each_region_moves_the_arm_that_it_holds() -> anyhow::Result<()> {
     let task = place.path().join("both_arms.yaml");
     std::fs::write(&task, TASK)?;
     let task = task.to_str().context("a path")?;
+    let output = place.ratn(&["robot", "check", robot]).output()?;
+    let (lines, said) = texts(&output);
+    ensure!(output.status.success(), "{lines}\n{said}");
+    for line in ["arm       7 joints to the link `left_tool`", "arm       `right`, 7 joints to the link `right_tool`"] {
+        ensure!(lines.contains(line), "{lines}");
+    }
+    ensure!(lines.matches("posture   home: free").count() == 2, "{lines}");
+
+    // What is predicted knows the arms: both move at once.
+    let output = place.ratn(&["check", task, "--robot", robot, "--json"]).output()?;
+    let (document, said) = texts(&output);
+    ensure!(output.status.success(), "{document}\n{said}");
+    let checked: Value = serde_json::from_str(&document).with_context(|| said.clone())?;
+    let predicted = |mode: &str| checked["sequential"][mode].as_f64();
+    ensure!(predicted("hsm_s").is_some_and(|seconds| seconds < 5.5), "{checked}\n{said}");
+    ensure!(checked["obstacle"].is_null(), "{checked}");
+
     let rest = ["--robot", robot, "--speed", "20", "--seed", "3", "--json"];
     let output = place.ratn(&[&["run", task][..], &rest].concat()).output()?;
     let (document, said) = texts(&output);

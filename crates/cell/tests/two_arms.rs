@@ -9,6 +9,7 @@ use ratn_cell::core::recording::{Line, ReplayError, replay};
 use ratn_cell::core::snapshot::{Snapshot, SnapshotError};
 use ratn_model::grasp;
 use ratn_model::pose::Pose;
+use ratn_model::value::{Trajectory, TrajectoryPoint};
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::pace::Control;
 use ratn_motion::plan::{Goal, Request as PlanRequest, plan};
@@ -306,4 +307,13 @@ fn an_arm_that_is_not_there_and_joints_of_another_number_are_refused() {
     assert_eq!(refused(&commands), "the robot has 2 arms, numbered from 0: there is no arm 2");
     let (_, commands) = bench.start_with(RIGHT, Request::MoveTo { joints: JointVector::zeros(6), speed: 0.3 });
     assert_eq!(refused(&commands), "input `joints` has 6 values: the arm has 7");
+
+    // What was planned for one arm does not move the other.
+    let home = bench.cell.robot_of(LEFT).posture("home").unwrap();
+    let point = |time_s: f64| TrajectoryPoint { time_s, positions: home.to_vec(), velocities: vec![0.0; 7] };
+    let names = bench.cell.robot_of(LEFT).arm_joints().iter().map(|joint| joint.name.clone()).collect();
+    let trajectory = Trajectory { joints: names, points: vec![point(0.0), point(1.0)] };
+    let (_, commands) = bench.start_with(RIGHT, Request::Follow { trajectory: trajectory.clone() });
+    assert!(refused(&commands).contains("left_arm_joint_1"), "{commands:?}");
+    assert!(matches!(bench.perform_with(LEFT, Request::Follow { trajectory }), Ending::Done(_)));
 }

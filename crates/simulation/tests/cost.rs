@@ -238,7 +238,13 @@ fn count_to(iterations: usize, task: &str, readers: usize) -> Duration {
 fn check_counting(iterations: usize) -> Duration {
     let program = load(&counting(iterations), "task.yaml", &NoFiles);
     let parameters = program.bind_parameters(&[]).unwrap();
-    let assumptions = Assumptions { parameters, elements: 2, durations_s: BTreeMap::new(), units: BTreeMap::new() };
+    let assumptions = Assumptions {
+        parameters,
+        elements: 2,
+        durations_s: BTreeMap::new(),
+        units: BTreeMap::new(),
+        attributes: BTreeMap::new(),
+    };
     #[expect(clippy::disallowed_methods, reason = "a test of what it takes")]
     let before = Instant::now();
     sequential(&program, &catalogue(), &assumptions).unwrap();

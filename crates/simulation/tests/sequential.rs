@@ -17,7 +17,8 @@ fn check_with_brains(text: &str, brains: u32) -> Result<Sequential, Obstacle> {
     let program = load(text, "task.yaml", &NoFiles);
     let parameters = program.bind_parameters(&[]).unwrap();
     let units = BTreeMap::from([("Brain".to_owned(), Quantity::whole(brains))]);
-    let assumptions = Assumptions { parameters, elements: 2, durations_s: BTreeMap::new(), units };
+    let (durations_s, attributes) = (BTreeMap::new(), BTreeMap::new());
+    let assumptions = Assumptions { parameters, elements: 2, durations_s, units, attributes };
     sequential(&program, &catalogue(), &assumptions)
 }
 

@@ -80,6 +80,12 @@ impl Module {
         }
     }
 
+    /// The name of the arm that it is, or whose gripper it is, of a robot with several arms: its resource says it as the attribute `arm`.
+    pub fn arm_name(self, robot: &Robot) -> Option<&str> {
+        let arm = self.arm().filter(|_| robot.arm_names().count() > 1)?;
+        robot.arm_names().nth(arm)
+    }
+
     /// The kind of the resource that it is.
     pub fn kind(self) -> &'static str {
         match self {

@@ -27,16 +27,10 @@ pub(crate) fn resource_id(module: Module, robot: &Robot, host: &str) -> String {
         Module::PanTilt => "pan-tilt",
         Module::Camera => "camera",
     };
-    match arm_of(module, robot) {
+    match module.arm_name(robot) {
         Some(arm) => format!("{name}_{arm}@{host}"),
         None => format!("{name}@{host}"),
     }
-}
-
-/// The name of the arm that a module is, or whose gripper it is, of a robot with several arms: its resource says it as the attribute `arm`.
-pub(crate) fn arm_of(module: Module, robot: &Robot) -> Option<&str> {
-    let arm = module.arm().filter(|_| robot.arm_names().count() > 1)?;
-    robot.arm_names().nth(arm)
 }
 
 /// The watch of who holds the modules.
@@ -59,7 +53,7 @@ pub(crate) fn server(
         let resources: Vec<Performer> = of_kind
             .map(|module| Performer {
                 arm: module.arm().unwrap_or(FIRST),
-                arm_name: arm_of(*module, handle.robot()).map(str::to_owned),
+                arm_name: module.arm_name(handle.robot()).map(str::to_owned),
                 resource: resource_id(*module, handle.robot(), &config.host),
             })
             .collect();

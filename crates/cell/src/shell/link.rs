@@ -1,7 +1,7 @@
 //! The link to the resource manager: a session, the modules and the battery as resources under it, the watch of leases.
 //! Follows the manager when it comes back somewhere else.
 
-use super::actions::{arm_of, resource_id};
+use super::actions::resource_id;
 use super::cell_actor::CellHandle;
 use crate::config::CellConfig;
 use crate::core::protocol::Module;
@@ -100,7 +100,7 @@ impl Link {
                 if module != Module::Camera {
                     resource = resource.with_standstill(self.config.standstill());
                 }
-                if let Some(arm) = arm_of(module, self.handle.robot()) {
+                if let Some(arm) = module.arm_name(self.handle.robot()) {
                     resource = resource.with_attribute("arm", Value::String(arm.to_owned()));
                 }
                 provider.offer(resource.on_host(&self.config.host)).await?;

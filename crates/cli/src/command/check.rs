@@ -129,6 +129,7 @@ fn simulate(
         durations_s: learned.durations_s,
         // What a system starts when there is demand is there in time.
         units: config.promised_resources().into_iter().map(|(kind, units)| (kind, units.max(Quantity::ONE))).collect(),
+        attributes: config.module_attributes().clone(),
     };
     Ok(sequential(program, &config.catalogue, &assumptions).map_err(|obstacle| obstacle.to_string()))
 }

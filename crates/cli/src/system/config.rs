@@ -14,6 +14,7 @@ use ratn_daemon::service::ServiceConfig;
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
 use ratn_model::catalogue::{Catalogue, JointChain};
 use ratn_model::resource::{Quantity, ResourceClass};
+use ratn_model::value::Value;
 use ratn_motion::description::DescriptionError;
 use ratn_motion::robot::Robot;
 use ratn_worker::endpoint::Endpoint;
@@ -82,7 +83,12 @@ struct Parts {
     joints: ArmJoints,
     /// Which those are.
     chain: Option<JointChain>,
+    /// The attributes of the modules of a kind, one after the other: which arm each is, of a robot with several.
+    attributes: ModuleAttributes,
 }
+
+/// By the kind of a module, for each module of this kind.
+type ModuleAttributes = BTreeMap<String, Vec<BTreeMap<String, Value>>>;
 
 /// How many joints an arm of the robot has.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -97,7 +103,12 @@ enum ArmJoints {
 
 impl Default for Parts {
     fn default() -> Self {
-        Parts { modules: Module::ALL.to_vec(), joints: ArmJoints::AsSaid, chain: None }
+        Parts {
+            modules: Module::ALL.to_vec(),
+            joints: ArmJoints::AsSaid,
+            chain: None,
+            attributes: ModuleAttributes::new(),
+        }
     }
 }
 
@@ -266,7 +277,13 @@ impl SystemConfig {
                 arm: robot.arm_name().to_owned(),
                 joints: robot.arm_joints().iter().map(|joint| joint.name.clone()).collect(),
             });
-            self.parts = Parts { modules: Module::of(&robot), joints, chain };
+            let modules = Module::of(&robot);
+            let mut attributes = ModuleAttributes::new();
+            for (module, arm) in modules.iter().filter_map(|module| Some((module, module.arm_name(&robot)?))) {
+                let said = [("arm".to_owned(), Value::String(arm.to_owned()))].into();
+                attributes.entry(module.kind().to_owned()).or_default().push(said);
+            }
+            self.parts = Parts { modules, joints, chain, attributes };
         }
         self.parts.fit(&mut self.catalogue, &self.process_manager.templates);
         self.process_manager_config().templates.iter().try_for_each(|template| self.check_told(template))
@@ -357,13 +374,20 @@ impl SystemConfig {
 
     /// How much of each kind is there once the system is ready.
     pub(crate) fn promised_resources(&self) -> BTreeMap<String, Quantity> {
-        let kinds = self.parts.modules.iter().map(|module| module.kind()).chain([BATTERY]);
-        let mut promised: BTreeMap<String, Quantity> = kinds.map(|kind| (kind.to_owned(), Quantity::ONE)).collect();
+        let mut promised: BTreeMap<String, Quantity> = BTreeMap::new();
+        for kind in self.parts.modules.iter().map(|module| module.kind()).chain([BATTERY]) {
+            *promised.entry(kind.to_owned()).or_default() += Quantity::ONE;
+        }
         promised.insert(self.world_pool.kind.clone(), self.world_pool.capacity.into());
         for template in &self.process_manager.templates {
             *promised.entry(template.kind.clone()).or_default() += template.min.into();
         }
         promised
+    }
+
+    /// Which arm each module of a kind is, of a robot with several arms.
+    pub(crate) fn module_attributes(&self) -> &ModuleAttributes {
+        &self.parts.attributes
     }
 
     /// The same config as a file.

@@ -10,7 +10,7 @@ mod providers;
 
 pub use chain::Link;
 
-use crate::run::{Run, RunError, Setup, run};
+use crate::run::{Circumstances, Run, RunError, Setup, run_under};
 use annotate::{annotated, missing};
 use providers::AssumedProviders;
 use ratn_executive::protocol::{Command, LogEntry};
@@ -46,6 +46,8 @@ pub struct Assumptions {
     pub durations_s: BTreeMap<String, f64>,
     /// How much there is of each resource kind, where it is not as much as the catalogue allows.
     pub units: BTreeMap<String, Quantity>,
+    /// What the attributes of the resources of a kind are, one after the other: those of arms say which arm they are.
+    pub attributes: BTreeMap<String, Vec<BTreeMap<String, Value>>>,
 }
 
 /// What keeps a task sequential.
@@ -245,7 +247,8 @@ fn simulate(
         latency: Duration::ZERO,
     };
     let mut providers = AssumedProviders::new(&program, assumptions);
-    let run = run(setup, &mut providers).map_err(|source| Obstacle::Run { mode: name, source })?;
+    let circumstances = Circumstances { attributes: assumptions.attributes.clone(), ..Circumstances::default() };
+    let run = run_under(setup, &mut providers, circumstances).map_err(|source| Obstacle::Run { mode: name, source })?;
     unknown.extend(providers.unknown_durations());
     if run.outcome == SUCCESS {
         Ok(run)
