@@ -386,6 +386,9 @@ states:
 #[test]
 fn what_is_wrong_with_a_wait_is_said() {
     let found = |state: &str| findings(&format!("task: t\nstates:\n  - {state}\n"));
+    assert_eq!(found("wait: { for: level(tank) > 3 and open(lid) }"), "", "somebody else says so");
+    let wrong = "task: t\nworld: [hand_empty(gripper)]\nstates:\n  - wait: { for: hand_emtpy(gripper) }\n";
+    assert!(findings(wrong).contains("did you mean `hand_empty`?"), "{}", findings(wrong));
     assert_snapshot!(found("wait: 5"), @"task.yaml:3:11: error[invalid-state] in wait: `wait` is a mapping, found a number. help: write `wait: { for: door_open(front) }`, or one of `seconds`, `until`, `signal` for `for`");
     assert_snapshot!(found("wait: { for: open(lid), signal: go }"), @"task.yaml:3:11: error[invalid-state] in wait: a state waits by `for` or by `signal`, not by both. help: write `wait: { for: door_open(front) }`, or one of `seconds`, `until`, `signal` for `for`");
     assert_snapshot!(found("wait: { seconds: 3, timeout: 5 }"), @"task.yaml:3:34: error[invalid-state] in wait: a wait for a time is over by itself. help: leave `timeout` out");

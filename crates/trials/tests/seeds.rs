@@ -57,3 +57,26 @@ fn everything_is_made() {
         assert!(with > 0, "no program has `{text}`");
     }
 }
+
+#[test]
+fn waits_of_every_kind_are_made() {
+    let made: Vec<String> = (0..400).map(|seed| listing(&program(seed, &Features::WAITS))).collect();
+    let expected = [
+        "seconds(seconds: ",
+        "until(until: ",
+        "condition(for: ",
+        "for: not exists ",
+        " and p",
+        "signal(signal: signal_",
+        "ask(question: ",
+        "default: ",
+        "timeout 60 s",
+        "timeout → ",
+        ": value",
+        ": answer",
+    ];
+    for text in expected {
+        let with = made.iter().filter(|listing| listing.contains(text)).count();
+        assert!(with > 0, "no program has `{text}`");
+    }
+}

@@ -81,6 +81,7 @@ fn elsewhere(name: &str) -> Option<&'static str> {
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     let program = subject.program;
     let known = predicates(subject);
+    let awaited = awaited(subject);
     let mut told = BTreeSet::new();
     for state in &program.states {
         for (slot, expr) in expressions(program, state) {
@@ -118,6 +119,8 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
                     }
                     // `unestablished-precondition` says it.
                     (None, None) if matches!(slot, Slot::Requires(_)) => {}
+                    // Somebody else is to write it.
+                    (None, None) if awaited.contains(name) => {}
                     // Once each: what nobody writes is null wherever it is read.
                     (None, near) if told.insert(name.to_owned()) => {
                         let help = match near {
@@ -202,6 +205,13 @@ fn predicates<'a>(subject: &Subject<'a>) -> BTreeSet<&'a str> {
     mentioned(subject, false)
 }
 
+/// The predicates that states wait for: that a task waits for a fact says that somebody else writes it.
+fn awaited<'a>(subject: &Subject<'a>) -> BTreeSet<&'a str> {
+    let waits = subject.program.states.iter().filter(|state| state.is_pause());
+    let expressions = waits.flat_map(|state| expressions(subject.program, state));
+    expressions.flat_map(|(_, expr)| expr.fact_expressions()).map(|fact| fact.predicate.as_str()).collect()
+}
+
 /// The same; where only `made` count, without those that are only deleted.
 fn mentioned<'a>(subject: &Subject<'a>, made: bool) -> BTreeSet<&'a str> {
     let program = subject.program;
@@ -214,7 +224,9 @@ fn mentioned<'a>(subject: &Subject<'a>, made: bool) -> BTreeSet<&'a str> {
     known.extend(program.initial.iter().flat_map(written));
     for state in &program.states {
         let annotations = &state.annotations;
-        known.extend(annotations.effects.values().flatten().flat_map(written));
+        // What a wait foresees it does not do: a letter may be wrong in it.
+        let effects = annotations.effects.values().filter(|_| !state.is_pause());
+        known.extend(effects.flatten().flat_map(written));
         let named = annotations.reads.iter().flatten().chain(annotations.senses());
         known.extend(named.map(|fact| fact.predicate.as_str()));
         for (_, expr) in expressions(program, state) {

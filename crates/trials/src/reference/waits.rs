@@ -33,12 +33,7 @@ impl Reference<'_> {
         Ok(outcome)
     }
 
-    fn waited(
-        &mut self,
-        state: &State,
-        path: &str,
-        variables: &Vec<(String, Value)>,
-    ) -> Result<(String, Outputs), Fail> {
+    fn waited(&mut self, state: &State, path: &str, variables: &[(String, Value)]) -> Result<(String, Outputs), Fail> {
         let late = "timeout".to_owned();
         let one = |port: &str, value: Value| Outputs::from([(port.to_owned(), value)]);
         match state.wait() {
