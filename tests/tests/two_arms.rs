@@ -66,6 +66,16 @@ fn each_region_moves_the_arm_that_it_holds() -> anyhow::Result<()> {
     ensure!(predicted("hsm_s").is_some_and(|seconds| seconds < 5.5), "{checked}\n{said}");
     ensure!(checked["obstacle"].is_null(), "{checked}");
 
+    // An arm that is not there is named before the run waits for it.
+    let wrong = place.path().join("middle.yaml");
+    std::fs::write(&wrong, TASK.replace("arm: right }", "arm: middle }"))?;
+    let wrong = wrong.to_str().context("a path")?;
+    for (of, said) in [(robot, "are left, right"), ("panda", "the robot has one arm")] {
+        let output = place.ratn(&["check", wrong, "--robot", of, "--no-simulation"]).output()?;
+        let (_, warned) = texts(&output);
+        ensure!(warned.contains("whose `arm` is `middle`") && warned.contains(said), "{warned}");
+    }
+
     let rest = ["--robot", robot, "--speed", "20", "--seed", "3", "--json"];
     let output = place.ratn(&[&["run", task][..], &rest].concat()).output()?;
     let (document, said) = texts(&output);

@@ -9,10 +9,12 @@ use crate::system::{System, catalogue, public_directory};
 use crate::{input, output};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
+use ratn_model::expression::scope::NothingKnown;
 use ratn_model::load::Files;
 use ratn_model::parameters::ParameterError;
 use ratn_model::program::Program;
 use ratn_model::resource::Quantity;
+use ratn_model::value::Value;
 use ratn_simulation::sequential::{Assumptions, Gain, Link, Sequential, sequential};
 use ratn_task_control::learn;
 use ratn_worker::tls::ClientTls;
@@ -53,8 +55,9 @@ pub(crate) fn run(arguments: &CheckArguments, tls: &ClientTls) -> Result<(), Fai
         }
     };
     let (program, findings) = (loaded.program, loaded.warnings);
-    let workers =
+    let mut workers =
         system.map(|system| [system.offered.lacking(&program), system.mismatches].concat()).unwrap_or_default();
+    workers.extend(arms_not_there(&program, &config));
     let simulated = if arguments.no_simulation { None } else { Some(simulate(&program, &config, arguments)?) };
     if arguments.json {
         let (sequential, obstacle) = match &simulated {
@@ -106,6 +109,39 @@ fn against(arguments: &CheckArguments, tls: &ClientTls) -> Result<(SystemConfig,
         catalogue::extend(&mut config.catalogue, said);
     }
     Ok((config, system))
+}
+
+/// The states that select an arm, or its gripper, by a name that none of the robot's arms has: the run would wait there.
+fn arms_not_there(program: &Program, config: &SystemConfig) -> Vec<String> {
+    let mut told = Vec::new();
+    for state in &program.states {
+        for resource in state.annotations.resources.iter().filter(|one| config.is_module_of_arm(&one.kind)) {
+            let said = resource.attributes.iter().filter(|(name, _)| name == "arm");
+            for (_, value) in said {
+                let Ok(Value::String(arm)) = value.evaluate(&NothingKnown) else { continue };
+                let all = config.module_attributes().get(&resource.kind).map_or(&[][..], Vec::as_slice);
+                let names = all.iter().filter_map(|said| match said.get("arm") {
+                    Some(Value::String(name)) => Some(name.clone()),
+                    _ => None,
+                });
+                let names: Vec<String> = names.collect();
+                let (kind, path) = (&resource.kind, &state.path);
+                match &names[..] {
+                    [] => told.push(format!(
+                        "`{path}` asks for a `{kind}` whose `arm` is `{arm}`, and the run will wait there: the robot has one arm, whose \
+                         resources have no attribute `arm`; leave it out"
+                    )),
+                    names if !names.contains(&arm) => told.push(format!(
+                        "`{path}` asks for a `{kind}` whose `arm` is `{arm}`, and the run will wait there: the arms of the robot that have one \
+                         are {}",
+                        names.join(", ")
+                    )),
+                    _ => {}
+                }
+            }
+        }
+    }
+    told
 }
 
 /// What keeps the task sequential, or why that cannot be said.

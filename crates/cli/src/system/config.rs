@@ -385,6 +385,13 @@ impl SystemConfig {
         promised
     }
 
+    /// Whether resources of a kind are the robot's own arms or grippers, and no worker's.
+    pub(crate) fn is_module_of_arm(&self, kind: &str) -> bool {
+        let is_of_arm = |module: &Module| module.kind() == kind && module.arm().is_some();
+        self.parts.modules.iter().any(is_of_arm)
+            && self.process_manager.templates.iter().all(|template| template.kind != kind)
+    }
+
     /// Which arm each module of a kind is, of a robot with several arms.
     pub(crate) fn module_attributes(&self) -> &ModuleAttributes {
         &self.parts.attributes
