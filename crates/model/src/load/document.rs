@@ -30,12 +30,12 @@ impl Document {
     ///
     /// # Errors
     /// The text is no YAML: a finding of the rule `invalid-yaml`, as [`super::load`] has it.
-    pub fn read(source: &str, file: &str) -> Result<Document, Diagnostic> {
+    pub fn read(source: &str, file: &str) -> Result<Document, Box<Diagnostic>> {
         yaml::read(source).map(Document::of).map_err(|error| {
             let mut findings = Findings::default();
             let help = advice::advice(source, &error);
             findings.error("invalid-yaml", error.at, "", error.message, help);
-            findings.in_file(file).swap_remove(0)
+            Box::new(findings.in_file(file).swap_remove(0))
         })
     }
 
