@@ -32,7 +32,7 @@ struct System {
 
 async fn system() -> System {
     let folder = tempfile::tempdir().unwrap();
-    let directory = RuntimeDirectory::create(&folder.path().join("run")).unwrap();
+    let directory = RuntimeDirectory::create(folder.path().join("run")).unwrap();
     let end = CancellationToken::new();
     let robot = duo::write(folder.path()).display().to_string();
     let config = CellConfig { robot, speed: 20.0, boxes: 1, seed: 2, ..CellConfig::default() };
