@@ -180,8 +180,7 @@ impl Cell {
 
     /// Whether another arm is on its way, or comes to rest.
     fn another_arm_moves(&self, arm: usize) -> bool {
-        let others = self.arms.numbers().filter(|other| *other != arm);
-        others.into_iter().any(|other| self.busy_with(Module::Arm(other)).is_some())
+        self.arms.numbers().any(|other| other != arm && self.busy_with(Module::Arm(other)).is_some())
     }
 
     /// What an arm does, and for how long.

@@ -42,7 +42,7 @@ impl Robot {
         for link in &self.model.links {
             digester.text(&link.name);
             // What is not there has a number of its own.
-            count(&mut digester, link.parent.map_or(usize::MAX, |parent| parent));
+            count(&mut digester, link.parent.unwrap_or(usize::MAX));
             numbers_of(&link.origin).for_each(|x| number(&mut digester, x));
             match link.drive {
                 None => count(&mut digester, usize::MAX),
