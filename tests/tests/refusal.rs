@@ -129,9 +129,13 @@ fn a_log_takes_the_place_of_nothing() -> anyhow::Result<()> {
     ensure!(output.status.code() == Some(2) && err.contains(file) && err.contains("--resume"), "{err}");
     ensure!(std::fs::read_to_string(&mine)? == "mine");
     // And says what the system says of one that is not there.
-    for (arguments, reason) in
-        [(&["run", "--resume", "/nonex/log.jsonl"][..], "No such file"), (&["control", "pause"], "no run is under way")]
-    {
+    for (arguments, reason) in [
+        (&["run", "--resume", "/nonex/log.jsonl"][..], "No such file"),
+        (&["control", "pause"], "no run is under way"),
+        (&["signal", "-", "go", "3"], "no run is under way"),
+        (&["signal", "-", "go", "two words"], "quote a text twice"),
+        (&["answer", "-", "later"], "no run is under way"),
+    ] {
         let (_, err) = texts(&place.ratn(arguments).output()?);
         ensure!(err.contains(reason), "{arguments:?}: {err}");
     }

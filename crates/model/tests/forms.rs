@@ -437,3 +437,138 @@ fn what_is_wrong_with_a_function_is_said() {
     let source = "task: t\nfunctions:\n  near($a, $b): $a\nstates:\n  - a: { condition: near(cup), then: [] }\n";
     assert_snapshot!(findings(source), @"task.yaml:5:21: error[invalid-expression] in a: `near` takes 2 arguments, and is given 1. help: write `near($a, $b)`");
 }
+
+/// Random functions that call each other, beside an evaluation that binds values to parameters and knows no text.
+mod random_functions {
+    use super::{NothingKnown, StateKind, Value, state};
+    use std::fmt;
+
+    #[derive(Debug, Clone)]
+    enum Term {
+        Int(i64),
+        Parameter(usize),
+        /// The element of the comprehension that many further out.
+        Element(usize),
+        Add(Box<Term>, Box<Term>),
+        Minus(Box<Term>, Box<Term>),
+        /// `if(a < b, c, d)`
+        If([Box<Term>; 4]),
+        /// The sum of the body over `[0, 1, 2]`.
+        Sum(Box<Term>),
+        Call(usize, Vec<Term>),
+    }
+
+    /// A term as text; all comprehensions at one depth name their elements alike, in functions and around calls.
+    struct Text<'a>(&'a Term, usize);
+
+    impl fmt::Display for Text<'_> {
+        fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            let depth = self.1;
+            let of = |term| Text(term, depth);
+            match self.0 {
+                Term::Int(n) => write!(f, "({n})"),
+                Term::Parameter(n) => write!(f, "$p{n}"),
+                Term::Element(outwards) => write!(f, "$e{}", depth - 1 - outwards),
+                Term::Add(a, b) => write!(f, "({} + {})", of(a), of(b)),
+                Term::Minus(a, b) => write!(f, "({} - {})", of(a), of(b)),
+                Term::If([a, b, c, d]) => write!(f, "if({} < {}, {}, {})", of(a), of(b), of(c), of(d)),
+                Term::Sum(body) => write!(f, "sum(map($e{depth} in [0, 1, 2], {}))", Text(body, depth + 1)),
+                Term::Call(function, arguments) => {
+                    let arguments: Vec<String> = arguments.iter().map(|argument| of(argument).to_string()).collect();
+                    write!(f, "f{function}({})", arguments.join(", "))
+                }
+            }
+        }
+    }
+
+    struct Dice(u64);
+
+    impl Dice {
+        fn below(&mut self, bound: u64) -> u64 {
+            self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (self.0 >> 33) % bound
+        }
+
+        fn term(&mut self, size: u32, parameters: usize, elements: usize, functions: usize) -> Term {
+            if size == 0 {
+                return match self.below(3) {
+                    0 if parameters > 0 => Term::Parameter(self.below(parameters as u64) as usize),
+                    1 if elements > 0 => Term::Element(self.below(elements as u64) as usize),
+                    _ => Term::Int(self.below(9) as i64 - 4),
+                };
+            }
+            let chosen = self.below(8);
+            let mut inner = |elements| Box::new(self.term(size - 1, parameters, elements, functions));
+            match chosen {
+                0 => Term::If([inner(elements), inner(elements), inner(elements), inner(elements)]),
+                1 | 2 => Term::Sum(inner(elements + 1)),
+                3 => Term::Minus(inner(elements), inner(elements)),
+                4..=6 if functions > 0 => {
+                    let function = self.below(functions as u64) as usize;
+                    let arguments = (0..2).map(|_| self.term(size - 1, parameters, elements, functions)).collect();
+                    Term::Call(function, arguments)
+                }
+                _ => Term::Add(inner(elements), inner(elements)),
+            }
+        }
+    }
+
+    fn value(term: &Term, functions: &[Term], parameters: &[i64], elements: &[i64]) -> i64 {
+        let of = |term: &Term| value(term, functions, parameters, elements);
+        match term {
+            Term::Int(n) => *n,
+            Term::Parameter(n) => parameters[*n],
+            Term::Element(outwards) => elements[elements.len() - 1 - outwards],
+            Term::Add(a, b) => of(a) + of(b),
+            Term::Minus(a, b) => of(a) - of(b),
+            Term::If([a, b, c, d]) => {
+                if of(a) < of(b) {
+                    of(c)
+                } else {
+                    of(d)
+                }
+            }
+            Term::Sum(body) => (0..3).map(|n| value(body, functions, parameters, &[elements, &[n]].concat())).sum(),
+            Term::Call(function, arguments) => {
+                let given: Vec<i64> = arguments.iter().map(of).collect();
+                value(&functions[*function], functions, &given, &[])
+            }
+        }
+    }
+
+    #[test]
+    fn a_call_is_worth_what_the_function_is_with_its_arguments() {
+        let mut compared = 0;
+        for seed in 0..300 {
+            let mut dice = Dice(seed * 7_919 + 1);
+            let functions: Vec<Term> = (0..3).map(|number| dice.term(2, 2, 0, number)).collect();
+            let asked = dice.term(2, 0, 0, functions.len());
+            let wanted = value(&asked, &functions, &[], &[]);
+            let defined: Vec<String> = functions
+                .iter()
+                .enumerate()
+                .map(|(number, body)| format!("  f{number}($p0, $p1): '{}'", Text(body, 0)))
+                .collect();
+            let source = format!(
+                "task: t\nfunctions:\n{}\nstates:\n  - a: {{ condition: '{} = {wanted}', then: [] }}\n",
+                defined.join("\n"),
+                Text(&asked, 0)
+            );
+            let program = match ratn_model::load::load(&source, "t.yaml", &super::catalogue()) {
+                Ok(loaded) => loaded.program,
+                // A call that comes to too much is refused, and that is all that is wrong.
+                Err(found) => {
+                    assert!(
+                        found.iter().all(|one| one.message.contains("parts") || one.message.contains("too large")),
+                        "{found:?}\n{source}"
+                    );
+                    continue;
+                }
+            };
+            let StateKind::Condition { predicate, .. } = &state(&program, "a").kind else { panic!("a condition") };
+            assert_eq!(predicate.evaluate(&NothingKnown), Ok(Value::Bool(true)), "{source}");
+            compared += 1;
+        }
+        assert!(compared > 200, "only {compared} of 300 are compared");
+    }
+}

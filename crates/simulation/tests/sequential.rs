@@ -157,3 +157,19 @@ fn a_handler_that_is_planned_for_in_vain_could_be_exceptional() {
     assert_eq!(gains, [("go", found.cdtn_s - marked.cdtn_s)]);
     assert!(found.cdtn_s > marked.cdtn_s, "{} {}", found.cdtn_s, marked.cdtn_s);
 }
+
+#[test]
+fn what_a_task_waits_for_comes_and_a_wait_is_not_said_to_lack_annotations() {
+    let waits = "  - lid: { wait: { for: open(lid) and level(tank) = 3 } }
+  - next: { wait: { signal: order }, duration: 4 }
+  - which: { ask: { question: Well?, choices: [one, two] }, transitions: { two: again } }\n";
+    let task = format!(
+        "task: t\nstates:\n{waits}{}  - again: {{ wait: {{ seconds: 2 }} }}\n",
+        move_arm("go", "next.value", 10)
+    );
+    let found = check(&task).unwrap();
+    assert_eq!((found.hsm_s, found.cdtn_s, found.gains.len()), (18.0, 18.0, 0), "{:?}", found.gains);
+    assert_eq!(found.unknown_durations, ["lid", "which"]);
+    let refused = check("task: t\nstates:\n  - cup: { wait: { for: at(cup) > 2 } }\n").unwrap_err();
+    assert!(refused.to_string().contains("what makes `at(cup) > 2` hold of cup is not known"), "{refused}");
+}

@@ -7,11 +7,12 @@
 //!
 //! | | |
 //! |---|---|
-//! | the tree | `list`, `composite`, `regions`, `action`, `guards`, `long`, `patterns` |
+//! | the tree | `list`, `composite`, `regions`, `action`, `guards`, `waits`, `long`, `patterns` |
 //! | what is said of a state | `annotations`, `variables`, `supplies`, `estimates` |
 //! | facts | `facts`, `effects`, `tolerance` |
 //!
-//! What it does not make: hierarchies and concurrencies with tolerated facts or port keys in their effects; numbers within a
+//! What it does not make: waits in races and beside imprecise motions, conditions of waits with keys that are not constants (scenarios of the
+//! simulation have them); hierarchies and concurrencies with tolerated facts or port keys in their effects; numbers within a
 //! tolerance that add up, or that are looked up by anything that compares exactly; individuals of classes (ontologies declare
 //! numbers and things); values that are poses, joint positions or trajectories; selectors of task resources; task resources and
 //! batteries that run out; consumption inside of routines; facts in `duration`; preemptive concurrencies within others, in

@@ -7,7 +7,6 @@ use super::{Subject, expressions, named};
 use crate::diagnostic::Findings;
 use crate::expression::{Comprehension, EffectExpr, Expr, FactExpr, Function};
 use crate::load::distance;
-use crate::program::Program;
 use crate::slot::Slot;
 use crate::value::Type;
 use std::collections::BTreeSet;

@@ -11,7 +11,7 @@ use ratn_model::slot::Slot;
 pub(super) fn missing(program: &Program, catalogue: &Catalogue, id: StateId) -> Vec<&'static str> {
     let state = program.state(id);
     let annotations = &state.annotations;
-    if !matches!(state.kind, StateKind::Action { .. }) {
+    if !matches!(state.kind, StateKind::Action { .. }) || state.is_pause() {
         return Vec::new();
     }
     let mut missing = Vec::new();

@@ -1,12 +1,18 @@
-//! Providers of which nothing is known but their ports: every goal succeeds, after as long as is known, with assumed outputs.
+//! Providers of which nothing is known but their ports: every goal succeeds, after as long as is known, with assumed outputs. What states
+//! wait for comes, too: conditions are made to hold, and questions have their default or their first choice as answer.
 
 use super::Assumptions;
 use crate::run::{Answer, Oracle, Performance};
 use crate::timed::TimedProviders;
-use ratn_executive::protocol::Goal;
+use ratn_executive::protocol::{Event, Goal};
+use ratn_model::expression::EffectExpr;
+use ratn_model::expression::scope::NothingKnown;
+use ratn_model::fact::{Change, FactKey};
+use ratn_model::id::{InstanceId, Revision};
 use ratn_model::pose::Pose;
-use ratn_model::program::{ABORTED, Program, SUCCESS, StateKind};
+use ratn_model::program::{ABORTED, Program, SUCCESS, State, StateKind};
 use ratn_model::value::{Trajectory, TrajectoryPoint, Type, Value};
+use ratn_model::wait::Wait;
 use ratn_world::world::World;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -23,6 +29,8 @@ const JOINTS: usize = 7;
 pub(super) struct AssumedProviders {
     /// By the path of the state.
     outputs: BTreeMap<String, BTreeMap<String, Type>>,
+    /// The states that wait, by path.
+    waits: BTreeMap<String, State>,
     durations_s: BTreeMap<String, f64>,
     known: TimedProviders,
     elements: usize,
@@ -38,6 +46,12 @@ impl AssumedProviders {
         });
         AssumedProviders {
             outputs: outputs.collect(),
+            waits: program
+                .states
+                .iter()
+                .filter(|state| state.wait().is_some())
+                .map(|state| (state.path.clone(), state.clone()))
+                .collect(),
             durations_s: assumptions.durations_s.clone(),
             known: TimedProviders { boxes: assumptions.elements },
             elements: assumptions.elements,
@@ -77,6 +91,50 @@ impl Oracle for AssumedProviders {
         let answer = Answer::Finished { outcome, outputs, measured: Vec::new() };
         Performance { duration_s: known_s.unwrap_or(UNKNOWN_S), answer }
     }
+
+    fn awaited(&mut self, path: &str, instance: InstanceId) -> Option<(f64, Event)> {
+        self.goals += 1;
+        let path = plain(path);
+        let state = self.waits.get(&path)?;
+        let event = match state.wait()? {
+            Wait::Seconds(_) | Wait::Until(_) => return None,
+            Wait::Signal(signal) => {
+                let value = assumed(&Type::Any, signal, self.elements);
+                Event::Signalled { signal: signal.to_owned(), value }
+            }
+            Wait::Answer(question) => {
+                let choice = question.default.or(question.choices.first().copied())?;
+                Event::Answered { instance, choice: choice.to_owned() }
+            }
+            Wait::Condition(condition) => match made_true(state) {
+                Some(facts) => Event::WorldChanged { revision: Revision(0), facts },
+                None => {
+                    Event::AbortRequested { reason: format!("what makes `{condition}` hold of {path} is not known") }
+                }
+            },
+        };
+        let declared = state.annotations.duration_s.as_ref().and_then(|duration| duration.evaluate(&NothingKnown).ok());
+        let known_s = self.durations_s.get(&path).copied().or(declared.and_then(|value| value.as_number()));
+        if known_s.is_none() {
+            self.unknown.insert(path);
+        }
+        Some((known_s.unwrap_or(UNKNOWN_S), event))
+    }
+}
+
+/// The facts that make the condition of a wait hold, where it says them outright and their arguments are constants.
+fn made_true(state: &State) -> Option<Vec<(FactKey, Option<Value>)>> {
+    let foreseen = state.annotations.effects.get(SUCCESS)?;
+    let changes = EffectExpr::bind(foreseen, &NothingKnown).ok().filter(|changes| !changes.is_empty())?;
+    let fact = |change: Change| match change {
+        Change::Set { fact, value } => Some((fact, Some(value))),
+        Change::Delete { pattern } => {
+            let arguments = pattern.arguments.into_iter().collect::<Option<Vec<_>>>()?;
+            Some((FactKey { predicate: pattern.predicate, arguments }, None))
+        }
+        Change::Increase { .. } => None,
+    };
+    changes.into_iter().map(fact).collect()
 }
 
 /// A path without visits: `for[2]/look#3` is `for/look`.
