@@ -107,18 +107,18 @@ impl Window {
     }
 
     /// An operator has answered.
-    pub(super) fn answer(&mut self, context: &mut Context<'_>, id: InstanceId, choice: String) {
+    pub(super) fn answer(&mut self, context: &mut Context<'_>, id: InstanceId, choice: &str) {
         let waiting = self
             .graph
             .get(id)
             .filter(|instance| instance.node().is_some_and(|node| matches!(node.status, Status::Running(_))));
         match waiting.map(|instance| context.program.state(instance.state)) {
             Some(state) => {
-                if let Some(end) = awaiting::answered(state, &choice) {
+                if let Some(end) = awaiting::answered(state, choice) {
                     self.has_waited(context, id, end);
                 }
             }
-            None => self.in_routine(context, Event::Answered { instance: id, choice }),
+            None => self.in_routine(context, Event::Answered { instance: id, choice: choice.to_owned() }),
         }
     }
 
