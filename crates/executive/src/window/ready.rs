@@ -10,7 +10,7 @@ use crate::context::Context;
 use crate::plan::{MAX_OUTCOMES, NodeNature};
 use ratn_model::expression::FactExpr;
 use ratn_model::fact::Footprint;
-use ratn_model::id::InstanceId;
+use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::StateKind;
 use ratn_model::resource::Requirement;
 
@@ -148,7 +148,8 @@ impl Window {
 
     /// An imprecise PIA that still runs beside an instance, although older, and must end before it begins.
     pub(super) fn conflict_beside(&self, context: &Context<'_>, instance: &Instance) -> Option<InstanceId> {
-        if self.graph.detached().is_empty() {
+        // A wait looks at what is real, and changes nothing.
+        if self.graph.detached().is_empty() || context.program.state(instance.state).is_pause() {
             return None;
         }
         let mine = self.touches(context, instance);
@@ -159,10 +160,14 @@ impl Window {
         })
     }
 
-    /// An imprecise PIA that still runs, and is older. A wait does not begin beside it: a signal that it took would be lost if that one
-    /// fails and its path is left.
+    /// An older imprecise PIA that still runs, of its line or of one around that. A wait does not begin beside it: a signal that it took
+    /// would be lost if that one fails and its path is left.
     fn older_beside(&self, instance: &Instance) -> Option<InstanceId> {
-        self.graph.detached().iter().copied().find(|id| *id < instance.id)
+        let is_around = |id: &InstanceId| {
+            let other = self.graph.get(*id).filter(|other| other.id < instance.id);
+            other.is_some_and(|other| regions_around(instance).starts_with(&regions_around(other)))
+        };
+        self.graph.detached().iter().copied().find(is_around)
     }
 
     /// An imprecise PIA that still runs beside an instance and whose outputs it is made of, its effects included.
@@ -245,6 +250,19 @@ pub(super) fn look(context: &Context<'_>, view: &View<'_>, nature: NodeNature) -
 /// Whether it has its resources and has not ended.
 fn has_begun(instance: &Instance) -> bool {
     instance.node().is_some_and(|node| node.status.since().is_some())
+}
+
+/// The regions that an instance is in, the outermost first: by fork and state.
+fn regions_around(instance: &Instance) -> Vec<(InstanceId, StateId)> {
+    let mut regions = Vec::new();
+    let mut inner = instance.state;
+    let mut frames = instance.environment.frames.as_deref();
+    while let Some(frame) = frames {
+        regions.extend(frame.fork.map(|fork| (fork, inner)));
+        (inner, frames) = (frame.owner, frame.below.as_deref());
+    }
+    regions.reverse();
+    regions
 }
 
 pub(super) fn not_bound(view: &View<'_>, error: &BindError) -> Readiness {
