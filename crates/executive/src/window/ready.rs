@@ -7,7 +7,7 @@ use super::memory::{Blocked, Looked, Seen, Sight, View, facts_of};
 use super::waits::Wait;
 use crate::binding::{self, BindError, Outputs};
 use crate::context::Context;
-use crate::plan::{MAX_OUTCOMES, NodeNature};
+use crate::plan::{MAX_OUTCOMES, NodeNature, WAITS};
 use ratn_model::expression::FactExpr;
 use ratn_model::fact::Footprint;
 use ratn_model::id::{InstanceId, StateId};
@@ -64,6 +64,11 @@ impl Window {
         }
         if let Some(writer) = view.operator_of(&own.kinds) {
             return Readiness::Waits(Wait::TaskResource(writer));
+        }
+        if own.nature == NodeNature::Senses
+            && let Some(waiting) = view.operator_of(&[WAITS])
+        {
+            return Readiness::Waits(Wait::Waiting(waiting));
         }
         if own.waits
             && let Some(beside) = self.older_beside(instance)
@@ -247,11 +252,6 @@ pub(super) fn look(context: &Context<'_>, view: &View<'_>, nature: NodeNature) -
     Ok(seen)
 }
 
-/// Whether it has its resources and has not ended.
-fn has_begun(instance: &Instance) -> bool {
-    instance.node().is_some_and(|node| node.status.since().is_some())
-}
-
 /// The regions that an instance is in, the outermost first: by fork and state.
 fn regions_around(instance: &Instance) -> Vec<(InstanceId, StateId)> {
     let mut regions = Vec::new();
@@ -263,6 +263,11 @@ fn regions_around(instance: &Instance) -> Vec<(InstanceId, StateId)> {
     }
     regions.reverse();
     regions
+}
+
+/// Whether it has its resources and has not ended.
+fn has_begun(instance: &Instance) -> bool {
+    instance.node().is_some_and(|node| node.status.since().is_some())
 }
 
 pub(super) fn not_bound(view: &View<'_>, error: &BindError) -> Readiness {
