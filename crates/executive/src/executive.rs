@@ -99,9 +99,9 @@ impl Executive {
         matches!(self.state, State::Ended)
     }
 
-    /// How many signals no state has taken yet; more than [`crate::MOST_SIGNALS_KEPT`] are not kept.
-    pub fn signals_kept(&self) -> usize {
-        self.signals.count()
+    /// How many signals of a name no state has taken yet; more than [`crate::MOST_SIGNALS_KEPT`] are not kept.
+    pub fn signals_kept(&self, name: &str) -> usize {
+        self.signals.count(name)
     }
 
     /// What every instance that has not begun waits for, as sentences; empty in HSM mode.

@@ -7,7 +7,7 @@ use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 
-/// More signals than this are not kept for waits to come.
+/// More signals of one name than this are not kept for waits to come.
 pub const MOST_SIGNALS_KEPT: usize = 1024;
 
 /// What was sent, by name.
@@ -17,10 +17,12 @@ pub(crate) struct Signals {
 }
 
 impl Signals {
-    /// A signal has come. Where too many are kept it is dropped: task control refuses those before they are events.
+    /// A signal has come. Where too many of its name are kept it is dropped: task control refuses those before they are events. A name
+    /// that somebody waits for has none that are kept, so what is waited for is never refused.
     pub(crate) fn came(&mut self, name: String, value: Value) {
-        if self.count() < MOST_SIGNALS_KEPT {
-            self.kept.entry(name).or_default().push_back(value);
+        let of_name = self.kept.entry(name).or_default();
+        if of_name.len() < MOST_SIGNALS_KEPT {
+            of_name.push_back(value);
         }
     }
 
@@ -34,9 +36,9 @@ impl Signals {
         value
     }
 
-    /// How many are kept.
-    pub(crate) fn count(&self) -> usize {
-        self.kept.values().map(VecDeque::len).sum()
+    /// How many of a name are kept.
+    pub(crate) fn count(&self, name: &str) -> usize {
+        self.kept.get(name).map_or(0, VecDeque::len)
     }
 }
 
@@ -50,7 +52,7 @@ mod tests {
         for (name, value) in [("go", 1), ("stop", 2), ("go", 3)] {
             signals.came(name.to_owned(), Value::Int(value));
         }
-        assert_eq!(signals.count(), 3);
+        assert_eq!((signals.count("go"), signals.count("stop")), (2, 1));
         assert_eq!(signals.take("go"), Some(Value::Int(1)));
         assert_eq!(signals.take("go"), Some(Value::Int(3)));
         assert_eq!(signals.take("go"), None);
@@ -59,11 +61,13 @@ mod tests {
     }
 
     #[test]
-    fn no_more_are_kept_than_the_bound_says() {
+    fn no_more_of_a_name_are_kept_than_the_bound_says_and_none_for_those_of_another() {
         let mut signals = Signals::default();
         for number in 0..2 * MOST_SIGNALS_KEPT as i64 {
             signals.came("go".to_owned(), Value::Int(number));
         }
-        assert_eq!(signals.count(), MOST_SIGNALS_KEPT);
+        assert_eq!(signals.count("go"), MOST_SIGNALS_KEPT);
+        signals.came("stop".to_owned(), Value::Null);
+        assert_eq!(signals.take("stop"), Some(Value::Null));
     }
 }

@@ -338,7 +338,7 @@ impl Shell {
             let help = suggestion(&signal, known.into_iter(), "", "it waits for no signal at all");
             return Err(format!("no state of {} waits for a signal `{signal}`: {help}", self.program.name));
         }
-        if self.executive.signals_kept() >= MOST_SIGNALS_KEPT {
+        if self.executive.signals_kept(&signal) >= MOST_SIGNALS_KEPT {
             return Err(format!(
                 "{MOST_SIGNALS_KEPT} signals are kept already for states that have yet to wait for them"
             ));

@@ -3,7 +3,7 @@
 //! A cancelled or crashed goal changes nothing, because it is not known how far it came.
 
 use super::node::GoalEnd;
-use super::{Current, DEFAULT_ATTEMPTS, Interpreter, Phase};
+use super::{Current, DEFAULT_ATTEMPTS, Interpreter, Phase, Progress};
 use crate::context::Context;
 use crate::plan::NodeNature;
 use crate::protocol::Command;
@@ -13,7 +13,7 @@ use std::time::Duration;
 
 impl Interpreter {
     /// Pauses between tries that are over, and goals that have had their time.
-    pub(super) fn look_at_the_time(&mut self, context: &mut Context<'_>) {
+    pub(super) fn look_at_the_time(&mut self, context: &mut Context<'_>) -> Progress {
         let all: Vec<u64> = self.threads.keys().copied().collect();
         for thread in all {
             let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { continue };
@@ -22,7 +22,14 @@ impl Interpreter {
                 Phase::Backoff(until) if until <= context.now => self.try_now(context, thread),
                 Phase::Running if current.timeout.is_some_and(|at| at <= context.now) => {
                     if context.program.state(current.state).is_pause() {
-                        self.waited_long_enough(context, thread);
+                        // What has ended already goes on first: who has lost a race by that takes no signal any more.
+                        let progress = self.advance(context);
+                        if progress != Progress::Busy {
+                            return progress;
+                        }
+                        if self.current(thread).is_some_and(|current| current.instance == instance) {
+                            self.waited_long_enough(context, thread);
+                        }
                         continue;
                     }
                     let limit = context.program.state(current.state).annotations.timeout_s.unwrap_or_default();
@@ -34,6 +41,7 @@ impl Interpreter {
                 _ => {}
             }
         }
+        Progress::Busy
     }
 
     /// A goal has ended: that is the result, unless it is tried again.

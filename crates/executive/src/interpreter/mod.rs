@@ -283,7 +283,14 @@ impl Interpreter {
 
     /// An event for an instance under way, for all of them, or for the operator's wishes; others are not for us.
     pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Progress {
-        self.look_at_the_time(context);
+        // An operator was told that his answer has come: the time that is up at this very moment does not throw it away.
+        if let Event::Answered { instance, choice } = &event {
+            self.answered(context, *instance, choice);
+        }
+        let progress = self.look_at_the_time(context);
+        if progress != Progress::Busy {
+            return progress;
+        }
         let of = |interpreter: &Interpreter, id: InstanceId, attempt: Option<u32>| {
             let at = |thread: &Thread| {
                 thread.current.as_ref().is_some_and(|c| c.instance == id && attempt.is_none_or(|a| a == c.attempt))
@@ -322,11 +329,6 @@ impl Interpreter {
                 {
                     let end = GoalEnd { outcome, outputs, measured, evidence, reason };
                     self.goal_ended(context, thread, end);
-                }
-            }
-            Event::Answered { instance, choice } => {
-                if let Some(thread) = of(self, instance, None) {
-                    self.answered(context, thread, &choice);
                 }
             }
             Event::PauseRequested => self.hold = Hold::Paused(0),

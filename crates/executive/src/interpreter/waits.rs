@@ -2,11 +2,11 @@
 //! come, every wait under way is looked at.
 
 use super::node::GoalEnd;
-use super::{Interpreter, Phase, Progress};
+use super::{Interpreter, Phase, Progress, Thread};
 use crate::awaiting::{self, WaitEnd};
 use crate::context::Context;
 use crate::protocol::{Awaited, Command, Note};
-use ratn_model::id::StateId;
+use ratn_model::id::{InstanceId, StateId};
 
 impl Interpreter {
     /// Goes on until everything waits: what one thread has changed may be what another one waits for.
@@ -52,7 +52,7 @@ impl Interpreter {
         }
     }
 
-    /// Looks at every wait under way; whether one was over.
+    /// Looks at the waits under way until one is over; whether one was. What its end leads to comes before the others are looked at.
     fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
         let waits = |(thread, current): (u64, &super::Current)| {
             let is_wait = current.phase == Phase::Running && context.program.state(current.state).is_pause();
@@ -60,11 +60,7 @@ impl Interpreter {
         };
         let under_way = self.threads.iter().filter_map(|(id, thread)| Some((*id, thread.current.as_ref()?)));
         let waiting: Vec<(u64, StateId)> = under_way.filter_map(waits).collect();
-        let mut any = false;
-        for (thread, state) in waiting {
-            any |= self.ends_waiting(context, thread, state);
-        }
-        any
+        waiting.into_iter().any(|(thread, state)| self.ends_waiting(context, thread, state))
     }
 
     /// Ends a wait if what it waits for is there; whether it did.
@@ -92,10 +88,12 @@ impl Interpreter {
     }
 
     /// An operator has answered.
-    pub(super) fn answered(&mut self, context: &mut Context<'_>, thread: u64, choice: &str) {
-        if self.phase(thread) != Some(Phase::Running) {
-            return;
-        }
+    pub(super) fn answered(&mut self, context: &mut Context<'_>, instance: InstanceId, choice: &str) {
+        let asks = |thread: &Thread| {
+            let current = thread.current.as_ref();
+            current.is_some_and(|current| current.instance == instance && current.phase == Phase::Running)
+        };
+        let Some(thread) = self.threads.iter().find(|(_, thread)| asks(thread)).map(|(id, _)| *id) else { return };
         let Some(id) = self.current(thread).map(|current| current.state) else { return };
         if let Some(end) = awaiting::answered(context.program.state(id), choice) {
             self.has_waited(context, thread, end);

@@ -7,6 +7,7 @@
 //! | [`outcomes`] | where its outcomes lead, which of them are computed ahead, what each of them changes |
 //! | [`footprint`] | the facts that it reads, senses, looks up and may write |
 //! | [`written`] | under which keys it writes |
+//! | [`waits`] | what a wait may find otherwise than it was before |
 //! | [`flows`] | the outputs and variables that its expressions use |
 //!
 //! Hierarchies and routines are resolved here: a routine is one node, so its plan speaks of what it contains, too. Predicates and kinds of
@@ -17,10 +18,12 @@ mod footprint;
 mod nature;
 mod outcomes;
 mod resources;
+mod waits;
 mod written;
 
 pub(crate) use nature::NodeNature;
 pub(crate) use outcomes::{ArmPlan, EVERYTHING, Effects, MAX_OUTCOMES, Outcome, Outcomes, gives_outputs};
+pub(crate) use waits::WAITS;
 pub(crate) use written::{Chain, Written};
 
 use ratn_model::expression::{EffectExpr, FactExpr};
@@ -100,7 +103,9 @@ pub(crate) struct StatePlan {
     /// The effects that it may have, with those of what it contains, if it does not end by a failure that nothing handles. `None`:
     /// it may write every fact.
     pub(crate) may_write: Option<Vec<EffectExpr>>,
-    /// The predicates and kinds that it writes with an outcome that is computed ahead. If it may write every fact: [`EVERYTHING`]
+    /// Of a node that waits: what may be otherwise when it has waited, by the doing of regions beside it.
+    pub(crate) awaited: Vec<EffectExpr>,
+    /// The predicates and kinds that it writes with an outcome that is computed ahead, and [`WAITS`]. If it may write every fact: [`EVERYTHING`]
     /// and the kinds.
     pub(crate) writes: Vec<Predicate>,
     /// And under which keys; nothing if it may write every fact.
@@ -129,7 +134,7 @@ impl Plan {
         let read = flows::read_anywhere(program);
         let of = |state| StatePlan::of(&Subject::of(program, state), &transitions, &operated, &read, &mut names);
         let states = program.states.iter().map(of).collect();
-        let (width, buckets) = (names.numbers.len() + 1, Plan::buckets(program.horizon));
+        let (width, buckets) = (names.numbers.len() + 2, Plan::buckets(program.horizon));
         let mut plan = Plan { states, width, buckets, names };
         for id in &read {
             for parent in std::iter::successors(program.state(*id).parent, |id| program.state(*id).parent) {
@@ -171,15 +176,18 @@ impl StatePlan {
         let (program, state) = (subject.program, subject.state);
         let nature = nature::of(subject);
         let may_write = footprint::may_write(subject);
-        let ends = outcomes::of(subject, transitions, nature, names);
-        let mut writes = footprint::writes(subject, &ends, may_write.as_deref(), names);
-        let (written, effects_written) = footprint::written(subject, &ends, may_write.as_deref(), names);
+        let awaited = waits::awaited(subject);
+        let ends = outcomes::of(subject, transitions, nature, &awaited, names);
+        let waits = subject.is_node && subject.contained.iter().any(|state| state.is_pause());
+        let may_differ = may_write.as_deref().map(|effects| [effects, awaited.as_slice()].concat());
+        let mut writes = footprint::writes(subject, &ends, may_differ.as_deref(), names);
+        let (written, effects_written) = footprint::written(subject, &ends, may_differ.as_deref(), names);
         let resources = resources::of(subject, operated, names);
         writes.extend(&resources.operated);
+        writes.extend(waits.then_some(WAITS));
         let exits = if subject.is_node { 0 } else { outcomes::exits(state, &ends, &resources.operations) };
         let around = state.parent.map(|parent| &program.state(parent).kind);
         let exceptions = state.annotations.exceptions.unwrap_or(program.exceptions);
-        let waits = subject.is_node && subject.contained.iter().any(|state| state.is_pause());
         StatePlan {
             nature,
             is_node: subject.is_node,
@@ -207,6 +215,7 @@ impl StatePlan {
             senses: footprint::senses(subject),
             effect_lookups: footprint::effect_lookups(state),
             may_write,
+            awaited,
             writes: writes.into_iter().collect(),
             requirements: resources.requirements,
             operations: resources.operations,
@@ -264,7 +273,7 @@ impl<'a> Subject<'a> {
     }
 }
 
-/// The numbers of predicates and kinds, given as they are met. 0 is [`EVERYTHING`].
+/// The numbers of predicates and kinds, given as they are met. 0 is [`EVERYTHING`], 1 is [`WAITS`].
 #[derive(Debug, Default)]
 struct Names {
     numbers: BTreeMap<String, Predicate>,
@@ -275,7 +284,7 @@ impl Names {
         if let Some(known) = self.numbers.get(name) {
             return *known;
         }
-        let next = self.numbers.len() + 1;
+        let next = self.numbers.len() + 2;
         self.numbers.insert(name.to_owned(), next);
         next
     }

@@ -102,11 +102,17 @@ pub(super) struct Ends {
     pub(super) predicates: Vec<Vec<Predicate>>,
 }
 
-pub(super) fn of(subject: &Subject<'_>, transitions: &Transitions, nature: NodeNature, names: &mut Names) -> Ends {
+pub(super) fn of(
+    subject: &Subject<'_>,
+    transitions: &Transitions,
+    nature: NodeNature,
+    awaited: &[EffectExpr],
+    names: &mut Names,
+) -> Ends {
     let state = subject.state;
     let outcomes = &transitions.outcomes[index(state.id)];
     let targets: Vec<Target> = outcomes.iter().map(|outcome| transitions.target(state, outcome)).collect();
-    let effects: Vec<Effects> = outcomes.iter().map(|outcome| changes(subject, nature, outcome)).collect();
+    let effects: Vec<Effects> = outcomes.iter().map(|outcome| changes(subject, nature, awaited, outcome)).collect();
     Ends {
         arms: arms(state, outcomes, &targets, &effects),
         predicates: effects.iter().map(|effects| predicates(effects, names).into_iter().collect()).collect(),
@@ -116,8 +122,9 @@ pub(super) fn of(subject: &Subject<'_>, transitions: &Transitions, nature: NodeN
     }
 }
 
-/// What an outcome changes. A routine has changed what the nodes inside of it have changed.
-fn changes(subject: &Subject<'_>, nature: NodeNature, outcome: &str) -> Effects {
+/// What an outcome changes. A routine has changed what the nodes inside of it have changed; when a wait is over, what others have done
+/// meanwhile is otherwise, too.
+fn changes(subject: &Subject<'_>, nature: NodeNature, awaited: &[EffectExpr], outcome: &str) -> Effects {
     let state = subject.state;
     let declared = if subject.is_routine() {
         None
@@ -126,7 +133,12 @@ fn changes(subject: &Subject<'_>, nature: NodeNature, outcome: &str) -> Effects 
     } else {
         Some(state.annotations.effects.get(outcome).map_or(&[][..], Vec::as_slice))
     };
-    declared.map_or(Effects::Unknown, |declared| Effects::Declared(declared.to_vec()))
+    let foretold = |effect: &&EffectExpr| {
+        let fact = effect.written();
+        declared.into_iter().flatten().any(|known| known.written() == fact)
+    };
+    let unknown = awaited.iter().filter(|effect| !foretold(effect));
+    declared.map_or(Effects::Unknown, |declared| Effects::Declared(declared.iter().chain(unknown).cloned().collect()))
 }
 
 /// The continuations that are computed ahead: those of outcomes that are not exceptional.

@@ -133,6 +133,10 @@ impl Window {
     /// Takes an event; the end of the run, when this was it.
     pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Option<End> {
         self.followed = 0;
+        // An operator was told that his answer has come: the time that is up at this very moment does not throw it away.
+        if let Event::Answered { instance, choice } = &event {
+            self.answer(context, *instance, choice);
+        }
         self.fire(context);
         match event {
             Event::Granted { .. } | Event::Refused { .. } | Event::Projected { .. } => self.answered(context, event),
@@ -160,9 +164,8 @@ impl Window {
                 self.world_changed(context, facts.iter().map(|(fact, _)| fact));
             }
             Event::Signalled { .. } => self.may_end_waits = true,
-            Event::Answered { instance, choice } => self.answer(context, instance, choice),
             Event::Woken => self.wake_routines(context),
-            Event::Started { .. } | Event::Progressed { .. } | Event::Resumed => {}
+            Event::Answered { .. } | Event::Started { .. } | Event::Progressed { .. } | Event::Resumed => {}
         }
         self.go_on(context)
     }

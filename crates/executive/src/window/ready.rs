@@ -7,10 +7,10 @@ use super::memory::{Blocked, Looked, Seen, Sight, View, facts_of};
 use super::waits::Wait;
 use crate::binding::{self, BindError, Outputs};
 use crate::context::Context;
-use crate::plan::{MAX_OUTCOMES, NodeNature};
+use crate::plan::{MAX_OUTCOMES, NodeNature, WAITS};
 use ratn_model::expression::FactExpr;
 use ratn_model::fact::Footprint;
-use ratn_model::id::InstanceId;
+use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::StateKind;
 use ratn_model::resource::Requirement;
 
@@ -64,6 +64,11 @@ impl Window {
         }
         if let Some(writer) = view.operator_of(&own.kinds) {
             return Readiness::Waits(Wait::TaskResource(writer));
+        }
+        if own.nature == NodeNature::Senses
+            && let Some(waiting) = view.operator_of(&[WAITS])
+        {
+            return Readiness::Waits(Wait::Waiting(waiting));
         }
         if own.waits
             && let Some(beside) = self.older_beside(instance)
@@ -148,7 +153,8 @@ impl Window {
 
     /// An imprecise PIA that still runs beside an instance, although older, and must end before it begins.
     pub(super) fn conflict_beside(&self, context: &Context<'_>, instance: &Instance) -> Option<InstanceId> {
-        if self.graph.detached().is_empty() {
+        // A wait looks at what is real, and changes nothing.
+        if self.graph.detached().is_empty() || context.program.state(instance.state).is_pause() {
             return None;
         }
         let mine = self.touches(context, instance);
@@ -159,10 +165,14 @@ impl Window {
         })
     }
 
-    /// An imprecise PIA that still runs, and is older. A wait does not begin beside it: a signal that it took would be lost if that one
-    /// fails and its path is left.
+    /// An older imprecise PIA that still runs, of its line or of one around that. A wait does not begin beside it: a signal that it took
+    /// would be lost if that one fails and its path is left.
     fn older_beside(&self, instance: &Instance) -> Option<InstanceId> {
-        self.graph.detached().iter().copied().find(|id| *id < instance.id)
+        let is_around = |id: &InstanceId| {
+            let other = self.graph.get(*id).filter(|other| other.id < instance.id);
+            other.is_some_and(|other| regions_around(instance).starts_with(&regions_around(other)))
+        };
+        self.graph.detached().iter().copied().find(is_around)
     }
 
     /// An imprecise PIA that still runs beside an instance and whose outputs it is made of, its effects included.
@@ -240,6 +250,19 @@ pub(super) fn look(context: &Context<'_>, view: &View<'_>, nature: NodeNature) -
     };
     view.see(reads, &mut seen).map_err(blocked)?;
     Ok(seen)
+}
+
+/// The regions that an instance is in, the outermost first: by fork and state.
+fn regions_around(instance: &Instance) -> Vec<(InstanceId, StateId)> {
+    let mut regions = Vec::new();
+    let mut inner = instance.state;
+    let mut frames = instance.environment.frames.as_deref();
+    while let Some(frame) = frames {
+        regions.extend(frame.fork.map(|fork| (fork, inner)));
+        (inner, frames) = (frame.owner, frame.below.as_deref());
+    }
+    regions.reverse();
+    regions
 }
 
 /// Whether it has its resources and has not ended.

@@ -6,12 +6,14 @@
 //! that is left.
 
 use super::Window;
-use super::graph::instance::{Changed, Ended, Instance, Status};
-use super::ready::{Readiness, not_bound};
+use super::graph::instance::{Changed, Ended, Status};
 use super::waits::Timer;
 use crate::awaiting::{self, WaitEnd};
+use crate::binding::Bindings;
 use crate::context::Context;
 use crate::protocol::{Awaited, Command, Event, Note};
+use ratn_model::expression::Scope;
+use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
 
 impl Window {
@@ -21,14 +23,10 @@ impl Window {
         let Some(attempt) = instance.node().map(|node| node.attempt) else { return };
         let state = context.program.state(instance.state);
         let now = context.now;
-        let begins = self.look(context, id, None, |_, view| {
-            awaiting::begins(state, now, view).map_err(|error| not_bound(view, &error))
-        });
-        let (awaited, until) = match begins {
+        let (awaited, until) = match self.in_reality(context, id, |scope| awaiting::begins(state, now, scope)) {
             Some(Ok(begins)) => begins,
-            Some(Err(Readiness::Waits(wait))) => return self.step_back(context, id, wait),
-            Some(Err(Readiness::Failed(reason))) => return self.finish(context, id, Ended::aborted(reason)),
-            Some(Err(Readiness::Ready(..))) | None => return,
+            Some(Err(error)) => return self.finish(context, id, Ended::aborted(error.reason())),
+            None => return,
         };
         context.note(Note::Running { instance: id, attempt });
         // What is over at once is no action: a loop of such waits goes in circles.
@@ -85,15 +83,21 @@ impl Window {
             self.has_waited(context, id, end);
             return true;
         }
-        let holds = self
-            .look(context, id, None, |_, view| awaiting::holds(state, view).map_err(|error| not_bound(view, &error)));
-        match holds {
+        match self.in_reality(context, id, |scope| awaiting::holds(state, scope)) {
             Some(Ok(true)) => self.has_waited(context, id, awaiting::has_come()),
-            Some(Err(Readiness::Failed(reason))) => self.finish(context, id, Ended::aborted(reason)),
-            // What is not known yet will be.
-            Some(Ok(false) | Err(_)) | None => return false,
+            Some(Err(error)) => self.finish(context, id, Ended::aborted(error.reason())),
+            Some(Ok(false)) | None => return false,
         }
         true
+    }
+
+    /// Uses the scope of a wait at its place: its variables and the ports of older instances, which are real there, and the facts of the
+    /// actual world; what imprecise PIAs of other regions will have done is not.
+    fn in_reality<T>(&self, context: &Context<'_>, id: InstanceId, use_scope: impl Fn(&dyn Scope) -> T) -> Option<T> {
+        self.look(context, id, None, |_, view| {
+            let unknown = &Footprint::NOTHING;
+            use_scope(&Bindings { names: view, outputs: None, world: context.root, unknown })
+        })
     }
 
     /// Its time is up.
@@ -107,27 +111,26 @@ impl Window {
     }
 
     /// An operator has answered.
-    pub(super) fn answer(&mut self, context: &mut Context<'_>, id: InstanceId, choice: String) {
+    pub(super) fn answer(&mut self, context: &mut Context<'_>, id: InstanceId, choice: &str) {
         let waiting = self
             .graph
             .get(id)
             .filter(|instance| instance.node().is_some_and(|node| matches!(node.status, Status::Running(_))));
         match waiting.map(|instance| context.program.state(instance.state)) {
             Some(state) => {
-                if let Some(end) = awaiting::answered(state, &choice) {
+                if let Some(end) = awaiting::answered(state, choice) {
                     self.has_waited(context, id, end);
                 }
             }
-            None => self.in_routine(context, Event::Answered { instance: id, choice }),
+            None => self.in_routine(context, Event::Answered { instance: id, choice: choice.to_owned() }),
         }
     }
 
     fn has_waited(&mut self, context: &mut Context<'_>, id: InstanceId, end: WaitEnd) {
         let WaitEnd { outcome, outputs } = end;
-        let as_it_is = self.look(context, id, None, |instance: &Instance, view| {
-            let foreseen = context.program.state(instance.state).annotations.effects.get(&outcome);
-            awaiting::as_it_is(foreseen, view, context.root)
-        });
+        let Some(state) = self.graph.get(id).map(|instance| instance.state) else { return };
+        let foreseen = context.program.state(state).annotations.effects.get(&outcome);
+        let as_it_is = self.in_reality(context, id, |scope| awaiting::as_it_is(foreseen, scope, context.root));
         let changes = Changed::Foreseen(as_it_is.unwrap_or_default());
         let ended = Ended { changes, ..Ended::with(outcome, outputs) };
         self.finish(context, id, ended);

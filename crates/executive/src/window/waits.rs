@@ -31,6 +31,8 @@ pub(crate) enum Wait {
     Writer(InstanceId),
     /// A task resource that an older instance operates on.
     TaskResource(InstanceId),
+    /// It senses, and an older instance waits: it looks when that is over.
+    Waiting(InstanceId),
     /// The same visit on another branch is computing the same.
     Twin(InstanceId),
     /// A condition on its path.
@@ -59,6 +61,7 @@ impl Wait {
             | Wait::Sensing(id)
             | Wait::Writer(id)
             | Wait::TaskResource(id)
+            | Wait::Waiting(id)
             | Wait::Twin(id)
             | Wait::Decision(id)
             | Wait::Settling(id) => Some(id),
@@ -81,6 +84,7 @@ impl Wait {
             Wait::Sensing(id) => format!("{path} waits for {} to have looked", named(id)),
             Wait::Writer(id) => format!("{path} waits for {} to stop moving", named(id)),
             Wait::TaskResource(id) => format!("{path} waits for {}, which operates on a resource it uses", named(id)),
+            Wait::Waiting(id) => format!("{path} looks when {} has waited", named(id)),
             Wait::Twin(id) => format!("{path} waits for {}, which computes the same on another branch", named(id)),
             Wait::Decision(id) => format!("{path} waits for the decision of {}", named(id)),
             Wait::Settling(id) => format!("{path} waits until the result of {} cannot change any more", named(id)),

@@ -162,7 +162,7 @@ impl<'a> Sight<'a> {
             Declared::Nothing => Part::Known(Arc::new([])),
             Declared::Unknown => {
                 let view = self.view(writer, None);
-                let footprint = self.may_write_along(&view, link);
+                let footprint = self.may_differ_along(&view, link);
                 view.register(Purpose::Effects);
                 Part::Blocked(footprint)
             }
@@ -410,6 +410,16 @@ impl<'a> Sight<'a> {
             difference.add_unknown(blocked.flatten());
         }
         difference
+    }
+
+    /// The facts that may be otherwise behind a writer: what it may write, and what others may have written while it waited.
+    pub(crate) fn may_differ_along(self, view: &View<'a>, link: Link) -> Footprint {
+        let awaited = &self.plan.state(view.instance.state).awaited;
+        let own = self.may_write_along(view, link);
+        if awaited.is_empty() || view.instance.node().is_none() {
+            return own;
+        }
+        own.union(EffectExpr::footprint(awaited, view))
     }
 
     /// The facts that a writer may write along a link, as far as a view knows.

@@ -149,7 +149,7 @@ impl<'a> Sight<'a> {
             return (true, None);
         }
         let view = self.settled_view(writer);
-        let may = looked.overlaps_any(&self.may_write_along(&view, link));
+        let may = looked.overlaps_any(&self.may_differ_along(&view, link));
         (may, view.blocker().filter(|_| may))
     }
 }

@@ -6,7 +6,7 @@ use super::forecast::Chunk;
 use super::overlay::Overlay;
 use super::walk::Looked;
 use super::{Sight, Source};
-use crate::binding::Outputs;
+use crate::binding::{Names, Outputs};
 use crate::plan::Predicate;
 use crate::window::graph::instance::Instance;
 use crate::window::growth::environment::{Binding, Producer, assigned};
@@ -328,6 +328,16 @@ impl Scope for View<'_> {
             Overlay::of(all).each_fact(self.sight.root, pattern, visit);
         }
         true
+    }
+}
+
+impl Names for View<'_> {
+    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
+        Scope::variable(self, name)
+    }
+
+    fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
+        Scope::port(self, state, port)
     }
 }
 
