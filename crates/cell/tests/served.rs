@@ -142,7 +142,9 @@ async fn arm_and_base_say_where_they_are_and_the_gripper_what_it_feels() {
     let lease = system.acquire(&["Base", "Arm", "Gripper"]).await;
     let stands = system.execute(&lease, "Base", "localise", []).await.unwrap();
     assert_eq!(stands.outputs["pose"], Value::Pose(Pose::IDENTITY));
-    let here = system.execute(&lease, "Arm", "where", []).await.unwrap();
+    // A robot with one arm does not look at the input `arm`.
+    let another = ("arm", Value::String("another".to_owned()));
+    let here = system.execute(&lease, "Arm", "where", [another]).await.unwrap();
     assert_eq!(here.outputs["joints"], Value::Joints(aimm::HOME.to_vec()));
     let felt = system.execute(&lease, "Gripper", "feel", []).await.unwrap();
     assert_eq!(felt.outputs["holding"], Value::Bool(false));

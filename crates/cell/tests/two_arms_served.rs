@@ -15,6 +15,7 @@ use ratn_worker::session::Session;
 use ratn_worker::tls::ClientTls;
 use std::time::Duration;
 use tokio_util::sync::CancellationToken;
+use tonic::Code;
 
 mod duo;
 
@@ -140,7 +141,9 @@ async fn a_lease_of_both_arms_needs_the_name_of_the_one_that_moves() {
     assert!(moved.is_success(), "{moved:?}");
     let there = system.execute(&both, "where", [named("right")]).await.unwrap();
     assert!(matches!(&there.outputs["joints"], Value::Joints(joints) if joints[0] == -0.3), "{there:?}");
-    let nobody = system.execute(&both, "where", [named("middle")]).await.unwrap_err().to_string();
+    let nobody = system.execute(&both, "where", [named("middle")]).await.unwrap_err();
+    assert_eq!(nobody.code(), Some(Code::InvalidArgument));
+    let nobody = nobody.to_string();
     assert!(nobody.contains("input `arm` is `middle`: `where` is for the arms `left`, `right`"), "{nobody}");
     system.end.cancel();
 }

@@ -14,6 +14,9 @@ use ratn_motion::workplace::HOME;
 /// The number of the arm that is meant where none is named.
 pub const FIRST: usize = 0;
 
+/// The most characters of the name of an arm.
+const MAX_NAME: usize = 64;
+
 /// The arms of one robot.
 #[derive(Debug, Clone)]
 pub(super) struct Arms(Vec<Arm>);
@@ -36,23 +39,38 @@ impl Arms {
     /// # Errors
     /// [`PlacementError`] where an arm cannot be in a cell.
     pub(super) fn of(robot: &Robot, pads: Pads, config: &CellConfig) -> Result<Arms, PlacementError> {
-        let mut arms = Vec::new();
+        let mut arms: Vec<Arm> = Vec::new();
+        let several = robot.arm_names().count() > 1;
         for (number, name) in robot.arm_names().enumerate() {
             let unfit =
                 |reason| PlacementError::UnfitArm { arm: name.to_owned(), robot: robot.name().to_owned(), reason };
             let named = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
-            if number > FIRST && (name.is_empty() || !name.chars().all(named)) {
-                return Err(unfit("its name becomes part of a resource's id: use letters, digits, `_`, `-` and `.`"));
+            // The only arm of a robot is `arm@sim` whatever it is called.
+            if several && !((1..=MAX_NAME).contains(&name.len()) && name.chars().all(named)) {
+                return Err(unfit(format!(
+                    "its name becomes part of a resource's id: use 1 to {MAX_NAME} letters, digits, `_`, `-` and `.`"
+                )));
+            }
+            let links = robot.links_of(number);
+            for (other, arm) in arms.iter().enumerate() {
+                let of_both = robot.links_of(other).into_iter().find(|link| links.contains(link));
+                if let Some(link) = of_both {
+                    return Err(unfit(format!(
+                        "the link `{}` is moved by its joints and by those of the arm `{}`, so that a lease of one arm would move the other; leave                          the joints that carry several arms out of `joints` of every arm",
+                        robot.model.links[link].name, arm.name
+                    )));
+                }
             }
             // A name that the robot has itself told is one of its arms.
             let view = if number == FIRST {
                 robot.clone()
             } else {
-                robot.with_arm(name).map_err(|_| unfit("it is not read"))?
+                robot.with_arm(name).map_err(|fault| unfit(fault.to_string()))?
             };
             let pads = if number == FIRST { Some(pads) } else { Pads::of(&view) };
             if pads.is_none() && view.finger().is_some() {
-                return Err(unfit("the finger of its gripper is no box in the URDF that lies along the tool's axes"));
+                let reason = "the finger of its gripper is no box in the URDF that lies along the tool's axes";
+                return Err(unfit(reason.to_owned()));
             }
             let most = view.open_finger_m();
             let open_finger_m = config.gripper.opening_m.map_or(most, |opening_m| match number {
@@ -149,7 +167,7 @@ impl Arms {
         first
     }
 
-    /// The same configuration with open fingers of all arms but one: as much room as those may come to take.
+    /// The same configuration with open fingers of all arms but one.
     pub(super) fn with_others_open(&self, arm: usize, configuration: &Configuration) -> Configuration {
         let mut opened = *configuration;
         for other in self.numbers().filter(|other| *other != arm) {

@@ -177,9 +177,10 @@ impl Braking {
         }
     }
 
-    /// Where the joints are now and may be until they stand: on the rest of the way.
-    pub(super) fn ahead(&self, now: Timestamp) -> &[JointVector] {
-        self.way.ahead(self.from_s + self.pace.passed_s(now))
+    /// Where the joints are now, at every later [`STEP`] of their course, and where they will stand.
+    pub(super) fn ahead(&self, now: Timestamp) -> Vec<JointVector> {
+        let from_s = self.from_s + self.pace.passed_s(now);
+        self.way.between(from_s, self.from_s + self.pace.whole().as_secs_f64())
     }
 
     /// How well it followed its trajectory, as far as it has come.
@@ -208,10 +209,24 @@ impl Way {
         Pace::change(now, rates, &[self.along(robot, from_s, times)])
     }
 
-    /// Where the joints are `time_s` after the start and at every later [`STEP`] to the end.
-    pub(super) fn ahead(&self, time_s: f64) -> &[JointVector] {
+    /// Where the joints are `time_s` after the start and at every later [`STEP`] to the end of their course, and from there until they stand:
+    /// a controller that has lost its joints brakes beyond that end.
+    pub(super) fn ahead(&self, robot: &Robot, time_s: f64) -> Vec<JointVector> {
+        let ends_s = self.motion().course_s();
+        let brakes = self.pace(robot, Timestamp::default(), [1.0, 0.0], ends_s, 1.0);
+        self.between(time_s, ends_s + brakes.whole().as_secs_f64())
+    }
+
+    /// Where the joints are at a moment of their course, at every later [`STEP`] and at another moment.
+    fn between(&self, from_s: f64, to_s: f64) -> Vec<JointVector> {
+        let (motion, dt) = (self.motion(), STEP.as_secs_f64());
+        let steps = ((to_s - from_s) / dt).ceil().max(0.0) as usize;
+        (0..=steps).map(|i| motion.at((from_s + i as f64 * dt).min(to_s.max(from_s)))).collect()
+    }
+
+    fn motion(&self) -> &Motion {
         match self {
-            Way::Arm(_, motion) | Way::Base(motion) => motion.ahead(time_s),
+            Way::Arm(_, motion) | Way::Base(motion) => motion,
         }
     }
 }
@@ -389,5 +404,35 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn the_way_ahead_reaches_to_where_a_motion_that_was_lost_comes_to_rest() {
+        let robot = Robot::aimm();
+        let joints = robot.base_joints();
+        let point = |time_s: f64, x: f64, v: f64| TrajectoryPoint {
+            time_s,
+            positions: vec![x, 0.0, 0.0],
+            velocities: vec![v, 0.0, 0.0],
+        };
+        let points = vec![point(0.0, 0.0, 0.0), point(2.0, 1.0, 1.0), point(4.0, 2.0, 0.0)];
+        let trajectory = Trajectory { joints: joints.iter().map(|j| j.name.clone()).collect(), points };
+        let weak = Controller { of: "base", stiffness: 3.0, most_off: 0.05, slides: Controller::base_slides() };
+        let motion = Motion::new(Curve::of(joints, &trajectory).unwrap(), JointVector::zeros(3), weak, None);
+        assert!(motion.end().is_err());
+        let (lasts_s, now) = (motion.lasts_s(), Timestamp::default());
+        let way = Way::Base(motion);
+        let ahead = way.ahead(&robot, 0.0);
+        let ending = Ending::Aborted(String::new());
+        let braking = Braking::begin(&robot, now, way, [1.0, lasts_s], 1.0, (Ticket(1), ending));
+        let mut stands = robot.at_zero();
+        braking.place(braking.ends(), &mut stands);
+        let lost_at = braking.way.motion().at(lasts_s)[0];
+        assert!(stands.base[0] > lost_at + 0.01, "it brakes over {} m", stands.base[0] - lost_at);
+        assert!((ahead[ahead.len() - 1][0] - stands.base[0]).abs() < 1e-6, "{} {stands:?}", ahead[ahead.len() - 1][0]);
+        // While it brakes, what is before it ends at the same place.
+        let brakes = braking.ahead(now);
+        assert!((brakes[0][0] - lost_at).abs() < 1e-9 && brakes.len() > 10 && brakes.len() < ahead.len());
+        assert!((brakes[brakes.len() - 1][0] - stands.base[0]).abs() < 1e-6);
     }
 }

@@ -283,7 +283,8 @@ impl Cell {
         self.scene_of(FIRST)
     }
 
-    /// What collides for one of the arms, by its number: what that arm holds is in its gripper, what others hold is where it is.
+    /// What collides, as it is seen from one of the arms, by its number. An object that this arm holds is placed in its gripper; an object that
+    /// another arm holds is placed in the world, where it is now.
     pub fn scene_of(&self, arm: usize) -> Scene {
         let tools = self.arms.tools(&self.configuration());
         let held = self.arms.held(arm);

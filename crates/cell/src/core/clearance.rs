@@ -1,117 +1,290 @@
-//! Whether two arms that move at once keep apart.
+//! Whether the links of two arms keep a distance from each other, wherever both are on their ways.
 //!
-//! Either may be stopped anywhere on its way: its goal is cancelled, its lease ends, a fault brakes it. So the ways are compared whatever
-//! the timing: wherever one arm may be on the rest of its way, the other one keeps [`APART_M`] from it on all of its own. Controllers know
-//! the robot's links, not what stands around them; so what the hands hold is not looked at here, the judge sees that (`contacts`).
+//! Either arm may be stopped anywhere on its way: its goal is cancelled, its lease ends, a fault brakes it. So the ways are compared whatever
+//! the timing: every place of the one with every place of the other. Controllers know the robot's links, not what stands around them; so what
+//! the hands hold is not looked at here, the judge sees that (`contacts`).
 //!
-//! An arm that stands is no matter of this file: a trajectory is checked against it with everything else of the robot's body.
+//! The comparison runs on the cell's only thread, where an emergency stop waits for its end. So its work is bounded: places that a way comes to
+//! again are kept once, the places of a body form a binary tree of which whole branches are ruled out by one distance, and a comparison that
+//! takes more than [`MAX_POSTURES`] or [`MAX_DISTANCES`] is given up ([`Crossing::TooLong`]).
 
 use rapier3d::math::Pose as Pose32;
-use rapier3d::parry::bounding_volume::{Aabb, BoundingVolume};
 use rapier3d::parry::query;
 use rapier3d::parry::shape::SharedShape;
-use ratn_motion::joint_vector::JointVector;
-use ratn_motion::robot::{Configuration, Robot};
+use ratn_model::pose::Pose;
+use ratn_motion::robot::{ArmPosition, Configuration, Robot, to_f32};
+use std::collections::BTreeMap;
 
-/// How far from each other two arms keep that are on their ways at once, in metres.
+/// The distance of two arms that are both on their ways, in metres.
 pub(super) const APART_M: f64 = 0.02;
+/// The distance of an arm on its way from an arm that stands, in metres: more than controllers and encoders are off.
+pub(super) const BESIDE_M: f64 = 0.003;
+/// How much nearer than at its start something may come to an arm that it is too near to already, in metres: rounding.
+const ROUNDED_M: f32 = 3e-4;
+/// The most postures of two arms on their ways that are compared. A motion of 10 s has 2500, twice as many where fingers count as open too.
+pub(super) const MAX_POSTURES: usize = 40_000;
+/// The most distances of two bodies that are computed for one comparison.
+const MAX_DISTANCES: u32 = 50_000;
 
-/// How far a point of a link may move from one looked-at posture to the next, in metres. Half of it on either side may be missed, which
-/// is added to what is looked for.
-const STEP_M: f64 = 0.02;
-
-/// A link of each of two arms that come too close.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct TooClose {
-    /// Of the arm that is asked about.
-    pub(super) link: String,
-    /// Of the other one.
-    pub(super) other: String,
-}
-
-/// The way that an arm has before it.
-pub(super) struct Ahead<'a> {
+/// What an arm, or its fingers alone, will do.
+#[derive(Debug, Clone)]
+pub(super) struct Ahead {
     /// The arm's number.
     pub(super) arm: usize,
-    /// Postures of the arm, near each other, in the order of time.
-    pub(super) postures: &'a [JointVector],
+    /// The links that are compared: all that move.
+    pub(super) links: Vec<usize>,
+    /// Courses that it may take: of each the positions, near each other, in the order of time.
+    pub(super) courses: Vec<Vec<ArmPosition>>,
+}
+
+/// What the other arm does meanwhile, which says how far apart both have to be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Other {
+    /// It is on its way: [`APART_M`].
+    Moves,
+    /// It stands: [`BESIDE_M`]. What is nearer than that already may go away, and come no nearer.
+    Stands,
+}
+
+/// Why two ways are not free.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Crossing {
+    /// A link of each comes too close to the other.
+    TooClose {
+        /// Of the arm that is asked about.
+        link: String,
+        /// Of the other one.
+        other: String,
+    },
+    /// They are too long, or too near to each other for too long, to be compared.
+    TooLong,
 }
 
 /// One body of a link, wherever it is on the way.
 struct Swept {
     link: usize,
+    in_link: Pose,
     shape: SharedShape,
+    /// The farthest that a point of it is from its origin.
     radius: f32,
     places: Vec<Pose32>,
-    around: Aabb,
+    /// The places as the leaves of a binary tree, its root last.
+    tree: Vec<Branch>,
+    /// The farthest that a point moves from one posture to the next.
+    leg: f32,
+    /// The farthest that a point is from where it is at the place that was kept instead.
+    dropped: f32,
 }
 
-/// Where two arms come nearer to each other than [`APART_M`], of a robot that is elsewhere as in `here`.
-pub(super) fn too_close(robot: &Robot, here: &Configuration, one: &Ahead<'_>, other: &Ahead<'_>) -> Option<TooClose> {
-    let margin = (APART_M + STEP_M) as f32;
-    let (ours, theirs) = (swept(robot, here, one), swept(robot, here, other));
+/// Some of the places of a body that follow each other.
+struct Branch {
+    /// One of them.
+    place: usize,
+    /// The farthest that a point of the body is at any of them from where it is at that one.
+    spread: f32,
+    halves: Option<[usize; 2]>,
+}
+
+/// Which places of a body are kept.
+struct Kept {
+    /// By their rounded coordinates.
+    known: BTreeMap<[i32; 7], Pose32>,
+    /// The one that stands for the last posture.
+    last: Option<Pose32>,
+    /// The place at the posture before.
+    before: Option<Pose32>,
+}
+
+impl Other {
+    /// How far from the other arm to stay, in metres.
+    pub(super) fn apart_m(self) -> f64 {
+        match self {
+            Other::Moves => APART_M,
+            Other::Stands => BESIDE_M,
+        }
+    }
+
+    /// Of places that are nearer to each other than that one is kept, in metres: what is added to the distance on either side.
+    fn resolution(self) -> f32 {
+        match self {
+            Other::Moves => 0.008,
+            Other::Stands => 2e-4,
+        }
+    }
+}
+
+/// Whether what moves stays away from another arm, of a robot that is elsewhere as in `here`.
+///
+/// # Errors
+/// [`Crossing`] where it does not, or where that is not found out.
+pub(super) fn keep_apart(
+    robot: &Robot,
+    here: &Configuration,
+    ours: &Ahead,
+    theirs: &Ahead,
+    other: Other,
+) -> Result<(), Crossing> {
+    if other == Other::Moves && ours.postures() + theirs.postures() > MAX_POSTURES {
+        return Err(Crossing::TooLong);
+    }
+    let resolution = other.resolution();
+    let (ours, theirs) = (swept(robot, here, ours, resolution), swept(robot, here, theirs, resolution));
+    let mut distances = MAX_DISTANCES;
     for a in &ours {
-        let around = a.around.loosened(margin);
-        let near = theirs.iter().filter(|b| !robot.model.is_excepted(a.link, b.link) && around.intersects(&b.around));
-        for b in near {
-            let reach = a.radius + b.radius + margin;
-            let meet = |at: &Pose32, of: &Pose32| {
-                let apart = (at.translation - of.translation).length_squared();
-                // A pair whose distance cannot be computed counts as one that is too close.
-                apart < reach * reach
-                    && query::distance(at, &*a.shape, of, &*b.shape).map_or(true, |apart| apart.distance < margin)
+        for b in theirs.iter().filter(|b| !robot.model.is_excepted(a.link, b.link)) {
+            let sure = other.apart_m() as f32 + a.missed() + b.missed();
+            let margin = match other {
+                Other::Moves => sure,
+                Other::Stands => match a.starts_at(b) {
+                    near if near < sure => near.min(other.apart_m() as f32) - ROUNDED_M,
+                    _ => sure,
+                },
             };
-            if a.places.iter().any(|at| b.places.iter().any(|of| meet(at, of))) {
+            if a.comes_to(b, margin, &mut distances)? {
                 let name = |link: usize| robot.model.links[link].name.clone();
-                return Some(TooClose { link: name(a.link), other: name(b.link) });
+                return Err(Crossing::TooClose { link: name(a.link), other: name(b.link) });
             }
         }
     }
-    None
+    Ok(())
 }
 
-/// The bodies of an arm's links at postures so near to each other that no point of them moves farther than [`STEP_M`] in between.
-fn swept(robot: &Robot, here: &Configuration, ahead: &Ahead<'_>) -> Vec<Swept> {
-    let links = robot.links_of(ahead.arm);
-    let mut swept: Vec<Swept> = Vec::new();
-    let mut last: Option<Vec<(Pose32, f32)>> = None;
-    for (i, posture) in ahead.postures.iter().enumerate() {
-        let mut configuration = *here;
-        configuration.set_joints(ahead.arm, *posture);
-        let shapes = robot.shapes(&configuration).into_iter().filter(|(link, ..)| links.contains(link));
-        let shapes: Vec<(usize, Pose32, SharedShape)> = shapes.collect();
-        let is_last = i + 1 == ahead.postures.len();
-        let moved = |last: &Vec<(Pose32, f32)>| {
-            let farthest = last.iter().zip(&shapes).map(|((before, radius), (_, now, _))| {
-                let turned = (before.rotation.inverse() * now.rotation).to_array()[3].abs().min(1.0).acos() * 2.0;
-                (now.translation - before.translation).length() + radius * turned
-            });
-            farthest.fold(0.0, f32::max)
-        };
-        // The other half is left for the posture that goes beyond it: from one to the next pass 4 ms.
-        if !is_last && last.as_ref().is_some_and(|last| moved(last) < 0.5 * STEP_M as f32) {
-            continue;
-        }
-        let radius = |shape: &SharedShape| {
-            let around = shape.compute_local_bounding_sphere();
-            around.center.length() + around.radius
-        };
-        last = Some(shapes.iter().map(|(_, pose, shape)| (*pose, radius(shape))).collect());
-        for (index, (link, pose, shape)) in shapes.into_iter().enumerate() {
-            let around = shape.compute_aabb(&pose);
-            match swept.get_mut(index) {
-                Some(known) => {
-                    known.around.merge(&around);
-                    known.places.push(pose);
-                }
-                None => {
-                    let radius = radius(&shape);
-                    swept.push(Swept { link, shape, radius, places: vec![pose], around });
-                }
+/// The bodies of an arm's links wherever they come to.
+fn swept(robot: &Robot, here: &Configuration, ahead: &Ahead, resolution: f32) -> Vec<Swept> {
+    let of_links = ahead.links.iter().flat_map(|link| robot.model.links[*link].bodies.iter().map(move |b| (*link, b)));
+    let mut swept: Vec<(Swept, Kept)> =
+        of_links.map(|(link, body)| (Swept::new(link, body.pose, body.geometry.shape(0.0)), Kept::nothing())).collect();
+    let mut configuration = *here;
+    for course in &ahead.courses {
+        swept.iter_mut().for_each(|(_, kept)| (kept.last, kept.before) = (None, None));
+        for at in course {
+            configuration.set_joints(ahead.arm, at.joints);
+            configuration.set_finger(ahead.arm, at.finger);
+            let poses = robot.poses(&configuration);
+            for (body, kept) in &mut swept {
+                let place = to_f32(&poses[body.link].compose(&body.in_link));
+                body.pass(place, kept, resolution);
             }
         }
     }
-    swept
+    let grown = |(mut body, _): (Swept, Kept)| {
+        if !body.places.is_empty() {
+            body.grow(0, body.places.len());
+        }
+        body
+    };
+    swept.into_iter().map(grown).collect()
+}
+
+impl Ahead {
+    fn postures(&self) -> usize {
+        self.courses.iter().map(Vec::len).sum()
+    }
+}
+
+impl Kept {
+    fn nothing() -> Kept {
+        Kept { known: BTreeMap::new(), last: None, before: None }
+    }
+}
+
+impl Swept {
+    fn new(link: usize, in_link: Pose, shape: SharedShape) -> Swept {
+        let around = shape.compute_local_bounding_sphere();
+        let radius = around.center.length() + around.radius;
+        Swept { link, in_link, shape, radius, places: Vec::new(), tree: Vec::new(), leg: 0.0, dropped: 0.0 }
+    }
+
+    /// The farthest that a point of the body is at one place from where it is at another.
+    fn moved(&self, from: &Pose32, to: &Pose32) -> f32 {
+        let [x, y, z, _] = (from.rotation.inverse() * to.rotation).to_array();
+        // The sine of half the angle: a point turns by a chord of twice that.
+        let sine = (x * x + y * y + z * z).sqrt();
+        (to.translation - from.translation).length() + 2.0 * self.radius * sine
+    }
+
+    /// The body comes to a place.
+    fn pass(&mut self, place: Pose32, kept: &mut Kept, resolution: f32) {
+        if let Some(before) = kept.before.replace(place) {
+            self.leg = self.leg.max(self.moved(&before, &place));
+        }
+        let near = kept.last.map(|last| self.moved(&last, &place)).filter(|moved| *moved < resolution);
+        let dropped = near.unwrap_or_else(|| {
+            let stands_for = *kept.known.entry(self.rounded(&place, resolution)).or_insert_with(|| {
+                self.places.push(place);
+                place
+            });
+            kept.last = Some(stands_for);
+            self.moved(&stands_for, &place)
+        });
+        self.dropped = self.dropped.max(dropped);
+    }
+
+    /// Coordinates that two places have in common only where no point of the body is farther apart than the resolution: half of it is for
+    /// the translation and half for the rotation.
+    fn rounded(&self, place: &Pose32, resolution: f32) -> [i32; 7] {
+        let along = resolution / (2.0 * 3_f32.sqrt());
+        let about = resolution / (8.0 * self.radius.max(1e-3));
+        let [x, y, z] = place.translation.to_array().map(|c| (c / along).floor() as i32);
+        // A rotation has two quaternions.
+        let sign = if place.rotation.to_array()[3] < 0.0 { -1.0 } else { 1.0 };
+        let [i, j, k, w] = place.rotation.to_array().map(|c| (sign * c / about).floor() as i32);
+        [x, y, z, i, j, k, w]
+    }
+
+    /// How far a point of the body may be, anywhere on the way, from where it is at the nearest place that was kept.
+    fn missed(&self) -> f32 {
+        self.dropped + self.leg / 2.0
+    }
+
+    /// Makes a branch of the places `from..to`.
+    fn grow(&mut self, from: usize, to: usize) -> usize {
+        let place = usize::midpoint(from, to);
+        let spread = self.places[from..to].iter().map(|at| self.moved(&self.places[place], at)).fold(0.0_f32, f32::max);
+        let halves = (to - from > 1).then(|| [self.grow(from, place), self.grow(place, to)]);
+        self.tree.push(Branch { place, spread, halves });
+        self.tree.len() - 1
+    }
+
+    fn distance(&self, at: &Pose32, other: &Swept, of: &Pose32) -> f32 {
+        // A pair whose distance cannot be computed counts as one that touches.
+        query::distance(at, &*self.shape, of, &*other.shape).map_or(0.0, |apart| apart.distance)
+    }
+
+    /// How far from another body this one is as it sets out; the other one stands.
+    fn starts_at(&self, other: &Swept) -> f32 {
+        let Some(start) = self.places.first() else { return f32::INFINITY };
+        other.places.iter().map(|place| self.distance(start, other, place)).fold(f32::INFINITY, f32::min)
+    }
+
+    /// Whether any of its places is nearer than `margin` to any place of another body.
+    fn comes_to(&self, other: &Swept, margin: f32, distances: &mut u32) -> Result<bool, Crossing> {
+        let (Some(ours), Some(theirs)) = (self.tree.len().checked_sub(1), other.tree.len().checked_sub(1)) else {
+            return Ok(false);
+        };
+        let mut left = vec![[ours, theirs]];
+        while let Some([ours, theirs]) = left.pop() {
+            let (a, b) = (&self.tree[ours], &other.tree[theirs]);
+            let (at, of) = (&self.places[a.place], &other.places[b.place]);
+            let around = margin + a.spread + b.spread;
+            if (at.translation - of.translation).length() - self.radius - other.radius > around {
+                continue;
+            }
+            *distances = distances.checked_sub(1).ok_or(Crossing::TooLong)?;
+            let distance = self.distance(at, other, of);
+            if distance < margin {
+                return Ok(true);
+            }
+            if distance >= around {
+                continue;
+            }
+            let split =
+                if a.spread >= b.spread { a.halves.map(|halves| halves.map(|half| [half, theirs])) } else { None };
+            let split = split.or(b.halves.map(|halves| halves.map(|half| [ours, half])));
+            left.extend(split.into_iter().flatten());
+        }
+        Ok(false)
+    }
 }
 
 #[cfg(test)]
@@ -119,19 +292,79 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
 
-    #[test]
-    fn no_place_is_farther_from_the_one_before_than_the_step() {
-        let robot = Robot::aimm();
+    fn here(robot: &Robot) -> Configuration {
+        Configuration { arm: robot.posture("home").unwrap(), ..robot.at_zero() }
+    }
+
+    /// The arm swings about its foot by so much and back, so many times; each way takes so many steps.
+    fn swings(robot: &Robot, by: f64, steps: u32, times: u32) -> Ahead {
         let from = robot.posture("home").unwrap();
-        let postures: Vec<JointVector> = (0..500).map(|i| from.map(|q| q + 0.4 * f64::from(i) / 500.0)).collect();
-        let here = Configuration { arm: from, ..robot.at_zero() };
-        let swept = swept(&robot, &here, &Ahead { arm: 0, postures: &postures });
+        let at = |i: u32| {
+            let passed = f64::from(i % (2 * steps)) / f64::from(steps);
+            let mut joints = from;
+            joints[0] += by * passed.min(2.0 - passed);
+            ArmPosition { joints, finger: 0.0 }
+        };
+        Ahead { arm: 0, links: robot.links_of(0), courses: vec![(0..2 * steps * times).map(at).collect()] }
+    }
+
+    #[test]
+    fn every_place_of_the_way_is_as_near_to_a_kept_one_as_is_said() {
+        let robot = Robot::aimm();
+        let ahead = swings(&robot, 0.4, 250, 1);
+        let resolution = 0.008;
+        let swept = swept(&robot, &here(&robot), &ahead, resolution);
         assert!(swept.len() > 7, "{}", swept.len());
         for body in &swept {
-            assert!((10..200).contains(&body.places.len()), "{}", body.places.len());
-            for pair in body.places.windows(2) {
-                assert!((pair[1].translation - pair[0].translation).length() <= STEP_M as f32);
+            assert!((2..200).contains(&body.places.len()), "{}", body.places.len());
+            assert!(body.dropped <= resolution && body.leg < 0.01, "{} {}", body.dropped, body.leg);
+            for at in &ahead.courses[0] {
+                let poses = robot.poses(&Configuration { arm: at.joints, finger: at.finger, ..here(&robot) });
+                let place = to_f32(&poses[body.link].compose(&body.in_link));
+                let nearest = body.places.iter().map(|kept| body.moved(kept, &place)).fold(f32::INFINITY, f32::min);
+                assert!(nearest <= body.missed(), "{nearest}");
             }
         }
+    }
+
+    #[test]
+    fn a_way_to_and_fro_has_hardly_more_places_than_once() {
+        let robot = Robot::aimm();
+        let places = |times: u32| -> usize {
+            let ahead = swings(&robot, 0.9, 250, times);
+            swept(&robot, &here(&robot), &ahead, 0.008).iter().map(|body| body.places.len()).sum()
+        };
+        let [once, often] = [1, 20].map(places);
+        assert!(often < 8 * once, "{once} {often}");
+    }
+
+    #[test]
+    fn a_tree_finds_what_all_pairs_of_places_do() {
+        let robot = Robot::aimm();
+        let ahead = swings(&robot, 0.9, 60, 1);
+        let swept = swept(&robot, &here(&robot), &ahead, 0.008);
+        let mut found = [0, 0];
+        for (i, a) in swept.iter().enumerate() {
+            for b in &swept[..i] {
+                for margin in [0.01, 0.05, 0.2] {
+                    let nearest = a.places.iter().flat_map(|at| b.places.iter().map(|of| a.distance(at, b, of)));
+                    let expected = nearest.fold(f32::INFINITY, f32::min) < margin;
+                    assert_eq!(a.comes_to(b, margin, &mut { MAX_DISTANCES }), Ok(expected));
+                    found[usize::from(expected)] += 1;
+                }
+            }
+        }
+        assert!(found.iter().all(|count| *count > 10), "{found:?}");
+    }
+
+    #[test]
+    fn ways_beyond_the_bounds_are_given_up() {
+        let robot = Robot::aimm();
+        let short = swings(&robot, 0.4, 10, 1);
+        let long = swings(&robot, 0.4, 250, u32::try_from(MAX_POSTURES / 500).unwrap());
+        let compared = keep_apart(&robot, &here(&robot), &long, &short, Other::Moves);
+        assert_eq!(compared, Err(Crossing::TooLong));
+        let swept = swept(&robot, &here(&robot), &short, 0.008);
+        assert_eq!(swept[0].comes_to(&swept[1], 0.0, &mut 0), Err(Crossing::TooLong));
     }
 }

@@ -380,9 +380,15 @@ impl Contacts {
     /// What a contact is for, where that is known as it begins.
     fn known(&self, touch: &Touch, doing: Doing<'_>) -> Option<Purpose> {
         let just_held = |arm: usize| self.hands[arm].grasped || !doing.arms[arm].is_moved;
+        // What another arm moves is nothing that an object was lifted from.
+        let is_pushed = |holder: usize| match &touch.things[0] {
+            Thing::Link(link) => moving_arm_of(&self.arm_links, link, doing).is_some_and(|arm| arm != holder),
+            Thing::Object(below) => doing.holder_of(*below).is_some_and(|arm| arm != holder && doing.arms[arm].moves),
+            Thing::Fixed(_) => false,
+        };
         let lifts = |object: usize| {
-            let is_lifted = doing.holder_of(object).is_some_and(just_held) && touch.normal[2] >= LEVEL;
-            is_lifted.then_some(Purpose::LiftOff)
+            let is_lifted = doing.holder_of(object).is_some_and(|arm| just_held(arm) && !is_pushed(arm));
+            (is_lifted && touch.normal[2] >= LEVEL).then_some(Purpose::LiftOff)
         };
         match &touch.things {
             things if things.iter().any(|thing| self.put.map(Thing::Object).as_ref() == Some(thing)) => {
@@ -452,7 +458,12 @@ impl Contacts {
 /// Whether it is a link that an arm moves which is on its way.
 fn is_moved(arm_links: &[Vec<String>], touch: &Touch, doing: Doing<'_>) -> bool {
     let Thing::Link(link) = &touch.things[0] else { return false };
-    doing.arms.iter().zip(arm_links).any(|(arm, links)| arm.moves && links.contains(link))
+    moving_arm_of(arm_links, link, doing).is_some()
+}
+
+/// The arm on its way that moves a link.
+fn moving_arm_of(arm_links: &[Vec<String>], link: &String, doing: Doing<'_>) -> Option<usize> {
+    doing.arms.iter().zip(arm_links).position(|(arm, links)| arm.moves && links.contains(link))
 }
 
 #[cfg(test)]
@@ -602,6 +613,37 @@ mod tests {
     fn what_is_held_may_press_what_is_below_it_when_it_is_lifted_and_nothing_beside_it() {
         assert_eq!(grasped_along([0.0, 0.0, 1.0]), []);
         assert_eq!(grasped_along([1.0, 0.0, 0.0]).len(), 1);
+    }
+
+    #[test]
+    fn what_another_arm_moves_is_nothing_that_an_object_was_lifted_from() {
+        let stands = ArmDoing { held: None, moves: false, is_moved: false, fingers_solid: true };
+        let holds = ArmDoing { held: Some(0), ..stands };
+        let moves = ArmDoing { moves: true, is_moved: true, ..stands };
+        let (keeps, carries) = (ArmDoing { held: Some(1), ..stands }, ArmDoing { held: Some(1), ..moves });
+        let (link, object) = (Thing::Link("right_hand".to_owned()), Thing::Object(1));
+        for (below, other, lifted) in
+            [(&link, stands, true), (&link, moves, false), (&object, keeps, true), (&object, carries, false)]
+        {
+            let watched = Watched::new();
+            let mut contacts = Contacts {
+                fingers: Fingers(vec![Vec::new(), Vec::new()]),
+                hands: vec![Hand::default(); 2],
+                arm_links: vec![vec!["left_hand".to_owned()], vec!["right_hand".to_owned()]],
+                ..Contacts::default()
+            };
+            let touch = Touch {
+                things: [below.clone(), Thing::Object(0)],
+                depth_m: 0.005,
+                at: [0.0; 3],
+                normal: [0.0, 0.0, 1.0],
+                speed_m_s: 0.1,
+            };
+            let doing = Doing { now: Timestamp::default(), arms: &[holds, other] };
+            let ids = ["box_1".to_owned(), "box_2".to_owned()];
+            contacts.observe(&[touch], doing, &watched.environment, &ids);
+            assert_eq!(contacts.unintended().is_empty(), lifted, "{below:?}: {:?}", contacts.unintended());
+        }
     }
 
     #[test]

@@ -12,7 +12,7 @@ use ratn_motion::joint_vector::{JointVector, PerJoint};
 use ratn_motion::robot::Configuration;
 use std::f64::consts::TAU;
 
-/// What is wrong in one cell, at one stop of its base.
+/// The errors of one cell: of its encoders, of its camera, and of where its base stands since its last stop.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Errors {
     config: ErrorsConfig,

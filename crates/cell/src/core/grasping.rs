@@ -139,8 +139,9 @@ impl Pads {
         self.meets(finger + self.thick, in_tool, size)
     }
 
-    /// Whether a cuboid is in the one that the pads sweep: whether no axis of either separates the two.
-    fn meets(&self, finger: f64, in_tool: &Pose, size: &[f64; 3]) -> bool {
+    /// Whether a cuboid is in the one that the pads sweep when they close from `finger` metres on each side of the middle: whether no axis of
+    /// either separates the two.
+    pub fn meets(&self, finger: f64, in_tool: &Pose, size: &[f64; 3]) -> bool {
         let [x_from, x_to] = self.x;
         let half = [(x_to - x_from) / 2.0, finger, (self.z_to - self.z_from) / 2.0];
         let middle = [(x_to + x_from) / 2.0, 0.0, (self.z_to + self.z_from) / 2.0];

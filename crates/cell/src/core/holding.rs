@@ -60,18 +60,24 @@ impl Cell {
     /// Where that is held by another arm.
     pub(super) fn closes_to(&self, arm: usize, from: f64) -> Result<f64, String> {
         let tools = self.arms.tools(&self.configuration());
-        let (_, closed) = self.between(arm, from, &tools);
-        self.held_by_another(&closed).map_or(Ok(closed.map_or(0.0, |grip| grip.width / 2.0)), Err)
+        let (parts, closed) = self.between(arm, from, &tools);
+        self.held_by_another(arm, from, &parts, &tools).map_or(Ok(closed.map_or(0.0, |grip| grip.width / 2.0)), Err)
     }
 
-    /// Why fingers do not close around what is between them where another arm holds it: what two grippers do to one object is not simulated.
-    fn held_by_another(&self, closed: &Result<GripOf, NotGrasped>) -> Option<String> {
-        let grip = closed.as_ref().ok()?;
-        let (holder, _) = self.arms.holder_of(grip.index)?;
+    /// Why fingers of an arm do not close where something is between them that another arm holds, whether they would hold it or not: what two
+    /// grippers do to one object is not simulated. `parts` are those of [`Cell::between`].
+    fn held_by_another(&self, arm: usize, from: f64, parts: &[Cuboid], tools: &[Pose]) -> Option<String> {
+        let (pads, seen) = (self.arms.pads(arm)?, tools[arm].inverse());
+        let held = |(object, (part, size)): (usize, &Cuboid)| {
+            let (holder, _) = self.arms.holder_of(object).filter(|(holder, _)| *holder != arm)?;
+            let in_tool = seen.compose(&self.pose_of(object, tools)).compose(part);
+            pads.meets(from, &in_tool, size).then_some((object, holder))
+        };
+        let (object, holder) = parts.iter().enumerate().find_map(held)?;
         Some(format!(
             "nothing is grasped: {} is between the fingers, and the arm `{}` holds it; this cell does not simulate that two arms hold one \
              object, so have it put down first",
-            self.ids[grip.index],
+            self.ids[object],
             self.arms.name(holder)
         ))
     }
@@ -102,7 +108,7 @@ impl Cell {
         let tools = self.arms.tools(&self.configuration());
         let tool = tools[arm];
         let (parts, closed) = self.between(arm, from, &tools);
-        if let Some(reason) = self.held_by_another(&closed) {
+        if let Some(reason) = self.held_by_another(arm, from, &parts, &tools) {
             self.contacts.closed(arm, None, &self.environment);
             self.resting.set_finger(arm, from);
             return Ending::Aborted(reason);

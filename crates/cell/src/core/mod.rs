@@ -17,6 +17,7 @@ pub mod snapshot;
 pub mod tableware;
 
 mod activity;
+mod apart;
 mod battery;
 mod clearance;
 mod deviations;

@@ -105,8 +105,7 @@ impl Motion {
 
     /// How long it takes, in seconds.
     pub(crate) fn lasts_s(&self) -> f64 {
-        let settled_s = STEP.as_secs_f64() * (self.course.len() - 1) as f64;
-        self.breaks.as_ref().map_or(settled_s, |(breaks_s, _)| *breaks_s)
+        self.breaks.as_ref().map_or(self.course_s(), |(breaks_s, _)| *breaks_s)
     }
 
     /// Where the joints are after so many seconds: a smooth curve through the course (Catmull and Rom). Beyond its end they go on as fast
@@ -123,10 +122,9 @@ impl Motion {
         })
     }
 
-    /// Where the joints are at the last [`STEP`] before so many seconds, and at every one from there to the end.
-    pub(crate) fn ahead(&self, time_s: f64) -> &[JointVector] {
-        let index = (time_s / STEP.as_secs_f64()).max(0.0) as usize;
-        &self.course[index.min(self.course.len() - 1)..]
+    /// How long it is known where the joints are, in seconds: longer than the motion lasts where something breaks that off.
+    pub(crate) fn course_s(&self) -> f64 {
+        STEP.as_secs_f64() * (self.course.len() - 1) as f64
     }
 
     /// How fast the joints are after so many seconds, and how fast that changes, per second and per second squared.
@@ -146,7 +144,10 @@ impl Motion {
         JointVector::from_fn(end.len(), |j| end[j] + (end[j] - before[j]) * beyond as f64)
     }
 
-    /// Where they end, at rest; or why they are still on their way then.
+    /// Where the joints end, at rest.
+    ///
+    /// # Errors
+    /// Why the motion breaks off: the joints still move then, and have to brake.
     pub(crate) fn end(&self) -> Result<JointVector, &str> {
         match &self.breaks {
             Some((_, reason)) => Err(reason),

@@ -72,7 +72,7 @@ pub enum PlacementError {
         /// Of which robot.
         robot: String,
         /// What is wrong with it, and what next.
-        reason: &'static str,
+        reason: String,
     },
 }
 

@@ -176,7 +176,8 @@ impl Snapshot {
 }
 
 impl Cell {
-    /// The state now. What goes on here and what goes on from it do so alike.
+    /// The state now. The battery counts its time anew from here on, as it does in a cell that is put back to the snapshot: so both cells behave
+    /// alike afterwards.
     pub(super) fn save(&mut self) -> Snapshot {
         let measured = self.measured();
         let Configuration { base, arm, pan, tilt, finger, .. } = measured;

@@ -3,11 +3,11 @@
 use super::activity::{Activity, Kind, Module, Ticket, seconds};
 use super::braking::Way;
 use super::cell::Cell;
-use super::clearance::{APART_M, Ahead, too_close};
 use super::deviations::LOST;
 use super::motion::{Controller, Motion};
 use super::protocol::Request;
 use super::trajectory;
+use ratn_model::value::Trajectory;
 use ratn_motion::drive::wrapped;
 use ratn_motion::joint_vector::{JointVector, PerJoint};
 use ratn_motion::robot::Configuration;
@@ -63,20 +63,19 @@ impl Cell {
             }
             Request::Follow { trajectory } => {
                 self.may_move_arm(arm)?;
-                let seen = self.room_for(arm, &here);
-                let trajectory = trajectory::check(self.arms.view(arm), &seen, &trajectory)?;
+                let trajectory = self.checked(arm, &here, &trajectory)?;
                 self.following(arm, trajectory)?
             }
             Request::MoveTo { joints, speed } => {
                 self.may_move_arm(arm)?;
-                let seen = self.room_for(arm, &here);
                 let robot = self.arms.view(arm);
                 let expected = robot.arm_joints().len();
                 if joints.len() != expected {
                     return Err(format!("input `joints` has {} values: the arm has {expected}", joints.len()));
                 }
-                let line = trajectory::straight(robot, &seen.arm, &joints, speed)?;
-                let trajectory = trajectory::check(robot, &seen, &line)?;
+                let from = self.arms.seen_from(arm, &here).arm;
+                let line = trajectory::straight(robot, &from, &joints, speed)?;
+                let trajectory = self.checked(arm, &here, &line)?;
                 self.following(arm, trajectory)?
             }
             Request::Grasp { .. } | Request::Release if self.arms.pads(arm).is_none() => {
@@ -90,14 +89,17 @@ impl Cell {
                 }
                 let from = self.arms.seen_from(arm, &here).finger;
                 let to = self.closes_to(arm, from)?;
+                // What slips out of the fingers lets them close fully.
+                self.fingers_keep_apart(arm, from, 0.0)?;
                 self.contacts.closing(arm);
                 (Kind::Close { from, to, object, expected }, self.config.gripper.close_s)
             }
             Request::Release => {
                 self.no_motion_of(Module::Base, BASE)?;
                 self.no_motion_of(Module::Arm(arm), HAND)?;
-                self.let_go(arm);
                 let (from, to) = (self.arms.seen_from(arm, &here).finger, self.arms.open_finger_m(arm));
+                self.fingers_keep_apart(arm, from, to)?;
+                self.let_go(arm);
                 (Kind::Open { from, to }, self.config.gripper.open_s)
             }
             Request::SenseBase => (Kind::SenseBase, 0.0),
@@ -144,49 +146,23 @@ impl Cell {
         self.no_motion_of(Module::PanTilt, HEAD)
     }
 
-    /// The robot as it is seen from an arm that is to move: with the fingers of the other arms open, which they may become meanwhile.
-    fn room_for(&self, arm: usize, here: &Configuration) -> Configuration {
-        self.arms.seen_from(arm, &self.arms.with_others_open(arm, here))
-    }
-
-    /// Whether an arm that is to go so keeps apart from the other arms that are on their ways.
-    fn keeps_apart(&self, arm: usize, motion: &Motion) -> Result<(), String> {
-        let here = self.arms.with_others_open(arm, &self.measured());
-        let ours = Ahead { arm, postures: motion.ahead(0.0) };
-        let under_way = self.activities.iter().filter_map(|(module, activity)| match &activity.kind {
-            Kind::Follow(way @ Way::Arm(..)) => {
-                Some((*module, activity.ticket, way.ahead(activity.elapsed_s(self.motion_time))))
-            }
-            _ => None,
-        });
-        let braking = self.braking.iter().map(|(module, braking)| (*module, braking.ticket, braking.ahead(self.now)));
-        for (module, ticket, postures) in under_way.chain(braking) {
-            let Some(other) = module.arm() else { continue };
-            if let Some(close) = too_close(&self.robot, &here, &ours, &Ahead { arm: other, postures }) {
-                let (ours, theirs) = (self.arms.name(arm), self.arms.name(other));
-                return Err(format!(
-                    "the trajectory is refused: on the way {} of the arm `{ours}` comes nearer than {:.0} mm to {} of the arm `{theirs}`, which \
-                     is under way with goal {}. Either may be stopped anywhere, so the ways of two arms that move at once must not cross: \
-                     move one after the other, or plan another way",
-                    close.link,
-                    APART_M * 1e3,
-                    close.other,
-                    ticket.0
-                ));
-            }
+    /// A trajectory of an arm, checked beside the other arms with their fingers as they are and with those open: neither takes all the room of
+    /// both, because closed fingers are in the middle and open ones are beside it.
+    fn checked(&self, arm: usize, here: &Configuration, trajectory: &Trajectory) -> Result<Curve, String> {
+        let robot = self.arms.view(arm);
+        let as_they_are = self.arms.seen_from(arm, here);
+        let open = self.arms.seen_from(arm, &self.arms.with_others_open(arm, here));
+        let checked = trajectory::check(robot, &as_they_are, trajectory)?;
+        if open != as_they_are {
+            trajectory::check(robot, &open, trajectory)?;
         }
-        Ok(())
-    }
-
-    /// Whether another arm is on its way, or comes to rest.
-    fn another_arm_moves(&self, arm: usize) -> bool {
-        self.arms.numbers().any(|other| other != arm && self.busy_with(Module::Arm(other)).is_some())
+        Ok(checked)
     }
 
     /// What an arm does, and for how long.
     ///
     /// # Errors
-    /// Where it would come too close to another arm that is on its way.
+    /// Where it would come too close to another arm.
     fn following(&mut self, arm: usize, trajectory: Curve) -> Result<(Kind, f64), String> {
         let lasts_s = trajectory.duration_s();
         let config = self.config.controllers;
@@ -198,8 +174,9 @@ impl Cell {
             slides: PerJoint::from_fn(slides.len(), |j| slides[j]),
         };
         let from = self.arms.seen_from(arm, &self.measured()).arm;
-        if self.another_arm_moves(arm) {
-            self.keeps_apart(arm, &Motion::new(trajectory.clone(), from, controller, None))?;
+        if self.arms.count() > 1 {
+            let motion = Motion::new(trajectory.clone(), from, controller, None);
+            self.arm_keeps_apart(arm, &Way::Arm(arm, motion))?;
         }
         let breaks = self.arm_breaks_off(lasts_s);
         let motion = Motion::new(trajectory, from, controller, breaks);

@@ -10,7 +10,9 @@ use ratn_model::value::Value;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_perception::noise::MAX_FRAMES;
-use ratn_worker::action::{Action, ActionFailure, ActionResult, ActionServer, Goal, GoalContext, GoalOutcome};
+use ratn_worker::action::{
+    Action, ActionFailure, ActionResult, ActionServer, Goal, GoalContext, GoalOutcome, NoResource,
+};
 use ratn_worker::client::Channels;
 use ratn_worker::lease_watch::LeaseWatch;
 use ratn_worker::safety::Safety;
@@ -160,7 +162,7 @@ impl Action for ModuleAction {
         self.performers.iter().map(|performer| performer.resource.as_str()).collect()
     }
 
-    fn resource_for(&self, goal: &Goal) -> Result<Option<&str>, String> {
+    fn resource_for(&self, goal: &Goal) -> Result<Option<&str>, NoResource> {
         Ok(Some(&self.performer(goal.inputs.get("arm"), goal.lease.as_ref())?.resource))
     }
 
@@ -170,7 +172,7 @@ impl Action for ModuleAction {
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let request = (self.read)(&goal)?;
-        let arm = self.performer(goal.inputs.get("arm"), goal.lease.as_ref()).map_err(ActionFailure::aborted)?.arm;
+        let arm = self.performer(goal.inputs.get("arm"), goal.lease.as_ref())?.arm;
         goal.while_held().await?;
         let mut suspended = goal.suspended();
         let mut motion = self.handle.perform_with(arm, request)?;
@@ -198,32 +200,32 @@ impl Action for ModuleAction {
 }
 
 impl ModuleAction {
-    /// The module that a goal is for: that of the arm which the input `arm` names; without this input the one whose resource the lease holds.
+    /// The module that a goal is for: that of the arm which the input `arm` names; without this input the one whose resource the lease holds. A
+    /// module that is no arm's, and that of a robot with one arm, ignores the input.
     ///
     /// # Errors
-    /// A sentence where there is no such arm, or the lease holds none or several of the resources.
-    fn performer(&self, arm: Option<&Value>, lease: Option<&Lease>) -> Result<&Performer, String> {
-        let named = match arm {
+    /// [`NoResource`] where no module of such an arm does this, or the lease holds none or several of the resources.
+    fn performer(&self, arm: Option<&Value>, lease: Option<&Lease>) -> Result<&Performer, NoResource> {
+        let of_arms: Vec<&str> = self.performers.iter().filter_map(|one| one.arm_name.as_deref()).collect();
+        let named = match arm.filter(|_| !of_arms.is_empty()) {
             None | Some(Value::Null) => None,
             Some(Value::String(name)) => Some(name),
             Some(other) => {
-                return Err(format!("input `arm` has a {}: expected the name of an arm, a string", other.type_name()));
+                let has = other.type_name();
+                return Err(NoResource::Input(format!(
+                    "input `arm` has a {has}: expected the name of an arm, a string"
+                )));
             }
         };
-        let arms = || {
-            let names = self.handle.robot().arm_names().map(|name| format!("`{name}`"));
-            names.collect::<Vec<_>>().join(", ")
-        };
-        if let [only] = &self.performers[..] {
-            let is_its = |name: &&String| self.handle.robot().arm_names().nth(only.arm) == Some(name.as_str());
-            return match named.filter(|name| !is_its(name)) {
-                Some(name) => Err(format!("input `arm` is `{name}`: `{}` is for the arm {}", self.name, arms())),
-                None => Ok(only),
-            };
-        }
+        let arms = || of_arms.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
         if let Some(name) = named {
             let found = self.performers.iter().find(|performer| performer.arm_name.as_ref() == Some(name));
-            return found.ok_or_else(|| format!("input `arm` is `{name}`: `{}` is for the arms {}", self.name, arms()));
+            let several = if of_arms.len() > 1 { "arms" } else { "arm" };
+            let why = || format!("input `arm` is `{name}`: `{}` is for the {several} {}", self.name, arms());
+            return found.ok_or_else(|| NoResource::Input(why()));
+        }
+        if let [only] = &self.performers[..] {
+            return Ok(only);
         }
         let is_leased = |performer: &&Performer| {
             lease.is_some_and(|lease| lease.resources.iter().any(|leased| leased.id == performer.resource))
@@ -231,17 +233,17 @@ impl ModuleAction {
         let leased: Vec<&Performer> = self.performers.iter().filter(is_leased).collect();
         match leased[..] {
             [only] => Ok(only),
-            [] => Err(format!(
+            [] => Err(NoResource::Lease(format!(
                 "the goal has no lease of any of {}: acquire one and send the lease along",
                 self.resources().join(", ")
-            )),
+            ))),
             [..] => {
                 let held: Vec<&str> = leased.iter().map(|performer| performer.resource.as_str()).collect();
-                Err(format!(
+                Err(NoResource::Lease(format!(
                     "the goal's lease holds {}, so the goal has to say which arm it is for: give it the input `arm`, one of {}",
                     held.join(" and "),
                     arms()
-                ))
+                )))
             }
         }
     }

@@ -32,8 +32,8 @@ impl Robot {
         bodies.iter().map(|body| part(&in_tool.compose(&body.pose), &body.geometry)).collect()
     }
 
-    /// A link and the tool in the frame of the last link that carries both: whatever is before that one does not matter, nor does its
-    /// rounding.
+    /// The poses of a link and of the tool in the frame of the last link that carries both. The links before that one are left out: they move
+    /// both alike, and would only add rounding errors.
     fn in_shared_link(&self, link: usize, positions: &[f64]) -> (Pose, Pose) {
         let links = &self.model.links;
         let above = |link: usize| std::iter::successors(Some(link), |index| links[*index].parent).collect::<Vec<_>>();

@@ -1,4 +1,4 @@
-//! Whether two robots are the same one: by name, and by a digest of all that moves and collides.
+//! Whether two robots are the same one: by name, and by a digest of all that moves, collides, reaches and grasps.
 
 use super::{Geometry, Part, Robot};
 use ratn_model::pose::Pose;
@@ -15,7 +15,8 @@ const SHOWN: usize = 12;
 pub struct RobotIdentity {
     /// The robot's name in its description.
     pub name: String,
-    /// A digest of links, shapes, joints with their limits, and of which joints are arms, grippers, base and head.
+    /// A digest of links, shapes, joints with their limits, of which joints are arms, grippers, base and head, and of the names and tools of the
+    /// arms and the hands and fingers of the grippers.
     pub digest: String,
 }
 
@@ -73,6 +74,18 @@ impl Robot {
             let indices: &[usize] = part.map_or(&[], |part: &Part| &part.indices);
             count(&mut digester, indices.len());
             indices.iter().for_each(|index| count(&mut digester, *index));
+        }
+        // Which frame is brought to goals, and which link of a gripper is the finger that its pads are found on.
+        for arm in std::iter::once(&self.description.arm).chain(&self.description.other_arms) {
+            digester.text(&arm.name);
+            digester.text(&arm.tool);
+        }
+        let grippers = std::iter::once(&self.description.gripper);
+        for gripper in grippers.chain(self.description.other_arms.iter().map(|arm| &arm.gripper)) {
+            digester.number(u64::from(gripper.is_some()));
+            for text in gripper.iter().flat_map(|gripper| [&gripper.joint, &gripper.hand, &gripper.finger]) {
+                digester.text(text);
+            }
         }
         RobotIdentity { name: self.name().to_owned(), digest: digester.finish().to_string() }
     }

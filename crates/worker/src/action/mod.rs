@@ -70,7 +70,7 @@ pub trait Action: Send + Sync + 'static {
     ///
     /// # Errors
     /// Why the goal is for none of the resources, or which of them it is for cannot be told: the goal is refused with that sentence.
-    fn resource_for(&self, _goal: &Goal) -> Result<Option<&str>, String> {
+    fn resource_for(&self, _goal: &Goal) -> Result<Option<&str>, NoResource> {
         Ok(self.resource())
     }
 
@@ -90,6 +90,17 @@ pub trait Action: Send + Sync + 'static {
     /// never interrupted, and its resource stays taken until it returns. Work that blocks for longer than a millisecond belongs into
     /// `tokio::task::spawn_blocking`.
     async fn execute(&self, goal: GoalContext) -> ActionResult;
+}
+
+/// Why it cannot be told which resource's lease a goal needs; what to do about it is in the sentence.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum NoResource {
+    /// An input of the goal names none of them: the goal is refused as `INVALID_ARGUMENT`.
+    #[error("{0}")]
+    Input(String),
+    /// The lease of the goal holds none of them, or several: the goal is refused as `FAILED_PRECONDITION` with the reason `NO_LEASE`.
+    #[error("{0}")]
+    Lease(String),
 }
 
 /// How a goal ends: an outcome with its outputs, or a failure.

@@ -5,7 +5,7 @@ use super::authority::{Authority, refusal};
 use super::goal::{Ending, Fingerprint, GoalEntry, LeaseKey, StopCause};
 use super::run::run;
 use super::service::{Messages, described};
-use super::{Action, GoalContext};
+use super::{Action, GoalContext, NoResource};
 use crate::access::Caller;
 use crate::client::Channels;
 use crate::gate::ending;
@@ -339,7 +339,10 @@ impl Inner {
             let message = format!("no action `{action}`: there are {}", known.join(", "));
             return Err(Status::invalid_argument(message));
         };
-        let resource = found.resource_for(goal).map_err(|why| refusal(Code::FailedPrecondition, "NO_LEASE", why))?;
+        let resource = found.resource_for(goal).map_err(|why| match why {
+            NoResource::Input(why) => Status::invalid_argument(why),
+            NoResource::Lease(why) => refusal(Code::FailedPrecondition, "NO_LEASE", why),
+        })?;
         Ok((found, resource.unwrap_or(&self.resource)))
     }
 

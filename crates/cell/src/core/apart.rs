@@ -1,0 +1,107 @@
+//! What an arm keeps from the other arms of its robot: an arm that sets out, and fingers that begin to close or to open, are compared with
+//! every other arm where it stands and on the way that it has before it (`clearance`).
+//!
+//! The fingers of another arm count where they are, where they are on their way to, and open: whoever holds that arm may open them.
+
+use super::activity::{Kind, Module, Ticket};
+use super::braking::Way;
+use super::cell::Cell;
+use super::clearance::{Ahead, Crossing, Other, keep_apart};
+use ratn_motion::robot::ArmPosition;
+
+/// How far a finger may be from one position to the next that are compared, in metres.
+const FINGER_STEP_M: f64 = 0.002;
+
+impl Cell {
+    /// Whether an arm that is to go so keeps apart from the other arms: on the course that its joints really take, and while it brakes at the end
+    /// of that course where the controller loses it there.
+    ///
+    /// # Errors
+    /// Which links come too close, of which arm, and what that one is doing.
+    pub(super) fn arm_keeps_apart(&self, arm: usize, way: &Way) -> Result<(), String> {
+        let finger = self.arms.seen_from(arm, &self.measured()).finger;
+        let course = way.ahead(&self.robot, 0.0).into_iter().map(|joints| ArmPosition { joints, finger });
+        let ours = Ahead { arm, links: self.robot.links_of(arm), courses: vec![course.collect()] };
+        self.keeps_apart(&ours, "the trajectory is refused: on the way ", "the trajectory is refused: its way")
+    }
+
+    /// Whether the fingers of an arm may go so: from and to these distances from the middle, in metres.
+    ///
+    /// # Errors
+    /// Which links come too close, of which arm, and what that one is doing.
+    pub(super) fn fingers_keep_apart(&self, arm: usize, from: f64, to: f64) -> Result<(), String> {
+        if from == to {
+            return Ok(());
+        }
+        let joints = self.arms.seen_from(arm, &self.measured()).arm;
+        let course = passed(from, to).map(|finger| ArmPosition { joints, finger });
+        let ours = Ahead { arm, links: self.robot.finger_links_of(arm), courses: vec![course.collect()] };
+        self.keeps_apart(&ours, "the fingers stay where they are: ", "the fingers stay where they are: their way")
+    }
+
+    fn keeps_apart(&self, ours: &Ahead, near: &str, long: &str) -> Result<(), String> {
+        let here = self.measured();
+        for other in self.arms.numbers().filter(|other| *other != ours.arm) {
+            let (theirs, ticket) = self.ahead_of(other);
+            let does = if ticket.is_some() { Other::Moves } else { Other::Stands };
+            let Err(crossing) = keep_apart(&self.robot, &here, ours, &theirs, does) else { continue };
+            let (our_name, name) = (self.arms.name(ours.arm), self.arms.name(other));
+            let under_way = ticket.map_or_else(String::new, |ticket| format!("is under way with goal {}", ticket.0));
+            return Err(match (crossing, does) {
+                (Crossing::TooClose { link, other }, Other::Moves) => format!(
+                    "{near}{link} of the arm `{our_name}` comes nearer than {:.0} mm to {other} of the arm `{name}`, which {under_way}. Either may be \
+                     stopped anywhere, so the ways of two arms that move at once must not cross: move one after the other, or plan another way",
+                    does.apart_m() * 1e3
+                ),
+                (Crossing::TooClose { link, other }, Other::Stands) => format!(
+                    "{near}{link} of the arm `{our_name}` comes nearer than {:.0} mm to {other} of the arm `{name}`, which stands there with its \
+                     fingers as they are or may open: move that arm away first, or plan another way",
+                    does.apart_m() * 1e3
+                ),
+                (Crossing::TooLong, _) => format!(
+                    "{long} and that of the arm `{name}`{} are too long, or too near to each other for too long, to be compared: move one \
+                     after the other, or in shorter motions",
+                    if under_way.is_empty() { String::new() } else { format!(", which {under_way},") }
+                ),
+            });
+        }
+        Ok(())
+    }
+
+    /// What another arm does from now on, and with which goal where it is on its way; else it stands, and its fingers may move.
+    fn ahead_of(&self, arm: usize) -> (Ahead, Option<Ticket>) {
+        let at = self.arms.seen_from(arm, &self.measured());
+        let activity = self.activities.get(&Module::Arm(arm));
+        let followed = activity.and_then(|activity| match &activity.kind {
+            Kind::Follow(way) => Some((activity.ticket, way.ahead(&self.robot, activity.elapsed_s(self.motion_time)))),
+            _ => None,
+        });
+        let braking = self.braking.get(&Module::Arm(arm));
+        let braked = braking.map(|braking| (braking.ticket, braking.ahead(self.now)));
+        let (ticket, joints) = followed.or(braked).map_or((None, vec![at.arm]), |(ticket, way)| (Some(ticket), way));
+        let mut fingers = vec![vec![at.finger]];
+        if self.arms.view(arm).finger().is_some() {
+            let open = self.arms.open_finger_m(arm);
+            match self.activities.get(&Module::Gripper(arm)).map(|activity| &activity.kind) {
+                // What slips out of fingers lets them close fully.
+                Some(Kind::Close { .. }) => fingers = vec![passed(at.finger, 0.0).collect(), vec![open]],
+                Some(Kind::Open { to, .. }) => fingers = vec![passed(at.finger, *to).collect()],
+                _ if open != at.finger => fingers.push(vec![open]),
+                _ => {}
+            }
+        }
+        // Either the joints move or the fingers do.
+        let course = |fingers: Vec<f64>| -> Vec<ArmPosition> {
+            let positions = fingers.into_iter().flat_map(|finger| joints.iter().map(move |at| (*at, finger)));
+            positions.map(|(joints, finger)| ArmPosition { joints, finger }).collect()
+        };
+        let courses = fingers.into_iter().map(course).collect();
+        (Ahead { arm, links: self.robot.links_of(arm), courses }, ticket)
+    }
+}
+
+/// Positions of fingers on their way.
+fn passed(from: f64, to: f64) -> impl Iterator<Item = f64> {
+    let steps = ((to - from).abs() / FINGER_STEP_M).ceil().max(1.0) as u32;
+    (0..=steps).map(move |i| from + (to - from) * f64::from(i) / f64::from(steps))
+}

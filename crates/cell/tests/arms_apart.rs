@@ -1,0 +1,321 @@
+//! What an arm keeps from another arm of the same robot: two gantries whose hands slide along x, y and z, so that every distance is known.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_cell::config::CellConfig;
+use ratn_cell::core::cell::Cell;
+use ratn_cell::core::protocol::{Command, Ending, Event, Request};
+use ratn_cell::core::snapshot::Snapshot;
+use ratn_model::pose::Pose;
+use ratn_motion::joint_vector::JointVector;
+use std::path::Path;
+use tempfile::TempDir;
+
+mod bench;
+#[allow(dead_code, reason = "not every test needs all of it")]
+mod duo;
+use bench::{Bench, grasp as close};
+
+const LEFT: usize = 0;
+const RIGHT: usize = 1;
+/// Where the hands hang in the posture `home`: x, y and z as seen from the middle of the gantry.
+const HOMES: [[f64; 3]; 2] = [[0.0, 0.4, 0.0], [0.0, -0.4, 0.0]];
+/// How long the rod of a hand is, from the middle of the hand.
+const ROD_M: f64 = 0.30;
+/// How far the fingers are beyond the hand's middle, downwards.
+const FINGERS_BELOW_M: f64 = 0.06;
+
+/// A hand with a rod ahead of it, two fingers below it and a tool that points down.
+fn side(side: &str) -> String {
+    let slides = |name: &str, parent: &str, child: &str, axis: &str, limits: &str, mimic: &str| {
+        format!(
+            "<joint name='{side}_{name}' type='prismatic'><parent link='{parent}'/><child link='{side}_{child}'/><axis xyz='{axis}'/>\
+             <limit {limits} effort='1' velocity='0.5' acceleration='2'/>{mimic}</joint>"
+        )
+    };
+    let boxed = |at: &str, size: &str| {
+        format!("<collision><origin xyz='{at}'/><geometry><box size='{size}'/></geometry></collision>")
+    };
+    let far = "lower='-1' upper='1'";
+    let opens = "lower='0' upper='0.04'";
+    let mimic = format!("<mimic joint='{side}_finger' multiplier='1' offset='0'/>");
+    let middle = ROD_M / 2.0;
+    [
+        format!("<link name='{side}_1'/><link name='{side}_2'/><link name='{side}_tool'/>"),
+        format!("<link name='{side}_hand'>{}", boxed("0 0 0", "0.06 0.12 0.04")),
+        format!("{}</link>", boxed(&format!("{middle} 0 0"), &format!("{ROD_M} 0.01 0.01"))),
+        format!("<link name='{side}_finger_a'>{}</link>", boxed("0 0.005 -0.06", "0.02 0.01 0.08")),
+        format!("<link name='{side}_finger_b'>{}</link>", boxed("0 -0.005 -0.06", "0.02 0.01 0.08")),
+        slides("x", "torso", "1", "1 0 0", far, ""),
+        slides("y", &format!("{side}_1"), "2", "0 1 0", far, ""),
+        slides("z", &format!("{side}_2"), "hand", "0 0 1", far, ""),
+        slides("finger", &format!("{side}_hand"), "finger_a", "0 1 0", opens, ""),
+        slides("mimics", &format!("{side}_hand"), "finger_b", "0 -1 0", opens, &mimic),
+        format!(
+            "<joint name='{side}_mount' type='fixed'><parent link='{side}_hand'/><child link='{side}_tool'/>\
+             <origin xyz='0 0 -0.1' rpy='3.141592653589793 0 0'/></joint>"
+        ),
+    ]
+    .concat()
+}
+
+fn urdf() -> String {
+    format!(
+        "<robot name='gantry'><link name='world'/><link name='torso'/><link name='camera'/>\
+         <joint name='camera_mount' type='fixed'><parent link='world'/><child link='camera'/><origin xyz='0 0 3'/></joint>\
+         <joint name='torso' type='prismatic'><parent link='world'/><child link='torso'/><axis xyz='0 0 1'/>\
+         <limit lower='1.5' upper='1.6' effort='1' velocity='0.5' acceleration='2'/></joint>{}{}</robot>",
+        side("left"),
+        side("right")
+    )
+}
+
+fn srdf() -> String {
+    let pairs = ["left", "right"].map(|side| {
+        [("hand", "finger_a"), ("hand", "finger_b"), ("finger_a", "finger_b")]
+            .map(|(a, b)| format!("<disable_collisions link1='{side}_{a}' link2='{side}_{b}'/>"))
+            .concat()
+    });
+    format!("<robot name='gantry'>{}</robot>", pairs.concat())
+}
+
+fn description() -> String {
+    let arm = |side: &str| {
+        format!("name = \"{side}\"\njoints = [\"{side}_x\", \"{side}_y\", \"{side}_z\"]\ntool = \"{side}_tool\"\n")
+    };
+    let gripper =
+        |side: &str| format!("joint = \"{side}_finger\"\nhand = \"{side}_hand\"\nfinger = \"{side}_finger_a\"\n");
+    let [left, right] = HOMES;
+    format!(
+        "name = \"gantry\"\nurdf = \"gantry.urdf\"\nsrdf = \"gantry.srdf\"\n[arm]\n{}[gripper]\n{}[camera]\nlink = \"camera\"\n[postures]\n\
+         home = {left:?}\n[[other_arm]]\n{}[other_arm.gripper]\n{}[other_arm.postures]\nhome = {right:?}\n[workplace]\n\
+         table = {{ centre = [0, 0, 0.675], size = [0.80, 1.40, 0.05] }}\n\
+         boxes = {{ x = [-0.1, 0.1], y = [-0.1, 0.1], least = [0.05, 0.04, 0.07], greatest = [0.10, 0.05, 0.10] }}\n\
+         places = {{ on = \"table\", yaw = 0, at = [[0.2, 0.2, 0.70]] }}\n",
+        arm("left"),
+        gripper("left"),
+        arm("right"),
+        gripper("right")
+    )
+}
+
+fn config(folder: &Path, description: &str) -> CellConfig {
+    std::fs::write(folder.join("gantry.urdf"), urdf()).unwrap();
+    std::fs::write(folder.join("gantry.srdf"), srdf()).unwrap();
+    let file = folder.join("robot.toml");
+    std::fs::write(&file, description).unwrap();
+    CellConfig { robot: file.display().to_string(), boxes: 0, seed: 2, ..CellConfig::default() }
+}
+
+fn gantry() -> (Bench, TempDir) {
+    let folder = tempfile::tempdir().unwrap();
+    (Bench::of(config(folder.path(), &description())), folder)
+}
+
+/// Why a cell with this robot is refused.
+fn refused_robot(description: &str) -> String {
+    let folder = tempfile::tempdir().unwrap();
+    Cell::new(config(folder.path(), description)).err().unwrap().to_string()
+}
+
+fn to(joints: [f64; 3], speed: f64) -> Request {
+    Request::MoveTo { joints: joints.into(), speed }
+}
+
+fn goes(bench: &mut Bench, arm: usize, joints: [f64; 3]) {
+    let ending = bench.perform_with(arm, to(joints, 0.5));
+    assert!(matches!(ending, Ending::Done(_)), "{joints:?}: {ending:?}");
+}
+
+fn refused(bench: &mut Bench, arm: usize, request: Request) -> String {
+    match &bench.start_with(arm, request).1[..] {
+        [Command::Ended { ending: Ending::Aborted(reason), .. }] => reason.clone(),
+        other => panic!("{other:?}"),
+    }
+}
+
+/// The cell with the right arm elsewhere, with no regard to what is on the way there.
+fn with_right_at(bench: &mut Bench, joints: [f64; 3]) {
+    let commands = bench.event(Event::Save);
+    let [Command::Saved { snapshot }] = &commands[..] else { panic!("{commands:?}") };
+    let mut state: serde_json::Value = serde_json::from_str(&snapshot.to_json()).unwrap();
+    state["posture"]["other_arms"][0]["joints"] = serde_json::json!(joints);
+    let snapshot = Snapshot::from_json(&state.to_string()).unwrap();
+    bench.event(Event::PutBack { snapshot: Box::new(snapshot) });
+}
+
+/// The tip of the right arm's rod is between the fingers of the left arm, where that hangs at home, or `beyond` short of there.
+fn between_the_fingers(beyond: f64) -> [f64; 3] {
+    let [x, y, z] = HOMES[LEFT];
+    [x - ROD_M + 0.005 - beyond, y, z - FINGERS_BELOW_M]
+}
+
+#[test]
+fn closed_fingers_of_an_arm_that_stands_are_in_the_way_where_they_are() {
+    let (mut bench, _folder) = gantry();
+    let (before, between) = (between_the_fingers(0.1), between_the_fingers(0.0));
+    // Through open fingers.
+    goes(&mut bench, RIGHT, before);
+    goes(&mut bench, RIGHT, between);
+    goes(&mut bench, RIGHT, before);
+    assert_eq!(bench.cell.unintended_contacts(), []);
+    assert!(matches!(bench.perform_with(LEFT, close()), Ending::Aborted(_)), "they close around nothing");
+    assert_eq!(bench.cell.measured_of(LEFT).finger, 0.0);
+    let reason = refused(&mut bench, RIGHT, to(between, 0.5));
+    assert!(reason.contains("the trajectory is refused") && reason.contains("left_finger"), "{reason}");
+    // Nor where they will be when they open.
+    let [x, y, z] = between;
+    let reason = refused(&mut bench, RIGHT, to([x, y + 0.045, z], 0.5));
+    assert!(reason.contains("the trajectory is refused") && reason.contains("left_finger"), "{reason}");
+}
+
+#[test]
+fn fingers_do_not_close_on_another_arm_that_stands_between_them() {
+    let (mut bench, _folder) = gantry();
+    goes(&mut bench, RIGHT, between_the_fingers(0.1));
+    goes(&mut bench, RIGHT, between_the_fingers(0.0));
+    let reason = refused(&mut bench, LEFT, close());
+    assert!(reason.starts_with("the fingers stay where they are: left_finger"), "{reason}");
+    assert!(reason.contains("nearer than 3 mm to right_hand of the arm `right`, which stands there"), "{reason}");
+    assert_eq!(bench.cell.measured_of(LEFT).finger, 0.04);
+    goes(&mut bench, RIGHT, between_the_fingers(0.1));
+    let ending = bench.perform_with(LEFT, close());
+    assert!(matches!(&ending, Ending::Aborted(reason) if reason.contains("nothing stopped the fingers")), "{ending:?}");
+    assert_eq!(bench.cell.unintended_contacts(), []);
+}
+
+#[test]
+fn fingers_do_not_close_on_the_way_of_another_arm_nor_does_an_arm_set_out_between_closing_fingers() {
+    let (mut bench, _folder) = gantry();
+    goes(&mut bench, RIGHT, between_the_fingers(0.1));
+    let (_, commands) = bench.start_with(RIGHT, to(between_the_fingers(0.0), 0.1));
+    assert_eq!(commands, []);
+    let reason = refused(&mut bench, LEFT, close());
+    assert!(
+        reason.contains("nearer than 20 mm to right_hand of the arm `right`, which is under way with goal"),
+        "{reason}"
+    );
+
+    let (mut bench, _folder) = gantry();
+    goes(&mut bench, RIGHT, between_the_fingers(0.1));
+    let (_, commands) = bench.start_with(LEFT, close());
+    assert_eq!(commands, []);
+    let reason = refused(&mut bench, RIGHT, to(between_the_fingers(0.0), 0.5));
+    assert!(reason.contains("to left_finger"), "{reason}");
+}
+
+#[test]
+fn an_arm_keeps_a_margin_from_one_that_stands_and_may_leave_where_it_is_nearer() {
+    let (mut bench, _folder) = gantry();
+    // The hands are 0.12 m wide and hang at the same height.
+    let beside = |gap_m: f64| [HOMES[LEFT][0], HOMES[LEFT][1] - 0.12 - gap_m, 0.0];
+    goes(&mut bench, RIGHT, beside(0.05));
+    let reason = refused(&mut bench, RIGHT, to(beside(0.001), 0.3));
+    assert!(reason.contains("comes nearer than 3 mm to left_hand of the arm `left`, which stands there"), "{reason}");
+    goes(&mut bench, RIGHT, beside(0.012));
+
+    with_right_at(&mut bench, beside(0.001));
+    let reason = refused(&mut bench, RIGHT, to(beside(0.0001), 0.1));
+    assert!(reason.contains("comes nearer than 3 mm to left_hand"), "{reason}");
+    goes(&mut bench, RIGHT, beside(0.05));
+}
+
+#[test]
+fn ways_that_are_too_long_to_be_compared_are_refused_by_name() {
+    let (mut bench, _folder) = gantry();
+    let far = |arm: usize| {
+        let [_, y, z] = HOMES[arm];
+        [1.0, y, z]
+    };
+    let (_, commands) = bench.start_with(LEFT, to(far(LEFT), 0.01));
+    assert_eq!(commands, []);
+    let reason = refused(&mut bench, RIGHT, to(far(RIGHT), 0.5));
+    let said = "its way and that of the arm `left`, which is under way with goal 1, are too long";
+    assert!(reason.contains(said) && reason.contains("in shorter motions"), "{reason}");
+}
+
+#[test]
+fn an_arm_that_carries_the_other_one_is_refused_and_so_are_names_that_are_no_part_of_an_id() {
+    let carries = description()
+        .replacen("\"left_x\"", "\"torso\", \"left_x\"", 1)
+        .replace("home = [0.0, 0.4", "home = [1.5, 0.0, 0.4");
+    let reason = refused_robot(&carries);
+    assert!(
+        reason.contains("the arm `right` of the robot `gantry` cannot be in a cell: the link `right_1`"),
+        "{reason}"
+    );
+    assert!(reason.contains("by those of the arm `left`"), "{reason}");
+    for (name, number) in [("left", 0), ("right", 1)] {
+        for wrong in ["a/b".to_owned(), String::new(), "a".repeat(65)] {
+            let named = description().replace(&format!("name = \"{name}\""), &format!("name = \"{wrong}\""));
+            let reason = refused_robot(&named);
+            assert!(reason.contains("use 1 to 64 letters"), "{number}: {reason}");
+        }
+    }
+    let longest = description().replace("name = \"left\"", &format!("name = \"{}\"", "a".repeat(64)));
+    let folder = tempfile::tempdir().unwrap();
+    assert!(Cell::new(config(folder.path(), &longest)).is_ok());
+}
+
+#[test]
+fn a_snapshot_of_a_robot_with_another_tool_or_pad_is_refused() {
+    let (mut bench, _folder) = gantry();
+    let commands = bench.event(Event::Save);
+    let [Command::Saved { snapshot }] = &commands[..] else { panic!("{commands:?}") };
+    let check = |description: &str| {
+        let folder = tempfile::tempdir().unwrap();
+        let cell = Cell::new(config(folder.path(), description)).unwrap();
+        snapshot.check_robot(cell.robot()).map_err(|error| error.to_string())
+    };
+    assert_eq!(check(&description()), Ok(()));
+    for (from, to) in [
+        ("tool = \"right_tool\"", "tool = \"right_hand\""),
+        ("name = \"right\"", "name = \"other\""),
+        ("finger = \"right_finger_a\"", "finger = \"right_finger_b\""),
+        ("finger = \"left_finger_a\"", "finger = \"left_finger_b\""),
+    ] {
+        let refused = check(&description().replace(from, to));
+        assert!(refused.as_ref().is_err_and(|reason| reason.contains("`gantry` (digest ")), "{to}: {refused:?}");
+    }
+}
+
+#[test]
+fn fingers_do_not_close_where_another_arm_holds_something_askew() {
+    let folder = tempfile::tempdir().unwrap();
+    let robot = duo::write(folder.path()).display().to_string();
+    let mut bench = Bench::of(CellConfig { robot, boxes: 1, seed: 2, ..CellConfig::default() });
+    let commands = bench.event(Event::Save);
+    let [Command::Saved { snapshot }] = &commands[..] else { panic!("{commands:?}") };
+    let mut state: serde_json::Value = serde_json::from_str(&snapshot.to_json()).unwrap();
+    let tool = |arm: usize| bench.cell.robot_of(arm).tool_pose(&bench.cell.measured_of(arm));
+    let askew = tool(LEFT).compose(&Pose::from_rpy([0.0; 3], 0.0, 0.0, 20_f64.to_radians()));
+    let in_tool = tool(RIGHT).inverse().compose(&askew);
+    state["posture"]["other_arms"][0]["held"] = serde_json::json!({ "object": 0, "in_tool": in_tool, "friction": 0.6 });
+    let held = Snapshot::from_json(&state.to_string()).unwrap();
+    bench.event(Event::PutBack { snapshot: Box::new(held) });
+    let reason = refused(&mut bench, LEFT, close());
+    assert!(reason.contains("slc_1 is between the fingers, and the arm `right` holds it"), "{reason}");
+}
+
+#[test]
+#[ignore = "it measures, and says so with --nocapture"]
+fn how_long_it_takes_to_compare_two_motions_of_ten_seconds() {
+    let folder = tempfile::tempdir().unwrap();
+    let robot = duo::write(folder.path()).display().to_string();
+    for left_moves in [false, true] {
+        let mut bench = Bench::of(CellConfig { robot: robot.clone(), boxes: 1, seed: 2, ..CellConfig::default() });
+        let turned = |bench: &Bench, arm: usize, sign: f64| {
+            let by = [1.5, 0.3, 0.4, 0.3, -0.4, 0.5, 0.8];
+            let home = bench.cell.measured_of(arm).arm;
+            Request::MoveTo { joints: JointVector::from_fn(7, |j| home[j] + sign * by[j]), speed: 0.07 }
+        };
+        let (left, right) = (turned(&bench, LEFT, 1.0), turned(&bench, RIGHT, -1.0));
+        if left_moves {
+            assert_eq!(bench.start_with(LEFT, left).1, []);
+        }
+        let began = std::time::Instant::now();
+        assert_eq!(bench.start_with(RIGHT, right).1, []);
+        let lasts_s = bench.cell.next_wake().unwrap().since(bench.now).as_secs_f64();
+        println!("started in {:?}, beside an arm on its way: {left_moves}, lasts {lasts_s:.1} s", began.elapsed());
+    }
+}
