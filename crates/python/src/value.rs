@@ -283,7 +283,7 @@ pub(crate) fn to_python<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'
         Value::Int(number) => number.into_pyobject(py)?.into_any(),
         Value::Float(number) => PyFloat::new(py, *number).into_any(),
         Value::String(text) => PyString::new(py, text).into_any(),
-        Value::Pose(pose) => Bound::new(py, Pose(pose.clone()))?.into_any(),
+        Value::Pose(pose) => Bound::new(py, Pose(*pose))?.into_any(),
         Value::Joints(positions) => Bound::new(py, Joints(positions.clone()))?.into_any(),
         Value::Trajectory(trajectory) => Bound::new(py, Trajectory(trajectory.clone()))?.into_any(),
         Value::List(items) => {
@@ -356,7 +356,7 @@ fn taken(object: &Bound<'_, PyAny>, depth: usize) -> PyResult<Value> {
         return Ok(Value::Bytes(bytes.to_vec()));
     }
     if let Ok(pose) = object.cast::<Pose>() {
-        return Ok(Value::Pose(pose.get().0.clone()));
+        return Ok(Value::Pose(pose.get().0));
     }
     if let Ok(joints) = object.cast::<Joints>() {
         return Ok(Value::Joints(joints.get().0.clone()));
