@@ -15,8 +15,10 @@ use std::io::{Error, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::net::unix::ReadHalf;
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinSet;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 /// In a system's runtime directory: where its run listens.
@@ -29,6 +31,12 @@ const MAX_LINE_BYTES: u64 = 64;
 const MAX_MESSAGE_BYTES: u64 = 64 << 10;
 /// A run that does not answer for so long does not listen.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(5);
+/// Who asks waits longer than the run has time to answer: then what was not answered is not taken later either.
+const PATIENCE: Duration = Duration::from_secs(6);
+/// Whoever has connected says its line at once.
+const LINE_DEADLINE: Duration = Duration::from_secs(1);
+/// So many connections are served beside each other; the next one waits until the line of one of them is late.
+const MAX_CONNECTIONS: usize = 32;
 const DONE: &str = "ok";
 /// The word that asks what the run is doing.
 const STATUS: &str = "status";
@@ -167,6 +175,11 @@ impl Control {
     /// # Errors
     /// Where the socket cannot be made, for example because its path is too long for one.
     pub(crate) fn listen(directory: &Path) -> std::io::Result<Control> {
+        Control::listen_with(directory, ANSWER_DEADLINE)
+    }
+
+    /// Who is not answered until the deadline is given up.
+    fn listen_with(directory: &Path, deadline: Duration) -> std::io::Result<Control> {
         let path = directory.join(SOCKET);
         match std::fs::remove_file(&path) {
             Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
@@ -181,7 +194,7 @@ impl Control {
                 tracing::warn!(%error, "clients cannot reach this run over gRPC");
             }
         });
-        tokio::spawn(end.clone().run_until_cancelled_owned(accept(listener, tell)));
+        tokio::spawn(end.clone().run_until_cancelled_owned(accept(listener, tell, deadline)));
         Ok(Control { words, path, _end: end.drop_guard() })
     }
 
@@ -210,24 +223,41 @@ impl Drop for Control {
     }
 }
 
-async fn accept(listener: UnixListener, tell: mpsc::Sender<Asked>) {
+async fn accept(listener: UnixListener, tell: mpsc::Sender<Asked>, deadline: Duration) {
+    // Whoever is slow keeps nobody else waiting, and is given up after a while. What it sent is not taken then.
+    let mut connections = JoinSet::new();
     loop {
-        // One after the other: whoever is slow is given up after a while.
-        if let Ok((stream, _)) = listener.accept().await {
-            let _ = tokio::time::timeout(ANSWER_DEADLINE, hear(stream, &tell)).await;
+        tokio::select! {
+            accepted = listener.accept(), if connections.len() < MAX_CONNECTIONS => {
+                if let Ok((stream, _)) = accepted {
+                    let tell = tell.clone();
+                    connections.spawn(async move {
+                        let _ = tokio::time::timeout(deadline, hear(stream, &tell)).await;
+                    });
+                }
+            }
+            Some(_) = connections.join_next() => {}
         }
     }
 }
 
+/// The line that somebody says, as bytes: a limit may lie within a character.
+async fn line_of(reader: ReadHalf<'_>) -> std::io::Result<Vec<u8>> {
+    let mut line = Vec::new();
+    let mut lines = BufReader::new(reader.take(MAX_LINE_BYTES));
+    lines.read_until(b'\n', &mut line).await?;
+    if line.starts_with(b"{") && !line.ends_with(b"\n") {
+        lines.get_mut().set_limit(MAX_MESSAGE_BYTES - MAX_LINE_BYTES);
+        lines.read_until(b'\n', &mut line).await?;
+    }
+    Ok(line)
+}
+
 async fn hear(mut stream: UnixStream, tell: &mpsc::Sender<Asked>) -> std::io::Result<()> {
     let (reader, mut writer) = stream.split();
-    let mut line = String::new();
-    let mut lines = BufReader::new(reader.take(MAX_LINE_BYTES));
-    lines.read_line(&mut line).await?;
-    if line.starts_with('{') && !line.ends_with('\n') {
-        lines.get_mut().set_limit(MAX_MESSAGE_BYTES - MAX_LINE_BYTES);
-        lines.read_line(&mut line).await?;
-    }
+    let line = tokio::time::timeout(LINE_DEADLINE, line_of(reader)).await.map_err(Error::other)??;
+    // What is no text in UTF-8 is no word of control.
+    let line = std::str::from_utf8(&line).unwrap_or_default();
     const BEHIND: &str = "the run is too far behind";
     let word = Word::ALL.into_iter().find(|word| word.text() == line.trim());
     let answer = match word {
@@ -240,7 +270,7 @@ async fn hear(mut stream: UnixStream, tell: &mpsc::Sender<Asked>) -> std::io::Re
                 Err(_) => BEHIND.to_owned(),
             }
         }
-        None if line.starts_with('{') => match serde_json::from_str(&line) {
+        None if line.starts_with('{') => match serde_json::from_str(line) {
             Ok(message) => {
                 let (say, said) = oneshot::channel();
                 match tell.try_send(Asked::Message(message, say)) {
@@ -274,7 +304,7 @@ fn one_line(text: &str) -> String {
 }
 
 /// Sends the run of the system in `directory` something that its states wait for, or may; what becomes of it. It is in the run's log,
-/// on the disk, when this returns. Where it fails on the way, the run may have got it all the same.
+/// on the disk, when this returns. Where it fails on the way, the run may have got it all the same, and the error says so.
 ///
 /// # Errors
 /// Where no run listens, or it does not take that.
@@ -283,7 +313,13 @@ pub async fn send(directory: &Path, message: &Message) -> std::io::Result<String
     if line.len() as u64 >= MAX_MESSAGE_BYTES {
         return Err(Error::new(ErrorKind::InvalidInput, format!("it has more than {MAX_MESSAGE_BYTES} bytes")));
     }
-    let answer = ask(directory, &line, MAX_MESSAGE_BYTES).await?;
+    let answer = ask(directory, &line, MAX_MESSAGE_BYTES).await.map_err(|error| {
+        if is_uncertain(&error) {
+            let why = "the run did not answer, and it is not known whether it got that: `ratn status` and its log tell";
+            return Error::new(error.kind(), why);
+        }
+        error
+    })?;
     match answer.strip_prefix(DONE) {
         Some(said) => Ok(said.trim().to_owned()),
         None => Err(Error::other(answer)),
@@ -307,6 +343,12 @@ pub fn is_nobody(error: &Error) -> bool {
     matches!(error.kind(), ErrorKind::NotFound | ErrorKind::ConnectionRefused)
 }
 
+/// Whether an error says that a run was reached and did not answer: it may have got what was sent.
+pub fn is_uncertain(error: &Error) -> bool {
+    use ErrorKind::{BrokenPipe, ConnectionReset, TimedOut, UnexpectedEof};
+    matches!(error.kind(), TimedOut | UnexpectedEof | ConnectionReset | BrokenPipe)
+}
+
 /// Says a word and hears the line that answers it.
 async fn ask(directory: &Path, word: &str, most: u64) -> std::io::Result<String> {
     let asking = async {
@@ -319,7 +361,7 @@ async fn ask(directory: &Path, word: &str, most: u64) -> std::io::Result<String>
             answer => Ok(answer.to_owned()),
         }
     };
-    tokio::time::timeout(ANSWER_DEADLINE, asking).await.unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()))
+    tokio::time::timeout(PATIENCE, asking).await.unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()))
 }
 
 #[cfg(test)]
@@ -391,8 +433,7 @@ mod tests {
         let long = signal("go", Value::String("x".repeat(10_000)));
         let expected = long.clone();
         let answering = tokio::spawn(async move {
-            let mut said = vec![Ok("it goes\non".to_owned()), Err("no state waits for that".to_owned())].into_iter();
-            while let Some(said) = said.next() {
+            for said in [Ok("it goes\non".to_owned()), Err("no state waits for that".to_owned())] {
                 let Asked::Message(message, say) = control.asked().await else { break };
                 assert!(said.is_err() || message == expected);
                 let _ = say.send(said);
@@ -405,6 +446,53 @@ mod tests {
         let huge = send(place.path(), &signal("go", Value::String("x".repeat(70_000)))).await;
         assert!(huge.is_err_and(|error| error.kind() == ErrorKind::InvalidInput));
         drop(answering.await?);
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn a_message_arrives_whatever_characters_it_has() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        let mut control = Control::listen(place.path())?;
+        // Whichever byte the first limit falls on.
+        for before in 0..8 {
+            let value = Value::String("x".repeat(before) + &"\u{1f916}\u{fc}".repeat(30));
+            let message = Message::Signal { run: ANY_RUN.to_owned(), signal: "go".to_owned(), value };
+            let sending = send(place.path(), &message);
+            let answering = async {
+                if let Asked::Message(heard, say) = control.asked().await {
+                    assert_eq!(heard, message);
+                    let _ = say.send(Ok(String::new()));
+                }
+            };
+            let (sent, ()) = tokio::join!(sending, answering);
+            sent?;
+        }
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn a_silent_connection_and_one_that_is_not_answered_keep_nobody_waiting() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        let mut control = Control::listen(place.path())?;
+        let _silent = UnixStream::connect(place.path().join(SOCKET)).await?;
+        let message = Message::Signal { run: ANY_RUN.to_owned(), signal: "go".to_owned(), value: Value::Null };
+        let mut unanswered = UnixStream::connect(place.path().join(SOCKET)).await?;
+        unanswered.write_all(format!("{}\n", serde_json::to_string(&message)?).as_bytes()).await?;
+        let Asked::Message(_, _unsaid) = control.asked().await else { anyhow::bail!("no message") };
+        tokio::time::timeout(Duration::from_millis(500), tell(place.path(), Word::Abort)).await??;
+        assert!(matches!(control.asked().await, Asked::Told(event) if matches!(*event, Event::AbortRequested { .. })));
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn who_got_no_answer_is_told_that_it_is_not_known_whether_the_message_came() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        let mut control = Control::listen_with(place.path(), Duration::from_millis(200))?;
+        let message = Message::Signal { run: ANY_RUN.to_owned(), signal: "go".to_owned(), value: Value::Null };
+        let Err(error) = send(place.path(), &message).await else { anyhow::bail!("nobody answered") };
+        assert!(error.to_string().contains("not known whether"), "{error}");
+        // It is still there to be taken; the run sees that nobody waits for it any more.
+        assert!(matches!(control.asked().await, Asked::Message(_, say) if say.is_closed()));
         Ok(())
     }
 

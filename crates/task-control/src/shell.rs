@@ -340,7 +340,7 @@ impl Shell {
         }
         if self.executive.signals_kept(&signal) >= MOST_SIGNALS_KEPT {
             return Err(format!(
-                "{MOST_SIGNALS_KEPT} signals are kept already for states that have yet to wait for them"
+                "{MOST_SIGNALS_KEPT} signals `{signal}` are kept already for states that have yet to wait for them"
             ));
         }
         let is_it = |awaited: &Awaited| matches!(awaited, Awaited::Signal { signal: name } if *name == signal);
@@ -429,6 +429,8 @@ impl Shell {
                         let _ = say.send(self.status());
                         continue;
                     }
+                    // Who sent it was told that it is not known whether it came.
+                    Asked::Message(_, say) if say.is_closed() => continue,
                     Asked::Message(message, say) => match self.event_of(message) {
                         Ok((event, said)) => {
                             self.confirm.push((say, said));

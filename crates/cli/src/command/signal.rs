@@ -39,6 +39,7 @@ fn send(directory: Option<&Path>, message: &Message) -> Result<(), Failure> {
             Err(error) if control::is_nobody(&error) => {
                 Err(anyhow::anyhow!("no run is under way in {place}: say the `--runtime-dir` of its system").into())
             }
+            Err(error) if control::is_uncertain(&error) => Err(anyhow::anyhow!("{error} (system in {place})").into()),
             sent => {
                 let said = sent.with_context(|| format!("the run in {place} does not take that"))?;
                 Ok(output::result(said)?)

@@ -1,5 +1,6 @@
 //! States that wait. A condition is about facts that only its own region may write, so that what makes it hold comes at one place of
-//! the program; a signal has a name of its own for each state.
+//! the program; of regions that share what they write (only where the runs need not end alike) about those, too. A signal has a name of
+//! its own for each state.
 
 use super::*;
 use ratn_model::program::CLOCK;
