@@ -4,9 +4,10 @@
 //! the timing: every place of the one with every place of the other. Controllers know the robot's links, not what stands around them; so what
 //! the hands hold is not looked at here, the judge sees that (`contacts`).
 //!
-//! The comparison runs on the cell's only thread, where an emergency stop waits for its end. So its work is bounded: places that a way comes to
-//! again are kept once, the places of a body form a binary tree of which whole branches are ruled out by one distance, and a comparison that
-//! takes more than [`MAX_POSTURES`] or [`MAX_DISTANCES`] is given up ([`Crossing::TooLong`]).
+//! The comparison runs on the cell's only thread, where an emergency stop waits for its end. So its work is bounded. Of two ways, places that one
+//! comes to again are kept once, and the places of a body form a binary tree of which whole branches are ruled out by one distance. Beside an
+//! arm that stands, postures are passed over as long as no joint has moved anything by as much as there was room (conservative advancement,
+//! Mirtich 1996). A comparison that takes more than [`MAX_POSTURES`] or [`MAX_DISTANCES`] is given up ([`Crossing::TooLong`]).
 
 use rapier3d::math::Pose as Pose32;
 use rapier3d::parry::query;
@@ -24,7 +25,11 @@ const ROUNDED_M: f32 = 3e-4;
 /// The most postures of two arms on their ways that are compared. A motion of 10 s has 2500, twice as many where fingers count as open too.
 pub(super) const MAX_POSTURES: usize = 40_000;
 /// The most distances of two bodies that are computed for one comparison.
-const MAX_DISTANCES: u32 = 50_000;
+const MAX_DISTANCES: u32 = 200_000;
+/// Of places on two ways that are nearer to each other than that one is kept, in metres: it is added to the distance on either side.
+const RESOLUTION_M: f32 = 0.008;
+/// The same of an arm that stands, whose fingers alone may move.
+const FINE_M: f32 = 1e-4;
 
 /// What an arm, or its fingers alone, will do.
 #[derive(Debug, Clone)]
@@ -85,6 +90,14 @@ struct Branch {
     halves: Option<[usize; 2]>,
 }
 
+/// How far the bodies of an arm move at the most where its joints do: by length of all links between, so in every posture.
+struct Levers {
+    /// In metres per radian, or per metre of a joint that slides.
+    joints: Vec<f64>,
+    /// In metres per metre of the fingers.
+    finger: f64,
+}
+
 /// Which places of a body are kept.
 struct Kept {
     /// By their rounded coordinates.
@@ -103,14 +116,6 @@ impl Other {
             Other::Stands => BESIDE_M,
         }
     }
-
-    /// Of places that are nearer to each other than that one is kept, in metres: what is added to the distance on either side.
-    fn resolution(self) -> f32 {
-        match self {
-            Other::Moves => 0.008,
-            Other::Stands => 2e-4,
-        }
-    }
 }
 
 /// Whether what moves stays away from another arm, of a robot that is elsewhere as in `here`.
@@ -124,26 +129,71 @@ pub(super) fn keep_apart(
     theirs: &Ahead,
     other: Other,
 ) -> Result<(), Crossing> {
-    if other == Other::Moves && ours.postures() + theirs.postures() > MAX_POSTURES {
+    match other {
+        Other::Moves => ways_apart(robot, here, ours, theirs),
+        Other::Stands => stays_beside(robot, here, ours, theirs),
+    }
+}
+
+/// Whether two ways keep [`APART_M`] from each other.
+fn ways_apart(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahead) -> Result<(), Crossing> {
+    if ours.postures() + theirs.postures() > MAX_POSTURES {
         return Err(Crossing::TooLong);
     }
-    let resolution = other.resolution();
-    let (ours, theirs) = (swept(robot, here, ours, resolution), swept(robot, here, theirs, resolution));
+    let (ours, theirs) = (swept(robot, here, ours, RESOLUTION_M), swept(robot, here, theirs, RESOLUTION_M));
     let mut distances = MAX_DISTANCES;
     for a in &ours {
         for b in theirs.iter().filter(|b| !robot.model.is_excepted(a.link, b.link)) {
-            let sure = other.apart_m() as f32 + a.missed() + b.missed();
-            let margin = match other {
-                Other::Moves => sure,
-                Other::Stands => match a.starts_at(b) {
-                    near if near < sure => near.min(other.apart_m() as f32) - ROUNDED_M,
-                    _ => sure,
-                },
-            };
+            let margin = APART_M as f32 + a.missed() + b.missed();
             if a.comes_to(b, margin, &mut distances)? {
-                let name = |link: usize| robot.model.links[link].name.clone();
-                return Err(Crossing::TooClose { link: name(a.link), other: name(b.link) });
+                return Err(Crossing::of(robot, a, b));
             }
+        }
+    }
+    Ok(())
+}
+
+/// Whether a way keeps [`BESIDE_M`] from an arm that stands. A body that is nearer as it sets out may come no nearer.
+fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahead) -> Result<(), Crossing> {
+    let (bodies, others) = (Swept::all(robot, ours), swept(robot, here, theirs, FINE_M));
+    let levers = Levers::of(robot, ours, &bodies);
+    let (mut distances, mut configuration) = (MAX_DISTANCES, *here);
+    // How near each pair may come, once it is known how near it is at the start; and whether that is nearer than it should be.
+    let mut allowed: Vec<Option<(f32, bool)>> = vec![None; bodies.len() * others.len()];
+    for course in &ours.courses {
+        let mut looked_at: Option<(&ArmPosition, f32)> = None;
+        for (i, at) in course.iter().enumerate() {
+            let beside = [i.checked_sub(1), Some(i + 1)].map(|next| next.and_then(|next| course.get(next)));
+            let leg = beside.into_iter().flatten().map(|next| levers.moved(at, next)).fold(0.0, f32::max) / 2.0;
+            if looked_at.is_some_and(|(before, room)| levers.moved(before, at) + leg <= room) {
+                continue;
+            }
+            configuration.set_joints(ours.arm, at.joints);
+            configuration.set_finger(ours.arm, at.finger);
+            let poses = robot.poses(&configuration);
+            let mut room = f32::INFINITY;
+            for (body, a) in bodies.iter().enumerate() {
+                let place = to_f32(&poses[a.link].compose(&a.in_link));
+                for (other, b) in others.iter().enumerate() {
+                    if robot.model.is_excepted(a.link, b.link) {
+                        continue;
+                    }
+                    let known = &mut allowed[body * others.len() + other];
+                    let up_to = known.map_or(f32::INFINITY, |(least, _)| room.max(leg) + least);
+                    let distance = a.nearest(&place, b, up_to, &mut distances)?;
+                    let sure = BESIDE_M as f32 + b.missed();
+                    let (least, is_near) = *known.get_or_insert(if distance < sure + leg {
+                        (distance.min(BESIDE_M as f32) - ROUNDED_M, true)
+                    } else {
+                        (sure, false)
+                    });
+                    if distance < if is_near { least } else { least + leg } {
+                        return Err(Crossing::of(robot, a, b));
+                    }
+                    room = room.min(distance - least);
+                }
+            }
+            looked_at = Some((at, room));
         }
     }
     Ok(())
@@ -151,9 +201,8 @@ pub(super) fn keep_apart(
 
 /// The bodies of an arm's links wherever they come to.
 fn swept(robot: &Robot, here: &Configuration, ahead: &Ahead, resolution: f32) -> Vec<Swept> {
-    let of_links = ahead.links.iter().flat_map(|link| robot.model.links[*link].bodies.iter().map(move |b| (*link, b)));
     let mut swept: Vec<(Swept, Kept)> =
-        of_links.map(|(link, body)| (Swept::new(link, body.pose, body.geometry.shape(0.0)), Kept::nothing())).collect();
+        Swept::all(robot, ahead).into_iter().map(|body| (body, Kept::nothing())).collect();
     let mut configuration = *here;
     for course in &ahead.courses {
         swept.iter_mut().for_each(|(_, kept)| (kept.last, kept.before) = (None, None));
@@ -188,7 +237,64 @@ impl Kept {
     }
 }
 
+impl Crossing {
+    fn of(robot: &Robot, a: &Swept, b: &Swept) -> Crossing {
+        let name = |body: &Swept| robot.model.links[body.link].name.clone();
+        Crossing::TooClose { link: name(a), other: name(b) }
+    }
+}
+
+impl Levers {
+    /// Of the bodies of an arm.
+    fn of(robot: &Robot, ahead: &Ahead, bodies: &[Swept]) -> Levers {
+        let links = &robot.model.links;
+        let joints: Vec<Option<usize>> =
+            robot.joints_of(ahead.arm).iter().map(|joint| robot.model.joint(&joint.name)).collect();
+        let fingers: Vec<usize> =
+            robot.finger_links_of(ahead.arm).iter().filter_map(|link| Some(links[*link].drive?.joint)).collect();
+        let mut levers = Levers { joints: vec![0.0; joints.len()], finger: 0.0 };
+        for body in bodies {
+            let (mut of_joints, mut of_finger) = (vec![0.0; joints.len()], 0.0);
+            let mut length = body.in_link.distance(&Pose::IDENTITY) + f64::from(body.radius);
+            for index in std::iter::successors(Some(body.link), |index| links[*index].parent) {
+                let link = &links[index];
+                if let Some(drive) = link.drive {
+                    let by = drive.factor.abs() * if drive.slides { 1.0 } else { length };
+                    let joint = &robot.model.joints[drive.joint];
+                    if let Some(j) = joints.iter().position(|joint| *joint == Some(drive.joint)) {
+                        of_joints[j] += by;
+                    } else if fingers.contains(&drive.joint) {
+                        of_finger += by;
+                    }
+                    if drive.slides {
+                        length += drive.factor.abs() * joint.lower.abs().max(joint.upper.abs());
+                    }
+                }
+                length += link.origin.distance(&Pose::IDENTITY);
+            }
+            for (most, by) in levers.joints.iter_mut().zip(of_joints) {
+                *most = most.max(by);
+            }
+            levers.finger = levers.finger.max(of_finger);
+        }
+        levers
+    }
+
+    /// No point of any body is farther from where it is at another position than that, in metres.
+    fn moved(&self, from: &ArmPosition, to: &ArmPosition) -> f32 {
+        let joints = self.joints.iter().enumerate().map(|(j, by)| by * (to.joints[j] - from.joints[j]).abs());
+        (joints.sum::<f64>() + self.finger * (to.finger - from.finger).abs()) as f32
+    }
+}
+
 impl Swept {
+    /// The bodies of the links that are compared, nowhere yet.
+    fn all(robot: &Robot, ahead: &Ahead) -> Vec<Swept> {
+        let of_links =
+            ahead.links.iter().flat_map(|link| robot.model.links[*link].bodies.iter().map(move |b| (*link, b)));
+        of_links.map(|(link, body)| Swept::new(link, body.pose, body.geometry.shape(0.0))).collect()
+    }
+
     fn new(link: usize, in_link: Pose, shape: SharedShape) -> Swept {
         let around = shape.compute_local_bounding_sphere();
         let radius = around.center.length() + around.radius;
@@ -251,10 +357,16 @@ impl Swept {
         query::distance(at, &*self.shape, of, &*other.shape).map_or(0.0, |apart| apart.distance)
     }
 
-    /// How far from another body this one is as it sets out; the other one stands.
-    fn starts_at(&self, other: &Swept) -> f32 {
-        let Some(start) = self.places.first() else { return f32::INFINITY };
-        other.places.iter().map(|place| self.distance(start, other, place)).fold(f32::INFINITY, f32::min)
+    /// How far it is from another body at the places of that one, or `up_to` where that is less.
+    fn nearest(&self, at: &Pose32, other: &Swept, up_to: f32, distances: &mut u32) -> Result<f32, Crossing> {
+        let mut nearest = up_to;
+        for of in &other.places {
+            if (at.translation - of.translation).length() - self.radius - other.radius < nearest {
+                *distances = distances.checked_sub(1).ok_or(Crossing::TooLong)?;
+                nearest = nearest.min(self.distance(at, other, of));
+            }
+        }
+        Ok(nearest)
     }
 
     /// Whether any of its places is nearer than `margin` to any place of another body.
@@ -355,6 +467,32 @@ mod tests {
             }
         }
         assert!(found.iter().all(|count| *count > 10), "{found:?}");
+    }
+
+    #[test]
+    fn nothing_moves_farther_than_the_levers_say() {
+        let robot = Robot::aimm();
+        let ahead = swings(&robot, 0.4, 2, 1);
+        let bodies = Swept::all(&robot, &ahead);
+        let levers = Levers::of(&robot, &ahead, &bodies);
+        assert!(levers.joints.iter().all(|by| (0.05..2.5).contains(by)) && levers.finger == 1.0, "{:?}", levers.joints);
+        let places = |at: &ArmPosition| -> Vec<Pose32> {
+            let poses = robot.poses(&Configuration { arm: at.joints, finger: at.finger, ..here(&robot) });
+            bodies.iter().map(|body| to_f32(&poses[body.link].compose(&body.in_link))).collect()
+        };
+        let from = ahead.courses[0][0];
+        for j in 0..=from.joints.len() {
+            let mut to = from;
+            if j < from.joints.len() {
+                to.joints[j] += 0.01;
+            } else {
+                to.finger += 0.01;
+            }
+            let (before, after) = (places(&from), places(&to));
+            let moved = bodies.iter().zip(before.iter().zip(&after)).map(|(body, (a, b))| body.moved(a, b));
+            let (most, bound) = (moved.fold(0.0, f32::max), levers.moved(&from, &to));
+            assert!(most > 0.0 && most <= bound + 1e-6, "{j}: {most} {bound}");
+        }
     }
 
     #[test]
