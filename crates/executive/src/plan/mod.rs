@@ -104,7 +104,7 @@ pub(crate) struct StatePlan {
     /// it may write every fact.
     pub(crate) may_write: Option<Vec<EffectExpr>>,
     /// Of a node that waits: what may be otherwise when it has waited, by the doing of regions beside it.
-    pub(crate) awaited: Vec<EffectExpr>,
+    pub(crate) awaited: Effects,
     /// The predicates and kinds that it writes with an outcome that is computed ahead, and [`WAITS`]. If it may write every fact: [`EVERYTHING`]
     /// and the kinds.
     pub(crate) writes: Vec<Predicate>,
@@ -179,7 +179,10 @@ impl StatePlan {
         let awaited = waits::awaited(subject);
         let ends = outcomes::of(subject, transitions, nature, &awaited, names);
         let waits = subject.is_node && subject.contained.iter().any(|state| state.is_pause());
-        let may_differ = may_write.as_deref().map(|effects| [effects, awaited.as_slice()].concat());
+        let may_differ = match (&may_write, &awaited) {
+            (Some(own), Effects::Declared(others)) => Some([own.as_slice(), others].concat()),
+            (None, _) | (_, Effects::Unknown) => None,
+        };
         let mut writes = footprint::writes(subject, &ends, may_differ.as_deref(), names);
         let (written, effects_written) = footprint::written(subject, &ends, may_differ.as_deref(), names);
         let resources = resources::of(subject, operated, names);

@@ -106,7 +106,7 @@ pub(super) fn of(
     subject: &Subject<'_>,
     transitions: &Transitions,
     nature: NodeNature,
-    awaited: &[EffectExpr],
+    awaited: &Effects,
     names: &mut Names,
 ) -> Ends {
     let state = subject.state;
@@ -124,7 +124,7 @@ pub(super) fn of(
 
 /// What an outcome changes. A routine has changed what the nodes inside of it have changed; when a wait is over, what others have done
 /// meanwhile is otherwise, too.
-fn changes(subject: &Subject<'_>, nature: NodeNature, awaited: &[EffectExpr], outcome: &str) -> Effects {
+fn changes(subject: &Subject<'_>, nature: NodeNature, awaited: &Effects, outcome: &str) -> Effects {
     let state = subject.state;
     let declared = if subject.is_routine() {
         None
@@ -133,6 +133,7 @@ fn changes(subject: &Subject<'_>, nature: NodeNature, awaited: &[EffectExpr], ou
     } else {
         Some(state.annotations.effects.get(outcome).map_or(&[][..], Vec::as_slice))
     };
+    let Effects::Declared(awaited) = awaited else { return Effects::Unknown };
     let foretold = |effect: &&EffectExpr| {
         let fact = effect.written();
         declared.into_iter().flatten().any(|known| known.written() == fact)

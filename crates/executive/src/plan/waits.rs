@@ -1,7 +1,7 @@
 //! What a wait may find otherwise when it is over. It changes nothing itself; but it lets time pass, in which the regions beside it go on:
 //! what they write of the facts that are `shared` is not what it was before, and nobody computes on what that was.
 
-use super::{Predicate, Subject};
+use super::{Effects, Predicate, Subject, footprint};
 use ratn_model::expression::scope::NothingKnown;
 use ratn_model::expression::{EffectExpr, Expr, FactExpr};
 use ratn_model::fact::{FactPattern, Footprint, Term};
@@ -11,10 +11,11 @@ use ratn_model::value::Value;
 /// States that wait, and routines that contain some, stand under this number: who senses looks when they have waited.
 pub(crate) const WAITS: Predicate = 1;
 
-/// The shared facts that regions beside a state that waits may write, with values that are not known before it has waited.
-pub(super) fn awaited(subject: &Subject<'_>) -> Vec<EffectExpr> {
+/// The shared facts that regions beside a state that waits may write, with values that are not known before it has waited; any fact where
+/// such a region may write any.
+pub(super) fn awaited(subject: &Subject<'_>) -> Effects {
     if !subject.is_node || !subject.contained.iter().any(|state| state.is_pause()) {
-        return Vec::new();
+        return Effects::Declared(Vec::new());
     }
     let program = subject.program;
     let mut facts: Vec<FactPattern> = Vec::new();
@@ -23,6 +24,9 @@ pub(super) fn awaited(subject: &Subject<'_>) -> Vec<EffectExpr> {
         if let StateKind::Concurrency { regions, .. } = &around.kind {
             let own = within(program, inner);
             for beside in regions.iter().filter(|id| **id != inner.id) {
+                if footprint::may_write(&Subject::of(program, program.state(*beside))).is_none() {
+                    return Effects::Unknown;
+                }
                 let beside = within(program, program.state(*beside));
                 let annotated = own.iter().chain(&beside).flat_map(|state| &state.annotations.shared);
                 let shared = FactExpr::footprint(&annotated.cloned().collect::<Vec<_>>(), &NothingKnown);
@@ -37,7 +41,7 @@ pub(super) fn awaited(subject: &Subject<'_>) -> Vec<EffectExpr> {
     }
     facts.sort();
     facts.dedup();
-    facts.into_iter().map(unknown).collect()
+    Effects::Declared(facts.into_iter().map(unknown).collect())
 }
 
 /// A state and all that it contains.

@@ -414,12 +414,12 @@ impl<'a> Sight<'a> {
 
     /// The facts that may be otherwise behind a writer: what it may write, and what others may have written while it waited.
     pub(crate) fn may_differ_along(self, view: &View<'a>, link: Link) -> Footprint {
-        let awaited = &self.plan.state(view.instance.state).awaited;
         let own = self.may_write_along(view, link);
-        if awaited.is_empty() || view.instance.node().is_none() {
-            return own;
+        match &self.plan.state(view.instance.state).awaited {
+            _ if view.instance.node().is_none() => own,
+            Effects::Unknown => Footprint::Everything,
+            Effects::Declared(awaited) => own.union(EffectExpr::footprint(awaited, view)),
         }
-        own.union(EffectExpr::footprint(awaited, view))
     }
 
     /// The facts that a writer may write along a link, as far as a view knows.
