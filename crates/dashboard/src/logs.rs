@@ -108,6 +108,10 @@ impl Logs {
         let mut all = self.lock();
         all.logs.iter_mut().for_each(|one| one.heard = None);
         let path = std::fs::canonicalize(&status.log).unwrap_or_else(|_| status.log.clone());
+        // A pipe is no log: opening it would wait for whoever writes it.
+        if std::fs::metadata(&path).is_ok_and(|is| !is.is_file()) {
+            return;
+        }
         let known = all.logs.iter().position(|one| one.path == path);
         let index = known.unwrap_or_else(|| all.add(path, false));
         if let Some(one) = all.logs.get_mut(index) {

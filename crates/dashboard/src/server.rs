@@ -19,16 +19,19 @@ use ratn_proto::types::Scale;
 use ratn_task_control::control::{self, Message, Word};
 use ratn_worker::tls::ClientTls;
 use serde::Serialize;
+use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
+use tokio::task::AbortHandle;
 
-/// Connections at the same time; more are closed at once. A browser has six.
+/// Connections at the same time; a browser has six. For one more the oldest is closed that has not shown the token, else that one.
 const MAX_CONNECTIONS: usize = 96;
 /// The head of a request has at most this many bytes …
 const MAX_REQUEST_BYTES: usize = 16 * 1024;
@@ -201,6 +204,12 @@ impl Dashboard {
         let mut paths: Vec<PathBuf> = Vec::new();
         for path in &logs {
             let path = absolute(path).map_err(|source| DashboardError::NoLog { path: path.clone(), source })?;
+            let is = std::fs::metadata(&path).map_err(|source| DashboardError::NoLog { path: path.clone(), source })?;
+            // Opening a pipe would wait for whoever writes it.
+            if !is.is_file() {
+                let source = io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file");
+                return Err(DashboardError::NoLog { path, source });
+            }
             ratn_event_log::first(&path)?;
             if !paths.contains(&path) {
                 paths.push(path);
@@ -223,26 +232,44 @@ impl Dashboard {
 
     /// Answers for as long as this is waited for.
     pub async fn serve(self) {
-        let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+        let mut open: VecDeque<Open> = VecDeque::new();
         loop {
             let Ok((connection, _)) = self.listener.accept().await else {
                 tokio::time::sleep(ACCEPT_AGAIN).await;
                 continue;
             };
-            let Ok(place) = Arc::clone(&places).try_acquire_owned() else { continue };
+            open.retain(|one| !one.task.is_finished());
+            if open.len() >= MAX_CONNECTIONS {
+                let strange = open.iter().position(|one| !one.has_shown_token.load(Ordering::Relaxed));
+                let Some(oldest) = strange.and_then(|place| open.remove(place)) else { continue };
+                oldest.task.abort();
+            }
             let (shown, patience) = (self.shown.clone(), self.patience);
-            tokio::spawn(async move {
+            let has_shown_token = Arc::new(AtomicBool::new(false));
+            let mark = Arc::clone(&has_shown_token);
+            let task = tokio::spawn(async move {
                 // Who left, or was too slow, hears nothing.
-                let _ = answer(shown, connection, patience).await;
-                drop(place);
+                let _ = answer(shown, connection, patience, mark).await;
             });
+            open.push_back(Open { has_shown_token, task: task.abort_handle() });
         }
     }
 }
 
-async fn answer(shown: Arc<Shown>, connection: TcpStream, patience: Duration) -> hyper::Result<()> {
+/// A connection that is open.
+struct Open {
+    has_shown_token: Arc<AtomicBool>,
+    task: AbortHandle,
+}
+
+async fn answer(
+    shown: Arc<Shown>,
+    connection: TcpStream,
+    patience: Duration,
+    has_shown_token: Arc<AtomicBool>,
+) -> hyper::Result<()> {
     let page = service_fn(move |request: Request<Incoming>| {
-        let shown = shown.clone();
+        let (shown, has_shown_token) = (shown.clone(), has_shown_token.clone());
         async move {
             // Nothing stands in the body of any question.
             let head = Head {
@@ -251,6 +278,9 @@ async fn answer(shown: Arc<Shown>, connection: TcpStream, patience: Duration) ->
                 headers: request.headers().clone(),
             };
             drop(request);
+            if gate::may_look(&head.headers, &shown.token).is_ok() {
+                has_shown_token.store(true, Ordering::Relaxed);
+            }
             Ok::<_, Infallible>(shown.answer(&head).await)
         }
     });

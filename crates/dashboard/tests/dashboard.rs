@@ -358,6 +358,28 @@ async fn what_cannot_be_shown_is_said() {
 }
 
 #[tokio::test]
+async fn who_has_the_token_is_answered_beside_a_crowd_that_says_nothing() {
+    let file = log_of(&[started("crowded")]);
+    let served = serve(&[file.path()], false).await;
+    let mut crowd = Vec::new();
+    for _ in 0..150 {
+        crowd.push(TcpStream::connect(&served.address).await.unwrap());
+    }
+    assert_eq!(served.get("/api/about").await.status, 200);
+    drop(crowd);
+}
+
+#[tokio::test]
+async fn a_pipe_is_no_log_and_is_not_waited_for() {
+    let place = tempfile::tempdir().unwrap();
+    let pipe = place.path().join("pipe.jsonl");
+    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let refused = Dashboard::bind(options(&[&pipe], place.path())).await.unwrap_err();
+    let DashboardError::NoLog { source, .. } = refused else { panic!("{refused}") };
+    assert_eq!(source.to_string(), "it is no regular file");
+}
+
+#[tokio::test]
 async fn a_browser_that_reads_nothing_is_cut_off_and_others_go_on() {
     let lines: Vec<String> = [vec![started("wide")], (1..=3_000).flat_map(visit).collect()].concat();
     let file = log_of(&lines);

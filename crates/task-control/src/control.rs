@@ -188,7 +188,8 @@ impl Control {
         let listener = UnixListener::bind(&path)?;
         let (tell, words) = mpsc::channel(MAX_PENDING);
         let end = CancellationToken::new();
-        let (server, to, until) = (RunServer::of(tell.clone()), directory.to_owned(), end.clone());
+        // Clients in other folders read where it is.
+        let (server, to, until) = (RunServer::of(tell.clone()), std::path::absolute(directory)?, end.clone());
         tokio::spawn(async move {
             if let Err(error) = server.serve(&to, until).await {
                 tracing::warn!(%error, "clients cannot reach this run over gRPC");
