@@ -4,7 +4,10 @@
 //! cells of a grid, so that what is near a shape of the robot is found without looking at all of them.
 
 use crate::exact::Exact;
+use crate::inside::Inside;
 use crate::mechanism::Mechanism;
+use parry3d::math::{Pose as Pose32, Vector};
+use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
 use std::collections::BTreeSet;
 
@@ -168,12 +171,7 @@ impl Cloud {
     }
 
     /// Shows the numbers and places of the points in a box, until it hears that no more are wanted.
-    pub(crate) fn visit(
-        &self,
-        least: [f32; 3],
-        greatest: [f32; 3],
-        wants_more: &mut dyn FnMut(usize, [f32; 3]) -> bool,
-    ) {
+    fn visit(&self, least: [f32; 3], greatest: [f32; 3], wants_more: &mut dyn FnMut(usize, [f32; 3]) -> bool) {
         let beyond = |i: usize| {
             let end = self.least[i] + self.counts[i] as f32 * self.cell;
             greatest[i] < self.least[i] || least[i] > end
@@ -194,6 +192,30 @@ impl Cloud {
                 }
             }
         }
+    }
+
+    /// Shows the points nearer than `within` metres to a shape in its pose, by number, and how far each is from its surface, negative inside,
+    /// until it hears that no more are wanted. What is inside a mesh says `inside`; other shapes know it by themselves.
+    pub(crate) fn visit_near(
+        &self,
+        pose: &Pose32,
+        shape: &SharedShape,
+        inside: Option<&Inside>,
+        within: f32,
+        wants_more: &mut dyn FnMut(usize, f32) -> bool,
+    ) {
+        let around = shape.compute_aabb(pose);
+        let reach = Vector::splat(within.max(0.0));
+        self.visit((around.mins - reach).into(), (around.maxs + reach).into(), &mut |point, [x, y, z]| {
+            let at = pose.inverse_transform_point(Vector::new(x, y, z));
+            let projection = shape.project_local_point(at, false);
+            let is_inside = match inside {
+                Some(inside) => inside.contains([at.x, at.y, at.z].map(f64::from)),
+                None => projection.is_inside,
+            };
+            let gap = (projection.point - at).length() * if is_inside { -1.0 } else { 1.0 };
+            gap >= within || wants_more(point, gap)
+        });
     }
 
     fn slots(&self, point: &[f32; 3]) -> [usize; 3] {

@@ -431,15 +431,8 @@ impl<'a> Checker<'a> {
         let Some(cloud) = &self.cloud else { return up_to };
         let (pose, shape) = (&self.placed[i], &self.moving[i].shape);
         let radius = cloud.radius_m() as f32;
-        // A ball that is wholly inside reaches no further out than its centre.
-        let reach = (radius + up_to as f32).max(0.0);
-        let around = shape.compute_aabb(pose);
-        let (least, greatest) = (around.mins - Vector::splat(reach), around.maxs + Vector::splat(reach));
         let mut gap = up_to;
-        cloud.visit(least.into(), greatest.into(), &mut |_, [x, y, z]| {
-            let at = pose.inverse_transform_point(Vector::new(x, y, z));
-            let projection = shape.project_local_point(at, false);
-            let distance = (projection.point - at).length() * if projection.is_inside { -1.0 } else { 1.0 };
+        cloud.visit_near(pose, shape, None, radius + up_to as f32, &mut |_, distance| {
             gap = gap.min(f64::from(distance - radius));
             true
         });

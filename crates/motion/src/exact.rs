@@ -115,19 +115,9 @@ impl Placed<'_> {
     /// Shows the balls of a cloud that come within a margin, by number, and how deep they are in that.
     fn meet(&self, cloud: &Cloud, margin: f32, wants_more: &mut dyn FnMut(usize, f32) -> bool) {
         let reach = cloud.radius_m() as f32 + self.shape.skin + margin;
-        let shape = &self.shape.shape;
-        let around = shape.compute_aabb(&self.pose);
-        let (least, greatest) = (around.mins - Vector::splat(reach), around.maxs + Vector::splat(reach));
-        cloud.visit(least.into(), greatest.into(), &mut |point, [x, y, z]| {
-            let at = self.pose.inverse_transform_point(Vector::new(x, y, z));
-            let projection = shape.project_local_point(at, false);
-            let is_inside = match &self.shape.inside {
-                Some(inside) => inside.contains([at.x, at.y, at.z].map(f64::from)),
-                None => projection.is_inside,
-            };
-            let gap = (projection.point - at).length() * if is_inside { -1.0 } else { 1.0 };
-            gap >= reach || wants_more(point, reach - gap)
-        });
+        let inside = self.shape.inside.as_deref();
+        cloud
+            .visit_near(&self.pose, &self.shape.shape, inside, reach, &mut |point, gap| wants_more(point, reach - gap));
     }
 }
 

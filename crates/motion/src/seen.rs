@@ -6,7 +6,6 @@
 use crate::cloud::{Cloud, CloudError};
 use crate::frame::compose;
 use crate::robot::{Body, Configuration, Geometry, Robot, to_f32};
-use parry3d::math::Vector;
 use ratn_world::scene::{Placement, Scene};
 use std::sync::Arc;
 
@@ -42,23 +41,14 @@ impl Seen {
         }));
         let mut is_known = vec![false; self.cloud.points().len()];
         for body in &known {
-            near(&self.cloud, body, self.known_within_m, &mut is_known);
+            let shape = body.geometry.shape(0.0);
+            self.cloud.visit_near(&to_f32(&body.pose), &shape, None, self.known_within_m as f32, &mut |point, _| {
+                is_known[point] = true;
+                true
+            });
         }
         let points = self.cloud.points().iter().zip(&is_known).filter(|(_, is_known)| !**is_known);
         let points: Vec<[f32; 3]> = points.map(|(point, _)| *point).collect();
         Cloud::new(&self.cloud.name, &points, self.cloud.radius_m())
     }
-}
-
-/// Marks the points that come within so many metres of a body.
-fn near(cloud: &Cloud, body: &Body, within_m: f64, marks: &mut [bool]) {
-    let (shape, pose, within) = (body.geometry.shape(0.0), to_f32(&body.pose), within_m as f32);
-    let around = shape.compute_aabb(&pose);
-    let (least, greatest) = (around.mins - Vector::splat(within), around.maxs + Vector::splat(within));
-    cloud.visit(least.into(), greatest.into(), &mut |point, [x, y, z]| {
-        let at = pose.inverse_transform_point(Vector::new(x, y, z));
-        // Of a point inside the solid shape it is the point itself.
-        marks[point] |= (shape.project_local_point(at, true).point - at).length() <= within;
-        true
-    });
 }

@@ -10,6 +10,8 @@ use super::progress::UnderWay;
 use crate::messages::Messages;
 use ratn_executive::protocol::{Awaited, Event, Mode};
 use ratn_model::value::Value;
+use ratn_proto::convert::{Malformed, label};
+use ratn_proto::v1;
 use serde::{Deserialize, Serialize};
 use std::io::{Error, ErrorKind};
 use std::path::{Path, PathBuf};
@@ -105,6 +107,25 @@ pub enum Message {
         /// One of its choices.
         choice: String,
     },
+}
+
+impl Message {
+    /// The message, if its names and its value are such as any client may send.
+    fn checked(self) -> Result<Message, Malformed> {
+        match &self {
+            Message::Signal { run, signal, value } => {
+                label(run, "run")?;
+                label(signal, "signal")?;
+                Value::try_from(v1::Value::from(value.clone()))?;
+            }
+            Message::Answer { run, state, choice } => {
+                label(run, "run")?;
+                label(state.as_deref().unwrap_or_default(), "state")?;
+                label(choice, "choice")?;
+            }
+        }
+        Ok(self)
+    }
 }
 
 /// Whichever run is under way.
@@ -271,7 +292,8 @@ async fn hear(mut stream: UnixStream, tell: &mpsc::Sender<Asked>) -> std::io::Re
                 Err(_) => BEHIND.to_owned(),
             }
         }
-        None if line.starts_with('{') => match serde_json::from_str(line) {
+        None if line.len() as u64 >= MAX_MESSAGE_BYTES => format!("that is longer than {MAX_MESSAGE_BYTES} bytes"),
+        None if line.starts_with('{') => match read(line) {
             Ok(message) => {
                 let (say, said) = oneshot::channel();
                 match tell.try_send(Asked::Message(message, say)) {
@@ -282,11 +304,16 @@ async fn hear(mut stream: UnixStream, tell: &mpsc::Sender<Asked>) -> std::io::Re
                     Err(_) => BEHIND.to_owned(),
                 }
             }
-            Err(error) => format!("that is no message of at most {MAX_MESSAGE_BYTES} bytes: {error}"),
+            Err(why) => format!("that is no message: {}", one_line(&why)),
         },
         None => "expected pause, resume, step, abort or status".to_owned(),
     };
     writer.write_all(format!("{answer}\n").as_bytes()).await
+}
+
+fn read(line: &str) -> Result<Message, String> {
+    let message: Message = serde_json::from_str(line).map_err(|error| error.to_string())?;
+    message.checked().map_err(|malformed| malformed.to_string())
 }
 
 /// Tells the run of the system in `directory`.
@@ -447,6 +474,24 @@ mod tests {
         let huge = send(place.path(), &signal("go", Value::String("x".repeat(70_000)))).await;
         assert!(huge.is_err_and(|error| error.kind() == ErrorKind::InvalidInput));
         drop(answering.await?);
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn what_no_client_may_send_is_refused_and_not_told() -> anyhow::Result<()> {
+        let place = tempfile::tempdir()?;
+        let mut control = Control::listen(place.path())?;
+        let signal = |name: &str, value| Message::Signal { run: ANY_RUN.to_owned(), signal: name.to_owned(), value };
+        let deep = (0..17).fold(Value::Null, |value, _| Value::List(vec![value]));
+        for (message, why) in [
+            (signal("go", deep), "nest deeper than 16"),
+            (signal("a\u{7}b", Value::Null), "holds control characters"),
+            (signal(&"x".repeat(60_000), Value::Null), "has 60000 bytes"),
+        ] {
+            let Err(refused) = send(place.path(), &message).await else { anyhow::bail!("it was taken") };
+            assert!(refused.to_string().contains(why), "{refused}");
+        }
+        assert!(control.words.try_recv().is_err());
         Ok(())
     }
 

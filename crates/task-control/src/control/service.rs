@@ -7,7 +7,6 @@ use super::{ANY_RUN, Asked, Awaiting, Message, RunStatus};
 use futures::FutureExt;
 use ratn_executive::protocol::Awaited;
 use ratn_model::value::Value;
-use ratn_proto::convert::label;
 use ratn_proto::v1;
 use ratn_proto::v1::run_service_server::{RunService, RunServiceServer};
 use ratn_worker::access::Caller;
@@ -96,14 +95,13 @@ impl RunService for RunServer {
     ) -> Result<Response<v1::SendSignalResponse>, Status> {
         let caller = Caller::of(&request);
         let v1::SendSignalRequest { run, signal, value } = request.into_inner();
-        label(&signal, "signal")?;
         let value = match value {
             Some(value) => Value::try_from(value)?,
             None => Value::Null,
         };
-        let run = named(run)?;
-        let pending = audit::begin(&caller, "", || Mutation::Signal { signal: signal.clone() });
-        let said = self.say(Message::Signal { run, signal, value }).await;
+        let message = Message::Signal { run: named(run), signal: signal.clone(), value }.checked()?;
+        let pending = audit::begin(&caller, "", || Mutation::Signal { signal });
+        let said = self.say(message).await;
         pending.ended(&said);
         Ok(Response::new(v1::SendSignalResponse { said: said? }))
     }
@@ -114,21 +112,17 @@ impl RunService for RunServer {
     ) -> Result<Response<v1::SendAnswerResponse>, Status> {
         let caller = Caller::of(&request);
         let v1::SendAnswerRequest { run, state, choice } = request.into_inner();
-        label(&state, "state")?;
-        label(&choice, "choice")?;
-        let run = named(run)?;
-        let answer = || Mutation::Answer { state: state.clone(), choice: choice.clone() };
-        let pending = audit::begin(&caller, "", answer);
-        let state = Some(state).filter(|state| !state.is_empty());
-        let said = self.say(Message::Answer { run, state, choice }).await;
+        let asking = Some(state.clone()).filter(|state| !state.is_empty());
+        let message = Message::Answer { run: named(run), state: asking, choice: choice.clone() }.checked()?;
+        let pending = audit::begin(&caller, "", || Mutation::Answer { state, choice });
+        let said = self.say(message).await;
         pending.ended(&said);
         Ok(Response::new(v1::SendAnswerResponse { said: said? }))
     }
 }
 
-fn named(run: String) -> Result<String, Status> {
-    label(&run, "run")?;
-    Ok(if run.is_empty() { ANY_RUN.to_owned() } else { run })
+fn named(run: String) -> String {
+    if run.is_empty() { ANY_RUN.to_owned() } else { run }
 }
 
 impl From<Awaiting> for v1::Wait {
