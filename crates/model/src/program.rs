@@ -234,6 +234,8 @@ pub enum Origin {
     State,
     /// Its action, in the catalogue.
     Action,
+    /// Both: effects add up.
+    Both,
 }
 
 /// What a state became that is tried again. It is said once more what its transitions and variables come to.

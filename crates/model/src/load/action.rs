@@ -1,7 +1,8 @@
 //! What a state's action says in the state's place: annotations of the catalogue, in terms of what the state gives the action's ports.
 //!
-//! The rule: what a state says under a key stands in place of what its action says under it. `computes`, `senses` and `pia` count as one key. An
-//! annotation that needs an input which the state does not give is not in force, and a warning says so: without it the state may
+//! The rule: what a state says under a key stands in place of what its action says under it; but what it says under `effects` is added to what the
+//! action changes, and stands in place of that only for the same facts. (Else a state that names a fact of its own would silently promise that
+//! the arm did not move.) `computes`, `senses` and `pia` count as one key. An annotation that needs an input which the state does not give is not in force, and a warning says so: without it the state may
 //! read and change more, which is safe.
 
 use super::fields::Fields;
@@ -9,9 +10,9 @@ use super::outline::{Form, Step};
 use super::state::action_name;
 use super::yaml::{Content, Node};
 use crate::catalogue::{ActionSignature, Annotations, unknown_input};
-use crate::expression::Expr;
 use crate::expression::parse::NameError;
-use crate::program::{Location, Nature, Origin, StateKind};
+use crate::expression::{EffectExpr, Expr, FactExpr};
+use crate::program::{Location, Nature, Origin, SUCCESS, StateKind};
 use crate::value::Value;
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
@@ -105,6 +106,37 @@ impl<'b> InForce<'b> {
             self.origin.insert(key.to_owned(), Origin::State);
             return Some(read(fields, node));
         }
+        self.of_action(fields, key, read)
+    }
+
+    /// What the state changes: what it says, and what its action changes beside that.
+    pub(crate) fn effects(
+        &mut self,
+        fields: &mut Fields<'_, '_>,
+        read: impl Fn(&mut Fields<'_, '_>, &Node) -> BTreeMap<String, Vec<EffectExpr>>,
+    ) -> BTreeMap<String, Vec<EffectExpr>> {
+        let Some(node) = self.body.get("effects") else {
+            return self.of_action(fields, "effects", read).unwrap_or_default();
+        };
+        let mut changed = read(fields, node);
+        let own: Vec<FactExpr> = changed.get(SUCCESS).into_iter().flatten().filter_map(fact).cloned().collect();
+        let mut more = self.of_action(fields, "effects", read).unwrap_or_default().remove(SUCCESS).unwrap_or_default();
+        more.retain(|effect| fact(effect).is_none_or(|fact| !own.contains(fact)));
+        let from = if more.is_empty() { Origin::State } else { Origin::Both };
+        self.origin.insert("effects".to_owned(), from);
+        if !more.is_empty() {
+            let own = changed.entry(SUCCESS.to_owned()).or_default();
+            own.splice(..0, more);
+        }
+        changed
+    }
+
+    fn of_action<T>(
+        &mut self,
+        fields: &mut Fields<'_, '_>,
+        key: &'static str,
+        read: impl FnOnce(&mut Fields<'_, '_>, &Node) -> T,
+    ) -> Option<T> {
         let (said, ports, at) = self.action.as_ref()?;
         let node = node(said, key, *at)?;
         fields.view.action = Some(Rc::clone(ports));
@@ -114,12 +146,17 @@ impl<'b> InForce<'b> {
             self.origin.insert(key.to_owned(), Origin::Action);
             return Some(value);
         };
-        let message = format!(
-            "what `{}` says under `{key}` needs {missing}, which this state does not have: it is not in force",
-            ports.name
-        );
-        let (at, path) = (*at, fields.path.clone());
-        fields.out.findings.warning("annotation-not-in-force", at, &path, message, format!("say `{key}` here"));
+        // What the state says itself is all that is known then; a required input that is missing is an error of its own.
+        let is_refused = ports.signature.inputs.keys().any(|input| ports.inputs.get(input).is_none());
+        if self.body.get(key).is_none() && !is_refused {
+            let action = &ports.name;
+            let message = format!(
+                "what `{action}` says under `{key}` needs {missing}, which this state does not have: it is not in force"
+            );
+            let (at, path) = (*at, fields.path.clone());
+            let help = format!("say `{key}` here");
+            fields.out.findings.warning("annotation-not-in-force", at, &path, message, help);
+        }
         None
     }
 
@@ -142,6 +179,14 @@ impl<'b> InForce<'b> {
             node.items().into_iter().filter_map(|fact| fields.fact(fact)).collect()
         };
         self.read(fields, "senses", senses).map_or_else(Nature::default, Nature::Senses)
+    }
+}
+
+/// The fact that an effect is about, of one.
+fn fact(effect: &EffectExpr) -> Option<&FactExpr> {
+    match effect {
+        EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => Some(fact),
+        EffectExpr::ForEach { .. } => None,
     }
 }
 

@@ -288,7 +288,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
             annotations.effects.extend(custom.map(|outcome| (outcome.clone(), Vec::new())));
         }
     }
-    let changed = in_force.read(fields, "effects", |fields, node| {
+    let changed = in_force.effects(fields, |fields, node| {
         // As it ends, what a hierarchy contains has written its outputs.
         fields.view.inside = matches!(kind, StateKind::Sequence { .. } | StateKind::Concurrency { .. });
         fields.view.own_outputs = true;
@@ -297,7 +297,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
         fields.view.inside = false;
         changed
     });
-    annotations.effects.extend(changed.unwrap_or_default());
+    annotations.effects.extend(changed);
     let resources = in_force.read(fields, "resources", |fields, node| {
         // What is created may be named by what the state put out; blocks are checked against that.
         fields.view.own_outputs = true;

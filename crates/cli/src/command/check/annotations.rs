@@ -22,9 +22,10 @@ pub(super) fn print(program: &Program, json: bool) -> Result<(), Failure> {
 fn shown(state: &InForce) -> String {
     let line = |line: &ratn_model::in_force::Line| {
         let from = match line.from {
-            Some(Origin::State) => "this state",
-            Some(Origin::Action) => state.action.as_str(),
-            None => "nobody says otherwise",
+            Some(Origin::State) => "this state".to_owned(),
+            Some(Origin::Action) => state.action.clone(),
+            Some(Origin::Both) => format!("this state, and {}", state.action),
+            None => "nobody says otherwise".to_owned(),
         };
         format!("  {:<10} {}  ({from})", line.key, line.text)
     };
