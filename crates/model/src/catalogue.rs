@@ -2,9 +2,12 @@
 //! task can be checked before anything is started. Where a system runs, what its workers say of
 //! themselves ([`WorkerDescription`]) extends it, or is compared with it.
 
+mod annotations;
 mod description;
 mod mismatch;
 
+pub use annotations::{Annotations, InvalidAnnotation};
+pub(crate) use annotations::{no_states, unknown_input};
 pub use description::{DescriptionError, WorkerDescription};
 
 use crate::resource::{Quantity, ResourceClass};
@@ -36,9 +39,24 @@ impl Catalogue {
     /// Reads the TOML form, as in `deploy/catalogue.toml`.
     ///
     /// # Errors
-    /// [`InvalidCatalogue`] with line and column of the first thing that does not fit.
+    /// [`InvalidCatalogue`] with line and column of the first thing that does not fit, or with the annotation that does not read.
     pub fn from_toml(text: &str) -> Result<Catalogue, InvalidCatalogue> {
-        toml::from_str(text).map_err(|error| InvalidCatalogue(error.to_string().trim_end().to_owned()))
+        let catalogue: Catalogue =
+            toml::from_str(text).map_err(|error| InvalidCatalogue(error.to_string().trim_end().to_owned()))?;
+        for (name, provider) in &catalogue.providers {
+            for (action, signature) in &provider.actions {
+                let wrong = |error| InvalidCatalogue(format!("annotations of {name}/{action}: {error}"));
+                signature.annotations.check(signature).map_err(wrong)?;
+                let blocked = &signature.annotations.resources;
+                if !blocked.is_empty() && !blocked.contains(&provider.resource) {
+                    let own = &provider.resource;
+                    let message =
+                        format!("annotations of {name}/{action}: `resources` lacks `{own}`, which performs it; add it");
+                    return Err(InvalidCatalogue(message));
+                }
+            }
+        }
+        Ok(catalogue)
     }
 
     /// The catalogue of the bundled system (`deploy/catalogue.toml`).
@@ -108,41 +126,9 @@ pub struct ActionSignature {
     /// What optional inputs are where they are not given, as people write it. For people: the provider fills them in.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub defaults: BTreeMap<String, String>,
-    /// What a state that performs it may say of itself.
+    /// What is true of every state that performs it and says nothing else itself.
     #[serde(default, skip_serializing_if = "Annotations::is_empty")]
     pub annotations: Annotations,
-}
-
-/// What a state that performs an action may say of itself, as task files have it. For people, who copy it; nothing follows from it by itself.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Annotations {
-    /// It reads its projection and changes nothing.
-    pub computes: bool,
-    /// Patterns of the facts that it reads.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub reads: Vec<String>,
-    /// Patterns of the facts that it senses.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub senses: Vec<String>,
-    /// What has to be true.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub requires: Vec<String>,
-    /// What is true afterwards.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub effects: Vec<String>,
-}
-
-impl Annotations {
-    /// Whether it says nothing.
-    pub fn is_empty(&self) -> bool {
-        *self == Annotations::default()
-    }
-
-    /// The lists, by the key of a task file.
-    pub fn lists(&self) -> [(&'static str, &Vec<String>); 4] {
-        [("reads", &self.reads), ("senses", &self.senses), ("requires", &self.requires), ("effects", &self.effects)]
-    }
 }
 
 /// A kind of resource that the system can have.

@@ -102,8 +102,12 @@ pub(crate) fn expressions<'a>(program: &'a Program, state: &'a State) -> Vec<(Sl
 
 /// An expression with the names of states instead of their ids.
 pub(crate) fn named(program: &Program, expr: &Expr) -> String {
-    let mut text = expr.to_string();
-    for id in expr.flows() {
+    named_in(program, expr.to_string(), expr.flows())
+}
+
+/// A text in which states stand as numbers, with their names.
+pub(crate) fn named_in(program: &Program, mut text: String, states: impl IntoIterator<Item = StateId>) -> String {
+    for id in states {
         text = text.replace(&format!("{id}."), &format!("{}.", program.state(id).name));
     }
     text

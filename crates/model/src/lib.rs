@@ -13,6 +13,7 @@ pub mod fact;
 pub mod grasp;
 pub mod guard;
 pub mod id;
+pub mod in_force;
 pub mod load;
 pub mod measurement;
 pub mod name;

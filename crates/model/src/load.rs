@@ -16,6 +16,7 @@
 //!     do: [...]
 //! ```
 
+mod action;
 mod advice;
 mod document;
 mod effects;
@@ -39,7 +40,7 @@ pub(crate) use names::distance;
 pub use names::suggestion;
 pub use yaml::MAX_SOURCE;
 
-use crate::catalogue::Catalogue;
+use crate::catalogue::{ActionSignature, Catalogue};
 use crate::check;
 use crate::diagnostic::{Diagnostic, Findings, Severity};
 use crate::expression::EffectExpr;
@@ -211,6 +212,10 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
         graft::graft(&mut states, *id, library, &task.in_sight(*id));
         out.libraries.push(task.outline.step(*id).path.clone());
     }
+    // What actions say belongs to the task, as what its libraries say does.
+    for (name, signature) in used(&task) {
+        hasher.update(format!("{name}: {:?}", signature.annotations).as_bytes());
+    }
     let digest = hasher.finalize().to_hex().to_string();
     let mut program = Program {
         name,
@@ -244,6 +249,19 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
         }
     }
     Some(program)
+}
+
+/// The actions that say something of the states that use them, by name.
+fn used<'t>(task: &Task<'t>) -> BTreeMap<String, &'t ActionSignature> {
+    let named = task.outline.steps.iter().filter_map(|step| match &step.form {
+        Form::Action { action } => state::action_name(action),
+        _ => None,
+    });
+    let signature = |(provider, action): (String, String)| {
+        let signature = task.catalogue.action(&provider, &action)?;
+        (!signature.annotations.is_empty()).then(|| (format!("{provider}/{action}"), signature))
+    };
+    named.filter_map(signature).collect()
 }
 
 fn horizon(fields: &mut Fields<'_, '_>, node: &Node) -> usize {

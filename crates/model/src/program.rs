@@ -217,10 +217,25 @@ pub struct Annotations {
     pub deterministic: bool,
     /// On a region: facts that other regions may touch too. The programmer answers for their order.
     pub shared: Vec<FactExpr>,
+    /// Who says what is in force, by key; keys that nobody says are left out.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub origin: BTreeMap<String, Origin>,
     /// That a sequence was made of a state that is tried again ([`crate::guard`]).
     pub again: Option<Again>,
     /// That a sequence was made of a state with something to do on every way out.
     pub finally: Option<Finally>,
+}
+
+/// Who says what is in force under a key of a state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Origin {
+    /// The state itself.
+    State,
+    /// Its action, in the catalogue.
+    Action,
+    /// Both: effects add up.
+    Both,
 }
 
 /// What a state became that is tried again. It is said once more what its transitions and variables come to.

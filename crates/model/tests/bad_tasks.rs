@@ -9,7 +9,8 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Rules that the folder must have a task for.
-const RULES: [&str; 41] = [
+const RULES: [&str; 42] = [
+    "annotation-not-in-force",
     "branch-may-not-have-written",
     "computes-actuates",
     "conflicting-annotations",

@@ -13,7 +13,7 @@ fn signature() -> ActionSignature {
         outputs: port("text", "list<string>"),
         outcomes: vec!["unreadable".to_owned()],
         defaults: [("tries".to_owned(), "3".to_owned())].into(),
-        annotations: Annotations { computes: true, reads: vec!["at(?)".to_owned()], ..Annotations::default() },
+        annotations: Annotations { computes: true, reads: Some(vec!["at(?)".to_owned()]), ..Annotations::default() },
         ..ActionSignature::default()
     }
 }

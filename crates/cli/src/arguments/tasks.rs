@@ -36,6 +36,9 @@ pub(crate) struct CheckArguments {
     /// Only check: leave out the simulation that says what keeps the task sequential
     #[arg(long)]
     pub(crate) no_simulation: bool,
+    /// Say what is in force for each state that performs an action, and whether the state or the action's catalogue says so
+    #[arg(long, conflicts_with_all = ["no_simulation", "learn"])]
+    pub(crate) annotations: bool,
     /// Give a parameter of the task a value for the simulation, `boxes=3`; may be repeated
     #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
     pub(crate) set: Vec<(String, String)>,

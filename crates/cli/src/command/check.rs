@@ -1,5 +1,7 @@
 //! `ratn check TASK`, and what `ratn run` does first.
 
+mod annotations;
+
 use super::blocking_here;
 use super::tables::improvement;
 use crate::arguments::CheckArguments;
@@ -55,6 +57,10 @@ pub(crate) fn run(arguments: &CheckArguments, tls: &ClientTls) -> Result<(), Fai
         }
     };
     let (program, findings) = (loaded.program, loaded.warnings);
+    if arguments.annotations {
+        findings.iter().for_each(output::progress);
+        return annotations::print(&program, arguments.json);
+    }
     let mut workers =
         system.map(|system| [system.offered.lacking(&program), system.mismatches].concat()).unwrap_or_default();
     workers.extend(arms_not_there(&program, &config));

@@ -125,6 +125,11 @@ impl<'t, 'a> Fields<'t, 'a> {
         match parsed {
             Ok(parsed) => Some(parsed),
             Err(error) => {
+                if let Some(action) = &self.view.action {
+                    let message = action.told(text, &error.message);
+                    self.error(error.rule, node.at, message, error.help);
+                    return None;
+                }
                 let at = node.place_in_text(self.task.source, offset + error.offset);
                 let help = if is_cut_off(text) { QUOTE.to_owned() } else { error.help };
                 self.error(error.rule, at, error.message, help);

@@ -5,7 +5,7 @@
 
 use super::functions::Functions;
 use super::outline::{Form, Outline};
-use crate::catalogue::Catalogue;
+use crate::catalogue::{Catalogue, no_states};
 use crate::expression::Expr;
 use crate::expression::parse::{NameError, Names};
 use crate::id::StateId;
@@ -13,6 +13,7 @@ use crate::ontology::Ontology;
 use crate::program::Program;
 use crate::value::Type;
 use std::collections::{BTreeMap, BTreeSet};
+use std::rc::Rc;
 
 /// The port of a region that says how it ended.
 const OUTCOME: &str = "outcome";
@@ -52,6 +53,8 @@ pub(crate) struct View {
     pub(crate) own_outputs: bool,
     /// Further variables (of quantified effects).
     pub(crate) variables: Vec<String>,
+    /// An annotation of the state's action is read: it sees the action's ports alone.
+    pub(crate) action: Option<Rc<super::action::Ports>>,
 }
 
 /// The names of a task as one expression sees them.
@@ -109,6 +112,9 @@ impl NamesFrom<'_, '_> {
 
 impl Names for NamesFrom<'_, '_> {
     fn variable(&mut self, name: &str) -> Result<Expr, NameError> {
+        if let Some(action) = &self.view.action {
+            return action.input(name);
+        }
         let mut known: Vec<&str> = self.view.variables.iter().map(String::as_str).collect();
         known.extend(self.view.state.iter().flat_map(|state| self.task.loop_variables(*state)));
         if let Some(state) = self.view.state {
@@ -136,11 +142,17 @@ impl Names for NamesFrom<'_, '_> {
     }
 
     fn word(&mut self, word: &str) -> Option<Expr> {
+        if let Some(action) = self.view.action.as_ref().filter(|_| self.view.own_outputs) {
+            return action.output(word);
+        }
         let own = &self.task.ports[self.view.state?.0 as usize];
         (self.view.own_outputs && own.types.contains_key(word)).then(|| Expr::Output(word.to_owned()))
     }
 
     fn port(&mut self, state: &str, port: &str) -> Result<Expr, NameError> {
+        if self.view.action.is_some() {
+            return Err(no_states(state, port));
+        }
         let Some(from) = self.view.state else {
             return Err(NameError {
                 rule: "unknown-state",
@@ -181,7 +193,7 @@ impl Names for NamesFrom<'_, '_> {
     }
 
     fn has_function(&self, name: &str) -> bool {
-        self.task.functions.has(name)
+        self.view.action.is_none() && self.task.functions.has(name)
     }
 
     fn call(&mut self, name: &str, arguments: Vec<Expr>) -> Result<Expr, NameError> {

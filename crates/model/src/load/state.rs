@@ -1,5 +1,6 @@
 //! A step of the outline → a state: its kind with every expression read, and its annotations.
 
+use super::action::InForce;
 use super::fields::{Fields, Output};
 use super::names::{Task, View};
 use super::outline::{Form, Step, Tests};
@@ -254,18 +255,26 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
         _ => boundary(Vec::new()),
     };
     let waits_s = annotations.timeout_s;
-    annotations.nature = nature(fields, body);
-    if let Some(node) = body.get("reads") {
+    let mut in_force = InForce::of(fields, step, kind);
+    annotations.nature = in_force.nature(fields, |fields| nature(fields, body));
+    let read = in_force.read(fields, "reads", |fields, node| {
         fields.note("reads", node.at);
-        annotations.reads = Some(node.items().into_iter().flat_map(|item| reads(fields, item)).collect());
+        node.items().into_iter().flat_map(|item| reads(fields, item)).collect()
+    });
+    if read.is_some() {
+        annotations.reads = read;
     } else if matches!(annotations.nature, Nature::Senses(_)) {
         // What a sensing state reads is what it senses.
         annotations.reads = Some(Vec::new());
     }
-    for (i, node) in body.get("requires").into_iter().flat_map(Node::items).enumerate() {
-        fields.note(format!("requires.{i}"), node.at);
-        annotations.requires.extend(fields.expression(node));
-    }
+    let requires = in_force.read(fields, "requires", |fields, node| {
+        let required = |(i, node): (usize, &Node)| {
+            fields.note(format!("requires.{i}"), node.at);
+            fields.expression(node)
+        };
+        node.items().into_iter().enumerate().filter_map(required).collect()
+    });
+    annotations.requires = requires.unwrap_or_default();
     // States that cannot change the environment change nothing when they fail, and computing alone changes nothing at all.
     if annotations.nature != Nature::Irreversible {
         for outcome in [ABORTED, PREEMPTED] {
@@ -279,33 +288,36 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
             annotations.effects.extend(custom.map(|outcome| (outcome.clone(), Vec::new())));
         }
     }
-    if let Some(node) = body.get("effects") {
+    let changed = in_force.effects(fields, |fields, node| {
         // As it ends, what a hierarchy contains has written its outputs.
         fields.view.inside = matches!(kind, StateKind::Sequence { .. } | StateKind::Concurrency { .. });
         fields.view.own_outputs = true;
-        annotations.effects.extend(effects::by_outcome(fields, node));
+        let changed = effects::by_outcome(fields, node);
         fields.view.own_outputs = false;
         fields.view.inside = false;
-    }
-    if let Some(node) = body.get("resources") {
+        changed
+    });
+    annotations.effects.extend(changed);
+    let resources = in_force.read(fields, "resources", |fields, node| {
         // What is created may be named by what the state put out; blocks are checked against that.
         fields.view.own_outputs = true;
-        annotations.resources = resources::list(fields, node);
+        let resources = resources::list(fields, node);
         fields.view.own_outputs = false;
-    }
+        resources
+    });
+    annotations.resources = resources.unwrap_or_default();
     annotations.routine = body.get("routine").is_some_and(|node| fields.flag(node));
-    if let Some(node) = body.get("duration") {
+    let duration = in_force.read(fields, "duration", |fields, node| {
         fields.note("duration", node.at);
-        annotations.duration_s = fields.expression(node);
-        if annotations.duration_s.as_ref().is_some_and(|d| !d.fact_expressions().is_empty()) {
-            fields.error(
-                "invalid-expression",
-                node.at,
-                "an estimated duration cannot look up facts",
-                "use a parameter",
-            );
+        let duration = fields.expression(node);
+        if duration.as_ref().is_some_and(|duration| !duration.fact_expressions().is_empty()) {
+            let message = "an estimated duration cannot look up facts";
+            fields.error("invalid-expression", node.at, message, "use a parameter");
         }
-    }
+        duration
+    });
+    annotations.duration_s = duration.flatten().or(annotations.duration_s);
+    annotations.origin = in_force.origin;
     flow::annotate(fields, body, &mut annotations);
     annotations.timeout_s = annotations.timeout_s.or(waits_s);
     let holds = body.get("resources").into_iter().flat_map(Node::items).filter_map(|item| item.get("hold"));

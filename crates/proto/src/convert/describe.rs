@@ -28,14 +28,40 @@ impl From<ActionSignature> for v1::ActionSignature {
         let required = inputs.into_iter().map(|given| port(false, &none, given));
         let inputs = required.chain(optional.into_iter().map(|given| port(true, &defaults, given))).collect();
         let outputs = outputs.into_iter().map(|given| port(false, &none, given)).collect();
-        let annotations = (!annotations.is_empty()).then_some(v1::ActionAnnotations {
-            computes: annotations.computes,
-            reads: annotations.reads,
-            senses: annotations.senses,
-            requires: annotations.requires,
-            effects: annotations.effects,
-        });
+        let annotations = (!annotations.is_empty()).then(|| annotations.into());
         v1::ActionSignature { inputs, outputs, outcomes, annotations }
+    }
+}
+
+impl From<Annotations> for v1::ActionAnnotations {
+    fn from(said: Annotations) -> v1::ActionAnnotations {
+        let is_none = |said: &Option<Vec<String>>| said.as_ref().is_some_and(Vec::is_empty);
+        v1::ActionAnnotations {
+            computes: said.computes,
+            reads_nothing: is_none(&said.reads),
+            changes_nothing: is_none(&said.effects),
+            reads: said.reads.unwrap_or_default(),
+            senses: said.senses,
+            requires: said.requires,
+            effects: said.effects.unwrap_or_default(),
+            resources: said.resources,
+            duration: said.duration.unwrap_or_default(),
+        }
+    }
+}
+
+impl From<v1::ActionAnnotations> for Annotations {
+    fn from(said: v1::ActionAnnotations) -> Annotations {
+        let list = |said: Vec<String>, is_none: bool| (is_none || !said.is_empty()).then_some(said);
+        Annotations {
+            computes: said.computes,
+            reads: list(said.reads, said.reads_nothing),
+            senses: said.senses,
+            requires: said.requires,
+            effects: list(said.effects, said.changes_nothing),
+            resources: said.resources,
+            duration: Some(said.duration).filter(|duration| !duration.is_empty()),
+        }
     }
 }
 
@@ -72,8 +98,7 @@ fn read(action: &str, description: String, said: v1::ActionSignature) -> Result<
         once(action, signature.outputs.insert(port.name.clone(), of_type), port.name)?;
     }
     if let Some(said) = said.annotations {
-        let v1::ActionAnnotations { computes, reads, senses, requires, effects } = said;
-        signature.annotations = Annotations { computes, reads, senses, requires, effects };
+        signature.annotations = said.into();
     }
     Ok(signature)
 }

@@ -5929,7 +5929,8 @@ pub struct PortDescription {
     #[prost(string, tag = "4")]
     pub default_value: ::prost::alloc::string::String,
 }
-/// What a state may say of itself, as task files have it.
+/// What is true of every state that performs an action and says nothing else itself: expressions as task files have them, in which
+/// `$port` stands for what the state gives an input and a bare word in effects for an output.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ActionAnnotations {
     /// It reads its projection and changes nothing.
@@ -5944,9 +5945,21 @@ pub struct ActionAnnotations {
     /// What has to be true.
     #[prost(string, repeated, tag = "4")]
     pub requires: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// What is true afterwards.
+    /// What is true afterwards, with success.
     #[prost(string, repeated, tag = "5")]
     pub effects: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// It reads no facts. Neither this nor `reads`: it may read all of them.
+    #[prost(bool, tag = "6")]
+    pub reads_nothing: bool,
+    /// It changes no facts. Neither this nor `effects`: it may change all of them.
+    #[prost(bool, tag = "7")]
+    pub changes_nothing: bool,
+    /// Kinds of resources that it blocks one of, its provider's among them; `world_model` is room for a projection.
+    #[prost(string, repeated, tag = "8")]
+    pub resources: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// How long it usually takes, in seconds; empty where the action does not say.
+    #[prost(string, tag = "9")]
+    pub duration: ::prost::alloc::string::String,
 }
 /// Generated client implementations.
 pub mod action_service_client {

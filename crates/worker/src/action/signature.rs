@@ -106,38 +106,67 @@ impl Signature {
         self
     }
 
-    /// A state with this action may say `computes: true`: the action reads its projection and changes nothing.
+    /// The action reads its projection and changes nothing. This and what the following say is true of every state with this action that
+    /// says nothing else itself. Texts are expressions of task files: `$port` is what the state gives an input, a bare word in an effect an output.
     #[must_use]
     pub fn computes(mut self) -> Signature {
         self.said.annotations.computes = true;
         self
     }
 
-    /// A state with this action reads the facts of this pattern, for example `at(?)`.
+    /// The action reads the facts of this pattern, for example `at(?)`, and no others than those said so.
     #[must_use]
     pub fn reads(mut self, pattern: &str) -> Signature {
-        self.said.annotations.reads.push(pattern.to_owned());
+        self.said.annotations.reads.get_or_insert_default().push(pattern.to_owned());
         self
     }
 
-    /// A state with this action senses the facts of this pattern.
+    /// The action reads no facts.
+    #[must_use]
+    pub fn reads_nothing(mut self) -> Signature {
+        self.said.annotations.reads = Some(Vec::new());
+        self
+    }
+
+    /// The action senses the facts of this pattern.
     #[must_use]
     pub fn senses(mut self, pattern: &str) -> Signature {
         self.said.annotations.senses.push(pattern.to_owned());
         self
     }
 
-    /// A state with this action requires this condition, for example `hand_empty(gripper)`.
+    /// The action requires this condition, for example `hand_empty(gripper)`.
     #[must_use]
     pub fn requires(mut self, condition: &str) -> Signature {
         self.said.annotations.requires.push(condition.to_owned());
         self
     }
 
-    /// A state with this action has this effect with success, for example `not hand_empty(gripper)`.
+    /// The action has this effect with success, for example `not hand_empty(gripper)`, and no others than those said so.
     #[must_use]
     pub fn effect(mut self, effect: &str) -> Signature {
-        self.said.annotations.effects.push(effect.to_owned());
+        self.said.annotations.effects.get_or_insert_default().push(effect.to_owned());
+        self
+    }
+
+    /// The action changes no facts.
+    #[must_use]
+    pub fn changes_nothing(mut self) -> Signature {
+        self.said.annotations.effects = Some(Vec::new());
+        self
+    }
+
+    /// The action blocks one of this kind of resource; the worker's own kind has to be said, too.
+    #[must_use]
+    pub fn blocks(mut self, kind: &str) -> Signature {
+        self.said.annotations.resources.push(kind.to_owned());
+        self
+    }
+
+    /// How long the action usually takes, in seconds: an expression of its inputs.
+    #[must_use]
+    pub fn takes(mut self, duration: &str) -> Signature {
+        self.said.annotations.duration = Some(duration.to_owned());
         self
     }
 

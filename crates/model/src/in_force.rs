@@ -1,0 +1,130 @@
+//! What is in force for each state that performs an action, and who says so: the state, its action in the catalogue, or nobody. For people who
+//! wonder why a state waits.
+
+use crate::check::{named, named_in};
+use crate::expression::{EffectExpr, Expr, FactExpr};
+use crate::id::StateId;
+use crate::program::{Annotations, Nature, Origin, Program, SUCCESS, StateKind};
+use serde::Serialize;
+use std::collections::BTreeSet;
+use std::fmt::Display;
+
+/// One state.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct InForce {
+    /// Its path.
+    pub state: String,
+    /// `provider/action`
+    pub action: String,
+    /// What holds for it.
+    pub lines: Vec<Line>,
+}
+
+/// One annotation.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Line {
+    /// The key of a task file.
+    pub key: &'static str,
+    /// What is in force under it, as a task file says it; `everything`, `nothing`, `unknown` where there is no text.
+    pub text: String,
+    /// Who says so; nobody where it is so because nothing is said.
+    pub from: Option<Origin>,
+}
+
+/// What is in force for every state that performs an action, in the order of the program.
+pub fn in_force(program: &Program) -> Vec<InForce> {
+    let states = program.states.iter().filter(|state| !state.is_pause());
+    let of_state = states.filter_map(|state| match &state.kind {
+        StateKind::Action { provider, action, .. } => Some(InForce {
+            state: state.path.clone(),
+            action: format!("{provider}/{action}"),
+            lines: lines(program, &state.annotations),
+        }),
+        _ => None,
+    });
+    of_state.collect()
+}
+
+fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
+    let line = |key: &'static str, text: String| Line { key, text, from: said.origin.get(key).copied() };
+    let facts = |facts: &[FactExpr]| {
+        let flows = |fact: &FactExpr| fact.arguments.iter().flatten().flat_map(Expr::flows).collect();
+        listed(program, facts, flows)
+    };
+    let required = listed(program, &said.requires, Expr::flows);
+    let changed = |effects: &Vec<EffectExpr>| {
+        let flows = |effect: &EffectExpr| {
+            let mut states = BTreeSet::new();
+            effect.each_expression(&mut |part| states.extend(part.flows()));
+            states
+        };
+        listed(program, effects, flows)
+    };
+    let blocked: Vec<String> = said.resources.iter().map(|line| format!("{} {}", line.operation, line.kind)).collect();
+    let unknown = || "unknown".to_owned();
+    let everything = || "everything".to_owned();
+    vec![
+        match &said.nature {
+            Nature::Computes => line("computes", "true".to_owned()),
+            Nature::Senses(sensed) => line("senses", facts(sensed)),
+            Nature::Irreversible => line("pia", "true".to_owned()),
+        },
+        line("reads", said.reads.as_ref().map_or_else(everything, |read| facts(read))),
+        line("requires", required),
+        line("effects", said.effects.get(SUCCESS).map_or_else(everything, changed)),
+        line("resources", listed(program, &blocked, |_| BTreeSet::new())),
+        line("duration", said.duration_s.as_ref().map_or_else(unknown, |duration| named(program, duration))),
+    ]
+}
+
+/// With the names of states in the place of their numbers.
+fn listed<T: Display>(program: &Program, items: &[T], flows: impl Fn(&T) -> BTreeSet<StateId>) -> String {
+    if items.is_empty() {
+        return "nothing".to_owned();
+    }
+    let texts: Vec<String> = items.iter().map(|item| named_in(program, item.to_string(), flows(item))).collect();
+    texts.join("; ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::catalogue::Catalogue;
+    use crate::load::load;
+
+    #[test]
+    fn what_is_in_force_is_told_with_who_says_so() {
+        let task = r#"
+task: t
+world: ["hand_empty(gripper)", "at(box_1) = pose(0, 0, 0)"]
+states:
+  - plan: { action: path_planner/plan, in: { start: "joints(0, 0, 0, 0, 0, 0, 0)", goal: "joints(1, 0, 0, 0, 0, 0, 0)" }, duration: 2 }
+  - grasp:
+      action: gripper/grasp
+      in: { object: box_1, expected: plan.end_pose }
+      pia: true
+"#;
+        let catalogue = Catalogue::standard();
+        let program =
+            load(task, "t.yaml", &catalogue).map(|loaded| loaded.program).unwrap_or_else(|found| panic!("{found:?}"));
+        let told: Vec<String> = in_force(&program)
+            .into_iter()
+            .flat_map(|state| state.lines.into_iter().map(move |line| (state.state.clone(), line)))
+            .map(|(state, line)| format!("{state} {}: {} ({:?})", line.key, line.text, line.from))
+            .collect();
+        insta::assert_snapshot!(told.join("\n"), @r"
+        plan computes: true (Some(Action))
+        plan reads: at(?); shape(?); in_gripper(?) (Some(Action))
+        plan requires: nothing (None)
+        plan effects: nothing (None)
+        plan resources: block PathPlanner; block WorldModel (Some(Action))
+        plan duration: 2 (Some(State))
+        grasp pia: true (Some(State))
+        grasp reads: at(box_1) (Some(Action))
+        grasp requires: hand_empty(gripper) (Some(Action))
+        grasp effects: set in_gripper(box_1) = plan.end_pose; delete hand_empty(gripper) (Some(Action))
+        grasp resources: block Arm; block Gripper (Some(Action))
+        grasp duration: 1.1 (Some(Action))
+        ");
+    }
+}

@@ -1,0 +1,210 @@
+//! What a state's action says in the state's place: annotations of the catalogue, in terms of what the state gives the action's ports.
+//!
+//! The rule: what a state says under a key stands in place of what its action says under it; but what it says under `effects` is added to what the
+//! action changes, and stands in place of that only for the same facts. (Else a state that names a fact of its own would silently promise that
+//! the arm did not move.) `computes`, `senses` and `pia` count as one key. An annotation that needs an input which the state does not give is not in force, and a warning says so: without it the state may
+//! read and change more, which is safe.
+
+use super::fields::Fields;
+use super::outline::{Form, Step};
+use super::state::action_name;
+use super::yaml::{Content, Node};
+use crate::catalogue::{ActionSignature, Annotations, unknown_input};
+use crate::expression::parse::NameError;
+use crate::expression::{EffectExpr, Expr, FactExpr};
+use crate::program::{Location, Nature, Origin, SUCCESS, StateKind};
+use crate::value::Value;
+use std::cell::RefCell;
+use std::collections::{BTreeMap, BTreeSet};
+use std::rc::Rc;
+
+/// The ports of an action, as its annotations see them from one state.
+#[derive(Debug)]
+pub(crate) struct Ports {
+    /// `provider/action`
+    name: String,
+    signature: ActionSignature,
+    /// What the state gives its inputs.
+    inputs: BTreeMap<String, Expr>,
+    /// The outputs that it writes.
+    written: BTreeSet<String>,
+    /// What was asked for and is not there.
+    missing: RefCell<Option<String>>,
+}
+
+impl Ports {
+    /// What `$name` stands for; anything where the state does not give it.
+    pub(crate) fn input(&self, name: &str) -> Result<Expr, NameError> {
+        if let Some(error) = unknown_input(&self.signature, name) {
+            return Err(error);
+        }
+        Ok(self.inputs.get(name).cloned().unwrap_or_else(|| {
+            self.missing.replace(Some(format!("the input `{name}`")));
+            Expr::Literal(Value::Null)
+        }))
+    }
+
+    /// What a bare word in effects stands for, where it is an output.
+    pub(crate) fn output(&self, word: &str) -> Option<Expr> {
+        self.signature.outputs.contains_key(word).then(|| {
+            if !self.written.contains(word) {
+                self.missing.replace(Some(format!("the output `{word}`")));
+            }
+            Expr::Output(word.to_owned())
+        })
+    }
+
+    /// An error in one of the action's texts, for the state that uses the action.
+    pub(crate) fn told(&self, text: &str, message: &str) -> String {
+        format!("the catalogue says `{text}` of `{}`: {message}", self.name)
+    }
+}
+
+/// The keys that say what a state is; one stands in the place of all.
+const NATURES: [&str; 3] = ["computes", "senses", "pia"];
+
+/// The annotations of one state, its own before those of its action.
+pub(crate) struct InForce<'b> {
+    body: &'b Node,
+    action: Option<(Annotations, Rc<Ports>, Location)>,
+    /// Who says what is in force, by key.
+    pub(crate) origin: BTreeMap<String, Origin>,
+}
+
+impl<'b> InForce<'b> {
+    /// Of a step whose inputs have been read.
+    pub(crate) fn of(fields: &Fields<'_, '_>, step: &Step<'b>, kind: &StateKind) -> InForce<'b> {
+        let says = || {
+            let (Form::Action { action: node }, StateKind::Action { inputs, outputs, .. }) = (&step.form, kind) else {
+                return None;
+            };
+            let (provider, action) = action_name(node)?;
+            let signature = fields.task.catalogue.action(&provider, &action)?;
+            if signature.annotations.is_empty() {
+                return None;
+            }
+            let ports = Ports {
+                name: format!("{provider}/{action}"),
+                signature: signature.clone(),
+                inputs: inputs.iter().cloned().collect(),
+                written: outputs.keys().cloned().collect(),
+                missing: RefCell::default(),
+            };
+            Some((signature.annotations.clone(), Rc::new(ports), node.at))
+        };
+        InForce { body: step.body, action: says(), origin: BTreeMap::new() }
+    }
+
+    /// What is said under a key, read.
+    pub(crate) fn read<T>(
+        &mut self,
+        fields: &mut Fields<'_, '_>,
+        key: &'static str,
+        read: impl FnOnce(&mut Fields<'_, '_>, &Node) -> T,
+    ) -> Option<T> {
+        if let Some(node) = self.body.get(key) {
+            self.origin.insert(key.to_owned(), Origin::State);
+            return Some(read(fields, node));
+        }
+        self.of_action(fields, key, read)
+    }
+
+    /// What the state changes: what it says, and what its action changes beside that.
+    pub(crate) fn effects(
+        &mut self,
+        fields: &mut Fields<'_, '_>,
+        read: impl Fn(&mut Fields<'_, '_>, &Node) -> BTreeMap<String, Vec<EffectExpr>>,
+    ) -> BTreeMap<String, Vec<EffectExpr>> {
+        let Some(node) = self.body.get("effects") else {
+            return self.of_action(fields, "effects", read).unwrap_or_default();
+        };
+        let mut changed = read(fields, node);
+        let own: Vec<FactExpr> = changed.get(SUCCESS).into_iter().flatten().filter_map(fact).cloned().collect();
+        let mut more = self.of_action(fields, "effects", read).unwrap_or_default().remove(SUCCESS).unwrap_or_default();
+        more.retain(|effect| fact(effect).is_none_or(|fact| !own.contains(fact)));
+        let from = if more.is_empty() { Origin::State } else { Origin::Both };
+        self.origin.insert("effects".to_owned(), from);
+        if !more.is_empty() {
+            let own = changed.entry(SUCCESS.to_owned()).or_default();
+            own.splice(..0, more);
+        }
+        changed
+    }
+
+    fn of_action<T>(
+        &mut self,
+        fields: &mut Fields<'_, '_>,
+        key: &'static str,
+        read: impl FnOnce(&mut Fields<'_, '_>, &Node) -> T,
+    ) -> Option<T> {
+        let (said, ports, at) = self.action.as_ref()?;
+        let node = node(said, key, *at)?;
+        fields.view.action = Some(Rc::clone(ports));
+        let value = read(fields, &node);
+        fields.view.action = None;
+        let Some(missing) = ports.missing.take() else {
+            self.origin.insert(key.to_owned(), Origin::Action);
+            return Some(value);
+        };
+        // What the state says itself is all that is known then; a required input that is missing is an error of its own.
+        let is_refused = ports.signature.inputs.keys().any(|input| ports.inputs.get(input).is_none());
+        if self.body.get(key).is_none() && !is_refused {
+            let action = &ports.name;
+            let message = format!(
+                "what `{action}` says under `{key}` needs {missing}, which this state does not have: it is not in force"
+            );
+            let (at, path) = (*at, fields.path.clone());
+            let help = format!("say `{key}` here");
+            fields.out.findings.warning("annotation-not-in-force", at, &path, message, help);
+        }
+        None
+    }
+
+    /// What the state is, where it does not say so itself.
+    pub(crate) fn nature(
+        &mut self,
+        fields: &mut Fields<'_, '_>,
+        own: impl FnOnce(&mut Fields<'_, '_>) -> Nature,
+    ) -> Nature {
+        let said: Vec<&str> = NATURES.into_iter().filter(|key| self.body.get(key).is_some()).collect();
+        if !said.is_empty() {
+            self.origin.extend(said.into_iter().map(|key| (key.to_owned(), Origin::State)));
+            return own(fields);
+        }
+        if self.action.as_ref().is_some_and(|(said, ..)| said.computes) {
+            self.origin.insert(NATURES[0].to_owned(), Origin::Action);
+            return Nature::Computes;
+        }
+        let senses = |fields: &mut Fields<'_, '_>, node: &Node| {
+            node.items().into_iter().filter_map(|fact| fields.fact(fact)).collect()
+        };
+        self.read(fields, "senses", senses).map_or_else(Nature::default, Nature::Senses)
+    }
+}
+
+/// The fact that an effect is about, of one.
+fn fact(effect: &EffectExpr) -> Option<&FactExpr> {
+    match effect {
+        EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => Some(fact),
+        EffectExpr::ForEach { .. } => None,
+    }
+}
+
+/// What an action says under a key, as if it stood in the file where the state names the action.
+fn node(said: &Annotations, key: &str, at: Location) -> Option<Node> {
+    let place = |content| Node { at, offset: None, content };
+    let list = |texts: &[String]| {
+        let text = |text: &String| place(Content::Text(text.clone()));
+        place(Content::List(texts.iter().map(text).collect()))
+    };
+    let some = |texts: &[String]| (!texts.is_empty()).then(|| list(texts));
+    match key {
+        "reads" => said.reads.as_deref().map(list),
+        "senses" => some(&said.senses),
+        "requires" => some(&said.requires),
+        "effects" => said.effects.as_deref().map(list),
+        "resources" => some(&said.resources),
+        "duration" => said.duration.as_ref().map(|text| place(Content::Text(text.clone()))),
+        _ => None,
+    }
+}

@@ -1,0 +1,115 @@
+//! What an action says in the catalogue is in force for the states that perform it, as if each had said it.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_model::catalogue::Catalogue;
+use ratn_model::in_force::in_force;
+use ratn_model::load::load;
+use ratn_model::program::Program;
+
+fn program(states: &str) -> Program {
+    let task = format!(
+        "task: t\nworld: [\"hand_empty(gripper)\", \"at(box_1) = pose(0, 0, 0)\", \"posture(arm) = home\"]\nstates:\n{states}"
+    );
+    match load(&task, "t.yaml", &Catalogue::standard()) {
+        Ok(loaded) => loaded.program,
+        Err(findings) => panic!("{findings:#?}\n{task}"),
+    }
+}
+
+/// What is in force, without who says it.
+fn held(states: &str) -> Vec<(String, &'static str, String)> {
+    let told = in_force(&program(states)).into_iter();
+    told.flat_map(|state| state.lines.into_iter().map(move |line| (state.state.clone(), line.key, line.text))).collect()
+}
+
+const GRASP: &str = "
+  - plan: { action: path_planner/plan, in: { start: \"joints(0, 0, 0, 0, 0, 0, 0)\", goal: \"joints(1, 0, 0, 0, 0, 0, 0)\" } }
+  - for: name in [box_1]
+    do:
+      - grasp:
+          action: gripper/grasp
+          in: { object: $name, expected: plan.end_pose }";
+
+#[test]
+fn a_state_that_says_nothing_is_as_one_that_says_what_its_action_does() {
+    let whole = format!(
+        "{}
+          pia: true
+          reads: [at($name)]
+          requires: [hand_empty(gripper)]
+          effects: [\"in_gripper($name) = plan.end_pose\", not hand_empty(gripper)]
+          resources: [{{ block: Arm }}, {{ block: Gripper }}]
+          duration: 1.1
+",
+        GRASP.replace(
+            " } }\n",
+            " }, computes: true, reads: [at(?), shape(?), in_gripper(?)], resources: [{ block: PathPlanner }, world_model] }\n"
+        )
+        .replace("[at(?), shape(?), in_gripper(?)]", "[\"at(?)\", \"shape(?)\", \"in_gripper(?)\"]")
+    );
+    assert_eq!(held(&format!("{GRASP}\n")), held(&whole));
+}
+
+#[test]
+fn what_a_state_says_stands_in_place_and_its_effects_are_added() {
+    let states = "
+  - tuck:
+      action: arm/move_to
+      in: { joints: \"joints(1, 0, 0, 0, 0, 0, 0)\" }
+      reads: [\"at(base)\"]
+      effects: [\"posture(arm) = tucked\"]
+  - back:
+      action: arm/move_to
+      in: { joints: \"joints(0, 0, 0, 0, 0, 0, 0)\" }
+      effects: [\"arm_at(arm) = home\", \"posture(arm) = home\"]
+";
+    let held = held(states);
+    let of =
+        |state: &str, key: &str| held.iter().find(|(s, k, _)| s == state && *k == key).map(|(.., text)| text.as_str());
+    assert_eq!(of("tuck", "reads"), Some("at(base)"));
+    let added = "set arm_at(arm) = joints(1, 0, 0, 0, 0, 0, 0); set posture(arm) = tucked";
+    assert_eq!(of("tuck", "effects"), Some(added), "a fact of one's own does not hide that the arm has moved");
+    assert_eq!(of("back", "effects"), Some("set arm_at(arm) = home; set posture(arm) = home"));
+}
+
+#[test]
+fn what_an_action_says_of_an_output_that_the_state_does_not_take_is_not_in_force() {
+    let task = "task: t\nstates:\n  - where: { action: arm/where, out: {} }\n";
+    let loaded = load(task, "t.yaml", &Catalogue::standard()).unwrap();
+    let told: Vec<&str> = loaded.warnings.iter().map(|warning| warning.rule.as_ref()).collect();
+    assert!(told.contains(&"annotation-not-in-force"), "{:#?}", loaded.warnings);
+    assert!(loaded.program.states[1].annotations.effects.get("success").is_none(), "it may change everything");
+}
+
+#[test]
+fn a_catalogue_whose_annotations_do_not_read_is_refused_with_action_key_and_text() {
+    let refused = |annotations: &str| {
+        let text = format!(
+            "[resources.Eye]\nclass = \"module\"\ncount = 1\n[providers.eye]\nresource = \"Eye\"\n[providers.eye.actions.look]\n\
+             inputs = {{ at = \"pose\" }}\noutputs = {{ seen = \"bool\" }}\nannotations = {{ {annotations} }}\n"
+        );
+        Catalogue::from_toml(&text).unwrap_err().to_string()
+    };
+    let port = refused("reads = [\"at($too)\"]");
+    assert!(
+        port.contains("eye/look") && port.contains("`reads: at($too)`") && port.contains("no input `too`"),
+        "{port}"
+    );
+    let state = refused("effects = [\"seen(box) = plan.end\"]");
+    assert!(state.contains("an action knows no states"), "{state}");
+    let both = refused("computes = true, effects = [\"seen(box)\"]");
+    assert!(both.contains("what only computes has no effects"), "{both}");
+    let other = refused("resources = [\"Arm\"]");
+    assert!(other.contains("lacks `Eye`"), "{other}");
+}
+
+#[test]
+fn the_digest_of_a_task_covers_what_its_actions_say() {
+    let task = "task: t\nstates:\n  - feel: { action: gripper/feel }\n";
+    let mut other = Catalogue::standard();
+    let feel = other.providers.get_mut("gripper").unwrap().actions.get_mut("feel").unwrap();
+    feel.annotations.duration = Some("3".to_owned());
+    let digest = |catalogue: &Catalogue| load(task, "t.yaml", catalogue).unwrap().program.digest;
+    assert_ne!(digest(&Catalogue::standard()), digest(&other));
+}
