@@ -264,7 +264,7 @@ states:
 
 #[test]
 fn a_program_survives_json() {
-    let program = program(FETCH);
+    let program = load(FETCH, "task.yaml", &Catalogue::standard()).unwrap().program;
     let json = serde_json::to_string(&program).unwrap();
     assert_eq!(serde_json::from_str::<Program>(&json).unwrap(), program);
 }
@@ -304,6 +304,6 @@ proptest! {
         let clip = |mut i: usize| { while !FETCH.is_char_boundary(i) { i -= 1; } i };
         let (from, to) = (clip(at), clip((at + length).min(FETCH.len())));
         let damaged = format!("{}{inserted}{}", &FETCH[..from], &FETCH[to..]);
-        let _ = check(&damaged);
+        let _ = load(&damaged, "task.yaml", &Catalogue::standard());
     }
 }
