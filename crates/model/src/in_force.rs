@@ -120,7 +120,7 @@ states:
         plan resources: block PathPlanner; block WorldModel (Some(Action))
         plan duration: 2 (Some(State))
         grasp pia: true (Some(State))
-        grasp reads: at(box_1) (Some(Action))
+        grasp reads: at(base); at(box_1) (Some(Action))
         grasp requires: hand_empty(gripper) (Some(Action))
         grasp effects: set in_gripper(box_1) = plan.end_pose; delete hand_empty(gripper) (Some(Action))
         grasp resources: block Arm; block Gripper (Some(Action))

@@ -36,7 +36,7 @@ fn a_state_that_says_nothing_is_as_one_that_says_what_its_action_does() {
     let whole = format!(
         "{}
           pia: true
-          reads: [at($name)]
+          reads: [at(base), at($name)]
           requires: [hand_empty(gripper)]
           effects: [\"in_gripper($name) = plan.end_pose\", not hand_empty(gripper)]
           resources: [{{ block: Arm }}, {{ block: Gripper }}]
@@ -57,7 +57,7 @@ fn what_a_state_says_stands_in_place_and_its_effects_are_added() {
   - tuck:
       action: arm/move_to
       in: { joints: \"joints(1, 0, 0, 0, 0, 0, 0)\" }
-      reads: [\"at(base)\"]
+      reads: [\"at(table)\"]
       effects: [\"posture(arm) = tucked\"]
   - back:
       action: arm/move_to
@@ -67,7 +67,7 @@ fn what_a_state_says_stands_in_place_and_its_effects_are_added() {
     let held = held(states);
     let of =
         |state: &str, key: &str| held.iter().find(|(s, k, _)| s == state && *k == key).map(|(.., text)| text.as_str());
-    assert_eq!(of("tuck", "reads"), Some("at(base)"));
+    assert_eq!(of("tuck", "reads"), Some("at(table)"));
     let added = "set arm_at(arm) = joints(1, 0, 0, 0, 0, 0, 0); set posture(arm) = tucked";
     assert_eq!(of("tuck", "effects"), Some(added), "a fact of one's own does not hide that the arm has moved");
     assert_eq!(of("back", "effects"), Some("set arm_at(arm) = home; set posture(arm) = home"));

@@ -147,7 +147,7 @@ impl<'b> InForce<'b> {
             return Some(value);
         };
         // What the state says itself is all that is known then; a required input that is missing is an error of its own.
-        let is_refused = ports.signature.inputs.keys().any(|input| ports.inputs.get(input).is_none());
+        let is_refused = ports.signature.inputs.keys().any(|input| !ports.inputs.contains_key(input));
         if self.body.get(key).is_none() && !is_refused {
             let action = &ports.name;
             let message = format!(
