@@ -1,7 +1,7 @@
 //! What a state's action says in the state's place: annotations of the catalogue, in terms of what the state gives the action's ports.
 //!
 //! The rule: what a state says under a key stands in place of what its action says under it; but what it says under `effects` is added to what the
-//! action changes, and stands in place of that only for the same facts. (Else a state that names a fact of its own would silently promise that
+//! action changes, and stands in place of that only where it is of the same predicate. (Else a state that names a fact of its own would silently promise that
 //! the arm did not move.) `computes`, `senses` and `pia` count as one key. An annotation that needs an input which the state does not give is not in force, and a warning says so: without it the state may
 //! read and change more, which is safe.
 
@@ -11,7 +11,7 @@ use super::state::action_name;
 use super::yaml::{Content, Node};
 use crate::catalogue::{ActionSignature, Annotations, unknown_input};
 use crate::expression::parse::NameError;
-use crate::expression::{EffectExpr, Expr, FactExpr};
+use crate::expression::{EffectExpr, Expr};
 use crate::program::{Location, Nature, Origin, SUCCESS, StateKind};
 use crate::value::Value;
 use std::cell::RefCell;
@@ -119,9 +119,10 @@ impl<'b> InForce<'b> {
             return self.of_action(fields, "effects", read).unwrap_or_default();
         };
         let mut changed = read(fields, node);
-        let own: Vec<FactExpr> = changed.get(SUCCESS).into_iter().flatten().filter_map(fact).cloned().collect();
+        let own: BTreeSet<String> =
+            changed.get(SUCCESS).into_iter().flatten().filter_map(predicate).map(str::to_owned).collect();
         let mut more = self.of_action(fields, "effects", read).unwrap_or_default().remove(SUCCESS).unwrap_or_default();
-        more.retain(|effect| fact(effect).is_none_or(|fact| !own.contains(fact)));
+        more.retain(|effect| predicate(effect).is_none_or(|predicate| !own.contains(predicate)));
         let from = if more.is_empty() { Origin::State } else { Origin::Both };
         self.origin.insert("effects".to_owned(), from);
         if !more.is_empty() {
@@ -182,10 +183,10 @@ impl<'b> InForce<'b> {
     }
 }
 
-/// The fact that an effect is about, of one.
-fn fact(effect: &EffectExpr) -> Option<&FactExpr> {
+/// What an effect on one fact says something of.
+fn predicate(effect: &EffectExpr) -> Option<&str> {
     match effect {
-        EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => Some(fact),
+        EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => Some(&fact.predicate),
         EffectExpr::ForEach { .. } => None,
     }
 }
