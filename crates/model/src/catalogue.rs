@@ -43,7 +43,15 @@ impl Catalogue {
     pub fn from_toml(text: &str) -> Result<Catalogue, InvalidCatalogue> {
         let catalogue: Catalogue =
             toml::from_str(text).map_err(|error| InvalidCatalogue(error.to_string().trim_end().to_owned()))?;
-        for (name, provider) in &catalogue.providers {
+        catalogue.check().map(|()| catalogue)
+    }
+
+    /// Whether all that it says of actions reads.
+    ///
+    /// # Errors
+    /// [`InvalidCatalogue`] with the first annotation that does not.
+    pub fn check(&self) -> Result<(), InvalidCatalogue> {
+        for (name, provider) in &self.providers {
             for (action, signature) in &provider.actions {
                 let wrong = |error| InvalidCatalogue(format!("annotations of {name}/{action}: {error}"));
                 signature.annotations.check(signature).map_err(wrong)?;
@@ -56,7 +64,7 @@ impl Catalogue {
                 }
             }
         }
-        Ok(catalogue)
+        Ok(())
     }
 
     /// The catalogue of the bundled system (`deploy/catalogue.toml`).

@@ -4,7 +4,8 @@
 use crate::check::{named, named_in};
 use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::id::StateId;
-use crate::program::{Annotations, Nature, Origin, Program, SUCCESS, StateKind};
+use crate::program::{Annotations, Nature, Origin, Program, ResourceExpr, SUCCESS, StateKind};
+use crate::resource::Quantity;
 use serde::Serialize;
 use std::collections::BTreeSet;
 use std::fmt::Display;
@@ -51,8 +52,7 @@ fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
         let flows = |fact: &FactExpr| fact.arguments.iter().flatten().flat_map(Expr::flows).collect();
         listed(program, facts, flows)
     };
-    let required = listed(program, &said.requires, Expr::flows);
-    let changed = |effects: &Vec<EffectExpr>| {
+    let changed = |effects: &[EffectExpr]| {
         let flows = |effect: &EffectExpr| {
             let mut states = BTreeSet::new();
             effect.each_expression(&mut |part| states.extend(part.flows()));
@@ -60,9 +60,12 @@ fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
         };
         listed(program, effects, flows)
     };
-    let blocked: Vec<String> = said.resources.iter().map(|line| format!("{} {}", line.operation, line.kind)).collect();
     let unknown = || "unknown".to_owned();
     let everything = || "everything".to_owned();
+    // Of other outcomes, those that change something.
+    let mut effects = vec![said.effects.get(SUCCESS).map_or_else(everything, |effects| changed(effects))];
+    let others = said.effects.iter().filter(|(outcome, effects)| *outcome != SUCCESS && !effects.is_empty());
+    effects.extend(others.map(|(outcome, effects)| format!("{outcome}: {}", changed(effects))));
     vec![
         match &said.nature {
             Nature::Computes => line("computes", "true".to_owned()),
@@ -70,11 +73,26 @@ fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
             Nature::Irreversible => line("pia", "true".to_owned()),
         },
         line("reads", said.reads.as_ref().map_or_else(everything, |read| facts(read))),
-        line("requires", required),
-        line("effects", said.effects.get(SUCCESS).map_or_else(everything, changed)),
-        line("resources", listed(program, &blocked, |_| BTreeSet::new())),
+        line("requires", listed(program, &said.requires, Expr::flows)),
+        line("effects", effects.join("; ")),
+        line(
+            "resources",
+            if said.resources.is_empty() { "nothing".to_owned() } else { resources(program, &said.resources) },
+        ),
         line("duration", said.duration_s.as_ref().map_or_else(unknown, |duration| named(program, duration))),
     ]
+}
+
+/// `block Arm where arm = left; consume 0.2 Battery`
+fn resources(program: &Program, lines: &[ResourceExpr]) -> String {
+    let shown = |line: &ResourceExpr| {
+        let count = if line.count == Quantity::ONE { String::new() } else { format!("{} ", line.count) };
+        let attributes = line.attributes.iter().map(|(name, value)| format!("{name} = {}", named(program, value)));
+        let selected: Vec<String> = attributes.chain(line.conditions.iter().map(ToString::to_string)).collect();
+        let selected = if selected.is_empty() { String::new() } else { format!(" where {}", selected.join(", ")) };
+        format!("{} {count}{}{selected}", line.operation, line.kind)
+    };
+    lines.iter().map(shown).collect::<Vec<_>>().join("; ")
 }
 
 /// With the names of states in the place of their numbers.

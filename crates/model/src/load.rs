@@ -40,7 +40,7 @@ pub(crate) use names::distance;
 pub use names::suggestion;
 pub use yaml::MAX_SOURCE;
 
-use crate::catalogue::{ActionSignature, Catalogue};
+use crate::catalogue::Catalogue;
 use crate::check;
 use crate::diagnostic::{Diagnostic, Findings, Severity};
 use crate::expression::EffectExpr;
@@ -49,7 +49,7 @@ use crate::guard;
 use crate::id::StateId;
 use crate::ontology::Ontology;
 use crate::ontology::turtle::{self, OntologyError};
-use crate::program::{Parameter, Program, StateKind, TaskOutput};
+use crate::program::{Origin, Parameter, Program, State, StateKind, TaskOutput};
 use crate::value::{Type, Value};
 use fields::{Fields, Output};
 use names::{Ports, Task, View};
@@ -207,14 +207,15 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     let mut hasher = blake3::Hasher::new();
     hasher.update(source.as_bytes());
     hasher.update(ontology_text.unwrap_or_default().as_bytes());
+    // What actions say belongs to the task, as what its libraries say does.
+    for (action, said) in said_by_actions(&states, catalogue) {
+        hasher.update(action.as_bytes());
+        hasher.update(said.as_bytes());
+    }
     for (id, library) in &task.libraries {
         hasher.update(library.digest.as_bytes());
         graft::graft(&mut states, *id, library, &task.in_sight(*id));
         out.libraries.push(task.outline.step(*id).path.clone());
-    }
-    // What actions say belongs to the task, as what its libraries say does.
-    for (name, signature) in used(&task) {
-        hasher.update(format!("{name}: {:?}", signature.annotations).as_bytes());
     }
     let digest = hasher.finalize().to_hex().to_string();
     let mut program = Program {
@@ -251,17 +252,16 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     Some(program)
 }
 
-/// The actions that say something of the states that use them, by name.
-fn used<'t>(task: &Task<'t>) -> BTreeMap<String, &'t ActionSignature> {
-    let named = task.outline.steps.iter().filter_map(|step| match &step.form {
-        Form::Action { action } => state::action_name(action),
-        _ => None,
-    });
-    let signature = |(provider, action): (String, String)| {
-        let signature = task.catalogue.action(&provider, &action)?;
-        (!signature.annotations.is_empty()).then(|| (format!("{provider}/{action}"), signature))
+/// What actions say of states that do not say it themselves, as text, by action. A task that says everything itself is the same
+/// whatever the catalogue says.
+fn said_by_actions(states: &[State], catalogue: &Catalogue) -> BTreeMap<String, String> {
+    let relies = |state: &&State| state.annotations.origin.values().any(|origin| *origin != Origin::State);
+    let said = |state: &State| {
+        let StateKind::Action { provider, action, .. } = &state.kind else { return None };
+        let signature = catalogue.action(provider, action)?;
+        Some((format!("{provider}/{action}"), toml::to_string(&signature.annotations).unwrap_or_default()))
     };
-    named.filter_map(signature).collect()
+    states.iter().filter(relies).filter_map(said).collect()
 }
 
 fn horizon(fields: &mut Fields<'_, '_>, node: &Node) -> usize {

@@ -63,6 +63,11 @@ fn what_a_state_says_stands_in_place_and_its_effects_are_added() {
       action: arm/move_to
       in: { joints: \"joints(0, 0, 0, 0, 0, 0, 0)\" }
       effects: [\"arm_at(arm) = home\", \"posture(arm) = home\"]
+  - left:
+      action: arm/move_to
+      in: { joints: \"joints(0, 0, 0, 0, 0, 0, 0)\" }
+      effects: { success: [\"arm_at(left) = out\"], aborted: [\"posture(arm) = lost\"] }
+      resources: [{ block: Arm, where: { arm: left } }]
 ";
     let held = held(states);
     let of =
@@ -71,6 +76,12 @@ fn what_a_state_says_stands_in_place_and_its_effects_are_added() {
     let added = "set arm_at(arm) = joints(1, 0, 0, 0, 0, 0, 0); set posture(arm) = tucked";
     assert_eq!(of("tuck", "effects"), Some(added), "a fact of one's own does not hide that the arm has moved");
     assert_eq!(of("back", "effects"), Some("set arm_at(arm) = home; set posture(arm) = home"));
+    assert_eq!(
+        of("left", "effects"),
+        Some("set arm_at(left) = out; aborted: set posture(arm) = lost"),
+        "of two arms, the one it names"
+    );
+    assert_eq!(of("left", "resources"), Some("block Arm where arm = left"));
 }
 
 #[test]
@@ -112,4 +123,8 @@ fn the_digest_of_a_task_covers_what_its_actions_say() {
     feel.annotations.duration = Some("3".to_owned());
     let digest = |catalogue: &Catalogue| load(task, "t.yaml", catalogue).unwrap().program.digest;
     assert_ne!(digest(&Catalogue::standard()), digest(&other));
+    // One that says all of it itself is the same, whatever the catalogue says.
+    let whole = "task: t\nstates:\n  - feel: { action: gripper/feel, reads: [], effects: [], resources: [Gripper], duration: 1 }\n";
+    let digest = |catalogue: &Catalogue| load(whole, "t.yaml", catalogue).unwrap().program.digest;
+    assert_eq!(digest(&Catalogue::standard()), digest(&other));
 }

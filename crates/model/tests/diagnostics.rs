@@ -2,19 +2,14 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
+mod support;
+
 use insta::assert_snapshot;
 use proptest::prelude::*;
 use ratn_model::catalogue::Catalogue;
 use ratn_model::load::load;
 use ratn_model::program::{Nature, Program, StateKind};
-
-/// The standard actions, of which the catalogue says nothing: what is refused here is what states say themselves.
-fn unannotated() -> Catalogue {
-    let mut catalogue = Catalogue::standard();
-    let actions = catalogue.providers.values_mut().flat_map(|provider| provider.actions.values_mut());
-    actions.for_each(|action| action.annotations = Default::default());
-    catalogue
-}
+use support::unannotated;
 
 const FETCH: &str = include_str!("../../../examples/fetch_boxes.yaml");
 

@@ -2,21 +2,15 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
-use ratn_model::catalogue::Catalogue;
+mod support;
+
 use ratn_model::expression::Expr;
 use ratn_model::id::StateId;
 use ratn_model::load::{Files, Loaded, load_with};
 use ratn_model::program::{StateKind, Target};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
-
-/// The standard actions, of which the catalogue says nothing: what is refused here is what states say themselves.
-fn unannotated() -> Catalogue {
-    let mut catalogue = Catalogue::standard();
-    let actions = catalogue.providers.values_mut().flat_map(|provider| provider.actions.values_mut());
-    actions.for_each(|action| action.annotations = Default::default());
-    catalogue
-}
+use support::unannotated;
 
 /// Files by name.
 struct Shelf(BTreeMap<&'static str, &'static str>);

@@ -24,7 +24,7 @@ impl Action for Talker {
     fn signature(&self) -> Option<Signature> {
         let mut said = self.0.clone()?;
         for number in 0..self.1 {
-            said = said.reads(&format!("fact_{number}({})", "?, ".repeat(100)));
+            said = said.reads(&format!("fact_{number}({}?)", "?, ".repeat(100)));
         }
         Some(said)
     }
@@ -87,7 +87,7 @@ impl Action for Wordy {
     }
 
     fn signature(&self) -> Option<Signature> {
-        Some((0..self.0).fold(Signature::new(), |signature, _| signature.reads(&"x".repeat(512))))
+        Some((0..self.0).fold(Signature::new(), |signature, _| signature.reads(&format!("{}()", "x".repeat(510)))))
     }
 
     async fn execute(&self, _: GoalContext) -> ActionResult {
@@ -107,6 +107,9 @@ async fn what_nobody_would_believe_is_refused_where_the_worker_starts() {
     let wrong = || defaulted(Type::Int, Value::String("fast".to_owned()));
     assert_eq!(refused(ActionServer::builder("").action(wrong()).check()), words);
     assert_eq!(performed(wrong(), []).await.unwrap_err(), words);
+    let unread = Talker(Some(Signature::new().requires("hand_empty($hand)")), 0);
+    let why = "action `talk`: `requires: hand_empty($hand)`: the action has no input `hand`";
+    assert_eq!(refused(ActionServer::builder("").action(unread).check()), why);
     // What is not told by its text, either.
     let pose = defaulted(Type::Joints, Value::Pose(ratn_model::pose::Pose::at(1.0, 0.0, 0.0)));
     assert!(refused(ActionServer::builder("").action(pose).check()).contains("which is no joints"));

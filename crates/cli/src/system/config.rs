@@ -285,6 +285,7 @@ impl SystemConfig {
             }
             self.parts = Parts { modules, joints, chain, attributes };
         }
+        self.catalogue.check().context("`catalogue`")?;
         self.parts.fit(&mut self.catalogue, &self.process_manager.templates);
         self.process_manager_config().templates.iter().try_for_each(|template| self.check_told(template))
     }

@@ -1,7 +1,7 @@
 //! What a worker says of itself: its provider's name, the kind of resource that it is, and its actions with their ports. Somebody else's
 //! words: it is believed only within these bounds.
 
-use super::{ActionSignature, Catalogue, Provider, ResourceOffer};
+use super::{ActionSignature, Catalogue, InvalidAnnotation, Provider, ResourceOffer};
 use crate::expression::parse::parse_expression;
 use crate::expression::scope::NothingKnown;
 use crate::expression::{Expr, Function};
@@ -88,6 +88,18 @@ pub enum DescriptionError {
         default: String,
         /// The port's type.
         expected: Type,
+    },
+    /// An annotation that does not read.
+    #[error("action `{action}`: `{key}: {text}`: {why}")]
+    Annotation {
+        /// Of which action.
+        action: String,
+        /// Under which key.
+        key: &'static str,
+        /// As it says it, cut.
+        text: String,
+        /// What is wrong, cut.
+        why: String,
     },
     /// More than is read.
     #[error("it has {bytes} bytes: at most {most} are taken")]
@@ -200,7 +212,13 @@ fn check(action: &str, signature: &ActionSignature) -> Result<(), DescriptionErr
         }
     }
     let mut lists = annotations.lists().into_iter();
-    lists.try_for_each(|(key, list)| list.iter().try_for_each(|said| text(key, &of, said, TEXT_BYTES)))
+    lists.try_for_each(|(key, list)| list.iter().try_for_each(|said| text(key, &of, said, TEXT_BYTES)))?;
+    annotations.check(signature).map_err(|InvalidAnnotation { key, text, message, .. }| DescriptionError::Annotation {
+        action: shown(action),
+        key,
+        text: shown(&text),
+        why: shown(&message),
+    })
 }
 
 /// Whether a default as people write it may be of this type. What is no plain constant (a trajectory, a pose with a quaternion) may be anything,

@@ -1,9 +1,11 @@
 //! What a state's action says in the state's place: annotations of the catalogue, in terms of what the state gives the action's ports.
 //!
-//! The rule: what a state says under a key stands in place of what its action says under it; but what it says under `effects` is added to what the
-//! action changes, and stands in place of that only where it is of the same predicate. (Else a state that names a fact of its own would silently promise that
-//! the arm did not move.) `computes`, `senses` and `pia` count as one key. An annotation that needs an input which the state does not give is not in force, and a warning says so: without it the state may
-//! read and change more, which is safe.
+//! The rule: what a state says under a key stands in place of what its action says under it. `computes`, `senses` and `pia` count as one key. Only
+//! `effects` add up: a state's stand in place of the action's of the same predicate alone. (Else a state that names a fact of its own would
+//! silently promise that the arm did not move.)
+//!
+//! An annotation that needs an input which the state does not give is not in force, and a warning says so: without it the state may read and
+//! change more, which is safe.
 
 use super::fields::Fields;
 use super::outline::{Form, Step};
@@ -63,17 +65,17 @@ impl Ports {
 /// The keys that say what a state is; one stands in the place of all.
 const NATURES: [&str; 3] = ["computes", "senses", "pia"];
 
-/// The annotations of one state, its own before those of its action.
-pub(crate) struct InForce<'b> {
+/// Where the annotations of one state come from: the state, then its action.
+pub(crate) struct Sources<'b> {
     body: &'b Node,
     action: Option<(Annotations, Rc<Ports>, Location)>,
     /// Who says what is in force, by key.
     pub(crate) origin: BTreeMap<String, Origin>,
 }
 
-impl<'b> InForce<'b> {
+impl<'b> Sources<'b> {
     /// Of a step whose inputs have been read.
-    pub(crate) fn of(fields: &Fields<'_, '_>, step: &Step<'b>, kind: &StateKind) -> InForce<'b> {
+    pub(crate) fn of(fields: &Fields<'_, '_>, step: &Step<'b>, kind: &StateKind) -> Sources<'b> {
         let says = || {
             let (Form::Action { action: node }, StateKind::Action { inputs, outputs, .. }) = (&step.form, kind) else {
                 return None;
@@ -92,7 +94,7 @@ impl<'b> InForce<'b> {
             };
             Some((signature.annotations.clone(), Rc::new(ports), node.at))
         };
-        InForce { body: step.body, action: says(), origin: BTreeMap::new() }
+        Sources { body: step.body, action: says(), origin: BTreeMap::new() }
     }
 
     /// What is said under a key, read.
@@ -183,7 +185,7 @@ impl<'b> InForce<'b> {
     }
 }
 
-/// What an effect on one fact says something of.
+/// The predicate that an effect on one fact changes.
 fn predicate(effect: &EffectExpr) -> Option<&str> {
     match effect {
         EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => Some(&fact.predicate),

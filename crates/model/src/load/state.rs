@@ -1,6 +1,6 @@
 //! A step of the outline → a state: its kind with every expression read, and its annotations.
 
-use super::action::InForce;
+use super::action::Sources;
 use super::fields::{Fields, Output};
 use super::names::{Task, View};
 use super::outline::{Form, Step, Tests};
@@ -255,9 +255,9 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
         _ => boundary(Vec::new()),
     };
     let waits_s = annotations.timeout_s;
-    let mut in_force = InForce::of(fields, step, kind);
-    annotations.nature = in_force.nature(fields, |fields| nature(fields, body));
-    let read = in_force.read(fields, "reads", |fields, node| {
+    let mut sources = Sources::of(fields, step, kind);
+    annotations.nature = sources.nature(fields, |fields| nature(fields, body));
+    let read = sources.read(fields, "reads", |fields, node| {
         fields.note("reads", node.at);
         node.items().into_iter().flat_map(|item| reads(fields, item)).collect()
     });
@@ -267,7 +267,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
         // What a sensing state reads is what it senses.
         annotations.reads = Some(Vec::new());
     }
-    let requires = in_force.read(fields, "requires", |fields, node| {
+    let requires = sources.read(fields, "requires", |fields, node| {
         let required = |(i, node): (usize, &Node)| {
             fields.note(format!("requires.{i}"), node.at);
             fields.expression(node)
@@ -288,7 +288,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
             annotations.effects.extend(custom.map(|outcome| (outcome.clone(), Vec::new())));
         }
     }
-    let changed = in_force.effects(fields, |fields, node| {
+    let changed = sources.effects(fields, |fields, node| {
         // As it ends, what a hierarchy contains has written its outputs.
         fields.view.inside = matches!(kind, StateKind::Sequence { .. } | StateKind::Concurrency { .. });
         fields.view.own_outputs = true;
@@ -298,7 +298,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
         changed
     });
     annotations.effects.extend(changed);
-    let resources = in_force.read(fields, "resources", |fields, node| {
+    let resources = sources.read(fields, "resources", |fields, node| {
         // What is created may be named by what the state put out; blocks are checked against that.
         fields.view.own_outputs = true;
         let resources = resources::list(fields, node);
@@ -307,7 +307,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
     });
     annotations.resources = resources.unwrap_or_default();
     annotations.routine = body.get("routine").is_some_and(|node| fields.flag(node));
-    let duration = in_force.read(fields, "duration", |fields, node| {
+    let duration = sources.read(fields, "duration", |fields, node| {
         fields.note("duration", node.at);
         let duration = fields.expression(node);
         if duration.as_ref().is_some_and(|duration| !duration.fact_expressions().is_empty()) {
@@ -317,7 +317,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
         duration
     });
     annotations.duration_s = duration.flatten().or(annotations.duration_s);
-    annotations.origin = in_force.origin;
+    annotations.origin = sources.origin;
     flow::annotate(fields, body, &mut annotations);
     annotations.timeout_s = annotations.timeout_s.or(waits_s);
     let holds = body.get("resources").into_iter().flat_map(Node::items).filter_map(|item| item.get("hold"));

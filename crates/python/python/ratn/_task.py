@@ -339,7 +339,7 @@ def delete(kind: str, **said: Any) -> dict[str, Any]:
 def perform(
     action: str, inputs: dict[str, Any], annotations: dict[str, Any], *, name: str | None = None, kind: str | None = None
 ) -> AnyState:
-    """Adds a state that performs ``provider/action``. It blocks what performs it, unless its resources are said."""
+    """Adds a state that performs ``provider/action``. Where nobody says its resources, it blocks one of ``kind``, which performs it."""
     at = user_line()
     trace = Trace.now(f"`{action}`")
     function = action.rpartition("/")[2]
@@ -388,7 +388,9 @@ class Provider:
                     known = ", ".join(sorted(ports)) or "none"
                     raise TypeError(f"`{self._name}.{action}` has no input `{key}`; it has {known}. Annotations are {', '.join(ANNOTATIONS)}")
                 inputs[key] = said.pop(key)
-        return perform(f"{self._name}/{action}", inputs, said, name=name, kind=self._provider["resource"])
+        # What the catalogue says that the action blocks is in force where the state says nothing.
+        kind = None if signature.get("annotations", {}).get("resources") else self._provider["resource"]
+        return perform(f"{self._name}/{action}", inputs, said, name=name, kind=kind)
 
 
 def action(name: str, /, inputs: dict[str, Any] | None = None, **annotations: Any) -> AnyState:
