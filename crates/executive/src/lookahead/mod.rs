@@ -9,7 +9,7 @@
 //! |---|---|
 //! | `problem`, `network`, `project` | what is to be done; as numbers; of that what has not begun |
 //! | `rollout` | the executive's dispatch, simulated |
-//! | `profile`, `schedule` | schedules from lists, for several units of several resources; double justification |
+//! | `packed`, `profile`, `schedule` | schedules from lists, for several units of several resources; double justification |
 //! | `population` | lists crossed, where resources have several units |
 //! | `disjunctive`, `tabu` | orders of machines and moves in critical blocks, where they have one |
 //! | `annealing` | other orders for the dispatch, where something is speculative |
@@ -24,6 +24,7 @@ mod dice;
 mod disjunctive;
 mod lookout;
 mod network;
+mod packed;
 mod population;
 mod problem;
 mod profile;

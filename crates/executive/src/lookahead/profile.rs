@@ -1,90 +1,87 @@
 //! What is free of several kinds over time, as a step function: where does something fit first?
 
-use super::network::Demand;
+use super::packed::Lanes;
+use std::ops::Range;
 
-/// Of so many kinds; the last step never ends.
+/// Of the kinds that have lanes; the last step never ends.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Profile {
-    kinds: usize,
+    lanes: Lanes,
     /// When a step begins; the first at 0.
     times: Vec<u64>,
-    /// Per step what is free of each kind.
+    /// Per step what is free, [`Lanes::words`] each.
     free: Vec<u64>,
 }
 
 impl Profile {
-    /// Everything is free.
-    pub(super) fn clear(&mut self, capacity: &[u64]) {
-        self.kinds = capacity.len();
+    /// With nothing in it yet.
+    pub(super) fn new(lanes: Lanes) -> Profile {
+        Profile { lanes, times: Vec::new(), free: Vec::new() }
+    }
+
+    /// Begins anew.
+    pub(super) fn clear(&mut self) {
         self.times.clear();
-        self.times.push(0);
         self.free.clear();
-        self.free.extend_from_slice(capacity);
     }
 
-    /// The earliest moment from `from` on at which so much is free for so long.
-    pub(super) fn earliest(&self, demands: &[Demand], from: u64, duration: u64) -> u64 {
-        if demands.is_empty() {
-            return from;
+    /// From a moment on, which is after all that were said, this is free.
+    pub(super) fn then(&mut self, from: u64, free: &[u64]) {
+        self.times.push(from);
+        self.free.extend_from_slice(free);
+    }
+
+    /// Takes so much for so long, at the earliest moment from `from` on at which it is free; that moment.
+    pub(super) fn take(&mut self, wanted: &[u64], from: u64, duration: u64) -> u64 {
+        let Some((start, first, last)) = self.earliest(wanted, from, duration) else { return from };
+        if duration == 0 {
+            return start;
         }
-        let mut start = from;
-        let mut step = self.step_at(from);
+        let end = start.saturating_add(duration);
+        if self.times.get(last + 1) != Some(&end) {
+            self.split(last, end);
+        }
+        let is_within = self.times[first] != start;
+        if is_within {
+            self.split(first, start);
+        }
+        for step in first..=last {
+            let words = self.words_of(step + usize::from(is_within));
+            for (free, wanted) in self.free[words].iter_mut().zip(wanted) {
+                *free = free.wrapping_sub(*wanted);
+            }
+        }
+        start
+    }
+
+    /// The moment, the step in which it is and that in which the duration ends; none where it is never free. Whoever compiled the
+    /// demands bounded them.
+    fn earliest(&self, wanted: &[u64], from: u64, duration: u64) -> Option<(u64, usize, usize)> {
+        let mut first = self.times.partition_point(|time| *time <= from) - 1;
+        let (mut start, mut end, mut step) = (from, from.saturating_add(duration), first);
         loop {
-            if self.has(step, demands) {
-                step += 1;
-                if step == self.times.len() || self.times[step] >= start.saturating_add(duration) {
-                    return start;
-                }
-            } else {
-                step += 1;
-                if step == self.times.len() {
-                    // More is asked for than the last step has: it is never free. Whoever compiled the demands bounded them.
-                    return start;
-                }
-                start = self.times[step];
+            let has = self.lanes.has(&self.free[self.words_of(step)], wanted);
+            let next = self.times.get(step + 1);
+            if !has {
+                (start, first) = (*next?, step + 1);
+                end = start.saturating_add(duration);
+            } else if next.is_none_or(|next| *next >= end) {
+                return Some((start, first, step));
             }
+            step += 1;
         }
     }
 
-    /// It is taken from `start` for so long.
-    pub(super) fn take(&mut self, demands: &[Demand], start: u64, duration: u64) {
-        if demands.is_empty() || duration == 0 {
-            return;
-        }
-        let first = self.split(start);
-        let last = self.split(start.saturating_add(duration));
-        for step in first..last {
-            for demand in demands {
-                let free = &mut self.free[step * self.kinds + demand.kind as usize];
-                *free = free.saturating_sub(demand.units);
-            }
-        }
+    fn words_of(&self, step: usize) -> Range<usize> {
+        let words = self.lanes.words();
+        step * words..(step + 1) * words
     }
 
-    fn has(&self, step: usize, demands: &[Demand]) -> bool {
-        let free = &self.free[step * self.kinds..(step + 1) * self.kinds];
-        demands.iter().all(|demand| free[demand.kind as usize] >= demand.units)
-    }
-
-    /// The step in which a moment is.
-    fn step_at(&self, moment: u64) -> usize {
-        self.times.partition_point(|time| *time <= moment) - 1
-    }
-
-    /// The step that begins at a moment, made where there is none.
-    fn split(&mut self, moment: u64) -> usize {
-        let step = self.step_at(moment);
-        if self.times[step] == moment {
-            return step;
-        }
-        let (from, to) = (step * self.kinds, (step + 1) * self.kinds);
+    /// Another step begins at a moment within a step, with the same free.
+    fn split(&mut self, step: usize, moment: u64) {
         self.times.insert(step + 1, moment);
-        let end = self.free.len();
-        self.free.extend_from_within(end - self.kinds..);
-        if to < end {
-            self.free.copy_within(to..end, to + self.kinds);
-        }
-        self.free.copy_within(from..to, to);
-        step + 1
+        let (words, end) = (self.words_of(step), self.free.len());
+        self.free.extend_from_within(end - words.len()..);
+        self.free.copy_within(words.start..end - words.len(), words.end);
     }
 }

@@ -6,7 +6,8 @@
 //! optimal. Justification moves all tasks as far to the end as they go, the last first, and then all to the beginning again, the
 //! first first; the schedule never becomes longer and often shorter (Valls, Ballestín, Quintanilla: Justification and RCPSP, 2005).
 
-use super::network::Demand;
+use super::network::{Demand, Lists};
+use super::packed::Lanes;
 use super::profile::Profile;
 use super::project::Project;
 use std::cmp::Reverse;
@@ -16,6 +17,11 @@ use std::collections::{BTreeSet, BinaryHeap};
 #[derive(Debug, Clone)]
 pub(super) struct Scheduler {
     profile: Profile,
+    /// By task what it needs, as words; nothing of one that needs nothing.
+    wanted: Lists<u64>,
+    /// What running tasks leave until when, the first end first; all is free after the last.
+    left: Vec<(u64, Vec<u64>)>,
+    all: Vec<u64>,
     /// When each task begins in the schedule made last.
     pub(super) starts: Vec<u64>,
     /// Of the time from the end: when each ends.
@@ -46,8 +52,15 @@ enum Ending {
 
 impl Scheduler {
     pub(super) fn new(project: &Project) -> Scheduler {
+        let demands = || (0..project.len() as u32).map(|task| project.demands.of_place(task));
+        let occupied = project.occupied.iter().map(|(_, demand)| demand);
+        let lanes = Lanes::of(&project.capacity, demands().flatten().chain(occupied));
+        let wanted = |demands: &[Demand]| if demands.is_empty() { Vec::new() } else { lanes.wanted(demands) };
         Scheduler {
-            profile: Profile::default(),
+            wanted: Lists::of(demands().map(wanted)),
+            left: left(project, &lanes),
+            all: lanes.free(&project.capacity),
+            profile: Profile::new(lanes),
             starts: vec![0; project.len()],
             mirrored: vec![0; project.len()],
             parallel: Parallel::default(),
@@ -57,18 +70,19 @@ impl Scheduler {
     /// Begins everything as early as possible, in the order of a list in which each task comes after those it waits for. When everything
     /// has ended.
     pub(super) fn forward(&mut self, project: &Project, list: &[u32]) -> u64 {
-        self.profile.clear(&project.capacity);
-        for (until, demand) in &project.occupied {
-            self.profile.take(std::slice::from_ref(demand), 0, *until);
+        self.profile.clear();
+        let mut from = 0;
+        for (until, free) in &self.left {
+            self.profile.then(from, free);
+            from = *until;
         }
+        self.profile.then(from, &self.all);
         let mut end = project.running_end;
         for task in list {
             let at = *task as usize;
             let ends = |before: &u32| self.starts[*before as usize] + project.durations[*before as usize];
             let ready = project.before.of_place(*task).iter().map(ends).max().unwrap_or(0).max(project.releases[at]);
-            let demands: &[Demand] = project.demands.of_place(*task);
-            let start = self.profile.earliest(demands, ready, project.durations[at]);
-            self.profile.take(demands, start, project.durations[at]);
+            let start = self.place(*task, ready, project.durations[at]);
             self.starts[at] = start;
             end = end.max(start + project.durations[at]);
         }
@@ -156,17 +170,24 @@ impl Scheduler {
             let at = *task as usize;
             Reverse((starts[at] + durations[at], *task))
         });
-        self.profile.clear(&project.capacity);
-        for (until, demand) in &project.occupied {
-            self.profile.take(std::slice::from_ref(demand), end - until, *until);
+        self.profile.clear();
+        let mut from = 0;
+        let mut free = &self.all;
+        for (until, left) in self.left.iter().rev() {
+            if from < end - until {
+                self.profile.then(from, free);
+            }
+            (from, free) = (end - until, left);
+        }
+        self.profile.then(from, free);
+        if from < end && !self.left.is_empty() {
+            self.profile.then(end, &self.all);
         }
         for task in list.iter() {
             let at = *task as usize;
             let begins = |behind: &u32| self.mirrored[*behind as usize] + project.durations[*behind as usize];
             let ready = project.behind.of_place(*task).iter().map(begins).max().unwrap_or(0);
-            let demands = project.demands.of_place(*task);
-            let from_end = self.profile.earliest(demands, ready, project.durations[at]);
-            self.profile.take(demands, from_end, project.durations[at]);
+            let from_end = self.place(*task, ready, project.durations[at]);
             self.mirrored[at] = from_end;
         }
         let (mirrored, durations) = (&self.mirrored, &project.durations);
@@ -180,8 +201,33 @@ impl Scheduler {
         end
     }
 
+    /// The earliest moment from `ready` on at which a task fits; what it needs is taken from then on.
+    fn place(&mut self, task: u32, ready: u64, duration: u64) -> u64 {
+        let wanted = self.wanted.of_place(task);
+        if wanted.is_empty() {
+            return ready;
+        }
+        self.profile.take(wanted, ready, duration)
+    }
+
     /// Puts a list into the order in which its tasks begin in the schedule made last.
     pub(super) fn sort(&self, list: &mut [u32]) {
         list.sort_unstable_by_key(|task| (self.starts[*task as usize], *task));
     }
+}
+
+/// What running tasks leave until when.
+fn left(project: &Project, lanes: &Lanes) -> Vec<(u64, Vec<u64>)> {
+    let mut ends: Vec<u64> = project.occupied.iter().map(|(until, _)| *until).filter(|until| *until > 0).collect();
+    ends.sort_unstable();
+    ends.dedup();
+    let until = |end: u64| {
+        let mut free = project.capacity.clone();
+        for (_, demand) in project.occupied.iter().filter(|(until, _)| *until >= end) {
+            // There may be less of something than there was when it was granted.
+            free[demand.kind as usize] = free[demand.kind as usize].saturating_sub(demand.units);
+        }
+        (end, lanes.free(&free))
+    };
+    ends.into_iter().map(until).collect()
 }
