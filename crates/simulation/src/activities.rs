@@ -21,7 +21,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 /// Schedules that are looked at whenever much has changed, unless told otherwise.
-pub const DEFAULT_ORDERS: usize = 10_000;
+pub const DEFAULT_ORDERS: usize = 30_000;
 
 /// An activity.
 #[derive(Debug, Clone, PartialEq)]

@@ -2,9 +2,10 @@
 //! advice comes out as an event where one was found. What is advised is in the log, so a replay needs no search.
 //!
 //! Bounded: one thread; a question replaces the one before it; each is thought about for [`THINKING`] at the most, and at most
-//! one is asked per [`PAUSE`], when enough has changed ([`ratn_executive::lookahead::Lookout`]).
+//! one is asked per [`PAUSE`], when enough has changed ([`ratn_executive::lookahead::Lookout`]). Each goes on with the good orders that were
+//! found for the one before, so that a long run is thought about for long.
 
-use ratn_executive::lookahead::{Problem, Search};
+use ratn_executive::lookahead::{Memory, Problem, Search};
 use ratn_executive::protocol::Event;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -95,9 +96,10 @@ impl TurnContext {
 
     fn work(&self, seed: u64, tell: &mpsc::Sender<Event>) {
         let mut asked = 0;
+        let mut memory = Memory::default();
         while let Some(problem) = self.next() {
             asked += 1;
-            if let Some(advice) = self.think(&problem, seed.wrapping_add(asked)) {
+            if let Some(advice) = self.think(&problem, seed.wrapping_add(asked), &mut memory) {
                 // Whoever is that far behind will ask again.
                 let _ = tell.try_send(advice);
             }
@@ -105,9 +107,10 @@ impl TurnContext {
     }
 
     /// A better order than the present one, if one is found in time and nobody asks for something else meanwhile.
-    fn think(&self, problem: &Problem, seed: u64) -> Option<Event> {
-        let mut search =
-            Search::new(problem, seed).inspect_err(|error| tracing::debug!(%error, "no look ahead")).ok()?;
+    fn think(&self, problem: &Problem, seed: u64, memory: &mut Memory) -> Option<Event> {
+        let mut search = Search::remembering(problem, seed, memory)
+            .inspect_err(|error| tracing::debug!(%error, "no look ahead"))
+            .ok()?;
         let begun = Instant::now();
         while !search.is_over() && begun.elapsed() < THINKING {
             search.step(ORDERS);
@@ -115,6 +118,7 @@ impl TurnContext {
                 return None;
             }
         }
+        *memory = search.memory();
         let best = search.best();
         // What is no number would not read back from a log.
         let is_usable = best.urgency_s.iter().all(|(_, seconds)| seconds.is_finite());

@@ -10,7 +10,7 @@
 //! | `problem`, `network`, `project` | what is to be done; as numbers; of that what has not begun |
 //! | `rollout` | the executive's dispatch, simulated |
 //! | `packed`, `profile`, `schedule` | schedules from lists, for several units of several resources; double justification |
-//! | `population` | lists crossed, where resources have several units |
+//! | `variation`, `population` | new lists; two populations of them, where resources have several units |
 //! | `disjunctive`, `tabu` | orders of machines and moves in critical blocks, where they have one |
 //! | `annealing` | other orders for the dispatch, where something is speculative |
 //! | `search`, `lookout` | the search and its advice; when to look ahead anew |
@@ -33,6 +33,7 @@ mod rollout;
 mod schedule;
 mod search;
 mod tabu;
+mod variation;
 
 pub use lookout::Lookout;
 pub use problem::{Problem, ProblemError, Task};

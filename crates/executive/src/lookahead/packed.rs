@@ -98,7 +98,7 @@ mod tests {
             let sizes = [1, 2, 3, 1_000, 7_000, 123_456_789, u64::from(u32::MAX) * 1_000];
             let kinds = 1 + dice.below(9);
             let capacity: Vec<u64> = (0..kinds).map(|_| sizes[dice.below(sizes.len())]).collect();
-            let mut draw = |dice: &mut Dice| -> Vec<u64> {
+            let draw = |dice: &mut Dice| -> Vec<u64> {
                 capacity
                     .iter()
                     .map(|most| if dice.below(4) == 0 { *most } else { dice.below(*most as usize + 1) as u64 })

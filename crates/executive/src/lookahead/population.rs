@@ -1,47 +1,53 @@
-//! A population of activity lists, crossed: the search where a resource has several units.
+//! Two populations of activity lists, crossed in turn: the search where a resource has several units.
 //!
-//! A list is decoded by the serial scheme and doubly justified, and its tasks are then put into the order in which they begin. A child takes a
-//! part of its mother's list, then what is missing in its father's order, then in its mother's again (two-point crossover: Hartmann, A
-//! competitive genetic algorithm for resource-constrained project scheduling, 1998; with justification: Valls, Ballestín,
-//! Quintanilla, A hybrid genetic algorithm for the RCPSP, 2008). When all have become alike, all but the best are drawn anew.
+//! One population's schedules begin everything as early as possible, the other's end everything as late as possible. The children of one are
+//! scheduled in the other's way and join it (Debels, Vanhoucke: A bi-population based genetic algorithm for the resource-constrained
+//! project scheduling problem, 2005): each generation justifies the one before, for one schedule per child where double
+//! justification takes two more. A child takes the place of the one that is where its mother is, unless that is better. When
+//! nothing better comes of them, all are drawn anew but the best.
 
-use super::dice::Dice;
 use super::project::{Plan, Project};
 use super::schedule::Scheduler;
+use super::variation::{Direction, Variation};
 
-/// Hartmann's population for some thousand schedules.
+/// Of each population: as many as Hartmann's has for some thousand schedules.
 const SIZE: usize = 40;
-/// How likely a task changes places with the next, as in Hartmann's.
-const MUTATION: f64 = 0.05;
-/// Of so many tasks that could come next in a drawn list the one with the longest remaining path does.
-const DRAWN: usize = 3;
-/// After so many lists without anything better all but the best are drawn anew.
-const PATIENCE: usize = 25 * SIZE;
-/// A list is decoded, and justified twice.
-const SCHEDULES_PER_LIST: usize = 3;
+/// After so many schedules without anything better all but the best are drawn anew.
+const PATIENCE: usize = 75 * SIZE;
+/// A list that is given is scheduled, and its schedule justified to the end and back.
+const SCHEDULES_OF_GIVEN: usize = 3;
 
+/// A schedule.
 #[derive(Debug, Clone)]
 struct Individual {
+    /// Its tasks in the order in which the schedule has them from the side on which the other population begins.
     list: Vec<u32>,
-    end: u64,
+    /// How long it takes.
+    takes: u64,
 }
 
-/// The lists, and the best schedule found.
+/// The populations, and the best schedule found.
 #[derive(Debug, Clone)]
 pub(super) struct Population {
     project: Project,
     scheduler: Scheduler,
-    dice: Dice,
-    individuals: Vec<Individual>,
-    /// Lists that are still to be decoded, the first last.
+    variation: Variation,
+    /// Those that were scheduled forward.
+    early: Vec<Individual>,
+    /// Those that were scheduled backward.
+    late: Vec<Individual>,
+    /// In which direction the present generation of children is scheduled.
+    direction: Direction,
+    /// The next mother.
+    mother: usize,
+    /// Lists that are still to be scheduled, the first last.
     given: Vec<Vec<u32>>,
-    /// Lists that were decoded since something was found that is better.
+    /// Schedules that were made since something was found that is better.
     in_vain: usize,
     child: Vec<u32>,
-    taken: Vec<bool>,
-    open: Vec<u32>,
-    eligible: Vec<u32>,
+    /// When each task begins in the best schedule.
     best: Vec<u64>,
+    best_list: Vec<u32>,
     best_end: u64,
     /// Of the best that was handed out.
     told_end: u64,
@@ -50,18 +56,19 @@ pub(super) struct Population {
 impl Population {
     /// Begins with these lists, the best first.
     pub(super) fn new(project: Project, seed: u64, lists: Vec<Vec<u32>>) -> Population {
-        let size = project.len();
+        let tasks = project.len();
         Population {
             scheduler: Scheduler::new(&project),
-            dice: Dice(seed),
-            individuals: Vec::with_capacity(SIZE),
+            variation: Variation::new(tasks, seed),
+            early: Vec::with_capacity(SIZE),
+            late: Vec::with_capacity(SIZE),
+            direction: Direction::Backward,
+            mother: 0,
             given: lists.into_iter().take(SIZE).rev().collect(),
             in_vain: 0,
-            child: Vec::with_capacity(size),
-            taken: vec![false; size],
-            open: vec![0; size],
-            eligible: Vec::with_capacity(size),
+            child: Vec::with_capacity(tasks),
             best: Vec::new(),
+            best_list: Vec::new(),
             best_end: u64::MAX,
             told_end: u64::MAX,
             project,
@@ -70,10 +77,12 @@ impl Population {
 
     /// The lists, the best first.
     pub(super) fn lists(&self) -> Vec<Vec<u32>> {
-        let mut individuals: Vec<&Individual> = self.individuals.iter().collect();
-        individuals.sort_by_key(|individual| individual.end);
-        let lists = individuals.into_iter().map(|individual| &individual.list);
-        lists.chain(self.given.iter().rev()).take(SIZE).cloned().collect()
+        let mut early: Vec<&Individual> = self.early.iter().collect();
+        early.sort_by_key(|individual| individual.takes);
+        // What is in the order of the ends, the last first, is backwards in an order in which it could begin.
+        let early = early.into_iter().map(|individual| individual.list.iter().rev().copied().collect());
+        let best = (!self.best_list.is_empty()).then(|| self.best_list.clone());
+        best.into_iter().chain(early).chain(self.given.iter().rev().cloned()).take(SIZE).collect()
     }
 
     /// The project that the lists are of.
@@ -81,141 +90,121 @@ impl Population {
         &self.project
     }
 
-    /// Makes so many schedules, until one ends at `bound`; the best, if it is better than all before.
+    /// Makes so many schedules or a few more, until one ends at `bound`; the best, if it is better than all before.
     pub(super) fn step(&mut self, schedules: usize, bound: u64) -> Option<Plan> {
-        for _ in 0..schedules.div_ceil(SCHEDULES_PER_LIST) {
-            if self.best_end <= bound {
-                break;
-            }
+        let mut made = 0;
+        while made < schedules && self.best_end > bound {
             if self.in_vain >= PATIENCE {
                 self.begin_anew();
             }
-            let end = if let Some(list) = self.given.pop() {
-                self.child = list;
-                self.decode()
-            } else if self.individuals.len() < SIZE {
-                self.draw();
-                // One in two by each scheme.
-                if self.individuals.len().is_multiple_of(2) { self.decode_in_parallel() } else { self.decode() }
+            let more = if let Some(list) = self.given.pop() {
+                self.take(list)
+            } else if self.early.len() < SIZE {
+                self.draw()
             } else {
-                self.cross();
-                self.mutate();
-                self.decode()
+                self.bear()
             };
-            self.join(end);
+            made += more;
+            self.in_vain += more;
         }
         (self.best_end < std::mem::replace(&mut self.told_end, self.best_end)).then(|| self.project.plan_of(&self.best))
     }
 
-    /// A list at random, of tasks with long remaining paths first.
-    fn draw(&mut self) {
-        let Population { project, dice, child, open, eligible, .. } = self;
-        child.clear();
-        eligible.clear();
-        for task in 0..project.len() as u32 {
-            open[task as usize] = project.before.of_place(task).len() as u32;
-            if open[task as usize] == 0 {
-                eligible.push(task);
-            }
-        }
-        while !eligible.is_empty() {
-            let drawn = (0..DRAWN).map(|_| dice.below(eligible.len()));
-            let remaining = |at: &usize| project.remaining[eligible[*at] as usize];
-            let Some(chosen) = drawn.max_by_key(remaining) else { break };
-            let task = eligible.swap_remove(chosen);
-            child.push(task);
-            for behind in project.behind.of_place(task) {
-                let open = &mut open[*behind as usize];
-                *open -= 1;
-                if *open == 0 {
-                    eligible.push(*behind);
-                }
-            }
-        }
-    }
-
-    /// A child of two, each the better of two drawn.
-    fn cross(&mut self) {
-        let Population { individuals, dice, child, taken, .. } = self;
-        let mut chosen = || {
-            let (one, other) = (dice.below(individuals.len()), dice.below(individuals.len()));
-            if individuals[one].end <= individuals[other].end { one } else { other }
-        };
-        let (mother, father) = (chosen(), chosen());
-        let (mother, father) = (&individuals[mother].list, &individuals[father].list);
-        let size = mother.len();
-        let (one, other) = (dice.below(size + 1), dice.below(size + 1));
-        let (from, to) = (one.min(other), one.max(other));
-        child.clear();
-        taken.fill(false);
-        let sources = [(mother, from), (father, to), (mother, size)];
-        for (list, until) in sources {
-            for task in list {
-                if child.len() == until {
-                    break;
-                }
-                if !std::mem::replace(&mut taken[*task as usize], true) {
-                    child.push(*task);
-                }
-            }
-        }
-    }
-
-    fn mutate(&mut self) {
-        for at in 1..self.child.len() {
-            if self.dice.share() < MUTATION {
-                let (one, next) = (self.child[at - 1], self.child[at]);
-                if !self.project.before.of_place(next).contains(&one) {
-                    self.child.swap(at - 1, at);
-                }
-            }
-        }
-    }
-
-    /// Makes the child's schedule, and its list the order in which that begins; when everything has ended.
-    fn decode(&mut self) -> u64 {
+    /// A given list joins the early ones; how many schedules that took.
+    fn take(&mut self, list: Vec<u32>) -> usize {
+        self.child = list;
         let end = self.scheduler.forward(&self.project, &self.child);
-        self.justify(end)
-    }
-
-    /// The same by the other scheme.
-    fn decode_in_parallel(&mut self) -> u64 {
-        let end = self.scheduler.parallel(&self.project, &self.child);
-        self.justify(end)
-    }
-
-    fn justify(&mut self, end: u64) -> u64 {
         let end = self.scheduler.justify(&self.project, &mut self.child, end);
-        self.scheduler.sort(&mut self.child);
-        self.in_vain += 1;
+        self.note(end);
+        self.join_early(end);
+        SCHEDULES_OF_GIVEN
+    }
+
+    /// A drawn list joins the early ones, one in two by each scheme; how many schedules that took.
+    fn draw(&mut self) -> usize {
+        self.variation.draw(&self.project, &mut self.child);
+        let is_parallel = self.early.len().is_multiple_of(2);
+        let scheme = if is_parallel { Scheduler::parallel } else { Scheduler::forward };
+        let end = scheme(&mut self.scheduler, &self.project, &self.child);
+        self.note(end);
+        self.join_early(end);
+        1
+    }
+
+    fn join_early(&mut self, takes: u64) {
+        self.scheduler.sort_from_end(&self.project, &mut self.child);
+        self.early.push(Individual { list: self.child.clone(), takes });
+    }
+
+    /// A child of the next mother and the better of two others joins the other population; how many schedules that took.
+    fn bear(&mut self) -> usize {
+        let Population { project, variation, child, direction, .. } = self;
+        let (parents, number) = match direction {
+            Direction::Forward => (&self.late, self.mother),
+            Direction::Backward => (&self.early, self.mother),
+        };
+        let (one, other) = (variation.below(parents.len()), variation.below(parents.len()));
+        let father = if parents[one].takes <= parents[other].takes { one } else { other };
+        let mother = &parents[number];
+        variation.cross(project, *direction, [&mother.list, &parents[father].list], child);
+        variation.mutate(project, *direction, child);
+        self.mother += 1;
+        let is_last = self.mother == parents.len();
+        let (takes, made) = match self.direction {
+            Direction::Forward => {
+                let end = self.scheduler.forward(&self.project, &self.child);
+                self.note(end);
+                self.scheduler.sort_from_end(&self.project, &mut self.child);
+                (end, 1)
+            }
+            Direction::Backward => {
+                let end = mother.takes;
+                let takes = self.scheduler.backward(&self.project, &self.child, end);
+                self.scheduler.sort_from_begin(&self.project, &mut self.child, takes);
+                let is_better = takes < self.best_end;
+                if is_better {
+                    let end = self.scheduler.forward(&self.project, &self.child);
+                    self.note(end);
+                }
+                (takes, 1 + usize::from(is_better))
+            }
+        };
+        let children = match self.direction {
+            Direction::Forward => &mut self.early,
+            Direction::Backward => &mut self.late,
+        };
+        match children.get_mut(number) {
+            None => children.push(Individual { list: self.child.clone(), takes }),
+            Some(there) if takes <= there.takes => {
+                there.list.clone_from(&self.child);
+                there.takes = takes;
+            }
+            Some(_) => {}
+        }
+        if is_last {
+            self.mother = 0;
+            self.direction = self.direction.other();
+        }
+        made
+    }
+
+    /// Keeps the schedule made last, of the child, if it is better.
+    fn note(&mut self, end: u64) {
         if end < self.best_end {
             self.best_end = end;
             self.best.clone_from(&self.scheduler.starts);
+            self.best_list.clone_from(&self.child);
+            self.scheduler.sort(&mut self.best_list);
             self.in_vain = 0;
-        }
-        end
-    }
-
-    /// The child takes the place of the worst, unless that is better or the child is there already.
-    fn join(&mut self, end: u64) {
-        if self.individuals.len() < SIZE {
-            return self.individuals.push(Individual { list: self.child.clone(), end });
-        }
-        if self.individuals.iter().any(|other| other.end == end && other.list == self.child) {
-            return;
-        }
-        if let Some(worst) = self.individuals.iter_mut().max_by_key(|individual| individual.end)
-            && end <= worst.end
-        {
-            worst.list.copy_from_slice(&self.child);
-            worst.end = end;
         }
     }
 
     /// Nothing better comes of them any more: the best stays.
     fn begin_anew(&mut self) {
-        self.individuals.sort_by_key(|individual| individual.end);
-        self.individuals.truncate(1);
+        self.early.clear();
+        self.late.clear();
+        (self.direction, self.mother) = (Direction::Backward, 0);
+        self.given.push(self.best_list.clone());
         self.in_vain = 0;
     }
 }

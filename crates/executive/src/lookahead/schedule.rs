@@ -164,41 +164,59 @@ impl Scheduler {
     /// Justifies the schedule made last to the end and again to the beginning. `list` becomes the tasks in the order in which they
     /// begin. When everything has ended.
     pub(super) fn justify(&mut self, project: &Project, list: &mut [u32], end: u64) -> u64 {
+        self.sort_from_end(project, list);
+        let end = self.backward(project, list, end);
+        self.sort_from_begin(project, list, end);
+        let end = self.forward(project, list);
+        self.sort(list);
+        end
+    }
+
+    /// Ends everything as late as possible, in the order of a list in which each task comes before those it waits for, where all has
+    /// to have ended at `end`. How long it takes.
+    pub(super) fn backward(&mut self, project: &Project, list: &[u32], end: u64) -> u64 {
+        self.profile.clear();
+        let mut from = 0;
+        let mut free = &self.all;
+        for (until, left) in self.left.iter().rev() {
+            if from < end.saturating_sub(*until) {
+                self.profile.then(from, free);
+            }
+            (from, free) = (end.saturating_sub(*until), left);
+        }
+        self.profile.then(from, free);
+        if from < end && !self.left.is_empty() {
+            self.profile.then(end, &self.all);
+        }
+        let mut takes = 0;
+        for task in list {
+            let at = *task as usize;
+            let begins = |behind: &u32| self.mirrored[*behind as usize] + project.durations[*behind as usize];
+            let ready = project.behind.of_place(*task).iter().map(begins).max().unwrap_or(0);
+            let from_end = self.place(*task, ready, project.durations[at]);
+            self.mirrored[at] = from_end;
+            takes = takes.max(from_end + project.durations[at]);
+        }
+        takes
+    }
+
+    /// Puts a list into the order in which its tasks end in the schedule made last, the last first.
+    pub(super) fn sort_from_end(&self, project: &Project, list: &mut [u32]) {
         // Who waits for whom is also in the order of the numbers, which decides among tasks without a duration.
         let (starts, durations) = (&self.starts, &project.durations);
         list.sort_unstable_by_key(|task| {
             let at = *task as usize;
             Reverse((starts[at] + durations[at], *task))
         });
-        self.profile.clear();
-        let mut from = 0;
-        let mut free = &self.all;
-        for (until, left) in self.left.iter().rev() {
-            if from < end - until {
-                self.profile.then(from, free);
-            }
-            (from, free) = (end - until, left);
-        }
-        self.profile.then(from, free);
-        if from < end && !self.left.is_empty() {
-            self.profile.then(end, &self.all);
-        }
-        for task in list.iter() {
-            let at = *task as usize;
-            let begins = |behind: &u32| self.mirrored[*behind as usize] + project.durations[*behind as usize];
-            let ready = project.behind.of_place(*task).iter().map(begins).max().unwrap_or(0);
-            let from_end = self.place(*task, ready, project.durations[at]);
-            self.mirrored[at] = from_end;
-        }
+    }
+
+    /// Puts a list into the order in which its tasks begin in the schedule made last from the end, which takes so long.
+    pub(super) fn sort_from_begin(&self, project: &Project, list: &mut [u32], takes: u64) {
         let (mirrored, durations) = (&self.mirrored, &project.durations);
-        let key = |task: &u32| {
+        list.sort_unstable_by_key(|task| {
             let at = *task as usize;
-            (end.saturating_sub(mirrored[at] + durations[at]), *task)
-        };
-        list.sort_unstable_by_key(key);
-        let end = self.forward(project, list);
-        self.sort(list);
-        end
+            (takes.saturating_sub(mirrored[at] + durations[at]), *task)
+        });
     }
 
     /// The earliest moment from `ready` on at which a task fits; what it needs is taken from then on.
