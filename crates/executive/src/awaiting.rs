@@ -1,11 +1,11 @@
 //! What a wait under way waits for, and how it ends. Both modes ask here; when they look is theirs.
 
-use crate::binding::{BindError, Outputs};
+use crate::binding::{self, BindError, Outputs};
 use crate::protocol::Awaited;
 use crate::signals::Signals;
 use ratn_model::expression::{EffectExpr, EvaluateError, Expr, Scope};
 use ratn_model::fact::{Change, FactPattern};
-use ratn_model::program::{SUCCESS, State};
+use ratn_model::program::{ABORTED, SUCCESS, State, VIOLATED};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_model::wait::{ANSWER, TIMEOUT, VALUE, Wait};
@@ -17,6 +17,8 @@ use std::time::Duration;
 pub(crate) struct WaitEnd {
     pub(crate) outcome: String,
     pub(crate) outputs: Outputs,
+    /// Why, where that is not what was waited for.
+    pub(crate) reason: String,
 }
 
 /// What a wait waits for that begins now, and until when at most.
@@ -43,6 +45,11 @@ pub(crate) fn begins(
             let at = Timestamp(0) + duration(seconds("until", at)?);
             (Awaited::Time, Some(at.max(now)))
         }
+        Some(Wait::Limit(after)) => (Awaited::Time, Some(now + duration(seconds("seconds", after)?))),
+        Some(Wait::Watch(holds)) => {
+            let all: Vec<String> = holds.iter().map(|condition| format!("not ({condition})")).collect();
+            (Awaited::Condition { condition: all.join(" or ") }, None)
+        }
         Some(Wait::Condition(condition)) => (Awaited::Condition { condition: condition.to_string() }, timeout),
         Some(Wait::Signal(name)) => (Awaited::Signal { signal: name.to_owned() }, timeout),
         Some(Wait::Answer(question)) => {
@@ -58,17 +65,19 @@ pub(crate) fn begins(
     })
 }
 
-/// Whether the condition of a wait holds; one that waits for something else waits on.
-pub(crate) fn holds(state: &State, scope: &dyn Scope) -> Result<bool, BindError> {
+/// How a wait ends for whose end the world is as it has to be; one that waits for something else waits on.
+pub(crate) fn has_come(state: &State, scope: &dyn Scope) -> Result<Option<WaitEnd>, BindError> {
     match state.wait() {
-        Some(Wait::Condition(condition)) => condition.holds(scope).map_err(BindError::at("`for`", state)),
-        _ => Ok(false),
+        Some(Wait::Condition(condition)) => {
+            let holds = condition.holds(scope).map_err(BindError::at("`for`", state))?;
+            Ok(holds.then(|| success(Outputs::new())))
+        }
+        Some(Wait::Watch(holds)) => {
+            let reason = binding::not_holding(holds, scope).map_err(BindError::at("`while`", state))?;
+            Ok(reason.map(|reason| cut_short(VIOLATED, reason)))
+        }
+        _ => Ok(None),
     }
-}
-
-/// How a wait for a condition ends that holds.
-pub(crate) fn has_come() -> WaitEnd {
-    success(Outputs::new())
 }
 
 /// How a wait ends for which a signal was kept, which it takes.
@@ -81,9 +90,11 @@ pub(crate) fn takes(state: &State, signals: &mut Signals) -> Option<WaitEnd> {
 
 /// How a wait ends whose time is up.
 pub(crate) fn is_up(state: &State) -> WaitEnd {
-    let late = |outputs| WaitEnd { outcome: TIMEOUT.to_owned(), outputs };
+    let late = |outputs| WaitEnd { outcome: TIMEOUT.to_owned(), outputs, reason: String::new() };
     match state.wait() {
-        None | Some(Wait::Seconds(_) | Wait::Until(_)) => success(Outputs::new()),
+        Some(Wait::Limit(seconds)) => cut_short(ABORTED, format!("it took longer than {seconds} s")),
+        // Nothing but a condition ends it.
+        Some(Wait::Watch(_)) | None | Some(Wait::Seconds(_) | Wait::Until(_)) => success(Outputs::new()),
         Some(Wait::Condition(_)) => late(Outputs::new()),
         Some(Wait::Signal(_)) => late([(VALUE.to_owned(), Value::Null)].into()),
         Some(Wait::Answer(question)) => match question.default {
@@ -105,11 +116,17 @@ pub(crate) fn answered(state: &State, choice: &str) -> Option<WaitEnd> {
 fn chosen(state: &State, choice: &str) -> WaitEnd {
     let is_outcome = state.outcomes.iter().any(|outcome| outcome == choice);
     let outcome = if is_outcome { choice } else { SUCCESS };
-    WaitEnd { outcome: outcome.to_owned(), outputs: [(ANSWER.to_owned(), Value::String(choice.to_owned()))].into() }
+    let outputs = [(ANSWER.to_owned(), Value::String(choice.to_owned()))].into();
+    WaitEnd { outcome: outcome.to_owned(), outputs, reason: String::new() }
 }
 
 fn success(outputs: Outputs) -> WaitEnd {
-    WaitEnd { outcome: SUCCESS.to_owned(), outputs }
+    WaitEnd { outcome: SUCCESS.to_owned(), outputs, reason: String::new() }
+}
+
+/// The state that was watched ends before its own end.
+pub(crate) fn cut_short(outcome: &str, reason: String) -> WaitEnd {
+    WaitEnd { outcome: outcome.to_owned(), outputs: Outputs::new(), reason }
 }
 
 /// What a wait that has ended so was taken to change, as the root shows it now. Nothing of it is made by the wait.

@@ -122,6 +122,24 @@ pub(crate) fn unmet(state: &State, scope: &dyn Scope) -> Result<Option<String>, 
     Ok(None)
 }
 
+/// Why a state has to end: the first of its conditions that does not hold; `Ok(None)` when all hold.
+pub(crate) fn violated(state: &State, scope: &dyn Scope) -> Result<Option<String>, BindError> {
+    not_holding(&state.annotations.holds, scope).map_err(BindError::at("`while`", state))
+}
+
+/// The first of some conditions that does not hold, as a sentence.
+pub(crate) fn not_holding<'e>(
+    conditions: impl IntoIterator<Item = &'e Expr>,
+    scope: &dyn Scope,
+) -> Result<Option<String>, EvaluateError> {
+    for condition in conditions {
+        if !condition.holds(scope)? {
+            return Ok(Some(format!("`{condition}` does not hold")));
+        }
+    }
+    Ok(None)
+}
+
 /// Checks what a provider returned against the declared output ports.
 pub(crate) fn missing_output(
     declared: &BTreeMap<String, ratn_model::value::Type>,

@@ -1,4 +1,4 @@
-//! States that are tried again and states with something to do on every way out, in terms of the transitions, scoped variables and
+//! States that are tried again, states that are watched, and states with something to do on every way out, in terms of the transitions, scoped variables and
 //! conditions that every program has. Both modes and routines execute them as they execute those.
 //!
 //! ```text
@@ -8,22 +8,30 @@
 //!       ├ again    (from aborted) tries < 2, else aborted            ├ finally ─ success ──► success
 //!       ├ pause    where there is one                                ├ finally_aborted ────► aborted
 //!       └ before ─ success ──► try                                   └ …          one for each outcome of the body
+//!
+//! carry: while [lit(lamp)], timeout 20
+//!
+//! carry ┬ while    ─ violated ► violated        all of them at once: the first that ends stops the others
+//!       ├ timeout  ─ aborted ─► aborted
+//!       └ body     ─────────────► as it ends
 //! ```
+//!
+//! Each try is watched anew; what is done on every way out is not watched.
 //!
 //! The state that was written is `try` or `body`; with both, `body` is what holds `try`. From outside, the state of its name is seen, with
 //! the same ports. Names of variables that are made here cannot be written in a task file.
 //!
-//! Task files have `retry`. `finally` is for programs that are made in code (random programs are): a task file refuses it, because a
+//! Task files have `retry`, `while` and `timeout`. `finally` is for programs that are made in code (random programs are): a task file refuses it, because a
 //! deadline and a lost race do not run it yet.
 
 use crate::expression::{BinaryOperator, Expr};
 use crate::id::StateId;
 use crate::program::{
     ABORTED, Again, Annotations, CLOCK, Finally, Nature, PREEMPTED, Program, SUCCESS, State, StateKind, Target,
-    TaskOutput,
+    TaskOutput, VIOLATED,
 };
 use crate::value::{Type, Value};
-use crate::wait::PAUSE;
+use crate::wait::{LIMIT, PAUSE, WATCH};
 use std::collections::BTreeMap;
 
 /// More states than this are not made.
@@ -34,8 +42,19 @@ const MAX_STATES: usize = 20_000;
 pub struct Guard {
     /// How it is tried again.
     pub retried: Option<Retried>,
+    /// How it is watched while it goes on.
+    pub limits: Option<Limits>,
     /// What is done on every way out; states whose parent is the guarded one, and that are in none of its lists.
     pub finally: Vec<StateId>,
+}
+
+/// What ends a state before its own end. It becomes one node of the program (a preemptive concurrency is one).
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Limits {
+    /// Booleans that must hold in the actual world as long as it goes on; else it ends [`VIOLATED`].
+    pub holds: Vec<Expr>,
+    /// It ends `aborted` when it has taken so long, in the robot's seconds.
+    pub timeout_s: Option<f64>,
 }
 
 /// How a state is tried again.
@@ -127,8 +146,67 @@ impl Unfolding<'_> {
         match (finally, retried) {
             (true, _) => self.with_finally(id, parent, name, scope, guard),
             (false, Some(retried)) => self.with_retry(id, parent, name, scope, retried, true),
-            (false, None) => self.written(id, parent, name, scope, true),
+            (false, None) => self.watched(id, parent, name, scope, true),
         }
+    }
+
+    /// The state with what watches it.
+    fn watched(
+        &mut self,
+        id: StateId,
+        parent: Option<StateId>,
+        name: String,
+        scope: usize,
+        is_outermost: bool,
+    ) -> Result<StateId, TooManyStates> {
+        let guards = self.guards;
+        let Some(limits) = guards.get(&id).and_then(|guard| guard.limits.as_ref()) else {
+            return self.written(id, parent, name, scope, is_outermost);
+        };
+        let around = self.around(id, parent, name, scope, is_outermost)?;
+        // What does not hold at the beginning is seen before anything begins.
+        let mut regions = Vec::new();
+        if !limits.holds.is_empty() {
+            let conditions = limits.holds.iter().map(|condition| ("for".to_owned(), condition.clone()));
+            regions.push(self.watch(id, around, ("while", WATCH, VIOLATED), conditions.collect(), scope)?);
+        }
+        if let Some(seconds) = limits.timeout_s {
+            let limit = vec![("seconds".to_owned(), Expr::Literal(Value::Float(seconds)))];
+            regions.push(self.watch(id, around, ("timeout", LIMIT, ABORTED), limit, scope)?);
+        }
+        let body = self.written(id, Some(around), "body".to_owned(), scope, false)?;
+        regions.push(body);
+        self.outputs.push((around, body));
+        self.at(body).outcomes.retain(|outcome| outcome != VIOLATED);
+        // These ends are not the body's, which is cut short.
+        let ends = [(VIOLATED, !limits.holds.is_empty()), (ABORTED, limits.timeout_s.is_some())];
+        for (outcome, _) in ends.into_iter().filter(|(_, ends)| *ends) {
+            if let Some(effects) = self.at(body).annotations.effects.remove(outcome) {
+                self.at(around).annotations.effects.insert(outcome.to_owned(), effects);
+            }
+        }
+        self.at(around).annotations.duration_s = self.at(body).annotations.duration_s.clone();
+        let (preemptive, decide, outputs) = (true, Vec::new(), Vec::new());
+        self.at(around).kind = StateKind::Concurrency { regions, preemptive, decide, outputs };
+        Ok(around)
+    }
+
+    /// A state that the executive waits in, beside the one that it watches; by this outcome it ends that.
+    fn watch(
+        &mut self,
+        id: StateId,
+        parent: StateId,
+        (name, action, outcome): (&str, &str, &str),
+        inputs: Vec<(String, Expr)>,
+        scope: usize,
+    ) -> Result<StateId, TooManyStates> {
+        let (provider, action) = (CLOCK.to_owned(), action.to_owned());
+        let kind = StateKind::Action { provider, action, inputs, outputs: BTreeMap::new() };
+        let watch = self.made(id, parent, name, kind, scope)?;
+        let nothing = |outcome: &str| (outcome.to_owned(), Vec::new());
+        self.at(watch).annotations.effects = [SUCCESS, ABORTED, PREEMPTED, outcome].map(nothing).into();
+        self.at(watch).outcomes = own([outcome]);
+        Ok(watch)
     }
 
     /// The state as it was written.
@@ -183,7 +261,7 @@ impl Unfolding<'_> {
         is_outermost: bool,
     ) -> Result<StateId, TooManyStates> {
         let around = self.around(id, parent, name, scope, is_outermost)?;
-        let body = self.written(id, Some(around), "try".to_owned(), scope, false)?;
+        let body = self.watched(id, Some(around), "try".to_owned(), scope, false)?;
         self.at(body).annotations.exceptional.extend(retried.on.iter().cloned());
         self.links.push((body, SUCCESS.to_owned(), Target::Outcome(SUCCESS.to_owned())));
         self.outputs.push((around, body));
@@ -253,7 +331,7 @@ impl Unfolding<'_> {
         let around = self.around(id, parent, name, scope, true)?;
         let body = match &guard.retried {
             Some(retried) => self.with_retry(id, Some(around), "body".to_owned(), scope, retried, false)?,
-            None => self.written(id, Some(around), "body".to_owned(), scope, false)?,
+            None => self.watched(id, Some(around), "body".to_owned(), scope, false)?,
         };
         self.outputs.push((around, body));
         self.at(body).annotations.exceptional.extend([ABORTED, PREEMPTED].map(str::to_owned));
@@ -421,7 +499,9 @@ impl Unfolding<'_> {
                 }
                 StateKind::ForEach { .. } | StateKind::While { .. } | StateKind::Condition { .. } => Vec::new(),
             };
-            if let StateKind::Sequence { outputs, .. } = &mut states[around.0 as usize].kind {
+            if let StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } =
+                &mut states[around.0 as usize].kind
+            {
                 *outputs = own;
             }
         }

@@ -19,8 +19,15 @@ pub const SUCCESS: &str = "success";
 pub const ABORTED: &str = "aborted";
 /// The outcome of a state that was told to stop.
 pub const PREEMPTED: &str = "preempted";
+/// The outcome of a state of which a condition did not hold to its end ([`Annotations::holds`]).
+pub const VIOLATED: &str = "violated";
 /// The outcome of a goal that an emergency stop ended. It is `preempted` to a state whose action has none of this name.
 pub const STOPPED: &str = "stopped";
+
+/// Whether a state that ends so has failed: it has no outputs and assigns nothing.
+pub fn is_failure(outcome: &str) -> bool {
+    matches!(outcome, ABORTED | PREEMPTED | VIOLATED)
+}
 
 /// The provider of what the executive does itself: it waits ([`crate::wait`]). No task file can name it.
 pub const CLOCK: &str = "(clock)";
@@ -195,6 +202,10 @@ pub struct Annotations {
     pub reads: Option<Vec<FactExpr>>,
     /// Booleans that must hold in the actual world when it starts.
     pub requires: Vec<Expr>,
+    /// Booleans that must hold in the actual world from its start to its end. Where one does not, an action is cancelled and ends
+    /// [`VIOLATED`]. Only PIAs have some; around any other state [`crate::guard`] puts a watch.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub holds: Vec<Expr>,
     /// Per outcome what it changes. No entry for an outcome: it may write everything.
     pub effects: BTreeMap<String, Vec<EffectExpr>>,
     /// What it asks of the resource manager.
@@ -388,15 +399,14 @@ impl Program {
         next.map_or_else(|| Target::Outcome(SUCCESS.to_owned()), |next| Target::State(*next))
     }
 
-    /// Whether what follows an outcome is not computed ahead: `aborted` and `preempted` unless they are connected to something
-    /// else than what follows success, and whatever is marked so.
+    /// Whether what follows an outcome is not computed ahead: `aborted`, `preempted` and `violated` unless they are connected to
+    /// something else than what follows success, and whatever is marked so.
     pub fn is_exceptional(&self, id: StateId, outcome: &str) -> bool {
         let state = self.state(id);
         if state.annotations.exceptional.iter().any(|marked| marked == outcome) {
             return true;
         }
-        matches!(outcome, ABORTED | PREEMPTED)
-            && state.transitions.get(outcome).is_none_or(|target| *target == self.target(id, SUCCESS))
+        is_failure(outcome) && state.transitions.get(outcome).is_none_or(|target| *target == self.target(id, SUCCESS))
     }
 
     /// The outcomes of a state, `success` first and the exceptional ones of every state last.

@@ -29,6 +29,8 @@ pub enum Slot<'a> {
     Assign(&'a str),
     /// A precondition, by its number.
     Requires(usize),
+    /// What must hold to the end, by its number.
+    Holds(usize),
     /// The estimated duration.
     Duration,
     /// An argument of a fact that it declares to read.
@@ -55,6 +57,7 @@ impl fmt::Display for Slot<'_> {
             Slot::Variable(name) => write!(f, "variables.{name}"),
             Slot::Assign(name) => write!(f, "assign.{name}"),
             Slot::Requires(number) => write!(f, "requires.{number}"),
+            Slot::Holds(number) => write!(f, "while.{number}"),
             Slot::Duration => f.write_str("duration"),
             Slot::Reads => f.write_str("reads"),
             Slot::Senses => f.write_str("senses"),
@@ -100,6 +103,9 @@ macro_rules! walk {
         let annotations = &$($mut)? $state.annotations;
         for (number, required) in (&$($mut)? annotations.requires).into_iter().enumerate() {
             $visit(Slot::Requires(number), required);
+        }
+        for (number, holds) in (&$($mut)? annotations.holds).into_iter().enumerate() {
+            $visit(Slot::Holds(number), holds);
         }
         if let Some(duration) = &$($mut)? annotations.duration_s {
             $visit(Slot::Duration, duration);
@@ -254,6 +260,7 @@ mod tests {
     fn state() -> State {
         let mut annotations = Annotations {
             requires: vec![number(5)],
+            holds: vec![number(17)],
             duration_s: Some(number(6)),
             reads: Some(vec![fact(7)]),
             nature: Nature::Senses(vec![fact(8)]),
@@ -288,7 +295,7 @@ mod tests {
     fn every_expression_is_visited_once_with_its_place() {
         let state = state();
         let all: Vec<String> = state.expressions().iter().map(|(slot, value)| format!("{slot}={value}")).collect();
-        let expected = "decide.failed=1 outputs.out=2 variables.v=3 assign.w=4 requires.0=5 duration=6 reads=7 senses=8 shared=9 \
+        let expected = "decide.failed=1 outputs.out=2 variables.v=3 assign.w=4 requires.0=5 while.0=17 duration=6 reads=7 senses=8 shared=9 \
                         effects.success=10 effects.success=11 effects.success=12 effects.success=13 effects.success=14 \
                         effects.success=15 resources.0=16";
         assert_eq!(all.join(" "), expected);

@@ -10,8 +10,10 @@
 //! | [`CONDITION`] | `for` | `success`, when that holds in the actual world |
 //! | [`SIGNAL`] | `signal` | `success`, with the output `value`: each signal ends one wait |
 //! | [`ASK`] | `question`, `choices`, `default` | by the choice where that is an outcome of the state, else `success`, with the output `answer` |
+//! | [`WATCH`] | `for`, once or more | `violated`, when one of these does not hold in the actual world |
+//! | [`LIMIT`] | `seconds` | `aborted`, so much later |
 //!
-//! The last three may have a timeout ([`crate::program::Annotations::timeout_s`]): then they end by [`TIMEOUT`], a question with a
+//! Those for a condition, a signal and an answer may have a timeout ([`crate::program::Annotations::timeout_s`]): then they end by [`TIMEOUT`], a question with a
 //! default by that.
 
 use crate::expression::{BinaryOperator, EffectExpr, Expr, FactExpr, UnaryOperator};
@@ -31,6 +33,11 @@ pub const SIGNAL: &str = "signal";
 /// Until an operator answers.
 pub const ASK: &str = "ask";
 
+/// Until a condition of the state beside it does not hold ([`crate::guard`]).
+pub const WATCH: &str = "watch";
+/// Until the state beside it has had its time ([`crate::guard`]).
+pub const LIMIT: &str = "limit";
+
 /// The outcome of a wait that took too long.
 pub const TIMEOUT: &str = "timeout";
 /// The output of a wait for a signal: what was sent with it, null where nothing was.
@@ -47,6 +54,10 @@ pub enum Wait<'s> {
     Until(&'s Expr),
     /// A condition on the actual world.
     Condition(&'s Expr),
+    /// Until one of these does not hold in the actual world.
+    Watch(Vec<&'s Expr>),
+    /// So many seconds, which are the limit of another state.
+    Limit(&'s Expr),
     /// The next signal of this name.
     Signal(&'s str),
     /// An answer.
@@ -76,6 +87,8 @@ impl State {
             PAUSE | SECONDS => Wait::Seconds(input("seconds")?),
             UNTIL => Wait::Until(input("until")?),
             CONDITION => Wait::Condition(input("for")?),
+            WATCH => Wait::Watch(inputs.iter().filter(|(port, _)| port == "for").map(|(_, holds)| holds).collect()),
+            LIMIT => Wait::Limit(input("seconds")?),
             SIGNAL => Wait::Signal(input("signal").and_then(text)?),
             ASK => Wait::Answer(Question {
                 text: input("question")?,
@@ -86,7 +99,19 @@ impl State {
         })
     }
 
-    /// Whether it is a pause between two tries, of which nothing is said.
+    /// Whether it was put into the program beside what is written there, so that nothing is said of it: a pause between two tries, or a
+    /// watch over another state.
+    pub fn is_unsaid(&self) -> bool {
+        matches!(&self.kind, StateKind::Action { provider, action, .. }
+            if provider == CLOCK && [PAUSE, WATCH, LIMIT].contains(&action.as_str()))
+    }
+
+    /// Whether it watches another state: a condition of that, or its time.
+    pub fn is_watch(&self) -> bool {
+        matches!(self.wait(), Some(Wait::Watch(_) | Wait::Limit(_)))
+    }
+
+    /// Whether it is a pause between two tries.
     pub fn is_between_tries(&self) -> bool {
         matches!(&self.kind, StateKind::Action { provider, action, .. } if provider == CLOCK && action == PAUSE)
     }

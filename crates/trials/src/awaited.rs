@@ -27,7 +27,7 @@ impl HashOracle<'_> {
         }
         let after_s = dice.below(80) as f64 / 10.0;
         let event = match state.wait()? {
-            Wait::Seconds(_) | Wait::Until(_) => return None,
+            Wait::Seconds(_) | Wait::Until(_) | Wait::Limit(_) | Wait::Watch(_) => return None,
             Wait::Condition(condition) => {
                 let mut facts = Vec::new();
                 make(condition, true, &mut facts);

@@ -6,7 +6,7 @@ use crate::context::{Context, Made};
 use crate::effects;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, State, StateKind};
+use ratn_model::program::{ABORTED, Program, SUCCESS, State, StateKind, is_failure};
 use ratn_model::value::Value;
 use std::sync::Arc;
 
@@ -57,7 +57,7 @@ impl Interpreter {
         {
             thread.variables.truncate(variables);
         }
-        let good = !matches!(outcome, ABORTED | PREEMPTED);
+        let good = !is_failure(outcome);
         let mut written = Outputs::new();
         if let (true, StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. }) =
             (good, &state.kind)

@@ -11,7 +11,7 @@ use ratn_model::expression::FactExpr;
 use ratn_model::fact::{FactKey, Footprint};
 use ratn_model::id::StateId;
 use ratn_model::measurement::Evidence;
-use ratn_model::program::{ABORTED, PREEMPTED, STOPPED, SUCCESS, StateKind, WORLD_MODEL};
+use ratn_model::program::{ABORTED, PREEMPTED, STOPPED, SUCCESS, StateKind, WORLD_MODEL, is_failure};
 use ratn_model::resource::Lease;
 use ratn_model::value::Value;
 
@@ -167,6 +167,9 @@ impl Interpreter {
         if self.is_held(context, thread) {
             return self.set_phase(thread, Phase::Held);
         }
+        if self.is_violated(context, thread) {
+            return;
+        }
         let program = context.program;
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let state = program.state(current.state);
@@ -243,7 +246,7 @@ impl Interpreter {
             aborted(&mut outcome, problem);
         }
         let mut assigned = Vec::new();
-        if !matches!(outcome.as_str(), ABORTED | PREEMPTED) {
+        if !is_failure(&outcome) {
             match self.assigned(context, thread, state, &outputs) {
                 Ok(values) => assigned = values,
                 Err(problem) => {
@@ -267,7 +270,7 @@ impl Interpreter {
         {
             aborted(&mut outcome, problem);
         }
-        if !matches!(outcome.as_str(), ABORTED | PREEMPTED) {
+        if !is_failure(&outcome) {
             self.outputs.insert(id, outputs);
             self.assign(thread, assigned);
         }

@@ -3,7 +3,7 @@
 use super::{Interpreter, Thread, Todo};
 use crate::context::Context;
 use ratn_model::id::StateId;
-use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind};
+use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind, VIOLATED};
 use std::sync::Arc;
 
 impl Interpreter {
@@ -92,7 +92,7 @@ impl Interpreter {
         let outcome = decision.unwrap_or_else(|| match first {
             Some(first) if *preemptive && decide.is_empty() => outcomes[first].clone(),
             _ if outcomes.iter().all(|outcome| outcome == SUCCESS) => SUCCESS.to_owned(),
-            _ if outcomes.iter().any(|outcome| outcome == ABORTED) => ABORTED.to_owned(),
+            _ if outcomes.iter().any(|outcome| outcome == ABORTED || outcome == VIOLATED) => ABORTED.to_owned(),
             _ => PREEMPTED.to_owned(),
         });
         self.decided(context, &path, outcome.clone());

@@ -4,9 +4,11 @@
 use super::node::GoalEnd;
 use super::{Interpreter, Phase, Progress, Thread};
 use crate::awaiting::{self, WaitEnd};
+use crate::binding;
 use crate::context::Context;
 use crate::protocol::{Awaited, Command, Note};
 use ratn_model::id::{InstanceId, StateId};
+use ratn_model::program::VIOLATED;
 
 impl Interpreter {
     /// Goes on until everything waits: what one thread has changed may be what another one waits for.
@@ -47,20 +49,27 @@ impl Interpreter {
         }
         self.has_begun_something(thread);
         context.commands.extend(until.map(|at| Command::Wake { at }));
-        if !state.is_between_tries() {
+        if !state.is_unsaid() {
             context.note(Note::Awaiting { instance, awaited, until });
         }
     }
 
-    /// Looks at the waits under way until one is over; whether one was. What its end leads to comes before the others are looked at.
+    /// Looks at what the world may end, waits and actions that are watched, until one is over; whether one was. What its end leads to comes before the others are looked at.
     fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
         let waits = |(thread, current): (u64, &super::Current)| {
-            let is_wait = current.phase == Phase::Running && context.program.state(current.state).is_pause();
-            is_wait.then_some((thread, current.state))
+            let state = context.program.state(current.state);
+            let may_end = state.is_pause() || !state.annotations.holds.is_empty();
+            (current.phase == Phase::Running && may_end).then_some((thread, current.state))
         };
         let under_way = self.threads.iter().filter_map(|(id, thread)| Some((*id, thread.current.as_ref()?)));
         let waiting: Vec<(u64, StateId)> = under_way.filter_map(waits).collect();
-        waiting.into_iter().any(|(thread, state)| self.ends_waiting(context, thread, state))
+        waiting.into_iter().any(|(thread, state)| {
+            if context.program.state(state).is_pause() {
+                self.ends_waiting(context, thread, state)
+            } else {
+                self.is_violated(context, thread)
+            }
+        })
     }
 
     /// Ends a wait if what it waits for is there; whether it did.
@@ -70,9 +79,28 @@ impl Interpreter {
             self.has_waited(context, thread, end);
             return true;
         }
-        match self.with_scope(context, thread, None, |scope| awaiting::holds(state, scope)) {
-            Ok(false) => return false,
-            Ok(true) => self.has_waited(context, thread, awaiting::has_come()),
+        match self.with_scope(context, thread, None, |scope| awaiting::has_come(state, scope)) {
+            Ok(None) => return false,
+            Ok(Some(end)) => self.has_waited(context, thread, end),
+            Err(error) => self.end_node(context, thread, error.reason()),
+        }
+        true
+    }
+
+    /// Ends an action of which a condition does not hold, before it begins or while it goes on; whether it did.
+    pub(super) fn is_violated(&mut self, context: &mut Context<'_>, thread: u64) -> bool {
+        let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return false };
+        let state = context.program.state(current.state);
+        if state.annotations.holds.is_empty() {
+            return false;
+        }
+        let violated = self.with_scope(context, thread, None, |scope| binding::violated(state, scope));
+        if let (Ok(Some(_)) | Err(_), Phase::Running) = (&violated, current.phase) {
+            context.commands.push(Command::Cancel { instance: current.instance, attempt: current.attempt });
+        }
+        match violated {
+            Ok(None) => return false,
+            Ok(Some(reason)) => self.has_waited(context, thread, awaiting::cut_short(VIOLATED, reason)),
             Err(error) => self.end_node(context, thread, error.reason()),
         }
         true
@@ -102,7 +130,7 @@ impl Interpreter {
 
     fn has_waited(&mut self, context: &mut Context<'_>, thread: u64, end: WaitEnd) {
         let (measured, evidence) = Default::default();
-        let WaitEnd { outcome, outputs } = end;
-        self.finish(context, thread, GoalEnd { outcome, outputs, measured, evidence, reason: String::new() });
+        let WaitEnd { outcome, outputs, reason } = end;
+        self.finish(context, thread, GoalEnd { outcome, outputs, measured, evidence, reason });
     }
 }

@@ -6,7 +6,7 @@ use super::{Names, Predicate, Subject, is_action, nature};
 use crate::effects;
 use ratn_model::expression::{EffectExpr, Expr, FactExpr};
 use ratn_model::id::StateId;
-use ratn_model::program::{ABORTED, Nature, PREEMPTED, ResourceExpr, State, StateKind};
+use ratn_model::program::{Nature, ResourceExpr, State, StateKind, is_failure};
 use ratn_model::slot::Slot;
 use std::collections::BTreeSet;
 
@@ -149,7 +149,7 @@ fn own_writes(subject: &Subject<'_>, state: &State) -> Option<Vec<EffectExpr>> {
     for outcome in subject.program.outcomes(state.id) {
         match effects::declared(state, nature::own(state), outcome) {
             Some(declared) => all.extend(declared.iter().cloned()),
-            None if matches!(outcome, ABORTED | PREEMPTED) && ends_all(subject, state, outcome) => {}
+            None if is_failure(outcome) && ends_all(subject, state, outcome) => {}
             None => return None,
         }
     }

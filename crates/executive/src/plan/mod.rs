@@ -196,7 +196,10 @@ impl StatePlan {
             is_node: subject.is_node,
             is_routine: subject.is_routine(),
             is_region: matches!(around, Some(StateKind::Concurrency { .. })),
-            imprecise: nature == NodeNature::Irreversible && exceptions == Exceptions::Imprecise && !waits,
+            imprecise: nature == NodeNature::Irreversible
+                && exceptions == Exceptions::Imprecise
+                && !waits
+                && state.annotations.holds.is_empty(),
             waits,
             action: match &state.kind {
                 StateKind::Action { provider, action, .. } => Some((Arc::from(&**provider), Arc::from(&**action))),

@@ -5,7 +5,7 @@ use super::{Names, Predicate, Subject, index};
 use crate::effects;
 use ratn_model::expression::EffectExpr;
 use ratn_model::id::StateId;
-use ratn_model::program::{ABORTED, PREEMPTED, Program, ResourceExpr, SUCCESS, State, StateKind, Target};
+use ratn_model::program::{Program, ResourceExpr, SUCCESS, State, StateKind, Target, is_failure};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -43,7 +43,7 @@ pub(crate) enum Effects {
 
 /// Whether a state that ends so has outputs and assigns.
 pub(crate) fn gives_outputs(outcome: &str) -> bool {
-    !matches!(outcome, ABORTED | PREEMPTED)
+    !is_failure(outcome)
 }
 
 /// The outcomes of all states, and where those lead that are not connected.

@@ -318,6 +318,10 @@ impl Window {
             return self.begin_waiting(context, id);
         }
         let Some((provider, action)) = context.plan.state(instance.state).action.clone() else { return };
+        if self.is_violated(context, id) {
+            return;
+        }
+        let Some(instance) = self.graph.get(id) else { return };
         let looked = self.look(context, id, None, |_, view| {
             let bound = match &known {
                 Some(inputs) => Ok(inputs.clone()),

@@ -15,7 +15,7 @@ use crate::plan::gives_outputs;
 use crate::protocol::Note;
 use ratn_model::expression::{Expr, Scope};
 use ratn_model::id::InstanceId;
-use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, StateKind};
+use ratn_model::program::{ABORTED, PREEMPTED, SUCCESS, StateKind, VIOLATED};
 use ratn_model::value::Value;
 
 impl Window {
@@ -271,7 +271,7 @@ pub(super) fn names_of(instance: &Instance) -> [&'static str; 2] {
 fn default_outcome(outcomes: &[String]) -> &'static str {
     if outcomes.iter().all(|outcome| outcome == SUCCESS) {
         SUCCESS
-    } else if outcomes.iter().any(|outcome| outcome == ABORTED) {
+    } else if outcomes.iter().any(|outcome| outcome == ABORTED || outcome == VIOLATED) {
         ABORTED
     } else {
         PREEMPTED

@@ -9,12 +9,13 @@ use super::Window;
 use super::graph::instance::{Changed, Ended, Status};
 use super::waits::Timer;
 use crate::awaiting::{self, WaitEnd};
-use crate::binding::Bindings;
+use crate::binding::{self, Bindings, Outputs};
 use crate::context::Context;
 use crate::protocol::{Awaited, Command, Event, Note};
 use ratn_model::expression::Scope;
 use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
+use ratn_model::program::VIOLATED;
 
 impl Window {
     /// A wait has its place: it begins, unless it is over.
@@ -41,7 +42,7 @@ impl Window {
             self.waits.set_timer_at(until, Timer::Timeout(id, attempt));
             context.commands.push(Command::Wake { at: until });
         }
-        if !state.is_between_tries() {
+        if !state.is_unsaid() {
             context.note(Note::Awaiting { instance: id, awaited, until });
         }
     }
@@ -60,6 +61,7 @@ impl Window {
                 Some(Status::Running(_)) if context.program.state(instance.state).is_pause() => {
                     any |= self.ends_waiting(context, id);
                 }
+                Some(Status::Running(_)) => any |= self.is_violated(context, id),
                 Some(Status::RunningRoutine(..)) if context.plan.state(instance.state).waits => {
                     let before = context.commands.len();
                     self.tell_routine(context, id, Event::Woken);
@@ -83,11 +85,30 @@ impl Window {
             self.has_waited(context, id, end);
             return true;
         }
-        match self.in_reality(context, id, |scope| awaiting::holds(state, scope)) {
-            Some(Ok(true)) => self.has_waited(context, id, awaiting::has_come()),
+        match self.in_reality(context, id, |scope| awaiting::has_come(state, scope)) {
+            Some(Ok(Some(end))) => self.has_waited(context, id, end),
             Some(Err(error)) => self.finish(context, id, Ended::aborted(error.reason())),
-            Some(Ok(false)) | None => return false,
+            Some(Ok(None)) | None => return false,
         }
+        true
+    }
+
+    /// Ends an action of which a condition does not hold, before it begins or while it goes on; whether it did.
+    pub(super) fn is_violated(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
+        let Some(instance) = self.graph.get(id) else { return false };
+        let state = context.program.state(instance.state);
+        if state.annotations.holds.is_empty() {
+            return false;
+        }
+        let ended = match self.in_reality(context, id, |scope| binding::violated(state, scope)) {
+            Some(Ok(Some(reason))) => Ended { reason, ..Ended::with(VIOLATED.to_owned(), Outputs::new()) },
+            Some(Err(error)) => Ended::aborted(error.reason()),
+            Some(Ok(None)) | None => return false,
+        };
+        if let Some(node) = instance.node().filter(|node| node.status.is_running()) {
+            context.commands.push(Command::Cancel { instance: id, attempt: node.attempt });
+        }
+        self.finish(context, id, ended);
         true
     }
 
@@ -127,12 +148,12 @@ impl Window {
     }
 
     fn has_waited(&mut self, context: &mut Context<'_>, id: InstanceId, end: WaitEnd) {
-        let WaitEnd { outcome, outputs } = end;
+        let WaitEnd { outcome, outputs, reason } = end;
         let Some(state) = self.graph.get(id).map(|instance| instance.state) else { return };
         let foreseen = context.program.state(state).annotations.effects.get(&outcome);
         let as_it_is = self.in_reality(context, id, |scope| awaiting::as_it_is(foreseen, scope, context.root));
         let changes = Changed::Foreseen(as_it_is.unwrap_or_default());
-        let ended = Ended { changes, ..Ended::with(outcome, outputs) };
+        let ended = Ended { changes, reason, ..Ended::with(outcome, outputs) };
         self.finish(context, id, ended);
     }
 }

@@ -8,7 +8,7 @@ use super::{Subject, branches, expressions};
 use crate::diagnostic::Findings;
 use crate::expression::Expr;
 use crate::id::StateId;
-use crate::program::{ABORTED, PREEMPTED, Program, SUCCESS, State, StateKind};
+use crate::program::{Program, SUCCESS, State, StateKind, is_failure};
 use crate::slot::Slot;
 use petgraph::graph::{DiGraph, NodeIndex};
 use std::collections::BTreeSet;
@@ -180,7 +180,7 @@ fn written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: StateId) -> 
     };
     let outcomes = control.outcomes(to.id).iter().enumerate().filter(|(_, outcome)| match only {
         Some(only) => outcome.as_str() == only,
-        None => !matches!(outcome.as_str(), ABORTED | PREEMPTED),
+        None => !is_failure(outcome),
     });
     outcomes
         .map(|(number, _)| Point::End(to.id, number))

@@ -4,7 +4,7 @@
 //! have. A state inside of a composite is forgotten when the composite is entered again.
 
 use crate::id::StateId;
-use crate::program::{ABORTED, PREEMPTED, Program, SUCCESS, State, StateKind, Target};
+use crate::program::{ABORTED, Program, SUCCESS, State, StateKind, Target, is_failure};
 use petgraph::graph::{DiGraph, NodeIndex};
 use petgraph::visit::EdgeRef;
 use std::collections::{BTreeMap, VecDeque};
@@ -263,7 +263,7 @@ impl ControlFlow {
                     }
                 }
                 Point::End(id, number) => {
-                    if !matches!(self.outcomes[id.0 as usize][number].as_str(), ABORTED | PREEMPTED) {
+                    if !is_failure(&self.outcomes[id.0 as usize][number]) {
                         surely.insert(id);
                         maybe.insert(id);
                     }

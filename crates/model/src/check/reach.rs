@@ -168,6 +168,9 @@ fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings)
             let variable = variable.map(|name| format!("the variable `${name}`"));
             let resource =
                 first.operated.intersection(&second.operated).next().map(|kind| format!("the task resource {kind}"));
+            // Who watches a region ends it in the moment in which a fact is written.
+            let is_watched = regions[i].is_watch() || other.is_watch();
+            let fact = fact.filter(|_| !is_watched);
             if let Some(what) = fact.or(variable).or(resource) {
                 let message =
                     format!("this region and `{}` both touch {what}, and nothing says in which order", other.name);

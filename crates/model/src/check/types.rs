@@ -121,6 +121,7 @@ fn what(slot: Slot<'_>) -> String {
     match slot {
         Slot::Input(name) | Slot::Output(name) => name.to_owned(),
         Slot::Requires(_) => "requires".to_owned(),
+        Slot::Holds(_) => "while".to_owned(),
         Slot::Decide(_) => "decide".to_owned(),
         other => other.to_string(),
     }
@@ -142,7 +143,7 @@ fn wanted(subject: &Subject<'_>, state: &State, slot: Slot<'_>) -> Option<Type> 
             let own = if state.id == Program::ROOT { &subject.program.outputs } else { outputs };
             own.iter().find(|output| output.name == name).map(|output| output.ty.clone())
         }
-        (Slot::Requires(_) | Slot::Decide(_) | Slot::Condition | Slot::While, _) => Some(Type::Bool),
+        (Slot::Requires(_) | Slot::Holds(_) | Slot::Decide(_) | Slot::Condition | Slot::While, _) => Some(Type::Bool),
         (Slot::Collection, _) => Some(Type::List(Box::new(Type::Any))),
         (Slot::Duration, _) => Some(Type::Float),
         _ => None,

@@ -1,14 +1,15 @@
-//! How control and values flow between states: outcomes, transitions, scoped variables, retry, timeouts.
+//! How control and values flow between states: outcomes, transitions, scoped variables, retry, timeouts, conditions.
 
 use super::fields::{Fields, Output};
 use super::names::{Task, suggestion};
 use super::outline::{Branch, Form, Step};
 use super::yaml::{Content, Node};
 use crate::expression::Expr;
-use crate::guard::{Guard, Retried};
+use crate::guard::{Limits, Retried};
 use crate::id::StateId;
 use crate::program::{
-    ABORTED, Annotations, Exceptions, Location, PREEMPTED, Program, Retry, SUCCESS, State, StateKind, Target,
+    ABORTED, Annotations, Exceptions, Location, Nature, PREEMPTED, Program, Retry, SUCCESS, State, StateKind, Target,
+    VIOLATED,
 };
 use std::collections::BTreeMap;
 
@@ -31,6 +32,7 @@ pub(crate) fn outcomes(fields: &mut Fields<'_, '_>, id: StateId) -> Vec<String> 
         }
         _ => Vec::new(),
     };
+    own.extend(step.holds().map(|_| VIOLATED.to_owned()));
     let declared = step.body.get("outcomes");
     for node in declared.into_iter().flat_map(Node::items) {
         own.extend(fields.word(node, "an outcome").map(str::to_owned));
@@ -214,7 +216,7 @@ pub(crate) fn decide(fields: &mut Fields<'_, '_>, body: &Node) -> Vec<(String, E
 /// Retry, timeout, exceptions, determinism, shared facts.
 pub(crate) fn annotate(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotations) {
     retry(fields, body, annotations);
-    annotations.timeout_s = body.get("timeout").and_then(|node| positive(fields, node, "timeout"));
+    limits(fields, body, annotations);
     annotations.exceptions = body.get("exceptions").and_then(|node| exceptions(fields, node));
     annotations.deterministic = body.get("deterministic").is_some_and(|node| fields.flag(node));
     for node in body.get("exceptional").into_iter().flat_map(Node::items) {
@@ -265,9 +267,60 @@ fn retry(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotations
             annotations.retry = Some(Retry { count, backoff_s });
         } else {
             let retried = Retried { count, backoff_s, on, before: step.before.clone() };
-            fields.out.guards.insert(id, Guard { retried: Some(retried), finally: Vec::new() });
+            fields.out.guards.entry(id).or_default().retried = Some(retried);
         }
     }
+}
+
+/// `while: [lit(lamp)]` and `timeout: 20`. An action's time is the executive's to watch, and so are the conditions of a PIA; the rest stands
+/// around the state.
+fn limits(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotations) {
+    let Some(id) = fields.view.state else { return };
+    let step = fields.task.outline.step(id);
+    let is_action = matches!(step.form, Form::Action { .. });
+    let mut timeout_s = body.get("timeout").and_then(|node| positive(fields, node, "timeout"));
+    if is_action || matches!(step.form, Form::Wait { .. }) {
+        annotations.timeout_s = timeout_s.take();
+    }
+    let mut holds = step.holds().map(|node| conditions(fields, node)).unwrap_or_default();
+    if is_action && annotations.nature == Nature::Irreversible {
+        annotations.holds = std::mem::take(&mut holds);
+    }
+    if !holds.is_empty() || timeout_s.is_some() {
+        fields.out.guards.entry(id).or_default().limits = Some(Limits { holds, timeout_s });
+    }
+}
+
+fn conditions(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<Expr> {
+    if node.items().is_empty() {
+        let help = "name a fact, such as `while: [closed(door)]`, or leave it out";
+        fields.error("invalid-state", node.at, "nothing has to hold meanwhile", help);
+    }
+    let mut all = Vec::new();
+    for (number, node) in node.items().into_iter().enumerate() {
+        fields.note(format!("while.{number}"), node.at);
+        let Some(condition) = fields.expression(node) else { continue };
+        if condition.fact_expressions().is_empty() {
+            let message = "this condition looks up no fact, so nothing changes it meanwhile";
+            fields.error("invalid-state", node.at, message, "name a fact, such as `while: [closed(door)]`");
+        }
+        all.push(condition);
+    }
+    all
+}
+
+/// A condition that did not hold leads where a failure leads, unless the task says otherwise.
+pub(crate) fn lead_violated(fields: &Fields<'_, '_>, id: StateId, state: &mut State) {
+    let step = fields.task.outline.step(id);
+    if step.holds().is_none() || fields.task.outline.is_region(id) || state.transitions.contains_key(VIOLATED) {
+        return;
+    }
+    let failed = state.transitions.get(ABORTED).cloned();
+    if failed.is_none() {
+        state.annotations.exceptional.push(VIOLATED.to_owned());
+    }
+    let failed = failed.unwrap_or_else(|| Target::Outcome(ABORTED.to_owned()));
+    state.transitions.insert(VIOLATED.to_owned(), failed);
 }
 
 /// A number of seconds above 0.

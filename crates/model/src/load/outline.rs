@@ -191,6 +191,16 @@ impl Outline<'_> {
     }
 }
 
+impl<'a> Step<'a> {
+    /// What must hold as long as it goes on: `while` beside what the step is.
+    pub(crate) fn holds(&self) -> Option<&'a Node> {
+        match self.form {
+            Form::While { tests: Tests::Before, .. } => None,
+            _ => self.body.get("while"),
+        }
+    }
+}
+
 impl Form<'_> {
     /// The children, or those of `then`.
     pub(crate) fn first_branch(&self) -> &[StateId] {
@@ -362,7 +372,11 @@ impl<'a> Builder<'a, '_> {
         branch: Branch,
         depth: usize,
     ) -> Option<StateId> {
-        let forms: Vec<&Entry> = body.entries().iter().filter(|e| FORMS.contains(&e.key.as_str())).collect();
+        let mut forms: Vec<&Entry> = body.entries().iter().filter(|e| FORMS.contains(&e.key.as_str())).collect();
+        if forms.len() > 1 {
+            // Beside another form it says what must hold meanwhile.
+            forms.retain(|form| form.key != "while");
+        }
         let [form] = forms.as_slice() else {
             let message = match forms.as_slice() {
                 [] => match foreign_form(body.entries()) {

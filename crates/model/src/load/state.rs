@@ -23,8 +23,10 @@ const LIBRARY_KEYS: [&str; 2] = ["library", "with"];
 const WAIT_KEYS: [&str; 2] = ["wait", "ask"];
 /// A state that waits reads what it says, holds nothing and changes nothing.
 const WAITING_KEYS: [&str; 7] = ["retry", "duration", "description", "transitions", "exceptional", "assign", "shared"];
-const NODE_KEYS: [&str; 11] = [
+const NODE_KEYS: [&str; 13] = [
     "retry",
+    "timeout",
+    "while",
     "reads",
     "routine",
     "duration",
@@ -37,7 +39,7 @@ const NODE_KEYS: [&str; 11] = [
     "shared",
 ];
 const BOUNDARY_KEYS: [&str; 2] = ["requires", "effects"];
-const NATURE_KEYS: [&str; 6] = ["computes", "senses", "pia", "attempts", "timeout", "deterministic"];
+const NATURE_KEYS: [&str; 5] = ["computes", "senses", "pia", "attempts", "deterministic"];
 
 /// Reads one step.
 pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
@@ -78,7 +80,7 @@ pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
     let assign = flow::assign(&mut fields, id, step.body);
     let defaults = defaults(&mut fields, step.body);
     let annotations = if id.0 > 0 { annotations(&mut fields, step, &kind) } else { boundary(Vec::new()) };
-    State {
+    let mut state = State {
         id,
         name: step.name.clone(),
         path: step.path.clone(),
@@ -91,7 +93,9 @@ pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
         defaults,
         annotations,
         location: step.at,
-    }
+    };
+    flow::lead_violated(&fields, id, &mut state);
+    state
 }
 
 fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {

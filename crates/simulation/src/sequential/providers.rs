@@ -97,7 +97,7 @@ impl Oracle for AssumedProviders {
         let path = plain(path);
         let state = self.waits.get(&path)?;
         let event = match state.wait()? {
-            Wait::Seconds(_) | Wait::Until(_) => return None,
+            Wait::Seconds(_) | Wait::Until(_) | Wait::Limit(_) | Wait::Watch(_) => return None,
             Wait::Signal(signal) => {
                 let value = assumed(&Type::Any, signal, self.elements);
                 Event::Signalled { signal: signal.to_owned(), value }

@@ -37,7 +37,7 @@ impl Reference<'_> {
         let late = "timeout".to_owned();
         let one = |port: &str, value: Value| Outputs::from([(port.to_owned(), value)]);
         match state.wait() {
-            None => Err(Fail::NotMine("a wait of another kind")),
+            None | Some(Wait::Watch(_) | Wait::Limit(_)) => Err(Fail::NotMine("a wait of another kind")),
             Some(Wait::Seconds(time) | Wait::Until(time)) => match time.read(&self.place(variables, None))? {
                 Value::Int(_) => Ok((SUCCESS.to_owned(), Outputs::new())),
                 Value::Float(seconds) if seconds.is_finite() => Ok((SUCCESS.to_owned(), Outputs::new())),

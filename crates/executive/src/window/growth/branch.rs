@@ -9,7 +9,7 @@ use crate::context::Context;
 use crate::plan::{Outcome, Outcomes};
 use crate::window::graph::Graph;
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{ABORTED, PREEMPTED, Program, StateKind};
+use ratn_model::program::{ABORTED, PREEMPTED, Program, StateKind, VIOLATED};
 use ratn_model::wait::TIMEOUT;
 use std::sync::Arc;
 
@@ -114,7 +114,7 @@ impl Growth {
             .iter()
             .map(|(_, _, name)| match learned {
                 Some(shares) => shares.get(*name).copied().filter(|s| s.is_finite()).unwrap_or(0.0).max(LEAST_SHARE),
-                None if matches!(*name, ABORTED | PREEMPTED | TIMEOUT) => FAILURE,
+                None if matches!(*name, ABORTED | PREEMPTED | VIOLATED | TIMEOUT) => FAILURE,
                 None => 1.0,
             })
             .collect();
