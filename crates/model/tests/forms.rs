@@ -575,3 +575,62 @@ mod random_functions {
         assert!(compared > 200, "only {compared} of 300 are compared");
     }
 }
+
+#[test]
+fn what_must_hold_meanwhile_and_times() {
+    let task = "
+task: t
+world: [closed(door), closed(lid) = false]
+outcomes: [locked]
+states:
+  - move: { action: gripper/release, pia: true, while: [closed(door), not closed(lid)], effects: { violated: [at(arm) = 0] }, resources: [{ block: Gripper }] }
+  - both:
+      while: closed(door)
+      timeout: 20
+      outputs: { n: 1 }
+      effects: { success: [done(both)], aborted: [done(none)], violated: [at(arm) = 1] }
+      states: [{ step: { states: [] } }]
+      transitions: { aborted: success, violated: last }
+  - each: { for: i in range(2), timeout: 5, do: [{ step: { states: [] } }], transitions: { aborted: success } }
+  - last: { action: gripper/release, while: [closed(door)], resources: [{ block: Gripper }], transitions: { aborted: success } }
+";
+    let program = program(task);
+    let moved = state(&program, "move");
+    let shown =
+        |all: &[ratn_model::expression::Expr]| all.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+    assert_eq!(shown(&moved.annotations.holds), "closed(door), not closed(lid)");
+    assert_eq!(transitions(&program, "move"), "violated → (aborted)");
+    assert!(program.is_exceptional(moved.id, "violated") && moved.outcomes == ["violated"]);
+    // A hierarchy, its watch and its limit race each other.
+    let StateKind::Concurrency { regions, preemptive: true, outputs, .. } = &state(&program, "both").kind else {
+        panic!()
+    };
+    let paths: Vec<&str> = regions.iter().map(|id| program.state(*id).path.as_str()).collect();
+    assert_eq!(paths, ["both/while", "both/timeout", "both/body"]);
+    assert_eq!(outputs.len(), 1);
+    assert_eq!(transitions(&program, "both"), "aborted → (success), violated → last");
+    let effects = |path: &str| state(&program, path).annotations.effects.keys().cloned().collect::<Vec<_>>().join(" ");
+    assert_eq!((effects("both").as_str(), effects("both/body").as_str()), ("aborted success violated", "success"));
+    assert!(!program.is_exceptional(state(&program, "both").id, "violated"));
+    assert_eq!(state(&program, "both/body").outcomes, Vec::<String>::new());
+    assert_eq!(transitions(&program, "last"), "aborted → (success), violated → (success)");
+    assert!(state(&program, "each/timeout").is_watch());
+}
+
+#[test]
+fn conditions_and_times_that_cannot_be_are_refused() {
+    let refused = |key: &str| findings(&format!("task: t\nstates:\n  - a: {{ {key} }}\n"));
+    let act = "action: gripper/release, resources: [{ block: Gripper }]";
+    for (keys, rule) in [
+        (format!("{act}, while: []"), "error[invalid-state] in a: nothing has to hold meanwhile"),
+        (format!("{act}, while: [1 < 2]"), "error[invalid-state] in a: this condition looks up no fact"),
+        (format!("{act}, while: [len(near(x))]"), "error[type-mismatch] in a"),
+        ("states: [], timeout: 0".to_owned(), "error[type-mismatch] in a: `timeout` is a number of seconds above 0"),
+        ("wait: { seconds: 1 }, while: [p()]".to_owned(), "error[unknown-key] in a"),
+        (format!("{act}, transitions: {{ violated: success }}"), "error[unknown-outcome] in a"),
+    ] {
+        assert!(refused(&keys).contains(rule), "{keys}: {}", refused(&keys));
+    }
+    let race = "task: t\nstates:\n  - around:\n      variables: { n: 0 }\n      states:\n        - a: { while: [p($n)], states: [{ b: { states: [], assign: { n: 1 } } }] }\n";
+    assert!(findings(race).contains("error[region-conflict]"), "{}", findings(race));
+}

@@ -52,6 +52,8 @@ pub struct Features {
     pub guards: bool,
     /// States that wait: for a time, a condition, a signal, an answer.
     pub waits: bool,
+    /// Motions that are watched: something must hold from their start to their end.
+    pub watched: bool,
 }
 
 impl Features {
@@ -81,6 +83,7 @@ impl Features {
         lists: false,
         guards: false,
         waits: false,
+        watched: false,
     };
 
     /// Sequences, hierarchies, loops over lists, conditions, routines and actions alone.
@@ -109,6 +112,7 @@ impl Features {
         lists: false,
         guards: false,
         waits: false,
+        watched: false,
     };
 
     /// [`Features::ALL`], without those assumptions.
@@ -137,6 +141,9 @@ impl Features {
 
     /// [`Features::GUARDS`], with states that wait.
     pub const WAITS: Features = Features { waits: true, ..Features::GUARDS };
+
+    /// [`Features::WAITS`], with motions that are watched.
+    pub const WATCHED: Features = Features { watched: true, ..Features::WAITS };
 
     /// Imprecise motions that fail, in programs that never look at the world: where a failure leads is then the same in both
     /// modes, whatever younger motions have done meanwhile.

@@ -7,11 +7,11 @@
 //!
 //! | | |
 //! |---|---|
-//! | the tree | `list`, `composite`, `regions`, `action`, `guards`, `waits`, `long`, `patterns` |
+//! | the tree | `list`, `composite`, `regions`, `action`, `guards`, `waits`, `watched`, `long`, `patterns` |
 //! | what is said of a state | `annotations`, `variables`, `supplies`, `estimates` |
 //! | facts | `facts`, `effects`, `tolerance` |
 //!
-//! What it does not make: waits in races and beside imprecise motions, conditions of waits with keys that are not constants (scenarios of the
+//! What it does not make: composites that are watched or have a limit; waits in races and beside imprecise motions, conditions of waits with keys that are not constants (scenarios of the
 //! simulation have them); hierarchies and concurrencies with tolerated facts or port keys in their effects; numbers within a
 //! tolerance that add up, or that are looked up by anything that compares exactly; individuals of classes (ontologies declare
 //! numbers and things); values that are poses, joint positions or trajectories; selectors of task resources; task resources and
@@ -48,6 +48,7 @@ mod supplies;
 pub(super) mod tolerance;
 mod variables;
 mod waits;
+mod watched;
 
 /// No program has many more states.
 const MAX_STATES: usize = 26;
@@ -125,6 +126,9 @@ pub fn program(seed: u64, features: &Features) -> Program {
     for id in around {
         // Blocks go to every state inside: regions that race must not wait for each other's workers.
         program.states[id.0 as usize].annotations.resources.retain(|r| r.operation != ResourceOperation::Block);
+    }
+    if features.watched {
+        watched::watch(&mut program, &mut Dice(seed ^ 0x0000_3a7c_11ed));
     }
     if features.lists {
         lists::say_with_comprehensions(&mut program, &mut maker.dice);

@@ -127,7 +127,10 @@ fn simplify(program: &mut Program, at: usize, what: usize) {
     let state = &mut program.states[at];
     let a = &mut state.annotations;
     match what {
-        0 => a.requires.clear(),
+        0 => {
+            a.requires.clear();
+            a.holds.clear();
+        }
         1 => a.routine = false,
         2 => a.retry = None,
         3 => a.timeout_s = None,

@@ -5,7 +5,7 @@ use super::{around, is_in_routine, is_preemptive, plain, state_of};
 use ratn_executive::protocol::{Command, Event, Goal, LogEntry, Note};
 use ratn_model::fact::Change;
 use ratn_model::id::InstanceId;
-use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, State, StateKind};
+use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, State, StateKind, VIOLATED};
 use ratn_model::value::Value;
 use ratn_simulation::run::Run;
 use std::collections::BTreeMap;
@@ -127,7 +127,7 @@ pub(super) fn story(program: &Program, run: &Run) -> Story {
                     if let Some(life) = lives.get(instance).filter(|life| life.tells) {
                         // Why something failed to begin, or to end, is not compared.
                         let data = match life.outcome.as_str() {
-                            ABORTED | PREEMPTED => Data::Untold,
+                            ABORTED | PREEMPTED | VIOLATED => Data::Untold,
                             _ if life.reused => Data::OneOf(answers.get(&life.path).cloned().unwrap_or_default()),
                             _ => Data::Of((life.inputs.clone().unwrap_or_default(), life.outputs.clone())),
                         };

@@ -8,7 +8,7 @@ use super::trial::same_end;
 use ratn_executive::protocol::{Command, LogEntry, Note};
 use ratn_model::expression::EffectExpr;
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, StateKind};
+use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, StateKind, VIOLATED};
 use ratn_simulation::run::Run;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -28,7 +28,7 @@ pub(super) fn problem(program: &Program, hsm: &Run, cdtn: &Run, (_, told): &(Sto
 pub(super) fn fails(run: &Run) -> bool {
     run.log.iter().any(|line| {
         matches!(&line.entry, LogEntry::Command(Command::Note(Note::Finished { outcome, .. }))
-            if matches!(&**outcome, ABORTED | PREEMPTED))
+            if matches!(&**outcome, ABORTED | PREEMPTED | VIOLATED))
     })
 }
 

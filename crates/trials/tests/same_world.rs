@@ -130,9 +130,12 @@ fn random_programs_leave_the_same_world_in_both_modes() {
         Ok("lists") => Features::LISTS,
         Ok("guards") => Features::GUARDS,
         Ok("waits") => Features::WAITS,
+        Ok("watched") => Features::WATCHED,
         Ok("all") | Err(_) => Features::ALL,
         Ok(other) => {
-            panic!("RATN_FEATURES: basic, all, everything, lists, guards, waits, weak or imprecise, not {other}")
+            panic!(
+                "RATN_FEATURES: basic, all, everything, lists, guards, waits, watched, weak or imprecise, not {other}"
+            )
         }
     };
     let by = match std::env::var("RATN_TRIAL").as_deref() {
@@ -179,6 +182,14 @@ fn random_programs_that_wait_leave_the_same_world_in_both_modes() {
     none_fails(trial, FURTHER, 120, &Features::WAITS);
     none_fails(trial_from_outside, FURTHER, 40, &Features::WAITS);
     none_fails(trial_interrupted, FURTHER, 40, &Features::WAITS);
+}
+
+/// What is watched changes before a motion begins, and from outside while it goes on.
+#[test]
+fn random_programs_that_are_watched_leave_the_same_world_in_both_modes() {
+    none_fails(trial, FURTHER, 80, &Features::WATCHED);
+    none_fails(trial_from_outside, FURTHER, 80, &Features::WATCHED);
+    none_fails(trial_interrupted, FURTHER, 40, &Features::WATCHED);
 }
 
 /// A pause asked for what a state around it blocks.

@@ -136,8 +136,10 @@ fn touched(program: &Program, region: &State) -> Touched {
 
 fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings) {
     let all: Vec<Touched> = regions.iter().map(|region| touched(subject.program, region)).collect();
+    // Who watches a region changes nothing.
+    let is_watched = regions.iter().any(|region| region.is_watch());
     for (region, touched) in regions.iter().zip(&all) {
-        if let Some(path) = &touched.unannotated {
+        if let Some(path) = &touched.unannotated.as_ref().filter(|_| !is_watched) {
             let message =
                 format!("`{path}` says neither what it reads nor what it changes, and runs beside other regions");
             let help = "give it `reads` and `effects`: then check can tell whether the regions get in each other's way";

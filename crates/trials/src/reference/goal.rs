@@ -10,7 +10,7 @@ use crate::story::{Real, goal_text};
 use ratn_executive::protocol::{Event, Goal};
 use ratn_model::fact::FactKey;
 use ratn_model::id::Revision;
-use ratn_model::program::{ABORTED, Nature, PREEMPTED, STOPPED, SUCCESS, State, StateKind};
+use ratn_model::program::{ABORTED, Nature, PREEMPTED, STOPPED, SUCCESS, State, StateKind, VIOLATED};
 use ratn_model::resource::ResourceOperation;
 use ratn_model::value::{Type, Value};
 use ratn_simulation::run::{Answer, Performance, Trigger};
@@ -84,8 +84,14 @@ impl Reference<'_> {
             if !in_routine {
                 self.asks(state, variables)?;
             }
+            if self.is_violated(state, variables)? {
+                return Ok(violated());
+            }
             let (goal, performance) = self.perform(state, path, variables, tries, attempt)?;
             *inputs = goal.inputs;
+            if self.is_violated(state, variables)? {
+                return Ok(violated());
+            }
             attempt += 1;
             let answer = match annotations.timeout_s {
                 Some(limit) if performance.duration_s > limit => None,
@@ -109,6 +115,16 @@ impl Reference<'_> {
             }
             return ended.ok_or_else(|| Fail::Wrong("it took too long".to_owned()));
         }
+    }
+
+    /// Whether something does not hold that has to while it goes on.
+    fn is_violated(&self, state: &State, variables: &[(String, Value)]) -> Result<bool, Fail> {
+        for holds in &state.annotations.holds {
+            if !holds.is_true(&self.place(variables, None))? {
+                return Ok(true);
+            }
+        }
+        Ok(false)
     }
 
     /// One goal.
@@ -227,8 +243,12 @@ impl Reference<'_> {
     }
 }
 
+fn violated() -> Ended {
+    Ended { outcome: VIOLATED.to_owned(), outputs: Outputs::new(), measured: Vec::new() }
+}
+
 fn is_good(outcome: &str) -> bool {
-    !matches!(outcome, ABORTED | PREEMPTED)
+    !matches!(outcome, ABORTED | PREEMPTED | VIOLATED)
 }
 
 /// The declared estimate, where it is one.

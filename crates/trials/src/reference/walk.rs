@@ -3,7 +3,7 @@
 use super::evaluate::Read;
 use super::{Fail, MAX_STEPS, Outputs, Reference, effects, fails};
 use ratn_model::id::StateId;
-use ratn_model::program::{ABORTED, Again, Finally, PREEMPTED, Program, SUCCESS, State, StateKind, Target};
+use ratn_model::program::{ABORTED, Again, Finally, PREEMPTED, Program, SUCCESS, State, StateKind, Target, VIOLATED};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 
@@ -297,7 +297,7 @@ impl Reference<'_> {
 
     /// What happens when a state is left: outputs, effects and resources; what it assigns.
     fn leave(&mut self, state: &State, outcome: &str, variables: &Variables) -> Result<Vec<(String, Value)>, Fail> {
-        let is_good = !matches!(outcome, ABORTED | PREEMPTED);
+        let is_good = !matches!(outcome, ABORTED | PREEMPTED | VIOLATED);
         let mut written = Outputs::new();
         if let (true, StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. }) =
             (is_good, &state.kind)

@@ -1,0 +1,63 @@
+//! Motions that are watched: a condition must hold from their start to their end.
+
+use super::super::{Dice, PREDICATES, around};
+use super::fact_at;
+use ratn_model::expression::{BinaryOperator, EffectExpr, Expr, UnaryOperator};
+use ratn_model::id::StateId;
+use ratn_model::program::{ABORTED, Nature, Program, State, StateKind, Target, VIOLATED};
+use ratn_model::value::Value;
+
+/// Some motions of a program are watched. Regions are left as they are: others may write there what is watched.
+pub(super) fn watch(program: &mut Program, dice: &mut Dice) {
+    let beside = |state: &State| around(program, state).any(|out| matches!(out.kind, StateKind::Concurrency { .. }));
+    let moves = |state: &&State| {
+        let is_motion = matches!(state.kind, StateKind::Action { .. }) && !state.is_pause();
+        is_motion && state.annotations.nature == Nature::Irreversible && !beside(state)
+    };
+    let motions: Vec<StateId> = program.states.iter().filter(moves).map(|state| state.id).collect();
+    for id in motions {
+        if !dice.percent(40) {
+            continue;
+        }
+        let state = &mut program.states[id.0 as usize];
+        let conditions = 1 + dice.below(2);
+        state.annotations.holds = (0..conditions).map(|_| condition(dice)).collect();
+        state.outcomes.push(VIOLATED.to_owned());
+        if dice.percent(70) {
+            let effect = EffectExpr::Set(fact_at(dice.below(PREDICATES), 0), number(dice.below(9) as i64));
+            state.annotations.effects.insert(VIOLATED.to_owned(), vec![effect]);
+        }
+        let failed = state.transitions.get(ABORTED).cloned();
+        if failed.is_none() || dice.percent(20) {
+            state.annotations.exceptional.push(VIOLATED.to_owned());
+        }
+        let failed = failed.unwrap_or_else(|| Target::Outcome(ABORTED.to_owned()));
+        state.transitions.insert(VIOLATED.to_owned(), failed);
+    }
+}
+
+/// One that holds more often than not.
+fn condition(dice: &mut Dice) -> Expr {
+    let fact = fact_at(dice.below(PREDICATES), 0);
+    let less = Expr::Binary(
+        BinaryOperator::Less,
+        Box::new(Expr::Fact(fact.clone())),
+        Box::new(number(2 + dice.below(8) as i64)),
+    );
+    match dice.below(4) {
+        0 => Expr::Exists(fact),
+        1 => Expr::Unary(
+            UnaryOperator::Not,
+            Box::new(Expr::Binary(
+                BinaryOperator::Equal,
+                Box::new(Expr::Fact(fact)),
+                Box::new(number(dice.below(5) as i64)),
+            )),
+        ),
+        _ => less,
+    }
+}
+
+fn number(value: i64) -> Expr {
+    Expr::Literal(Value::Int(value))
+}
