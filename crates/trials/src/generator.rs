@@ -109,6 +109,9 @@ pub fn program(seed: u64, features: &Features) -> Program {
         states: maker.states,
         digest: String::new(),
     };
+    if features.watched {
+        watched::watch(&mut program, &mut Dice(seed ^ 0x0000_3a7c_11ed));
+    }
     if !maker.guards.is_empty() {
         let unfolded = ratn_model::guard::unfold(&mut program, &maker.guards);
         assert!(unfolded.is_ok(), "a random program is small");
@@ -126,9 +129,6 @@ pub fn program(seed: u64, features: &Features) -> Program {
     for id in around {
         // Blocks go to every state inside: regions that race must not wait for each other's workers.
         program.states[id.0 as usize].annotations.resources.retain(|r| r.operation != ResourceOperation::Block);
-    }
-    if features.watched {
-        watched::watch(&mut program, &mut Dice(seed ^ 0x0000_3a7c_11ed));
     }
     if features.lists {
         lists::say_with_comprehensions(&mut program, &mut maker.dice);

@@ -75,6 +75,7 @@ fn said(program: &Program, state: &State) -> String {
         said.push(format!("{outcome}! [{}]", joined::<EffectExpr>(effects)));
     }
     said.extend(a.requires.iter().map(|required| format!("requires {required}")));
+    said.extend(a.holds.iter().map(|holds| format!("while {holds}")));
     let resources = a.resources.iter().map(|r| {
         let unordered = if r.unordered { " unordered" } else { "" };
         let mut like: Vec<String> = r.attributes.iter().map(|(name, value)| format!("{name} = {value}")).collect();

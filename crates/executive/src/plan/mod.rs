@@ -61,6 +61,8 @@ pub(crate) struct StatePlan {
     pub(crate) imprecise: bool,
     /// It waits, or something that it contains does.
     pub(crate) waits: bool,
+    /// What happens in the world may end it, or something inside of it: a wait, or a motion that is watched.
+    pub(crate) is_watched: bool,
     /// Of an action: its provider and its name there.
     pub(crate) action: Option<(Arc<str>, Arc<str>)>,
 
@@ -179,6 +181,8 @@ impl StatePlan {
         let awaited = waits::awaited(subject);
         let ends = outcomes::of(subject, transitions, nature, &awaited, names);
         let waits = subject.is_node && subject.contained.iter().any(|state| state.is_pause());
+        let is_watched = subject.is_node
+            && subject.contained.iter().any(|state| state.is_pause() || !state.annotations.holds.is_empty());
         let may_differ = match (&may_write, &awaited) {
             (Some(own), Effects::Declared(others)) => Some([own.as_slice(), others].concat()),
             (None, _) | (_, Effects::Unknown) => None,
@@ -196,11 +200,9 @@ impl StatePlan {
             is_node: subject.is_node,
             is_routine: subject.is_routine(),
             is_region: matches!(around, Some(StateKind::Concurrency { .. })),
-            imprecise: nature == NodeNature::Irreversible
-                && exceptions == Exceptions::Imprecise
-                && !waits
-                && state.annotations.holds.is_empty(),
+            imprecise: nature == NodeNature::Irreversible && exceptions == Exceptions::Imprecise && !is_watched,
             waits,
+            is_watched,
             action: match &state.kind {
                 StateKind::Action { provider, action, .. } => Some((Arc::from(&**provider), Arc::from(&**action))),
                 _ => None,

@@ -198,7 +198,6 @@ impl Window {
                 }
             };
             reads = reads.union(facts_of(&state.annotations.requires, view));
-            reads = reads.union(facts_of(&state.annotations.holds, view));
             // What its effects are made of is read when it ends.
             reads = reads.union(FactExpr::footprint(&own.effect_lookups, view));
             let ended = instance.ended().and_then(|ended| own.outcome(&ended.outcome));

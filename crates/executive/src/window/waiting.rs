@@ -62,7 +62,7 @@ impl Window {
                     any |= self.ends_waiting(context, id);
                 }
                 Some(Status::Running(_)) => any |= self.is_violated(context, id),
-                Some(Status::RunningRoutine(..)) if context.plan.state(instance.state).waits => {
+                Some(Status::RunningRoutine(..)) if context.plan.state(instance.state).is_watched => {
                     let before = context.commands.len();
                     self.tell_routine(context, id, Event::Woken);
                     any |= context.commands.len() > before;
