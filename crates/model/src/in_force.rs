@@ -66,7 +66,7 @@ fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
     let mut effects = vec![said.effects.get(SUCCESS).map_or_else(everything, |effects| changed(effects))];
     let others = said.effects.iter().filter(|(outcome, effects)| *outcome != SUCCESS && !effects.is_empty());
     effects.extend(others.map(|(outcome, effects)| format!("{outcome}: {}", changed(effects))));
-    vec![
+    let mut all = vec![
         match &said.nature {
             Nature::Computes => line("computes", "true".to_owned()),
             Nature::Senses(sensed) => line("senses", facts(sensed)),
@@ -80,7 +80,11 @@ fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
             if said.resources.is_empty() { "nothing".to_owned() } else { resources(program, &said.resources) },
         ),
         line("duration", said.duration_s.as_ref().map_or_else(unknown, |duration| named(program, duration))),
-    ]
+    ];
+    if !said.holds.is_empty() {
+        all.push(line("while", listed(program, &said.holds, Expr::flows)));
+    }
+    all
 }
 
 /// `block Arm where arm = left; consume 0.2 Battery`

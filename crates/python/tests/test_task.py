@@ -131,8 +131,8 @@ def test_every_form_of_a_state_is_traced() -> None:
         tries = ratn.variable(0)
         look = detector.segment(region=REGION, resources=["Detector", "Camera"], out={"boxes": {"default": []}})
         with ratn.when((fn.len(look.boxes) > 0) & ~ratn.exists(ratn.fact("in_gripper", "cup")) | (count < 2), outcomes=["empty"], transitions={"empty": "none"}):
-            with ratn.sequence("held", routine=True, resources=["Arm"]):
-                gripper.release()
+            with ratn.sequence("held", routine=True, resources=["Arm"], timeout=20):
+                gripper.release(holds=[ratn.fact("closed", "door")])
         with ratn.otherwise():
             ratn.leave("empty")
         with ratn.while_(tries < 3) as loop:
@@ -153,6 +153,8 @@ def test_every_form_of_a_state_is_traced() -> None:
         "condition: \"((len(look.boxes) > 0) and (not (exists in_gripper(cup)))) or ($count < 2)\"",
         "target: \"pose(0.8, $iteration * 0.1, 0.7)\"",
         "until: \"len(again.boxes) > 1\"",
+        "while: [closed(door)]",
+        "timeout: 20",
         "for: \"box in sort_by($b in look.boxes, $b.size[0])\"",
         "requires: [\"$i < 9\", \"cup in [cup, mug]\"]",
         "description: \"All of them.\"",

@@ -10,6 +10,8 @@ import re
 from typing import Any
 
 _INDENT = "    "
+#: Keys of a task file that are words of Python's own, and what they are called here.
+RENAMED = {"while": "holds"}
 _ACTION_KEYS = ("action", "in")
 _NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?\Z")
 _TASK_KEYS = ("description", "horizon", "speculation_width", "deadline", "exceptions", "ontology", "tolerance", "world", "outcomes", "variables", "functions")
@@ -49,6 +51,7 @@ def _annotations(body: dict[str, Any], without: tuple[str, ...]) -> list[str]:
     for key, value in body.items():
         if key in without:
             continue
+        key = RENAMED.get(key, key)
         if key == "outputs" and isinstance(value, dict):
             said.append("outputs={" + ", ".join(f"{name!r}: {_output(item)}" for name, item in value.items()) + "}")
         else:
@@ -143,7 +146,7 @@ class _Source:
 
     def loop_or_sequence(self, called: list[str], body: dict[str, Any]) -> None:
         for key, function in (("while", "while_"), ("do_while", "do_while"), ("until", "until")):
-            if key in body:
+            if key in body and "do" in body and not (key == "while" and ("do_while" in body or "until" in body)):
                 index = [f"index={body['index']!r}"] if "index" in body else []
                 arguments = [_test(body[key]), *index, *called, *_annotations(body, (key, "index", "do"))]
                 return self.block(function, arguments, body.get("do"))

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
-from ratn import _ports, _ratn, _yaml
+from ratn import _ports, _ratn, _source, _yaml
 from ratn._expression import Untraceable, Value, call, refuse, statements_at_work, user_frame, user_line, written
 from ratn._ratn import Error, InvalidTask
 from ratn._yaml import Body
@@ -44,6 +44,7 @@ class Annotations(typing.TypedDict, total=False):
     duration: float | Value
     attempts: int
     timeout: float
+    holds: Sequence[str | Value]
     retry: int | Mapping[str, Any]
     transitions: Mapping[str, str | State]
     exceptional: Sequence[str]
@@ -59,6 +60,8 @@ ANNOTATIONS = (
 )
 #: Annotations that are expressions, or have some within: a text of Python is a text there, and not an expression.
 _VALUES = {"duration", "variables", "assign", "outputs", "decide"}
+
+_KEYS = {name: key for key, name in _source.RENAMED.items()}
 
 _tracing: contextvars.ContextVar[Trace | None] = contextvars.ContextVar("ratn_tracing", default=None)
 
@@ -275,6 +278,7 @@ def annotate(body: dict[str, Any], said: dict[str, Any]) -> None:
             raise TypeError(f"there is no annotation `{key}`; there are {known}")
         if value is None:
             continue
+        key = _KEYS.get(key, key)
         if key in _VALUES:
             body[key] = _outputs(value) if key == "outputs" else entry(value)
         elif key == "resources" or isinstance(value, (list, tuple, set, frozenset)):
@@ -879,8 +883,6 @@ class Task:
 
     def to_python(self) -> str:
         """Python of which the same task can be traced: to go on with a task file in Python."""
-        from ratn import _source
-
         return _source.python_of(self.document)
 
     def _lines(self) -> _yaml.Lines:

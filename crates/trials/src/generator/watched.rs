@@ -1,27 +1,38 @@
-//! Motions that are watched: a condition must hold from their start to their end.
+//! Motions and hierarchies that are watched: a condition must hold from their start to their end.
 
 use super::super::{Dice, PREDICATES, around};
 use super::fact_at;
 use ratn_model::expression::{BinaryOperator, EffectExpr, Expr, UnaryOperator};
+use ratn_model::guard::{Guard, Limits};
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Nature, Program, State, StateKind, Target, VIOLATED};
 use ratn_model::value::Value;
+use std::collections::BTreeMap;
 
 /// Some motions of a program are watched. Regions are left as they are: others may write there what is watched.
-pub(super) fn watch(program: &mut Program, dice: &mut Dice) {
+pub(super) fn watch(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>, dice: &mut Dice) {
     let beside = |state: &State| around(program, state).any(|out| matches!(out.kind, StateKind::Concurrency { .. }));
-    let moves = |state: &&State| {
-        let is_motion = matches!(state.kind, StateKind::Action { .. }) && !state.is_pause();
-        is_motion && state.annotations.nature == Nature::Irreversible && !beside(state)
+    let moves = |state: &State| {
+        matches!(state.kind, StateKind::Action { .. }) && state.annotations.nature == Nature::Irreversible
     };
-    let motions: Vec<StateId> = program.states.iter().filter(moves).map(|state| state.id).collect();
-    for id in motions {
-        if !dice.percent(40) {
+    let holds_some =
+        |state: &State| matches!(&state.kind, StateKind::Sequence { children, .. } if !children.is_empty());
+    let may_be = |state: &&State| {
+        state.parent.is_some() && !state.is_pause() && (moves(state) || holds_some(state)) && !beside(state)
+    };
+    let watched: Vec<(StateId, bool)> =
+        program.states.iter().filter(may_be).map(|state| (state.id, moves(state))).collect();
+    for (id, moves) in watched {
+        if !dice.percent(if moves { 40 } else { 15 }) {
             continue;
         }
-        let state = &mut program.states[id.0 as usize];
         let conditions = 1 + dice.below(2);
-        state.annotations.holds = (0..conditions).map(|_| condition(dice)).collect();
+        let holds = (0..conditions).map(|_| condition(dice)).collect();
+        let state = &mut program.states[id.0 as usize];
+        match moves {
+            true => state.annotations.holds = holds,
+            false => guards.entry(id).or_default().limits = Some(Limits { holds, timeout_s: None }),
+        }
         state.outcomes.push(VIOLATED.to_owned());
         if dice.percent(70) {
             let effect = EffectExpr::Set(fact_at(dice.below(PREDICATES), 0), number(dice.below(9) as i64));
