@@ -31,6 +31,7 @@ mod resources;
 mod state;
 mod tolerance;
 mod wait;
+mod written_out;
 mod yaml;
 
 pub use document::Document;
@@ -148,7 +149,7 @@ pub(crate) fn load_within(source: &str, loading: &Loading<'_>) -> Result<Loaded,
 
 fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mut Vec<Diagnostic>) -> Option<Program> {
     let catalogue = loading.catalogue;
-    let root = match yaml::read(source) {
+    let mut root = match yaml::read(source) {
         Ok(root) => root,
         Err(error) => {
             let help = advice::advice(source, &error);
@@ -174,6 +175,11 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
             String::new()
         }
     };
+    if let Content::Map(entries) = &mut root.content
+        && let Some(states) = entries.iter_mut().find(|entry| entry.key == "states")
+    {
+        written_out::write_out(&mut states.value, &mut out.findings);
+    }
     let outline = outline::outline(&name, &root, &mut out.findings);
     let libraries = library::load_all(&outline, loading, &mut out.findings, of_libraries);
     let ports = ports(&outline, catalogue, &libraries, &mut out.findings);

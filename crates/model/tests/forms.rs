@@ -634,3 +634,90 @@ fn conditions_and_times_that_cannot_be_are_refused() {
     let race = "task: t\nstates:\n  - around:\n      variables: { n: 0 }\n      states:\n        - a: { while: [p($n)], states: [{ b: { states: [], assign: { n: 1 } } }] }\n";
     assert!(findings(race).contains("error[region-conflict]"), "{}", findings(race));
 }
+
+/// Every state in its place with where it leads.
+fn outlined(program: &Program) -> Vec<String> {
+    let shown = |state: &State| {
+        let kind = match &state.kind {
+            StateKind::Condition { predicate, .. } => format!(" if {predicate}"),
+            _ => String::new(),
+        };
+        format!("{}{kind}: {}", state.path, transitions(program, &state.path))
+    };
+    program.states.iter().skip(1).map(shown).collect()
+}
+
+#[test]
+fn a_switch_is_conditions_in_each_other() {
+    let task = "
+task: t
+parameters: { kind: { type: string } }
+outcomes: [unknown]
+states:
+  - which:
+      switch: $kind
+      outcomes: [none]
+      cases:
+        cup: [{ a: { states: [] } }]
+        two words: [{ b: { states: [], transitions: { success: none } } }]
+        3: []
+      default: [{ c: { states: [], transitions: { success: none } } }]
+      transitions: { none: unknown }
+  - switch: $kind
+    cases: { cup: [{ d: { fallback: [{ e: { states: [] } }] } }] }
+";
+    assert_eq!(
+        outlined(&program(task)),
+        [
+            "which if $kind = cup: none → (unknown)",
+            "which/a: ",
+            "which/else if $kind = \"two words\": ",
+            "which/else/b: success → (none)",
+            "which/else/else if $kind = 3: ",
+            "which/else/else/c: success → (none)",
+            "condition if $kind = cup: ",
+            "condition/d: ",
+            "condition/d/e: success → (success)",
+        ]
+    );
+}
+
+#[test]
+fn of_a_fallback_each_state_leads_to_the_next_when_it_fails() {
+    let act = "action: gripper/release, resources: [{ block: Gripper }]";
+    let task = format!(
+        "task: t\nworld: [closed(door)]\nstates:\n  - grip:\n      fallback:\n        - first: {{ {act}, while: [closed(door)] }}\n        - \
+         second: {{ {act}, transitions: {{ preempted: success }} }}\n        - last: {{ fallback: [{{ only: {{ {act} }} }}] }}\n"
+    );
+    assert_eq!(
+        outlined(&program(&task)),
+        [
+            "grip: ",
+            "grip/first: aborted → grip/second, success → (success), violated → grip/second",
+            "grip/second: aborted → grip/last, preempted → (success), success → (success)",
+            "grip/last: success → (success)",
+            "grip/last/only: success → (success)",
+        ]
+    );
+}
+
+#[test]
+fn switches_and_fallbacks_that_cannot_be_are_refused() {
+    for (keys, message) in [
+        ("switch: 3, cases: { a: [] }", "a `switch` looks at an expression"),
+        ("switch: $x", "a `switch` has 1 to 24 cases"),
+        ("switch: $x, cases: {}", "a `switch` has 1 to 24 cases"),
+        ("switch: $x, cases: { 'a\"b': [] }", "is no value that a case can be for"),
+        ("fallback: []", "there is nothing to try"),
+        ("fallback: [{ states: [] }]", "each state of a `fallback` has a name"),
+        (
+            "fallback: [{ b: { states: [], transitions: { aborted: success } } }]",
+            "where `aborted` leads the `fallback` says",
+        ),
+        ("fallback: 3", "expected a list of states"),
+        ("selector: []", "there is no form `selector`"),
+    ] {
+        let found = findings(&format!("task: t\nstates:\n  - a: {{ {keys} }}\n"));
+        assert!(found.contains(message), "{keys}: {found}");
+    }
+}

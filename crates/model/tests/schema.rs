@@ -178,6 +178,8 @@ fn the_schema_has_the_keys_of_the_loader_and_no_others() {
     let forms = [
         ("", "task: t\nstates: []\n"),
         ("action", "task: t\nstates:\n- a:\n    action: gripper/release\n"),
+        ("fallback", "task: t\nstates:\n- a:\n    fallback: [{ b: { states: [] } }]\n"),
+        ("switch", "task: t\nstates:\n- a:\n    switch: $x\n    cases: { b: [] }\n"),
         ("hierarchy", "task: t\nstates:\n- a:\n    states: []\n"),
         ("for", "task: t\nstates:\n- a:\n    for: b in [1]\n    do: []\n"),
         ("while", "task: t\nstates:\n- a:\n    while: false\n    do: []\n"),

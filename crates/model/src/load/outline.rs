@@ -16,11 +16,14 @@ const MAX_DEPTH: usize = 32;
 /// Keys that say what a step is.
 const FORMS: [&str; 11] =
     ["action", "for", "condition", "states", "while", "do_while", "until", "concurrency", "library", "wait", "ask"];
+/// Those that were written out as others before ([`super::written_out`]).
+const SHORT_FORMS: [&str; 2] = ["switch", "fallback"];
 /// Those that are names that people give to states, too.
 const NAMES: [&str; 2] = ["wait", "ask"];
 
 /// Keys that say in other languages what a step is, and how it is written here.
-const FOREIGN_FORMS: [(&str, &str); 9] = [
+const FOREIGN_FORMS: [(&str, &str); 10] = [
+    ("selector", "write `- name:`, with `fallback: […]`"),
     ("if", CONDITION),
     ("when", CONDITION),
     ("repeat", COUNTED),
@@ -391,7 +394,7 @@ impl<'a> Builder<'a, '_> {
                 Some((form, value)) => format!("put a blank behind the colon: `{form}: {value}`"),
                 None => match foreign_form(body.entries()) {
                     Some((_, here)) => here.to_owned(),
-                    None => format!("give it one of {}", FORMS.join(", ")),
+                    None => format!("give it one of {}", [&FORMS[..], &SHORT_FORMS[..]].concat().join(", ")),
                 },
             };
             self.findings.error("invalid-state", at, &path, message, help);

@@ -5,6 +5,7 @@ Expressions stay in the words of task files (``ratn.expr("…")``): they mean th
 
 from __future__ import annotations
 
+import json
 import keyword
 import re
 from typing import Any
@@ -100,6 +101,7 @@ class _Source:
             ((key, value),) = item.items()
             if isinstance(value, dict) and not _is_form(key, value):
                 name, body = key, value
+        body = _written_out(body)
         called = [] if name is None else [f"name={name!r}"]
         retry = body.get("retry")
         # A loop or a condition has what is done before another try in the words of task files.
@@ -185,7 +187,7 @@ class _Source:
         self.line(")")
 
 
-_FORMS = ("action", "for", "condition", "states", "while", "do_while", "until", "concurrency", "library", "wait", "ask")
+_FORMS = ("fallback", "cases", "action", "for", "condition", "states", "while", "do_while", "until", "concurrency", "library", "wait", "ask")
 
 
 def _is_form(key: str, value: dict[str, Any]) -> bool:
@@ -194,6 +196,28 @@ def _is_form(key: str, value: dict[str, Any]) -> bool:
         return False
     is_state = any(form in value for form in _FORMS)
     return not (is_state and (key == "ask" or not ("for" in value or "until" in value) or "do" in value))
+
+
+def _written_out(body: dict[str, Any]) -> dict[str, Any]:
+    """`switch` as conditions in each other, `fallback` as states that lead to each other: as the loader reads them."""
+    if "fallback" in body:
+        ways = [dict(way) for way in body["fallback"]]
+        names = [next(iter(way)) for way in ways]
+        for way, following in zip(ways, [*names[1:], None], strict=True):
+            ((name, said),) = way.items()
+            leads = {**said.get("transitions", {}), "success": "success", **({"aborted": following} if following else {})}
+            way[name] = {**said, "transitions": leads}
+        return {"states": ways, **{key: value for key, value in body.items() if key != "fallback"}}
+    if "cases" in body:
+        rest = {key: value for key, value in body.items() if key not in ("switch", "cases", "default")}
+        outcomes = {"outcomes": body["outcomes"]} if "outcomes" in body else {}
+        otherwise = body.get("default") or []
+        for number, (case, states) in reversed(list(enumerate(body["cases"].items()))):
+            value = str(case) if str(case).isidentifier() or isinstance(case, (int, float)) else json.dumps(str(case), ensure_ascii=False)
+            condition = {"condition": f"({body['switch']}) = {value}", "then": states or [], "else": otherwise}
+            otherwise = [{"else": {**condition, **outcomes}}]
+        return {**condition, **rest}
+    return body
 
 
 def _test(condition: Any) -> str:

@@ -1,0 +1,200 @@
+//! `switch` and `fallback`: forms that are other forms in fewer words. They are written out before anything else is read.
+//!
+//! ```text
+//! switch: look.kind              condition: (look.kind) = cup
+//! cases:                         then: […]
+//!   cup: […]              →      else:
+//!   bowl: […]                      - else: { condition: (look.kind) = bowl, then: […], else: […] }
+//! default: […]
+//!
+//! fallback:                      states:
+//!   - pick: {…}           →        - pick: {…, transitions: {success: success, aborted: ask}}
+//!   - ask: {…}                     - ask: {…, transitions: {success: success}}
+//! ```
+
+use super::yaml::{Content, Entry, Node};
+use crate::diagnostic::Findings;
+use crate::expression::display::is_word;
+use crate::program::{ABORTED, SUCCESS};
+
+/// A switch has at most so many cases: each is a condition in the one before.
+const MAX_CASES: usize = 24;
+
+/// Keys of a state below which there are lists of states.
+const LISTS: [&str; 8] = ["states", "do", "then", "else", "regions", "default", "fallback", "before"];
+
+/// Writes out what stands in a list of states, and in all lists within.
+pub(crate) fn write_out(list: &mut Node, findings: &mut Findings) {
+    let Content::List(items) = &mut list.content else { return };
+    for item in items {
+        state(item, "", findings);
+    }
+}
+
+/// A state: a mapping with its keys, or one of its name to that.
+fn state(node: &mut Node, name: &str, findings: &mut Findings) {
+    if node.get("switch").is_some() && (node.get("cases").is_some() || node.entries().len() == 1) {
+        switch(node, name, findings);
+    } else if node.get("fallback").is_some() {
+        fallback(node, name, findings);
+    }
+    let Content::Map(entries) = &mut node.content else { return };
+    let is_alone = entries.len() == 1;
+    for Entry { key, value, .. } in entries {
+        match (&value.content, key.as_str()) {
+            (Content::List(_), list) if LISTS.contains(&list) => write_out(value, findings),
+            (Content::Map(_), "retry") => state(value, name, findings),
+            (Content::Map(_), _) if is_alone => state(value, &key.clone(), findings),
+            _ => {}
+        }
+    }
+}
+
+/// Conditions in each other: one for each case.
+fn switch(node: &mut Node, name: &str, findings: &mut Findings) {
+    let at = node.at;
+    let Some(entries) = taken(node) else { return };
+    let (mut on, mut cases, mut default) = (None, None, None);
+    let mut rest = Vec::new();
+    for entry in entries {
+        match entry.key.as_str() {
+            "switch" => on = Some(entry.value),
+            "cases" => cases = Some(entry),
+            "default" => default = Some(entry.value),
+            "condition" | "then" | "else" => {
+                let message = format!("there is no key `{}` of a `switch`", entry.key);
+                findings.error("unknown-key", entry.at, name, message, "it has `cases` and `default`");
+            }
+            _ => rest.push(entry),
+        }
+    }
+    let mut refuse = |message: String, help: &str| findings.error("invalid-state", at, name, message, help);
+    let (text, cases) = match (on.as_ref().map(|node| &node.content), cases.map(|entry| entry.value.content)) {
+        (Some(Content::Text(text)), Some(Content::Map(cases))) if (1..=MAX_CASES).contains(&cases.len()) => {
+            (text.clone(), cases)
+        }
+        (Some(Content::Text(_)), _) => {
+            refuse(
+                format!("a `switch` has 1 to {MAX_CASES} cases, each a value with a list of states"),
+                "write `cases: { cup: […], bowl: […] }`, and `default: […]` for any other value",
+            );
+            return empty(node, rest);
+        }
+        _ => {
+            refuse("a `switch` looks at an expression".to_owned(), "write `switch: look.kind`");
+            return empty(node, rest);
+        }
+    };
+    let outcomes = rest.iter().find(|entry| entry.key == "outcomes").cloned();
+    let mut otherwise = default.unwrap_or(Node { at, offset: None, content: Content::List(Vec::new()) });
+    for (number, case) in cases.into_iter().enumerate().rev() {
+        let Some(value) = value(&case.key) else {
+            let message = format!("`{}` is no value that a case can be for", case.key);
+            findings.error(
+                "invalid-state",
+                case.at,
+                name,
+                message,
+                "a case is a word, a number, or a text without quotes in it",
+            );
+            continue;
+        };
+        // Where it stands in the file is where the switch stands.
+        let condition = Node { at: case.at, offset: None, content: Content::Text(format!("({text}) = {value}")) };
+        let entry = |key: &str, value: Node| Entry { key: key.to_owned(), at: case.at, value };
+        let mut condition = vec![entry("condition", condition), entry("then", case.value), entry("else", otherwise)];
+        if number == 0 {
+            condition.append(&mut rest);
+            node.content = Content::Map(condition);
+            return;
+        }
+        condition.extend(outcomes.clone());
+        let inner = Node { at: case.at, offset: None, content: Content::Map(condition) };
+        let named = Content::Map(vec![entry("else", inner)]);
+        let item = Node { at: case.at, offset: None, content: named };
+        otherwise = Node { at: case.at, offset: None, content: Content::List(vec![item]) };
+    }
+    empty(node, rest);
+}
+
+/// The value of a case as an expression.
+fn value(key: &str) -> Option<String> {
+    let is_number = key.parse::<f64>().is_ok_and(f64::is_finite);
+    if is_word(key) || is_number {
+        return Some(key.to_owned());
+    }
+    (!key.contains(['"', '\\', '\n'])).then(|| format!("\"{key}\""))
+}
+
+/// States of which each leads to the next when it fails, and out by success.
+fn fallback(node: &mut Node, name: &str, findings: &mut Findings) {
+    let at = node.at;
+    let Content::Map(entries) = &mut node.content else { return };
+    let Some(list) = entries.iter_mut().find(|entry| entry.key == "fallback") else { return };
+    list.key = "states".to_owned();
+    let Content::List(ways) = &mut list.value.content else { return };
+    let names: Vec<Option<String>> = ways.iter().map(|way| named(way).map(str::to_owned)).collect();
+    if ways.is_empty() {
+        findings.error(
+            "invalid-state",
+            at,
+            name,
+            "there is nothing to try",
+            "list states: the first that succeeds is the last",
+        );
+    }
+    for (number, way) in ways.iter_mut().enumerate() {
+        if names[number].is_none() {
+            let help = "write `- name: {…}`: the state before it leads there by its name";
+            findings.error("invalid-state", way.at, name, "each state of a `fallback` has a name", help);
+            continue;
+        }
+        let next = names.get(number + 1).cloned().flatten();
+        let Content::Map(way) = &mut way.content else { continue };
+        let Some(body) = way.first_mut().map(|entry| &mut entry.value) else { continue };
+        let at = body.at;
+        let Content::Map(keys) = &mut body.content else { continue };
+        if !keys.iter().any(|entry| entry.key == "transitions") {
+            let value = Node { at, offset: None, content: Content::Map(Vec::new()) };
+            keys.push(Entry { key: "transitions".to_owned(), at, value });
+        }
+        let Some(transitions) = keys.iter_mut().find(|entry| entry.key == "transitions") else { continue };
+        let Content::Map(leads) = &mut transitions.value.content else { continue };
+        if let Some(entry) = leads.iter().find(|entry| [SUCCESS, ABORTED].contains(&entry.key.as_str())) {
+            let help = "leave it out, or write the states as `states`, with transitions of your own";
+            let message = format!("where `{}` leads the `fallback` says", entry.key);
+            findings.error("invalid-state", entry.at, name, message, help);
+            continue;
+        }
+        let mut lead = |outcome: &str, to: &str| {
+            let value = Node { at, offset: None, content: Content::Text(to.to_owned()) };
+            leads.push(Entry { key: outcome.to_owned(), at, value });
+        };
+        lead(SUCCESS, SUCCESS);
+        if let Some(next) = next {
+            lead(ABORTED, &next);
+        }
+    }
+}
+
+/// The name of a state of a list, where it has one.
+fn named(item: &Node) -> Option<&str> {
+    match item.entries() {
+        [entry] if matches!(entry.value.content, Content::Map(_)) => Some(&entry.key),
+        _ => None,
+    }
+}
+
+fn taken(node: &mut Node) -> Option<Vec<Entry>> {
+    match &mut node.content {
+        Content::Map(entries) => Some(std::mem::take(entries)),
+        _ => None,
+    }
+}
+
+/// What is refused is a state without states.
+fn empty(node: &mut Node, mut rest: Vec<Entry>) {
+    let value = Node { at: node.at, offset: None, content: Content::List(Vec::new()) };
+    rest.push(Entry { key: "states".to_owned(), at: node.at, value });
+    node.content = Content::Map(rest);
+}
