@@ -77,6 +77,9 @@ pub enum Expr {
     Exists(FactExpr),
     /// `exists (condition, …)`: whether the query has an answer.
     Query(Vec<Expr>),
+    /// `find(?name, …, condition, …)`: the values that answers to the query give to the variables, each once and the least first; of several
+    /// variables records with a field for each.
+    Find(Vec<String>, Vec<Expr>),
     /// `?name`: a variable of the query around.
     Unknown(String),
     /// `not a`, `-a`

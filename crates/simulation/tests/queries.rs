@@ -58,6 +58,39 @@ fn a_query_over_facts_that_older_states_write_is_answered_as_their_order_has_it(
     }
 }
 
+/// What is found decides what a loop does; a state before it changes what there is to find.
+#[test]
+fn a_loop_over_what_a_query_finds_does_what_holds_at_its_place() {
+    let task = "
+task: clear
+world: [\"on(cup, table)\", \"on(box, table)\", \"on(fork, shelf)\", \"weight(cup) = 1\", \"weight(box) = 3\", \"weight(mug) = 2\"]
+outputs: { heavy: \"find(?x, ?w, weight(?x) = ?w, ?w > 1)\", left: \"len(find(?x, on(?x, table)))\" }
+states:
+  - put: { action: arm/move, pia: true, reads: [], effects: [\"on(mug, table)\"], resources: [{ block: Arm }] }
+  - for: \"thing in sort_by($x in find(?x, on(?x, table)), 0 - weight($x))\"
+    do:
+      - plan: { action: brain/think, computes: true, in: { a: $thing }, reads: [], resources: [{ block: Brain }] }
+      - get:
+          action: arm/move
+          pia: true
+          in: { a: $thing }
+          reads: []
+          effects: [\"delete on($thing, table)\", \"took($thing, $index)\"]
+          resources: [{ block: Arm }]
+    index: index
+";
+    for mode in MODES {
+        let run = simulate(task, mode, &mut Providers(|_: &str, _: u32, _: &Goal, _: &World| ("success", Value::Null)));
+        assert_eq!(run.outcome, "success", "{mode:?}: {}", run.reason);
+        let facts = facts(&run);
+        for took in ["took(box, 0) = true", "took(mug, 1) = true", "took(cup, 2) = true", "on(fork, shelf) = true"] {
+            assert!(facts.contains(&took.to_owned()), "{mode:?}: {facts:?}");
+        }
+        assert_eq!(run.outputs["heavy"].to_string(), "[{w: 2, x: mug}, {w: 3, x: box}]", "{mode:?}");
+        assert_eq!(run.outputs["left"], Value::Int(0), "{mode:?}");
+    }
+}
+
 #[test]
 fn a_query_that_cannot_be_planned_is_refused_with_its_place() {
     let task =

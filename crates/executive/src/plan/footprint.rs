@@ -89,7 +89,7 @@ impl Inside {
             has |= match part {
                 Expr::Port { state, .. } => self.states.contains(state),
                 Expr::Variable(name) => self.variables.contains(name),
-                Expr::Fact(_) | Expr::Exists(_) | Expr::Query(_) | Expr::Output(_) => true,
+                Expr::Fact(_) | Expr::Exists(_) | Expr::Query(_) | Expr::Find(..) | Expr::Output(_) => true,
                 _ => false,
             };
         });

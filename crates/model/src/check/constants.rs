@@ -65,7 +65,7 @@ fn parts(expr: &Expr) -> Vec<&Expr> {
         // Its body is evaluated for no element of an empty list.
         Expr::Each { list, .. } => vec![list],
         // What is not looked at when an earlier condition fails.
-        Expr::Query(_) => Vec::new(),
+        Expr::Query(_) | Expr::Find(..) => Vec::new(),
         Expr::Field(of, _) | Expr::Unary(_, of) | Expr::Binary(And | Or, of, _) => vec![of],
         Expr::Index(a, b) | Expr::Binary(_, a, b) => vec![a, b],
         Expr::Call(Function::If, arguments) => arguments.iter().take(1).collect(),

@@ -115,6 +115,12 @@ fn writes(effects: &[EffectExpr]) -> Vec<FactPattern> {
     patterns
 }
 
+fn finds(required: &Expr) -> bool {
+    let mut found = false;
+    required.visit(&mut |part| found |= matches!(part, Expr::Find(..)));
+    found
+}
+
 /// A fact without which the expression cannot be true, and which nothing establishes.
 fn missing<'e>(required: &'e Expr, established: &Established) -> Option<&'e FactExpr> {
     match required {
@@ -122,6 +128,8 @@ fn missing<'e>(required: &'e Expr, established: &Established) -> Option<&'e Fact
         Expr::Query(conditions) => conditions.iter().find_map(|condition| missing(condition, established)),
         Expr::Binary(BinaryOperator::And, a, b) => missing(a, established).or_else(|| missing(b, established)),
         Expr::Binary(BinaryOperator::Or, a, b) => missing(a, established).and_then(|_| missing(b, established)),
+        // There may be none of what is looked for.
+        other if finds(other) => None,
         // Absence can be what is asked for.
         Expr::Binary(BinaryOperator::NotEqual, ..) => None,
         Expr::Binary(_, a, b) if [a, b].into_iter().any(|e| **e == Expr::Literal(Value::Null)) => None,

@@ -286,6 +286,10 @@ impl Types<'_> {
                 conditions.iter().try_for_each(|condition| self.of(condition).map(drop))?;
                 Type::Bool
             }
+            Expr::Find(_, conditions) => {
+                conditions.iter().try_for_each(|condition| self.of(condition).map(drop))?;
+                Type::List(Box::new(Type::Any))
+            }
             Expr::Unknown(_) => Type::Any,
             Expr::Element(name) => self.elements.get(name).cloned().unwrap_or(Type::Any),
             Expr::Each { what, element, list, body } => {

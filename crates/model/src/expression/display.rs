@@ -101,6 +101,12 @@ impl Display for Expr {
                 separated(f, conditions)?;
                 f.write_str(")")
             }
+            Expr::Find(wanted, conditions) => {
+                f.write_str("find(")?;
+                wanted.iter().try_for_each(|name| write!(f, "?{name}, "))?;
+                separated(f, conditions)?;
+                f.write_str(")")
+            }
             Expr::Unknown(name) => match name.rsplit_once('#') {
                 Some((fact, _)) => f.write_str(fact),
                 None => write!(f, "?{name}"),

@@ -40,6 +40,29 @@ impl EvaluateError {
     }
 }
 
+/// A value in the order of all values.
+struct Ordered(Value);
+
+impl Ord for Ordered {
+    fn cmp(&self, other: &Ordered) -> std::cmp::Ordering {
+        self.0.total_order(&other.0)
+    }
+}
+
+impl PartialOrd for Ordered {
+    fn partial_cmp(&self, other: &Ordered) -> Option<std::cmp::Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl PartialEq for Ordered {
+    fn eq(&self, other: &Ordered) -> bool {
+        self.cmp(other).is_eq()
+    }
+}
+
+impl Eq for Ordered {}
+
 impl Expr {
     /// The value in a scope.
     ///
@@ -111,6 +134,7 @@ impl Expr {
                 Lookup::Unknown => known(None)?,
             },
             Expr::Query(conditions) => Cow::Owned(Value::Bool(self.has_answer(conditions, scope)?)),
+            Expr::Find(wanted, conditions) => Cow::Owned(Value::List(self.answers(wanted, conditions, scope)?)),
             Expr::Unknown(name) => known(scope.unknown(name))?,
             Expr::Unary(UnaryOperator::Not, operand) => Cow::Owned(Value::Bool(!operand.holds(scope)?)),
             Expr::Unary(UnaryOperator::Negate, operand) => Cow::Owned(match operand.value(scope)?.as_ref() {
@@ -138,6 +162,37 @@ impl Expr {
         });
         match ran {
             Ok(()) => Ok(found),
+            Err(RunError::Evaluate(error)) => Err(error),
+            Err(error @ RunError::TooManySteps) => Err(self.wrong(error.to_string())),
+        }
+    }
+
+    /// The answers to the query of `self`, as values of the wanted variables.
+    fn answers(&self, wanted: &[String], conditions: &[Expr], scope: &dyn Scope) -> Result<Vec<Value>, EvaluateError> {
+        let plan = query::plan(conditions, &|name| scope.unknown(name).is_some());
+        let plan = plan.map_err(|error| self.wrong(error.to_string()))?;
+        let place = |name: &String| {
+            let place = plan.variables().iter().position(|variable| variable == name);
+            place.ok_or_else(|| self.wrong(format!("`?{name}` gets no value")))
+        };
+        let places = wanted.iter().map(place).collect::<Result<Vec<usize>, _>>()?;
+        let mut found = std::collections::BTreeSet::new();
+        let ran = query::run(&plan, scope, &mut |row| {
+            let value = match places.as_slice() {
+                [one] => row[*one].clone(),
+                several => {
+                    Value::Map(wanted.iter().cloned().zip(several.iter().map(|place| row[*place].clone())).collect())
+                }
+            };
+            found.insert(Ordered(value));
+            if found.len() > query::MAX_FOUND { Flow::Enough } else { Flow::More }
+        });
+        match ran {
+            Ok(()) if found.len() > query::MAX_FOUND => {
+                let most = query::MAX_FOUND;
+                Err(self.wrong(format!("it finds more than {most} answers; narrow it by another condition")))
+            }
+            Ok(()) => Ok(found.into_iter().map(|Ordered(value)| value).collect()),
             Err(RunError::Evaluate(error)) => Err(error),
             Err(error @ RunError::TooManySteps) => Err(self.wrong(error.to_string())),
         }

@@ -436,6 +436,7 @@ impl Parser<'_> {
                 let (fact, below) = self.fact()?;
                 return self.node(Expr::Exists(fact), below);
             }
+            "find" if self.finds() => return self.find(at),
             _ if KEYWORDS.contains(&word) => {
                 return Err(self.unexpected(&format!("expected a value, found the keyword `{word}`")));
             }
@@ -541,9 +542,45 @@ impl Parser<'_> {
         Ok((conditions, below))
     }
 
+    /// Whether this is `find(?name, …`: outside of a query a variable stands nowhere else.
+    fn finds(&self) -> bool {
+        let begins = [Some(&Token::Symbol("(")), Some(&Token::Symbol("?"))];
+        let next = |ahead: usize| self.tokens.get(self.next + ahead).map(|(_, token)| token);
+        self.queries == 0 && [next(1), next(2)] == begins && matches!(next(3), Some(Token::Word(_)))
+    }
+
+    /// `find(?name, …, condition, …)`
+    fn find(&mut self, at: usize) -> Parsed {
+        self.next += 2;
+        let mut wanted = Vec::new();
+        // A variable and a comma: one that is wanted. The conditions come behind.
+        while let [Some(Token::Symbol("?")), Some(Token::Word(name)), Some(Token::Symbol(","))] =
+            [0, 1, 2].map(|ahead| self.tokens.get(self.next + ahead).map(|(_, token)| token))
+        {
+            let name = name.clone();
+            if wanted.contains(&name) {
+                return Err(ParseError::syntax(at, format!("`?{name}` is wanted twice")));
+            }
+            wanted.push(name);
+            self.next += 3;
+        }
+        let (conditions, below) = self.nested(|parser| parser.query(Some(")")))?;
+        let plan = plan(&conditions, &|_| false).map_err(|error| ParseError::syntax(at, error.to_string()))?;
+        if let Some(name) = wanted.iter().find(|name| !plan.variables().contains(name)) {
+            let message = format!("no condition of this `find` says anything of `?{name}`");
+            return Err(ParseError::syntax(at, message));
+        }
+        if wanted.is_empty() {
+            let message =
+                "nothing is wanted: write `find(?box, at(?box) = ?pose)`, first what is wanted and then the conditions";
+            return Err(ParseError::syntax(at, message));
+        }
+        self.node(Expr::Find(wanted, conditions), below)
+    }
+
     fn unknown(&mut self) -> Result<Expr, ParseError> {
         if self.queries == 0 {
-            let message = "`?name` is a variable of a query, and stands only within `exists (…)`";
+            let message = "`?name` is a variable of a query, and stands only within `exists (…)` and `find(…)`";
             return Err(self.unexpected(message));
         }
         self.expects("?")?;
@@ -700,6 +737,16 @@ mod tests {
 
     fn check(text: &str, expect: &str) {
         assert_eq!(printed(parse_expression(text, &mut OneState)), expect, "{text}");
+    }
+
+    #[test]
+    fn what_is_found_is_named_before_the_conditions() {
+        check("find(?x, on(?x, table))", "find(?x, on(?x, table))");
+        check("len(find(?x,?w, weight(?x) = ?w and ?w > 1)) > 2", "len(find(?x, ?w, weight(?x) = ?w and ?w > 1)) > 2");
+        check("find(?x, ?x, on(?x, table))", "invalid-expression: `?x` is wanted twice at 0");
+        check("find(?x, ?y, on(?x, table))", "invalid-expression: no condition of this `find` says anything of `?y` at 0");
+        check("find(?x)", "invalid-expression: `?x` in `?x` gets no value: no fact of the query has it as an argument or says it at 5");
+        check("find(on(?x, table))", "invalid-expression: `?name` is a variable of a query, and stands only within `exists (…)` and `find(…)` at 8");
     }
 
     #[test]

@@ -29,5 +29,7 @@ pub use run::{Flow, RunError, run};
 
 /// A query has no more conditions, those within `not` and `exists` counted.
 pub const MAX_CONDITIONS: usize = 64;
+/// A `find` finds at most so many.
+pub const MAX_FOUND: usize = 10_000;
 /// So many facts may be looked at for the answers to one query; beyond, it is refused.
 pub const MAX_STEPS: u64 = 2_000_000;

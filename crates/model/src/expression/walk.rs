@@ -29,7 +29,9 @@ impl Expr {
                 visit(a);
                 visit(b);
             }
-            Expr::List(items) | Expr::Call(_, items) | Expr::Query(items) => items.iter().for_each(visit),
+            Expr::List(items) | Expr::Call(_, items) | Expr::Query(items) | Expr::Find(_, items) => {
+                items.iter().for_each(visit)
+            }
             Expr::Map(fields) => fields.iter().for_each(|(_, item)| visit(item)),
             Expr::Fact(fact) | Expr::Exists(fact) => fact.arguments.iter().flatten().for_each(visit),
         }
@@ -88,7 +90,7 @@ impl Expr {
                 a.rewrite(change);
                 b.rewrite(change);
             }
-            Expr::List(items) | Expr::Call(_, items) | Expr::Query(items) => {
+            Expr::List(items) | Expr::Call(_, items) | Expr::Query(items) | Expr::Find(_, items) => {
                 items.iter_mut().for_each(|item| item.rewrite(change))
             }
             Expr::Map(fields) => fields.iter_mut().for_each(|(_, item)| item.rewrite(change)),

@@ -135,6 +135,7 @@ impl TakeOut<'_> {
             | Expr::Unary(UnaryOperator::Not, _)
             | Expr::Exists(_)
             | Expr::Query(_)
+            | Expr::Find(..)
             | Expr::Literal(_)
             | Expr::Variable(_)
             | Expr::Output(_)

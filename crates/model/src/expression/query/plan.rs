@@ -287,7 +287,7 @@ fn unknowns(expr: &Expr) -> Vec<&str> {
     fn of<'e>(expr: &'e Expr, names: &mut Vec<&'e str>) {
         match expr {
             Expr::Unknown(name) => names.push(name),
-            Expr::Query(_) => {}
+            Expr::Query(_) | Expr::Find(..) => {}
             other => other.parts(&mut |part| of(part, names)),
         }
     }
@@ -300,7 +300,7 @@ fn unknowns(expr: &Expr) -> Vec<&str> {
 fn within(expr: &Expr) -> Vec<&str> {
     let mut names = Vec::new();
     expr.visit(&mut |query| {
-        if let Expr::Query(_) = query {
+        if let Expr::Query(_) | Expr::Find(..) = query {
             query.visit(&mut |part| {
                 if let Expr::Unknown(name) = part {
                     names.push(name.as_str());
