@@ -34,6 +34,8 @@ A task is a function, which is called once and makes the same model as a task fi
 
 import pkgutil
 
+from ratn._annotations import Annotations, block, consume, create, delete, output
+from ratn._blocks import concurrently, do_while, each, otherwise, retry, sequence, until, when, while_
 from ratn._expression import Functions, Untraceable, Value, exists, expr, fact, fn, isin
 
 from ratn._ratn import (
@@ -64,37 +66,11 @@ from ratn._ratn import (
     Unimplemented,
     WorldWatch,
 )
+from ratn._states import action, ask, function, leave, library, variable, wait
 from ratn._step import Step, step
 from ratn._system import Result, Run, System
-from ratn._task import (
-    Annotations,
-    Doc,
-    Finding,
-    State,
-    Task,
-    action,
-    ask,
-    block,
-    concurrently,
-    consume,
-    create,
-    delete,
-    do_while,
-    each,
-    function,
-    leave,
-    library,
-    otherwise,
-    output,
-    retry,
-    sequence,
-    task,
-    until,
-    variable,
-    wait,
-    when,
-    while_,
-)
+from ratn._task import Doc, Finding, Task, task
+from ratn._trace import State
 from ratn._views import Chart, CriticalPath, Log, Network, Nodes, Report, Why
 from ratn._worker import Driver, Outcome, Worker
 

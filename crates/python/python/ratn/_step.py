@@ -15,7 +15,7 @@ import typing
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from ratn import _expression, _ports, _stubs, _task, _worker
+from ratn import _annotations, _expression, _ports, _states, _stubs, _trace, _worker
 from ratn._ratn import Error, Goal
 
 #: The steps of this process, by file.
@@ -58,7 +58,7 @@ class Step:
         return worker._actions[self.name]
 
     def __call__(self, *positional: Any, **given: Any) -> Any:
-        trace = _task._tracing.get()
+        trace = _trace.tracing.get()
         if trace is None:
             return self.function(*positional, **given)
         if not os.path.exists(self.file):
@@ -70,12 +70,12 @@ class Step:
         name = given.pop("name", None) if "name" not in ports else None
         inputs = {key: given.pop(key) for key in list(given) if key in ports}
         for key in given:
-            if key not in _task.ANNOTATIONS:
+            if key not in _annotations.ANNOTATIONS:
                 raise TypeError(f"the step `{self.name}` has no input `{key}`; it has {', '.join(sorted(ports)) or 'none'}")
         # What it says of itself holds for the state, unless the state says otherwise.
         said = {"computes": self.action.computes or None, "reads": self.action.reads if self.action.computes else self.action.reads or None}
         said |= {key: getattr(self.action, key) or None for key in ("senses", "requires", "effects")}
-        return _task.perform(f"{self.provider}/{self.name}", inputs, {**said, **given}, name=name, kind=self.kind)
+        return _states.perform(f"{self.provider}/{self.name}", inputs, {**said, **given}, name=name, kind=self.kind)
 
     def catalogue(self) -> str:
         """What it offers, as a catalogue has it."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from ratn import _ratn
 from ratn._ratn import Error
-from ratn._task import Annotations
+from ratn._annotations import Annotations
 
 _HEAD = '''"""Stubs of the actions of {what}, written by `python -m ratn stubs`."""
 

@@ -11,7 +11,7 @@ from functools import cache
 from typing import Any
 
 from ratn import _ratn
-from ratn._task import Provider
+from ratn._states import Provider
 
 
 @cache

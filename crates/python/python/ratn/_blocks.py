@@ -1,0 +1,283 @@
+"""States with states inside, as ``with`` blocks and loops."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from ratn._annotations import annotate, entry, outputs_said
+from ratn._expression import Value, refuse, statements_at_work, user_line, written
+from ratn._trace import AnyState, Node, Trace, assigned_name, calls
+
+
+class Block(AnyState):
+    """A ``with`` block: a state with states inside."""
+
+    __slots__ = ("_branch", "_trace")
+    _FORM: str = "states"
+
+    def __init__(self, function: str, name: str | None, annotations: dict[str, Any], head: dict[str, Any], default: str) -> None:
+        at = user_line()
+        trace = Trace.now(f"`ratn.{function}`")
+        node = trace.add(name or assigned_name(function, at), default, at)
+        node.body.update(head)
+        annotate(node.body, annotations)
+        node.branches[self._FORM] = []
+        self._trace, self._branch = trace, self._FORM
+        super().__init__(node)
+
+    def __enter__(self) -> Any:
+        self._trace.enter(self._node, self._branch)
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            self._trace.leave(self._node)
+
+    def _say(self, key: str, said: dict[str, Any]) -> None:
+        """Something about what is inside, said inside or after it."""
+        inside = (self._node.branches[self._FORM], self._node)
+        is_open = any(one[0] is inside[0] for one in self._trace.open)
+        if not is_open:
+            self._trace.open.append(inside)
+        try:
+            self._node.body.setdefault(key, {}).update(outputs_said(said) if key == "outputs" else entry(said))
+        finally:
+            if not is_open:
+                self._trace.open.pop()
+
+
+class Ordered(Block):
+    """States in order, as one state."""
+
+    __slots__ = ()
+
+    def outputs(self, **outputs: Any) -> None:
+        """What is seen of it outside: ``think.outputs(way=plan.trajectory)``. What is used outside is seen without that, too."""
+        self._say("outputs", outputs)
+
+
+class Retry(Ordered):
+    """What is tried again. A block of one action, without ``name=``, is that action with a ``retry``."""
+
+    __slots__ = ("_is_named",)
+    _is_named: bool
+
+    def before(self) -> _Before:
+        """What is done before each further try: ``with attempt.before():``."""
+        return _Before(self._trace, self._node)
+
+    def __exit__(self, kind: object, *exception: object) -> None:
+        super().__exit__(kind, *exception)
+        node = self._node
+        inside = node.branches["states"]
+        own = node.body.keys() - {"retry", "resources"}
+        if kind is not None or self._is_named or own or node.body.get("resources") or len(inside) != 1:
+            return
+        (single,) = inside
+        is_free = single.name not in {other.name for other in node.siblings if other is not node}
+        if "action" in single.body and "retry" not in single.body and is_free:
+            single.body["retry"], single.before = node.body["retry"], node.before
+            single.siblings, single.owner = node.siblings, node.owner
+            node.siblings[node.siblings.index(node)] = single
+            self._node = single
+
+
+class _Before:
+    def __init__(self, trace: Trace, node: Node) -> None:
+        self._trace, self._node = trace, node
+        self._outside: list[tuple[list[Node], Node | None]] = []
+
+    def __enter__(self) -> None:
+        trace, node = self._trace, self._node
+        if node.before is not None:
+            refuse("there is a `before` of this retry already", "put all that is done before another try into one block")
+        node.before = []
+        # It is not inside of what is tried again, and sees nothing of it.
+        at = next((index for index, (_, owner) in enumerate(trace.open) if owner is node), len(trace.open))
+        self._outside, trace.open[at:] = trace.open[at:], [(node.before, node)]
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            self._trace.open[-1:] = self._outside
+
+
+class Condition(Block):
+    """What is done where something is true; :func:`otherwise` is the other branch."""
+
+    __slots__ = ()
+    _FORM = "then"
+
+
+class Loop(Block):
+    """What is done again and again."""
+
+    __slots__ = ("_key", "_index")
+    _FORM = "do"
+    _key: str
+    _index: str | None
+
+    def test(self, condition: object) -> None:
+        """The condition, said inside: it may speak of the states in the loop."""
+        self._node.body[self._key] = condition if isinstance(condition, str) else entry(condition)
+
+    @property
+    def index(self) -> Value:
+        """The number of the iteration, from 0."""
+        if self._index is None:
+            self._index = str(self._node.body.setdefault("index", "iteration"))
+        return Value(f"${self._index}")
+
+    def __exit__(self, kind: object, *exception: object) -> None:
+        super().__exit__(kind, *exception)
+        if kind is None and self._key not in self._node.body:
+            refuse("a loop without a condition", "say it as `ratn.until(condition)`, or inside as `loop.test(condition)`", self._node.line)
+
+
+class Concurrency(Block):
+    """Regions that run at the same time: each state inside is one."""
+
+    __slots__ = ()
+    _FORM = "regions"
+
+    def outputs(self, **outputs: Any) -> None:
+        """What is seen of it outside."""
+        self._say("outputs", outputs)
+
+    def decide(self, **outcomes: Any) -> None:
+        """Its outcome is the first whose condition holds: ``both.decide(blind=head.outcome == "aborted")``."""
+        self._say("decide", outcomes)
+
+
+def sequence(name: str | None = None, **annotations: Any) -> Ordered:
+    """States in order as one state: ``with ratn.sequence("think", routine=True) as think:``."""
+    return Ordered("sequence", name, annotations, {}, "sequence")
+
+
+def retry(
+    times: int | None = None, *, on: Iterable[str] | None = None, backoff: float | None = None, name: str | None = None, **annotations: Any
+) -> Retry:
+    """What is inside is tried again, so many times after the first: ``with ratn.retry(3):``.
+
+    ``on`` are the outcomes after which it is (``aborted`` unless given), ``backoff`` the seconds before the second try.
+    """
+    said: dict[str, Any] = {} if times is None else {"times": times}
+    if backoff is not None:
+        said["backoff"] = backoff
+    if on is not None:
+        said["on"] = list(on)
+    attempt = Retry("retry", name, annotations, {"retry": said}, "retry")
+    attempt._is_named = name is not None
+    return attempt
+
+
+def _condition(condition: object) -> Any:
+    return condition if isinstance(condition, str) else entry(condition)
+
+
+def when(condition: object, *, name: str | None = None, **annotations: Any) -> Condition:
+    """What is inside is done where the condition is true: ``with ratn.when(fn.len(look.boxes) > 0):``. A text is an expression."""
+    return Condition("when", name, annotations, {"condition": _condition(condition)}, "condition")
+
+
+class _Otherwise:
+    def __init__(self) -> None:
+        trace = Trace.now("`ratn.otherwise`")
+        siblings, _ = trace.open[-1]
+        if not siblings or "then" not in siblings[-1].branches or "else" in siblings[-1].branches:
+            refuse("`ratn.otherwise` without `ratn.when`", "write it right behind the block of `with ratn.when(…):`")
+        self._trace, self._node = trace, siblings[-1]
+
+    def __enter__(self) -> None:
+        self._trace.enter(self._node, "else")
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            self._trace.leave(self._node)
+
+
+def otherwise() -> _Otherwise:
+    """What is done where the condition of the ``ratn.when`` before it is not true."""
+    return _Otherwise()
+
+
+class Each(Iterator[Any]):
+    """A loop over a list; its body is traced once."""
+
+    def __init__(self, elements: object, variable: str | None, index: str | bool | None, name: str | None, annotations: dict[str, Any]) -> None:
+        at = user_line()
+        self._trace = Trace.now("`ratn.each`")
+        targets = self._targets(at)
+        if index is True:
+            self._index: str | None = targets[0] if len(targets) == 2 else "index"
+        else:
+            self._index = index or None
+        if variable is None and not targets and statements_at_work(*at):
+            refuse("`ratn.each` outside of a `for`", "write `for x in ratn.each(list):`; of a list of values make another with `fn.map(list, lambda x: …)`", at)
+        self._variable = variable or (targets[-1] if targets else "element")
+        node = self._trace.add(name, f"for_{self._variable}", at)
+        text = elements if isinstance(elements, str) else str(written(elements))
+        node.body["for"] = f"{self._variable} in {text}"
+        if self._index:
+            node.body["index"] = self._index
+        annotate(node.body, annotations)
+        node.branches["do"] = []
+        self._node, self._has_begun, self._gives_index = node, False, index is True
+
+    @staticmethod
+    def _targets(at: tuple[str, int]) -> list[str]:
+        for node in statements_at_work(*at):
+            if isinstance(node, ast.comprehension):
+                refuse("states are not made in a comprehension", "write `for x in ratn.each(list):` as a statement", at)
+            if isinstance(node, ast.For) and calls(node.iter, "each"):
+                names = node.target.elts if isinstance(node.target, ast.Tuple) else [node.target]
+                return [name.id for name in names if isinstance(name, ast.Name)]
+        return []
+
+    def __iter__(self) -> Each:
+        return self
+
+    def __next__(self) -> Any:
+        if self._has_begun:
+            self._trace.leave(self._node)
+            raise StopIteration
+        self._has_begun = True
+        self._trace.enter(self._node, "do")
+        element = Value(f"${self._variable}")
+        return (Value(f"${self._index}"), element) if self._gives_index else element
+
+
+def each(elements: object, *, variable: str | None = None, index: str | bool | None = None, name: str | None = None, **annotations: Any) -> Each:
+    """The elements of a list that is known only while the task runs: ``for box in ratn.each(look.boxes):``.
+
+    With ``index=True`` also their numbers: ``for i, box in ratn.each(look.boxes, index=True):``.
+    """
+    return Each(elements, variable, index, name, annotations)
+
+
+def _loop(key: str, function: str, condition: object, index: str | None, name: str | None, annotations: dict[str, Any]) -> Loop:
+    head = {} if condition is None else {key: _condition(condition)}
+    loop = Loop(function, name, annotations, {**head, **({"index": index} if index else {})}, function.rstrip("_"))
+    loop._key, loop._index = key, index
+    return loop
+
+
+def while_(condition: object, *, index: str | None = None, name: str | None = None, **annotations: Any) -> Loop:
+    """What is inside is done while the condition is true, which is looked at before each time: ``with ratn.while_(tries < 3) as loop:``."""
+    return _loop("while", "while_", condition, index, name, annotations)
+
+
+def do_while(condition: object = None, *, index: str | None = None, name: str | None = None, **annotations: Any) -> Loop:
+    """As :func:`while_`, looked at after each time."""
+    return _loop("do_while", "do_while", condition, index, name, annotations)
+
+
+def until(condition: object = None, *, index: str | None = None, name: str | None = None, **annotations: Any) -> Loop:
+    """What is inside is done until the condition is true, which is looked at after each time."""
+    return _loop("until", "until", condition, index, name, annotations)
+
+
+def concurrently(kind: str = "barrier", *, name: str | None = None, **annotations: Any) -> Concurrency:
+    """Regions: each state inside is one. ``barrier`` waits for all, ``preemptive`` ends with the first."""
+    return Concurrency("concurrently", name, annotations, {"concurrency": kind}, "concurrency")

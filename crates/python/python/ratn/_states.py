@@ -1,0 +1,205 @@
+"""States without states inside, as functions: actions, waits, parts from other files, functions of expressions, variables."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import pathlib
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from ratn._annotations import ANNOTATIONS, annotate, entry
+from ratn._expression import Value, call, refuse, user_line, written
+from ratn._trace import AnyState, State, Trace, assigned_name
+
+
+def perform(
+    action: str, inputs: dict[str, Any], annotations: dict[str, Any], *, name: str | None = None, kind: str | None = None
+) -> AnyState:
+    """Adds a state that performs ``provider/action``. Where nobody says its resources, it blocks one of ``kind``, which performs it."""
+    at = user_line()
+    trace = Trace.now(f"`{action}`")
+    function = action.rpartition("/")[2]
+    node = trace.add(name or assigned_name(function, at) or function, function, at)
+    node.body["action"] = action
+    if inputs:
+        node.body["in"] = {port: entry(value) for port, value in inputs.items()}
+    annotate(node.body, annotations)
+    if kind is not None and "resources" not in annotations:
+        reads_world = node.body.get("computes") is True and node.body.get("reads", True) != []
+        node.body["resources"] = [kind, "world_model"] if reads_world else [kind]
+    return AnyState(node)
+
+
+class Provider:
+    """The actions of a provider as functions: ``arm.follow(trajectory=…, pia=True)``. Ports and annotations are keyword arguments."""
+
+    def __init__(self, name: str, provider: dict[str, Any], catalogue: str | None) -> None:
+        self._name, self._provider, self._catalogue = name, provider, catalogue
+
+    def __getattr__(self, name: str) -> Callable[..., AnyState]:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        actions = self._provider.get("actions", {})
+        if name not in actions:
+            raise AttributeError(f"`{self._name}` has no action `{name}`; it has {', '.join(sorted(actions))}")
+        return lambda *positional, **said: self._call(name, positional, said)
+
+    def __dir__(self) -> list[str]:
+        return sorted(self._provider.get("actions", {}))
+
+    def _call(self, action: str, positional: tuple[Any, ...], said: dict[str, Any]) -> AnyState:
+        if positional:
+            raise TypeError(f"`{self._name}.{action}` takes its inputs by name: `{action}(port=value)`")
+        trace = Trace.now(f"`{self._name}.{action}`")
+        if self._catalogue is not None and self._catalogue not in trace.catalogues:
+            trace.catalogues.append(self._catalogue)
+        signature = self._provider["actions"][action]
+        ports = {*signature.get("inputs", {}), *signature.get("optional", {})}
+        name = said.pop("name", None) if "name" not in ports else None
+        inputs = dict(said.pop("inputs", {})) if "inputs" not in ports else {}
+        for key in list(said):
+            # Where a port has the name of an annotation, the port is meant by `inputs={…}` only.
+            if key not in ANNOTATIONS:
+                if key not in ports:
+                    known = ", ".join(sorted(ports)) or "none"
+                    raise TypeError(f"`{self._name}.{action}` has no input `{key}`; it has {known}. Annotations are {', '.join(ANNOTATIONS)}")
+                inputs[key] = said.pop(key)
+        # What the catalogue says that the action blocks is in force where the state says nothing.
+        kind = None if signature.get("annotations", {}).get("resources") else self._provider["resource"]
+        return perform(f"{self._name}/{action}", inputs, said, name=name, kind=kind)
+
+
+def action(name: str, /, inputs: dict[str, Any] | None = None, **annotations: Any) -> AnyState:
+    """A state that performs an action by its name, ``ratn.action("arm/follow", {"trajectory": plan.trajectory}, pia=True)``."""
+    state_name = annotations.pop("name", None)
+    return perform(name, inputs or {}, annotations, name=state_name)
+
+
+def library(file: str | os.PathLike[str], *, name: str | None = None, **given: Any) -> AnyState:
+    """Another task file as a state; what is no annotation is a parameter: ``ratn.library("fetch_boxes.yaml", boxes=2)``."""
+    at = user_line()
+    trace = Trace.now("`ratn.library`")
+    node = trace.add(name or assigned_name("library", at) or pathlib.Path(file).stem, "library", at)
+    node.body["library"] = os.fspath(file)
+    parameters = {**given.pop("parameters", {}), **{key: given.pop(key) for key in list(given) if key not in ANNOTATIONS}}
+    if parameters:
+        node.body["with"] = {key: entry(value) for key, value in parameters.items()}
+    annotate(node.body, given)
+    return AnyState(node)
+
+
+def leave(outcome: str, *, name: str | None = None) -> State:
+    """A step out of the block around by one of its outcomes."""
+    trace = Trace.now("`ratn.leave`")
+    node = trace.add(name or f"leave_{outcome}", "leave")
+    node.body.update({"states": [], "transitions": {"success": outcome}})
+    return State(node)
+
+
+def wait(
+    condition: object = None,
+    *,
+    seconds: object = None,
+    until: object = None,
+    signal: str | None = None,
+    timeout: float | None = None,
+    name: str | None = None,
+    **annotations: Any,
+) -> AnyState:
+    """Waits for a condition on the world, for a time, or for a signal; nothing is held meanwhile.
+
+    ``ratn.wait(ratn.fact("open", "lid"), timeout=60)``, ``ratn.wait(seconds=0.5)``, ``ratn.wait(until=30)`` (seconds since the run began), and
+    ``order = ratn.wait(signal="order")``, of which ``order.value`` is what ``run.signal("order", 2)`` has sent. After ``timeout`` seconds the
+    outcome is ``timeout``.
+    """
+    given = {"for": condition, "seconds": seconds, "until": until, "signal": signal}
+    said = {key: value for key, value in given.items() if value is not None}
+    if len(said) != 1:
+        refuse("a state waits for one thing", "say a condition, `seconds=`, `until=` or `signal=`")
+    ((key, value),) = said.items()
+    body = {key: value if isinstance(value, str) else entry(value)}
+    if timeout is not None:
+        body["timeout"] = timeout
+    return _own("wait", name, f"wait_{'condition' if key == 'for' else key}", body, annotations)
+
+
+def ask(
+    question: object, choices: Iterable[str], *, default: str | None = None, timeout: float | None = None, name: str | None = None, **annotations: Any
+) -> AnyState:
+    """Asks an operator, who answers with ``ratn answer`` or ``run.answer("now")``: ``go_on = ratn.ask("May the arm move?", ["now", "never"])``.
+
+    ``go_on.answer`` is the choice. One that ``transitions`` name is an outcome. After ``timeout`` seconds the answer is ``default``, or the outcome
+    ``timeout`` without one.
+    """
+    text = str(question)
+    if isinstance(question, Value) and not text.startswith(("'", '"', "$", "concat(")):
+        text = f"concat({text})"
+    elif not isinstance(question, Value) and text.startswith(("'", '"', "$", "concat(")):
+        # As a sentence, and not as an expression.
+        text = json.dumps(text, ensure_ascii=False)
+    body: dict[str, Any] = {"question": text, "choices": list(choices)}
+    if default is not None:
+        body["default"] = default
+    if timeout is not None:
+        body["timeout"] = timeout
+    return _own("ask", name, "ask_operator", body, annotations)
+
+
+def _own(function: str, name: str | None, default: str, body: dict[str, Any], annotations: dict[str, Any]) -> AnyState:
+    """A state that task control executes itself."""
+    at = user_line()
+    trace = Trace.now(f"`ratn.{function}`")
+    node = trace.add(name or assigned_name(function, at) or default, default, at)
+    node.body[function] = body
+    annotate(node.body, annotations)
+    return AnyState(node)
+
+
+class TaskFunction:
+    """A function of expressions, of a task: see :func:`function`."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function, self._name = function, function.__name__
+        self._parameters = list(inspect.signature(function).parameters)
+        self._is_traced = False
+
+    def __call__(self, *arguments: Any) -> Value:
+        trace = Trace.now(f"`{self._name}`")
+        if len(arguments) != len(self._parameters):
+            raise TypeError(f"`{self._name}` takes {len(self._parameters)} arguments ({', '.join(self._parameters)}), and is given {len(arguments)}")
+        if self._is_traced:
+            refuse(f"`{self._name}` uses itself", "write it without: a function is what would stand there if it were written out")
+        known = trace.functions.get(self._name)
+        if known is None or known[0] is not self:
+            if known is not None:
+                refuse(f"there are two functions `{self._name}`", "give one another name")
+            self._is_traced = True
+            try:
+                body = str(written(self._function(*(Value(f"${parameter}") for parameter in self._parameters))))
+            finally:
+                self._is_traced = False
+            head = f"{self._name}({', '.join(f'${parameter}' for parameter in self._parameters)})"
+            trace.functions[self._name] = (self, head, body)
+        return call(self._name, *arguments)
+
+
+def function(function: Callable[..., Any]) -> TaskFunction:
+    """Makes a function one of the task file: written once, used in expressions, ``near(box.pose, table)``. It sees its parameters and facts only."""
+    return TaskFunction(function)
+
+
+def variable(value: object, *, name: str | None = None) -> Value:
+    """A scoped variable of the task or block around: ``tries = ratn.variable(0)``. States give it new values with ``assign``."""
+    at = user_line()
+    trace = Trace.now("`ratn.variable`")
+    called = name or assigned_name("variable", at)
+    if called is None:
+        refuse("a variable has a name", "write `tries = ratn.variable(0)`, or `ratn.variable(0, name=\"tries\")`")
+    owner = trace.open[-1][1]
+    if owner is not None and "states" not in owner.branches:
+        refuse("variables belong to the task or to a `ratn.sequence`", "say it before the block, or in a `with ratn.sequence():` inside of it")
+    variables = trace.variables if owner is None else owner.body.setdefault("variables", {})
+    variables[called] = entry(value)
+    return Value(f"${called}")

@@ -1,0 +1,194 @@
+"""What is being traced: the states in the making, and the outputs of those that there are."""
+
+from __future__ import annotations
+
+import ast
+import contextvars
+import typing
+from typing import Any, NoReturn
+
+from ratn._expression import Value, refuse, statements_at_work, user_line
+from ratn._yaml import Body
+
+if typing.TYPE_CHECKING:
+    from ratn._states import TaskFunction
+
+tracing: contextvars.ContextVar[Trace | None] = contextvars.ContextVar("ratn_tracing", default=None)
+
+
+class Node:
+    """A state in the making: its body, and the lists of states inside."""
+
+    def __init__(self, siblings: list[Node], owner: Node | None, name: str | None, line: tuple[str, int], default: str) -> None:
+        self.siblings, self.owner, self.default, self.line = siblings, owner, default, line
+        self.body = Body()
+        self.body.line = line
+        self.branches: dict[str, list[Node]] = {}
+        self.before: list[Node] | None = None
+        self.is_open = False
+        self.name = None if name is None else self._unique(name)
+        siblings.append(self)
+
+    def _unique(self, name: str) -> str:
+        taken = {other.name for other in self.siblings}
+        number = 2
+        unique = name
+        while unique in taken:
+            unique, number = f"{name}_{number}", number + 1
+        return unique
+
+    def named(self) -> str:
+        """Its name; one that had none gets one, because somebody speaks of it."""
+        if self.name is None:
+            self.name = self._unique(self.default)
+        return self.name
+
+    @property
+    def shows_outputs(self) -> bool:
+        """Whether states inside are seen from outside, through outputs."""
+        return "states" in self.branches or "regions" in self.branches
+
+    def item(self) -> Body:
+        """As it stands in a list of states."""
+        body = Body(self.body)
+        body.line = self.line
+        for key, inside in self.branches.items():
+            body[key] = [node.item() for node in inside]
+        if self.before is not None:
+            body["retry"] = {**body.get("retry", {}), "before": [node.item() for node in self.before]}
+        if self.name is None:
+            return body
+        item = Body({self.name: body})
+        item.line = self.line
+        return item
+
+
+class Trace:
+    """What is being traced: the lists of states that are open, the innermost last."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self.top: list[Node] = []
+        self.open: list[tuple[list[Node], Node | None]] = [(self.top, None)]
+        self.variables: dict[str, Any] = {}
+        self.catalogues: list[str] = []
+        self.steps: dict[str, Any] = {}
+        self.functions: dict[str, tuple[TaskFunction, str, str]] = {}
+
+    @staticmethod
+    def now(what: str) -> Trace:
+        """The one that is at work."""
+        trace = tracing.get()
+        if trace is None:
+            refuse(f"{what} belongs into a task", "call it in a function with `@ratn.task`")
+        return trace
+
+    def add(self, name: str | None, default: str, at: tuple[str, int] | None = None) -> Node:
+        siblings, owner = self.open[-1]
+        return Node(siblings, owner, name, at or user_line(), default)
+
+    def enter(self, node: Node, branch: str) -> None:
+        node.is_open = True
+        self.open.append((node.branches.setdefault(branch, []), node))
+
+    def leave(self, node: Node) -> None:
+        innermost = self.open[-1][1]
+        if innermost is not node:
+            self.unfinished(innermost)
+        self.open.pop()
+        node.is_open = False
+
+    def unfinished(self, node: Node | None) -> NoReturn:
+        at = node.line if node is not None else None
+        refuse("the block that begins here is left in its middle", "a `break` or `return` cannot be traced: write `with ratn.when(…)`, or a transition", at)
+
+    def seen(self, node: Node, port: str) -> str:
+        """What an output of a state is called here."""
+        lists = [siblings for siblings, _ in self.open]
+        if any(siblings is node.siblings for siblings in lists):
+            return f"{node.named()}.{port}"
+        owner = node.owner
+        if owner is None:
+            refuse(f"`{node.named()}` is a state of another task", "states see those of their own task only")
+        if node.siblings is owner.before or not owner.shows_outputs:
+            where = f"{owner.line[0]}:{owner.line[1]}"
+            refuse(
+                f"`{node.named()}` is not seen outside of the block that begins at {where}",
+                "a loop, a condition or a `before` has no outputs: let an effect say it as a fact, and read that",
+            )
+        if port == "outcome":
+            refuse(f"how `{node.named()}` ended is seen only beside it", "let an effect say it as a fact, or give the block around an outcome")
+        outputs = owner.body.setdefault("outputs", {})
+        text = f"{node.named()}.{port}"
+        known = [name for name, said in outputs.items() if said == text]
+        name = known[0] if known else port if port not in outputs else f"{node.named()}_{port}"
+        outputs[name] = text
+        return self.seen(owner, name)
+
+
+class Port:
+    """An output of a state, named as it is seen where it is written down."""
+
+    def __init__(self, node: Node, port: str) -> None:
+        self.node, self.port = node, port
+
+    def __str__(self) -> str:
+        return Trace.now(f"`{self.node.named()}.{self.port}`").seen(self.node, self.port)
+
+
+class State:
+    """A state of a task. Its outputs are its attributes, ``look.boxes``; in ``transitions`` it stands for itself."""
+
+    __slots__ = ("_node",)
+    #: How it ended, as the ``decide`` of a concurrency sees it of its regions.
+    outcome: Value
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+
+    if not typing.TYPE_CHECKING:
+        # To type checkers a state has the outputs that stubs say.
+        def __getattr__(self, name):
+            if name.startswith("_"):
+                raise AttributeError(name)
+            return Value(Port(self._node, name))
+
+    def __getitem__(self, name: str) -> Value:
+        return Value(Port(self._node, name))
+
+    def __repr__(self) -> str:
+        return f"<State {self._node.named()}>"
+
+    def __bool__(self) -> bool:
+        refuse("whether a state succeeds is known only while the task runs", "say `transitions={\"aborted\": …}` at it, or `ratn.retry(n)` around it")
+
+
+class AnyState(State):
+    """A state of which type checkers do not know the outputs."""
+
+    __slots__ = ()
+    if typing.TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Value: ...
+
+
+def assigned_name(function: str, at: tuple[str, int]) -> str | None:
+    """The variable that the call at a line is assigned to, ``look = detector.segment(…)``: its state is called so, too."""
+    for node in statements_at_work(*at):
+        if isinstance(node, ast.NamedExpr) and calls(node.value, function):
+            return node.target.id
+        if isinstance(node, ast.Assign) and len(node.targets) == 1 and calls(node.value, function):
+            target = node.targets[0]
+            return target.id if isinstance(target, ast.Name) else None
+        if isinstance(node, ast.With):
+            for item in node.items:
+                if calls(item.context_expr, function) and isinstance(item.optional_vars, ast.Name):
+                    return item.optional_vars.id
+    return None
+
+
+def calls(node: ast.expr, function: str) -> bool:
+    if not isinstance(node, ast.Call):
+        return False
+    name = node.func.attr if isinstance(node.func, ast.Attribute) else node.func.id if isinstance(node.func, ast.Name) else ""
+    return name == function
