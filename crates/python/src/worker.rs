@@ -35,10 +35,14 @@ pub(crate) struct Described {
     outputs: Vec<(String, String)>,
     outcomes: Vec<String>,
     computes: bool,
-    reads: Vec<String>,
+    reads: Option<Vec<String>>,
     senses: Vec<String>,
     requires: Vec<String>,
-    effects: Vec<String>,
+    effects: Option<Vec<String>>,
+    /// Kinds of resources beside its own.
+    blocks: Vec<String>,
+    /// How long it usually takes, as an expression.
+    takes: Option<String>,
     /// It stands still while its goal is suspended.
     suspends: bool,
     /// Called with the goal and its inputs as a dict; gives an outcome, its outputs as a dict and a reason.
@@ -72,7 +76,7 @@ pub(crate) fn serve(
     let arguments = Arguments::of(arguments, pooled).and_then(Arguments::worker);
     let mut worker = arguments.map_err(|error| PyValueError::new_err(line(&error)))?.provides(provider, kind);
     for action in actions {
-        worker = worker.action(PythonAction::of(py, action)?);
+        worker = worker.action(PythonAction::of(py, action, kind)?);
     }
     if without_leases {
         worker = worker.without_leases();
@@ -147,7 +151,7 @@ struct PythonAction {
 }
 
 impl PythonAction {
-    fn of(py: Python<'_>, described: Described) -> PyResult<PythonAction> {
+    fn of(py: Python<'_>, described: Described, kind: &str) -> PyResult<PythonAction> {
         let Described { name, description, inputs, outputs, outcomes, perform, .. } = described;
         let of_type = |port: &str, text: String| {
             let read = Type::try_from(text);
@@ -155,26 +159,39 @@ impl PythonAction {
         };
         let mut signature = Signature::new();
         for (port, text, is_required, default) in inputs {
-            let kind = of_type(&port, text)?;
+            let of = of_type(&port, text)?;
             let default = default.into_bound(py);
             signature = match (is_required, default.is_none()) {
-                (true, _) => signature.input(&port, kind),
-                (false, true) => signature.optional(&port, kind),
-                (false, false) => signature.with_default(&port, kind, from_python(&default)?),
+                (true, _) => signature.input(&port, of),
+                (false, true) => signature.optional(&port, of),
+                (false, false) => signature.with_default(&port, of, from_python(&default)?),
             };
         }
         for (port, text) in outputs {
-            let kind = of_type(&port, text)?;
-            signature = signature.output(&port, kind);
+            signature = signature.output(&port, of_type(&port, text)?);
         }
         signature = outcomes.iter().fold(signature, |signature, outcome| signature.outcome(outcome));
         if described.computes {
             signature = signature.computes();
         }
-        signature = described.reads.iter().fold(signature, |signature, pattern| signature.reads(pattern));
+        signature = match &described.reads {
+            Some(none) if none.is_empty() => signature.reads_nothing(),
+            read => read.iter().flatten().fold(signature, |signature, pattern| signature.reads(pattern)),
+        };
         signature = described.senses.iter().fold(signature, |signature, pattern| signature.senses(pattern));
         signature = described.requires.iter().fold(signature, |signature, condition| signature.requires(condition));
-        signature = described.effects.iter().fold(signature, |signature, effect| signature.effect(effect));
+        signature = match &described.effects {
+            Some(none) if none.is_empty() && !described.computes => signature.changes_nothing(),
+            changed => changed.iter().flatten().fold(signature, |signature, effect| signature.effect(effect)),
+        };
+        if !described.blocks.is_empty() {
+            let own = (!described.blocks.iter().any(|blocked| blocked == kind)).then_some(kind);
+            let blocked = own.into_iter().chain(described.blocks.iter().map(String::as_str));
+            signature = blocked.fold(signature, Signature::blocks);
+        }
+        if let Some(takes) = &described.takes {
+            signature = signature.takes(takes);
+        }
         Ok(PythonAction { suspends: described.suspends, name, description, signature, perform: Arc::new(perform) })
     }
 }

@@ -93,6 +93,24 @@ def test_every_kind_of_value_comes_back_as_it_was(tester: Place, value: str) -> 
     assert not isinstance(got, bool) or value == "true"
 
 
+def test_what_an_action_says_of_itself_is_what_the_native_part_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    worker = ratn.Worker("scanner")
+
+    @worker.action(reads=[], effects=[], blocks=["Camera"], takes="0.5 * $rows")
+    def scan(goal: ratn.Goal, rows: int) -> dict[str, int]:
+        return {"rows": rows}
+
+    @worker.action
+    def other(goal: ratn.Goal) -> None: ...
+
+    served: list[object] = []
+    monkeypatch.setattr(ratn._ratn, "serve", lambda *given: served.append(given))
+    worker.run([])
+    scanned, unsaid = served[0][3]  # type: ignore[index]
+    assert (scanned.reads, scanned.effects, scanned.blocks, scanned.takes) == ([], [], ["Camera"], "0.5 * $rows")
+    assert (unsaid.reads, unsaid.effects, unsaid.blocks, unsaid.takes) == (None, None, [], None)
+
+
 def test_an_outcome_of_its_own_is_followed(tester: Place) -> None:
     text = (
         "task: odd\nstates:\n  - it:\n      action: tester/halve\n      in: { number: 7 }\n      computes: true\n      reads: []\n"

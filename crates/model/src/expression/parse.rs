@@ -744,9 +744,18 @@ mod tests {
         check("find(?x, on(?x, table))", "find(?x, on(?x, table))");
         check("len(find(?x,?w, weight(?x) = ?w and ?w > 1)) > 2", "len(find(?x, ?w, weight(?x) = ?w and ?w > 1)) > 2");
         check("find(?x, ?x, on(?x, table))", "invalid-expression: `?x` is wanted twice at 0");
-        check("find(?x, ?y, on(?x, table))", "invalid-expression: no condition of this `find` says anything of `?y` at 0");
-        check("find(?x)", "invalid-expression: `?x` in `?x` gets no value: no fact of the query has it as an argument or says it at 5");
-        check("find(on(?x, table))", "invalid-expression: `?name` is a variable of a query, and stands only within `exists (…)` and `find(…)` at 8");
+        check(
+            "find(?x, ?y, on(?x, table))",
+            "invalid-expression: no condition of this `find` says anything of `?y` at 0",
+        );
+        check(
+            "find(?x)",
+            "invalid-expression: `?x` in `?x` gets no value: no fact of the query has it as an argument or says it at 5",
+        );
+        check(
+            "find(on(?x, table))",
+            "invalid-expression: `?name` is a variable of a query, and stands only within `exists (…)` and `find(…)` at 8",
+        );
     }
 
     #[test]

@@ -52,10 +52,12 @@ class Action:
     outputs: list[tuple[str, str]]
     outcomes: list[str]
     computes: bool
-    reads: list[str]
+    reads: list[str] | None
     senses: list[str]
     requires: list[str]
-    effects: list[str]
+    effects: list[str] | None
+    blocks: list[str]
+    takes: str | None
     perform: Callable[..., tuple[str, dict[str, Any], str]]
     suspends: bool = False
     arrays: set[str] = field(default_factory=set)

@@ -73,7 +73,7 @@ class Step:
             if key not in _annotations.ANNOTATIONS:
                 raise TypeError(f"the step `{self.name}` has no input `{key}`; it has {', '.join(sorted(ports)) or 'none'}")
         # What it says of itself holds for the state, unless the state says otherwise.
-        said = {"computes": self.action.computes or None, "reads": self.action.reads if self.action.computes else self.action.reads or None}
+        said = {"computes": self.action.computes or None, "reads": self.action.reads or ([] if self.action.computes else None)}
         said |= {key: getattr(self.action, key) or None for key in ("senses", "requires", "effects")}
         return _states.perform(f"{self.provider}/{self.name}", inputs, {**said, **given}, name=name, kind=self.kind)
 

@@ -46,21 +46,26 @@ class Worker:
         outputs: dict[str, Any] | None = None,
         outcomes: Iterable[str] = (),
         computes: bool | None = None,
-        reads: Iterable[str] = (),
+        reads: Iterable[str] | None = None,
         senses: Iterable[str] = (),
         requires: Iterable[str] = (),
-        effects: Iterable[str] = (),
+        effects: Iterable[str] | None = None,
+        blocks: Iterable[str] = (),
+        takes: float | str | None = None,
         suspends: bool = False,
     ) -> Any:
         """Makes a function (also an ``async def``) an action. Its first parameter is the goal, the others are the input ports.
 
-        It returns its outputs as a ``dict``, or an ``Outcome``. ``computes`` is true where it neither senses nor changes anything. One that
+        It returns its outputs as a ``dict``, or an ``Outcome``. ``computes`` is true where it neither senses nor changes anything. What else is said of it
+        holds for every state that says nothing itself, in the words of task files (``$start`` is the state's input): the facts that it ``reads`` and its
+        ``effects`` (``[]``: none; left out: unknown, so any), what it ``senses`` and ``requires``, which kinds of resources it ``blocks`` beside its own, and
+        how many seconds it usually ``takes``. One that
         ``suspends`` stands still while its goal is suspended, because the resource manager is not heard (``goal.while_held()`` between its steps);
         the others end then.
         """
 
         def known(function: _Function) -> _Function:
-            senses_, effects_ = list(senses), list(effects)
+            senses_, effects_ = list(senses), None if effects is None else list(effects)
             inputs, arrays = _ports.inputs_of(function)
             action = _ports.Action(
                 name=name or function.__name__,
@@ -69,10 +74,12 @@ class Worker:
                 outputs=_ports.outputs_of(function, outputs),
                 outcomes=list(outcomes),
                 computes=not (senses_ or effects_) if computes is None else computes,
-                reads=list(reads),
+                reads=None if reads is None else list(reads),
                 senses=senses_,
                 requires=list(requires),
                 effects=effects_,
+                blocks=list(blocks),
+                takes=None if takes is None else str(takes),
                 suspends=suspends,
                 perform=lambda *_: ("aborted", {}, "not ready"),
                 arrays=arrays,
