@@ -52,8 +52,10 @@ pub struct Features {
     pub guards: bool,
     /// States that wait: for a time, a condition, a signal, an answer.
     pub waits: bool,
-    /// Motions that are watched: something must hold from their start to their end.
+    /// Motions and hierarchies that are watched: something must hold from their start to their end.
     pub watched: bool,
+    /// Queries are said with what they find.
+    pub finds: bool,
 }
 
 impl Features {
@@ -84,6 +86,7 @@ impl Features {
         guards: false,
         waits: false,
         watched: false,
+        finds: false,
     };
 
     /// Sequences, hierarchies, loops over lists, conditions, routines and actions alone.
@@ -113,6 +116,7 @@ impl Features {
         guards: false,
         waits: false,
         watched: false,
+        finds: false,
     };
 
     /// [`Features::ALL`], without those assumptions.
@@ -142,8 +146,8 @@ impl Features {
     /// [`Features::GUARDS`], with states that wait.
     pub const WAITS: Features = Features { waits: true, ..Features::GUARDS };
 
-    /// [`Features::WAITS`], with motions that are watched.
-    pub const WATCHED: Features = Features { watched: true, ..Features::WAITS };
+    /// [`Features::WAITS`], with states that are watched, and with what queries find.
+    pub const WATCHED: Features = Features { watched: true, finds: true, ..Features::WAITS };
 
     /// Imprecise motions that fail, in programs that never look at the world: where a failure leads is then the same in both
     /// modes, whatever younger motions have done meanwhile.

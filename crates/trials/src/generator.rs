@@ -20,7 +20,8 @@
 //! loader makes of one is made directly).
 
 use super::{
-    AGAIN, ARGUMENTS, Dice, EMPTY, FOUND, Features, PART, PREDICATES, TOOL, around, is_in_routine, is_preemptive, lists,
+    AGAIN, ARGUMENTS, Dice, EMPTY, FOUND, Features, PART, PREDICATES, TOOL, around, finds, is_in_routine,
+    is_preemptive, lists,
 };
 use annotations::{block, resource, task_resource};
 use ratn_model::expression::{BinaryOperator, EffectExpr, Expr, FactExpr, Function, UnaryOperator};
@@ -129,6 +130,9 @@ pub fn program(seed: u64, features: &Features) -> Program {
     for id in around {
         // Blocks go to every state inside: regions that race must not wait for each other's workers.
         program.states[id.0 as usize].annotations.resources.retain(|r| r.operation != ResourceOperation::Block);
+    }
+    if features.finds {
+        finds::say_with_find(&mut program, &mut Dice(seed ^ 0x0000_f19d_5a1d));
     }
     if features.lists {
         lists::say_with_comprehensions(&mut program, &mut maker.dice);

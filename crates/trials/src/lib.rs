@@ -30,6 +30,7 @@
 mod awaited;
 mod blind;
 mod features;
+mod finds;
 mod generator;
 mod interrupt;
 mod listing;

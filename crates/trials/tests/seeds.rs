@@ -84,3 +84,15 @@ fn waits_of_every_kind_are_made() {
         assert!(with > 0, "no program has `{text}`");
     }
 }
+
+#[test]
+fn what_is_watched_and_what_is_found_is_made() {
+    let made: Vec<String> = (0..300).map(|seed| listing(&program(seed, &Features::WATCHED))).collect();
+    for (expected, least) in [("while not p", 20), ("while exists p", 20), ("len(find(?", 60)] {
+        let found = made.iter().filter(|listing| listing.contains(expected)).count();
+        assert!(found >= least, "`{expected}` is in {found} of 300 programs");
+    }
+    let has_watch = |seed: &u64| program(*seed, &Features::WATCHED).states.iter().any(|state| state.is_watch());
+    let hierarchies = (0..300).filter(has_watch).count();
+    assert!(hierarchies >= 20, "a hierarchy is watched in {hierarchies} of 300 programs");
+}

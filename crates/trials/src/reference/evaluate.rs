@@ -128,7 +128,7 @@ impl Read for Expr {
             }
             Expr::Element(name) => written(last(&place.elements, name)),
             Expr::Each { what, element, list, body } => comprehension::read((*what, element), (list, body), place),
-            Expr::Find(..) => Err(Fail::NotMine("what a query finds")),
+            Expr::Find(wanted, conditions) => Ok(Value::List(query::found_values(wanted, conditions, place)?)),
             Expr::Query(conditions) => Ok(Value::Bool(query::has_answer(conditions, place)?)),
             Expr::Unary(UnaryOperator::Not, of) => Ok(Value::Bool(!of.is_true(place)?)),
             Expr::Unary(UnaryOperator::Negate, of) => match of.read(place)? {

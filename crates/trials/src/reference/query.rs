@@ -31,8 +31,32 @@ pub(super) fn has_answer(query: &[Expr], place: &Place<'_>) -> Result<bool, Fail
     let mut hidden = place.row.len();
     let conditions = conditions(query, &mut hidden);
     let all: Vec<&Condition> = conditions.iter().collect();
-    answers(&all, &mut place.clone())
+    answers(&all, &mut place.clone(), &mut |_| true)
 }
+
+/// What the answers say of some variables, each once; in the order of all values, which is the model's.
+pub(super) fn found_values(wanted: &[String], query: &[Expr], place: &Place<'_>) -> Result<Vec<Value>, Fail> {
+    let mut hidden = place.row.len();
+    let conditions = conditions(query, &mut hidden);
+    let all: Vec<&Condition> = conditions.iter().collect();
+    let mut values: Vec<Value> = Vec::new();
+    answers(&all, &mut place.clone(), &mut |place| {
+        let of =
+            |name: &String| place.row.iter().rev().find(|(known, _)| known == name).map(|(_, value)| value.clone());
+        let each: Vec<(String, Value)> =
+            wanted.iter().map(|name| (name.clone(), of(name).unwrap_or(Value::Null))).collect();
+        let value = if let [(_, one)] = each.as_slice() { one.clone() } else { Value::Map(each.into_iter().collect()) };
+        if !values.contains(&value) {
+            values.push(value);
+        }
+        false
+    })?;
+    values.sort_by(|a, b| a.total_order(b));
+    Ok(values)
+}
+
+/// Whether an answer is enough.
+type Enough<'a> = dyn FnMut(&Place<'_>) -> bool + 'a;
 
 fn conditions(query: &[Expr], hidden: &mut usize) -> Vec<Condition> {
     let mut all = Vec::new();
@@ -97,10 +121,10 @@ fn without_facts(expr: &Expr, hidden: &mut usize, all: &mut Vec<Condition>) -> E
     }
 }
 
-/// Whether there are values that make all of these true.
-fn answers(conditions: &[&Condition], place: &mut Place<'_>) -> Result<bool, Fail> {
+/// Whether there are values that make all of these true, and that are enough.
+fn answers(conditions: &[&Condition], place: &mut Place<'_>, enough: &mut Enough<'_>) -> Result<bool, Fail> {
     if conditions.is_empty() {
-        return Ok(true);
+        return Ok(enough(place));
     }
     let others = |at: usize| conditions.iter().enumerate().filter(move |(n, _)| *n != at).map(|(_, other)| *other);
     let rest = |at: usize| others(at).collect::<Vec<&Condition>>();
@@ -110,18 +134,18 @@ fn answers(conditions: &[&Condition], place: &mut Place<'_>) -> Result<bool, Fai
         let holds = match condition {
             Condition::Answers(inner, wanted) if names_in(condition).iter().all(is_bound) => {
                 let all: Vec<&Condition> = inner.iter().collect();
-                answers(&all, &mut place.clone())? == *wanted
+                answers(&all, &mut place.clone(), &mut |_| true)? == *wanted
             }
             Condition::Test(test) if is_readable(test, place) => test.is_true(place)?,
             _ => continue,
         };
-        return if holds { answers(&rest(at), place) } else { Ok(false) };
+        return if holds { answers(&rest(at), place, enough) } else { Ok(false) };
     }
     for (at, condition) in conditions.iter().enumerate() {
         if let Condition::Fact(fact, says) = condition
             && let Some(pattern) = pattern(fact, place)?
         {
-            return found(fact, &pattern, says, &rest(at), place);
+            return found(fact, &pattern, says, &rest(at), place, enough);
         }
     }
     for (at, condition) in conditions.iter().enumerate() {
@@ -132,7 +156,7 @@ fn answers(conditions: &[&Condition], place: &mut Place<'_>) -> Result<bool, Fai
             {
                 let value = value.read(place)?;
                 place.row.push((name.clone(), value));
-                let answer = answers(&rest(at), place);
+                let answer = answers(&rest(at), place, enough);
                 place.row.pop();
                 return answer;
             }
@@ -148,6 +172,7 @@ fn found(
     says: &Says,
     rest: &[&Condition],
     place: &mut Place<'_>,
+    enough: &mut Enough<'_>,
 ) -> Result<bool, Fail> {
     let Some(pattern) = pattern else { return Ok(false) };
     let before = place.row.len();
@@ -169,7 +194,7 @@ fn found(
             Says::Value(Expr::Unknown(name)) => unify(name, value.clone(), place),
             Says::Value(wanted) => same(&wanted.read(place)?, value),
         };
-        let answer = if fits { answers(rest, place) } else { Ok(false) };
+        let answer = if fits { answers(rest, place, enough) } else { Ok(false) };
         place.row.truncate(before);
         if answer? {
             return Ok(true);
