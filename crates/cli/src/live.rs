@@ -1,14 +1,19 @@
 //! A run while it goes on, from its event log as it grows: on a terminal a few lines that are painted again, for programs the log's lines.
 //!
 //! It reads what the run has written, in a thread of its own, so a run is not slower for being watched. What is painted is the one
-//! projection of the log; this file only lays it out.
+//! projection of the log; this file only lays it out. While an operator is asked nothing is painted anew: who types sees what he types
+//! ([`answers`]).
+
+mod answers;
 
 use crate::colour::Colours;
 use crate::output;
+use answers::Questions;
 use ratn_event_log::Tail;
 use ratn_executive::protocol::LogLine;
 use ratn_report::statistics::mode_name;
 use ratn_report::timeline::{Instance, Speculation, Stage, Timeline};
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
@@ -40,11 +45,15 @@ pub(crate) struct Live {
 
 impl Live {
     /// Follows a log that is about to be written. `speed` is the robot's seconds per second.
-    pub(crate) fn follow(log: &Path, way: Way, speed: f64) -> Live {
+    /// What is typed on a terminal answers the questions of the run in `directory`.
+    pub(crate) fn follow(log: &Path, way: Way, speed: f64, directory: &Path) -> Live {
         let (end, ends) = channel();
         let log: PathBuf = log.to_owned();
+        let can_answer = way == Way::Painted && std::io::stdin().is_terminal() && answers::listen(directory);
         let follow = move || {
-            let mut painter = Painter { way, speed, run: Timeline::following(KEPT), heard: (Instant::now(), 0.0) };
+            let run = Timeline::following(KEPT);
+            let questions = Questions::new(can_answer);
+            let mut painter = Painter { way, speed, run, questions, heard: (Instant::now(), 0.0) };
             let mut tail = Tail::of(&log);
             loop {
                 let is_over = !matches!(ends.recv_timeout(PERIOD), Err(RecvTimeoutError::Timeout));
@@ -74,6 +83,7 @@ struct Painter {
     way: Way,
     speed: f64,
     run: Timeline,
+    questions: Questions,
     /// When the last line came, and its moment.
     heard: (Instant, f64),
 }
@@ -84,7 +94,10 @@ impl Painter {
         for line in &lines {
             self.heard = (Instant::now(), line.at.seconds());
             match self.way {
-                Way::Painted => drop(self.run.apply(line)),
+                Way::Painted => {
+                    drop(self.run.apply(line));
+                    self.questions.follow(line);
+                }
                 Way::Lines => {
                     let text = serde_json::to_string(line).unwrap_or_default();
                     if !matches!(output::line(text), Ok(true)) {
@@ -100,11 +113,18 @@ impl Painter {
         if self.way != Way::Painted || self.run.task.is_empty() {
             return;
         }
+        if self.questions.keep_still() {
+            return;
+        }
         let (heard, at_s) = self.heard;
         self.run.wait_until(at_s + heard.elapsed().as_secs_f64() * self.speed);
         let size = terminal_size::terminal_size_of(std::io::stderr());
         let (width, height) = size.map_or((80, 24), |(width, height)| (usize::from(width.0), usize::from(height.0)));
-        output::paint_area(&page(&self.run, width, height, Colours::of_errors()));
+        let mut lines = page(&self.run, width, height, Colours::of_errors());
+        let asked =
+            self.questions.lines(|id| self.run.instance(id).map_or_else(|| id.to_string(), |one| one.path.to_string()));
+        lines.extend(asked.iter().map(|line| cut(line, width)));
+        output::paint_area(&lines);
     }
 }
 

@@ -43,6 +43,14 @@ pub(crate) fn paint_area(lines: &[String]) {
     let _ = io::stderr().write_all(text.as_bytes());
 }
 
+/// A line was typed below what is painted, which stands a row higher now.
+pub(crate) fn area_was_pushed() {
+    let mut progress = PROGRESS.lock().unwrap_or_else(PoisonError::into_inner);
+    if !progress.area.is_empty() {
+        progress.area.push(0);
+    }
+}
+
 /// Takes away what is painted.
 pub(crate) fn clear_area() {
     paint_area(&[]);

@@ -136,7 +136,7 @@ async fn begin(
         quiet: arguments.quiet || way == Some(Way::Painted),
         checkpoint_every: arguments.checkpoint_every,
     };
-    let live = way.map(|way| Live::follow(&log, way, system.place().speed));
+    let live = way.map(|way| Live::follow(&log, way, system.place().speed, system.directory().path()));
     let ended = on_system(run, system, interrupt, async |_| Ok(())).await;
     drop(live);
     output::progress(format_args!("event log: {}", log.display()));
