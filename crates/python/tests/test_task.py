@@ -153,7 +153,7 @@ def test_every_form_of_a_state_is_traced() -> None:
         "condition: \"((len(look.boxes) > 0) and (not (exists in_gripper(cup)))) or ($count < 2)\"",
         "target: \"pose(0.8, $iteration * 0.1, 0.7)\"",
         "until: \"len(again.boxes) > 1\"",
-        "while: [closed(door)]",
+        "while: [\"closed(door)\"]",
         "timeout: 20",
         "for: \"box in sort_by($b in look.boxes, $b.size[0])\"",
         "requires: [\"$i < 9\", \"cup in [cup, mug]\"]",
