@@ -91,6 +91,28 @@ states:
     }
 }
 
+/// The variables of a `find` in a function are its own, wherever the function is used; its records have the names that are written.
+#[test]
+fn what_a_function_finds_has_nothing_to_do_with_the_variables_around() {
+    let task = "
+task: apart
+world: [\"on(cup, table)\", \"on(box, shelf)\", \"weight(cup) = 1\"]
+functions:
+  tabled(): find(?x, on(?x, table))
+  heavy($least): find(?x, ?w, weight(?x) = ?w, ?w >= $least)
+outputs:
+  both: \"exists (on(?x, shelf), len(tabled()) > 0, ?x = box)\"
+  others: \"map($x in tabled(), exists (on(?x, shelf), ?x != $x))\"
+  heavy: heavy(1)
+states: []
+";
+    for mode in MODES {
+        let run = simulate(task, mode, &mut Providers(|_: &str, _: u32, _: &Goal, _: &World| ("success", Value::Null)));
+        let shown: Vec<String> = run.outputs.values().map(ToString::to_string).collect();
+        assert_eq!(shown, ["true", "[{w: 1, x: cup}]", "[true]"], "{mode:?}: {}", run.reason);
+    }
+}
+
 #[test]
 fn a_query_that_cannot_be_planned_is_refused_with_its_place() {
     let task =

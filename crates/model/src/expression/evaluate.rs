@@ -181,7 +181,9 @@ impl Expr {
             let value = match places.as_slice() {
                 [one] => row[*one].clone(),
                 several => {
-                    Value::Map(wanted.iter().cloned().zip(several.iter().map(|place| row[*place].clone())).collect())
+                    // In the body of a function a variable has more to its name than was written.
+                    let fields = wanted.iter().map(|name| name.split(' ').next().unwrap_or_default().to_owned());
+                    Value::Map(fields.zip(several.iter().map(|place| row[*place].clone())).collect())
                 }
             };
             found.insert(Ordered(value));

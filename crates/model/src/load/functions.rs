@@ -170,6 +170,7 @@ impl Reading<'_, '_> {
             body.rewrite(&mut |part| match part {
                 Expr::Each { element, .. } => own(element),
                 Expr::Element(inner) | Expr::Unknown(inner) => own(inner),
+                Expr::Find(wanted, _) => wanted.iter_mut().for_each(own),
                 _ => {}
             });
         }
