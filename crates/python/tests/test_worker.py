@@ -109,6 +109,8 @@ def test_what_an_action_says_of_itself_is_what_the_native_part_is_told(monkeypat
     scanned, unsaid = served[0][3]  # type: ignore[index]
     assert (scanned.reads, scanned.effects, scanned.blocks, scanned.takes) == ([], [], ["Camera"], "0.5 * $rows")
     assert (unsaid.reads, unsaid.effects, unsaid.blocks, unsaid.takes) == (None, None, [], None)
+    # What is not said may move something.
+    assert scanned.computes and not unsaid.computes
 
 
 def test_an_outcome_of_its_own_is_followed(tester: Place) -> None:

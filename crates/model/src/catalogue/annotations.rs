@@ -15,7 +15,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 pub struct Annotations {
     /// It reads its projection and changes nothing.
     pub computes: bool,
-    /// Patterns of the facts that it reads; empty for none.
+    /// Patterns of the facts that it reads, `scene` for those of the geometry; empty for none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reads: Option<Vec<String>>,
     /// Patterns of the facts that it senses; where there are none, it does not only look.
@@ -90,6 +90,7 @@ impl Annotations {
             for text in texts {
                 let names = &mut Ports { signature, has_outputs: key == "effects" };
                 let read = match key {
+                    "reads" if text == "scene" => Ok(()),
                     "reads" | "senses" => parse_fact(text, names).map(drop),
                     "effects" => parse_effect(text, names).map(drop),
                     "resources" if !crate::expression::display::is_word(text) => {

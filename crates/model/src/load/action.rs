@@ -102,7 +102,7 @@ impl<'b> Sources<'b> {
         &mut self,
         fields: &mut Fields<'_, '_>,
         key: &'static str,
-        read: impl FnOnce(&mut Fields<'_, '_>, &Node) -> T,
+        read: impl Fn(&mut Fields<'_, '_>, &Node) -> T,
     ) -> Option<T> {
         if let Some(node) = self.body.get(key) {
             self.origin.insert(key.to_owned(), Origin::State);
@@ -123,8 +123,17 @@ impl<'b> Sources<'b> {
         let mut changed = read(fields, node);
         let own: BTreeSet<String> =
             changed.get(SUCCESS).into_iter().flatten().filter_map(predicate).map(str::to_owned).collect();
-        let mut more = self.of_action(fields, "effects", read).unwrap_or_default().remove(SUCCESS).unwrap_or_default();
-        more.retain(|effect| predicate(effect).is_none_or(|predicate| !own.contains(predicate)));
+        let replaced = |effect: &EffectExpr| predicate(effect).is_some_and(|predicate| own.contains(predicate));
+        let mut more = Vec::new();
+        for (one, missing) in self.each_of_action(fields, "effects", read) {
+            let mut one: Vec<EffectExpr> = one.into_values().flatten().collect();
+            one.retain(|effect| !replaced(effect));
+            match missing {
+                None => more.extend(one),
+                Some(missing) if !one.is_empty() => self.not_in_force(fields, "effects", &missing),
+                Some(_) => {}
+            }
+        }
         let from = if more.is_empty() { Origin::State } else { Origin::Both };
         self.origin.insert("effects".to_owned(), from);
         if !more.is_empty() {
@@ -138,29 +147,50 @@ impl<'b> Sources<'b> {
         &mut self,
         fields: &mut Fields<'_, '_>,
         key: &'static str,
-        read: impl FnOnce(&mut Fields<'_, '_>, &Node) -> T,
+        read: impl Fn(&mut Fields<'_, '_>, &Node) -> T,
     ) -> Option<T> {
         let (said, ports, at) = self.action.as_ref()?;
-        let node = node(said, key, *at)?;
-        fields.view.action = Some(Rc::clone(ports));
-        let value = read(fields, &node);
-        fields.view.action = None;
-        let Some(missing) = ports.missing.take() else {
-            self.origin.insert(key.to_owned(), Origin::Action);
-            return Some(value);
-        };
-        // What the state says itself is all that is known then; a required input that is missing is an error of its own.
-        let is_refused = ports.signature.inputs.keys().any(|input| !ports.inputs.contains_key(input));
-        if self.body.get(key).is_none() && !is_refused {
-            let action = &ports.name;
-            let message = format!(
-                "what `{action}` says under `{key}` needs {missing}, which this state does not have: it is not in force"
-            );
-            let (at, path) = (*at, fields.path.clone());
-            let help = format!("say `{key}` here");
-            fields.out.findings.warning("annotation-not-in-force", at, &path, message, help);
+        let mut node = node(said, key, *at)?;
+        let (mut value, missing) = in_its_terms(fields, ports, &node, &read);
+        if let Some(missing) = missing {
+            self.not_in_force(fields, key, &missing);
+            // What must be true and is known has to be; of all else only the whole says anything.
+            let Content::List(items) = &mut node.content else { return None };
+            if key != "requires" {
+                return None;
+            }
+            items.retain(|item| in_its_terms(fields, ports, item, &read).1.is_none());
+            value = in_its_terms(fields, ports, &node, &read).0;
         }
-        None
+        self.origin.insert(key.to_owned(), Origin::Action);
+        Some(value)
+    }
+
+    /// What the action says under a key, one item after the other, each with what it needs and the state does not have.
+    fn each_of_action<T>(
+        &self,
+        fields: &mut Fields<'_, '_>,
+        key: &'static str,
+        read: impl Fn(&mut Fields<'_, '_>, &Node) -> T,
+    ) -> Vec<(T, Option<String>)> {
+        let Some((said, ports, at)) = &self.action else { return Vec::new() };
+        let node = node(said, key, *at);
+        let items = node.as_ref().map(Node::items).unwrap_or_default();
+        items.into_iter().map(|item| in_its_terms(fields, ports, item, &read)).collect()
+    }
+
+    fn not_in_force(&self, fields: &mut Fields<'_, '_>, key: &str, missing: &str) {
+        let Some((_, ports, at)) = &self.action else { return };
+        // A required input that is missing is an error of its own.
+        if ports.signature.inputs.keys().any(|input| !ports.inputs.contains_key(input)) {
+            return;
+        }
+        let action = &ports.name;
+        let message = format!(
+            "what `{action}` says under `{key}` needs {missing}, which this state does not have: it is not in force"
+        );
+        let path = fields.path.clone();
+        fields.out.findings.warning("annotation-not-in-force", *at, &path, message, format!("say `{key}` here"));
     }
 
     /// What the state is, where it does not say so itself.
@@ -183,6 +213,19 @@ impl<'b> Sources<'b> {
         };
         self.read(fields, "senses", senses).map_or_else(Nature::default, Nature::Senses)
     }
+}
+
+/// A node of the action's, read in terms of its ports; what it needs and the state does not have.
+fn in_its_terms<T>(
+    fields: &mut Fields<'_, '_>,
+    ports: &Rc<Ports>,
+    node: &Node,
+    read: impl Fn(&mut Fields<'_, '_>, &Node) -> T,
+) -> (T, Option<String>) {
+    fields.view.action = Some(Rc::clone(ports));
+    let value = read(fields, node);
+    fields.view.action = None;
+    (value, ports.missing.take())
 }
 
 /// The predicate that an effect on one fact changes.

@@ -121,6 +121,8 @@ def step(
     It is as ``Worker.action``, but for the goal, which it may do without. Its file is run by the worker: what shall happen only in the
     program that starts the run stands below ``if __name__ == "__main__":``.
     """
+    senses, effects = list(senses), list(effects)
+    computes = not (senses or effects) if computes is None else computes
     said = {"outputs": outputs, "outcomes": outcomes, "computes": computes, "reads": reads, "senses": senses, "requires": requires, "effects": effects}
     return (lambda function: Step(function, name, said)) if function is None else Step(function, name, said)
 

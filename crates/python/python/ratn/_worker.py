@@ -56,7 +56,7 @@ class Worker:
     ) -> Any:
         """Makes a function (also an ``async def``) an action. Its first parameter is the goal, the others are the input ports.
 
-        It returns its outputs as a ``dict``, or an ``Outcome``. ``computes`` is true where it neither senses nor changes anything. What else is said of it
+        It returns its outputs as a ``dict``, or an ``Outcome``. ``computes`` is true where it says that it changes nothing (``effects=[]``) and senses nothing: one that says nothing may move something. What else is said of it
         holds for every state that says nothing itself, in the words of task files (``$start`` is the state's input): the facts that it ``reads`` and its
         ``effects`` (``[]``: none; left out: unknown, so any), what it ``senses`` and ``requires``, which kinds of resources it ``blocks`` beside its own, and
         how many seconds it usually ``takes``. One that
@@ -73,7 +73,7 @@ class Worker:
                 inputs=inputs,
                 outputs=_ports.outputs_of(function, outputs),
                 outcomes=list(outcomes),
-                computes=not (senses_ or effects_) if computes is None else computes,
+                computes=not senses_ and effects_ == [] if computes is None else computes,
                 reads=None if reads is None else list(reads),
                 senses=senses_,
                 requires=list(requires),
