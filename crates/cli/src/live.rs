@@ -120,9 +120,11 @@ impl Painter {
         self.run.wait_until(at_s + heard.elapsed().as_secs_f64() * self.speed);
         let size = terminal_size::terminal_size_of(std::io::stderr());
         let (width, height) = size.map_or((80, 24), |(width, height)| (usize::from(width.0), usize::from(height.0)));
-        let mut lines = page(&self.run, width, height, Colours::of_errors());
-        let asked =
-            self.questions.lines(|id| self.run.instance(id).map_or_else(|| id.to_string(), |one| one.path.to_string()));
+        let path = |id| self.run.instance(id).map_or_else(|| String::from("?"), |one| one.path.to_string());
+        let asked = self.questions.lines(path);
+        // The first questions come before what runs and waits: they are what the run stands still for.
+        let asked = &asked[..asked.len().min(MOST_WAITING).min(height.saturating_sub(4))];
+        let mut lines = page(&self.run, width, height - asked.len(), Colours::of_errors());
         lines.extend(asked.iter().map(|line| cut(line, width)));
         output::paint_area(&lines);
     }

@@ -65,7 +65,7 @@ pub(crate) fn begins(
     })
 }
 
-/// How a wait ends for whose end the world is as it has to be; one that waits for something else waits on.
+/// How a wait for a condition ends, if the world is now as it ends it; `None`: it goes on. Waits for anything else go on, too.
 pub(crate) fn has_come(state: &State, scope: &dyn Scope) -> Result<Option<WaitEnd>, BindError> {
     match state.wait() {
         Some(Wait::Condition(condition)) => {

@@ -1,4 +1,5 @@
-//! States that are tried again, states that are watched, and states with something to do on every way out, in terms of the transitions, scoped variables and
+//! States that are tried again, states that are watched, and states with something to do on every way out, in terms of the
+//! transitions, scoped variables and
 //! conditions that every program has. Both modes and routines execute them as they execute those.
 //!
 //! ```text
@@ -168,11 +169,11 @@ impl Unfolding<'_> {
         let mut regions = Vec::new();
         if !limits.holds.is_empty() {
             let conditions = limits.holds.iter().map(|condition| ("for".to_owned(), condition.clone()));
-            regions.push(self.watch(id, around, ("while", WATCH, VIOLATED), conditions.collect(), scope)?);
+            regions.push(self.wait(id, around, ("while", WATCH, VIOLATED), conditions.collect(), scope)?);
         }
         if let Some(seconds) = limits.timeout_s {
             let limit = vec![("seconds".to_owned(), Expr::Literal(Value::Float(seconds)))];
-            regions.push(self.watch(id, around, ("timeout", LIMIT, ABORTED), limit, scope)?);
+            regions.push(self.wait(id, around, ("timeout", LIMIT, ABORTED), limit, scope)?);
         }
         let body = self.written(id, Some(around), "body".to_owned(), scope, false)?;
         regions.push(body);
@@ -191,8 +192,8 @@ impl Unfolding<'_> {
         Ok(around)
     }
 
-    /// A state that the executive waits in, beside the one that it watches; by this outcome it ends that.
-    fn watch(
+    /// A state that the executive waits in, which changes nothing and ends by this outcome.
+    fn wait(
         &mut self,
         id: StateId,
         parent: StateId,
@@ -202,11 +203,11 @@ impl Unfolding<'_> {
     ) -> Result<StateId, TooManyStates> {
         let (provider, action) = (CLOCK.to_owned(), action.to_owned());
         let kind = StateKind::Action { provider, action, inputs, outputs: BTreeMap::new() };
-        let watch = self.made(id, parent, name, kind, scope)?;
+        let wait = self.made(id, parent, name, kind, scope)?;
         let nothing = |outcome: &str| (outcome.to_owned(), Vec::new());
-        self.at(watch).annotations.effects = [SUCCESS, ABORTED, PREEMPTED, outcome].map(nothing).into();
-        self.at(watch).outcomes = own([outcome]);
-        Ok(watch)
+        self.at(wait).annotations.effects = [SUCCESS, ABORTED, PREEMPTED, outcome].map(nothing).into();
+        self.at(wait).outcomes = own([outcome]);
+        Ok(wait)
     }
 
     /// The state as it was written.
@@ -291,11 +292,7 @@ impl Unfolding<'_> {
         let mut last = again;
         if retried.backoff_s > 0.0 {
             let seconds = vec![("seconds".to_owned(), variable(&pause_s))];
-            let (provider, action) = (CLOCK.to_owned(), PAUSE.to_owned());
-            let kind = StateKind::Action { provider, action, inputs: seconds, outputs: BTreeMap::new() };
-            let pause = self.made(id, around, "pause", kind, scope)?;
-            let nothing = |outcome: &str| (outcome.to_owned(), Vec::new());
-            self.at(pause).annotations.effects = [SUCCESS, ABORTED, PREEMPTED].map(nothing).into();
+            let pause = self.wait(id, around, ("pause", PAUSE, SUCCESS), seconds, scope)?;
             self.at(pause).annotations.duration_s = Some(variable(&pause_s));
             self.at(pause).assign =
                 vec![(pause_s.clone(), of(BinaryOperator::Multiply, variable(&pause_s), number(2)))];

@@ -132,14 +132,30 @@ fn the_digest_of_a_task_covers_what_its_actions_say() {
 fn what_is_in_force_of_an_action_is_so_item_by_item() {
     // The effect that needs `expected` is one that the state says itself; that the hand is not empty any more holds all the same.
     let task = "task: t\nworld: [\"hand_empty(gripper)\", \"at(cup) = pose(0.8, 0, 0.7)\"]\nstates:\n  - grasp: { action: gripper/grasp, in: { object: cup }, effects: [\"in_gripper(cup) = pose(0, 0, 0)\"] }\n";
-    let loaded = ratn_model::load::load(task, "t.yaml", &ratn_model::catalogue::Catalogue::standard()).unwrap();
+    let loaded = load(task, "t.yaml", &Catalogue::standard()).unwrap();
     assert!(loaded.warnings.is_empty(), "{:?}", loaded.warnings);
     let effects = &loaded.program.states[1].annotations.effects["success"];
     let effects: Vec<String> = effects.iter().map(ToString::to_string).collect();
     assert_eq!(effects.len(), 2, "{effects:?}");
     // An effect that the state neither has what it needs for nor says itself is told of.
     let task = "task: t\nworld: [\"hand_empty(gripper)\", \"at(cup) = pose(0.8, 0, 0.7)\"]\nstates:\n  - grasp: { action: gripper/grasp, in: { object: cup }, effects: [\"tried(cup)\"] }\n";
-    let loaded = ratn_model::load::load(task, "t.yaml", &ratn_model::catalogue::Catalogue::standard()).unwrap();
+    let loaded = load(task, "t.yaml", &Catalogue::standard()).unwrap();
     assert_eq!(loaded.warnings.len(), 1, "{:?}", loaded.warnings);
     assert_eq!(loaded.warnings[0].rule, "annotation-not-in-force");
+}
+
+#[test]
+fn each_requirement_stands_for_itself_and_no_effects_are_something_said() {
+    let mut catalogue = Catalogue::standard();
+    let grasp = catalogue.providers.get_mut("gripper").unwrap().actions.get_mut("grasp").unwrap();
+    grasp.annotations.requires.push("$expected.z < 0.1".to_owned());
+    let task = "task: t\nworld: [\"hand_empty(gripper)\"]\nstates:\n  - grasp: { action: gripper/grasp, in: { object: cup }, effects: [\"in_gripper(cup) = pose(0, 0, 0)\"] }\n";
+    let loaded = load(task, "t.yaml", &catalogue).unwrap();
+    let required: Vec<String> = loaded.program.states[1].annotations.requires.iter().map(ToString::to_string).collect();
+    assert_eq!(required, ["hand_empty(gripper)"]);
+    assert_eq!(loaded.warnings.len(), 1, "{:?}", loaded.warnings);
+    let task = "task: t\nstates:\n  - look: { action: camera/capture, effects: { aborted: [] } }\n";
+    let loaded = load(task, "t.yaml", &Catalogue::standard()).unwrap();
+    let effects = &loaded.program.states[1].annotations.effects;
+    assert!(effects["success"].is_empty() && effects["aborted"].is_empty());
 }

@@ -1,12 +1,18 @@
 //! What an operator is asked while a run is painted on a terminal, and what he types there.
 
 use crate::output;
+use nix::errno::Errno;
+use nix::sys::signal::{SigSet, Signal};
 use ratn_executive::protocol::{Awaited, Command, LogEntry, LogLine, Note};
 use ratn_model::id::InstanceId;
 use ratn_task_control::control::{self, ANY_RUN, Message};
 use std::collections::BTreeMap;
 use std::io::BufRead;
 use std::path::Path;
+use std::time::Duration;
+
+/// A run in the background of its shell reads nothing; so often it is looked whether it is in the foreground again.
+const IN_BACKGROUND: Duration = Duration::from_secs(1);
 
 /// The questions that are open.
 #[derive(Debug, Default)]
@@ -55,12 +61,16 @@ impl Questions {
     }
 }
 
-/// Sends what is typed to the run of the system in `directory`, as long as this process lives; whether it is listened.
+/// Sends what is typed to the run of the system in `directory`, as long as this process lives; whether anybody listens.
 pub(super) fn listen(directory: &Path) -> bool {
     let directory = directory.to_owned();
     let listening = move || {
+        // Whoever reads a terminal from the background is stopped by this signal, with all its threads; with it blocked, reading fails.
+        if SigSet::from(Signal::SIGTTIN).thread_block().is_err() {
+            return;
+        }
         let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_all().build() else { return };
-        for line in std::io::stdin().lock().lines().map_while(Result::ok) {
+        while let Some(line) = typed() {
             // The line is on the terminal, below what is painted.
             output::area_was_pushed();
             let Some(message) = answer(&line) else { continue };
@@ -71,6 +81,19 @@ pub(super) fn listen(directory: &Path) -> bool {
         }
     };
     std::thread::Builder::new().name("answers".to_owned()).spawn(listening).is_ok()
+}
+
+/// The next line; `None` when there will be no other.
+fn typed() -> Option<String> {
+    let mut line = String::new();
+    loop {
+        match std::io::stdin().lock().read_line(&mut line) {
+            Ok(0) => return None,
+            Ok(_) => return Some(line),
+            Err(error) if error.raw_os_error() == Some(Errno::EIO as i32) => std::thread::sleep(IN_BACKGROUND),
+            Err(_) => return None,
+        }
+    }
 }
 
 /// `go`, or `STATE go`.

@@ -167,7 +167,7 @@ impl Interpreter {
         if self.is_held(context, thread) {
             return self.set_phase(thread, Phase::Held);
         }
-        if self.is_violated(context, thread) {
+        if self.ends_violated(context, thread) {
             return;
         }
         let program = context.program;

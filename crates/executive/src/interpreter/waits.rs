@@ -54,7 +54,8 @@ impl Interpreter {
         }
     }
 
-    /// Looks at what the world may end, waits and actions that are watched, until one is over; whether one was. What its end leads to comes before the others are looked at.
+    /// Looks at what the world may end (waits, and motions that are watched) until one is over; whether one was. What its end leads to
+    /// comes before the others are looked at.
     fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
         let waits = |(thread, current): (u64, &super::Current)| {
             let state = context.program.state(current.state);
@@ -67,7 +68,7 @@ impl Interpreter {
             if context.program.state(state).is_pause() {
                 self.ends_waiting(context, thread, state)
             } else {
-                self.is_violated(context, thread)
+                self.ends_violated(context, thread)
             }
         })
     }
@@ -88,7 +89,7 @@ impl Interpreter {
     }
 
     /// Ends an action of which a condition does not hold, before it begins or while it goes on; whether it did.
-    pub(super) fn is_violated(&mut self, context: &mut Context<'_>, thread: u64) -> bool {
+    pub(super) fn ends_violated(&mut self, context: &mut Context<'_>, thread: u64) -> bool {
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return false };
         let state = context.program.state(current.state);
         if state.annotations.holds.is_empty() {

@@ -318,7 +318,7 @@ impl Window {
             return self.begin_waiting(context, id);
         }
         let Some((provider, action)) = context.plan.state(instance.state).action.clone() else { return };
-        if self.is_violated(context, id) {
+        if self.ends_violated(context, id) {
             return;
         }
         let Some(instance) = self.graph.get(id) else { return };

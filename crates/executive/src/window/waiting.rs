@@ -47,7 +47,7 @@ impl Window {
         }
     }
 
-    /// Looks at every wait under way, if what they wait for may have come; whether one was over.
+    /// Looks at every wait and every watched motion under way, if the world may have ended one; whether one was over.
     pub(super) fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
         if !std::mem::take(&mut self.may_end_waits) {
             return false;
@@ -61,7 +61,7 @@ impl Window {
                 Some(Status::Running(_)) if context.program.state(instance.state).is_pause() => {
                     any |= self.ends_waiting(context, id);
                 }
-                Some(Status::Running(_)) => any |= self.is_violated(context, id),
+                Some(Status::Running(_)) => any |= self.ends_violated(context, id),
                 Some(Status::RunningRoutine(..)) if context.plan.state(instance.state).is_watched => {
                     let before = context.commands.len();
                     self.tell_routine(context, id, Event::Woken);
@@ -94,7 +94,7 @@ impl Window {
     }
 
     /// Ends an action of which a condition does not hold, before it begins or while it goes on; whether it did.
-    pub(super) fn is_violated(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
+    pub(super) fn ends_violated(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
         let Some(instance) = self.graph.get(id) else { return false };
         let state = context.program.state(instance.state);
         if state.annotations.holds.is_empty() {

@@ -40,29 +40,6 @@ impl EvaluateError {
     }
 }
 
-/// A value in the order of all values.
-struct Ordered(Value);
-
-impl Ord for Ordered {
-    fn cmp(&self, other: &Ordered) -> std::cmp::Ordering {
-        self.0.total_order(&other.0)
-    }
-}
-
-impl PartialOrd for Ordered {
-    fn partial_cmp(&self, other: &Ordered) -> Option<std::cmp::Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl PartialEq for Ordered {
-    fn eq(&self, other: &Ordered) -> bool {
-        self.cmp(other).is_eq()
-    }
-}
-
-impl Eq for Ordered {}
-
 impl Expr {
     /// The value in a scope.
     ///
@@ -176,7 +153,7 @@ impl Expr {
             place.ok_or_else(|| self.wrong(format!("`?{name}` gets no value")))
         };
         let places = wanted.iter().map(place).collect::<Result<Vec<usize>, _>>()?;
-        let mut found = std::collections::BTreeSet::new();
+        let mut found: Vec<Value> = Vec::new();
         let ran = query::run(&plan, scope, &mut |row| {
             let value = match places.as_slice() {
                 [one] => row[*one].clone(),
@@ -186,7 +163,9 @@ impl Expr {
                     Value::Map(fields.zip(several.iter().map(|place| row[*place].clone())).collect())
                 }
             };
-            found.insert(Ordered(value));
+            if let Err(at) = found.binary_search_by(|other| other.total_order(&value)) {
+                found.insert(at, value);
+            }
             if found.len() > query::MAX_FOUND { Flow::Enough } else { Flow::More }
         });
         match ran {
@@ -194,7 +173,7 @@ impl Expr {
                 let most = query::MAX_FOUND;
                 Err(self.wrong(format!("it finds more than {most} answers; narrow it by another condition")))
             }
-            Ok(()) => Ok(found.into_iter().map(|Ordered(value)| value).collect()),
+            Ok(()) => Ok(found),
             Err(RunError::Evaluate(error)) => Err(error),
             Err(error @ RunError::TooManySteps) => Err(self.wrong(error.to_string())),
         }

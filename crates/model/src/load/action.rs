@@ -134,6 +134,10 @@ impl<'b> Sources<'b> {
                 Some(_) => {}
             }
         }
+        // Nothing is something to say, too: what the action says of success holds also where the state speaks of other outcomes only.
+        if self.action.as_ref().is_some_and(|(said, ..)| said.effects.as_ref().is_some_and(Vec::is_empty)) {
+            changed.entry(SUCCESS.to_owned()).or_default();
+        }
         let from = if more.is_empty() { Origin::State } else { Origin::Both };
         self.origin.insert("effects".to_owned(), from);
         if !more.is_empty() {
@@ -150,20 +154,37 @@ impl<'b> Sources<'b> {
         read: impl Fn(&mut Fields<'_, '_>, &Node) -> T,
     ) -> Option<T> {
         let (said, ports, at) = self.action.as_ref()?;
-        let mut node = node(said, key, *at)?;
-        let (mut value, missing) = in_its_terms(fields, ports, &node, &read);
+        let node = node(said, key, *at)?;
+        let (value, missing) = in_its_terms(fields, ports, &node, &read);
         if let Some(missing) = missing {
             self.not_in_force(fields, key, &missing);
-            // What must be true and is known has to be; of all else only the whole says anything.
-            let Content::List(items) = &mut node.content else { return None };
-            if key != "requires" {
-                return None;
-            }
-            items.retain(|item| in_its_terms(fields, ports, item, &read).1.is_none());
-            value = in_its_terms(fields, ports, &node, &read).0;
+            return None;
         }
         self.origin.insert(key.to_owned(), Origin::Action);
         Some(value)
+    }
+
+    /// As [`Sources::read`] of a key of which each item stands for itself: one that is not in force takes no other with it.
+    pub(crate) fn read_each<T>(
+        &mut self,
+        fields: &mut Fields<'_, '_>,
+        key: &'static str,
+        read: impl Fn(&mut Fields<'_, '_>, &Node) -> Vec<T>,
+    ) -> Vec<T> {
+        if self.body.get(key).is_some() {
+            return self.read(fields, key, read).unwrap_or_default();
+        }
+        let mut all = Vec::new();
+        for (items, missing) in self.each_of_action(fields, key, read) {
+            match missing {
+                None => all.extend(items),
+                Some(missing) => self.not_in_force(fields, key, &missing),
+            }
+        }
+        if !all.is_empty() {
+            self.origin.insert(key.to_owned(), Origin::Action);
+        }
+        all
     }
 
     /// What the action says under a key, one item after the other, each with what it needs and the state does not have.

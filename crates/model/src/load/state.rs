@@ -271,14 +271,13 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
         // What a sensing state reads is what it senses.
         annotations.reads = Some(Vec::new());
     }
-    let requires = sources.read(fields, "requires", |fields, node| {
+    annotations.requires = sources.read_each(fields, "requires", |fields, node| {
         let required = |(i, node): (usize, &Node)| {
             fields.note(format!("requires.{i}"), node.at);
             fields.expression(node)
         };
         node.items().into_iter().enumerate().filter_map(required).collect()
     });
-    annotations.requires = requires.unwrap_or_default();
     // States that cannot change the environment change nothing when they fail, and computing alone changes nothing at all.
     if annotations.nature != Nature::Irreversible {
         for outcome in [ABORTED, PREEMPTED] {
