@@ -1,4 +1,5 @@
-//! What an arm keeps from another arm of the same robot: two gantries whose hands slide along x, y and z, so that every distance is known.
+//! What an arm keeps from another arm and from the head of the same robot: two gantries whose hands slide along x, y and z, and a head with a
+//! stick, so that every distance is known.
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
@@ -110,6 +111,32 @@ fn config(folder: &Path, description: &str) -> CellConfig {
 fn gantry() -> (Bench, TempDir) {
     let folder = tempfile::tempdir().unwrap();
     (Bench::of(config(folder.path(), &description())), folder)
+}
+
+/// The same gantries with a head between them in place of the camera above: a stick of 0.5 m at the height of the hands, which pan turns about
+/// x = 0.6, y = 0 from +x over +y. It hangs from the link `parent`.
+fn with_head(parent: &str) -> (Bench, TempDir) {
+    let head = format!(
+        "<link name='pan'/><link name='head'><collision><origin xyz='0.25 0 0'/><geometry><box size='0.5 0.02 0.02'/></geometry></collision></link>\
+         <link name='lens'/>\
+         <joint name='pan' type='revolute'><parent link='{parent}'/><child link='pan'/><origin xyz='0.6 0 {height}'/><axis xyz='0 0 1'/>\
+         <limit lower='0' upper='3' effort='1' velocity='0.5' acceleration='2'/></joint>\
+         <joint name='tilt' type='revolute'><parent link='pan'/><child link='head'/><axis xyz='0 1 0'/>\
+         <limit lower='-0.5' upper='0.5' effort='1' velocity='0.5' acceleration='2'/></joint>\
+         <joint name='lens' type='fixed'><parent link='head'/><child link='lens'/><origin rpy='-1.5707963 0 -1.5707963'/></joint></robot>",
+        height = if parent == "world" { 1.5 } else { 0.0 }
+    );
+    let folder = tempfile::tempdir().unwrap();
+    let description = description()
+        .replace("[camera]\nlink = \"camera\"", "[head]\njoints = [\"pan\", \"tilt\"]\n[camera]\nlink = \"lens\"");
+    let config = config(folder.path(), &description);
+    std::fs::write(folder.path().join("gantry.urdf"), urdf().replace("</robot>", &head)).unwrap();
+    (Bench::of(config), folder)
+}
+
+/// The head turns to where its stick points so far round, in radians.
+fn look(pan: f64) -> Request {
+    Request::LookAt { target: [0.6 + 5.0 * pan.cos(), 5.0 * pan.sin(), 1.5] }
 }
 
 /// Why a cell with this robot is refused.
@@ -318,4 +345,63 @@ fn how_long_it_takes_to_compare_two_motions_of_ten_seconds() {
         let lasts_s = bench.cell.next_wake().unwrap().since(bench.now).as_secs_f64();
         println!("started in {:?}, beside an arm on its way: {left_moves}, lasts {lasts_s:.1} s", began.elapsed());
     }
+}
+
+/// The left hand where the stick does not reach it, and where it does.
+const ASIDE: [f64; 3] = [0.0, 0.6, 0.0];
+const IN_THE_WAY: [f64; 3] = [0.0, 0.15, 0.0];
+/// How far the stick turns before it is near to the hands, and how far to pass them, in radians.
+const SHORT: f64 = 1.5;
+const ROUND: f64 = 2.8;
+
+#[test]
+fn a_head_does_not_turn_into_the_way_of_an_arm_nor_into_one_that_stands() {
+    let (mut bench, _folder) = with_head("world");
+    assert_eq!(bench.start_with(LEFT, to(IN_THE_WAY, 0.1)).1, []);
+    let reason = refused(&mut bench, LEFT, look(ROUND));
+    assert!(
+        reason.starts_with("the head stays where it is: head of the head comes nearer than 20 mm to left_hand"),
+        "{reason}"
+    );
+    assert!(reason.contains("of the arm `left`, which is under way with goal 1"), "{reason}");
+    // As far as the ways are apart.
+    assert_eq!(bench.start_with(LEFT, look(SHORT)).1, []);
+    bench.pass(60.0);
+    let reason = refused(&mut bench, LEFT, look(ROUND));
+    assert!(reason.contains("comes nearer than 3 mm to left_hand of the arm `left`, which stands there"), "{reason}");
+    goes(&mut bench, LEFT, ASIDE);
+    bench.done(look(ROUND));
+    assert_eq!(bench.cell.unintended_contacts(), []);
+}
+
+#[test]
+fn an_arm_does_not_set_out_into_the_way_of_a_head_that_turns() {
+    let (mut bench, _folder) = with_head("world");
+    goes(&mut bench, LEFT, ASIDE);
+    assert_eq!(bench.start_with(LEFT, look(ROUND)).1, []);
+    bench.pass(0.1);
+    let reason = refused(&mut bench, LEFT, to(IN_THE_WAY, 0.5));
+    assert!(reason.starts_with("the trajectory is refused: on the way left_hand of the arm `left`"), "{reason}");
+    assert!(reason.contains("to head of the head, which is under way with goal"), "{reason}");
+    // Away from it, and the other arm.
+    assert_eq!(bench.start_with(LEFT, to([0.0, 0.7, 0.1], 0.5)).1, []);
+    assert_eq!(bench.start_with(RIGHT, to([0.0, -0.5, 0.1], 0.5)).1, []);
+    bench.pass(60.0);
+    // A head that stands is what the check of the trajectory knows.
+    let reason = refused(&mut bench, LEFT, to(IN_THE_WAY, 0.5));
+    assert!(reason.contains("the trajectory is refused"), "{reason}");
+    assert_eq!(bench.cell.unintended_contacts(), []);
+}
+
+#[test]
+fn an_arm_whose_joints_carry_the_head_moves_before_or_after_it() {
+    // One arm alone hangs from the torso.
+    let (mut bench, _folder) = with_head("left_2");
+    assert_eq!(bench.start_with(LEFT, to([0.0, 0.5, 0.0], 0.1)).1, []);
+    let reason = refused(&mut bench, LEFT, look(SHORT));
+    assert!(reason.contains("is moved by the head and by the arm `left`, which is under way with goal 1"), "{reason}");
+    bench.pass(60.0);
+    assert_eq!(bench.start_with(LEFT, look(SHORT)).1, []);
+    let reason = refused(&mut bench, LEFT, to([0.0, 0.4, 0.0], 0.5));
+    assert!(reason.contains("is moved by the arm `left` and by the head, which is under way"), "{reason}");
 }

@@ -450,6 +450,11 @@ impl Robot {
         self.head.as_ref().map_or(&[], |head| &head.joints)
     }
 
+    /// The links that pan and tilt move; none of a robot without a head.
+    pub fn head_links(&self) -> Vec<usize> {
+        self.head.as_ref().map_or_else(Vec::new, |head| head.moved_links(&self.model))
+    }
+
     /// The link that carries the fingers.
     pub fn hand(&self) -> Option<usize> {
         self.gripper.map(|[hand, _]| hand)

@@ -1,66 +1,96 @@
-//! What an arm keeps from the other arms of its robot: an arm that sets out, and fingers that begin to close or to open, are compared with
-//! every other arm where it stands and on the way that it has before it (`clearance`).
+//! What the parts of a robot keep from each other: an arm that sets out, fingers that begin to close or to open, and a head that begins to turn
+//! are compared with every other arm, where it stands and on the way that it has before it, and with a head that turns (`clearance`). A head that
+//! stands is no matter of this file: the check of the arm's trajectory knows where it is.
 //!
 //! The fingers of another arm count where they are, where they are on their way to, and open: whoever holds that arm may open them.
 
 use super::activity::{Kind, Module, Ticket};
 use super::braking::Way;
 use super::cell::Cell;
-use super::clearance::{Ahead, Crossing, Other, keep_apart};
+use super::clearance::{Ahead, Crossing, Other, Part, keep_apart};
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::ArmPosition;
 
 /// How far a finger may be from one position to the next that are compared, in metres.
 const FINGER_STEP_M: f64 = 0.002;
+/// The same of the head's joints, in radians.
+const HEAD_STEP_RAD: f64 = 0.01;
 
 impl Cell {
-    /// Whether an arm that is to go so keeps apart from the other arms: on the course that its joints really take, and while it brakes at the end
+    /// Whether an arm that is to go so keeps apart from the rest: on the course that its joints really take, and while it brakes at the end
     /// of that course where the controller loses it there.
     ///
     /// # Errors
-    /// Which links come too close, of which arm, and what that one is doing.
+    /// Which links come too close, of what, and what that one is doing.
     pub(super) fn arm_keeps_apart(&self, arm: usize, way: &Way) -> Result<(), String> {
         let finger = self.arms.seen_from(arm, &self.measured()).finger;
         let course = way.ahead(&self.robot, 0.0).into_iter().map(|joints| ArmPosition { joints, finger });
-        let ours = Ahead { arm, links: self.robot.links_of(arm), courses: vec![course.collect()] };
-        self.keeps_apart(&ours, "the trajectory is refused: on the way ", "the trajectory is refused: its way")
+        let ours = Ahead { part: Part::Arm(arm), links: self.robot.links_of(arm), courses: vec![course.collect()] };
+        self.keeps_apart(&ours, ["the trajectory is refused: on the way ", "the trajectory is refused: its way"])
     }
 
     /// Whether the fingers of an arm may go so: from and to these distances from the middle, in metres.
     ///
     /// # Errors
-    /// Which links come too close, of which arm, and what that one is doing.
+    /// Which links come too close, of what, and what that one is doing.
     pub(super) fn fingers_keep_apart(&self, arm: usize, from: f64, to: f64) -> Result<(), String> {
         if from == to {
             return Ok(());
         }
         let joints = self.arms.seen_from(arm, &self.measured()).arm;
-        let course = passed(from, to).map(|finger| ArmPosition { joints, finger });
-        let ours = Ahead { arm, links: self.robot.finger_links_of(arm), courses: vec![course.collect()] };
-        self.keeps_apart(&ours, "the fingers stay where they are: ", "the fingers stay where they are: their way")
+        let course = passed(from, to).map(|finger| ArmPosition { joints, finger }).collect();
+        let ours = Ahead { part: Part::Arm(arm), links: self.robot.finger_links_of(arm), courses: vec![course] };
+        self.keeps_apart(&ours, ["the fingers stay where they are: ", "the fingers stay where they are: their way"])
     }
 
-    fn keeps_apart(&self, ours: &Ahead, near: &str, long: &str) -> Result<(), String> {
+    /// Whether the head may turn so: from and to these positions of pan and tilt, in radians.
+    ///
+    /// # Errors
+    /// Which links come too close, of what, and what that one is doing.
+    pub(super) fn head_keeps_apart(&self, from: [f64; 2], to: [f64; 2]) -> Result<(), String> {
+        let ours = Ahead { part: Part::Head, links: self.robot.head_links(), courses: vec![turned(from, to)] };
+        self.keeps_apart(&ours, ["the head stays where it is: ", "the head stays where it is: its way"])
+    }
+
+    /// What may be on its way beside a part, or in its way.
+    fn beside(&self, part: Part) -> impl Iterator<Item = Part> {
+        let turns = matches!(self.activities.get(&Module::PanTilt).map(|head| &head.kind), Some(Kind::Look { .. }));
+        let others = self.arms.numbers().map(Part::Arm).chain(turns.then_some(Part::Head));
+        others.filter(move |other| *other != part)
+    }
+
+    /// `near` begins the sentence that something comes too near, `long` the one that this was not found out.
+    fn keeps_apart(&self, ours: &Ahead, [near, long]: [&str; 2]) -> Result<(), String> {
         let here = self.measured();
-        for other in self.arms.numbers().filter(|other| *other != ours.arm) {
-            let (theirs, ticket) = self.ahead_of(other);
+        for other in self.beside(ours.part) {
+            let (mut theirs, ticket) = self.ahead_of(other);
             let does = if ticket.is_some() { Other::Moves } else { Other::Stands };
-            let Err(crossing) = keep_apart(&self.robot, &here, ours, &theirs, does) else { continue };
-            let (our_name, name) = (self.arms.name(ours.arm), self.arms.name(other));
+            let (our_name, name) = (self.named(ours.part), self.named(other));
             let under_way = ticket.map_or_else(String::new, |ticket| format!("is under way with goal {}", ticket.0));
+            // A torso that is one of the arm's joints carries the head.
+            let of_both = theirs.links.iter().copied().find(|link| ours.links.contains(link));
+            if let (Some(link), Other::Moves) = (of_both, does) {
+                return Err(format!(
+                    "{near}{} is moved by {our_name} and by {name}, which {under_way}: move one after the other",
+                    self.robot.model.links[link].name
+                ));
+            }
+            theirs.links.retain(|link| !ours.links.contains(link));
+            let Err(crossing) = keep_apart(&self.robot, &here, ours, &theirs, does) else { continue };
             return Err(match (crossing, does) {
                 (Crossing::TooClose { link, other }, Other::Moves) => format!(
-                    "{near}{link} of the arm `{our_name}` comes nearer than {:.0} mm to {other} of the arm `{name}`, which {under_way}. Either may be \
-                     stopped anywhere, so the ways of two arms that move at once must not cross: move one after the other, or plan another way",
+                    "{near}{link} of {our_name} comes nearer than {:.0} mm to {other} of {name}, which {under_way}. Either may be stopped \
+                     anywhere, so the ways of two that move at once must not cross: move one after the other, or plan another way",
                     does.apart_m() * 1e3
                 ),
                 (Crossing::TooClose { link, other }, Other::Stands) => format!(
-                    "{near}{link} of the arm `{our_name}` comes nearer than {:.0} mm to {other} of the arm `{name}`, which stands there with its \
-                     fingers as they are or may open: move that arm away first, or plan another way",
+                    "{near}{link} of {our_name} comes nearer than {:.0} mm to {other} of {name}, which stands there with its fingers as they \
+                     are or may open: move that arm away first, or plan another way",
                     does.apart_m() * 1e3
                 ),
                 (Crossing::TooLong, _) => format!(
-                    "{long} and that of the arm `{name}`{} are too long, or too near to each other for too long, to be compared: move one \
-                     after the other, or in shorter motions",
+                    "{long} and that of {name}{} are too long, or too near to each other for too long, to be compared: move one after the \
+                     other, or in shorter motions",
                     if under_way.is_empty() { String::new() } else { format!(", which {under_way},") }
                 ),
             });
@@ -68,8 +98,35 @@ impl Cell {
         Ok(())
     }
 
-    /// What another arm does from now on, and with which goal where it is on its way; else it stands, and its fingers may move.
-    fn ahead_of(&self, arm: usize) -> (Ahead, Option<Ticket>) {
+    /// A part for people.
+    fn named(&self, part: Part) -> String {
+        match part {
+            Part::Arm(arm) => format!("the arm `{}`", self.arms.name(arm)),
+            Part::Head => "the head".to_owned(),
+        }
+    }
+
+    /// What another part does from now on, and with which goal where it is on its way; else it stands.
+    fn ahead_of(&self, part: Part) -> (Ahead, Option<Ticket>) {
+        match part {
+            Part::Arm(arm) => self.ahead_of_arm(arm),
+            Part::Head => self.ahead_of_head(),
+        }
+    }
+
+    fn ahead_of_head(&self) -> (Ahead, Option<Ticket>) {
+        let here = self.measured();
+        let activity = self.activities.get(&Module::PanTilt);
+        let (to, ticket) = match activity.map(|activity| (&activity.kind, activity.ticket)) {
+            Some((Kind::Look { to, .. }, ticket)) => (*to, Some(ticket)),
+            _ => ([here.pan, here.tilt], None),
+        };
+        let courses = vec![turned([here.pan, here.tilt], to)];
+        (Ahead { part: Part::Head, links: self.robot.head_links(), courses }, ticket)
+    }
+
+    /// The fingers of an arm that stands may move.
+    fn ahead_of_arm(&self, arm: usize) -> (Ahead, Option<Ticket>) {
         let at = self.arms.seen_from(arm, &self.measured());
         let activity = self.activities.get(&Module::Arm(arm));
         let followed = activity.and_then(|activity| match &activity.kind {
@@ -96,7 +153,7 @@ impl Cell {
             positions.map(|(joints, finger)| ArmPosition { joints, finger }).collect()
         };
         let courses = fingers.into_iter().map(course).collect();
-        (Ahead { arm, links: self.robot.links_of(arm), courses }, ticket)
+        (Ahead { part: Part::Arm(arm), links: self.robot.links_of(arm), courses }, ticket)
     }
 }
 
@@ -104,4 +161,12 @@ impl Cell {
 fn passed(from: f64, to: f64) -> impl Iterator<Item = f64> {
     let steps = ((to - from).abs() / FINGER_STEP_M).ceil().max(1.0) as u32;
     (0..=steps).map(move |i| from + (to - from) * f64::from(i) / f64::from(steps))
+}
+
+/// Positions of a head on its way, which is a straight line in its joints.
+fn turned(from: [f64; 2], to: [f64; 2]) -> Vec<ArmPosition> {
+    let most = (to[0] - from[0]).abs().max((to[1] - from[1]).abs());
+    let steps = (most / HEAD_STEP_RAD).ceil().max(1.0) as u32;
+    let at = |i: u32| [0, 1].map(|j| from[j] + (to[j] - from[j]) * f64::from(i) / f64::from(steps));
+    (0..=steps).map(|i| ArmPosition { joints: JointVector::of(at(i)), finger: 0.0 }).collect()
 }

@@ -1,48 +1,56 @@
-//! Whether the links of two arms keep a distance from each other, wherever both are on their ways.
+//! Whether the links of two parts of the robot (arms, its head) keep a distance from each other, wherever both are on their ways.
 //!
-//! Either arm may be stopped anywhere on its way: its goal is cancelled, its lease ends, a fault brakes it. So the ways are compared whatever
+//! Either part may be stopped anywhere on its way: its goal is cancelled, its lease ends, a fault brakes it. So the ways are compared whatever
 //! the timing: every place of the one with every place of the other. Controllers know the robot's links, not what stands around them; so what
 //! the hands hold is not looked at here, the judge sees that (`contacts`).
 //!
 //! The comparison runs on the cell's only thread, where an emergency stop waits for its end. So its work is bounded. Of two ways, places that one
-//! comes to again are kept once, and the places of a body form a binary tree of which whole branches are ruled out by one distance. Beside an
-//! arm that stands, postures are passed over as long as no joint has moved anything by as much as there was room (conservative advancement,
+//! comes to again are kept once, and the places of a body form a binary tree of which whole branches are ruled out by one distance. Beside a
+//! part that stands, postures are passed over as long as no joint has moved anything by as much as there was room (conservative advancement,
 //! Mirtich 1996). A comparison that takes more than [`MAX_POSTURES`] or [`MAX_DISTANCES`] is given up ([`Crossing::TooLong`]).
 
 use rapier3d::math::Pose as Pose32;
 use rapier3d::parry::query;
 use rapier3d::parry::shape::SharedShape;
 use ratn_model::pose::Pose;
-use ratn_motion::robot::{ArmPosition, Configuration, Robot, to_f32};
+use ratn_motion::robot::{ArmPosition, Configuration, Joint, Robot, to_f32};
 use std::collections::BTreeMap;
 
-/// The distance of two arms that are both on their ways, in metres.
+/// The distance of two parts that are both on their ways, in metres.
 pub(super) const APART_M: f64 = 0.02;
-/// The distance of an arm on its way from an arm that stands, in metres: more than controllers and encoders are off.
+/// The distance of a part on its way from one that stands, in metres: more than controllers and encoders are off.
 pub(super) const BESIDE_M: f64 = 0.003;
-/// How much nearer than at its start something may come to an arm that it is too near to already, in metres: rounding.
+/// How much nearer than at its start something may come to a part that it is too near to already, in metres: rounding.
 const ROUNDED_M: f32 = 3e-4;
-/// The most postures of two arms on their ways that are compared. A motion of 10 s has 2500, twice as many where fingers count as open too.
+/// The most postures of two parts on their ways that are compared. A motion of 10 s has 2500, twice as many where fingers count as open too.
 pub(super) const MAX_POSTURES: usize = 40_000;
 /// The most distances of two bodies that are computed for one comparison.
 const MAX_DISTANCES: u32 = 200_000;
 /// Of places on two ways that are nearer to each other than that one is kept, in metres: it is added to the distance on either side.
 const RESOLUTION_M: f32 = 0.008;
-/// The same of an arm that stands, whose fingers alone may move.
+/// The same of a part that stands; of an arm the fingers alone may move.
 const FINE_M: f32 = 1e-4;
 
-/// What an arm, or its fingers alone, will do.
+/// A part of the robot that moves beside others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Part {
+    /// The arm of this number, with its fingers.
+    Arm(usize),
+    /// The camera's head. Its joints are pan and tilt, and it has no fingers.
+    Head,
+}
+
+/// What a part, or the fingers of an arm alone, will do.
 #[derive(Debug, Clone)]
 pub(super) struct Ahead {
-    /// The arm's number.
-    pub(super) arm: usize,
+    pub(super) part: Part,
     /// The links that are compared: all that move.
     pub(super) links: Vec<usize>,
     /// Courses that it may take: of each the positions, near each other, in the order of time.
     pub(super) courses: Vec<Vec<ArmPosition>>,
 }
 
-/// What the other arm does meanwhile, which says how far apart both have to be.
+/// What the other part does meanwhile, which says how far apart both have to be.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Other {
     /// It is on its way: [`APART_M`].
@@ -56,7 +64,7 @@ pub(super) enum Other {
 pub(super) enum Crossing {
     /// A link of each comes too close to the other.
     TooClose {
-        /// Of the arm that is asked about.
+        /// Of the part that is asked about.
         link: String,
         /// Of the other one.
         other: String,
@@ -90,7 +98,7 @@ struct Branch {
     halves: Option<[usize; 2]>,
 }
 
-/// How far the bodies of an arm move at the most where its joints do: by length of all links between, so in every posture.
+/// How far the bodies of a part move at the most where its joints do: by length of all links between, so in every posture.
 struct Levers {
     /// In metres per radian, or per metre of a joint that slides.
     joints: Vec<f64>,
@@ -109,7 +117,7 @@ struct Kept {
 }
 
 impl Other {
-    /// How far from the other arm to stay, in metres.
+    /// How far from the other part to stay, in metres.
     pub(super) fn apart_m(self) -> f64 {
         match self {
             Other::Moves => APART_M,
@@ -118,7 +126,7 @@ impl Other {
     }
 }
 
-/// Whether what moves stays away from another arm, of a robot that is elsewhere as in `here`.
+/// Whether what moves stays away from another part, of a robot that is elsewhere as in `here`.
 ///
 /// # Errors
 /// [`Crossing`] where it does not, or where that is not found out.
@@ -153,7 +161,7 @@ fn ways_apart(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahead)
     Ok(())
 }
 
-/// Whether a way keeps [`BESIDE_M`] from an arm that stands. A body that is nearer as it sets out may come no nearer.
+/// Whether a way keeps [`BESIDE_M`] from a part that stands. A body that is nearer as it sets out may come no nearer.
 fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahead) -> Result<(), Crossing> {
     let (bodies, others) = (Swept::all(robot, ours), swept(robot, here, theirs, FINE_M));
     let levers = Levers::of(robot, ours, &bodies);
@@ -168,8 +176,7 @@ fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahea
             if looked_at.is_some_and(|(before, room)| levers.moved(before, at) + leg <= room) {
                 continue;
             }
-            configuration.set_joints(ours.arm, at.joints);
-            configuration.set_finger(ours.arm, at.finger);
+            ours.part.put(at, &mut configuration);
             let poses = robot.poses(&configuration);
             let mut room = f32::INFINITY;
             for (body, a) in bodies.iter().enumerate() {
@@ -199,7 +206,7 @@ fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahea
     Ok(())
 }
 
-/// The bodies of an arm's links wherever they come to.
+/// The bodies of a part's links wherever they come to.
 fn swept(robot: &Robot, here: &Configuration, ahead: &Ahead, resolution: f32) -> Vec<Swept> {
     let mut swept: Vec<(Swept, Kept)> =
         Swept::all(robot, ahead).into_iter().map(|body| (body, Kept::nothing())).collect();
@@ -207,8 +214,7 @@ fn swept(robot: &Robot, here: &Configuration, ahead: &Ahead, resolution: f32) ->
     for course in &ahead.courses {
         swept.iter_mut().for_each(|(_, kept)| (kept.last, kept.before) = (None, None));
         for at in course {
-            configuration.set_joints(ahead.arm, at.joints);
-            configuration.set_finger(ahead.arm, at.finger);
+            ahead.part.put(at, &mut configuration);
             let poses = robot.poses(&configuration);
             for (body, kept) in &mut swept {
                 let place = to_f32(&poses[body.link].compose(&body.in_link));
@@ -223,6 +229,33 @@ fn swept(robot: &Robot, here: &Configuration, ahead: &Ahead, resolution: f32) ->
         body
     };
     swept.into_iter().map(grown).collect()
+}
+
+impl Part {
+    /// Brings the part to a position.
+    fn put(self, at: &ArmPosition, configuration: &mut Configuration) {
+        match self {
+            Part::Arm(arm) => {
+                configuration.set_joints(arm, at.joints);
+                configuration.set_finger(arm, at.finger);
+            }
+            Part::Head => [configuration.pan, configuration.tilt] = [at.joints[0], at.joints[1]],
+        }
+    }
+
+    fn joints(self, robot: &Robot) -> &[Joint] {
+        match self {
+            Part::Arm(arm) => robot.joints_of(arm),
+            Part::Head => robot.head_joints(),
+        }
+    }
+
+    fn finger_links(self, robot: &Robot) -> Vec<usize> {
+        match self {
+            Part::Arm(arm) => robot.finger_links_of(arm),
+            Part::Head => Vec::new(),
+        }
+    }
 }
 
 impl Ahead {
@@ -245,13 +278,13 @@ impl Crossing {
 }
 
 impl Levers {
-    /// Of the bodies of an arm.
+    /// Of the bodies of a part.
     fn of(robot: &Robot, ahead: &Ahead, bodies: &[Swept]) -> Levers {
         let links = &robot.model.links;
         let joints: Vec<Option<usize>> =
-            robot.joints_of(ahead.arm).iter().map(|joint| robot.model.joint(&joint.name)).collect();
+            ahead.part.joints(robot).iter().map(|joint| robot.model.joint(&joint.name)).collect();
         let fingers: Vec<usize> =
-            robot.finger_links_of(ahead.arm).iter().filter_map(|link| Some(links[*link].drive?.joint)).collect();
+            ahead.part.finger_links(robot).iter().filter_map(|link| Some(links[*link].drive?.joint)).collect();
         let mut levers = Levers { joints: vec![0.0; joints.len()], finger: 0.0 };
         for body in bodies {
             let (mut of_joints, mut of_finger) = (vec![0.0; joints.len()], 0.0);
@@ -417,7 +450,7 @@ mod tests {
             joints[0] += by * passed.min(2.0 - passed);
             ArmPosition { joints, finger: 0.0 }
         };
-        Ahead { arm: 0, links: robot.links_of(0), courses: vec![(0..2 * steps * times).map(at).collect()] }
+        Ahead { part: Part::Arm(0), links: robot.links_of(0), courses: vec![(0..2 * steps * times).map(at).collect()] }
     }
 
     #[test]

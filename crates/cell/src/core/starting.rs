@@ -31,8 +31,6 @@ const BASE: &str = "nothing else happens while the base drives, so let both stat
 const HAND: &str = "arm and gripper do not move at once, so let one of both states block `Arm` and `Gripper`";
 const PICTURE: &str =
     "no picture is taken while the head moves, so let one of both states block `PanTilt` and `Camera`";
-const HEAD: &str =
-    "a motion of the arm is checked with the head where it is, so let one of both states block `Arm` and `PanTilt`";
 
 impl Cell {
     /// Starts a goal, of the arm of this number where it is one for an arm or its gripper.
@@ -108,9 +106,8 @@ impl Cell {
             Request::LookAt { target } => {
                 self.no_motion_of(Module::Base, BASE)?;
                 self.no_motion_of(Module::Camera, PICTURE)?;
-                self.arms.numbers().try_for_each(|arm| self.no_motion_of(Module::Arm(arm), HEAD))?;
-                let to = self.aim(target)?;
-                let from = [here.pan, here.tilt];
+                let (from, to) = ([here.pan, here.tilt], self.aim(target)?);
+                self.head_keeps_apart(from, to)?;
                 let lasts_s = self.turning_s(from, to) + self.config.pan_tilt.settle_s;
                 (Kind::Look { from, to }, lasts_s)
             }
@@ -142,8 +139,7 @@ impl Cell {
     /// What does not move while an arm does.
     fn may_move_arm(&self, arm: usize) -> Result<(), String> {
         self.no_motion_of(Module::Base, BASE)?;
-        self.no_motion_of(Module::Gripper(arm), HAND)?;
-        self.no_motion_of(Module::PanTilt, HEAD)
+        self.no_motion_of(Module::Gripper(arm), HAND)
     }
 
     /// A trajectory of an arm, checked beside the other arms with their fingers as they are and with those open: neither takes all the room of
@@ -162,7 +158,7 @@ impl Cell {
     /// What an arm does, and for how long.
     ///
     /// # Errors
-    /// Where it would come too close to another arm.
+    /// Where it would come too close to another arm, or to a head that turns.
     fn following(&mut self, arm: usize, trajectory: Curve) -> Result<(Kind, f64), String> {
         let lasts_s = trajectory.duration_s();
         let config = self.config.controllers;
@@ -174,10 +170,8 @@ impl Cell {
             slides: PerJoint::from_fn(slides.len(), |j| slides[j]),
         };
         let from = self.arms.seen_from(arm, &self.measured()).arm;
-        if self.arms.count() > 1 {
-            let motion = Motion::new(trajectory.clone(), from, controller, None);
-            self.arm_keeps_apart(arm, &Way::Arm(arm, motion))?;
-        }
+        let motion = Motion::new(trajectory.clone(), from, controller, None);
+        self.arm_keeps_apart(arm, &Way::Arm(arm, motion))?;
         let breaks = self.arm_breaks_off(lasts_s);
         let motion = Motion::new(trajectory, from, controller, breaks);
         let lasts_s = motion.lasts_s();
