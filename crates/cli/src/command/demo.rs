@@ -25,7 +25,7 @@ use ratn_report::gantt;
 use ratn_report::timeline::Timeline;
 use ratn_task_control::shell::Run;
 use ratn_worker::tls::ClientTls;
-use result::{Demonstration, Outcome, Plan};
+use result::{Demonstration, Outcome, Plan, Work};
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -42,6 +42,15 @@ const RECOVERING: (&str, &str) =
 const SET: (&str, &str) = ("set_table.yaml", include_str!("../../../../examples/set_table.yaml"));
 const LOOK_AND_SET: (&str, &str) =
     ("set_table_recovering.yaml", include_str!("../../../../examples/set_table_recovering.yaml"));
+
+/// The same two jobs with what can go on beside each other said so.
+const FETCH_OVERLAPPED: (&str, &str) =
+    ("fetch_boxes_overlapped.yaml", include_str!("../../../../examples/fetch_boxes_overlapped.yaml"));
+const SET_OVERLAPPED: (&str, &str) =
+    ("set_table_overlapped.yaml", include_str!("../../../../examples/set_table_overlapped.yaml"));
+
+/// The times for which plans of their state machines may get better, in seconds: the best is compared with the network. 0 leaves it to the planner.
+const SWEEP_S: [f64; 3] = [0.0, 0.2, 0.5];
 
 /// How far a bowl or a cup may have leaned on its way, in radians: as far as the task says, and what the grasp adds.
 const MAX_TILT_RAD: f64 = 0.11;
@@ -69,15 +78,19 @@ pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Fail
         Setting::Table => built_in(LOOK_AND_SET),
     };
     let goods = result::Goods::of(arguments, config.robot == AIMM)?;
-    let program = Arc::new(check::load_from(&BuiltIn, &text, file, &config.catalogue)?);
+    let load = |text: &str, file: &str| check::load_from(&BuiltIn, text, file, &config.catalogue).map(Arc::new);
+    let program = load(&text, file)?;
+    let overlapped = overlapped(arguments, &config).map(|(file, text)| load(text, file)).transpose()?;
+    let plans = plans(arguments, overlapped.is_some());
     let directory = out_directory(arguments)?;
-    let setup = Setup { goods: &goods, arguments, config: &config, program: &program, directory: &directory, tls };
+    let programs = (program, overlapped);
+    let setup = Setup { goods: &goods, arguments, config: &config, programs, directory: &directory, tls };
     let mut demonstration = Demonstration::new(arguments, goods);
     // What went wrong first; the other ways are shown all the same.
     let mut failed: Option<String> = None;
     let outcome: Result<(), Failure> = blocking_here(async {
         let interrupt = Interrupt::listen()?;
-        for plan in plans(arguments) {
+        for plan in plans {
             output::progress(format_args!("\n{}", plan.announcement(&goods)));
             let run = setup.run(&plan, &interrupt);
             // A config is large.
@@ -109,6 +122,16 @@ pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Fail
     }
     outcome?;
     failed.map_or(Ok(()), |failed| Err(anyhow!(failed).into()))
+}
+
+/// The task of the last row. It is made for the paper's robot and a cell in which nothing goes wrong, and plates are not looked for.
+fn overlapped(arguments: &DemoArguments, config: &SystemConfig) -> Option<(&'static str, &'static str)> {
+    let fits = config.robot == AIMM && arguments.faults.fault.is_empty() && arguments.budget != Budget::Task;
+    match arguments.scenario {
+        _ if !fits => None,
+        Setting::Boxes => Some(FETCH_OVERLAPPED),
+        Setting::Table => (arguments.plates == 0).then_some(SET_OVERLAPPED),
+    }
 }
 
 fn built_in((file, text): (&'static str, &'static str)) -> (&'static str, Cow<'static, str>) {
@@ -149,21 +172,26 @@ fn what_is_wrong(outcome: &Outcome, goods: &result::Goods) -> Option<String> {
     })
 }
 
-/// The runs in the order of the table's columns.
-fn plans(arguments: &DemoArguments) -> Vec<Plan> {
-    let plan = |mode, planners, budget| Plan { mode, planners, budget };
+/// The runs in the order of the table's rows and columns.
+fn plans(arguments: &DemoArguments, overlapped: bool) -> Vec<Plan> {
+    let plan = |mode, planners, work| Plan { mode, planners, work };
     let mut plans = Vec::new();
     if arguments.budget != Budget::None {
-        plans.push(plan(Mode::Hsm, arguments.planners, true));
-        plans.push(plan(Mode::Cdtn, 1, true));
-        plans.push(plan(Mode::Cdtn, arguments.planners, true));
+        plans.push(plan(Mode::Hsm, arguments.planners, Work::Budget));
+        plans.push(plan(Mode::Cdtn, 1, Work::Budget));
+        plans.push(plan(Mode::Cdtn, arguments.planners, Work::Budget));
     }
     if arguments.budget != Budget::Task {
-        plans.push(plan(Mode::Hsm, arguments.planners, false));
+        plans.push(plan(Mode::Hsm, arguments.planners, Work::NoBudget));
         if arguments.budget == Budget::None {
-            plans.push(plan(Mode::Cdtn, 1, false));
+            plans.push(plan(Mode::Cdtn, 1, Work::NoBudget));
         }
-        plans.push(plan(Mode::Cdtn, arguments.planners, false));
+        plans.push(plan(Mode::Cdtn, arguments.planners, Work::NoBudget));
+    }
+    if overlapped {
+        let hsm = SWEEP_S.map(|plan_s| plan(Mode::Hsm, arguments.planners, Work::Overlapped { plan_s }));
+        plans.extend(hsm);
+        plans.push(plan(Mode::Cdtn, arguments.planners, Work::Overlapped { plan_s: 0.0 }));
     }
     // With one planner two columns are the same.
     plans.dedup_by_key(|plan| plan.file_stem());
@@ -175,7 +203,8 @@ struct Setup<'a> {
     goods: &'a result::Goods,
     arguments: &'a DemoArguments,
     config: &'a SystemConfig,
-    program: &'a Arc<Program>,
+    /// The paper's task, and the one that overlaps.
+    programs: (Arc<Program>, Option<Arc<Program>>),
     /// Where logs and charts go.
     directory: &'a Path,
     tls: &'a ClientTls,
@@ -184,7 +213,7 @@ struct Setup<'a> {
 impl Setup<'_> {
     /// Runs the task in one way, on a system of its own.
     async fn run(&self, plan: &Plan, interrupt: &Interrupt) -> anyhow::Result<Outcome> {
-        let Setup { goods, arguments, config, program, directory, tls } = *self;
+        let Setup { goods, arguments, config, ref programs, directory, tls } = *self;
         let mut config = config.clone();
         config.apply(&SystemArguments {
             robot: None,
@@ -202,7 +231,17 @@ impl Setup<'_> {
             faults: arguments.faults.clone(),
         });
         let mut set = goods.parameters();
-        set.push(("budget".to_owned(), plan.budget.to_string()));
+        let program = match plan.work {
+            Work::Budget | Work::NoBudget => {
+                set.push(("budget".to_owned(), (plan.work == Work::Budget).to_string()));
+                &programs.0
+            }
+            Work::Overlapped { plan_s } => {
+                set.retain(|(name, _)| name != "plates");
+                set.push(("plan_s".to_owned(), plan_s.to_string()));
+                programs.1.as_ref().context("there is no task that overlaps")?
+            }
+        };
         if config.robot != AIMM {
             set.push((OBSERVATION.to_owned(), observation(&config.robot)?));
         }
@@ -263,10 +302,10 @@ fn out_directory(arguments: &DemoArguments) -> anyhow::Result<PathBuf> {
     }
 }
 
-/// One chart per run, all of one budget with the time axis of the longest.
+/// One chart per run, all of one row with the time axis of the longest.
 fn draw(demonstration: &mut Demonstration) -> anyhow::Result<()> {
     for outcome in &demonstration.outcomes {
-        let same = demonstration.outcomes.iter().filter(|other| other.plan.budget == outcome.plan.budget);
+        let same = demonstration.outcomes.iter().filter(|other| other.plan.work.is_like(outcome.plan.work));
         let scale_s = same.map(|other| other.timeline.end_s).fold(0.0, f64::max);
         gantt::write(&outcome.chart, &outcome.timeline, Some(scale_s))
             .with_context(|| format!("cannot write {}", outcome.chart.display()))?;

@@ -22,6 +22,9 @@ const PAPER: [(Goods, f64, Option<f64>, f64); 5] = [
     (Goods::Dishes { bowls: 3, forks: 3, cups: 0, plates: 0 }, 255.4, None, 207.2),
 ];
 
+/// The row of the task whose motions and looks overlap.
+const OVERLAPPED: Work = Work::Overlapped { plan_s: 0.0 };
+
 /// What a task brings somewhere.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Goods {
@@ -33,13 +36,26 @@ pub(super) enum Goods {
     Dishes { bowls: u32, forks: u32, cups: u32, plates: u32 },
 }
 
+/// Which task is run, and how long its planners take. Each is a row of the table.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Work {
+    /// The paper's task; planners use the time that it gives them.
+    Budget,
+    /// The paper's task; planners take as long as a path takes.
+    NoBudget,
+    /// The task whose motions and looks overlap.
+    Overlapped {
+        /// How long a plan may get better, in the robot's seconds; 0 leaves it to the planner.
+        plan_s: f64,
+    },
+}
+
 /// One run to be made.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Plan {
     pub(super) mode: Mode,
     pub(super) planners: u32,
-    /// Planners use the time that the task gives them; else as long as a path takes.
-    pub(super) budget: bool,
+    pub(super) work: Work,
 }
 
 /// One run that was made.
@@ -69,6 +85,32 @@ pub(super) struct Demonstration {
     pub(super) outcomes: Vec<Outcome>,
 }
 
+impl Work {
+    /// Whether it is of the same row.
+    pub(super) fn is_like(self, other: Work) -> bool {
+        std::mem::discriminant(&self) == std::mem::discriminant(&other)
+    }
+
+    /// For people, behind the name of a mode.
+    fn suffix(self) -> String {
+        match self {
+            Work::Budget => String::new(),
+            Work::NoBudget => ", no budget".to_owned(),
+            Work::Overlapped { plan_s: 0.0 } => ", overlapped".to_owned(),
+            Work::Overlapped { plan_s } => format!(", overlapped, {plan_s} s"),
+        }
+    }
+
+    /// What `--json` calls the budget of the planners.
+    fn budget(self) -> &'static str {
+        match self {
+            Work::Budget => "task",
+            Work::NoBudget => "none",
+            Work::Overlapped { .. } => "overlapped",
+        }
+    }
+}
+
 impl Plan {
     /// For people.
     pub(super) fn name(&self) -> String {
@@ -76,7 +118,7 @@ impl Plan {
             Mode::Hsm => String::new(),
             Mode::Cdtn => format!(" {} MP", self.planners),
         };
-        format!("{}{planners}{}", mode_name(self.mode), if self.budget { "" } else { ", no budget" })
+        format!("{}{planners}{}", mode_name(self.mode), self.work.suffix())
     }
 
     /// For files.
@@ -85,7 +127,7 @@ impl Plan {
             Mode::Hsm => "hsm".to_owned(),
             Mode::Cdtn => format!("cdtn-{}mp", self.planners),
         };
-        format!("{mode}{}", if self.budget { "" } else { "-no-budget" })
+        format!("{mode}{}", self.work.suffix().replace(", ", "-").replace(' ', "-"))
     }
 
     /// Before it begins.
@@ -95,8 +137,18 @@ impl Plan {
             Mode::Cdtn if self.planners == 1 => "as a dataflow network, one motion planner".to_owned(),
             Mode::Cdtn => format!("as a dataflow network, {} motion planners", self.planners),
         };
-        let budget = if self.budget { "" } else { "; planning takes what it takes" };
-        format!("== {}: {} {how}{budget} ==", self.name(), goods)
+        let work = match self.work {
+            Work::Budget => "",
+            Work::NoBudget => "; planning takes what it takes",
+            Work::Overlapped { .. } => "; the task whose motions and looks overlap",
+        };
+        format!("== {}: {} {how}{work} ==", self.name(), goods)
+    }
+}
+
+impl Outcome {
+    fn makespan_s(&self) -> Option<f64> {
+        (self.timeline.outcome.as_deref() == Some(SUCCESS)).then_some(self.timeline.end_s)
     }
 }
 
@@ -106,39 +158,54 @@ impl Demonstration {
         Demonstration { goods, planners, speed, seed, outcomes: Vec::new() }
     }
 
-    /// Of a run that ended with success; how long another lasted says nothing.
-    fn makespan_s(&self, mode: Mode, planners: u32, budget: bool) -> Option<f64> {
-        let mut fitting = self.outcomes.iter().filter(|o| o.plan.mode == mode && o.plan.budget == budget);
-        let run = fitting.find(|o| mode == Mode::Hsm || o.plan.planners == planners)?;
-        (run.timeline.outcome.as_deref() == Some(SUCCESS)).then_some(run.timeline.end_s)
+    /// The runs of a row.
+    fn of(&self, work: Work) -> impl Iterator<Item = &Outcome> {
+        self.outcomes.iter().filter(move |outcome| outcome.plan.work.is_like(work))
     }
 
-    fn row(&self, budget: bool) -> Row {
+    /// Of the quickest run that ended with success; how long another lasted says nothing.
+    fn makespan_s(&self, mode: Mode, planners: u32, work: Work) -> Option<f64> {
+        let fitting =
+            self.of(work).filter(|o| o.plan.mode == mode && (mode == Mode::Hsm || o.plan.planners == planners));
+        fitting.filter_map(Outcome::makespan_s).min_by(f64::total_cmp)
+    }
+
+    fn row(&self, work: Work) -> Row {
         Row {
-            hsm_s: self.makespan_s(Mode::Hsm, 0, budget),
-            cdtn_1mp_s: self.makespan_s(Mode::Cdtn, 1, budget),
-            cdtn_nmp_s: self.makespan_s(Mode::Cdtn, self.planners, budget),
+            hsm_s: self.makespan_s(Mode::Hsm, 0, work),
+            cdtn_1mp_s: self.makespan_s(Mode::Cdtn, 1, work),
+            cdtn_nmp_s: self.makespan_s(Mode::Cdtn, self.planners, work),
         }
     }
 
-    /// With the task's budget unless only the other was asked for.
-    fn main_budget(&self) -> bool {
-        self.outcomes.iter().any(|o| o.plan.budget) || self.outcomes.is_empty()
+    /// The work of the first run.
+    fn main_work(&self) -> Work {
+        self.outcomes.first().map_or(Work::Budget, |first| first.plan.work)
     }
 
-    /// The document of `--json`. The keys of the main runs, with the task's budget, are at the top; those of the runs
-    /// without one are the same, below `budget_none`.
+    /// For each time that plans of the state machine were given, how long the run lasted, where it ended with success.
+    fn sweep(&self) -> Vec<(f64, Option<f64>)> {
+        let hsm = self.outcomes.iter().filter(|o| o.plan.mode == Mode::Hsm);
+        let overlapped = hsm.filter_map(|o| match o.plan.work {
+            Work::Overlapped { plan_s } => Some((plan_s, o.makespan_s())),
+            Work::Budget | Work::NoBudget => None,
+        });
+        overlapped.collect()
+    }
+
+    /// The document of `--json`. The keys of the main runs, with the task's budget, are at the top; those of the runs without one are the
+    /// same, below `budget_none`, and those of the task that overlaps below `overlapped`.
     pub(super) fn to_json(&self) -> Value {
-        let main = self.main_budget();
+        let main = self.main_work();
         let mut document = json!({
             "planners": self.planners,
             "speed": self.speed,
             "seed": self.seed,
-            "budget": budget_name(main),
+            "budget": main.budget(),
             "runs": self.outcomes.iter().map(|o| json!({
                 "name": o.plan.name(),
                 "planners": o.plan.planners,
-                "budget": budget_name(o.plan.budget),
+                "budget": o.plan.work.budget(),
                 "delivered": o.delivered,
                 "greatest_tilt_rad": (o.greatest_tilt_rad * 1000.0).round() / 1000.0,
                 "contacts": o.unintended_contacts.iter().map(contact_json).collect::<Vec<_>>(),
@@ -149,15 +216,21 @@ impl Demonstration {
         });
         merge(&mut document, self.goods.to_json());
         merge(&mut document, self.row_json(main));
-        if main && self.outcomes.iter().any(|o| !o.plan.budget) {
-            document["budget_none"] = self.row_json(false);
+        for (name, work) in [("budget_none", Work::NoBudget), ("overlapped", OVERLAPPED)] {
+            if !work.is_like(main) && self.of(work).next().is_some() {
+                document[name] = self.row_json(work);
+            }
+        }
+        if document.get("overlapped").is_some() {
+            let sweep = self.sweep().into_iter().map(|(plan_s, hsm_s)| json!({ "plan_s": plan_s, "hsm_s": hsm_s }));
+            document["overlapped"]["sweep"] = sweep.collect();
         }
         document
     }
 
-    fn row_json(&self, budget: bool) -> Value {
-        let row = self.row(budget);
-        let outcomes: Vec<&Outcome> = self.outcomes.iter().filter(|o| o.plan.budget == budget).collect();
+    fn row_json(&self, work: Work) -> Value {
+        let row = self.row(work);
+        let outcomes: Vec<&Outcome> = self.of(work).collect();
         let delivered: Vec<usize> = outcomes.iter().map(|o| o.delivered).collect();
         let rounded = |number: Option<f64>| number.map(|n| (n * 1000.0).round() / 1000.0);
         json!({
@@ -275,10 +348,6 @@ impl fmt::Display for Goods {
     }
 }
 
-fn budget_name(budget: bool) -> &'static str {
-    if budget { "task" } else { "none" }
-}
-
 fn merge(into: &mut Value, from: Value) {
     if let (Value::Object(into), Value::Object(from)) = (into, from) {
         into.extend(from);
@@ -323,16 +392,18 @@ impl fmt::Display for Demonstration {
         )?;
         let columns = (format!("CDTN {planners} MP"), format!("{planners} MP over HSM"));
         writeln!(f, "  {:<26} {:>8} {:>11} {:>11} {:>13}", "", "HSM", "CDTN 1 MP", columns.0, columns.1)?;
-        if self.outcomes.iter().any(|o| o.plan.budget) {
-            self.row(true).write(f, "this run")?;
-        }
-        if self.outcomes.iter().any(|o| !o.plan.budget) {
-            self.row(false).write(f, "planning without a budget")?;
+        let rows =
+            [(Work::Budget, "this run"), (Work::NoBudget, "planning without a budget"), (OVERLAPPED, "and overlapped")];
+        for (work, name) in rows {
+            if self.of(work).next().is_some() {
+                self.row(work).write(f, name)?;
+            }
         }
         if let Some((_, hsm, one, two)) = PAPER.into_iter().find(|row| row.0 == self.goods) {
             let paper = Row { hsm_s: Some(hsm), cdtn_1mp_s: one, cdtn_nmp_s: (planners == 2).then_some(two) };
             paper.write(f, "the paper")?;
         }
+        self.write_sweep(f)?;
         self.write_where_the_time_went(f)?;
         self.write_plans(f)?;
         writeln!(f, "\nfiles")?;
@@ -345,6 +416,23 @@ impl fmt::Display for Demonstration {
 }
 
 impl Demonstration {
+    fn write_sweep(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let sweep = self.sweep();
+        if sweep.is_empty() {
+            return Ok(());
+        }
+        let one = |(plan_s, hsm_s): &(f64, Option<f64>)| match hsm_s {
+            Some(hsm_s) => format!("{hsm_s:.1} s with {plan_s} s"),
+            None => format!("no success with {plan_s} s"),
+        };
+        let all: Vec<String> = sweep.iter().map(one).collect();
+        writeln!(
+            f,
+            "\n  overlapped, HSM by the time that a plan may get better: {}; the best is in the table",
+            all.join(", ")
+        )
+    }
+
     fn write_where_the_time_went(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
@@ -369,9 +457,9 @@ impl Demonstration {
     }
 
     fn write_plans(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let budget = self.main_budget();
-        let fitting = |o: &&Outcome| o.plan.mode == Mode::Cdtn && o.plan.budget == budget;
-        let Some(outcome) = self.outcomes.iter().rfind(fitting) else { return Ok(()) };
+        let Some(outcome) = self.of(self.main_work()).filter(|o| o.plan.mode == Mode::Cdtn).last() else {
+            return Ok(());
+        };
         let plans = Statistics::of(&outcome.timeline).plans;
         writeln!(f, "\nwhat the planners did with their time in {}", outcome.plan.name())?;
         f.write_str(statistics::plan_table(&plans).trim_start_matches('\n'))?;
@@ -396,10 +484,10 @@ fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
 mod tests {
     use super::*;
 
-    fn outcome(mode: Mode, end: Option<&str>) -> Outcome {
+    fn outcome(mode: Mode, work: Work, end: Option<&str>, end_s: f64) -> Outcome {
         let mut timeline = Timeline::of(&[]);
-        (timeline.outcome, timeline.end_s) = (end.map(str::to_owned), 50.0);
-        let plan = Plan { mode, planners: 2, budget: true };
+        (timeline.outcome, timeline.end_s) = (end.map(str::to_owned), end_s);
+        let plan = Plan { mode, planners: 2, work };
         Outcome {
             plan,
             timeline,
@@ -415,12 +503,36 @@ mod tests {
     #[test]
     fn a_run_that_did_not_succeed_has_no_figure() {
         let mut shown = Demonstration { goods: Goods::Boxes(3), planners: 2, speed: 1.0, seed: 1, outcomes: vec![] };
-        shown.outcomes = vec![outcome(Mode::Hsm, Some(SUCCESS)), outcome(Mode::Cdtn, Some("preempted"))];
+        let of = |mode, end| outcome(mode, Work::Budget, Some(end), 50.0);
+        shown.outcomes = vec![of(Mode::Hsm, SUCCESS), of(Mode::Cdtn, "preempted")];
         let json = shown.to_json();
         assert_eq!((&json["hsm_s"], &json["cdtn_2mp_s"]), (&json!(50.0), &Value::Null));
         assert_eq!(json["improvement_2mp_percent"], Value::Null);
         let text = shown.to_string();
         let row: Vec<&str> = text.lines().filter(|line| line.contains("this run")).collect();
         assert!(row[0].split_whitespace().eq(["this", "run", "50.0", "-", "-", "-"]), "{row:?}");
+    }
+
+    #[test]
+    fn the_state_machine_of_the_task_that_overlaps_is_shown_with_the_time_for_plans_that_suits_it_best() {
+        let mut shown = Demonstration { goods: Goods::Boxes(3), planners: 2, speed: 1.0, seed: 1, outcomes: vec![] };
+        let of = |mode, plan_s, end_s| outcome(mode, Work::Overlapped { plan_s }, Some(SUCCESS), end_s);
+        let failed = outcome(Mode::Hsm, Work::Overlapped { plan_s: 0.1 }, Some("aborted"), 20.0);
+        shown.outcomes = vec![
+            outcome(Mode::Hsm, Work::Budget, Some(SUCCESS), 90.0),
+            of(Mode::Hsm, 0.0, 42.0),
+            failed,
+            of(Mode::Hsm, 0.2, 40.0),
+            of(Mode::Cdtn, 0.0, 30.0),
+        ];
+        let json = shown.to_json();
+        assert_eq!(json["hsm_s"], json!(90.0));
+        let overlapped = &json["overlapped"];
+        assert_eq!((&overlapped["hsm_s"], &overlapped["improvement_2mp_percent"]), (&json!(40.0), &json!(25.0)));
+        let (sweep, failed) = (&overlapped["sweep"], json!({ "plan_s": 0.1, "hsm_s": null }));
+        assert_eq!((&sweep[1], &sweep[2]), (&failed, &json!({ "plan_s": 0.2, "hsm_s": 40.0 })));
+        let text = shown.to_string();
+        assert!(text.contains("42.0 s with 0 s, no success with 0.1 s, 40.0 s with 0.2 s; the best"), "{text}");
+        assert_eq!(shown.outcomes[3].plan.file_stem(), "hsm-overlapped-0.2-s");
     }
 }
