@@ -92,6 +92,32 @@ fn what_an_action_says_of_an_output_that_the_state_does_not_take_is_not_in_force
     assert!(!loaded.program.states[1].annotations.effects.contains_key("success"), "it may change everything");
 }
 
+const EYE: &str = "[resources.Eye]\nclass = \"module\"\ncount = 1\n[providers.eye]\nresource = \"Eye\"\n[providers.eye.actions.look]\n\
+    inputs = { times = \"int\" }\noptional = { at = \"string\" }\noutputs = {}\n";
+
+#[test]
+fn variables_inside_of_an_input_are_none_of_the_annotation_that_it_stands_in() {
+    let requires = "annotations = { resources = [\"Eye\"], requires = [\"len(find(?x, at(?x), $times > 1)) > 0\"] }\n";
+    let catalogue = Catalogue::from_toml(&format!("{EYE}{requires}")).unwrap();
+    let task = "task: t\nworld: [at(a) = 1, at(b) = 2]\nstates:\n  - look: { action: eye/look, in: { times: \"len(find(?x, at(?x)))\" } }\n";
+    let program = load(task, "t.yaml", &catalogue).unwrap().program;
+    let told = in_force(&program);
+    let required = told[0].lines.iter().find(|line| line.key == "requires").unwrap();
+    // There are two, whatever ?x is outside.
+    assert_eq!(required.text, "len(find(?x, at(?x), len(find(?x of times, at(?x of times))) > 1)) > 0");
+}
+
+#[test]
+fn an_input_that_is_null_is_not_given() {
+    let reads = "annotations = { resources = [\"Eye\"], reads = [\"at($at)\"] }\n";
+    let catalogue = Catalogue::from_toml(&format!("{EYE}{reads}")).unwrap();
+    let task = "task: t\nstates:\n  - look: { action: eye/look, in: { times: 1, at: null } }\n";
+    let loaded = load(task, "t.yaml", &catalogue).unwrap();
+    let told: Vec<&str> = loaded.warnings.iter().map(|warning| warning.rule.as_ref()).collect();
+    assert!(told.contains(&"annotation-not-in-force"), "{:#?}", loaded.warnings);
+    assert_eq!(loaded.program.states[1].annotations.reads, None, "it may read everything");
+}
+
 #[test]
 fn a_catalogue_whose_annotations_do_not_read_is_refused_with_action_key_and_text() {
     let refused = |annotations: &str| {

@@ -8,6 +8,7 @@
 //! change more, which is safe.
 
 use super::fields::Fields;
+use super::functions::rename_inner;
 use super::outline::{Form, Step};
 use super::state::action_name;
 use super::yaml::{Content, Node};
@@ -26,7 +27,7 @@ pub(crate) struct Ports {
     /// `provider/action`
     name: String,
     signature: ActionSignature,
-    /// What the state gives its inputs.
+    /// What the state gives its inputs; what is `null` is not given.
     inputs: BTreeMap<String, Expr>,
     /// The outputs that it writes.
     written: BTreeSet<String>,
@@ -88,7 +89,7 @@ impl<'b> Sources<'b> {
             let ports = Ports {
                 name: format!("{provider}/{action}"),
                 signature: signature.clone(),
-                inputs: inputs.iter().cloned().collect(),
+                inputs: inputs.iter().filter(|(_, given)| *given != Expr::Literal(Value::Null)).map(as_input).collect(),
                 written: outputs.keys().cloned().collect(),
                 missing: RefCell::default(),
             };
@@ -234,6 +235,13 @@ impl<'b> Sources<'b> {
         };
         self.read(fields, "senses", senses).map_or_else(Nature::default, Nature::Senses)
     }
+}
+
+/// What a state gives an input, for expressions of the action.
+fn as_input((name, given): &(String, Expr)) -> (String, Expr) {
+    let mut given = given.clone();
+    rename_inner(&mut given, name);
+    (name.clone(), given)
 }
 
 /// A node of the action's, read in terms of its ports; what it needs and the state does not have.

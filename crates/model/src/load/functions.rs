@@ -92,6 +92,18 @@ fn wrong(rule: &'static str, message: String, help: &str) -> NameError {
     NameError { rule, message, help: help.to_owned() }
 }
 
+/// Gives the variables of comprehensions and queries inside names that nobody can write, so that they are none of what is put into the expression,
+/// or of what it is put into.
+pub(super) fn rename_inner(expression: &mut Expr, of: &str) {
+    let own = |inner: &mut String| *inner = format!("{inner} of {of}");
+    expression.rewrite(&mut |part| match part {
+        Expr::Each { element, .. } => own(element),
+        Expr::Element(inner) | Expr::Unknown(inner) => own(inner),
+        Expr::Find(wanted, _) => wanted.iter_mut().for_each(own),
+        _ => {}
+    });
+}
+
 /// Reads the functions of a file.
 pub(crate) fn functions(source: &str, root: &Node, findings: &mut Findings) -> Functions {
     let Some(node) = root.get("functions") else { return Functions::default() };
@@ -165,14 +177,7 @@ impl Reading<'_, '_> {
         let mut body = self.expression(node, &parameters);
         self.under_way.pop();
         if let Some(body) = &mut body {
-            // Names that no argument can have.
-            let own = |inner: &mut String| *inner = format!("{inner} of {name}");
-            body.rewrite(&mut |part| match part {
-                Expr::Each { element, .. } => own(element),
-                Expr::Element(inner) | Expr::Unknown(inner) => own(inner),
-                Expr::Find(wanted, _) => wanted.iter_mut().for_each(own),
-                _ => {}
-            });
+            rename_inner(body, name);
         }
         self.done.insert(name.to_owned(), Defined { parameters, body });
     }
