@@ -18,6 +18,7 @@
 
 mod action;
 mod advice;
+mod allowed;
 mod document;
 mod effects;
 mod fields;

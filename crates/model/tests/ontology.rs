@@ -11,6 +11,7 @@ use ratn_model::ontology::turtle::imports::{MAX_FILES, read_with};
 use ratn_model::ontology::turtle::{MAX_CLASSES, MAX_STATEMENTS, OntologyError, read};
 use ratn_model::ontology::{Ontology, Uncertainty};
 use ratn_model::pose::Pose;
+use ratn_model::program::Nature;
 use ratn_model::tolerance::{Deviation, Tolerance, Tolerances};
 use ratn_model::value::Value;
 use std::time::{Duration, Instant};
@@ -268,6 +269,30 @@ fn the_scene_and_the_tolerances_of_a_task_are_those_of_its_ontology() {
     assert_eq!(of("place"), Tolerance { number: 0.1, position_m: 0.02, ..Tolerance::ROBOT });
     let refused = load_with(task, "task.yaml", &Catalogue::standard(), &Shop("false")).unwrap_err();
     assert_eq!((refused.len(), refused[0].rule.as_str()), (1, "unknown-predicate"), "{}", refused[0]);
+}
+
+#[test]
+fn of_what_actions_say_a_task_with_an_ontology_of_its_own_keeps_what_that_has_predicates_for() {
+    let task = "task: t\nontology: shop.ttl\nstates:
+  - move: { action: arm/move_to, in: { joints: \"joints(0, 0, 0, 0, 0, 0, 0)\" }, effects: [\"place(box_1) = pose(0, 0, 0)\"] }
+  - plan: { action: path_planner/plan, in: { start: \"joints(0, 0, 0, 0, 0, 0, 0)\", goal: \"joints(0, 0, 0, 0, 0, 0, 0)\" } }
+  - close: { action: gripper/grasp, in: { object: box_1, expected: \"place(box_1)\" } }
+  - look: { action: detector/locate, in: { object: \"{id: box_1, pose: place(box_1), size: [1.0]}\" } }\n";
+    for (geometric, scene) in [("true", "place(?)"), ("false", "")] {
+        let loaded = load_with(task, "task.yaml", &Catalogue::standard(), &Shop(geometric));
+        let program = loaded.unwrap_or_else(|findings| panic!("{findings:#?}")).program;
+        let told = |n: usize| {
+            let said = &program.states[n].annotations;
+            let reads: Vec<String> = said.reads.iter().flatten().map(ToString::to_string).collect();
+            let effects =
+                said.effects.get("success").map(|effects| effects.iter().map(ToString::to_string).collect::<Vec<_>>());
+            (reads.join(", "), said.requires.len(), effects)
+        };
+        assert_eq!(told(1), (String::new(), 0, Some(vec!["set place(box_1) = pose(0, 0, 0)".to_owned()])));
+        assert_eq!(told(2), (scene.to_owned(), 0, Some(vec![])));
+        assert_eq!(told(3), (String::new(), 0, Some(vec![])), "no hand_empty(gripper), no in_gripper(box_1)");
+        assert_eq!(program.states[4].annotations.nature, Nature::Irreversible, "what a look depends on has no name");
+    }
 }
 
 struct Folder(&'static [(&'static str, &'static str)]);

@@ -4,9 +4,10 @@
 //! `effects` add up: a state's stand in place of the action's of the same predicate alone. (Else a state that names a fact of its own would
 //! silently promise that the arm did not move.)
 //!
-//! An annotation that needs an input which the state does not give is not in force, and a warning says so: without it the state may read and
+//! What the task's ontology has no predicate for is left out ([`super::allowed`]). An annotation that needs an input which the state does not give is not in force, and a warning says so: without it the state may read and
 //! change more, which is safe.
 
+use super::allowed::OfAction;
 use super::fields::Fields;
 use super::functions::rename_inner;
 use super::outline::{Form, Step};
@@ -14,7 +15,7 @@ use super::state::action_name;
 use super::yaml::{Content, Node};
 use crate::catalogue::{ActionSignature, Annotations, unknown_input};
 use crate::expression::parse::NameError;
-use crate::expression::{EffectExpr, Expr};
+use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::program::{Location, Nature, Origin, SUCCESS, StateKind};
 use crate::value::Value;
 use std::cell::RefCell;
@@ -99,7 +100,7 @@ impl<'b> Sources<'b> {
     }
 
     /// What is said under a key, read.
-    pub(crate) fn read<T>(
+    pub(crate) fn read<T: OfAction>(
         &mut self,
         fields: &mut Fields<'_, '_>,
         key: &'static str,
@@ -148,7 +149,7 @@ impl<'b> Sources<'b> {
         changed
     }
 
-    fn of_action<T>(
+    fn of_action<T: OfAction>(
         &mut self,
         fields: &mut Fields<'_, '_>,
         key: &'static str,
@@ -171,7 +172,10 @@ impl<'b> Sources<'b> {
         fields: &mut Fields<'_, '_>,
         key: &'static str,
         read: impl Fn(&mut Fields<'_, '_>, &Node) -> Vec<T>,
-    ) -> Vec<T> {
+    ) -> Vec<T>
+    where
+        Vec<T>: OfAction,
+    {
         if self.body.get(key).is_some() {
             return self.read(fields, key, read).unwrap_or_default();
         }
@@ -189,7 +193,7 @@ impl<'b> Sources<'b> {
     }
 
     /// What the action says under a key, one item after the other, each with what it needs and the state does not have.
-    fn each_of_action<T>(
+    fn each_of_action<T: OfAction>(
         &self,
         fields: &mut Fields<'_, '_>,
         key: &'static str,
@@ -230,10 +234,18 @@ impl<'b> Sources<'b> {
             self.origin.insert(NATURES[0].to_owned(), Origin::Action);
             return Nature::Computes;
         }
-        let senses = |fields: &mut Fields<'_, '_>, node: &Node| {
+        let senses = |fields: &mut Fields<'_, '_>, node: &Node| -> Vec<FactExpr> {
             node.items().into_iter().filter_map(|fact| fields.fact(fact)).collect()
         };
-        self.read(fields, "senses", senses).map_or_else(Nature::default, Nature::Senses)
+        let said = self.action.as_ref().map_or(0, |(said, ..)| said.senses.len());
+        match self.of_action(fields, "senses", senses) {
+            Some(senses) if senses.len() == said => Nature::Senses(senses),
+            // What it looks at has no name in the task's world: then it waits for its place in the program.
+            _ => {
+                self.origin.remove("senses");
+                Nature::default()
+            }
+        }
     }
 }
 
@@ -245,15 +257,18 @@ fn as_input((name, given): &(String, Expr)) -> (String, Expr) {
 }
 
 /// A node of the action's, read in terms of its ports; what it needs and the state does not have.
-fn in_its_terms<T>(
+fn in_its_terms<T: OfAction>(
     fields: &mut Fields<'_, '_>,
     ports: &Rc<Ports>,
     node: &Node,
     read: impl Fn(&mut Fields<'_, '_>, &Node) -> T,
 ) -> (T, Option<String>) {
     fields.view.action = Some(Rc::clone(ports));
-    let value = read(fields, node);
+    let mut value = read(fields, node);
     fields.view.action = None;
+    if let Some(ontology) = &fields.task.ontology {
+        value.leave_out(ontology);
+    }
     (value, ports.missing.take())
 }
 

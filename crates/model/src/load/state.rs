@@ -365,7 +365,7 @@ fn reads(fields: &mut Fields<'_, '_>, item: &Node) -> Vec<FactExpr> {
         None => SCENE_PREDICATES.to_vec(),
         Some(ontology) => ontology.scene(),
     };
-    if predicates.is_empty() {
+    if predicates.is_empty() && fields.view.action.is_none() {
         let message = "the ontology has no geometric predicate, and `scene` stands for those";
         fields.error("unknown-predicate", item.at, message, "say `ratn:geometric true` of some, or name the facts");
     }

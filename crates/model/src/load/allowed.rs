@@ -1,0 +1,51 @@
+//! What a task's ontology has no predicate for is left out of what an action says: a fact that cannot be named can neither be read nor change.
+
+use crate::expression::{EffectExpr, Expr, FactExpr};
+use crate::ontology::Ontology;
+use crate::program::ResourceExpr;
+use std::collections::BTreeMap;
+
+/// What stands under a key of an action's annotations.
+pub(super) trait OfAction {
+    /// Leaves out what the ontology has no predicate for.
+    fn leave_out(&mut self, _: &Ontology) {}
+}
+
+impl OfAction for Vec<FactExpr> {
+    fn leave_out(&mut self, ontology: &Ontology) {
+        self.retain(|fact| can_be(ontology, fact));
+    }
+}
+
+/// Requirements.
+impl OfAction for Vec<Expr> {
+    fn leave_out(&mut self, ontology: &Ontology) {
+        self.retain(|required| required.fact_expressions().into_iter().all(|fact| can_be(ontology, fact)));
+    }
+}
+
+/// Effects by outcome.
+impl OfAction for BTreeMap<String, Vec<EffectExpr>> {
+    fn leave_out(&mut self, ontology: &Ontology) {
+        self.values_mut().for_each(|effects| retain(ontology, effects));
+    }
+}
+
+impl OfAction for Vec<ResourceExpr> {}
+
+/// A duration.
+impl OfAction for Option<Expr> {}
+
+fn retain(ontology: &Ontology, effects: &mut Vec<EffectExpr>) {
+    effects.retain_mut(|effect| match effect {
+        EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => can_be(ontology, fact),
+        EffectExpr::ForEach { effects, .. } => {
+            retain(ontology, effects);
+            !effects.is_empty()
+        }
+    });
+}
+
+fn can_be(ontology: &Ontology, fact: &FactExpr) -> bool {
+    ontology.predicate(&fact.predicate).is_some()
+}
