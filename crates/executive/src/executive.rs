@@ -5,6 +5,7 @@ mod checkpoint;
 pub use checkpoint::RestoreError;
 
 use crate::context::Context;
+use crate::hold;
 use crate::interpreter::{Interpreter, Progress};
 use crate::lookahead::Problem;
 use crate::plan::Plan;
@@ -74,14 +75,14 @@ impl Executive {
     pub fn handle(&mut self, now: Timestamp, event: Event) -> Vec<Command> {
         let mut commands = Vec::with_capacity(8);
         match event {
-            Event::Started { mode, parameters, seed, world, revision, capacity, learned, .. } => {
+            Event::Started { mode, parameters, seed, world, revision, capacity, learned, breakpoints, .. } => {
                 if matches!(self.state, State::Fresh) {
                     self.root = World::from_facts(world, revision);
                     self.seed = seed;
                     let window =
                         || Window::new(&self.program, &self.plan, &parameters, capacity, learned, self.tolerance);
                     let window = (mode == Mode::Cdtn).then(|| Box::new(window()));
-                    self.start(now, window, &parameters, &mut commands);
+                    self.start(now, window, &parameters, breakpoints, &mut commands);
                 }
             }
             event => self.step(now, event, &mut commands),
@@ -102,6 +103,20 @@ impl Executive {
     /// How many signals of a name no state has taken yet; more than [`crate::MOST_SIGNALS_KEPT`] are not kept.
     pub fn signals_kept(&self, name: &str) -> usize {
         self.signals.count(name)
+    }
+
+    /// The breakpoints, by the paths of states.
+    pub fn breakpoints(&self) -> &[String] {
+        match &self.state {
+            State::Cdtn(window) => window.breakpoints(),
+            State::Hsm(interpreter) => interpreter.breakpoints(),
+            State::Fresh | State::Ended => &[],
+        }
+    }
+
+    /// Whether a breakpoint at a path, without visits, ever stops a run of a program: something that may change the environment is there.
+    pub fn stops_for(program: &Program, path: &str) -> bool {
+        hold::stops_for(program, path)
     }
 
     /// What every instance that has not begun waits for, as sentences; empty in HSM mode.
@@ -175,6 +190,7 @@ impl Executive {
         now: Timestamp,
         window: Option<Box<Window>>,
         parameters: &BTreeMap<String, Value>,
+        breakpoints: Vec<String>,
         commands: &mut Vec<Command>,
     ) {
         let program = self.program.clone();
@@ -201,12 +217,14 @@ impl Executive {
                 self.deadline = seconds.map(|seconds| now + seconds);
                 context.commands.extend(self.deadline.map(|at| Command::Wake { at }));
                 let mut interpreter = Box::new(Interpreter::of_program(parameters));
+                interpreter.break_at(&program, breakpoints);
                 let progress = interpreter.start(&mut context, Program::ROOT, "");
                 let end = end_of(&mut context, &interpreter, progress);
                 self.state = State::Hsm(interpreter);
                 end
             }
             Some(mut window) => {
+                window.break_at(&program, breakpoints);
                 let end = window.start(&mut context);
                 self.state = State::Cdtn(window);
                 end

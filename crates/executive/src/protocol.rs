@@ -98,6 +98,9 @@ pub enum Event {
         /// What earlier runs of the task have taught.
         #[serde(default)]
         learned: Learned,
+        /// The breakpoints that it begins with, as in [`Event::BreakpointsSet`].
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        breakpoints: Vec<String>,
         /// Which run this is.
         #[serde(default)]
         origin: Origin,
@@ -127,6 +130,11 @@ pub enum Event {
     ResumeRequested,
     /// One PIA may begin; then it is a pause again.
     StepRequested,
+    /// Before a PIA of these states or inside of them begins, it becomes a pause. These are all breakpoints from now on.
+    BreakpointsSet {
+        /// The paths of states, without visits.
+        states: Vec<String>,
+    },
     /// A look ahead found a better order: how long before the end of everything known each instance should begin.
     Advised {
         /// Seconds, by instance; it stands in for the longest remaining path.
@@ -346,6 +354,11 @@ pub enum Note {
         path: String,
         /// What it came to: `then`, `else`, or the number of elements.
         decision: String,
+    },
+    /// It would begin and stands at a breakpoint: no PIA begins until the operator lets it go.
+    Stopped {
+        /// Its id.
+        instance: InstanceId,
     },
     /// It has its resources and, where it needs one, its projection: its goal starts.
     Running {

@@ -87,6 +87,7 @@ fn transcript(run: &Run, script: &Script) -> String {
                 }
                 Note::Decided { path, decision, .. } => Some(("decide", format!("{path}: {decision}"))),
                 Note::Retired { instance } => Some(("retire", path(instance))),
+                Note::Stopped { instance } => Some(("stopped", path(instance))),
                 Note::Squashed { instance } => Some(("squash", path(instance))),
                 Note::Reused { instance } => Some(("reuse", path(instance))),
                 Note::Invalidated { instance, reason } => {
@@ -122,6 +123,7 @@ fn transcript(run: &Run, script: &Script) -> String {
                 Event::PauseRequested => Some(("pause", String::new())),
                 Event::ResumeRequested => Some(("resume", String::new())),
                 Event::StepRequested => Some(("step", String::new())),
+                Event::BreakpointsSet { states } => Some(("break", states.join(", "))),
                 Event::WorldChanged { facts, .. } => {
                     let fact = |(key, value): &(FactKey, Option<Value>)| match value {
                         Some(value) => format!("{key} = {value}"),

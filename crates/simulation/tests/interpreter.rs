@@ -186,6 +186,7 @@ impl Bench {
             revision: Revision(0),
             capacity: BTreeMap::new(),
             learned: Learned::default(),
+            breakpoints: Vec::new(),
             origin: Origin::default(),
         });
         bench

@@ -1,5 +1,5 @@
 //! A run's ear: a Unix socket in the runtime directory of its system, over which `ratn control` pauses it, lets it go on, lets
-//! one PIA begin, or ends it, `ratn status` asks what it is doing, `ratn signal` and `ratn answer` send it what its states wait for. One
+//! one PIA begin, or ends it, and sets breakpoints, `ratn status` asks what it is doing, `ratn signal` and `ratn answer` send it what its states wait for. One
 //! word or [`Message`] (in JSON) per line; each is answered by one line.
 
 mod service;
@@ -85,7 +85,7 @@ pub struct Awaiting {
     pub until_s: Option<f64>,
 }
 
-/// What the states of a run wait for, from somebody else.
+/// What a run is sent by somebody: what its states wait for, or where it shall stop.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "message", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Message {
@@ -107,9 +107,24 @@ pub enum Message {
         /// One of its choices.
         choice: String,
     },
+    /// A breakpoint: the run is paused before a PIA of a state, or inside of it, begins.
+    Breakpoint {
+        /// The run: its id, the name of its task, or [`ANY_RUN`].
+        run: String,
+        /// The path of the state, with or without visits; none stands for all breakpoints that there are.
+        state: Option<String>,
+        /// Whether it is set, else it is taken away.
+        set: bool,
+    },
 }
 
 impl Message {
+    /// The run that it is for.
+    pub(crate) fn run(&self) -> &str {
+        let (Message::Signal { run, .. } | Message::Answer { run, .. } | Message::Breakpoint { run, .. }) = self;
+        run
+    }
+
     /// The message, if its names and its value are such as any client may send.
     fn checked(self) -> Result<Message, Malformed> {
         match &self {
@@ -122,6 +137,10 @@ impl Message {
                 label(run, "run")?;
                 label(state.as_deref().unwrap_or_default(), "state")?;
                 label(choice, "choice")?;
+            }
+            Message::Breakpoint { run, state, .. } => {
+                label(run, "run")?;
+                label(state.as_deref().unwrap_or_default(), "state")?;
             }
         }
         Ok(self)

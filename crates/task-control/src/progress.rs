@@ -100,6 +100,7 @@ impl Progress {
                 Command::Note(Note::Finished { instance, .. } | Note::Squashed { instance }) => {
                     self.awaiting.remove(instance);
                 }
+                Command::Note(Note::Stopped { .. }) => self.paused = true,
                 _ => {}
             }
         }
@@ -226,6 +227,8 @@ impl Progress {
             Event::PauseRequested => say(&mut lines, at, "pause"),
             Event::ResumeRequested => say(&mut lines, at, "resume"),
             Event::StepRequested => say(&mut lines, at, "step"),
+            Event::BreakpointsSet { states } if states.is_empty() => say(&mut lines, at, "no breakpoints"),
+            Event::BreakpointsSet { states } => say(&mut lines, at, &format!("breakpoints: {}", states.join(", "))),
             Event::Started { .. }
             | Event::Granted { .. }
             | Event::Projected { .. }
@@ -248,6 +251,10 @@ impl Progress {
                     {
                         say(&mut lines, at, &format!("ask    answer with `ratn answer - {choice} --state {path}`"));
                     }
+                }
+                Command::Note(Note::Stopped { instance }) => {
+                    let path = self.path(*instance);
+                    say(&mut lines, at, &format!("stop   {path}  at its breakpoint; go on with `ratn control resume` or `step`"));
                 }
                 Command::Note(Note::Finished { instance, outcome }) if waited.contains(instance) => {
                     let took = self.started.remove(instance).map_or(0.0, |s| at.since(s).as_secs_f64());

@@ -46,6 +46,8 @@ pub(super) const MAX_PENDING_EVENTS: usize = 1024;
 
 /// How often a run says what it waits for, at the most.
 const LOOK: Duration = Duration::from_secs(5);
+/// More breakpoints than this are no help.
+const MOST_BREAKPOINTS: usize = 256;
 
 /// A task to be run once.
 #[derive(Debug, Clone)]
@@ -64,6 +66,8 @@ pub struct Run {
     pub learned: Learned,
     /// Where the event log goes.
     pub log: PathBuf,
+    /// Before which states the run is paused, by their paths.
+    pub breakpoints: Vec<String>,
     /// Whether the nodes that start and end are not told to [`Place::messages`].
     pub quiet: bool,
     /// A checkpoint after so many events; 0 is none.
@@ -146,6 +150,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
             revision,
             capacity: place.catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
             learned: run.learned,
+            breakpoints: run.breakpoints,
             origin: Origin {
                 run: id,
                 version: VERSION.to_owned(),
@@ -158,6 +163,29 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
         shell.step(begun)
     };
     shell.run_to_its_end(begin, interrupt).await
+}
+
+/// Breakpoints of a program, by the paths of states with or without visits.
+///
+/// # Errors
+/// Where there is no such state, where a run would never stop for it, and where they are too many.
+pub fn breakpoints(program: &Program, states: &[String]) -> Result<Vec<String>, String> {
+    if states.len() > MOST_BREAKPOINTS {
+        return Err(format!("a run has at most {MOST_BREAKPOINTS} breakpoints: take one away first"));
+    }
+    let breakpoint = |state: &String| {
+        let path = without_visits(state);
+        let known = || program.states.iter().map(|state| state.path.as_str()).filter(|path| !path.is_empty());
+        if !known().any(|known| known == path) {
+            let help = suggestion(&path, known(), "", "`ratn check TASK --annotations` lists the states");
+            return Err(format!("{} has no state `{path}`: {help}", program.name));
+        }
+        if !Executive::stops_for(program, &path) {
+            return Err(format!("`{path}` changes nothing, and may run ahead of its turn: break at a state that acts"));
+        }
+        Ok(path)
+    };
+    states.iter().map(breakpoint).collect()
 }
 
 /// A run under way.
@@ -317,14 +345,15 @@ impl Shell {
     /// # Errors
     /// Why it is none for this run as it stands.
     fn event_of(&self, message: Message) -> Result<(Event, String), String> {
-        let (Message::Signal { run, .. } | Message::Answer { run, .. }) = &message;
+        let run = message.run();
         let (id, task) = (self.performer.run(), self.program.name.as_str());
-        if ![id, task, ANY_RUN].contains(&run.as_str()) {
+        if ![id, task, ANY_RUN].contains(&run) {
             return Err(format!("no run `{run}` is under way here, but {id} of the task {task}"));
         }
         match message {
             Message::Signal { signal, value, .. } => self.signalled(signal, value),
             Message::Answer { state, choice, .. } => self.answered(state.as_deref(), choice),
+            Message::Breakpoint { state, set, .. } => self.breakpoints(state.as_deref(), set),
         }
     }
 
@@ -350,6 +379,33 @@ impl Shell {
             None => format!("it is kept for the next state that waits for `{signal}`"),
         };
         Ok((Event::Signalled { signal, value }, said))
+    }
+
+    /// A breakpoint is set, or one is taken away, or all are.
+    fn breakpoints(&self, state: Option<&str>, set: bool) -> Result<(Event, String), String> {
+        let mut states = self.executive.breakpoints().to_vec();
+        match state.map(without_visits) {
+            None if set => return Err("say before which state: `ratn control break STATE`".to_owned()),
+            None => states.clear(),
+            Some(path) if set => {
+                if !states.contains(&path) {
+                    states.push(path);
+                }
+                states = breakpoints(&self.program, &states)?;
+            }
+            Some(path) => {
+                if !states.contains(&path) {
+                    let there = if states.is_empty() { "there is none".to_owned() } else { format!("there is {}", states.join(", ")) };
+                    return Err(format!("there is no breakpoint at `{path}`: {there}"));
+                }
+                states.retain(|other| *other != path);
+            }
+        }
+        let said = match states.as_slice() {
+            [] => "no breakpoints are set any more".to_owned(),
+            all => format!("the run pauses before {}", all.join(", ")),
+        };
+        Ok((Event::BreakpointsSet { states }, said))
     }
 
     fn answered(&self, state: Option<&str>, choice: String) -> Result<(Event, String), String> {

@@ -67,6 +67,9 @@ pub(crate) struct RunArguments {
     /// How it is executed
     #[arg(long, value_enum, default_value = "cdtn")]
     pub(crate) mode: ModeArgument,
+    /// Pause before this state, or a motion inside of it, begins: its path, `for_box/grasp`; may be repeated
+    #[arg(long = "break", value_name = "STATE", conflicts_with = "resume")]
+    pub(crate) breakpoints: Vec<String>,
     /// Give a parameter of the task a value, `boxes=3`; may be repeated
     #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
     pub(crate) set: Vec<(String, String)>,
@@ -122,6 +125,10 @@ pub(crate) enum WordArgument {
     Step,
     /// The run ends: motions stop and hold, everything is given back
     Abort,
+    /// The run pauses before STATE, or a motion inside of it, begins; `resume` and `step` let it go on
+    Break,
+    /// The breakpoint at STATE is taken away; without a STATE all are
+    Clear,
 }
 
 #[derive(Debug, Clone, Args)]
@@ -129,6 +136,9 @@ pub(crate) struct ControlArguments {
     /// What to tell the run
     #[arg(value_enum)]
     pub(crate) word: WordArgument,
+    /// For `break` and `clear`: the path of a state, `for_box/grasp`, as `ratn check TASK --annotations` and `ratn status` name it
+    #[arg(value_name = "STATE")]
+    pub(crate) state: Option<String>,
     /// Where the endpoint files of the run's system are
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,

@@ -1,29 +1,30 @@
-//! `ratn control pause|resume|step|abort`
+//! `ratn control pause|resume|step|abort|break|clear`
 
-use super::blocking_on;
+use super::{blocking_on, signal};
 use crate::arguments::{ControlArguments, WordArgument};
 use crate::failure::Failure;
 use crate::output;
 use crate::system::public_directory;
 use anyhow::Context;
-use ratn_task_control::control::{self, RunStatus, Word};
-
-impl From<WordArgument> for Word {
-    fn from(word: WordArgument) -> Word {
-        match word {
-            WordArgument::Pause => Word::Pause,
-            WordArgument::Resume => Word::Resume,
-            WordArgument::Step => Word::Step,
-            WordArgument::Abort => Word::Abort,
-        }
-    }
-}
+use ratn_task_control::control::{self, ANY_RUN, Message, RunStatus, Word};
 
 /// Tells the run of a system.
 pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
+    let state = arguments.state.clone();
+    let breakpoint = |set| Message::Breakpoint { run: ANY_RUN.to_owned(), state: state.clone(), set };
+    let word = match arguments.word {
+        WordArgument::Break => return signal::send(arguments.runtime_dir.as_deref(), &breakpoint(true)),
+        WordArgument::Clear => return signal::send(arguments.runtime_dir.as_deref(), &breakpoint(false)),
+        WordArgument::Pause => Word::Pause,
+        WordArgument::Resume => Word::Resume,
+        WordArgument::Step => Word::Step,
+        WordArgument::Abort => Word::Abort,
+    };
+    if let Some(state) = state {
+        return Err(Failure::Refused(format!("ratn: `{state}` is for `break` and `clear` only: leave it out")));
+    }
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
-        let word = Word::from(arguments.word);
         // Before and after: a run that is told to end may be gone when it is asked.
         let before = control::status(&directory).await.ok().flatten();
         let told = control::tell(&directory, word).await;

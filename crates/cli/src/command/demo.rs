@@ -255,6 +255,7 @@ impl Setup<'_> {
             seed: arguments.seed,
             learned: Default::default(),
             log: log_file.clone(),
+            breakpoints: Vec::new(),
             quiet: false,
             // The system ends with the demo: nobody resumes it.
             checkpoint_every: 0,

@@ -108,6 +108,8 @@ async fn begin(
     let learned = learn::from_files(&arguments.learn, &program.name, &output::messages())?;
     let log = arguments.log.clone().map_or_else(|| log_file(&program.name), Ok)?;
 
+    let breakpoints = shell::breakpoints(&program, &arguments.breakpoints)
+        .map_err(|why| Failure::Refused(format!("ratn: --break: {why}")))?;
     let system = match found {
         Some(system) => {
             output::progress(format_args!("on the system in {}", directory.display()));
@@ -133,6 +135,7 @@ async fn begin(
         seed: arguments.seed,
         learned,
         log: log.clone(),
+        breakpoints,
         quiet: arguments.quiet || way == Some(Way::Painted),
         checkpoint_every: arguments.checkpoint_every,
     };

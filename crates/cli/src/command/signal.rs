@@ -31,7 +31,8 @@ pub(crate) fn answer(arguments: &AnswerArguments) -> Result<(), Failure> {
     send(arguments.runtime_dir.as_deref(), &Message::Answer { run, state, choice })
 }
 
-fn send(directory: Option<&Path>, message: &Message) -> Result<(), Failure> {
+/// Sends a message to the run of a system, and says what becomes of it.
+pub(crate) fn send(directory: Option<&Path>, message: &Message) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = public_directory(directory)?;
         let place = directory.display();

@@ -186,6 +186,7 @@ pub fn started(world: Vec<(FactKey, Value)>) -> Event {
         revision: Revision(0),
         capacity: BTreeMap::new(),
         learned: Learned::default(),
+        breakpoints: Vec::new(),
         origin: Default::default(),
     }
 }

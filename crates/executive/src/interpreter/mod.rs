@@ -29,7 +29,7 @@ use node::GoalEnd;
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, Revision, StateId};
 use ratn_model::measurement::Evidence;
-use ratn_model::program::StateKind;
+use ratn_model::program::{Program, StateKind};
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
@@ -331,9 +331,13 @@ impl Interpreter {
                     self.goal_ended(context, thread, end);
                 }
             }
-            Event::PauseRequested => self.hold = Hold::Paused(0),
+            Event::PauseRequested => self.hold.pause(),
             Event::ResumeRequested => {
-                self.hold = Hold::Running;
+                self.hold.resume();
+                self.let_go(context);
+            }
+            Event::BreakpointsSet { states } => {
+                self.hold.break_at(context.program, states);
                 self.let_go(context);
             }
             Event::StepRequested => {
@@ -347,6 +351,16 @@ impl Interpreter {
             self.renew_leases(context);
         }
         progress
+    }
+
+    /// These are the breakpoints from now on.
+    pub(crate) fn break_at(&mut self, program: &Program, breakpoints: Vec<String>) {
+        self.hold.break_at(program, breakpoints);
+    }
+
+    /// As [`crate::executive::Executive::breakpoints`].
+    pub(crate) fn breakpoints(&self) -> &[String] {
+        self.hold.breakpoints()
     }
 
     fn current(&mut self, thread: u64) -> Option<&mut Current> {

@@ -101,9 +101,21 @@ impl Interpreter {
         }
     }
 
-    /// Whether the operator lets a node not begin. A routine is one PIA: what it contains is not held.
-    pub(super) fn is_held(&self, context: &Context<'_>, thread: u64) -> bool {
-        self.routine_of(thread).is_none() && self.is_pia(context, thread) && !self.hold.lets_begin()
+    /// Whether the operator lets a node not begin; where it stands at a breakpoint, nothing else begins from now on. A routine is one PIA: what it
+    /// contains is not held.
+    pub(super) fn is_held(&mut self, context: &mut Context<'_>, thread: u64) -> bool {
+        if self.routine_of(thread).is_some() || !self.is_pia(context, thread) {
+            return false;
+        }
+        let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return false };
+        let (instance, state) = (current.instance, current.state);
+        if self.hold.lets_begin(instance, state) {
+            return false;
+        }
+        if self.hold.stops_at(instance, state) {
+            context.note(Note::Stopped { instance });
+        }
+        true
     }
 
     pub(super) fn is_pia(&self, context: &Context<'_>, thread: u64) -> bool {
@@ -197,7 +209,7 @@ impl Interpreter {
         };
         let timeout = state.annotations.timeout_s.map(|seconds| context.now + duration(seconds));
         if self.routine_of(thread).is_none() && self.is_pia(context, thread) {
-            self.hold.has_begun();
+            self.hold.has_begun(instance);
         }
         if let Some(current) = self.current(thread) {
             current.phase = Phase::Running;

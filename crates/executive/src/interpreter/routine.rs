@@ -40,11 +40,11 @@ impl Interpreter {
         if self.is_held(context, thread) {
             return self.set_phase(thread, super::Phase::Held);
         }
-        if self.is_pia(context, thread) {
-            self.hold.has_begun();
-        }
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let (id, instance, attempt, path) = (current.state, current.instance, current.attempt, current.path.clone());
+        if context.plan.state(id).nature == crate::plan::NodeNature::Irreversible {
+            self.hold.has_begun(instance);
+        }
         let state = context.program.state(id);
         let wanted = &context.plan.state(id).requirements;
         let requirements = self.with_scope(context, thread, None, |scope| binding::requirements(state, wanted, scope));

@@ -33,7 +33,7 @@ impl Interpreter {
             Err(error) => return self.end_node(context, thread, error.reason()),
         };
         if self.routine_of(thread).is_none() && self.is_pia(context, thread) {
-            self.hold.has_begun();
+            self.hold.has_begun(instance);
         }
         if let Some(current) = self.current(thread) {
             current.phase = Phase::Running;

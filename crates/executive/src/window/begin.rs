@@ -41,6 +41,10 @@ impl Window {
         });
         match looked {
             None => {}
+            Some((Readiness::Waits(Wait::Pause), _)) => {
+                self.is_held_back(context, id);
+                self.wait(id, Wait::Pause);
+            }
             Some((Readiness::Waits(wait), _)) => self.wait(id, wait),
             Some((Readiness::Failed(reason), seen)) => {
                 self.graph.set_seen(id, Some(seen));
@@ -54,6 +58,19 @@ impl Window {
                 self.acquire(context, id, requirements, inputs, seen);
             }
         }
+    }
+
+    /// Whether the operator lets a node not begin; where it stands at a breakpoint, nothing else begins from now on.
+    pub(super) fn is_held_back(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
+        let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return false };
+        let state = instance.state;
+        if self.hold.lets_begin(id, state) {
+            return false;
+        }
+        if self.hold.stops_at(id, state) {
+            context.note(Note::Stopped { instance: id });
+        }
+        true
     }
 
     /// It never began and never will.
@@ -205,8 +222,7 @@ impl Window {
                     return self.in_routine(context, Event::Granted { instance: id, lease });
                 }
                 self.graph.grant(id, Some(lease), context.now);
-                let is_held = self.graph.get(id).is_some_and(Instance::is_pia) && !self.hold.lets_begin();
-                if is_held {
+                if self.is_held_back(context, id) {
                     return self.wait(id, Wait::Pause);
                 }
                 self.proceed(context, id);
@@ -275,7 +291,7 @@ impl Window {
         let Status::Granted(held) = &node.status else { return };
         let own = context.plan.state(instance.state);
         if held.projection.is_none() && instance.is_pia() {
-            self.hold.has_begun();
+            self.hold.has_begun(id);
         }
         if own.needs_world && held.projection.is_none() && !own.is_routine {
             return self.project(context, id);

@@ -145,13 +145,17 @@ impl Window {
                 self.stop(context, ABORTED, format!("what had happened could not be recorded: {reason}"));
             }
             Event::AbortRequested { reason } => self.stop(context, PREEMPTED, reason),
-            Event::PauseRequested => self.hold = Hold::Paused(0),
+            Event::PauseRequested => self.hold.pause(),
             Event::ResumeRequested => {
-                self.hold = Hold::Running;
+                self.hold.resume();
                 self.look_at_those_held();
             }
             Event::StepRequested => {
                 self.hold.step();
+                self.look_at_those_held();
+            }
+            Event::BreakpointsSet { states } => {
+                self.hold.break_at(context.program, states);
                 self.look_at_those_held();
             }
             Event::Advised { urgency_s, held } => {
@@ -203,7 +207,11 @@ impl Window {
         match (instance.role(), instance.node().map(|node| &node.status)) {
             (None, Some(Status::Expanded)) => self.begin(context, id),
             // It got its resources during a pause, and keeps them.
-            (None, Some(Status::Granted(_))) if self.hold.lets_begin() => self.proceed(context, id),
+            (None, Some(Status::Granted(_))) => {
+                if !self.is_held_back(context, id) {
+                    self.proceed(context, id);
+                }
+            }
             (None, Some(Status::Finished(_))) if instance.is_undecided() => self.decide_by_outcome(context, id),
             (Some(Role::Condition | Role::Test), _) if !has_ended => self.decide(context, id),
             (Some(Role::Loop), _) if !has_ended => self.count(context, id),
@@ -236,6 +244,16 @@ impl Window {
         for id in held {
             self.waits.enqueue(&mut self.graph, id);
         }
+    }
+
+    /// These are the breakpoints from now on.
+    pub(crate) fn break_at(&mut self, program: &Program, breakpoints: Vec<String>) {
+        self.hold.break_at(program, breakpoints);
+    }
+
+    /// As [`crate::executive::Executive::breakpoints`].
+    pub(crate) fn breakpoints(&self) -> &[String] {
+        self.hold.breakpoints()
     }
 
     /// What every instance that has not begun waits for.

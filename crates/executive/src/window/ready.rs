@@ -49,7 +49,7 @@ impl Window {
         if node.not_before > context.now {
             return Readiness::Waits(Wait::Backoff);
         }
-        if is_pia && !self.hold.lets_begin() {
+        if is_pia && !self.hold.lets_begin(instance.id, instance.state) {
             return Readiness::Waits(Wait::Pause);
         }
         if node.crashes > 0

@@ -157,6 +157,7 @@ impl Timeline {
             Event::PauseRequested
             | Event::ResumeRequested
             | Event::StepRequested
+            | Event::BreakpointsSet { .. }
             | Event::Answered { .. }
             | Event::AbortRequested { .. } => Cause::Operator,
             Event::Signalled { signal, .. } => Cause::Signal(signal.as_str().into()),
@@ -199,7 +200,8 @@ impl Timeline {
                 self.steps += 1;
             }
             Event::ResumeRequested => self.goes_on(at),
-            Event::Projected { .. }
+            Event::BreakpointsSet { .. }
+            | Event::Projected { .. }
             | Event::Progressed { .. }
             | Event::WorldChanged { .. }
             | Event::RetirementFailed { .. }
@@ -267,6 +269,7 @@ impl Timeline {
             Note::Expanded { instance, .. }
             | Note::Decided { instance, .. }
             | Note::Running { instance, .. }
+            | Note::Stopped { instance }
             | Note::Awaiting { instance, .. }
             | Note::Finished { instance, .. }
             | Note::Retired { instance }
@@ -289,6 +292,7 @@ impl Timeline {
                 }
             }
             Note::Running { .. } => {}
+            Note::Stopped { .. } => _ = self.paused.get_or_insert(at),
             Note::Awaiting { awaited, .. } => self.known(id, at).awaits = Some(awaited.to_string()),
             Note::Finished { outcome, .. } => {
                 let instance = self.known(id, at);
@@ -430,6 +434,7 @@ fn instance_of(event: &Event) -> Option<InstanceId> {
         | Event::PauseRequested
         | Event::ResumeRequested
         | Event::StepRequested
+        | Event::BreakpointsSet { .. }
         | Event::Advised { .. }
         | Event::WorldChanged { .. }
         | Event::Signalled { .. }

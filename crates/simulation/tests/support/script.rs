@@ -123,6 +123,8 @@ struct Outside {
     signal: Option<String>,
     value: Option<toml::Value>,
     #[serde(default)]
+    states: Vec<String>,
+    #[serde(default)]
     facts: BTreeMap<String, toml::Value>,
     #[serde(default)]
     gone: Vec<String>,
@@ -185,6 +187,7 @@ impl Outside {
             "pause" => Event::PauseRequested,
             "resume" => Event::ResumeRequested,
             "step" => Event::StepRequested,
+            "break" => Event::BreakpointsSet { states: self.states.clone() },
             "abort" => Event::AbortRequested { reason: "the user wants it so".to_owned() },
             "world" => {
                 let set = self.facts.iter().map(|(key, v)| (fact(key), Some(value(v))));
@@ -207,7 +210,7 @@ impl Outside {
                 let instance = holders.find(|instance| paths[instance] == path).unwrap();
                 Event::Crashed { instance, attempt: 1, reason: "its lease was lost".to_owned() }
             }
-            other => panic!("event: pause, resume, step, abort, world, signal or lease_lost, not {other}"),
+            other => panic!("event: pause, resume, step, break, abort, world, signal or lease_lost, not {other}"),
         }
     }
 }

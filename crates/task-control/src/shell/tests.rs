@@ -40,6 +40,7 @@ impl Bench {
             seed: 1,
             learned: Learned::default(),
             log: directory.path().join("log.jsonl"),
+            breakpoints: Vec::new(),
             quiet: true,
             checkpoint_every: 0,
         };
