@@ -128,6 +128,9 @@ mod tests {
         hold.step();
         assert!(hold.lets_begin(first, STATE));
         hold.has_begun(first);
-        assert!(!hold.lets_begin(other, StateId(0)) && !hold.stops_at(other, StateId(0)), "it is the pause of the step");
+        assert!(
+            !hold.lets_begin(other, StateId(0)) && !hold.stops_at(other, StateId(0)),
+            "it is the pause of the step"
+        );
     }
 }

@@ -254,7 +254,11 @@ impl Progress {
                 }
                 Command::Note(Note::Stopped { instance }) => {
                     let path = self.path(*instance);
-                    say(&mut lines, at, &format!("stop   {path}  at its breakpoint; go on with `ratn control resume` or `step`"));
+                    say(
+                        &mut lines,
+                        at,
+                        &format!("stop   {path}  at its breakpoint; go on with `ratn control resume` or `step`"),
+                    );
                 }
                 Command::Note(Note::Finished { instance, outcome }) if waited.contains(instance) => {
                     let took = self.started.remove(instance).map_or(0.0, |s| at.since(s).as_secs_f64());

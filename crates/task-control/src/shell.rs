@@ -395,7 +395,11 @@ impl Shell {
             }
             Some(path) => {
                 if !states.contains(&path) {
-                    let there = if states.is_empty() { "there is none".to_owned() } else { format!("there is {}", states.join(", ")) };
+                    let there = if states.is_empty() {
+                        "there is none".to_owned()
+                    } else {
+                        format!("there is {}", states.join(", "))
+                    };
                     return Err(format!("there is no breakpoint at `{path}`: {there}"));
                 }
                 states.retain(|other| *other != path);

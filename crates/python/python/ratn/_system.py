@@ -372,6 +372,14 @@ class Run:
         """One such state begins, then the run pauses again."""
         return self._control("step")
 
+    def break_at(self, state: str) -> str:
+        """The run pauses before a state that acts, at this path or inside of it, begins (``for_box/grasp``); :meth:`resume` and :meth:`step` let it go on."""
+        return self._tell(["control", "break", state])
+
+    def clear(self, state: str | None = None) -> str:
+        """Takes the breakpoint at a state away, or all."""
+        return self._tell(["control", "clear", *([] if state is None else [state])])
+
     def resume(self) -> str:
         """Ends a pause."""
         return self._control("resume")

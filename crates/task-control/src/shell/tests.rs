@@ -161,6 +161,55 @@ async fn over_grpc(place: &Place) {
     assert_eq!(said, "it is kept for the next state that waits for `later`");
 }
 
+fn breakpoint(state: Option<&str>, set: bool) -> Message {
+    Message::Breakpoint { run: ANY_RUN.to_owned(), state: state.map(str::to_owned), set }
+}
+
+#[tokio::test]
+async fn a_run_stops_at_its_breakpoints_until_it_is_let_go() -> anyhow::Result<()> {
+    use crate::control::{Word, tell};
+    const TWO: &str = "
+task: two
+states:
+  - first: { wait: { seconds: 0.1 } }
+  - second: { states: [{ inner: { wait: { seconds: 0.1 } } }] }
+  - name: { condition: true, then: [], else: [] }
+";
+    let mut bench = Bench::new(|two| *two = program(TWO)).await?;
+    bench.run.breakpoints = breakpoints(&bench.run.program, &["first".to_owned()]).map_err(anyhow::Error::msg)?;
+    let place = &bench.place;
+    let (_asks, interrupt) = Interrupt::new();
+    let stopped = async |ended: u64| loop {
+        let status = crate::control::status(&place.directory).await.ok().flatten();
+        if status.is_some_and(|status| status.paused && status.ended >= ended) {
+            break;
+        }
+        tokio::task::yield_now().await;
+    };
+    let telling = async {
+        stopped(0).await;
+        let unknown = sent(place, breakpoint(Some("secnod"), true)).await.expect_err("there is none");
+        assert!(unknown.contains("two has no state `secnod`: did you mean `second`?"), "{unknown}");
+        let quiet = sent(place, breakpoint(Some("name"), true)).await.expect_err("it never stops there");
+        assert!(quiet.contains("`name` changes nothing"), "{quiet}");
+        let set = sent(place, breakpoint(Some("second[3]/inner"), true)).await;
+        assert_eq!(set, Ok("the run pauses before first, second/inner".to_owned()));
+        assert_eq!(
+            sent(place, breakpoint(Some("first"), false)).await,
+            Ok("the run pauses before second/inner".to_owned())
+        );
+        tell(&place.directory, Word::Resume).await.expect("it listens");
+        stopped(1).await;
+        let none = sent(place, breakpoint(Some("first"), false)).await.expect_err("it was taken away");
+        assert!(none.contains("no breakpoint at `first`: there is second/inner"), "{none}");
+        assert_eq!(sent(place, breakpoint(None, false)).await, Ok("no breakpoints are set any more".to_owned()));
+        tell(&place.directory, Word::Resume).await.expect("it listens");
+    };
+    let (ended, ()) = tokio::join!(run(bench.run.clone(), place, &interrupt), telling);
+    assert_eq!(ended?.outcome, SUCCESS);
+    Ok(())
+}
+
 #[tokio::test]
 async fn a_run_that_waits_has_what_it_was_sent_also_after_it_was_killed() -> anyhow::Result<()> {
     let mut bench = Bench::new(|waiting| *waiting = program(WAITING)).await?;
