@@ -426,7 +426,7 @@ mod tests {
             revision: Revision(3),
             capacity: Default::default(),
             learned: Default::default(),
-            breakpoints: Vec::new(),
+            breakpoints: Box::default(),
             origin: Default::default(),
         }
     }

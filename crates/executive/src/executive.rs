@@ -82,7 +82,7 @@ impl Executive {
                     let window =
                         || Window::new(&self.program, &self.plan, &parameters, capacity, learned, self.tolerance);
                     let window = (mode == Mode::Cdtn).then(|| Box::new(window()));
-                    self.start(now, window, &parameters, breakpoints, &mut commands);
+                    self.start(now, window, &parameters, breakpoints.into_vec(), &mut commands);
                 }
             }
             event => self.step(now, event, &mut commands),

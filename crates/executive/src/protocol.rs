@@ -99,8 +99,8 @@ pub enum Event {
         #[serde(default)]
         learned: Learned,
         /// The breakpoints that it begins with, as in [`Event::BreakpointsSet`].
-        #[serde(default, skip_serializing_if = "Vec::is_empty")]
-        breakpoints: Vec<String>,
+        #[serde(default, skip_serializing_if = "<[String]>::is_empty")]
+        breakpoints: Box<[String]>,
         /// Which run this is.
         #[serde(default)]
         origin: Origin,

@@ -35,7 +35,7 @@ fn goals(states: &str, n: i64) -> usize {
         revision: Revision(0),
         capacity: BTreeMap::new(),
         learned: Learned::default(),
-        breakpoints: Vec::new(),
+        breakpoints: Box::default(),
         origin: Default::default(),
     };
     let mut goals = 0;

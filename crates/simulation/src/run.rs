@@ -262,7 +262,7 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
             revision: simulation.root.revision(),
             capacity: setup.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
             learned,
-            breakpoints: Vec::new(),
+            breakpoints: Box::default(),
             origin: Origin::default(),
         },
     );

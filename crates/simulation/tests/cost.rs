@@ -178,7 +178,7 @@ fn started(program: &Program) -> Event {
         revision: Revision(0),
         capacity: BTreeMap::new(),
         learned: Learned::default(),
-        breakpoints: Vec::new(),
+        breakpoints: Box::default(),
         origin: Origin::default(),
     }
 }

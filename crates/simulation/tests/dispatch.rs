@@ -40,7 +40,7 @@ impl Begun {
             revision: Revision(0),
             capacity: BTreeMap::from([("Brain".to_owned(), Quantity::whole(2))]),
             learned: Learned { durations_s, ..Learned::default() },
-            breakpoints: Vec::new(),
+            breakpoints: Box::default(),
             origin: Origin::default(),
         };
         let (asked, paths, attempts) = Default::default();

@@ -186,7 +186,7 @@ impl Bench {
             revision: Revision(0),
             capacity: BTreeMap::new(),
             learned: Learned::default(),
-            breakpoints: Vec::new(),
+            breakpoints: Box::default(),
             origin: Origin::default(),
         });
         bench

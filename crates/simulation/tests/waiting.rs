@@ -27,7 +27,7 @@ fn begun(task: &str, mode: Mode) -> (Executive, Vec<Command>) {
         revision: Revision(0),
         capacity: BTreeMap::new(),
         learned: Learned::default(),
-        breakpoints: Vec::new(),
+        breakpoints: Box::default(),
         origin: Origin::default(),
     };
     let mut executive = Executive::new(Arc::new(program), Tolerance::ROBOT);

@@ -150,7 +150,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
             revision,
             capacity: place.catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
             learned: run.learned,
-            breakpoints: run.breakpoints,
+            breakpoints: run.breakpoints.into_boxed_slice(),
             origin: Origin {
                 run: id,
                 version: VERSION.to_owned(),

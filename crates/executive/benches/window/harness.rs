@@ -186,7 +186,7 @@ pub fn started(world: Vec<(FactKey, Value)>) -> Event {
         revision: Revision(0),
         capacity: BTreeMap::new(),
         learned: Learned::default(),
-        breakpoints: Vec::new(),
+        breakpoints: Box::default(),
         origin: Default::default(),
     }
 }

@@ -73,6 +73,14 @@ impl Window {
         true
     }
 
+    /// It has its resources, and keeps them where the operator lets it not begin.
+    pub(super) fn proceed_unless_held_back(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        if self.is_held_back(context, id) {
+            return self.wait(id, Wait::Pause);
+        }
+        self.proceed(context, id);
+    }
+
     /// It never began and never will.
     pub(super) fn fail(&mut self, context: &mut Context<'_>, id: InstanceId, reason: String) {
         context.note(Note::Finished { instance: id, outcome: ABORTED.into() });
@@ -222,10 +230,7 @@ impl Window {
                     return self.in_routine(context, Event::Granted { instance: id, lease });
                 }
                 self.graph.grant(id, Some(lease), context.now);
-                if self.is_held_back(context, id) {
-                    return self.wait(id, Wait::Pause);
-                }
-                self.proceed(context, id);
+                self.proceed_unless_held_back(context, id);
             }
             Event::Refused { instance: id, reason } => {
                 if !matches!(self.status(id), Some(Status::Acquiring { .. })) {
