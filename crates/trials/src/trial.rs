@@ -263,7 +263,7 @@ fn circumstances(program: &Program, conditions: &Conditions) -> Circumstances {
     let percent = conditions.mischief_percent;
     Circumstances {
         orders: conditions.orders,
-        events: if conditions.pauses { pauses(seed) } else { Vec::new() },
+        events: if conditions.pauses { pauses(program, seed) } else { Vec::new() },
         mischief: Mischief { seed, twice_percent: percent, late_percent: percent, crossing_percent: 2 * percent },
         // Long programs are not examined, which would take minutes.
         checks: !is_long(program),
@@ -333,9 +333,11 @@ fn checkpoint_every(seed: u64) -> NonZeroUsize {
     some.saturating_add(Dice(seed ^ 0xc4ec).below(30) as usize)
 }
 
-/// A pause, a step and what ends both.
-fn pauses(seed: u64) -> Vec<(Trigger, Event)> {
+/// A pause, a step, breakpoints, and what ends them.
+fn pauses(program: &Program, seed: u64) -> Vec<(Trigger, Event)> {
     let mut dice = Dice(seed ^ 0xbea7);
+    let mut some = Dice(seed ^ 0xb4ea);
+    let states = program.states.iter().filter(|_| some.percent(30)).map(|state| state.path.clone()).collect();
     let mut at = 0.0;
     let mut later = |event: Event| {
         at += dice.below(60) as f64 / 10.0;
@@ -346,6 +348,11 @@ fn pauses(seed: u64) -> Vec<(Trigger, Event)> {
         later(Event::StepRequested),
         later(Event::ResumeRequested),
         later(Event::PauseRequested),
+        later(Event::BreakpointsSet { states }),
+        later(Event::ResumeRequested),
+        later(Event::ResumeRequested),
+        later(Event::StepRequested),
+        later(Event::BreakpointsSet { states: Vec::new() }),
         later(Event::ResumeRequested),
     ]
 }
