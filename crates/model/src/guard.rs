@@ -188,7 +188,7 @@ impl Unfolding<'_> {
         }
         self.at(around).annotations.duration_s = self.at(body).annotations.duration_s.clone();
         let (preemptive, decide, outputs) = (true, Vec::new(), Vec::new());
-        self.at(around).kind = StateKind::Concurrency { regions, preemptive, decide, outputs };
+        self.at(around).kind = StateKind::Concurrency { regions, preemptive, successes: None, decide, outputs };
         Ok(around)
     }
 
@@ -240,8 +240,8 @@ impl Unfolding<'_> {
             StateKind::While { predicate, body_first, index, body } => {
                 StateKind::While { predicate, body_first, index, body: listed(&body)? }
             }
-            StateKind::Concurrency { regions, preemptive, decide, outputs } => {
-                StateKind::Concurrency { regions: listed(&regions)?, preemptive, decide, outputs }
+            StateKind::Concurrency { regions, preemptive, successes, decide, outputs } => {
+                StateKind::Concurrency { regions: listed(&regions)?, preemptive, successes, decide, outputs }
             }
             StateKind::Condition { predicate, then, otherwise } => {
                 StateKind::Condition { predicate, then: listed(&then)?, otherwise: listed(&otherwise)? }

@@ -174,8 +174,11 @@ pub enum StateKind {
     Concurrency {
         /// The regions; their order means nothing.
         regions: Vec<StateId>,
-        /// The first region that ends preempts the others, and its outcome is the outcome; else all are waited for.
+        /// Regions that still go on when it ends are preempted: when the first has ended, whose outcome is the outcome, or with `successes`;
+        /// else all are waited for.
         preemptive: bool,
+        /// With `preemptive`: it ends when so many regions have succeeded, or so many can no longer succeed.
+        successes: Option<u32>,
         /// The decider: the first outcome whose boolean holds. Where none does: `success` if all regions succeeded, `aborted` if
         /// one aborted, else `preempted`.
         decide: Vec<(String, Expr)>,
@@ -430,9 +433,9 @@ impl Program {
             };
             state.outcomes.iter().for_each(|name| add(&mut own, name));
             let decides = match &state.kind {
-                StateKind::Concurrency { decide, preemptive, .. } => {
+                StateKind::Concurrency { decide, preemptive, successes, .. } => {
                     decide.iter().for_each(|(name, _)| add(&mut own, name));
-                    !preemptive || !decide.is_empty()
+                    !preemptive || successes.is_some() || !decide.is_empty()
                 }
                 _ => false,
             };

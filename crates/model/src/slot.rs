@@ -280,7 +280,7 @@ mod tests {
             name: "both".to_owned(),
             path: "both".to_owned(),
             parent: Some(Program::ROOT),
-            kind: StateKind::Concurrency { regions: Vec::new(), preemptive: false, decide, outputs },
+            kind: StateKind::Concurrency { regions: Vec::new(), preemptive: false, successes: None, decide, outputs },
             outcomes: Vec::new(),
             transitions: Default::default(),
             variables: vec![("v".to_owned(), number(3))],

@@ -56,8 +56,11 @@ fn kind(state: &State) -> String {
         StateKind::While { predicate, body_first, index, .. } => {
             format!("{}{} {predicate}", if *body_first { "do while" } else { "while" }, with_index(index))
         }
-        StateKind::Concurrency { preemptive, decide, outputs: declared, .. } => {
-            let kind = if *preemptive { "preemptive" } else { "barrier" };
+        StateKind::Concurrency { preemptive, successes, decide, outputs: declared, .. } => {
+            let kind = match successes {
+                Some(wanted) => format!("{wanted} of the regions"),
+                None => if *preemptive { "preemptive" } else { "barrier" }.to_owned(),
+            };
             format!("{kind} decide {{{}}}{}", pairs(decide), arrow(declared))
         }
         StateKind::Condition { predicate, .. } => format!("if {predicate}"),

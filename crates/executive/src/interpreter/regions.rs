@@ -35,9 +35,19 @@ impl Interpreter {
     pub(super) fn may_join(&self, program: &Program, state: StateId, regions: &[u64]) -> bool {
         let mut ended = regions.iter().map(|region| self.region_end(*region).is_some());
         match program.state(state).kind {
+            StateKind::Concurrency { successes: Some(wanted), .. } => {
+                let going_on = ended.filter(|ended| !ended).count();
+                let succeeded = self.succeeded(regions);
+                succeeded >= wanted as usize || succeeded + going_on < wanted as usize
+            }
             StateKind::Concurrency { preemptive: true, .. } => regions.is_empty() || ended.any(|ended| ended),
             _ => ended.all(|ended| ended),
         }
+    }
+
+    /// How many regions have ended with success.
+    fn succeeded(&self, regions: &[u64]) -> usize {
+        regions.iter().filter(|region| self.region_end(**region).is_some_and(|(outcome, _)| outcome == SUCCESS)).count()
     }
 
     /// How a region has ended, and why.
@@ -51,9 +61,11 @@ impl Interpreter {
     /// The regions have ended: their outcomes decide.
     pub(super) fn join(&mut self, context: &mut Context<'_>, thread: u64, id: StateId, path: String, regions: &[u64]) {
         let program = context.program;
-        let StateKind::Concurrency { regions: states, decide, preemptive, .. } = &program.state(id).kind else {
+        let StateKind::Concurrency { regions: states, decide, preemptive, successes, .. } = &program.state(id).kind
+        else {
             return;
         };
+        let enough = successes.map(|wanted| self.succeeded(regions) >= wanted as usize);
         let first = regions.iter().position(|region| self.region_end(*region).is_some());
         let mut outcomes = Vec::new();
         let mut reasons = Vec::new();
@@ -90,11 +102,16 @@ impl Interpreter {
             }
         }
         let outcome = decision.unwrap_or_else(|| match first {
+            _ if enough == Some(true) => SUCCESS.to_owned(),
+            _ if enough == Some(false) => ABORTED.to_owned(),
             Some(first) if *preemptive && decide.is_empty() => outcomes[first].clone(),
             _ if outcomes.iter().all(|outcome| outcome == SUCCESS) => SUCCESS.to_owned(),
             _ if outcomes.iter().any(|outcome| outcome == ABORTED || outcome == VIOLATED) => ABORTED.to_owned(),
             _ => PREEMPTED.to_owned(),
         });
+        if enough == Some(true) && outcome == SUCCESS {
+            reason.clear();
+        }
         self.decided(context, &path, outcome.clone());
         self.exit(context, thread, id, &path, base, outcome, reason);
     }

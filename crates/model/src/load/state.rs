@@ -149,12 +149,24 @@ fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
             StateKind::While { predicate, body_first, index: index.clone(), body: body.clone() }
         }
         Form::Concurrency { kind, regions } => {
-            let preemptive = match &kind.content {
-                Content::Text(text) if text == "barrier" => false,
-                Content::Text(text) if text == "preemptive" => true,
+            let (preemptive, successes) = match &kind.content {
+                Content::Text(text) if text == "barrier" => (false, None),
+                Content::Text(text) if text == "preemptive" => (true, None),
+                Content::Int(n) if (1..=regions.len() as i64).contains(n) => (true, u32::try_from(*n).ok()),
+                Content::Int(n) => {
+                    let message = format!("{n} of {} regions cannot succeed", regions.len());
+                    fields.error(
+                        "invalid-state",
+                        kind.at,
+                        message,
+                        "say 1 or more, and no more than there are regions",
+                    );
+                    (false, None)
+                }
                 _ => {
-                    fields.error("invalid-state", kind.at, "`concurrency` is `barrier` or `preemptive`", "");
-                    false
+                    let message = "`concurrency` is `barrier`, `preemptive`, or how many regions have to succeed";
+                    fields.error("invalid-state", kind.at, message, "");
+                    (false, None)
                 }
             };
             let decide = flow::decide(fields, step.body);
@@ -162,7 +174,7 @@ fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
             let node = step.body.get("outputs");
             let outputs = node.map(|node| task_outputs(fields, node)).unwrap_or_default();
             fields.view.inside = false;
-            StateKind::Concurrency { regions: regions.clone(), preemptive, decide, outputs }
+            StateKind::Concurrency { regions: regions.clone(), preemptive, successes, decide, outputs }
         }
         Form::Wait { node, asks } => wait::kind(fields, node, *asks),
         // Its states are put below it when all states are there.

@@ -278,6 +278,6 @@ def until(condition: object = None, *, index: str | None = None, name: str | Non
     return _loop("until", "until", condition, index, name, annotations)
 
 
-def concurrently(kind: str = "barrier", *, name: str | None = None, **annotations: Any) -> Concurrency:
-    """Regions: each state inside is one. ``barrier`` waits for all, ``preemptive`` ends with the first."""
+def concurrently(kind: str | int = "barrier", *, name: str | None = None, **annotations: Any) -> Concurrency:
+    """Regions: each state inside is one. ``barrier`` waits for all, ``preemptive`` ends with the first, a number as soon as so many have succeeded."""
     return Concurrency("concurrently", name, annotations, {"concurrency": kind}, "concurrency")

@@ -111,6 +111,8 @@ impl Maker {
             )
         };
         let (first, last) = (regions[0], regions[regions.len() - 1]);
+        let successes = (preemptive && self.features.watched && self.dice.percent(50))
+            .then(|| 1 + self.dice.below(regions.len() as u64) as u32);
         let mut decide = Vec::new();
         if self.dice.percent(50) {
             decide.push((FOUND.to_owned(), ended(first, FOUND)));
@@ -137,7 +139,7 @@ impl Maker {
             value.map(|value| TaskOutput { name: "x".to_owned(), ty: Type::Any, value }).into_iter().collect();
         let mut outcomes: Vec<String> =
             decide.iter().map(|(name, _)| name.clone()).filter(|name| name != SUCCESS).collect();
-        if preemptive && decide.is_empty() {
+        if preemptive && successes.is_none() && decide.is_empty() {
             outcomes = regions.iter().flat_map(|id| self.states[id.0 as usize].outcomes.clone()).collect();
             outcomes.sort();
             outcomes.dedup();
@@ -148,6 +150,6 @@ impl Maker {
         state.outcomes = outcomes;
         state.assign = assign;
         state.annotations = annotations;
-        StateKind::Concurrency { regions, preemptive, decide, outputs }
+        StateKind::Concurrency { regions, preemptive, successes, decide, outputs }
     }
 }
