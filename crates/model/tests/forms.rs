@@ -186,7 +186,7 @@ states:
     );
     let program = program(&source);
     let both = state(&program, "both");
-    let StateKind::Concurrency { regions, preemptive, decide, outputs } = &both.kind else { panic!("a concurrency") };
+    let StateKind::Concurrency { regions, preemptive, decide, outputs, .. } = &both.kind else { panic!("a concurrency") };
     assert_eq!((regions.len(), *preemptive, both.annotations.routine), (2, false, false));
     assert_eq!(bound(decide), "lost: s2.outcome = empty and exists at(cup), success: s3.outcome in [success, aborted]");
     assert_eq!((outputs[0].name.as_str(), both.defaults["found"].to_string().as_str()), ("found", "0"));
@@ -211,7 +211,7 @@ fn a_region_leads_nowhere_and_its_outcome_is_seen_where_all_have_ended() {
     "#);
     assert_snapshot!(both("", "decide: { aborted: left.outcom = aborted }"), @"task.yaml:3:157: error[unknown-port] in both: state `left` has no output port `outcom`. help: there is `found`");
     assert_snapshot!(findings("task: t\nstates:\n  - a: { concurrency: all, regions: [], decide: [a] }\n  - b: { states: [], shared: ['at(?)'] }\n"), @r#"
-    task.yaml:3:23: error[invalid-state] in a: `concurrency` is `barrier` or `preemptive`
+    task.yaml:3:23: error[invalid-state] in a: `concurrency` is `barrier`, `preemptive`, or how many regions have to succeed
     task.yaml:3:49: error[invalid-state] in a: `decide` is a mapping, found a list. help: write `decide: { failed: left.outcome = aborted }`
     task.yaml:4:30: error[invalid-state] in b: `shared` is what two regions may both touch. help: say it of a region of a `concurrency`
     "#);
