@@ -82,7 +82,7 @@ impl Hold {
 fn states_at(program: &Program, path: &str) -> impl Iterator<Item = StateId> {
     let is_in = |inner: &str, outer: &str| inner.strip_prefix(outer).is_some_and(|rest| rest.starts_with('/'));
     let meant = program.states.iter().filter(move |state| {
-        state.path == path || is_in(&state.path, path) || state.annotations.routine && is_in(path, &state.path)
+        state.path == path || is_in(&state.path, path) || state.is_routine() && is_in(path, &state.path)
     });
     meant.map(|state| state.id)
 }
@@ -92,7 +92,7 @@ pub(crate) fn stops_for(program: &Program, path: &str) -> bool {
     states_at(program, path).any(|id| {
         let state = program.state(id);
         let acts = matches!(state.kind, StateKind::Action { .. }) && state.annotations.nature == Nature::Irreversible;
-        acts || state.is_pause() || state.annotations.routine
+        acts || state.is_pause() || state.is_routine()
     })
 }
 

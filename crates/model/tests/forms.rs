@@ -186,7 +186,9 @@ states:
     );
     let program = program(&source);
     let both = state(&program, "both");
-    let StateKind::Concurrency { regions, preemptive, decide, outputs, .. } = &both.kind else { panic!("a concurrency") };
+    let StateKind::Concurrency { regions, preemptive, decide, outputs, .. } = &both.kind else {
+        panic!("a concurrency")
+    };
     assert_eq!((regions.len(), *preemptive, both.annotations.routine), (2, false, false));
     assert_eq!(bound(decide), "lost: s2.outcome = empty and exists at(cup), success: s3.outcome in [success, aborted]");
     assert_eq!((outputs[0].name.as_str(), both.defaults["found"].to_string().as_str()), ("found", "0"));
