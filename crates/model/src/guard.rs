@@ -180,7 +180,7 @@ impl Unfolding<'_> {
         self.outputs.push((around, body));
         self.at(body).outcomes.retain(|outcome| outcome != VIOLATED);
         // These ends are not the body's, which is cut short.
-        let ends = [(VIOLATED, !limits.holds.is_empty()), (ABORTED, limits.timeout_s.is_some())];
+        let ends = [(PREEMPTED, true), (VIOLATED, !limits.holds.is_empty()), (ABORTED, limits.timeout_s.is_some())];
         for (outcome, _) in ends.into_iter().filter(|(_, ends)| *ends) {
             if let Some(effects) = self.at(body).annotations.effects.remove(outcome) {
                 self.at(around).annotations.effects.insert(outcome.to_owned(), effects);

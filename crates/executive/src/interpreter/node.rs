@@ -134,7 +134,10 @@ impl Interpreter {
         if let Some(current) = self.current(thread) {
             current.lease = Some(lease);
         }
-        self.go_on(context, thread);
+        // While it waited for them, somebody else may have changed what it requires.
+        if self.may_try(context, thread) {
+            self.go_on(context, thread);
+        }
     }
 
     /// It has its resources.
@@ -221,15 +224,20 @@ impl Interpreter {
         context.commands.push(Command::Start { instance, attempt, goal: Box::new(goal) });
     }
 
-    /// It ends `aborted` without having done anything (more).
+    /// It ends `aborted` without an answer: nothing more is said of the world.
     pub(super) fn end_node(&mut self, context: &mut Context<'_>, thread: u64, reason: String) {
+        self.end_unanswered(context, thread, ABORTED, reason);
+    }
+
+    /// It ends so, and nothing is said of the world: not even what the outcome declares.
+    pub(super) fn end_unanswered(&mut self, context: &mut Context<'_>, thread: u64, outcome: &str, reason: String) {
         let Some(current) = self.threads.get_mut(&thread).and_then(|thread| thread.current.take()) else { return };
-        context.note(Note::Finished { instance: current.instance, outcome: ABORTED.into() });
+        context.note(Note::Finished { instance: current.instance, outcome: outcome.into() });
         self.give_back(context, &current);
         if matches!(self.target, Target::Actual) {
             context.note(Note::Retired { instance: current.instance });
         }
-        self.ended(thread, current.state, ABORTED, format!("{}: {reason}", current.path));
+        self.ended(thread, current.state, outcome, format!("{}: {reason}", current.path));
     }
 
     pub(super) fn finish(&mut self, context: &mut Context<'_>, thread: u64, end: GoalEnd) {

@@ -67,6 +67,8 @@ impl Interpreter {
         };
         let enough = successes.map(|wanted| self.succeeded(regions) >= wanted as usize);
         let first = regions.iter().position(|region| self.region_end(*region).is_some());
+        let last = regions.last().and_then(|last| self.threads.get(last));
+        let is_entered = last.is_none_or(|last| !matches!(last.todo, Todo::Enter(..)) || last.frames.len() > 1);
         let mut outcomes = Vec::new();
         let mut reasons = Vec::new();
         for (region, state) in regions.iter().zip(states) {
@@ -113,6 +115,13 @@ impl Interpreter {
             reason.clear();
         }
         self.decided(context, &path, outcome.clone());
+        if outcome == VIOLATED && !is_entered {
+            // What is watched has not begun: it has changed nothing.
+            if let Some(thread) = self.threads.get_mut(&thread) {
+                thread.variables.truncate(base);
+            }
+            return self.ended(thread, id, outcome, reason);
+        }
         self.exit(context, thread, id, &path, base, outcome, reason);
     }
 

@@ -18,14 +18,15 @@ impl Interpreter {
         self.give_up_routines(context);
     }
 
-    /// Another region was first: what this one has under way is cancelled, and the composite states in which it is end
-    /// `preempted`, the innermost first.
+    /// Another region was first: what this one has under way is cancelled and ends `preempted`, then the composite states in which it is, the
+    /// innermost first.
     ///
     /// # Errors
     /// Why an effect that they declare for that could not be made.
     pub(super) fn preempt(&mut self, context: &mut Context<'_>, id: u64) -> Result<(), String> {
-        self.cancel(context, id);
-        let mut result = Ok(());
+        let cut = self.cancel(context, id);
+        // What that did to the world is said as for any end.
+        let mut result = cut.map_or(Ok(()), |(state, path)| self.leave_preempted(context, id, state, &path));
         let Some(thread) = self.threads.get_mut(&id) else { return result };
         let todo = std::mem::replace(&mut thread.todo, Todo::Busy);
         if let Todo::Join { state, path, regions } = todo {
@@ -62,12 +63,13 @@ impl Interpreter {
         changed.map_err(|problem| format!("{path}: {problem}"))
     }
 
-    /// Ends the action that a thread has under way.
-    fn cancel(&mut self, context: &mut Context<'_>, id: u64) {
-        let Some(current) = self.threads.get_mut(&id).and_then(|thread| thread.current.take()) else { return };
+    /// Ends the action that a thread has under way; its state and its path, where its goal had begun.
+    fn cancel(&mut self, context: &mut Context<'_>, id: u64) -> Option<(StateId, String)> {
+        let current = self.threads.get_mut(&id)?.current.take()?;
+        let has_begun = current.phase == Phase::Running && !context.program.state(current.state).is_pause();
         match current.phase {
             Phase::Held | Phase::Stalled | Phase::Backoff(_) => {}
-            Phase::Running if context.program.state(current.state).is_pause() => {}
+            Phase::Running if !has_begun => {}
             Phase::Acquiring => context.commands.push(Command::Withdraw { instance: current.instance }),
             Phase::Projecting | Phase::Running => {
                 context.commands.push(Command::Cancel { instance: current.instance, attempt: current.attempt });
@@ -75,5 +77,6 @@ impl Interpreter {
         }
         self.give_back(context, &current);
         context.note(Note::Squashed { instance: current.instance });
+        has_begun.then_some((current.state, current.path))
     }
 }

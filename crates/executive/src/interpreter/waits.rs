@@ -11,7 +11,7 @@ use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::VIOLATED;
 
 impl Interpreter {
-    /// Goes on until everything waits: what one thread has changed may be what another one waits for.
+    /// Goes on until everything waits, and nothing is over that waits.
     pub(super) fn go_on_with(&mut self, context: &mut Context<'_>) -> Progress {
         loop {
             let progress = self.advance(context);
@@ -56,7 +56,7 @@ impl Interpreter {
 
     /// Looks at what the world may end (waits, and motions that are watched) until one is over; whether one was. What its end leads to
     /// comes before the others are looked at.
-    fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
+    pub(super) fn look_at_waits(&mut self, context: &mut Context<'_>) -> bool {
         let waits = |(thread, current): (u64, &super::Current)| {
             let state = context.program.state(current.state);
             let may_end = state.is_pause() || !state.annotations.holds.is_empty();
@@ -88,7 +88,7 @@ impl Interpreter {
         true
     }
 
-    /// Ends an action of which a condition does not hold, before it begins or while it goes on; whether it did.
+    /// Ends an action of which a condition does not hold, before it begins (then it has changed nothing) or while it goes on; whether it did.
     pub(super) fn ends_violated(&mut self, context: &mut Context<'_>, thread: u64) -> bool {
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return false };
         let state = context.program.state(current.state);
@@ -96,12 +96,14 @@ impl Interpreter {
             return false;
         }
         let violated = self.with_scope(context, thread, None, |scope| binding::violated(state, scope));
-        if let (Ok(Some(_)) | Err(_), Phase::Running) = (&violated, current.phase) {
+        let has_begun = current.phase == Phase::Running;
+        if has_begun && !matches!(violated, Ok(None)) {
             context.commands.push(Command::Cancel { instance: current.instance, attempt: current.attempt });
         }
         match violated {
             Ok(None) => return false,
-            Ok(Some(reason)) => self.has_waited(context, thread, awaiting::cut_short(VIOLATED, reason)),
+            Ok(Some(reason)) if has_begun => self.has_waited(context, thread, awaiting::cut_short(VIOLATED, reason)),
+            Ok(Some(reason)) => self.end_unanswered(context, thread, VIOLATED, reason),
             Err(error) => self.end_node(context, thread, error.reason()),
         }
         true

@@ -10,17 +10,22 @@ use ratn_model::value::Value;
 use std::sync::Arc;
 
 impl Interpreter {
-    /// Lets every thread go on until all wait for events, or the state has ended.
+    /// Lets every thread go on until all wait for events, or the state has ended. What has ended is followed to where something begins; before
+    /// that, what the end has changed may be what another thread waits for, or what must hold for anything to begin.
     pub(super) fn advance(&mut self, context: &mut Context<'_>) -> Progress {
         loop {
-            let ready = self.threads.iter().find(|(id, thread)| match &thread.todo {
-                Todo::Enter(..) | Todo::Ended { .. } | Todo::Iterate => true,
-                Todo::Busy => false,
+            let follows = |thread: u64, todo: &Todo| match todo {
+                Todo::Ended { .. } | Todo::Iterate => true,
+                Todo::Enter(..) | Todo::Busy => false,
                 Todo::Join { state, regions, .. } => self.may_join(context.program, *state, regions),
-                Todo::Done { .. } => **id == MAIN,
-            });
-            let Some((id, _)) = ready else { return Progress::Busy };
-            let id = *id;
+                Todo::Done { .. } => thread == MAIN,
+            };
+            let id = match (self.first(follows), self.first(|_, todo| matches!(todo, Todo::Enter(..)))) {
+                (Some(id), _) => id,
+                (None, None) => return Progress::Busy,
+                (None, Some(_)) if self.look_at_waits(context) => continue,
+                (None, Some(id)) => id,
+            };
             let Some(thread) = self.threads.get_mut(&id) else { return Progress::Busy };
             match std::mem::replace(&mut thread.todo, Todo::Busy) {
                 Todo::Enter(state, path) => self.enter(context, id, state, path),
@@ -35,6 +40,11 @@ impl Interpreter {
                 return Progress::Ended { outcome: ABORTED.to_owned(), reason };
             }
         }
+    }
+
+    /// The first thread with such a thing to do.
+    fn first(&self, is_such: impl Fn(u64, &Todo) -> bool) -> Option<u64> {
+        self.threads.iter().find(|(id, thread)| is_such(**id, &thread.todo)).map(|(id, _)| *id)
     }
 
     /// A thread enters a state or begins an iteration; false if it has done so too often without starting anything.

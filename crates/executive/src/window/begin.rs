@@ -291,6 +291,10 @@ impl Window {
 
     /// What it reads is as it was when it asked: it gets its projection, then its goal starts.
     fn launch(&mut self, context: &mut Context<'_>, id: InstanceId, known: Option<Outputs>) {
+        // What ends before it begins is no step of the operator's.
+        if self.ends_violated(context, id) {
+            return;
+        }
         let Some(instance) = self.graph.get(id) else { return };
         let Some(node) = instance.node() else { return };
         let Status::Granted(held) = &node.status else { return };
@@ -339,10 +343,6 @@ impl Window {
             return self.begin_waiting(context, id);
         }
         let Some((provider, action)) = context.plan.state(instance.state).action.clone() else { return };
-        if self.ends_violated(context, id) {
-            return;
-        }
-        let Some(instance) = self.graph.get(id) else { return };
         let looked = self.look(context, id, None, |_, view| {
             let bound = match &known {
                 Some(inputs) => Ok(inputs.clone()),

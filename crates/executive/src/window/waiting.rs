@@ -10,7 +10,7 @@ use super::graph::instance::{Changed, Ended, Status};
 use super::waits::Timer;
 use crate::awaiting::{self, WaitEnd};
 use crate::binding::{self, Bindings, Outputs};
-use crate::context::Context;
+use crate::context::{Context, Made};
 use crate::protocol::{Awaited, Command, Event, Note};
 use ratn_model::expression::Scope;
 use ratn_model::fact::Footprint;
@@ -105,9 +105,13 @@ impl Window {
             Some(Err(error)) => Ended::aborted(error.reason()),
             Some(Ok(None)) | None => return false,
         };
-        if let Some(node) = instance.node().filter(|node| node.status.is_running()) {
-            context.commands.push(Command::Cancel { instance: id, attempt: node.attempt });
-        }
+        let ended = match instance.node().filter(|node| node.status.is_running()) {
+            Some(node) => {
+                context.commands.push(Command::Cancel { instance: id, attempt: node.attempt });
+                ended
+            }
+            None => Ended { changes: Changed::Exactly(Made::default()), ..ended },
+        };
         self.finish(context, id, ended);
         true
     }

@@ -436,7 +436,11 @@ impl Parser<'_> {
                 let (fact, below) = self.fact()?;
                 return self.node(Expr::Exists(fact), below);
             }
-            "find" if self.finds() => return self.find(at),
+            "find" if self.finds() && self.queries == 0 => return self.find(at),
+            "find" if self.finds() => {
+                let message = "a `find` stands in no other query; let a variable have what it finds, and say `?name in $variable` or `len($variable)` here";
+                return Err(ParseError::syntax(at, message));
+            }
             _ if KEYWORDS.contains(&word) => {
                 return Err(self.unexpected(&format!("expected a value, found the keyword `{word}`")));
             }
@@ -542,11 +546,11 @@ impl Parser<'_> {
         Ok((conditions, below))
     }
 
-    /// Whether this is `find(?name, …`: outside of a query a variable stands nowhere else.
+    /// Whether this is `find(?name …`: no fact is called so.
     fn finds(&self) -> bool {
         let begins = [Some(&Token::Symbol("(")), Some(&Token::Symbol("?"))];
         let next = |ahead: usize| self.tokens.get(self.next + ahead).map(|(_, token)| token);
-        self.queries == 0 && [next(1), next(2)] == begins && matches!(next(3), Some(Token::Word(_)))
+        [next(1), next(2)] == begins && matches!(next(3), Some(Token::Word(_)))
     }
 
     /// `find(?name, …, condition, …)`

@@ -149,6 +149,13 @@ fn fallback(node: &mut Node, name: &str, findings: &mut Findings) {
             findings.error("invalid-state", way.at, name, "each state of a `fallback` has a name", help);
             continue;
         }
+        if let Some(outcome) = names[number].as_deref().filter(|name| [SUCCESS, ABORTED].contains(name)) {
+            let message = format!(
+                "a state of a `fallback` is not called `{outcome}`: success leads out, and what fails to the next one"
+            );
+            findings.error("invalid-state", way.at, name, message, "give it another name");
+            continue;
+        }
         let next = names.get(number + 1).cloned().flatten();
         let Content::Map(way) = &mut way.content else { continue };
         let Some(body) = way.first_mut().map(|entry| &mut entry.value) else { continue };
