@@ -49,10 +49,11 @@ impl Live {
     pub(crate) fn follow(log: &Path, way: Way, speed: f64, directory: &Path) -> Live {
         let (end, ends) = channel();
         let log: PathBuf = log.to_owned();
-        let can_answer = way == Way::Painted && std::io::stdin().is_terminal() && answers::listen(directory);
+        let is_typed_on = way == Way::Painted && std::io::stdin().is_terminal();
+        let answered = is_typed_on.then(|| directory.to_owned());
         let follow = move || {
             let run = Timeline::following(KEPT);
-            let questions = Questions::new(can_answer);
+            let questions = Questions::new(answered);
             let mut painter = Painter { way, speed, run, questions, heard: (Instant::now(), 0.0) };
             let mut tail = Tail::of(&log);
             loop {

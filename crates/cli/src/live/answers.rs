@@ -3,12 +3,15 @@
 use crate::output;
 use nix::errno::Errno;
 use nix::sys::signal::{SigSet, Signal};
-use ratn_executive::protocol::{Awaited, Command, LogEntry, LogLine, Note};
+use nix::sys::termios::{FlushArg, tcflush};
+use ratn_executive::protocol::{Awaited, Command, Event, LogEntry, LogLine, Note};
 use ratn_model::id::InstanceId;
-use ratn_task_control::control::{self, ANY_RUN, Message};
+use ratn_task_control::control::{self, Message};
 use std::collections::BTreeMap;
 use std::io::BufRead;
-use std::path::Path;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 /// A run in the background of its shell reads nothing; so often it is looked whether it is in the foreground again.
@@ -18,22 +21,44 @@ const IN_BACKGROUND: Duration = Duration::from_secs(1);
 #[derive(Debug, Default)]
 pub(super) struct Questions {
     open: BTreeMap<InstanceId, (String, Vec<String>)>,
-    can_answer: bool,
+    /// The run, once its log says it.
+    run: String,
+    /// The system whose run is answered by what is typed, until somebody listens.
+    directory: Option<PathBuf>,
+    typing: Option<Arc<Typing>>,
     has_changed: bool,
 }
 
+/// What whoever reads the terminal tells whoever paints on it.
+#[derive(Debug, Default)]
+struct Typing {
+    /// A line was typed, and what was said of it stands where the questions were.
+    has_come: AtomicBool,
+    /// Nothing more will be read.
+    is_over: AtomicBool,
+}
+
 impl Questions {
-    pub(super) fn new(can_answer: bool) -> Questions {
-        Questions { can_answer, ..Questions::default() }
+    /// What is typed on this terminal answers the run of the system in `directory`; `None`: nobody types.
+    pub(super) fn new(directory: Option<PathBuf>) -> Questions {
+        Questions { directory, ..Questions::default() }
     }
 
     /// A line of the log.
     pub(super) fn follow(&mut self, line: &LogLine) {
-        let LogEntry::Command(Command::Note(note)) = &line.entry else { return };
+        let note = match &line.entry {
+            LogEntry::Event(Event::Started { origin, .. }) => return origin.run.clone_into(&mut self.run),
+            LogEntry::Command(Command::Note(note)) => note,
+            _ => return,
+        };
         match note {
             Note::Awaiting { instance, awaited: Awaited::Answer { question, choices, .. }, .. } => {
                 self.open.insert(*instance, (question.clone(), choices.clone()));
                 self.has_changed = true;
+                // Before the first question nothing is read: what is typed then is for the shell.
+                if let Some(directory) = self.directory.take() {
+                    self.typing = listen(directory, self.run.clone());
+                }
             }
             Note::Finished { instance, .. } | Note::Squashed { instance } => {
                 self.has_changed |= self.open.remove(instance).is_some();
@@ -44,12 +69,18 @@ impl Questions {
 
     /// Whether what is painted stays as it is: somebody may be typing.
     pub(super) fn keep_still(&mut self) -> bool {
-        self.can_answer && !self.open.is_empty() && !std::mem::take(&mut self.has_changed)
+        let has_come = self.typing.as_ref().is_some_and(|typing| typing.has_come.swap(false, Ordering::Relaxed));
+        let has_changed = std::mem::take(&mut self.has_changed) || has_come;
+        self.can_answer() && !self.open.is_empty() && !has_changed
+    }
+
+    fn can_answer(&self) -> bool {
+        self.typing.as_ref().is_some_and(|typing| !typing.is_over.load(Ordering::Relaxed))
     }
 
     /// The questions, one line each.
     pub(super) fn lines(&self, path: impl Fn(InstanceId) -> String) -> Vec<String> {
-        let how = match (self.can_answer, self.open.len()) {
+        let how = match (self.can_answer(), self.open.len()) {
             (false, _) => "answer with `ratn answer - CHOICE`",
             (true, 1) => "type the answer",
             (true, _) => "type STATE ANSWER",
@@ -61,26 +92,36 @@ impl Questions {
     }
 }
 
-/// Sends what is typed to the run of the system in `directory`, as long as this process lives; whether anybody listens.
-pub(super) fn listen(directory: &Path) -> bool {
-    let directory = directory.to_owned();
+/// Sends what is typed to a run of the system in `directory`, as long as this process lives; `None`: nobody listens.
+fn listen(directory: PathBuf, run: String) -> Option<Arc<Typing>> {
+    let typing = Arc::new(Typing::default());
+    let told = Arc::clone(&typing);
     let listening = move || {
-        // Whoever reads a terminal from the background is stopped by this signal, with all its threads; with it blocked, reading fails.
-        if SigSet::from(Signal::SIGTTIN).thread_block().is_err() {
-            return;
-        }
-        let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_all().build() else { return };
-        while let Some(line) = typed() {
-            // The line is on the terminal, below what is painted.
-            output::area_was_pushed();
-            let Some(message) = answer(&line) else { continue };
-            match runtime.block_on(control::send(&directory, &message)) {
-                Ok(said) => output::progress(said),
-                Err(error) => output::progress(format_args!("not taken: {error}")),
+        // Whoever reads a terminal from the background is stopped by one of these signals, and whoever changes it by the other one, with all
+        // its threads; with them blocked, that fails.
+        let mut stopping = SigSet::from(Signal::SIGTTIN);
+        stopping.add(Signal::SIGTTOU);
+        if stopping.thread_block().is_ok()
+            && let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_all().build()
+        {
+            // What was typed before the question is no answer to it.
+            let _ = tcflush(std::io::stdin(), FlushArg::TCIFLUSH);
+            while let Some(line) = typed() {
+                // The line is on the terminal, below what is painted.
+                output::area_was_pushed();
+                if let Some(message) = answer(&run, &line) {
+                    match runtime.block_on(control::send(&directory, &message)) {
+                        Ok(said) => output::progress(said),
+                        Err(error) => output::progress(format_args!("not taken: {error}")),
+                    }
+                }
+                told.has_come.store(true, Ordering::Relaxed);
             }
         }
+        told.is_over.store(true, Ordering::Relaxed);
     };
-    std::thread::Builder::new().name("answers".to_owned()).spawn(listening).is_ok()
+    let thread = std::thread::Builder::new().name("answers".to_owned()).spawn(listening);
+    thread.is_ok().then_some(typing)
 }
 
 /// The next line; `None` when there will be no other.
@@ -97,14 +138,14 @@ fn typed() -> Option<String> {
 }
 
 /// `go`, or `STATE go`.
-fn answer(line: &str) -> Option<Message> {
+fn answer(run: &str, line: &str) -> Option<Message> {
     let mut words = line.split_whitespace();
     let (first, second) = (words.next()?, words.next());
     let (state, choice) = match second {
         Some(choice) => (Some(first.to_owned()), choice),
         None => (None, first),
     };
-    Some(Message::Answer { run: ANY_RUN.to_owned(), state, choice: choice.to_owned() })
+    Some(Message::Answer { run: run.to_owned(), state, choice: choice.to_owned() })
 }
 
 #[cfg(test)]
@@ -117,13 +158,20 @@ mod tests {
 
     #[test]
     fn a_question_is_shown_until_it_is_answered_and_nothing_is_painted_over_who_types() {
-        let mut questions = Questions::new(true);
+        let typing = Arc::new(Typing::default());
+        let mut questions = Questions { typing: Some(Arc::clone(&typing)), ..Questions::default() };
         assert!(!questions.keep_still());
         let asks = r#"{"at":0,"command":"note","note":"awaiting","instance":1,"awaits":"answer","question":"Go on?","choices":["go","stop"]}"#;
         questions.follow(&line(asks));
         assert!(!questions.keep_still(), "the question itself is painted");
         assert!(questions.keep_still());
         assert_eq!(questions.lines(|_| "ask".to_owned()), ["  asks   ask: Go on? (go, stop): type the answer"]);
+        typing.has_come.store(true, Ordering::Relaxed);
+        assert!(!questions.keep_still(), "what was said of a wrong answer stands where the question was");
+        assert!(questions.keep_still());
+        typing.is_over.store(true, Ordering::Relaxed);
+        assert!(!questions.keep_still(), "nobody types any more");
+        assert!(questions.lines(|_| "ask".to_owned())[0].ends_with("answer with `ratn answer - CHOICE`"));
         questions.follow(&line(r#"{"at":1,"command":"note","note":"finished","instance":1,"outcome":"success"}"#));
         assert!(!questions.keep_still() && questions.lines(|_| String::new()).is_empty());
     }
@@ -132,10 +180,10 @@ mod tests {
     fn one_word_is_the_answer_and_two_say_whose_question() {
         let of = |state: Option<&str>, choice: &str| {
             let state = state.map(str::to_owned);
-            Some(Message::Answer { run: ANY_RUN.to_owned(), state, choice: choice.to_owned() })
+            Some(Message::Answer { run: "run-1".to_owned(), state, choice: choice.to_owned() })
         };
-        assert_eq!(answer("  go "), of(None, "go"));
-        assert_eq!(answer("left/ask stop"), of(Some("left/ask"), "stop"));
-        assert_eq!(answer(" "), None);
+        assert_eq!(answer("run-1", "  go "), of(None, "go"));
+        assert_eq!(answer("run-1", "left/ask stop"), of(Some("left/ask"), "stop"));
+        assert_eq!(answer("run-1", " "), None);
     }
 }
