@@ -105,14 +105,14 @@ fn a_task_runs_on_the_system_that_is_up_and_leaves_it_running() -> anyhow::Resul
     ensure!(output.status.code() == Some(4) && err.contains("nothing_found, an outcome of its own"), "{err}");
     ensure!(err.contains("`ratn reset` lays a new table"), "{err}");
 
-    // One run at a time: a second is refused and leaves no log.
+    // One that waits for what nobody has.
     let waits = place.path().join("waits.yaml");
     std::fs::write(&waits, WAITS)?;
     let waits = waits.to_str().context("a path")?;
     let mut first = place.start_as("first", &["run", waits])?;
     wait_for("the first run", || {
-        let list = place.ratn(&["resource", "get", "run"]).output()?;
-        Ok(list.status.success().then_some(()))
+        let list = support::texts(&place.ratn(&["resource", "list", "Run"]).output()?).0;
+        Ok(list.contains("run-").then_some(()))
     })
     .with_context(|| first.said())?;
     // It is told by the names of its states what runs and what waits, also of who holds something.
@@ -129,11 +129,37 @@ fn a_task_runs_on_the_system_that_is_up_and_leaves_it_running() -> anyhow::Resul
     ensure!(output.status.success() && said.starts_with("wait is paused"), "{said}{err}");
     let json = support::texts(&place.ratn(&["status", "--json"]).output()?).0;
     let json: serde_json::Value = serde_json::from_str(&json)?;
-    ensure!(json["run"]["paused"] == true && json["waiting"][0]["holder"] == "wait: want", "{json}");
+    ensure!(json["runs"][0]["paused"] == true && json["waiting"][0]["holder"] == "wait: want", "{json}");
+
+    // One that is to go alone is refused and leaves no log; others go beside it, and who means one of them says which.
     let second = place.path().join("second.jsonl");
-    let output = place.ratn(&["run", waits, "--log", second.to_str().context("a path")?]).output()?;
+    let output = place.ratn(&["run", waits, "--alone", "--log", second.to_str().context("a path")?]).output()?;
     let err = support::texts(&output).1;
-    ensure!(output.status.code() == Some(2) && err.contains("another run is under way") && !second.exists(), "{err}");
+    ensure!(
+        output.status.code() == Some(2) && err.contains("another run is under way on this system (`wait`)"),
+        "{err}"
+    );
+    ensure!(!second.exists());
+    let output = place.ratn(&["run", own.to_str().context("a path")?]).output()?;
+    ensure!(output.status.code() == Some(4), "{}", support::texts(&output).1);
+    let mut other = place.start_as("other", &["run", waits])?;
+    let json = wait_for("two runs", || {
+        let json = support::texts(&place.ratn(&["status", "--json"]).output()?).0;
+        let json: serde_json::Value = serde_json::from_str(&json)?;
+        let both = json["runs"].as_array().is_some_and(|runs| runs.len() == 2);
+        Ok((both && json["waiting"].as_array().is_some_and(|waiting| waiting.len() == 2)).then_some(json))
+    })?;
+    let ids: Vec<&str> = json["runs"].as_array().into_iter().flatten().filter_map(|run| run["run"].as_str()).collect();
+    for which in [&["control", "resume"][..], &["control", "resume", "--run", "wait"], &["control", "break", "want"]] {
+        let output = place.ratn(which).output()?;
+        let err = support::texts(&output).1;
+        ensure!(!output.status.success() && err.contains("2 runs are under way") && err.contains(ids[1]), "{err}");
+    }
+    let output = place.ratn(&["control", "abort", "--run", ids[1]]).output()?;
+    ensure!(output.status.success(), "{}", support::texts(&output).1);
+    let (code, _, said) = other.finish()?;
+    ensure!(code == Some(1) && said.contains("the user asked for it"), "{code:?}\n{said}");
+    ensure!(first.child.try_wait()?.is_none(), "{}", first.said());
     first.signal(nix::sys::signal::Signal::SIGINT)?;
     first.finish()?;
 

@@ -310,8 +310,12 @@ async fn over_tls_a_certificate_is_who_one_is_and_nobody_touches_what_is_another
     let lease = in_time(first.block(lease)).await.unwrap().into_inner().lease.unwrap();
     let list = in_time(second.list(v1::ListRequest::default())).await.unwrap().into_inner();
     assert_eq!(list.resources[0].holdings[0].opened_by, "first (certificate)");
-    let release =
-        v1::ResourceServiceReleaseRequest { request_id: String::new(), session_id: "s".into(), lease_id: lease.id };
+    let release = v1::ResourceServiceReleaseRequest {
+        request_id: String::new(),
+        session_id: "s".into(),
+        lease_id: lease.id,
+        note: String::new(),
+    };
     let sessionless = v1::ResourceServiceReleaseRequest { session_id: String::new(), ..release.clone() };
     for refused in [
         in_time(second.release(release.clone())).await.unwrap_err(),

@@ -82,8 +82,12 @@ async fn answers_come_as_they_are_there_and_not_in_the_order_of_questions() {
     // It waits, while what comes after it is answered.
     line.ask(3, acquire("b", "second")).await;
     let lease_id = first.lease.unwrap().id;
-    let give_back =
-        v1::ResourceServiceReleaseRequest { request_id: "give back".to_owned(), session_id: "b".to_owned(), lease_id };
+    let give_back = v1::ResourceServiceReleaseRequest {
+        request_id: "give back".to_owned(),
+        session_id: "b".to_owned(),
+        lease_id,
+        note: String::new(),
+    };
     line.ask(4, Some(Asked::Release(give_back))).await;
     let mut answers = BTreeMap::new();
     for _ in 0..2 {

@@ -98,24 +98,21 @@ impl Logs {
         Logs { all: Mutex::new(all) }
     }
 
-    /// No run is under way.
-    pub(crate) fn hear_nobody(&self) {
-        self.lock().logs.iter_mut().for_each(|one| one.heard = None);
-    }
-
-    /// A run says what it is doing; its log is one of them from now on. A system has one run at a time.
-    pub(crate) fn hear(&self, status: RunStatus) {
+    /// These runs say what they are doing, and no others are under way; their logs are among them from now on.
+    pub(crate) fn hear(&self, statuses: Vec<RunStatus>) {
         let mut all = self.lock();
         all.logs.iter_mut().for_each(|one| one.heard = None);
-        let path = std::fs::canonicalize(&status.log).unwrap_or_else(|_| status.log.clone());
-        // A pipe is no log: opening it would wait for whoever writes it.
-        if std::fs::metadata(&path).is_ok_and(|is| !is.is_file()) {
-            return;
-        }
-        let known = all.logs.iter().position(|one| one.path == path);
-        let index = known.unwrap_or_else(|| all.add(path, false));
-        if let Some(one) = all.logs.get_mut(index) {
-            one.heard = Some((Instant::now(), status));
+        for status in statuses {
+            let path = std::fs::canonicalize(&status.log).unwrap_or_else(|_| status.log.clone());
+            // A pipe is no log: opening it would wait for whoever writes it.
+            if std::fs::metadata(&path).is_ok_and(|is| !is.is_file()) {
+                continue;
+            }
+            let known = all.logs.iter().position(|one| one.path == path);
+            let index = known.unwrap_or_else(|| all.add(path, false));
+            if let Some(one) = all.logs.get_mut(index) {
+                one.heard = Some((Instant::now(), status));
+            }
         }
     }
 

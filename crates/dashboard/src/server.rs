@@ -329,14 +329,12 @@ impl Shown {
         }
     }
 
-    /// Asks the system for its run: its log is one of those that are looked at.
+    /// Asks the system for its runs: their logs are among those that are looked at.
     async fn hear(&self) -> Result<(), String> {
-        match self.system.run().await {
+        match self.system.runs().await {
             Ok(heard) => {
-                match heard {
-                    Heard::Run(status) => self.logs.hear(*status),
-                    Heard::Nobody => self.logs.hear_nobody(),
-                    Heard::JustNow => {}
+                if let Heard::Runs(statuses) = heard {
+                    self.logs.hear(statuses);
                 }
                 Ok(())
             }
@@ -479,7 +477,7 @@ impl Shown {
             return Answer::Refused(StatusCode::CONFLICT, problem);
         };
         let said = match word {
-            Told::Word(word, said) => self.system.tell(word).await.map(|()| said.to_owned()),
+            Told::Word(word, said) => self.system.tell(&run, word).await.map(|()| said.to_owned()),
             Told::Answer { state, choice } => {
                 self.system.send(&Message::Answer { run, state: Some(state), choice }).await
             }

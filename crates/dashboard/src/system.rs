@@ -1,4 +1,4 @@
-//! The system that is up: its resources, who holds them and who waits, its hosts with their workers, and the run that is under way.
+//! The system that is up: its resources, who holds them and who waits, its hosts with their workers, and the runs that are under way.
 //!
 //! It asks the daemons as every client does, no more often than once in [`FRESH`] however many pages there are, and says what is wrong
 //! where they do not answer. What somebody may see and do is theirs to decide (`docs/who-may-speak.md`).
@@ -30,15 +30,13 @@ const TAIL_BYTES: usize = 16 << 10;
 /// More of it is not read through.
 const MOST_LOG_BYTES: usize = 64 << 20;
 
-/// What is heard of the run of a system.
+/// What is heard of the runs of a system.
 #[derive(Debug)]
 pub(crate) enum Heard {
-    /// It was asked a moment ago.
+    /// They were asked a moment ago.
     JustNow,
-    /// No run is under way.
-    Nobody,
-    /// This.
-    Run(Box<RunStatus>),
+    /// These are under way.
+    Runs(Vec<RunStatus>),
 }
 
 /// A system, by its runtime directory.
@@ -61,26 +59,26 @@ impl System {
         self.directory.display().to_string()
     }
 
-    /// What its run is doing.
-    pub(crate) async fn run(&self) -> std::io::Result<Heard> {
+    /// What its runs are doing.
+    pub(crate) async fn runs(&self) -> std::io::Result<Heard> {
         let mut asked = self.run.lock().await;
         if asked.is_some_and(|asked| asked.elapsed() < RUN_FRESH) {
             return Ok(Heard::JustNow);
         }
-        let status = control::status(&self.directory).await;
+        let statuses = control::statuses(&self.directory).await;
         *asked = Some(Instant::now());
-        Ok(status?.map_or(Heard::Nobody, |status| Heard::Run(Box::new(status))))
+        Ok(Heard::Runs(statuses?))
     }
 
-    /// Tells its run.
-    pub(crate) async fn tell(&self, word: Word) -> std::io::Result<()> {
-        let told = control::tell(&self.directory, word).await;
+    /// Tells a run, by its id.
+    pub(crate) async fn tell(&self, run: &str, word: Word) -> std::io::Result<()> {
+        let told = control::tell(&self.directory, run, word).await;
         // What it does now is asked at once.
         *self.run.lock().await = None;
         told
     }
 
-    /// Sends its run what a state of it waits for; what became of that.
+    /// Sends a run what a state of it waits for; what became of that.
     pub(crate) async fn send(&self, message: &Message) -> std::io::Result<String> {
         let sent = control::send(&self.directory, message).await;
         *self.run.lock().await = None;

@@ -1,9 +1,11 @@
-//! A run's ear: a Unix socket in the runtime directory of its system, over which `ratn control` pauses it, lets it go on, lets
+//! A run's ear: a Unix socket in the runtime directory of its system, `RUN.control`, over which `ratn control` pauses it, lets it go on, lets
 //! one PIA begin, or ends it, and sets breakpoints, `ratn status` asks what it is doing, `ratn signal` and `ratn answer` send it what its states wait for. One
 //! word or [`Message`] (in JSON) per line; each is answered by one line.
 
+mod find;
 mod service;
 
+pub use find::{status, statuses};
 pub use service::{ROLE, RunServer};
 
 use super::progress::UnderWay;
@@ -23,8 +25,6 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-/// In a system's runtime directory: where its run listens.
-const SOCKET: &str = "run.control";
 /// Words that the run has not been told yet.
 const MAX_PENDING: usize = 16;
 /// Longer lines are no words of control.
@@ -147,7 +147,7 @@ impl Message {
     }
 }
 
-/// Whichever run is under way.
+/// The run that is under way, where it is the only one.
 pub const ANY_RUN: &str = "-";
 
 impl RunStatus {
@@ -210,17 +210,17 @@ pub(crate) struct Control {
 }
 
 impl Control {
-    /// Listens in `directory`. A socket that is there already is one of a run that was killed: a system has one run at a time.
+    /// Listens in `directory` for the run of this id. A socket that is there already is its own, of before it was killed.
     ///
     /// # Errors
     /// Where the socket cannot be made, for example because its path is too long for one.
-    pub(crate) fn listen(directory: &Path) -> std::io::Result<Control> {
-        Control::listen_with(directory, ANSWER_DEADLINE)
+    pub(crate) fn listen(directory: &Path, run: &str) -> std::io::Result<Control> {
+        Control::listen_with(directory, run, ANSWER_DEADLINE)
     }
 
     /// Who is not answered until the deadline is given up.
-    fn listen_with(directory: &Path, deadline: Duration) -> std::io::Result<Control> {
-        let path = directory.join(SOCKET);
+    fn listen_with(directory: &Path, run: &str, deadline: Duration) -> std::io::Result<Control> {
+        let path = find::socket(directory, run);
         match std::fs::remove_file(&path) {
             Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
             _ => {}
@@ -229,8 +229,10 @@ impl Control {
         let (tell, words) = mpsc::channel(MAX_PENDING);
         let end = CancellationToken::new();
         // Clients in other folders read where it is.
-        let (server, to, until) = (RunServer::of(tell.clone()), std::path::absolute(directory)?, end.clone());
+        let to = std::path::absolute(directory)?;
+        let (server, until) = (RunServer::of(&to, run, tell.clone()), end.clone());
         tokio::spawn(async move {
+            find::sweep(&to).await;
             if let Err(error) = server.serve(&to, until).await {
                 tracing::warn!(%error, "clients cannot reach this run over gRPC");
             }
@@ -240,10 +242,10 @@ impl Control {
     }
 
     /// As [`Control::listen`]; a run goes on without it where it cannot be.
-    pub(crate) fn listen_if_possible(directory: &Path, messages: &Messages) -> Option<Control> {
-        let listening = Control::listen(directory);
+    pub(crate) fn listen_if_possible(directory: &Path, run: &str, messages: &Messages) -> Option<Control> {
+        let listening = Control::listen(directory, run);
         if let Err(error) = &listening {
-            let place = directory.join(SOCKET);
+            let place = find::socket(directory, run);
             messages.say(format_args!("`ratn control` cannot reach this run: {}: {error}", place.display()));
         }
         listening.ok()
@@ -335,12 +337,12 @@ fn read(line: &str) -> Result<Message, String> {
     message.checked().map_err(|malformed| malformed.to_string())
 }
 
-/// Tells the run of the system in `directory`.
+/// Tells a run of the system in `directory`: of this id or this task, or [`ANY_RUN`].
 ///
 /// # Errors
-/// Where no run listens, or it does not take the word.
-pub async fn tell(directory: &Path, word: Word) -> std::io::Result<()> {
-    match ask(directory, word.text(), MAX_LINE_BYTES).await?.as_str() {
+/// Where no run listens, it is not known which is meant, or it does not take the word.
+pub async fn tell(directory: &Path, run: &str, word: Word) -> std::io::Result<()> {
+    match say(&find::meant(directory, run).await?, word.text(), MAX_LINE_BYTES).await?.as_str() {
         DONE => Ok(()),
         other => Err(Error::other(other.to_owned())),
     }
@@ -350,17 +352,18 @@ fn one_line(text: &str) -> String {
     text.replace(['\n', '\r'], " ")
 }
 
-/// Sends the run of the system in `directory` something that its states wait for, or may; what becomes of it. It is in the run's log,
+/// Sends the run that a message is for, of the system in `directory`, something that its states wait for, or may; what becomes of it. It is in the run's log,
 /// on the disk, when this returns. Where it fails on the way, the run may have got it all the same, and the error says so.
 ///
 /// # Errors
-/// Where no run listens, or it does not take that.
+/// Where no run listens, it is not known which is meant, or it does not take that.
 pub async fn send(directory: &Path, message: &Message) -> std::io::Result<String> {
     let line = serde_json::to_string(message)?;
     if line.len() as u64 >= MAX_MESSAGE_BYTES {
         return Err(Error::new(ErrorKind::InvalidInput, format!("it has more than {MAX_MESSAGE_BYTES} bytes")));
     }
-    let answer = ask(directory, &line, MAX_MESSAGE_BYTES).await.map_err(|error| {
+    let socket = find::meant(directory, message.run()).await?;
+    let answer = say(&socket, &line, MAX_MESSAGE_BYTES).await.map_err(|error| {
         if is_uncertain(&error) {
             let why = "the run did not answer, and it is not known whether it got that: `ratn status` and its log tell";
             return Error::new(error.kind(), why);
@@ -370,18 +373,6 @@ pub async fn send(directory: &Path, message: &Message) -> std::io::Result<String
     match answer.strip_prefix(DONE) {
         Some(said) => Ok(said.trim().to_owned()),
         None => Err(Error::other(answer)),
-    }
-}
-
-/// What the run of the system in `directory` is doing; `None` where none is under way.
-///
-/// # Errors
-/// Where it does not say.
-pub async fn status(directory: &Path) -> std::io::Result<Option<RunStatus>> {
-    match ask(directory, STATUS, MAX_STATUS_BYTES).await {
-        Ok(answer) => serde_json::from_str(&answer).map(Some).map_err(|_| Error::other(answer)),
-        Err(error) if is_nobody(&error) => Ok(None),
-        Err(error) => Err(error),
     }
 }
 
@@ -396,10 +387,10 @@ pub fn is_uncertain(error: &Error) -> bool {
     matches!(error.kind(), TimedOut | UnexpectedEof | ConnectionReset | BrokenPipe)
 }
 
-/// Says a word and hears the line that answers it.
-async fn ask(directory: &Path, word: &str, most: u64) -> std::io::Result<String> {
+/// Says a word at a run's socket and hears the line that answers it.
+async fn say(socket: &Path, word: &str, most: u64) -> std::io::Result<String> {
     let asking = async {
-        let mut stream = UnixStream::connect(directory.join(SOCKET)).await?;
+        let mut stream = UnixStream::connect(socket).await?;
         stream.write_all(format!("{word}\n").as_bytes()).await?;
         let mut answer = String::new();
         BufReader::new(stream.take(most)).read_line(&mut answer).await?;
@@ -415,30 +406,32 @@ async fn ask(directory: &Path, word: &str, most: u64) -> std::io::Result<String>
 mod tests {
     use super::*;
 
+    const RUN: &str = "run-1";
+
     #[tokio::test]
     async fn words_arrive_as_events_in_order() -> anyhow::Result<()> {
         let place = tempfile::tempdir()?;
         // One of a run that was killed.
-        std::fs::write(place.path().join(SOCKET), "")?;
-        let mut control = Control::listen(place.path())?;
+        std::fs::write(find::socket(place.path(), RUN), "")?;
+        let mut control = Control::listen(place.path(), RUN)?;
         for word in [Word::Pause, Word::Step] {
-            tell(place.path(), word).await?;
+            tell(place.path(), ANY_RUN, word).await?;
         }
         for expected in [Event::PauseRequested, Event::StepRequested] {
             assert!(matches!(control.asked().await, Asked::Told(event) if *event == expected));
         }
         drop(control);
-        assert!(tell(place.path(), Word::Resume).await.is_err());
+        assert!(tell(place.path(), ANY_RUN, Word::Resume).await.is_err());
         Ok(())
     }
 
     #[tokio::test]
     async fn a_run_says_what_it_is_doing_and_where_none_listens_there_is_none() -> anyhow::Result<()> {
         let place = tempfile::tempdir()?;
-        assert_eq!(status(place.path()).await?, None);
-        let mut control = Control::listen(place.path())?;
+        assert_eq!(status(place.path(), ANY_RUN).await?, None);
+        let mut control = Control::listen(place.path(), RUN)?;
         let doing = RunStatus {
-            run: "run-1".to_owned(),
+            run: RUN.to_owned(),
             task: "sort".to_owned(),
             mode: Mode::Cdtn,
             log: PathBuf::from("log.jsonl"),
@@ -464,18 +457,18 @@ mod tests {
                 let _ = say.send(said);
             }
         });
-        assert_eq!(status(place.path()).await?, Some(doing));
+        assert_eq!(status(place.path(), ANY_RUN).await?, Some(doing));
         answering.await?;
         // The socket of a run that was killed.
-        std::fs::write(place.path().join(SOCKET), "")?;
-        assert_eq!(status(place.path()).await?, None);
+        std::fs::write(find::socket(place.path(), RUN), "")?;
+        assert_eq!(status(place.path(), ANY_RUN).await?, None);
         Ok(())
     }
 
     #[tokio::test]
     async fn a_message_is_answered_with_what_became_of_it() -> anyhow::Result<()> {
         let place = tempfile::tempdir()?;
-        let mut control = Control::listen(place.path())?;
+        let mut control = Control::listen(place.path(), RUN)?;
         let signal = |name: &str, value| Message::Signal { run: ANY_RUN.to_owned(), signal: name.to_owned(), value };
         let long = signal("go", Value::String("x".repeat(10_000)));
         let expected = long.clone();
@@ -499,7 +492,7 @@ mod tests {
     #[tokio::test]
     async fn what_no_client_may_send_is_refused_and_not_told() -> anyhow::Result<()> {
         let place = tempfile::tempdir()?;
-        let mut control = Control::listen(place.path())?;
+        let mut control = Control::listen(place.path(), RUN)?;
         let signal = |name: &str, value| Message::Signal { run: ANY_RUN.to_owned(), signal: name.to_owned(), value };
         let deep = (0..17).fold(Value::Null, |value, _| Value::List(vec![value]));
         for (message, why) in [
@@ -517,7 +510,7 @@ mod tests {
     #[tokio::test]
     async fn a_message_arrives_whatever_characters_it_has() -> anyhow::Result<()> {
         let place = tempfile::tempdir()?;
-        let mut control = Control::listen(place.path())?;
+        let mut control = Control::listen(place.path(), RUN)?;
         // Whichever byte the first limit falls on.
         for before in 0..8 {
             let value = Value::String("x".repeat(before) + &"\u{1f916}\u{fc}".repeat(30));
@@ -538,13 +531,13 @@ mod tests {
     #[tokio::test]
     async fn a_silent_connection_and_one_that_is_not_answered_keep_nobody_waiting() -> anyhow::Result<()> {
         let place = tempfile::tempdir()?;
-        let mut control = Control::listen(place.path())?;
-        let _silent = UnixStream::connect(place.path().join(SOCKET)).await?;
+        let mut control = Control::listen(place.path(), RUN)?;
+        let _silent = UnixStream::connect(find::socket(place.path(), RUN)).await?;
         let message = Message::Signal { run: ANY_RUN.to_owned(), signal: "go".to_owned(), value: Value::Null };
-        let mut unanswered = UnixStream::connect(place.path().join(SOCKET)).await?;
+        let mut unanswered = UnixStream::connect(find::socket(place.path(), RUN)).await?;
         unanswered.write_all(format!("{}\n", serde_json::to_string(&message)?).as_bytes()).await?;
         let Asked::Message(_, _unsaid) = control.asked().await else { anyhow::bail!("no message") };
-        tokio::time::timeout(Duration::from_millis(500), tell(place.path(), Word::Abort)).await??;
+        tokio::time::timeout(Duration::from_millis(500), tell(place.path(), ANY_RUN, Word::Abort)).await??;
         assert!(matches!(control.asked().await, Asked::Told(event) if matches!(*event, Event::AbortRequested { .. })));
         Ok(())
     }
@@ -552,7 +545,7 @@ mod tests {
     #[tokio::test]
     async fn who_got_no_answer_is_told_that_it_is_not_known_whether_the_message_came() -> anyhow::Result<()> {
         let place = tempfile::tempdir()?;
-        let mut control = Control::listen_with(place.path(), Duration::from_millis(200))?;
+        let mut control = Control::listen_with(place.path(), RUN, Duration::from_millis(200))?;
         let message = Message::Signal { run: ANY_RUN.to_owned(), signal: "go".to_owned(), value: Value::Null };
         let Err(error) = send(place.path(), &message).await else { anyhow::bail!("nobody answered") };
         assert!(error.to_string().contains("not known whether"), "{error}");
@@ -564,15 +557,15 @@ mod tests {
     #[tokio::test]
     async fn what_is_no_word_is_answered_and_not_told() -> anyhow::Result<()> {
         let place = tempfile::tempdir()?;
-        let mut control = Control::listen(place.path())?;
+        let mut control = Control::listen(place.path(), RUN)?;
         for nonsense in ["fly\n".to_owned(), "x".repeat(1000)] {
-            let mut stream = UnixStream::connect(place.path().join(SOCKET)).await?;
+            let mut stream = UnixStream::connect(find::socket(place.path(), RUN)).await?;
             let _ = stream.write_all(nonsense.as_bytes()).await;
             let mut answer = String::new();
             let _ = stream.read_to_string(&mut answer).await;
             assert!(control.words.try_recv().is_err());
         }
-        tell(place.path(), Word::Abort).await?;
+        tell(place.path(), ANY_RUN, Word::Abort).await?;
         assert!(matches!(control.asked().await, Asked::Told(event) if matches!(*event, Event::AbortRequested { .. })));
         Ok(())
     }

@@ -30,7 +30,7 @@ mod task_for_tests;
 pub use background_runtime::BackgroundRuntime;
 pub use interrupt::{Interrupt, Interrupter};
 pub use messages::Messages;
-pub use performer::{RUN_KIND, only_run as claim};
+pub use performer::{RUN_KIND, claim};
 
 use ratn_worker::endpoint::Endpoint;
 

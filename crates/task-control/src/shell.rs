@@ -89,6 +89,8 @@ pub struct Place {
     pub speed: f64,
     /// Where what people read of the run goes.
     pub messages: Messages,
+    /// Whether no other run may be under way on it beside this one.
+    pub alone: bool,
 }
 
 /// How a run ended.
@@ -127,7 +129,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
         log,
         checkpointer,
         clock: RobotClock::start(place.speed),
-        control: Control::listen_if_possible(&place.directory, &place.messages),
+        control: Control::listen_if_possible(&place.directory, &id, &place.messages),
         advisor: advisor_of(run.mode, run.seed),
         lookout: Lookout::default(),
         ask_at: None,

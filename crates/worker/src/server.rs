@@ -133,6 +133,13 @@ pub enum BindError {
     Tls(#[from] TlsError),
 }
 
+impl BindError {
+    /// Whether somebody else listens there.
+    pub fn is_taken(&self) -> bool {
+        matches!(self, BindError::Refused { source, .. } if source.kind() == io::ErrorKind::AddrInUse)
+    }
+}
+
 /// What a server may listen on.
 #[derive(Debug, Clone, Default)]
 pub struct Exposure {

@@ -38,6 +38,7 @@ pub(crate) fn release(session: &str, lease: u64) -> v1::ResourceServiceReleaseRe
         request_id: format!("{session}/release/{lease}"),
         session_id: session.to_owned(),
         lease_id: lease,
+        note: String::new(),
     }
 }
 

@@ -292,6 +292,7 @@ impl Client {
                 request_id: request_id.clone(),
                 session_id: session(self.number),
                 lease_id: lease.id,
+                note: String::new(),
             };
             async move { once(patience, rpc.release(question)).await }
         })
@@ -550,7 +551,7 @@ fn block(kind: &str, amount: u64) -> v1::Requirement {
 
 fn lease(answer: Answer<v1::AcquireResponse>) -> Answer<v1::Lease> {
     match answer {
-        Answer::Yes(v1::AcquireResponse { lease: Some(lease) }) => Answer::Yes(lease),
+        Answer::Yes(v1::AcquireResponse { lease: Some(lease), .. }) => Answer::Yes(lease),
         Answer::Yes(_) => Answer::No(Code::Internal, "a grant without a lease".to_owned()),
         Answer::No(code, message) => Answer::No(code, message),
         Answer::Unknown => Answer::Unknown,

@@ -70,6 +70,9 @@ pub(crate) struct RunArguments {
     /// Pause before this state, or a motion inside of it, begins: its path, `for_box/grasp`; may be repeated
     #[arg(long = "break", value_name = "STATE", conflicts_with = "resume")]
     pub(crate) breakpoints: Vec<String>,
+    /// Let no other run be under way on the system beside this one
+    #[arg(long)]
+    pub(crate) alone: bool,
     /// Give a parameter of the task a value, `boxes=3`; may be repeated
     #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
     pub(crate) set: Vec<(String, String)>,
@@ -139,6 +142,9 @@ pub(crate) struct ControlArguments {
     /// For `break` and `clear`: the path of a state, `for_box/grasp`, as `ratn check TASK --annotations` and `ratn status` name it
     #[arg(value_name = "STATE")]
     pub(crate) state: Option<String>,
+    /// The run: its id, the name of its task, or `-` for the one that is under way
+    #[arg(long, value_name = "RUN", default_value = "-")]
+    pub(crate) run: String,
     /// Where the endpoint files of the run's system are
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,

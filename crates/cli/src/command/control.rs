@@ -6,12 +6,12 @@ use crate::failure::Failure;
 use crate::output;
 use crate::system::public_directory;
 use anyhow::Context;
-use ratn_task_control::control::{self, ANY_RUN, Message, RunStatus, Word};
+use ratn_task_control::control::{self, Message, RunStatus, Word};
 
-/// Tells the run of a system.
+/// Tells a run of a system.
 pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
     let state = arguments.state.clone();
-    let breakpoint = |set| Message::Breakpoint { run: ANY_RUN.to_owned(), state: state.clone(), set };
+    let breakpoint = |set| Message::Breakpoint { run: arguments.run.clone(), state: state.clone(), set };
     let word = match arguments.word {
         WordArgument::Break => return signal::send(arguments.runtime_dir.as_deref(), &breakpoint(true)),
         WordArgument::Clear => return signal::send(arguments.runtime_dir.as_deref(), &breakpoint(false)),
@@ -26,8 +26,9 @@ pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
     blocking_on(tokio::runtime::Builder::new_current_thread(), async {
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
         // Before and after: a run that is told to end may be gone when it is asked.
-        let before = control::status(&directory).await.ok().flatten();
-        let told = control::tell(&directory, word).await;
+        let run = &arguments.run;
+        let before = control::status(&directory, run).await.ok().flatten();
+        let told = control::tell(&directory, run, word).await;
         let place = directory.display();
         match told {
             Err(error) if control::is_nobody(&error) => {
@@ -35,7 +36,7 @@ pub(crate) fn run(arguments: &ControlArguments) -> Result<(), Failure> {
             }
             told => {
                 told.with_context(|| format!("the run in {place} does not take that"))?;
-                let run = control::status(&directory).await.ok().flatten().or(before);
+                let run = control::status(&directory, run).await.ok().flatten().or(before);
                 Ok(output::result(said(word, run.as_ref()))?)
             }
         }

@@ -261,7 +261,8 @@ impl Setup<'_> {
             checkpoint_every: 0,
         };
         let system = starting(Box::pin(System::start_private(config, tls)), interrupt).await?;
-        let (ended, judgement) = on_system(run, system, interrupt, async |system| system.judgement().await).await?;
+        let (ended, judgement) =
+            on_system(run, system, false, interrupt, async |system| system.judgement().await).await?;
         let Judgement { delivered, greatest_tilt_rad, unintended_contacts } = judgement;
         let timeline = Timeline::of(&log::read(&log_file)?.lines);
         if timeline.outcome.as_deref() != Some(ended.outcome.as_str()) {

@@ -1,7 +1,7 @@
 //! `ratn reset`: a new table, and a world model that knows nothing of the one before.
 //!
 //! The boxes of a new table have the names of the old ones, so facts about those would be taken for facts about these. The reset
-//! counts as a run: it is refused while one is under way, and none begins meanwhile.
+//! counts as a run that goes alone: it is refused while one is under way, and none begins meanwhile.
 
 use super::blocking_on;
 use crate::arguments::ResetArguments;
@@ -34,7 +34,7 @@ pub(crate) fn run(arguments: &ResetArguments, tls: &ClientTls) -> Result<(), Fai
         let session = Session::open(&channels, &manager, "ratn reset", DEFAULT_TTL);
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, &manager, session.id())?;
-        let done = match claim(&resources, "reset").await {
+        let done = match claim(&resources, session.id(), "reset", true).await {
             Ok(()) => {
                 let world = WorldClient::new(&channels, &pool)?;
                 reset(arguments, &world, CellServiceClient::new(channels.get(&cell)?)).await

@@ -1,7 +1,7 @@
 //! `ratn status`: what runs, who holds what, and who waits for what and why.
 //!
-//! What the run is doing it says itself, over its socket in the runtime directory; who holds and who waits is the resource manager's
-//! word. Exit code 0 also where no run is under way; 2 where no system is.
+//! What the runs are doing they say themselves, over their sockets in the runtime directory; who holds and who waits is the resource manager's
+//! word, as are the runs of other hosts. Exit code 0 also where no run is under way; 2 where no system is.
 
 use super::{blocking_on, unanswered};
 use crate::arguments::StatusArguments;
@@ -30,8 +30,10 @@ const MOST_LINES: usize = 40;
 /// What is shown.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(super) struct Status {
-    /// None where no run is under way.
-    run: Option<RunStatus>,
+    /// What the runs here are doing, in the order in which they began.
+    runs: Vec<RunStatus>,
+    /// The ids of runs that are under way elsewhere, or do not say what they are doing.
+    elsewhere: Vec<String>,
     held: Vec<Held>,
     waiting: Vec<Waiting>,
     /// Resources that nobody holds.
@@ -76,14 +78,14 @@ pub(crate) fn run(arguments: &StatusArguments, tls: &ClientTls) -> Result<(), Fa
 
 impl Status {
     pub(super) async fn of(directory: &Path, client: &ResourceClient) -> Result<Status, Failure> {
-        let run = control::status(directory).await;
-        let run = run.with_context(|| format!("the run in {} does not say what it is doing", directory.display()))?;
+        let runs = control::statuses(directory).await;
+        let runs = runs.with_context(|| format!("the run in {} does not say what it is doing", directory.display()))?;
         let resources = client.list(&[]).await?;
         let waiting = client.explain("").await?;
-        Ok(Status::from(run, &resources, waiting))
+        Ok(Status::from(runs, &resources, waiting))
     }
 
-    fn from(run: Option<RunStatus>, resources: &[Resource], waiting: Vec<WaitingAcquire>) -> Status {
+    fn from(runs: Vec<RunStatus>, resources: &[Resource], waiting: Vec<WaitingAcquire>) -> Status {
         let held = |resource: &Resource| {
             let held = |holding: &ratn_proto::types::Holding| Held {
                 resource: resource.id.clone(),
@@ -93,12 +95,15 @@ impl Status {
             };
             resource.holdings.iter().map(held).collect::<Vec<_>>()
         };
-        // Room for projections is no thing that somebody looks for, and the run is told of above.
+        // Room for projections is no thing that somebody looks for, and the runs are told of above.
         let is_thing = |kind: &str| kind != WORLD_MODEL && kind != RUN_KIND;
         let things = || resources.iter().filter(|resource| is_thing(&resource.kind));
         let is_free = |resource: &&Resource| resource.holdings.is_empty() && resource.free > Quantity::ZERO;
+        let is_said = |id: &str| runs.iter().any(|run| run.run == id);
+        let elsewhere = resources.iter().filter(|resource| resource.kind == RUN_KIND && !is_said(&resource.id));
         Status {
-            run,
+            elsewhere: elsewhere.map(|resource| resource.id.clone()).collect(),
+            runs,
             held: things().flat_map(held).collect(),
             waiting: waiting
                 .into_iter()
@@ -113,25 +118,29 @@ impl Status {
 
     pub(super) fn text(&self, directory: &Path, colours: Colours) -> String {
         let mut lines = Vec::new();
-        match &self.run {
-            None => lines.push(format!("no run is under way in {}", directory.display())),
-            Some(run) => {
-                let RunStatus { task, mode, at_s, ended, log, .. } = run;
-                let paused = if run.paused { format!(", {}", colours.yellow("paused")) } else { String::new() };
-                let states = if *ended == 1 { "state has" } else { "states have" };
-                let head = colours.bold(task);
-                lines.push(format!("{head} in {} mode: {at_s:.1} s{paused}; {ended} {states} ended", mode_name(*mode)));
-                lines.push(format!("event log: {}", log.display()));
-                let rows = run.under_way.iter().map(|one| [one.path.clone(), one.text()]);
-                section(&mut lines, &colours.green("under way"), rows.collect());
-                let until =
-                    |one: &Awaiting| one.until_s.map_or_else(String::new, |until| format!(", until {until:.1} s"));
-                let rows =
-                    run.awaits.iter().map(|one| [one.path.clone(), format!("for {}{}", one.awaited, until(one))]);
-                section(&mut lines, &colours.yellow("waiting by themselves"), rows.collect());
-                let rows = run.waits.iter().map(|sentence| [sentence.clone(), String::new()]);
-                section(&mut lines, &colours.yellow("states that wait"), rows.collect());
+        if self.runs.is_empty() && self.elsewhere.is_empty() {
+            lines.push(format!("no run is under way in {}", directory.display()));
+        }
+        for run in &self.runs {
+            let RunStatus { task, mode, at_s, ended, log, .. } = run;
+            let paused = if run.paused { format!(", {}", colours.yellow("paused")) } else { String::new() };
+            let states = if *ended == 1 { "state has" } else { "states have" };
+            let head = colours.bold(task);
+            lines.push(format!("{head} in {} mode: {at_s:.1} s{paused}; {ended} {states} ended", mode_name(*mode)));
+            if self.runs.len() > 1 {
+                lines.push(format!("run: {}", run.run));
             }
+            lines.push(format!("event log: {}", log.display()));
+            let rows = run.under_way.iter().map(|one| [one.path.clone(), one.text()]);
+            section(&mut lines, &colours.green("under way"), rows.collect());
+            let until = |one: &Awaiting| one.until_s.map_or_else(String::new, |until| format!(", until {until:.1} s"));
+            let rows = run.awaits.iter().map(|one| [one.path.clone(), format!("for {}{}", one.awaited, until(one))]);
+            section(&mut lines, &colours.yellow("waiting by themselves"), rows.collect());
+            let rows = run.waits.iter().map(|sentence| [sentence.clone(), String::new()]);
+            section(&mut lines, &colours.yellow("states that wait"), rows.collect());
+        }
+        if !self.elsewhere.is_empty() {
+            lines.push(format!("{}: {}", colours.bold("runs elsewhere"), self.elsewhere.join(", ")));
         }
         let rows = self.held.iter().map(|held| [held.resource.clone(), held.holder.clone()]);
         section(&mut lines, &colours.bold("held"), rows.collect());
@@ -171,7 +180,8 @@ mod tests {
     #[test]
     fn what_runs_is_told_by_the_names_of_states_and_who_holds_what() {
         let status = Status {
-            run: Some(RunStatus {
+            elsewhere: Vec::new(),
+            runs: vec![RunStatus {
                 run: "run-1".to_owned(),
                 task: "sort_boxes".to_owned(),
                 mode: Mode::Cdtn,
@@ -191,7 +201,7 @@ mod tests {
                     awaited: Awaited::Signal { signal: "lid_closed".to_owned() },
                     until_s: Some(20.0),
                 }],
-            }),
+            }],
             held: vec![Held {
                 resource: "path-planner-1@compute".to_owned(),
                 kind: "PathPlanner".to_owned(),
@@ -216,11 +226,13 @@ mod tests {
           sort_boxes: look  its turn
         free: arm@sim, base@sim
         ");
-        let kinds = [("run", RUN_KIND), ("world-model@compute", WORLD_MODEL), ("arm@sim", "Arm")];
+        let kinds = [("run-7", RUN_KIND), ("world-model@compute", WORLD_MODEL), ("arm@sim", "Arm")];
         let resources: Vec<Resource> =
             kinds.into_iter().map(|(id, kind)| Resource::new(id, ResourceClass::Task, kind)).collect();
-        assert_eq!(Status::from(None, &resources, Vec::new()).free, ["arm@sim"]);
-        let nothing = Status { run: None, held: Vec::new(), waiting: Vec::new(), free: Vec::new() };
+        let status = Status::from(Vec::new(), &resources, Vec::new());
+        assert_eq!((status.free, status.elsewhere), (vec!["arm@sim".to_owned()], vec!["run-7".to_owned()]));
+        let nothing =
+            Status { runs: Vec::new(), elsewhere: Vec::new(), held: Vec::new(), waiting: Vec::new(), free: Vec::new() };
         assert_snapshot!(nothing.text(Path::new("/run/ratn"), Colours::default()), @"no run is under way in /run/ratn");
     }
 }

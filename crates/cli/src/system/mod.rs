@@ -156,6 +156,7 @@ impl System {
             catalogue: Arc::new(self.config.catalogue.clone()),
             speed: self.config.speed,
             messages: output::messages(),
+            alone: false,
         }
     }
 

@@ -655,6 +655,9 @@ pub struct ResourceServiceReleaseRequest {
     /// The lease.
     #[prost(uint64, tag = "3")]
     pub lease_id: u64,
+    /// What the next holder of its resources is told, at most 256 bytes: for task control, of what it has made of the world until now.
+    #[prost(string, tag = "4")]
+    pub note: ::prost::alloc::string::String,
 }
 /// The lease has ended.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -737,6 +740,10 @@ pub struct AcquireResponse {
     /// The lease.
     #[prost(message, optional, tag = "1")]
     pub lease: ::core::option::Option<Lease>,
+    /// What those who gave its resources back within the last two seconds have left to be told, each once. A resource manager that was started anew
+    /// knows none.
+    #[prost(string, repeated, tag = "2")]
+    pub notes: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
 /// Asks for the resources that are there.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -7983,9 +7990,13 @@ pub mod safety_service_server {
         const NAME: &'static str = SERVICE_NAME;
     }
 }
-/// Nothing.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
-pub struct GetWaitsRequest {}
+/// Asks what a run waits for.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetWaitsRequest {
+    /// The run: its id or the name of its task; empty for the one that is under way.
+    #[prost(string, tag = "1")]
+    pub run: ::prost::alloc::string::String,
+}
 /// What is waited for.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct GetWaitsResponse {
@@ -8092,7 +8103,7 @@ pub mod run_service_client {
     )]
     use tonic::codegen::*;
     use tonic::codegen::http::Uri;
-    /// Served by task control while a run is under way; its address is in the endpoint file `run` of the runtime directory.
+    /// Served by task control while runs are under way, by one of them for all; its address is in the endpoint file `run` of the runtime directory.
     #[derive(Debug, Clone)]
     pub struct RunServiceClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -8173,7 +8184,7 @@ pub mod run_service_client {
             self.inner = self.inner.max_encoding_message_size(limit);
             self
         }
-        /// What the states of the run wait for by themselves now.
+        /// What the states of a run wait for by themselves now. FAILED_PRECONDITION where it is not known which run is meant.
         pub async fn get_waits(
             &mut self,
             request: impl tonic::IntoRequest<super::GetWaitsRequest>,
@@ -8199,7 +8210,7 @@ pub mod run_service_client {
             self.inner.unary(req, path, codec).await
         }
         /// Sends a signal: it ends the wait of one state, of one that waits for it now, else of the next that will. Answered when it is in the run's
-        /// log, on the disk. FAILED_PRECONDITION where no state of the task waits for such a signal, where it is of another run, or where too many
+        /// log, on the disk. FAILED_PRECONDITION where no state of the task waits for such a signal, where there is no such run, where it is not known which of several is meant, or where too many
         /// are kept. Sent again it is another signal.
         pub async fn send_signal(
             &mut self,
@@ -8266,7 +8277,7 @@ pub mod run_service_server {
     /// Generated trait containing gRPC methods that should be implemented for use with RunServiceServer.
     #[async_trait]
     pub trait RunService: std::marker::Send + std::marker::Sync + 'static {
-        /// What the states of the run wait for by themselves now.
+        /// What the states of a run wait for by themselves now. FAILED_PRECONDITION where it is not known which run is meant.
         async fn get_waits(
             &self,
             request: tonic::Request<super::GetWaitsRequest>,
@@ -8275,7 +8286,7 @@ pub mod run_service_server {
             tonic::Status,
         >;
         /// Sends a signal: it ends the wait of one state, of one that waits for it now, else of the next that will. Answered when it is in the run's
-        /// log, on the disk. FAILED_PRECONDITION where no state of the task waits for such a signal, where it is of another run, or where too many
+        /// log, on the disk. FAILED_PRECONDITION where no state of the task waits for such a signal, where there is no such run, where it is not known which of several is meant, or where too many
         /// are kept. Sent again it is another signal.
         async fn send_signal(
             &self,
@@ -8294,7 +8305,7 @@ pub mod run_service_server {
             tonic::Status,
         >;
     }
-    /// Served by task control while a run is under way; its address is in the endpoint file `run` of the runtime directory.
+    /// Served by task control while runs are under way, by one of them for all; its address is in the endpoint file `run` of the runtime directory.
     #[derive(Debug)]
     pub struct RunServiceServer<T> {
         inner: Arc<T>,

@@ -1,19 +1,22 @@
 //! gRPC in front of a run's ear: signals and answers from clients of any language, and what is waited for.
 //!
-//! It says the same as the socket of [`super`], which it tells. Served at the Unix socket `run.sock` of the runtime directory, whose
-//! endpoint file is `run.endpoint`; who may is what the table of roles says of a process without a config of its own.
+//! It says the same as the sockets of [`super`], which it tells. Served at the Unix socket `run.sock` of the runtime directory, whose
+//! endpoint file is `run.endpoint`, by one of the runs for all of them; when that ends, by the next one. Who may is what the table of roles says
+//! of a process without a config of its own.
 
-use super::{ANY_RUN, Asked, Awaiting, Message, RunStatus};
+use super::{ANY_RUN, Asked, Awaiting, Message, RunStatus, find, is_nobody, is_uncertain, send};
 use futures::FutureExt;
 use ratn_executive::protocol::Awaited;
 use ratn_model::value::Value;
+use ratn_proto::convert::label;
 use ratn_proto::v1;
 use ratn_proto::v1::run_service_server::{RunService, RunServiceServer};
 use ratn_worker::access::Caller;
 use ratn_worker::audit::{self, Mutation};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{ServeError, Services, bind};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status};
@@ -21,20 +24,26 @@ use tonic::{Request, Response, Status};
 /// Under this name a run is found in the runtime directory.
 pub const ROLE: &str = "run";
 
-/// Serves a run's [`RunService`].
+/// So often a run looks whether nobody serves any more.
+const TURN: Duration = Duration::from_millis(200);
+
+/// Serves the [`RunService`] of the runs in a directory.
 #[derive(Debug, Clone)]
 pub struct RunServer {
+    directory: PathBuf,
+    /// Where the own run listens.
+    socket: PathBuf,
     tell: mpsc::Sender<Asked>,
 }
 
 impl RunServer {
     /// Of no run: every call that is let in is refused. For tests of who is.
     pub fn of_nobody() -> RunServer {
-        RunServer { tell: mpsc::channel(1).0 }
+        RunServer { directory: PathBuf::new(), socket: PathBuf::new(), tell: mpsc::channel(1).0 }
     }
 
-    pub(super) fn of(tell: mpsc::Sender<Asked>) -> RunServer {
-        RunServer { tell }
+    pub(super) fn of(directory: &Path, run: &str, tell: mpsc::Sender<Asked>) -> RunServer {
+        RunServer { directory: directory.to_owned(), socket: find::socket(directory, run), tell }
     }
 
     /// For [`Services::with`].
@@ -42,18 +51,54 @@ impl RunServer {
         RunServiceServer::new(self)
     }
 
-    /// Serves it in a runtime directory until `end`.
+    /// Serves it in a runtime directory until `end`, from when no other run does.
     pub(super) async fn serve(self, directory: &Path, end: CancellationToken) -> Result<(), ServeProblem> {
         let directory = RuntimeDirectory::at(directory);
-        let bound = bind(&directory.socket(ROLE)).await?;
+        let bound = loop {
+            match bind(&directory.socket(ROLE)).await {
+                Err(error) if !error.is_taken() => return Err(error.into()),
+                Ok(bound) => break bound,
+                Err(_) => {
+                    if end.run_until_cancelled(tokio::time::sleep(TURN)).await.is_none() {
+                        return Ok(());
+                    }
+                }
+            }
+        };
         let _published = directory.publish(ROLE, bound.endpoint())?;
         Ok(bound.serve(Services::new().with(self.into_service()), end).boxed().await?)
     }
 
+    /// Whether a run is the own one, of those that there are.
+    async fn is_own(&self, run: &str) -> Result<bool, Status> {
+        match find::meant(&self.directory, run).await {
+            Ok(socket) => Ok(socket == self.socket),
+            Err(error) if is_nobody(&error) => Err(has_ended()),
+            Err(error) => Err(Status::failed_precondition(error.to_string())),
+        }
+    }
+
     async fn say(&self, message: Message) -> Result<String, Status> {
-        let (say, said) = oneshot::channel();
-        self.ask(Asked::Message(message, say))?;
-        said.await.map_err(|_| has_ended())?.map_err(Status::failed_precondition)
+        if self.is_own(message.run()).await? {
+            let (say, said) = oneshot::channel();
+            self.ask(Asked::Message(message, say))?;
+            return said.await.map_err(|_| has_ended())?.map_err(Status::failed_precondition);
+        }
+        send(&self.directory, &message).await.map_err(|error| match error {
+            error if is_nobody(&error) => has_ended(),
+            error if is_uncertain(&error) => Status::unknown(error.to_string()),
+            error => Status::failed_precondition(error.to_string()),
+        })
+    }
+
+    async fn status(&self, run: &str) -> Result<RunStatus, Status> {
+        if self.is_own(run).await? {
+            let (say, said) = oneshot::channel();
+            self.ask(Asked::Status(say))?;
+            return said.await.map_err(|_| has_ended());
+        }
+        let status = find::status(&self.directory, run).await;
+        status.map_err(|error| Status::unavailable(error.to_string()))?.ok_or_else(has_ended)
     }
 
     fn ask(&self, asked: Asked) -> Result<(), Status> {
@@ -81,10 +126,10 @@ fn has_ended() -> Status {
 
 #[tonic::async_trait]
 impl RunService for RunServer {
-    async fn get_waits(&self, _: Request<v1::GetWaitsRequest>) -> Result<Response<v1::GetWaitsResponse>, Status> {
-        let (say, said) = oneshot::channel();
-        self.ask(Asked::Status(say))?;
-        let RunStatus { run, task, awaits, .. } = said.await.map_err(|_| has_ended())?;
+    async fn get_waits(&self, request: Request<v1::GetWaitsRequest>) -> Result<Response<v1::GetWaitsResponse>, Status> {
+        let wanted = named(request.into_inner().run);
+        label(&wanted, "run")?;
+        let RunStatus { run, task, awaits, .. } = self.status(&wanted).await?;
         let waits = awaits.into_iter().map(v1::Wait::from).collect();
         Ok(Response::new(v1::GetWaitsResponse { run, task, waits }))
     }

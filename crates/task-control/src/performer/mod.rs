@@ -6,6 +6,7 @@ mod handover;
 mod resume;
 #[cfg(test)]
 mod tests;
+mod told;
 mod watch;
 
 pub(super) use resume::{check_world, remembers};
@@ -43,6 +44,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
+use told::Told;
 
 /// A resource manager that does not open a session within this time is not there.
 const SESSION_DEADLINE: Duration = Duration::from_secs(5);
@@ -52,9 +54,13 @@ const ACQUIRE_DEADLINE: Duration = Duration::from_secs(3600);
 const LONG_WHILE_IDLE: Duration = Duration::from_secs(4);
 /// what waits longer than this in any case.
 const LONG: Duration = Duration::from_secs(30);
-/// The resource that the one run of a system is.
-const RUN: &str = "run";
-/// The kind of the resource that says that a run is under way: a system has one run at a time.
+/// So many runs are under way on a system at the most.
+const MOST_RUNS: usize = 64;
+/// The attributes of the resource that says that a run is under way: its task,
+const TASK: &str = "task";
+/// and whether no other run may be.
+const ALONE: &str = "alone";
+/// The kind of that resource, whose id is the run's.
 pub const RUN_KIND: &str = "Run";
 /// At the end of a run, for everything that is still being given back.
 const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
@@ -109,6 +115,9 @@ pub(super) struct Performer {
     events: mpsc::Sender<Answer>,
     records: mpsc::Sender<Record>,
     outside: Outside,
+    told: Told,
+    /// The run's own number of its last commit.
+    decided: Revision,
     /// Hears of the root's revisions.
     following: Option<AbortOnDropHandle<()>>,
     cancelled: Cancelled,
@@ -163,7 +172,10 @@ impl Performer {
         let session = background.enter(open);
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, manager, session.id())?;
-        only_run(&resources, task).await?;
+        if let Err(refused) = claim(&resources, &run, task, place.alone).await {
+            session.close().await;
+            return Err(refused);
+        }
         let world = WorldClient::new(&channels, &place.endpoints.world_pool)?;
         let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
         let (cancelled, recorded) = (Cancelled::default(), Recorded::default());
@@ -194,6 +206,8 @@ impl Performer {
             events,
             records,
             outside: Outside::default(),
+            told: Told::new(),
+            decided: Revision::default(),
             following: None,
             cancelled,
             recorded,
@@ -220,7 +234,8 @@ impl Performer {
     /// Hears of every revision of the root after this one.
     fn follow(&mut self, after: Revision) -> anyhow::Result<()> {
         self.record(Record::Known(after))?;
-        let following = watch::follow(self.world.clone(), after, self.events.clone());
+        self.told.root(after);
+        let following = watch::follow(self.world.clone(), after, self.events.clone(), self.told.clone());
         self.following = Some(AbortOnDropHandle::new(tokio::spawn(following)));
         Ok(())
     }
@@ -300,6 +315,7 @@ impl Performer {
             Command::Commit { instance, writer, changes, evidence, revision } => {
                 let decided = Decided { instance, writer, changes, evidence, revision };
                 self.outside.decided(&self.run, &decided);
+                self.decided = decided.revision;
                 self.record(Record::Commit(decided))?;
             }
             Command::Operate { instance, operations } => {
@@ -359,15 +375,16 @@ impl Performer {
         };
         let requirements: Vec<Requirement> = requirements.into_iter().map(|one| self.of_performers(one)).collect();
         let (resources, events) = (self.resources.clone(), self.events.clone());
+        let (told, run) = (self.told.clone(), self.run.clone());
         let mut asking = Box::pin(trace::within(self.trace.child(), async move {
             let unheard = AtomicBool::new(false);
             let ask = || async {
-                let answer = resources.acquire(requirements.clone(), options.clone()).await;
+                let answer = resources.acquire_with_notes(requirements.clone(), options.clone()).await;
                 unheard.fetch_or(answer.as_ref().is_err_and(CallError::is_crash), Ordering::Relaxed);
                 answer
             };
             let answer = match handed {
-                Some(lease) => Ok(lease),
+                Some(lease) => Ok((lease, Vec::new())),
                 None => tokio::select! {
                     // A manager that does not answer is waited for until the run gives its session up ([`Performer::lost`]).
                     answer = retry_until_answered(ask) => answer,
@@ -383,7 +400,10 @@ impl Performer {
                 let _ = retry_unanswered(|| resources.withdraw(&options.request)).await;
             }
             let event = match answer {
-                Ok(lease) => Event::Granted { instance, lease },
+                Ok((lease, notes)) => {
+                    told.until(&run, &notes).await;
+                    Event::Granted { instance, lease }
+                }
                 Err(error) => Event::Refused { instance, reason: said(&error) },
             };
             let _ = events.send(Answer::Event { event: Box::new(event), withdrawn: Some(withdrawn) }).await;
@@ -538,6 +558,7 @@ impl Performer {
             self.leases.given_back(lease);
         }
         let (resources, world) = (self.resources.clone(), self.world.clone());
+        let note = self.told.left(&self.run, self.decided).to_string();
         self.giving_back.spawn(async move {
             // Whoever gets the resources next finds them idle.
             for job in jobs {
@@ -549,7 +570,7 @@ impl Performer {
                 tracing::warn!(%instance, "a projection was not given back: {}", said(&error));
             }
             if let Some(lease) = lease
-                && let Err(error) = retry_unanswered(|| resources.release(lease)).await
+                && let Err(error) = retry_unanswered(|| resources.release_with_note(lease, note.clone())).await
             {
                 tracing::warn!(%instance, "a lease was not given back: {}", said(&error));
             }
@@ -557,20 +578,48 @@ impl Performer {
     }
 }
 
-/// Two runs would each change the world under the other's projections: a system has one at a time. The resource that says so
-/// goes with the run's session.
+/// A run begins on a system. It goes beside others, unless it or one of them is to be `alone`. The resource that says so, of its id, goes with
+/// its session.
 ///
 /// # Errors
-/// Where another run is under way, or the resource manager cannot be asked.
-pub async fn only_run(resources: &ResourceClient, task: &str) -> anyhow::Result<()> {
-    let claim =
-        Resource::new(RUN, ResourceClass::Task, RUN_KIND).with_attribute("task", Value::String(task.to_owned()));
+/// Where it may not begin beside what is under way, it is under way already, or the resource manager cannot be asked.
+pub async fn claim(resources: &ResourceClient, run: &str, task: &str, alone: bool) -> anyhow::Result<()> {
+    let claim = Resource::new(run, ResourceClass::Task, RUN_KIND)
+        .with_attribute(TASK, Value::String(task.to_owned()))
+        .with_attribute(ALONE, Value::Bool(alone));
+    let refused = |message: String| Err(NotStarted(message).into());
     match retry_unanswered(|| resources.create(claim.clone())).await {
-        Ok(_) => Ok(()),
+        Ok(_) => {}
         Err(error) if error.code() == Some(tonic::Code::AlreadyExists) => {
-            let message = "another run is under way on this system: wait for its end, or use a system of your own";
-            Err(NotStarted(message.to_owned()).into())
+            return refused(format!("{run} is under way on this system"));
         }
         Err(error) => bail!("cannot begin the run: {}", said(&error)),
     }
+    // Of two that begin at the same moment each sees the other one.
+    let runs = retry_unanswered(|| resources.list(&[RUN_KIND])).await;
+    let runs = runs.map_err(|error| anyhow::anyhow!("cannot begin the run: {}", said(&error)))?;
+    let others: Vec<&Resource> = runs.iter().filter(|other| other.id != run).collect();
+    let task_of = |other: &Resource| match other.attributes.get(TASK) {
+        Some(Value::String(task)) => format!("`{task}`"),
+        _ => other.id.clone(),
+    };
+    if let Some(other) = others.iter().find(|other| other.attributes.get(ALONE) == Some(&Value::Bool(true))) {
+        let task = task_of(other);
+        return refused(format!(
+            "{task} is under way on this system and goes alone: wait for its end, or use a system of your own"
+        ));
+    }
+    if alone && !others.is_empty() {
+        let tasks: Vec<String> = others.iter().map(|other| task_of(other)).collect();
+        let tasks = tasks.join(", ");
+        return refused(format!(
+            "another run is under way on this system ({tasks}): wait for its end, or use a system of your own"
+        ));
+    }
+    if others.len() >= MOST_RUNS {
+        return refused(format!(
+            "{MOST_RUNS} runs are under way on this system, as many as there may be: wait for the end of one"
+        ));
+    }
+    Ok(())
 }

@@ -38,6 +38,7 @@ fn place_of(endpoints: &Endpoints) -> Place {
         catalogue: Arc::default(),
         speed: 1.0,
         messages: Messages::nowhere(),
+        alone: false,
     }
 }
 
@@ -180,12 +181,64 @@ async fn the_next_node_takes_a_lease_over_until_others_get_their_turn() -> anyho
 }
 
 #[tokio::test]
-async fn a_second_run_is_refused_before_anything_is_started() -> anyhow::Result<()> {
+async fn a_run_goes_beside_others_and_one_that_goes_alone_does_not() -> anyhow::Result<()> {
     let bench = Bench::new().await?;
-    let (events, _) = mpsc::channel(1);
-    let second = connect(&bench.endpoints, "second", events).await;
-    assert!(second.is_err_and(|error| error.to_string().contains("another run is under way")));
-    Ok(())
+    let events = || mpsc::channel(1).0;
+    let second = connect(&bench.endpoints, "second", events()).await?;
+    let alone = Place { alone: true, ..place_of(&bench.endpoints) };
+    let refused = Performer::connect(&alone, "run-3", "third", events()).await.err().context("it went")?;
+    assert!(refused.to_string().contains("another run is under way on this system (`"), "{refused}");
+    second.close().await?;
+    bench.performer.close().await?;
+    let third = Performer::connect(&alone, "run-3", "third", events()).await?;
+    let fourth = connect(&bench.endpoints, "fourth", events()).await.err().context("it went")?;
+    assert!(fourth.to_string().starts_with("`third` is under way on this system and goes alone"), "{fourth}");
+    third.close().await
+}
+
+/// The next grant, and what was told of the world last before it.
+async fn granted_after(
+    performer: &mut Performer,
+    answers: &mut mpsc::Receiver<Answer>,
+) -> anyhow::Result<(LeaseId, Option<(FactKey, Option<Value>)>)> {
+    let mut told = None;
+    loop {
+        match performer.accept(answers.recv().await.context("no answer")?, &World::default())? {
+            Some(Event::WorldChanged { facts, .. }) => told = facts.into_iter().next(),
+            Some(Event::Granted { lease, .. }) => return Ok((lease.id, told)),
+            _ => {}
+        }
+    }
+}
+
+#[tokio::test]
+async fn who_gets_what_another_run_had_has_been_told_what_that_had_committed() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (events, mut answers) = mpsc::channel(16);
+    let mut second = connect(&bench.endpoints, "second", events).await?;
+    bench.performer.root().await?;
+    second.root().await?;
+    let fact = FactKey { predicate: "round".to_owned(), arguments: Vec::new() };
+    for round in 1..=20 {
+        let (first, other) = (InstanceId(2 * round), InstanceId(2 * round + 1));
+        bench.ask(first)?;
+        let (lease, _) = granted_after(&mut bench.performer, &mut bench.answers).await?;
+        second.perform(Command::Acquire { instance: other, requirements: arm(), priority: 0 })?;
+        let value = Value::Int(i64::try_from(round)?);
+        bench.performer.perform(Command::Commit {
+            instance: first,
+            writer: "place".into(),
+            changes: vec![Change::Set { fact: fact.clone(), value: value.clone() }],
+            evidence: Vec::new(),
+            revision: Revision(1_000 + round),
+        })?;
+        bench.performer.perform(Command::Release { instance: first, lease: Some(lease), projection: None })?;
+        let (lease, told) = granted_after(&mut second, &mut answers).await?;
+        assert_eq!(told, Some((fact.clone(), Some(value))));
+        second.perform(Command::Release { instance: other, lease: Some(lease), projection: None })?;
+    }
+    second.close().await?;
+    bench.performer.close().await
 }
 
 #[tokio::test]

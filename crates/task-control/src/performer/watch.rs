@@ -1,6 +1,7 @@
 //! What the world pool tells of its root while a run is under way.
 
 use super::Answer;
+use super::told::{Told, maker};
 use crate::record::said;
 use ratn_executive::protocol::Event;
 use ratn_model::id::{InstanceId, Revision};
@@ -11,9 +12,9 @@ use tokio::sync::mpsc;
 
 /// Tells of every revision after one, in order and without a gap, as long as somebody listens. A pool that comes back with its
 /// state is heard again where it was; with one that has lost it the run cannot go on.
-pub(super) async fn follow(world: WorldClient, mut after: Revision, events: mpsc::Sender<Answer>) {
+pub(super) async fn follow(world: WorldClient, mut after: Revision, events: mpsc::Sender<Answer>, heard: Told) {
     loop {
-        let told = tell(&world, &mut after, &events).await;
+        let told = tell(&world, &mut after, &events, &heard).await;
         if events.is_closed() {
             return;
         }
@@ -32,14 +33,21 @@ pub(super) async fn follow(world: WorldClient, mut after: Revision, events: mpsc
     }
 }
 
-async fn tell(world: &WorldClient, after: &mut Revision, events: &mpsc::Sender<Answer>) -> Result<(), CallError> {
+async fn tell(
+    world: &WorldClient,
+    after: &mut Revision,
+    events: &mpsc::Sender<Answer>,
+    heard: &Told,
+) -> Result<(), CallError> {
     let mut watch = retry_unanswered(|| world.watch(Some(*after), &[])).await?;
     while let Some(update) = watch.next().await? {
         if let WorldUpdate::Changed(change) = update {
             *after = change.revision;
+            let made_by = maker(&change);
             if events.send(Answer::World(change)).await.is_err() {
                 return Ok(());
             }
+            heard.hear(*after, made_by);
         }
     }
     Ok(())

@@ -71,8 +71,8 @@ impl Resumption {
 /// Goes on with a run whose task control was killed, on the system that it was on.
 ///
 /// # Errors
-/// As when a run begins; and where the run cannot go on: its log is of another program, its world is not there any more, another run is
-/// under way.
+/// As when a run begins; and where the run cannot go on: its log is of another program, its world is not there any more, it is under
+/// way.
 pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
     let ledger = &resumption.replayed.standing.ledger;
     performer::check_world(place, ledger).await?;
@@ -102,7 +102,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         log,
         checkpointer,
         clock: RobotClock::going_on(replay::now(&ledger, unix_ms(), place.speed), place.speed),
-        control: Control::listen_if_possible(&place.directory, &place.messages),
+        control: Control::listen_if_possible(&place.directory, &ledger.origin.run, &place.messages),
         advisor: advisor_of(mode, seed),
         lookout: Lookout::default(),
         ask_at: None,

@@ -51,6 +51,7 @@ impl Bench {
             catalogue: Arc::new(catalogue),
             speed: 10.0,
             messages: Messages::nowhere(),
+            alone: false,
         };
         Ok(Bench { place, run, directory, _shutdown: shutdown.drop_guard() })
     }
@@ -78,14 +79,14 @@ async fn a_run_is_told_to_end_over_its_socket() -> anyhow::Result<()> {
     let (_asks, interrupt) = Interrupt::new();
     let running = run(bench.run.clone(), &bench.place, &interrupt);
     let telling = async {
-        while tell(&bench.place.directory, Word::Abort).await.is_err() {
+        while tell(&bench.place.directory, ANY_RUN, Word::Abort).await.is_err() {
             tokio::task::yield_now().await;
         }
     };
     let (ended, ()) = tokio::join!(running, telling);
     assert_eq!(ended?.outcome, "preempted");
     // Nobody listens there any more.
-    assert!(tell(&bench.place.directory, Word::Abort).await.is_err());
+    assert!(tell(&bench.place.directory, ANY_RUN, Word::Abort).await.is_err());
     Ok(())
 }
 
@@ -120,7 +121,7 @@ fn answer(run: &str, state: Option<&str>, choice: &str) -> Message {
 /// Whether the run says that this state waits.
 async fn waits(place: &Place, path: &str) {
     let is_it = |status: &RunStatus| status.awaits.iter().any(|awaiting| awaiting.path == path);
-    while !crate::control::status(&place.directory).await.ok().flatten().is_some_and(|status| is_it(&status)) {
+    while !crate::control::status(&place.directory, ANY_RUN).await.ok().flatten().is_some_and(|status| is_it(&status)) {
         tokio::task::yield_now().await;
     }
 }
@@ -132,7 +133,7 @@ async fn over_grpc(place: &Place) {
     let endpoint = runtime.wait_for(crate::control::ROLE, READY).await.expect("it is served");
     let channel = ratn_worker::client::Channels::new(&place.tls).get(&endpoint).expect("a channel");
     let mut client = v1::run_service_client::RunServiceClient::new(channel);
-    let waits = client.get_waits(v1::GetWaitsRequest {}).await.expect("it says").into_inner();
+    let waits = client.get_waits(v1::GetWaitsRequest::default()).await.expect("it says").into_inner();
     let awaited = Some(v1::wait::Awaited::Signal("order".to_owned()));
     let wait = v1::Wait { path: "next".to_owned(), until_s: None, awaited };
     assert_eq!((waits.task.as_str(), waits.waits), ("hand_over", vec![wait]));
@@ -180,7 +181,7 @@ states:
     let place = &bench.place;
     let (_asks, interrupt) = Interrupt::new();
     let stopped = async |ended: u64| loop {
-        let status = crate::control::status(&place.directory).await.ok().flatten();
+        let status = crate::control::status(&place.directory, ANY_RUN).await.ok().flatten();
         if status.is_some_and(|status| status.paused && status.ended >= ended) {
             break;
         }
@@ -198,12 +199,12 @@ states:
             sent(place, breakpoint(Some("first"), false)).await,
             Ok("the run pauses before second/inner".to_owned())
         );
-        tell(&place.directory, Word::Resume).await.expect("it listens");
+        tell(&place.directory, ANY_RUN, Word::Resume).await.expect("it listens");
         stopped(1).await;
         let none = sent(place, breakpoint(Some("first"), false)).await.expect_err("it was taken away");
         assert!(none.contains("no breakpoint at `first`: there is second/inner"), "{none}");
         assert_eq!(sent(place, breakpoint(None, false)).await, Ok("no breakpoints are set any more".to_owned()));
-        tell(&place.directory, Word::Resume).await.expect("it listens");
+        tell(&place.directory, ANY_RUN, Word::Resume).await.expect("it listens");
     };
     let (ended, ()) = tokio::join!(run(bench.run.clone(), place, &interrupt), telling);
     assert_eq!(ended?.outcome, SUCCESS);

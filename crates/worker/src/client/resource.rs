@@ -188,6 +188,18 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn acquire(&self, requirements: Vec<Requirement>, options: AcquireOptions) -> Result<Lease, CallError> {
+        Ok(self.acquire_with_notes(requirements, options).await?.0)
+    }
+
+    /// As [`ResourceClient::acquire`], with what those who gave the resources back last have left to be told.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn acquire_with_notes(
+        &self,
+        requirements: Vec<Requirement>,
+        options: AcquireOptions,
+    ) -> Result<(Lease, Vec<String>), CallError> {
         let (request_id, session_id) = self.mutation(&options.request);
         let question = v1::AcquireRequest {
             request_id,
@@ -198,7 +210,7 @@ impl ResourceClient {
             holder: options.holder,
         };
         match self.ask_for_lease(&question.request_id.clone(), Asked::Acquire(question)).await? {
-            Answered::Acquire(granted) => self.field(granted.lease, "lease"),
+            Answered::Acquire(granted) => Ok((self.field(granted.lease, "lease")?, granted.notes)),
             _ => Err(self.another("an acquire")),
         }
     }
@@ -225,8 +237,16 @@ impl ResourceClient {
     /// # Errors
     /// [`CallError`].
     pub async fn release(&self, lease: LeaseId) -> Result<bool, CallError> {
+        self.release_with_note(lease, String::new()).await
+    }
+
+    /// As [`ResourceClient::release`]; whoever gets its resources next is told this, of at most 256 bytes.
+    ///
+    /// # Errors
+    /// [`CallError`].
+    pub async fn release_with_note(&self, lease: LeaseId, note: String) -> Result<bool, CallError> {
         let (request_id, session_id) = self.mutation("");
-        let question = v1::ResourceServiceReleaseRequest { request_id, session_id, lease_id: lease.0 };
+        let question = v1::ResourceServiceReleaseRequest { request_id, session_id, lease_id: lease.0, note };
         match self.ask(Asked::Release(question)).await? {
             Answered::Release(ended) => Ok(ended.released),
             _ => Err(self.another("a release")),

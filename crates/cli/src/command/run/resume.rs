@@ -10,7 +10,7 @@ use crate::system::System;
 use crate::system::config::SystemConfig;
 use ratn_event_log::LogWriter;
 use ratn_task_control::history::History;
-use ratn_task_control::shell::{self, Resumption};
+use ratn_task_control::shell::{self, Place, Resumption};
 use ratn_worker::tls::ClientTls;
 use std::path::Path;
 
@@ -47,7 +47,7 @@ pub(super) async fn run(
     let resumption = Resumption::new(program, history, writer, arguments.checkpoint_every)
         .map_err(|error| refused(&format_args!("{:#}", anyhow::Error::from(error))))?;
     output::progress(format_args!("on the system in {}", directory.display()));
-    let place = system.place();
+    let place = Place { alone: arguments.alone, ..system.place() };
     let ended = tokio::select! {
         ended = shell::resume(resumption, &place, interrupt) => ended,
         error = system.one_ended() => Err(error.context("a part of the system ended during the run")),

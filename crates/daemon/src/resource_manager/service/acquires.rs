@@ -1,6 +1,7 @@
 //! Calls for a lease: acquire and block wait in the queue, withdraw leaves it, and explain says why a call waits.
 
 use super::mutation;
+use super::notes::Notes;
 use super::requests::{Requests, session};
 use super::waiting_call::{Tickets, WaitingCall};
 use crate::access::{Caller, speaker};
@@ -39,6 +40,7 @@ pub(super) async fn block(
 pub(super) async fn acquire(
     requests: &Requests,
     tickets: &Tickets,
+    notes: &Notes,
     caller: &Caller,
     request: v1::AcquireRequest,
 ) -> Result<v1::AcquireResponse, Status> {
@@ -49,7 +51,8 @@ pub(super) async fn acquire(
         ..AcquireRequest::new(session(&request.session_id)?, requirements)
     };
     let lease = wait_for_grant(requests, tickets, caller, request.request_id, acquire, request.deadline_ms).await?;
-    Ok(v1::AcquireResponse { lease: Some(wire::lease(lease, request.session_id)) })
+    let notes = notes.of(&lease, Instant::now());
+    Ok(v1::AcquireResponse { lease: Some(wire::lease(lease, request.session_id)), notes })
 }
 
 async fn wait_for_grant(

@@ -1,22 +1,32 @@
 //! Calls that end a lease: a release, and the confirmation that a machine stands still.
 
+use super::notes::Notes;
 use super::requests::{Requests, odd_reply, optional_session};
 use crate::access::Caller;
 use crate::resource_manager::actor::Message;
 use ratn_model::id::LeaseId;
-use ratn_proto::convert::name;
+use ratn_proto::convert::{label, name};
 use ratn_proto::v1;
 use ratn_resources::{Reply, Request};
+use std::time::Instant;
 use tonic::{Code, Status};
 
 pub(super) async fn release(
     requests: &Requests,
+    notes: &Notes,
     caller: &Caller,
     request: v1::ResourceServiceReleaseRequest,
 ) -> Result<v1::ResourceServiceReleaseResponse, Status> {
+    label(&request.note, "note")?;
     let session = optional_session(&request.session_id)?;
-    let release = Request::Release { session, lease: LeaseId(request.lease_id) };
-    let (released, revision) = match requests.perform(caller, request.request_id, release).await {
+    let lease = LeaseId(request.lease_id);
+    // Before: whoever gets its resources in the same turn is told already.
+    let left = notes.left(lease, request.note, Instant::now());
+    let performed = requests.perform(caller, request.request_id, Request::Release { session, lease }).await;
+    if performed.is_err() {
+        notes.take_back(lease, left);
+    }
+    let (released, revision) = match performed {
         Ok((_, revision)) => (true, revision),
         Err(status) if status.code() == Code::NotFound => {
             (false, requests.actor().ask(|answer| Message::Revision { answer }).await?.0)

@@ -9,6 +9,7 @@ mod acquires;
 mod demand;
 mod leases;
 mod mutation;
+mod notes;
 mod requests;
 mod resources;
 mod sessions;
@@ -23,6 +24,7 @@ use crate::access::{Caller, speaker};
 use crate::metrics::Metrics;
 use crate::quota::Quotas;
 use futures::stream::BoxStream;
+use notes::Notes;
 use ratn_model::id::LeaseId;
 use ratn_proto::v1;
 use ratn_resources::SessionId;
@@ -39,6 +41,7 @@ use waiting_call::Tickets;
 pub(super) struct Service {
     requests: Requests,
     tickets: Tickets,
+    notes: Notes,
     shutdown: CancellationToken,
 }
 
@@ -46,7 +49,8 @@ type Streamed<T> = BoxStream<'static, Result<T, Status>>;
 
 impl Service {
     pub(super) fn new(actor: Handle, shutdown: CancellationToken, metrics: Arc<Metrics>) -> Service {
-        Service { requests: Requests::new(actor, metrics), tickets: Tickets::default(), shutdown }
+        let (tickets, notes) = Default::default();
+        Service { requests: Requests::new(actor, metrics), tickets, notes, shutdown }
     }
 
     pub(super) fn metrics(&self) -> &Arc<Metrics> {
@@ -122,7 +126,7 @@ impl v1::resource_service_server::ResourceService for Service {
 
     async fn acquire(&self, request: Request<v1::AcquireRequest>) -> Result<Response<v1::AcquireResponse>, Status> {
         let (caller, request) = parts(request);
-        acquires::acquire(&self.requests, &self.tickets, &caller, request).await.map(Response::new)
+        acquires::acquire(&self.requests, &self.tickets, &self.notes, &caller, request).await.map(Response::new)
     }
 
     async fn withdraw(&self, request: Request<v1::WithdrawRequest>) -> Result<Response<v1::WithdrawResponse>, Status> {
@@ -140,7 +144,7 @@ impl v1::resource_service_server::ResourceService for Service {
         request: Request<v1::ResourceServiceReleaseRequest>,
     ) -> Result<Response<v1::ResourceServiceReleaseResponse>, Status> {
         let (caller, request) = parts(request);
-        leases::release(&self.requests, &caller, request).await.map(Response::new)
+        leases::release(&self.requests, &self.notes, &caller, request).await.map(Response::new)
     }
 
     async fn confirm_standstill(
