@@ -10,5 +10,6 @@ pub mod jobshop;
 pub mod psplib;
 pub mod run;
 pub mod sequential;
+pub mod several;
 pub mod tables;
 pub mod timed;

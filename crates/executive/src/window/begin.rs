@@ -292,7 +292,7 @@ impl Window {
     /// What it reads is as it was when it asked: it gets its projection, then its goal starts.
     fn launch(&mut self, context: &mut Context<'_>, id: InstanceId, known: Option<Outputs>) {
         // What ends before it begins is no step of the operator's.
-        if self.ends_violated(context, id) {
+        if self.is_not_met(context, id) || self.ends_violated(context, id) {
             return;
         }
         let Some(instance) = self.graph.get(id) else { return };
@@ -310,6 +310,33 @@ impl Window {
             return self.start_routine(context, id);
         }
         self.start_goal(context, id, known);
+    }
+
+    /// Ends a PIA of which a precondition does not hold any more: while it waited for its resources somebody else has changed the world.
+    /// Whether it did.
+    fn is_not_met(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
+        let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return false };
+        let state = context.program.state(instance.state);
+        if state.annotations.requires.is_empty() {
+            return false;
+        }
+        let unmet = self.look(context, id, None, |_, view| match binding::unmet(state, view) {
+            Ok(None) => None,
+            Ok(Some(reason)) => Some(Readiness::Failed(reason)),
+            Err(error) => Some(not_bound(view, &error)),
+        });
+        match unmet.flatten() {
+            Some(Readiness::Failed(reason)) => {
+                let outputs = self.unassigned(context, id);
+                self.finish(context, id, Ended { outputs, ..Ended::aborted(reason) });
+                true
+            }
+            Some(Readiness::Waits(wait)) => {
+                self.step_back(context, id, wait);
+                true
+            }
+            Some(Readiness::Ready(..)) | None => false,
+        }
     }
 
     fn project(&mut self, context: &mut Context<'_>, id: InstanceId) {

@@ -159,13 +159,14 @@ class System:
         seed: int | None = None,
         log: str | os.PathLike[str] | None = None,
         step_workers: int = 1,
+        alone: bool = False,
         **parameters: Any,
     ) -> Run:
         """Begins a run of a task, or of a task file; its parameters are keyword arguments. ``mode`` is ``cdtn`` or ``hsm``.
 
-        The steps of a task (``@ratn.step``) are performed by workers that live as long as the run: ``step_workers`` processes for each file.
+        It goes beside other runs of the system, unless it or one of them is to be ``alone``. The steps of a task (``@ratn.step``) are performed by workers that live as long as the run: ``step_workers`` processes for each file.
         """
-        return Run(self, task, mode, seed, log, parameters, step_workers)
+        return Run(self, task, mode, seed, log, parameters, step_workers, alone)
 
     def acquire(
         self, *kinds: str, priority: int = 0, timeout_s: float | None = None, holder: str = "python"
@@ -220,6 +221,7 @@ class Run:
         log: str | os.PathLike[str] | None,
         parameters: dict[str, Any],
         step_workers: int = 1,
+        alone: bool = False,
     ) -> None:
         self._system = system
         self._folder = tempfile.TemporaryDirectory(prefix="ratn-run-")
@@ -235,6 +237,7 @@ class Run:
         command = [_program(), "run", os.fspath(task), "--json", "--mode", mode]
         command += ["--runtime-dir", str(system.runtime_dir), "--log", str(self.log)]
         command += ["--seed", str(seed)] if seed is not None else []
+        command += ["--alone"] if alone else []
         for name, value in parameters.items():
             # Texts are taken as they are.
             command += ["--set", f"{name}={value if isinstance(value, str) else written(value)}"]
@@ -346,8 +349,15 @@ class Run:
         said = json.loads(text)
         return Result(said["outcome"], said.get("outputs", {}), said.get("reason", ""), said.get("makespan_s", 0.0))
 
-    def _control(self, word: str) -> str:
-        return self._tell(["control", word])
+    @property
+    def id(self) -> str:
+        """Its id, which tells it from other runs of the system."""
+        self._wait_for_log()
+        with self.log.open("rb") as log:
+            return str(json.loads(log.readline())["origin"]["run"])
+
+    def _control(self, *words: str) -> str:
+        return self._tell(["control", *words, "--run", self.id])
 
     def _tell(self, words: list[str]) -> str:
         command = [_program(), *words, "--runtime-dir", str(self._system.runtime_dir)]
@@ -358,11 +368,11 @@ class Run:
 
     def signal(self, name: str, value: Any = None) -> None:
         """Sends a signal, which a state of the task waits for (``ratn.wait(signal="order")``), with a value. It is kept until one does."""
-        self._tell(["signal", "-", name, *([] if value is None else [str(written(value))])])
+        self._tell(["signal", self.id, name, *([] if value is None else [str(written(value))])])
 
     def answer(self, choice: str, *, state: str | None = None) -> None:
         """Answers the question of a state (``ratn.ask``); where several ask, of that of this path."""
-        self._tell(["answer", "-", choice, *(["--state", state] if state is not None else [])])
+        self._tell(["answer", self.id, choice, *(["--state", state] if state is not None else [])])
 
     def pause(self) -> str:
         """No further state begins that acts for real; what runs goes on."""
@@ -374,11 +384,11 @@ class Run:
 
     def break_at(self, state: str) -> str:
         """The run pauses before a state that acts, at this path or inside of it, begins (``for_box/grasp``); :meth:`resume` and :meth:`step` let it go on."""
-        return self._tell(["control", "break", state])
+        return self._control("break", state)
 
     def clear(self, state: str | None = None) -> str:
         """Takes the breakpoint at a state away, or all."""
-        return self._tell(["control", "clear", *([] if state is None else [state])])
+        return self._control("clear", *([] if state is None else [state]))
 
     def resume(self) -> str:
         """Ends a pause."""
@@ -388,7 +398,7 @@ class Run:
         """Ends the run: motions stop, everything is given back."""
         return self._control("abort")
 
-    def _read(self) -> _views.Log:
+    def _wait_for_log(self) -> None:
         # A run that has just begun has not written its first line.
         until = time.monotonic() + _ENDED_WITHIN_S
         while not (self.log.exists() and b"\n" in self.log.read_bytes()[:1_000_000]):
@@ -397,6 +407,9 @@ class Run:
             if time.monotonic() > until:
                 raise Error(f"the run has written nothing within {_ENDED_WITHIN_S:.0f} s: {self.messages().strip()}")
             time.sleep(_LOOK_S)
+
+    def _read(self) -> _views.Log:
+        self._wait_for_log()
         return _views.Log(self.log)
 
     def report(self) -> _views.Report:

@@ -24,6 +24,8 @@ struct Ended {
     outcome: String,
     outputs: Outputs,
     measured: Vec<(FactKey, Value)>,
+    /// Whether anything was done at all; else nothing is changed, whatever the outcome declares.
+    has_begun: bool,
 }
 
 impl Reference<'_> {
@@ -42,10 +44,13 @@ impl Reference<'_> {
             return Ok(ABORTED.to_owned());
         };
         let assigned = self.answered(state, &mut ended, variables)?;
-        let Ended { outcome, outputs, measured } = ended;
+        let Ended { outcome, outputs, measured, has_begun } = ended;
         // Both modes log the outcome before they make the effects; that an effect has no value makes it `aborted` all the same.
         self.tell(path, in_routine, &outcome, (inputs, outputs.clone()));
-        let made = self.effects_of(state, &outcome, &outputs, &measured, variables);
+        let made = match has_begun {
+            true => self.effects_of(state, &outcome, &outputs, &measured, variables),
+            false => Ok(()),
+        };
         let made = made.and_then(|()| match &*outcome {
             SUCCESS => self.operates(state, variables, &outputs),
             _ => Ok(()),
@@ -85,12 +90,12 @@ impl Reference<'_> {
                 self.asks(state, variables)?;
             }
             if self.is_violated(state, variables)? {
-                return Ok(violated());
+                return Ok(violated(false));
             }
             let (goal, performance) = self.perform(state, path, variables, tries, attempt)?;
             *inputs = goal.inputs;
             if self.is_violated(state, variables)? {
-                return Ok(violated());
+                return Ok(violated(true));
             }
             attempt += 1;
             let answer = match annotations.timeout_s {
@@ -105,7 +110,9 @@ impl Reference<'_> {
                     }
                     continue;
                 }
-                Some(Answer::Finished { outcome, outputs, measured }) => Some(Ended { outcome, outputs, measured }),
+                Some(Answer::Finished { outcome, outputs, measured }) => {
+                    Some(Ended { outcome, outputs, measured, has_begun: true })
+                }
                 None => None,
             };
             let has_aborted = ended.as_ref().is_none_or(|ended| ended.outcome == ABORTED);
@@ -243,8 +250,8 @@ impl Reference<'_> {
     }
 }
 
-fn violated() -> Ended {
-    Ended { outcome: VIOLATED.to_owned(), outputs: Outputs::new(), measured: Vec::new() }
+fn violated(has_begun: bool) -> Ended {
+    Ended { outcome: VIOLATED.to_owned(), outputs: Outputs::new(), measured: Vec::new(), has_begun }
 }
 
 fn is_good(outcome: &str) -> bool {

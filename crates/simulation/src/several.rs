@@ -1,0 +1,326 @@
+//! Several runs beside each other in virtual time: one resource pool, one root world, an executive each.
+//!
+//! What one run commits the others are told at once, as a change from outside. Leases and projections come late, at random. That the real system
+//! tells in time is not seen here: who gets a lease there has been told what its last holder committed (`ratn-task-control`).
+
+use crate::dice::Dice;
+use crate::run::{Answer, MAX_EVENTS, Oracle, Performance, RunError};
+use ratn_executive::executive::Executive;
+use ratn_executive::protocol::{Command, Event, Learned, Mode, Note, Origin};
+use ratn_model::catalogue::ResourceOffer;
+use ratn_model::fact::{FactKey, Footprint};
+use ratn_model::id::{InstanceId, LeaseId, ProjectionId};
+use ratn_model::program::Program;
+use ratn_model::resource::{Quantity, ResourceClass};
+use ratn_model::time::Timestamp;
+use ratn_model::tolerance::Tolerance;
+use ratn_model::value::Value;
+use ratn_resources::{AcquireRequest, Limits, Notice, Pool, ResourceSpec, SessionId, WaiterId};
+use ratn_world::world::World;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// One of the runs.
+#[derive(Debug, Clone)]
+pub struct Together {
+    /// Its task, without parameters; it says nothing of its own of the initial world, creates and uses up no resources.
+    pub program: Arc<Program>,
+    /// How it is executed.
+    pub mode: Mode,
+    /// When it begins, in virtual seconds.
+    pub begins_s: f64,
+}
+
+/// What all of them are on.
+#[derive(Debug, Clone)]
+pub struct Shared {
+    /// Everything there is, by kind.
+    pub resources: Vec<(String, ResourceOffer)>,
+    /// The facts that hold at first.
+    pub world: Vec<(FactKey, Value)>,
+    /// Leases and projections take up to this long to come, at random by the seed.
+    pub latency: Duration,
+    /// The seed.
+    pub seed: u64,
+}
+
+/// What became of them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AllEnded {
+    /// The outcome of each, and its reason.
+    pub outcomes: Vec<(String, String)>,
+    /// The root world at the end.
+    pub world: World,
+}
+
+/// Makes the runs.
+///
+/// # Errors
+/// [`RunError`] where a core breaks a promise: a run gets stuck, never ends, or its mirror is not the root.
+pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Result<AllEnded, RunError> {
+    let broken = |problem: String| RunError::Broken { at_s: 0.0, problem };
+    let mut pool = Pool::new(Limits::default());
+    for (kind, offer) in &shared.resources {
+        let is_one = offer.class == ResourceClass::World || offer.divisible;
+        let (count, capacity) = if is_one { (1, offer.count) } else { (offer.count.units(), Quantity::ONE) };
+        for number in 1..=count {
+            let mut spec =
+                ResourceSpec::new(offer.class, kind.clone()).id(format!("{kind}-{number}")).capacity(capacity);
+            (spec.divisible, spec.renewable) = (offer.divisible, offer.renewable);
+            pool.create(Timestamp(0), None, spec).map_err(|error| broken(error.to_string()))?;
+        }
+    }
+    let mut root = World::default();
+    root.overwrite(shared.world.iter().map(|(fact, value)| (fact.clone(), Some(value.clone()))));
+    let (agenda, next, projections) = Default::default();
+    let mut system = System {
+        now: Timestamp(0),
+        pool,
+        root,
+        agenda,
+        next,
+        projections,
+        latency: shared.latency,
+        dice: Dice(shared.seed),
+        runs: Vec::new(),
+        oracle,
+    };
+    let _ = system.pool.take_notices();
+    for (number, together) in runs.iter().enumerate() {
+        let session = SessionId::from(format!("run-{number}").as_str());
+        let forever = Duration::from_secs(10 * 365 * 24 * 3600);
+        let alive = system.pool.keep_alive(Timestamp(0), &session, "simulation", forever);
+        alive.map_err(|error| broken(error.to_string()))?;
+        system.runs.push(One {
+            executive: Executive::new(together.program.clone(), Tolerance::ROBOT),
+            session,
+            waiters: BTreeMap::new(),
+            leases: BTreeMap::new(),
+            paths: BTreeMap::new(),
+            has_begun: false,
+            end: None,
+        });
+        system.at(number, Duration::from_secs_f64(together.begins_s.max(0.0)), Due::Begin);
+    }
+    system.until_all_have_ended(shared, runs)
+}
+
+/// What is due.
+enum Due {
+    Begin,
+    Event(Event),
+}
+
+/// One run.
+struct One {
+    executive: Executive,
+    session: SessionId,
+    waiters: BTreeMap<InstanceId, WaiterId>,
+    leases: BTreeMap<LeaseId, InstanceId>,
+    paths: BTreeMap<InstanceId, String>,
+    has_begun: bool,
+    end: Option<(String, String)>,
+}
+
+struct System<'a> {
+    now: Timestamp,
+    pool: Pool,
+    root: World,
+    /// By time and order: of which run.
+    agenda: BTreeMap<(Timestamp, u64), (usize, Due)>,
+    next: u64,
+    projections: BTreeMap<ProjectionId, World>,
+    latency: Duration,
+    dice: Dice,
+    runs: Vec<One>,
+    oracle: &'a mut dyn Oracle,
+}
+
+impl System<'_> {
+    fn at(&mut self, run: usize, delay: Duration, due: Due) {
+        self.next += 1;
+        self.agenda.insert((self.now + delay, self.next), (run, due));
+    }
+
+    fn late(&mut self) -> Duration {
+        Duration::from_nanos(self.dice.below(u64::try_from(self.latency.as_nanos()).unwrap_or(u64::MAX)))
+    }
+
+    fn broken(&self, problem: impl ToString) -> RunError {
+        RunError::Broken { at_s: self.now.seconds(), problem: problem.to_string() }
+    }
+
+    fn until_all_have_ended(mut self, shared: &Shared, runs: &[Together]) -> Result<AllEnded, RunError> {
+        for _ in 0..MAX_EVENTS {
+            let Some(((now, _), (run, due))) = self.agenda.pop_first() else {
+                let waits = self.runs.iter().flat_map(|run| run.executive.explain()).collect();
+                return Err(RunError::Stuck { at_s: self.now.seconds(), waits });
+            };
+            self.now = now;
+            let event = match due {
+                Due::Begin => Event::Started {
+                    task: runs[run].program.name.clone(),
+                    digest: runs[run].program.digest.clone(),
+                    mode: runs[run].mode,
+                    parameters: BTreeMap::new(),
+                    seed: shared.seed,
+                    world: self.root.iter().map(|(key, fact)| (key.clone(), fact.value.clone())).collect(),
+                    revision: self.root.revision(),
+                    capacity: shared.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
+                    learned: Learned::default(),
+                    breakpoints: Box::default(),
+                    origin: Origin::default(),
+                },
+                // Word of what was given back meanwhile is none.
+                Due::Event(Event::Granted { instance, lease })
+                    if self.runs[run].leases.get(&lease.id) != Some(&instance) =>
+                {
+                    continue;
+                }
+                Due::Event(event) => event,
+            };
+            self.tell(run, event)?;
+            if let Some(ends) = self.runs.iter().map(|run| run.end.clone()).collect::<Option<Vec<_>>>() {
+                return Ok(AllEnded { outcomes: ends, world: self.root });
+            }
+        }
+        Err(RunError::Endless(MAX_EVENTS))
+    }
+
+    /// Tells a run, performs what comes of it, and tells the others of each revision that it makes.
+    fn tell(&mut self, run: usize, event: Event) -> Result<(), RunError> {
+        self.runs[run].has_begun |= matches!(event, Event::Started { .. });
+        if self.runs[run].end.is_some() || !self.runs[run].has_begun {
+            return Ok(());
+        }
+        let commands = self.runs[run].executive.handle(self.now, event);
+        let mut told = Vec::new();
+        for command in commands {
+            let before = self.root.clone();
+            if let Command::Commit { changes, .. } = &command {
+                self.root.apply(changes).map_err(|error| self.broken(error))?;
+                let written = self.root.iter().filter(|(key, fact)| before.get(key) != Some(&fact.value));
+                let gone = before.iter().filter(|(key, _)| self.root.get(key).is_none());
+                let facts: Vec<(FactKey, Option<Value>)> = written
+                    .map(|(key, fact)| (key.clone(), Some(fact.value.clone())))
+                    .chain(gone.map(|(key, _)| (key.clone(), None)))
+                    .collect();
+                told.push(Event::WorldChanged { revision: self.root.revision(), facts });
+            } else {
+                self.perform(run, command)?;
+            }
+        }
+        for event in told {
+            for other in (0..self.runs.len()).filter(|other| *other != run) {
+                self.tell(other, event.clone())?;
+            }
+        }
+        let mirror = self.runs[run].executive.root();
+        let is_root = || {
+            mirror
+                .iter()
+                .map(|(key, fact)| (key, &fact.value))
+                .eq(self.root.iter().map(|(key, fact)| (key, &fact.value)))
+        };
+        if self.runs[run].end.is_none() && !is_root() {
+            return Err(self.broken(format!("the mirror of run {run} is not the root")));
+        }
+        self.runs[run].executive.check_invariants().map_err(|problem| self.broken(problem))
+    }
+
+    fn perform(&mut self, run: usize, command: Command) -> Result<(), RunError> {
+        match command {
+            Command::Note(Note::Expanded { instance, path, .. }) => drop(self.runs[run].paths.insert(instance, path)),
+            Command::Note(_) | Command::Commit { .. } | Command::Operate { .. } => {}
+            Command::Acquire { instance, requirements, priority } => {
+                let request = AcquireRequest::new(self.runs[run].session.clone(), requirements).priority(priority);
+                let waiter = self.pool.acquire(self.now, request).map_err(|error| self.broken(error))?;
+                self.runs[run].waiters.insert(instance, waiter);
+                self.answers();
+            }
+            Command::Withdraw { instance } => {
+                if let Some(waiter) = self.runs[run].waiters.remove(&instance) {
+                    self.pool.cancel(self.now, waiter).map_err(|error| self.broken(error))?;
+                } else if let Some(lease) =
+                    self.runs[run].leases.iter().find(|(_, of)| **of == instance).map(|(lease, _)| *lease)
+                {
+                    self.give_back(run, lease)?;
+                }
+                self.answers();
+            }
+            Command::Project { instance, attempt, changes, reads, .. } => {
+                let world = self.root.project(&changes).map_err(|error| self.broken(error))?;
+                let facts: Vec<_> = match &reads {
+                    Footprint::Everything => {
+                        world.iter().map(|(key, fact)| (key.clone(), fact.value.clone())).collect()
+                    }
+                    Footprint::Patterns(patterns) => {
+                        let seen = patterns.iter().flat_map(|read| world.matching(read));
+                        seen.map(|(key, fact)| (key.clone(), fact.value.clone())).collect()
+                    }
+                };
+                self.next += 1;
+                let projection = ProjectionId(self.next);
+                self.projections.insert(projection, World::from_facts(facts, world.revision()));
+                let late = self.late();
+                self.at(run, late, Due::Event(Event::Projected { instance, attempt, projection }));
+            }
+            Command::Start { instance, attempt, goal } => {
+                let path = format!("{run}:{}", self.runs[run].paths.get(&instance).map_or("", String::as_str));
+                let world = goal.projection.and_then(|id| self.projections.get(&id)).unwrap_or(&self.root);
+                let Performance { duration_s, answer } = self.oracle.perform(&path, attempt, &goal, world);
+                let event = match answer {
+                    Answer::Finished { outcome, outputs, measured } => {
+                        let (evidence, reason) = Default::default();
+                        Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason }
+                    }
+                    Answer::Crashed | Answer::LeaseLost => {
+                        Event::Crashed { instance, attempt, reason: "the worker died".to_owned() }
+                    }
+                };
+                self.at(run, Duration::from_secs_f64(duration_s.max(0.0)), Due::Event(event));
+            }
+            Command::Cancel { instance, attempt } => self.agenda.retain(|_, (of, due)| {
+                let is_its = |id: &InstanceId, number: &u32| (*id, *number) == (instance, attempt);
+                *of != run
+                    || !matches!(due, Due::Event(
+                        Event::Finished { instance, attempt, .. }
+                        | Event::Crashed { instance, attempt, .. }
+                        | Event::Projected { instance, attempt, .. }) if is_its(instance, attempt))
+            }),
+            Command::Release { lease, .. } => {
+                if let Some(lease) = lease {
+                    self.give_back(run, lease)?;
+                }
+                self.answers();
+            }
+            Command::Wake { at } => self.at(run, at.since(self.now), Due::Event(Event::Woken)),
+            Command::End { outcome, reason, .. } => self.runs[run].end = Some((outcome, reason)),
+        }
+        Ok(())
+    }
+
+    fn give_back(&mut self, run: usize, lease: LeaseId) -> Result<(), RunError> {
+        let one = &mut self.runs[run];
+        one.leases.remove(&lease);
+        let session = one.session.clone();
+        self.pool.release(self.now, Some(&session), lease).map(drop).map_err(|error| self.broken(error))
+    }
+
+    /// The pool's answers become events.
+    fn answers(&mut self) {
+        drop(self.pool.take_records());
+        for notice in self.pool.take_notices() {
+            let Notice::Granted { waiter, lease } = notice else { continue };
+            let asked = self.runs.iter().enumerate().find_map(|(run, one)| {
+                one.waiters.iter().find(|(_, waits)| **waits == waiter).map(|(instance, _)| (run, *instance))
+            });
+            let Some((run, instance)) = asked else { continue };
+            self.runs[run].waiters.remove(&instance);
+            self.runs[run].leases.insert(lease.id, instance);
+            let late = self.late();
+            self.at(run, late, Due::Event(Event::Granted { instance, lease }));
+        }
+    }
+}

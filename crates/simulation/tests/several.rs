@@ -1,0 +1,251 @@
+//! Two runs on one system leave a world that some interleaving of their sequential programs leaves.
+//!
+//! The programs are random and small; every interleaving of the beginnings and ends of their steps is made by an evaluator that shares nothing
+//! with the executive but the values of facts. Two motions are under way at once where they are of different resources.
+//!
+//! `RATN_PROGRAMS=20000 RATN_FIRST=1000 cargo test -p ratn-simulation --test several` tries other pairs.
+
+mod support;
+
+use ratn_executive::protocol::Mode;
+use ratn_model::value::Value;
+use ratn_simulation::dice::Dice;
+use ratn_simulation::several::{Shared, Together, run};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+use support::{MODES, NoFiles, Providers, fact, load, setup};
+
+const FACTS: u64 = 3;
+
+/// What a motion makes of the world.
+#[derive(Debug, Clone, PartialEq)]
+enum Effect {
+    Set(u64, i64),
+    Increase(u64, i64),
+    /// The first becomes twice the second, plus one.
+    Double(u64, u64),
+    /// The first becomes what was computed last.
+    Computed(u64),
+}
+
+/// A motion, of the arm or of the head.
+#[derive(Debug, Clone, PartialEq)]
+struct Motion {
+    of: &'static str,
+    effect: Effect,
+}
+
+/// One step of a program.
+#[derive(Debug, Clone, PartialEq)]
+enum Step {
+    /// Requires that a fact is greater than a number, where it says so; else it aborts, and the program goes on.
+    Move(Option<(u64, i64)>, Motion),
+    /// Computes the fact plus ten.
+    Think(u64),
+    /// One motion or another one, by whether a fact is greater than a number.
+    Choose((u64, i64), Motion, Motion),
+}
+
+fn motion(dice: &mut Dice, has_computed: bool) -> Motion {
+    let of = if dice.below(3) == 0 { "head" } else { "arm" };
+    let (p, n) = (dice.below(FACTS), i64::try_from(dice.below(5)).unwrap_or_default());
+    let effect = match dice.below(if has_computed { 5 } else { 3 }) {
+        0 => Effect::Set(p, n),
+        1 => Effect::Increase(p, n + 1),
+        2 => Effect::Double(p, dice.below(FACTS)),
+        _ => Effect::Computed(p),
+    };
+    Motion { of, effect }
+}
+
+fn program(dice: &mut Dice) -> Vec<Step> {
+    let mut has_computed = false;
+    let condition = |dice: &mut Dice| (dice.below(FACTS), i64::try_from(dice.below(6)).unwrap_or_default());
+    let count = 2 + dice.below(3);
+    (0..count)
+        .map(|_| match dice.below(4) {
+            0 => {
+                has_computed = true;
+                Step::Think(dice.below(FACTS))
+            }
+            1 => Step::Choose(condition(dice), motion(dice, has_computed), motion(dice, has_computed)),
+            2 => Step::Move(Some(condition(dice)), motion(dice, has_computed)),
+            _ => Step::Move(None, motion(dice, has_computed)),
+        })
+        .collect()
+}
+
+/// The program as a task file.
+fn task(name: &str, steps: &[Step]) -> String {
+    let mut computed = String::new();
+    let mut text = format!("task: {name}\nstates:\n");
+    let says = |effect: &Effect, computed: &str| match effect {
+        Effect::Set(p, n) => format!("p{p}() = {n}"),
+        Effect::Increase(p, n) => format!("increase p{p}() by {n}"),
+        Effect::Double(p, q) => format!("p{p}() = p{q}() * 2 + 1"),
+        Effect::Computed(p) => format!("p{p}() = {computed}.x"),
+    };
+    let moves = |name: &str, requires: &str, Motion { of, effect }: &Motion, computed: &str, ends: &str| {
+        let (action, kind) = if *of == "arm" { ("arm/move", "Arm") } else { ("head/turn", "Head") };
+        let effect = says(effect, computed);
+        format!(
+            "- {name}: {{ action: {action}, pia: true, reads: [], {requires}effects: ['{effect}'], resources: [{{ block: {kind} }}], duration: 2{ends} }}\n"
+        )
+    };
+    for (number, step) in steps.iter().enumerate() {
+        let next = if number + 1 < steps.len() { format!("s{}", number + 1) } else { "success".to_owned() };
+        let ends = format!(", transitions: {{ success: {next}, aborted: {next} }}");
+        match step {
+            Step::Move(requires, motion) => {
+                let requires = requires.map_or(String::new(), |(p, n)| format!("requires: ['p{p}() > {n}'], "));
+                text += &format!("  {}", moves(&format!("s{number}"), &requires, motion, &computed, &ends));
+            }
+            Step::Think(p) => {
+                text += &format!(
+                    "  - s{number}: {{ action: brain/think, computes: true, reads: ['p{p}()'], in: {{ a: p{p}() }}, resources: [{{ block: Brain }}], duration: 1, transitions: {{ success: {next} }} }}\n"
+                );
+                computed = format!("s{number}");
+            }
+            Step::Choose((p, n), then, otherwise) => {
+                text += &format!("  - s{number}:\n      condition: p{p}() > {n}\n      then:\n        ");
+                text += &moves("yes", "", then, &computed, "");
+                text += "      else:\n        ";
+                text += &moves("no", "", otherwise, &computed, "");
+                text += &format!("      transitions: {{ success: {next} }}\n");
+            }
+        }
+    }
+    text
+}
+
+type Facts = BTreeMap<u64, i64>;
+
+/// Where one program is: its next step, which motion it has chosen, the one under way, and what it has computed last.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Place {
+    step: usize,
+    chosen: Option<bool>,
+    moving: Option<&'static str>,
+    computed: i64,
+}
+
+fn apply(facts: &mut Facts, effect: &Effect, computed: i64) {
+    let value = |facts: &Facts, p: &u64| facts[p];
+    match effect {
+        Effect::Set(p, n) => drop(facts.insert(*p, *n)),
+        Effect::Increase(p, n) => drop(facts.insert(*p, value(facts, p) + n)),
+        Effect::Double(p, q) => drop(facts.insert(*p, value(facts, q) * 2 + 1)),
+        Effect::Computed(p) => drop(facts.insert(*p, computed)),
+    }
+}
+
+/// What may come next of a program while the other one moves this: nothing at its end, or where that is in the way.
+fn next(steps: &[Step], place: &Place, facts: &Facts, other: Option<&'static str>) -> Option<(Place, Facts)> {
+    let (mut place, mut facts) = (place.clone(), facts.clone());
+    let (requires, motion) = match steps.get(place.step)? {
+        Step::Think(p) => {
+            place.computed = facts[p] + 10;
+            place.step += 1;
+            return Some((place, facts));
+        }
+        Step::Choose((p, n), ..) if place.chosen.is_none() => {
+            place.chosen = Some(facts[p] > *n);
+            return Some((place, facts));
+        }
+        Step::Move(requires, motion) => (*requires, motion),
+        Step::Choose(_, then, otherwise) => (None, if place.chosen == Some(true) { then } else { otherwise }),
+    };
+    let is_met = requires.is_none_or(|(p, n)| facts[&p] > n);
+    match place.moving {
+        None if is_met && other == Some(motion.of) => return None,
+        None if is_met => {
+            place.moving = Some(motion.of);
+            return Some((place, facts));
+        }
+        None => {}
+        Some(_) => apply(&mut facts, &motion.effect, place.computed),
+    }
+    (place.moving, place.chosen) = (None, None);
+    place.step += 1;
+    Some((place, facts))
+}
+
+/// The worlds that all interleavings leave.
+fn interleaved(programs: &[Vec<Step>; 2], facts: Facts) -> BTreeSet<Facts> {
+    let begin = Place { step: 0, chosen: None, moving: None, computed: 0 };
+    let mut open = vec![([begin.clone(), begin], facts)];
+    let (mut seen, mut ends) = (BTreeSet::new(), BTreeSet::new());
+    while let Some((places, facts)) = open.pop() {
+        if !seen.insert((places.clone(), facts.clone())) {
+            continue;
+        }
+        let mut is_end = true;
+        for which in 0..2 {
+            let other = places[1 - which].moving;
+            if let Some((place, after)) = next(&programs[which], &places[which], &facts, other) {
+                let mut places = places.clone();
+                places[which] = place;
+                open.push((places, after));
+                is_end = false;
+            }
+        }
+        if is_end {
+            ends.insert(facts);
+        }
+    }
+    ends
+}
+
+/// How many different worlds the pairs of these seeds could have left, and how many pairs could have left more than one.
+fn try_pairs(seeds: std::ops::Range<u64>) -> (usize, usize) {
+    let (mut worlds, mut open) = (0, 0);
+    for seed in seeds {
+        let dice = &mut Dice(seed);
+        let programs = [program(dice), program(dice)];
+        let modes: [Mode; 2] = [MODES[dice.below(2) as usize], MODES[dice.below(2) as usize]];
+        let tasks = [task("one", &programs[0]), task("two", &programs[1])];
+        let begin: Facts = (0..FACTS).map(|p| (p, i64::try_from(p).unwrap_or_default() + 1)).collect();
+        let loaded = |text: &str| load(text, "task.yaml", &NoFiles);
+        let shared = Shared {
+            resources: setup(loaded(&tasks[0]), Mode::Hsm).resources,
+            world: begin.iter().map(|(p, n)| (fact(&format!("p{p}()")), Value::Int(*n))).collect(),
+            latency: Duration::from_millis(900),
+            seed,
+        };
+        let begins_s = dice.below(3_000) as f64 / 1000.0;
+        let runs = [
+            Together { program: Arc::new(loaded(&tasks[0])), mode: modes[0], begins_s: 0.0 },
+            Together { program: Arc::new(loaded(&tasks[1])), mode: modes[1], begins_s },
+        ];
+        let mut providers =
+            Providers(|_: &str, _: u32, goal: &ratn_executive::protocol::Goal, _: &ratn_world::world::World| {
+                let x = match goal.inputs.get("a") {
+                    Some(Value::Int(a)) => Value::Int(a + 10),
+                    other => other.cloned().unwrap_or(Value::Null),
+                };
+                ("success", x)
+            });
+        let about = || format!("seed {seed}, {modes:?}\n{}\n{}", tasks[0], tasks[1]);
+        let ended = run(&shared, &runs, &mut providers).unwrap_or_else(|error| panic!("{error}\n{}", about()));
+        assert!(ended.outcomes.iter().all(|(outcome, _)| outcome == "success"), "{:?}\n{}", ended.outcomes, about());
+        let number = |p: u64| match ended.world.get(&fact(&format!("p{p}()"))) {
+            Some(Value::Int(n)) => *n,
+            other => panic!("p{p} is {other:?}\n{}", about()),
+        };
+        let left: Facts = (0..FACTS).map(|p| (p, number(p))).collect();
+        let possible = interleaved(&programs, begin);
+        assert!(possible.contains(&left), "{left:?} is none of {possible:?}\n{}", about());
+        worlds += possible.len();
+        open += usize::from(possible.len() > 1);
+    }
+    (worlds, open)
+}
+
+#[test]
+fn two_runs_leave_a_world_that_some_interleaving_of_their_sequential_programs_leaves() {
+    let given = |name: &str, usual| std::env::var(name).map_or(usual, |number| number.parse().unwrap());
+    let (first, count) = (given("RATN_FIRST", 0), given("RATN_PROGRAMS", 600));
+    let (worlds, open) = try_pairs(first..first + count);
+    assert!(open as u64 > count / 2, "the pairs hardly meet: {open} of them have several ends, {worlds} worlds in all");
+}
