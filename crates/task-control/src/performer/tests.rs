@@ -219,6 +219,7 @@ async fn who_gets_what_another_run_had_has_been_told_what_that_had_committed() -
     bench.performer.root().await?;
     second.root().await?;
     let fact = FactKey { predicate: "round".to_owned(), arguments: Vec::new() };
+    let began = Instant::now();
     for round in 1..=20 {
         let (first, other) = (InstanceId(2 * round), InstanceId(2 * round + 1));
         bench.ask(first)?;
@@ -237,6 +238,15 @@ async fn who_gets_what_another_run_had_has_been_told_what_that_had_committed() -
         assert_eq!(told, Some((fact.clone(), Some(value))));
         second.perform(Command::Release { instance: other, lease: Some(lease), projection: None })?;
     }
+    // Nor does one that begins only now wait for what was there before.
+    let (events, mut answers) = mpsc::channel(16);
+    let mut third = connect(&bench.endpoints, "third", events).await?;
+    third.root().await?;
+    third.perform(Command::Acquire { instance: InstanceId(1), requirements: arm(), priority: 0 })?;
+    granted_after(&mut third, &mut answers).await?;
+    third.close().await?;
+    // Nobody waited in vain.
+    assert!(began.elapsed() < Duration::from_secs(2), "{:?}", began.elapsed());
     second.close().await?;
     bench.performer.close().await
 }

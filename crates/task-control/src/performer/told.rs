@@ -5,8 +5,9 @@
 //! whoever gets it next waits until it has been told as much. So runs that hold the same resource one after the other see each other's
 //! doing as one program would, and no call is needed for it.
 
+#[cfg(doc)]
+use crate::record::Decided;
 use ratn_model::id::Revision;
-use ratn_proto::types::WorldChange;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::str::FromStr;
@@ -108,16 +109,19 @@ impl Told {
     }
 }
 
-/// The run that made a commit, and its own number of it.
-pub(super) fn maker(change: &WorldChange) -> Option<(String, Revision)> {
-    let (instance, number) = change.commit.rsplit_once('/')?;
+/// The run that made a commit, and its own number of it, as [`Decided::id`] says them.
+pub(super) fn maker(commit: &str) -> Option<(String, Revision)> {
+    let (instance, number) = commit.rsplit_once('/')?;
     let (run, _) = instance.rsplit_once('/')?;
+    let number = number.trim_start_matches(|c: char| !c.is_ascii_digit());
     Some((run.to_owned(), Revision(number.parse().ok()?)))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::record::Decided;
+    use ratn_model::id::InstanceId;
 
     fn note(told: u64, pending: u64) -> String {
         Left { told: Revision(told), run: "run-b".to_owned(), pending: Revision(pending) }.to_string()
@@ -143,6 +147,14 @@ mod tests {
         assert_eq!(told.left("run-b", Revision(4)).to_string(), "7 0 run-b");
         assert_eq!(told.left("run-b", Revision(5)).to_string(), "7 5 run-b");
         assert_eq!(told.left("run-c", Revision::default()).to_string(), "7 0 run-c");
+    }
+
+    #[test]
+    fn a_commit_says_whose_it_is() {
+        let (instance, writer) = (InstanceId(7), String::new());
+        let decided = Decided { instance, writer, changes: Vec::new(), evidence: Vec::new(), revision: Revision(12) };
+        assert_eq!(maker(&decided.id("run-1")), Some(("run-1".to_owned(), Revision(12))));
+        assert_eq!(maker("by hand"), None);
     }
 
     #[tokio::test]

@@ -10,11 +10,15 @@ use ratn_worker::client::{CallError, WorldClient};
 use ratn_worker::client::{PAUSE, retry_unanswered};
 use tokio::sync::mpsc;
 
+/// So many revisions before the run are looked at, for whose they are: a resource may be given on by who made one of them.
+const LOOK_BACK: u64 = 256;
+
 /// Tells of every revision after one, in order and without a gap, as long as somebody listens. A pool that comes back with its
 /// state is heard again where it was; with one that has lost it the run cannot go on.
-pub(super) async fn follow(world: WorldClient, mut after: Revision, events: mpsc::Sender<Answer>, heard: Told) {
+pub(super) async fn follow(world: WorldClient, after: Revision, events: mpsc::Sender<Answer>, heard: Told) {
+    let mut from = Revision(after.0.saturating_sub(LOOK_BACK));
     loop {
-        let told = tell(&world, &mut after, &events, &heard).await;
+        let told = tell(&world, &mut from, after, &events, &heard).await;
         if events.is_closed() {
             return;
         }
@@ -22,8 +26,13 @@ pub(super) async fn follow(world: WorldClient, mut after: Revision, events: mpsc
             // The watch ended with its pool, which may come back.
             Ok(()) => {}
             Err(error) if error.is_crash() => {}
+            // The pool does not keep what was so long ago.
+            Err(_) if from < after => {
+                from = after;
+                continue;
+            }
             Err(error) => {
-                let reason = format!("the world pool does not tell of its revisions after {after}: {}", said(&error));
+                let reason = format!("the world pool does not tell of its revisions after {from}: {}", said(&error));
                 let failed = Event::RetirementFailed { instance: InstanceId(0), reason };
                 let _ = events.send(failed.into()).await;
                 return;
@@ -35,19 +44,20 @@ pub(super) async fn follow(world: WorldClient, mut after: Revision, events: mpsc
 
 async fn tell(
     world: &WorldClient,
-    after: &mut Revision,
+    from: &mut Revision,
+    after: Revision,
     events: &mpsc::Sender<Answer>,
     heard: &Told,
 ) -> Result<(), CallError> {
-    let mut watch = retry_unanswered(|| world.watch(Some(*after), &[])).await?;
+    let mut watch = retry_unanswered(|| world.watch(Some(*from), &[])).await?;
     while let Some(update) = watch.next().await? {
         if let WorldUpdate::Changed(change) = update {
-            *after = change.revision;
-            let made_by = maker(&change);
-            if events.send(Answer::World(change)).await.is_err() {
+            *from = change.revision;
+            let made_by = maker(&change.commit);
+            if *from > after && events.send(Answer::World(change)).await.is_err() {
                 return Ok(());
             }
-            heard.hear(*after, made_by);
+            heard.hear(*from, made_by);
         }
     }
     Ok(())

@@ -1,0 +1,51 @@
+//! Several runs on one system: they share its gripper and its world, and who dies and comes back loses nothing of the others'.
+
+mod support;
+
+use anyhow::{Context, ensure};
+use support::{Place, texts, wait_for};
+
+/// Each turn opens the gripper twice. The second time reads what all runs have done before.
+const TASK: &str = r#"task: turns
+parameters: { turns: { type: int, default: 6 } }
+states:
+  - for: turn in range($turns)
+    do:
+      - open: { action: gripper/release, pia: true, reads: [], effects: ["increase opened() by 1"], resources: [Gripper] }
+      - again: { action: gripper/release, pia: true, reads: ["opened()"], requires: ["opened() > 0"], effects: ["last() = opened() + 1", "increase opened() by 1"], resources: [Gripper] }
+"#;
+
+#[test]
+fn runs_beside_each_other_leave_what_all_of_them_did_also_where_one_is_killed_and_comes_back() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let mut up = place.start_as("up", &["up", "--speed", "10", "--boxes", "1"])?;
+    wait_for("the system", || Ok(up.said().contains("is ready").then_some(()))).with_context(|| up.said())?;
+    let file = place.path().join("turns.yaml");
+    std::fs::write(&file, TASK)?;
+    let file = file.to_str().context("a path")?;
+    let log = |name: &str| place.path().join(format!("{name}.jsonl")).display().to_string();
+    let run = |name: &str, mode: &str| place.start_as(name, &["run", file, "--mode", mode, "--log", &log(name)]);
+    let (mut first, mut killed, mut third) = (run("first", "cdtn")?, run("killed", "cdtn")?, run("third", "hsm")?);
+    let has_opened = |name: &str, times: usize| {
+        let text = std::fs::read_to_string(log(name)).unwrap_or_default();
+        (text.matches("\"command\":\"commit\"").count() >= times).then_some(())
+    };
+    wait_for("some turns", || Ok(has_opened("killed", 3))).with_context(|| killed.said())?;
+    killed.child.kill()?;
+    killed.child.wait()?;
+    let mut again = place.start_as("again", &["run", "--resume", &log("killed")])?;
+    for one in [&mut first, &mut again, &mut third] {
+        let (code, _, said) = one.finish()?;
+        ensure!(code == Some(0), "{code:?}\n{said}");
+        ensure!(!said.contains("did not tell in time"), "{said}");
+    }
+    let (facts, err) = texts(&place.ratn(&["world", "facts", "opened()", "last()"]).output()?);
+    for fact in ["opened()", "last()"] {
+        let told = facts.lines().find(|line| line.starts_with(fact)).unwrap_or_default();
+        ensure!(told.split_whitespace().nth(1) == Some("36"), "{facts}{err}");
+    }
+    up.signal(nix::sys::signal::Signal::SIGTERM)?;
+    let (code, _, said) = up.finish()?;
+    ensure!(code == Some(0), "{code:?}\n{said}");
+    place.wait_until_empty()
+}
