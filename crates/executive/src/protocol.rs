@@ -227,6 +227,9 @@ fn nothing() -> Value {
     Value::Null
 }
 
+/// The least priority of an acquire for what is needed whatever is decided; speculative ones ask with less.
+pub const CERTAIN: i64 = 1 << 62;
+
 /// What the shell shall do. Performed in order: commits and projections reach the world pool, acquires and releases the
 /// resource manager, in this order. The
 /// acquires of one event come in the order of their priority and its releases last, so that what is free goes to the most urgent.
@@ -241,7 +244,7 @@ pub enum Command {
         instance: InstanceId,
         /// Blocks, consumes and exists, all or nothing.
         requirements: Vec<Requirement>,
-        /// Larger first.
+        /// Larger first; from [`CERTAIN`] on it is needed whatever is decided.
         priority: i64,
     },
     /// Withdraw an acquire that was not answered yet (a grant that crosses it is released by the shell).

@@ -22,7 +22,7 @@ use anyhow::{Context, bail};
 use futures::FutureExt;
 use goal::{Given, Performing};
 use handover::{Handover, Leases};
-use ratn_executive::protocol::{Command, Event, Goal, Note};
+use ratn_executive::protocol::{CERTAIN, Command, Event, Goal, Note};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::condition::Condition;
 use ratn_model::fact::FactKey;
@@ -62,6 +62,10 @@ const TASK: &str = "task";
 const ALONE: &str = "alone";
 /// The kind of that resource, whose id is the run's.
 pub const RUN_KIND: &str = "Run";
+/// What is needed and waits longer than this beside other runs comes next: of what does, what waits longest.
+const LONG_BESIDE_OTHERS: Duration = Duration::from_secs(2);
+/// The priority with which it asks then; nobody else does.
+const OVERDUE: i64 = i64::MAX;
 /// At the end of a run, for everything that is still being given back.
 const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
 
@@ -172,9 +176,14 @@ impl Performer {
         let session = background.enter(open);
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, manager, session.id())?;
-        if let Err(refused) = claim(&resources, &run, task, place.alone).await {
-            session.close().await;
-            return Err(refused);
+        let told = Told::new();
+        match claim(&resources, &run, task, place.alone).await {
+            Ok(true) => told.beside_others(),
+            Ok(false) => {}
+            Err(refused) => {
+                session.close().await;
+                return Err(refused);
+            }
         }
         let world = WorldClient::new(&channels, &place.endpoints.world_pool)?;
         let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
@@ -206,7 +215,7 @@ impl Performer {
             events,
             records,
             outside: Outside::default(),
-            told: Told::new(),
+            told,
             decided: Revision::default(),
             following: None,
             cancelled,
@@ -367,9 +376,9 @@ impl Performer {
         };
         self.asking.insert(instance, asked);
         let handed = self.handover.as_ref().filter(|handover| handover.to == instance).map(|one| one.lease.clone());
-        let options = AcquireOptions {
+        let mut options = AcquireOptions {
             request,
-            priority,
+            priority: priority.min(OVERDUE - 1),
             deadline: ACQUIRE_DEADLINE,
             holder: holder(&self.task, self.paths.get(&instance).map_or(&instance.to_string(), |path| path)),
         };
@@ -378,22 +387,30 @@ impl Performer {
         let (told, run) = (self.told.clone(), self.run.clone());
         let mut asking = Box::pin(trace::within(self.trace.child(), async move {
             let unheard = AtomicBool::new(false);
-            let ask = || async {
-                let answer = resources.acquire_with_notes(requirements.clone(), options.clone()).await;
-                unheard.fetch_or(answer.as_ref().is_err_and(CallError::is_crash), Ordering::Relaxed);
-                answer
-            };
-            let answer = match handed {
-                Some(lease) => Ok((lease, Vec::new())),
-                None => tokio::select! {
+            let answer = loop {
+                if let Some(lease) = handed {
+                    break Ok((lease, Vec::new()));
+                }
+                let ask = || async {
+                    let answer = resources.acquire_with_notes(requirements.clone(), options.clone()).await;
+                    unheard.fetch_or(answer.as_ref().is_err_and(CallError::is_crash), Ordering::Relaxed);
+                    answer
+                };
+                let may_be_late = (CERTAIN..OVERDUE).contains(&options.priority);
+                tokio::select! {
                     // A manager that does not answer is waited for until the run gives its session up ([`Performer::lost`]).
-                    answer = retry_until_answered(ask) => answer,
+                    answer = retry_until_answered(ask) => break answer,
                     () = withdrawn.cancelled() => {
                         // The call is dropped; what was granted meanwhile goes back.
                         let _ = retry_unanswered(|| resources.withdraw(&options.request)).await;
                         return;
                     }
-                },
+                    // Others are not let pass any more.
+                    () = told.others_after(LONG_BESIDE_OTHERS), if may_be_late => {
+                        let _ = retry_unanswered(|| resources.withdraw(&options.request)).await;
+                        options.priority = OVERDUE;
+                    }
+                }
             };
             if answer.is_err() && unheard.into_inner() {
                 // An answer that was lost before the refusal may have been a grant.
@@ -446,6 +463,9 @@ impl Performer {
             Answer::Event { event, withdrawn } => (*event, withdrawn.is_some_and(|token| token.is_cancelled())),
             Answer::World(change) => {
                 self.record(Record::Known(change.revision))?;
+                if told::maker(&change.commit).is_some_and(|(run, _)| run != self.run) {
+                    self.told.beside_others();
+                }
                 return Ok(self.outside.told(change, mirror));
             }
         };
@@ -578,12 +598,12 @@ impl Performer {
     }
 }
 
-/// A run begins on a system. It goes beside others, unless it or one of them is to be `alone`. The resource that says so, of its id, goes with
-/// its session.
+/// A run begins on a system; whether others are under way. It goes beside them, unless it or one of them is to be `alone`. The resource that
+/// says so, of its id, goes with its session.
 ///
 /// # Errors
 /// Where it may not begin beside what is under way, it is under way already, or the resource manager cannot be asked.
-pub async fn claim(resources: &ResourceClient, run: &str, task: &str, alone: bool) -> anyhow::Result<()> {
+pub async fn claim(resources: &ResourceClient, run: &str, task: &str, alone: bool) -> anyhow::Result<bool> {
     let claim = Resource::new(run, ResourceClass::Task, RUN_KIND)
         .with_attribute(TASK, Value::String(task.to_owned()))
         .with_attribute(ALONE, Value::Bool(alone));
@@ -621,5 +641,5 @@ pub async fn claim(resources: &ResourceClient, run: &str, task: &str, alone: boo
             "{MOST_RUNS} runs are under way on this system, as many as there may be: wait for the end of one"
         ));
     }
-    Ok(())
+    Ok(!others.is_empty())
 }

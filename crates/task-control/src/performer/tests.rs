@@ -252,6 +252,39 @@ async fn who_gets_what_another_run_had_has_been_told_what_that_had_committed() -
 }
 
 #[tokio::test]
+async fn a_run_that_asks_again_and_again_with_the_highest_priority_lets_another_one_pass() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (events, mut answers) = mpsc::channel(16);
+    let mut second = connect(&bench.endpoints, "second", events).await?;
+    let ask = |performer: &mut Performer, instance: u64, priority: i64| {
+        performer.perform(Command::Acquire { instance: InstanceId(instance), requirements: arm(), priority })
+    };
+    ask(&mut bench.performer, 1, i64::MAX)?;
+    let mut lease = bench.granted(InstanceId(1)).await?;
+    ask(&mut second, 1, CERTAIN)?;
+    let waiting = granted_after(&mut second, &mut answers);
+    tokio::pin!(waiting);
+    let (began, mut turns) = (Instant::now(), 1);
+    // It asks for its next turn before it gives this one back.
+    while tokio::time::timeout(Duration::from_millis(50), &mut waiting).await.is_err() {
+        assert!(began.elapsed() < 5 * LONG_BESIDE_OTHERS, "it is never let pass");
+        ask(&mut bench.performer, turns + 1, i64::MAX)?;
+        bench.performer.perform(Command::Release {
+            instance: InstanceId(turns),
+            lease: Some(lease),
+            projection: None,
+        })?;
+        turns += 1;
+        lease = match tokio::time::timeout(Duration::from_secs(1), bench.granted(InstanceId(turns))).await {
+            Ok(granted) => granted?,
+            Err(_) => break,
+        };
+    }
+    assert!(turns > 20 && began.elapsed() < 3 * LONG_BESIDE_OTHERS, "{turns} turns, {:?}", began.elapsed());
+    Ok(())
+}
+
+#[tokio::test]
 async fn a_run_whose_effects_are_not_all_recorded_does_not_end_well() -> anyhow::Result<()> {
     let mut bench = Bench::new().await?;
     // Nothing can be added to it.

@@ -57,6 +57,8 @@ struct Heard {
     revision: Revision,
     /// Of runs, its own among them: their own numbers of their last commits.
     runs: BTreeMap<String, Revision>,
+    /// Whether another run is, or was, under way beside this one.
+    has_others: bool,
 }
 
 impl Told {
@@ -84,6 +86,19 @@ impl Told {
         });
     }
 
+    /// Another run is under way beside this one.
+    pub(super) fn beside_others(&self) {
+        self.0.send_modify(|heard| heard.has_others = true);
+    }
+
+    /// Waits for so long, and until another run is known of.
+    pub(super) async fn others_after(&self, time: Duration) {
+        tokio::time::sleep(time).await;
+        let mut heard = self.0.subscribe();
+        // Whoever could tell of it is this.
+        let _ = heard.wait_for(|heard| heard.has_others).await;
+    }
+
     /// What a run leaves whose last commit is its own number `decided`.
     pub(super) fn left(&self, run: &str, decided: Revision) -> Left {
         let heard = self.0.borrow();
@@ -96,6 +111,10 @@ impl Told {
     pub(super) async fn until(&self, own: &str, notes: &[String]) {
         let notes: Vec<Left> = notes.iter().filter_map(|note| note.parse().ok()).collect();
         let others: Vec<&Left> = notes.iter().filter(|note| note.run != own).collect();
+        if others.is_empty() {
+            return;
+        }
+        self.beside_others();
         let is_told = |heard: &Heard| {
             others.iter().all(|note| {
                 let of_run = heard.runs.get(&note.run).copied().unwrap_or_default();

@@ -11,6 +11,7 @@ mod outlook;
 use super::graph::Graph;
 use super::graph::instance::{Instance, Status};
 use crate::plan::Plan;
+use crate::protocol::CERTAIN;
 use ratn_model::id::InstanceId;
 use ratn_model::program::WORLD_MODEL;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
@@ -21,6 +22,7 @@ use std::collections::{BTreeMap, BTreeSet};
 /// the urgency of an unlikely path is small and still tells it from another.
 const URGENCY_BITS: u32 = 31;
 const ORDER_BITS: u32 = 31;
+const _: () = assert!(CERTAIN == 1 << (URGENCY_BITS + ORDER_BITS));
 
 /// How long a node is assumed to take that says nothing, in seconds.
 const DEFAULT_DURATION_S: f32 = 1.0;
@@ -70,14 +72,14 @@ impl Dispatch {
 
     /// The priority of an acquire: larger first.
     pub(crate) fn priority(&self, graph: &Graph, instance: &Instance) -> i64 {
-        let certain = i64::from(!graph.is_speculative(instance.segment));
+        let certain = if graph.is_speculative(instance.segment) { 0 } else { CERTAIN };
         let remaining_s = instance.dispatch.remaining_s.or(instance.dispatch.duration_s).unwrap_or(DEFAULT_DURATION_S);
         let urgency = (f64::from(remaining_s) * graph.probability(instance.segment)).max(0.0) as f32;
         let urgency = if urgency.is_finite() { i64::from(urgency.to_bits()) } else { i64::from(f32::MAX.to_bits()) };
         // Ids grow in program order.
         let greatest = (1_i64 << ORDER_BITS) - 1;
         let order = i64::try_from(instance.id.0).unwrap_or(i64::MAX).min(greatest);
-        (certain << (URGENCY_BITS + ORDER_BITS)) | (urgency << ORDER_BITS) | (greatest - order)
+        certain | (urgency << ORDER_BITS) | (greatest - order)
     }
 
     /// A node asks for resources, or goes on without any.
