@@ -109,7 +109,7 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
 /// What is due.
 enum Due {
     Begin,
-    Event(Event),
+    Event(Box<Event>),
 }
 
 /// One run.
@@ -172,13 +172,13 @@ impl System<'_> {
                     breakpoints: Box::default(),
                     origin: Origin::default(),
                 },
-                // Word of what was given back meanwhile is none.
-                Due::Event(Event::Granted { instance, lease })
-                    if self.runs[run].leases.get(&lease.id) != Some(&instance) =>
-                {
-                    continue;
-                }
-                Due::Event(event) => event,
+                Due::Event(event) => match *event {
+                    // Word of what was given back meanwhile is none.
+                    Event::Granted { instance, lease } if self.runs[run].leases.get(&lease.id) != Some(&instance) => {
+                        continue;
+                    }
+                    event => event,
+                },
             };
             self.tell(run, event)?;
             if let Some(ends) = self.runs.iter().map(|run| run.end.clone()).collect::<Option<Vec<_>>>() {
@@ -264,7 +264,7 @@ impl System<'_> {
                 let projection = ProjectionId(self.next);
                 self.projections.insert(projection, World::from_facts(facts, world.revision()));
                 let late = self.late();
-                self.at(run, late, Due::Event(Event::Projected { instance, attempt, projection }));
+                self.at(run, late, Due::Event(Box::new(Event::Projected { instance, attempt, projection })));
             }
             Command::Start { instance, attempt, goal } => {
                 let path = format!("{run}:{}", self.runs[run].paths.get(&instance).map_or("", String::as_str));
@@ -279,15 +279,19 @@ impl System<'_> {
                         Event::Crashed { instance, attempt, reason: "the worker died".to_owned() }
                     }
                 };
-                self.at(run, Duration::from_secs_f64(duration_s.max(0.0)), Due::Event(event));
+                self.at(run, Duration::from_secs_f64(duration_s.max(0.0)), Due::Event(Box::new(event)));
             }
             Command::Cancel { instance, attempt } => self.agenda.retain(|_, (of, due)| {
-                let is_its = |id: &InstanceId, number: &u32| (*id, *number) == (instance, attempt);
-                *of != run
-                    || !matches!(due, Due::Event(
+                let of_what = match due {
+                    Due::Event(event) => match &**event {
                         Event::Finished { instance, attempt, .. }
                         | Event::Crashed { instance, attempt, .. }
-                        | Event::Projected { instance, attempt, .. }) if is_its(instance, attempt))
+                        | Event::Projected { instance, attempt, .. } => Some((*instance, *attempt)),
+                        _ => None,
+                    },
+                    Due::Begin => None,
+                };
+                *of != run || of_what != Some((instance, attempt))
             }),
             Command::Release { lease, .. } => {
                 if let Some(lease) = lease {
@@ -295,7 +299,7 @@ impl System<'_> {
                 }
                 self.answers();
             }
-            Command::Wake { at } => self.at(run, at.since(self.now), Due::Event(Event::Woken)),
+            Command::Wake { at } => self.at(run, at.since(self.now), Due::Event(Box::new(Event::Woken))),
             Command::End { outcome, reason, .. } => self.runs[run].end = Some((outcome, reason)),
         }
         Ok(())
@@ -320,7 +324,7 @@ impl System<'_> {
             self.runs[run].waiters.remove(&instance);
             self.runs[run].leases.insert(lease.id, instance);
             let late = self.late();
-            self.at(run, late, Due::Event(Event::Granted { instance, lease }));
+            self.at(run, late, Due::Event(Box::new(Event::Granted { instance, lease })));
         }
     }
 }

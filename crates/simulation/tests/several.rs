@@ -244,7 +244,7 @@ fn try_pairs(seeds: std::ops::Range<u64>) -> (usize, usize) {
 
 #[test]
 fn two_runs_leave_a_world_that_some_interleaving_of_their_sequential_programs_leaves() {
-    let given = |name: &str, usual| std::env::var(name).map_or(usual, |number| number.parse().unwrap());
+    let given = |name: &str, usual| std::env::var(name).map_or(usual, |number| number.parse().expect("a number"));
     let (first, count) = (given("RATN_FIRST", 0), given("RATN_PROGRAMS", 600));
     let (worlds, open) = try_pairs(first..first + count);
     assert!(open as u64 > count / 2, "the pairs hardly meet: {open} of them have several ends, {worlds} worlds in all");

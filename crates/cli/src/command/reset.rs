@@ -35,7 +35,7 @@ pub(crate) fn run(arguments: &ResetArguments, tls: &ClientTls) -> Result<(), Fai
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, &manager, session.id())?;
         let done = match claim(&resources, session.id(), "reset", true).await {
-            Ok(()) => {
+            Ok(_) => {
                 let world = WorldClient::new(&channels, &pool)?;
                 reset(arguments, &world, CellServiceClient::new(channels.get(&cell)?)).await
             }
