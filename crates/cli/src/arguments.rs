@@ -23,7 +23,7 @@ pub(crate) use tasks::{
     AnswerArguments, CheckArguments, CompletionsArguments, ControlArguments, DashboardArguments, DrawingArgument,
     ExportArguments, FormatArgument, JsonArgument, ManArguments, ModeArgument, PlanArguments, ReportArguments,
     RobotArguments, RobotCommand, RowArgument, RunArguments, SignalArguments, SimulateArguments, StatusArguments,
-    TablesArguments, TopArguments, WordArgument,
+    TablesArguments, TopArguments, UrgencyArgument, WordArgument,
 };
 
 /// Runs robot tasks, written as sequential state machines, as fast as their real dependencies allow.

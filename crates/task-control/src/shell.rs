@@ -91,6 +91,20 @@ pub struct Place {
     pub messages: Messages,
     /// Whether no other run may be under way on it beside this one.
     pub alone: bool,
+    /// What comes first of what several runs need.
+    pub urgency: Urgency,
+}
+
+/// How urgent a run is beside others. What is needed for certain comes before what is speculative, however urgent that is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+pub enum Urgency {
+    /// It has what others leave.
+    Low,
+    /// As most are.
+    #[default]
+    Normal,
+    /// Others wait for it.
+    High,
 }
 
 /// How a run ended.

@@ -73,6 +73,9 @@ pub(crate) struct RunArguments {
     /// Let no other run be under way on the system beside this one
     #[arg(long)]
     pub(crate) alone: bool,
+    /// What comes first of what several runs on the system need
+    #[arg(long, value_enum, value_name = "HOW", default_value = "normal")]
+    pub(crate) urgency: UrgencyArgument,
     /// Give a parameter of the task a value, `boxes=3`; may be repeated
     #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
     pub(crate) set: Vec<(String, String)>,
@@ -106,6 +109,17 @@ pub(crate) struct RunArguments {
     /// Print JSON on standard output: one document at the end, with `--json=lines` the event log as it grows before it, all of it a line each
     #[arg(long, value_enum, value_name = "HOW", num_args = 0..=1, require_equals = true, default_missing_value = "document")]
     pub(crate) json: Option<JsonArgument>,
+}
+
+/// How urgent a run is beside others, on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum UrgencyArgument {
+    /// It has what others leave
+    Low,
+    /// As most are
+    Normal,
+    /// Others wait for it
+    High,
 }
 
 /// How a run is told in JSON, on the command line.

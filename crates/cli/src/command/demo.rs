@@ -23,7 +23,7 @@ use ratn_motion::robot::Robot;
 use ratn_proto::v1::UnintendedContact;
 use ratn_report::gantt;
 use ratn_report::timeline::Timeline;
-use ratn_task_control::shell::Run;
+use ratn_task_control::shell::{Run, Urgency};
 use ratn_worker::tls::ClientTls;
 use result::{Demonstration, Outcome, Plan, Work};
 use std::borrow::Cow;
@@ -262,7 +262,8 @@ impl Setup<'_> {
         };
         let system = starting(Box::pin(System::start_private(config, tls)), interrupt).await?;
         let (ended, judgement) =
-            on_system(run, system, false, interrupt, async |system| system.judgement().await).await?;
+            on_system(run, system, (false, Urgency::Normal), interrupt, async |system| system.judgement().await)
+                .await?;
         let Judgement { delivered, greatest_tilt_rad, unintended_contacts } = judgement;
         let timeline = Timeline::of(&log::read(&log_file)?.lines);
         if timeline.outcome.as_deref() != Some(ended.outcome.as_str()) {

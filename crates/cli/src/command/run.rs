@@ -3,7 +3,7 @@
 mod resume;
 
 use super::{blocking_here, check};
-use crate::arguments::{JsonArgument, ModeArgument, RunArguments, SystemArguments};
+use crate::arguments::{JsonArgument, ModeArgument, RunArguments, SystemArguments, UrgencyArgument};
 use crate::colour::can_paint;
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
@@ -21,7 +21,7 @@ use ratn_report::gantt;
 use ratn_report::statistics::Statistics;
 use ratn_report::timeline::Timeline;
 use ratn_task_control::learn;
-use ratn_task_control::shell::{self, Ended, Place, Run};
+use ratn_task_control::shell::{self, Ended, Place, Run, Urgency};
 use ratn_worker::tls::ClientTls;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -140,11 +140,21 @@ async fn begin(
         checkpoint_every: arguments.checkpoint_every,
     };
     let live = way.map(|way| Live::follow(&log, way, system.place().speed, system.directory().path()));
-    let ended = on_system(run, system, arguments.alone, interrupt, async |_| Ok(())).await;
+    let ended = on_system(run, system, (arguments.alone, arguments.urgency.into()), interrupt, async |_| Ok(())).await;
     drop(live);
     output::progress(format_args!("event log: {}", log.display()));
     let (ended, ()) = ended?;
     conclude(&ended, &log, arguments)
+}
+
+impl From<UrgencyArgument> for Urgency {
+    fn from(argument: UrgencyArgument) -> Urgency {
+        match argument {
+            UrgencyArgument::Low => Urgency::Low,
+            UrgencyArgument::Normal => Urgency::Normal,
+            UrgencyArgument::High => Urgency::High,
+        }
+    }
 }
 
 /// How the run is followed while it goes on, beside the lines of its nodes; on a terminal in place of them.
@@ -176,15 +186,15 @@ pub(super) async fn starting<T>(
     }
 }
 
-/// Runs a task, `alone` on its system or beside others, asks `afterwards` what has become of the system, and ends the system if it was started for this.
+/// Runs a task, alone on its system or beside others and how urgent, asks `afterwards` what has become of the system, and ends the system if it was started for this.
 pub(super) async fn on_system<T>(
     run: Run,
     mut system: System,
-    alone: bool,
+    (alone, urgency): (bool, Urgency),
     interrupt: &Interrupt,
     afterwards: impl AsyncFnOnce(&System) -> anyhow::Result<T>,
 ) -> anyhow::Result<(Ended, T)> {
-    let place = Place { alone, ..system.place() };
+    let place = Place { alone, urgency, ..system.place() };
     let ended = tokio::select! {
         ended = shell::run(run, &place, interrupt) => ended,
         error = system.one_ended() => Err(error.context("a part of the system ended during the run")),

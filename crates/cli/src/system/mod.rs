@@ -17,7 +17,7 @@ use ratn_proto::v1::cell_service_client::CellServiceClient;
 use ratn_proto::v1::{GetGroundTruthRequest, UnintendedContact};
 use ratn_task_control::Endpoints;
 use ratn_task_control::NotStarted;
-use ratn_task_control::shell::Place;
+use ratn_task_control::shell::{Place, Urgency};
 use ratn_worker::client::{Channels, ResourceClient, WorldClient};
 use ratn_worker::endpoint::{self, Endpoint};
 use ratn_worker::runtime_directory::RuntimeDirectory;
@@ -157,6 +157,7 @@ impl System {
             speed: self.config.speed,
             messages: output::messages(),
             alone: false,
+            urgency: Urgency::Normal,
         }
     }
 

@@ -160,13 +160,14 @@ class System:
         log: str | os.PathLike[str] | None = None,
         step_workers: int = 1,
         alone: bool = False,
+        urgency: str = "normal",
         **parameters: Any,
     ) -> Run:
         """Begins a run of a task, or of a task file; its parameters are keyword arguments. ``mode`` is ``cdtn`` or ``hsm``.
 
-        It goes beside other runs of the system, unless it or one of them is to be ``alone``. The steps of a task (``@ratn.step``) are performed by workers that live as long as the run: ``step_workers`` processes for each file.
+        It goes beside other runs of the system, unless it or one of them is to be ``alone``; ``urgency`` (``low``, ``normal``, ``high``) says whose needs come first. The steps of a task (``@ratn.step``) are performed by workers that live as long as the run: ``step_workers`` processes for each file.
         """
-        return Run(self, task, mode, seed, log, parameters, step_workers, alone)
+        return Run(self, task, mode, seed, log, parameters, step_workers, alone, urgency)
 
     def acquire(
         self, *kinds: str, priority: int = 0, timeout_s: float | None = None, holder: str = "python"
@@ -222,6 +223,7 @@ class Run:
         parameters: dict[str, Any],
         step_workers: int = 1,
         alone: bool = False,
+        urgency: str = "normal",
     ) -> None:
         self._system = system
         self._folder = tempfile.TemporaryDirectory(prefix="ratn-run-")
@@ -237,7 +239,7 @@ class Run:
         command = [_program(), "run", os.fspath(task), "--json", "--mode", mode]
         command += ["--runtime-dir", str(system.runtime_dir), "--log", str(self.log)]
         command += ["--seed", str(seed)] if seed is not None else []
-        command += ["--alone"] if alone else []
+        command += ["--urgency", urgency, *(["--alone"] if alone else [])]
         for name, value in parameters.items():
             # Texts are taken as they are.
             command += ["--set", f"{name}={value if isinstance(value, str) else written(value)}"]

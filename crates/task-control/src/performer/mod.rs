@@ -14,7 +14,7 @@ pub(super) use resume::{check_world, remembers};
 use super::ledger::{Confirmed, acquire_request};
 use super::outside::Outside;
 use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Record, Recorded, Recorder, said};
-use super::shell::Place;
+use super::shell::{Place, Urgency};
 use crate::NotStarted;
 use crate::background_runtime::BackgroundRuntime;
 use crate::messages::Messages;
@@ -82,6 +82,13 @@ fn holder(task: &str, path: &str) -> String {
     }
 }
 
+/// The priority of an acquire among those of all runs: certain or not, then the run's urgency, then its own order.
+fn beside_others(priority: i64, urgency: Urgency) -> i64 {
+    const OWN_BITS: u32 = 60;
+    let own = (priority & (CERTAIN - 1)) >> (CERTAIN.trailing_zeros() - OWN_BITS);
+    ((priority & CERTAIN) | ((urgency as i64) << OWN_BITS) | own).min(OVERDUE - 1)
+}
+
 /// What is on its way to the executive.
 #[derive(Debug)]
 pub(super) enum Answer {
@@ -105,6 +112,7 @@ impl From<Event> for Answer {
 pub(super) struct Performer {
     run: String,
     task: String,
+    urgency: Urgency,
     /// The robot's seconds per second.
     speed: f64,
     catalogue: Arc<Catalogue>,
@@ -203,6 +211,7 @@ impl Performer {
         Ok(Performer {
             run,
             task: task.to_owned(),
+            urgency: place.urgency,
             speed: place.speed,
             catalogue: place.catalogue.clone(),
             messages: place.messages.clone(),
@@ -378,7 +387,7 @@ impl Performer {
         let handed = self.handover.as_ref().filter(|handover| handover.to == instance).map(|one| one.lease.clone());
         let mut options = AcquireOptions {
             request,
-            priority: priority.min(OVERDUE - 1),
+            priority: beside_others(priority, self.urgency),
             deadline: ACQUIRE_DEADLINE,
             holder: holder(&self.task, self.paths.get(&instance).map_or(&instance.to_string(), |path| path)),
         };

@@ -39,6 +39,7 @@ fn place_of(endpoints: &Endpoints) -> Place {
         speed: 1.0,
         messages: Messages::nowhere(),
         alone: false,
+        urgency: Urgency::Normal,
     }
 }
 
@@ -249,6 +250,23 @@ async fn who_gets_what_another_run_had_has_been_told_what_that_had_committed() -
     assert!(began.elapsed() < Duration::from_secs(2), "{:?}", began.elapsed());
     second.close().await?;
     bench.performer.close().await
+}
+
+#[test]
+fn what_is_certain_comes_first_then_the_urgent_run_then_the_own_order() {
+    let (certain, speculative) = (CERTAIN | 5, CERTAIN - 1);
+    let order = [
+        (i64::MAX, Urgency::High),
+        (certain | 8, Urgency::High),
+        (certain, Urgency::High),
+        (i64::MAX, Urgency::Normal),
+        (certain, Urgency::Low),
+        (speculative, Urgency::High),
+        (speculative, Urgency::Low),
+    ];
+    let ranks = order.map(|(priority, urgency)| beside_others(priority, urgency));
+    assert!(ranks.is_sorted_by(|a, b| a > b), "{ranks:?}");
+    assert!(ranks[0] < OVERDUE && ranks[4] >= CERTAIN && ranks[5] < CERTAIN);
 }
 
 #[tokio::test]

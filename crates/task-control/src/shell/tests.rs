@@ -52,6 +52,7 @@ impl Bench {
             speed: 10.0,
             messages: Messages::nowhere(),
             alone: false,
+            urgency: Urgency::Normal,
         };
         Ok(Bench { place, run, directory, _shutdown: shutdown.drop_guard() })
     }

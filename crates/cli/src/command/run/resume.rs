@@ -47,7 +47,7 @@ pub(super) async fn run(
     let resumption = Resumption::new(program, history, writer, arguments.checkpoint_every)
         .map_err(|error| refused(&format_args!("{:#}", anyhow::Error::from(error))))?;
     output::progress(format_args!("on the system in {}", directory.display()));
-    let place = Place { alone: arguments.alone, ..system.place() };
+    let place = Place { alone: arguments.alone, urgency: arguments.urgency.into(), ..system.place() };
     let ended = tokio::select! {
         ended = shell::resume(resumption, &place, interrupt) => ended,
         error = system.one_ended() => Err(error.context("a part of the system ended during the run")),
