@@ -704,6 +704,29 @@ fn of_a_fallback_each_state_leads_to_the_next_when_it_fails() {
 }
 
 #[test]
+fn regions_that_are_alike_differ_in_a_variable() {
+    let task = "
+task: t
+states:
+  - both:
+      concurrency: barrier
+      regions:
+        for: which in [left, 2]
+        outcomes: [none]
+        do:
+          - a: { states: [], effects: ['done($which)'] }
+";
+    let program = program(task);
+    assert_eq!(outlined(&program), ["both: ", "both/left: ", "both/left/a: ", "both/which_2: ", "both/which_2/a: "]);
+    let effects = |path: &str| {
+        let state = program.states.iter().find(|state| state.path == path).unwrap();
+        state.annotations.effects["success"].iter().map(ToString::to_string).collect::<Vec<_>>()
+    };
+    let all = [effects("both/left/a"), effects("both/which_2/a")].concat();
+    assert_eq!(all, ["set done(left) = true", "set done(2) = true"]);
+}
+
+#[test]
 fn switches_and_fallbacks_that_cannot_be_are_refused() {
     for (keys, message) in [
         ("switch: 3, cases: { a: [] }", "a `switch` looks at an expression"),
@@ -717,6 +740,20 @@ fn switches_and_fallbacks_that_cannot_be_are_refused() {
             "where `aborted` leads the `fallback` says",
         ),
         ("fallback: 3", "expected a list of states"),
+        ("fallback: [{ success: { states: [] } }]", "a state of a `fallback` is not called `success`"),
+        (
+            "concurrency: barrier, regions: { for: x in $l, do: [] }",
+            "regions are a list of states, or `for` a variable",
+        ),
+        (
+            "concurrency: barrier, regions: { for: 'x in []', do: [] }",
+            "there are 1 to 64 regions that are alike, and not 0",
+        ),
+        ("concurrency: barrier, regions: { for: 'x in [a, a]', do: [] }", "`a`"),
+        (
+            "concurrency: barrier, regions: { for: 'x in [a]', do: [{ for: 'x in [1]', do: [] }] }",
+            "another variable inside is called `x`",
+        ),
         ("selector: []", "there is no form `selector`"),
     ] {
         let found = findings(&format!("task: t\nstates:\n  - a: {{ {keys} }}\n"));

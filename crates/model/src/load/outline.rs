@@ -30,7 +30,10 @@ const FOREIGN_FORMS: [(&str, &str); 10] = [
     ("loop", COUNTED),
     ("foreach", "write `- for: x in list`, with `do: […]`"),
     ("sequence", "write `- name:`, with `states: […]`"),
-    ("parallel", "write `- name:`, with `concurrency: barrier` and `regions: […]`"),
+    (
+        "parallel",
+        "write `- name:`, with `concurrency: barrier` and `regions: […]`, or `regions: { for: arm in [left, right], do: […] }`",
+    ),
     ("sleep", "write `- wait: { seconds: 1 }`"),
     ("call", "write `- name:`, with `action: provider/action` and `in: {…}`"),
 ];

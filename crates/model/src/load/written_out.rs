@@ -1,4 +1,4 @@
-//! `switch` and `fallback`: forms that are other forms in fewer words. They are written out before anything else is read.
+//! `switch`, `fallback` and regions that are alike: forms that are other forms in fewer words. They are written out before anything else is read.
 //!
 //! ```text
 //! switch: look.kind              condition: (look.kind) = cup
@@ -10,15 +10,24 @@
 //! fallback:                      states:
 //!   - pick: {…}           →        - pick: {…, transitions: {success: success, aborted: ask}}
 //!   - ask: {…}                     - ask: {…, transitions: {success: success}}
+//!
+//! regions:                       regions:
+//!   for: arm in [left, right]  →   - left: {states: […with left for $arm…]}
+//!   do: […]                        - right: {states: […with right for $arm…]}
 //! ```
 
 use super::yaml::{Content, Entry, Node};
 use crate::diagnostic::Findings;
 use crate::expression::display::is_word;
+use crate::parameters::constant;
 use crate::program::{ABORTED, SUCCESS};
+use crate::value::Value;
 
 /// A switch has at most so many cases: each is a condition in the one before.
 const MAX_CASES: usize = 24;
+
+/// So many regions that are alike are written out at the most.
+const MAX_REGIONS: usize = 64;
 
 /// Keys of a state below which there are lists of states.
 const LISTS: [&str; 8] = ["states", "do", "then", "else", "regions", "default", "fallback", "before"];
@@ -37,6 +46,12 @@ fn state(node: &mut Node, name: &str, findings: &mut Findings) {
         switch(node, name, findings);
     } else if node.get("fallback").is_some() {
         fallback(node, name, findings);
+    } else if node.get("concurrency").is_some()
+        && let Content::Map(entries) = &mut node.content
+        && let Some(regions) = entries.iter_mut().find(|entry| entry.key == "regions")
+        && matches!(regions.value.content, Content::Map(_))
+    {
+        alike(&mut regions.value, name, findings);
     }
     let Content::Map(entries) = &mut node.content else { return };
     let is_alone = entries.len() == 1;
@@ -182,6 +197,111 @@ fn fallback(node: &mut Node, name: &str, findings: &mut Findings) {
             lead(ABORTED, &next);
         }
     }
+}
+
+/// Regions that differ in the value of a variable.
+fn alike(node: &mut Node, name: &str, findings: &mut Findings) {
+    let at = node.at;
+    let Some(entries) = taken(node) else { return };
+    node.content = Content::List(Vec::new());
+    let (mut over, mut body, mut rest) = (None, None, Vec::new());
+    for entry in entries {
+        match entry.key.as_str() {
+            "for" => over = Some(entry.value),
+            "do" => body = Some(entry.value),
+            "variables" | "states" => {
+                let message = format!("there is no key `{}` of regions that are alike", entry.key);
+                findings.error("unknown-key", entry.at, name, message, "they have `for` and `do`");
+            }
+            _ => rest.push(entry),
+        }
+    }
+    let help = "write `regions: { for: arm in [left, right], do: […] }`, or a list of states";
+    let listed = |node: &Node| {
+        let Content::Text(text) = &node.content else { return None };
+        let (variable, list) = text.split_once(" in ")?;
+        let Ok(Value::List(values)) = constant(list.trim()) else { return None };
+        is_word(variable.trim()).then(|| (variable.trim().to_owned(), values))
+    };
+    let (Some((variable, values)), Some(body)) = (over.as_ref().and_then(listed), body) else {
+        let message = "regions are a list of states, or `for` a variable and a list of values what each of them does";
+        return findings.error("invalid-state", at, name, message, help);
+    };
+    if !(1..=MAX_REGIONS).contains(&values.len()) {
+        let message = format!("there are 1 to {MAX_REGIONS} regions that are alike, and not {}", values.len());
+        return findings.error("invalid-state", at, name, message, help);
+    }
+    if binds(&body, &variable) {
+        let message = format!("another variable inside is called `{variable}`, too");
+        return findings.error("invalid-state", at, name, message, "give one of them another name");
+    }
+    let region = |(number, value): (usize, &Value)| {
+        let (text, name) = match value {
+            Value::String(word) if is_word(word) => (word.clone(), word.clone()),
+            number_or_other => (constant_text(number_or_other), format!("{variable}_{}", number + 1)),
+        };
+        let entry = |key: String, at, value| Entry { key, at, value };
+        let mut keys = vec![entry("states".to_owned(), body.at, with(&body, &variable, &text))];
+        keys.extend(rest.iter().map(|one| entry(one.key.clone(), one.at, with(&one.value, &variable, &text))));
+        let keys = Node { at, offset: None, content: Content::Map(keys) };
+        Node { at, offset: None, content: Content::Map(vec![entry(name, at, keys)]) }
+    };
+    node.content = Content::List(values.iter().enumerate().map(region).collect());
+}
+
+/// A value as it can stand wherever a variable can.
+fn constant_text(value: &Value) -> String {
+    let is_plain = value.as_number().is_some_and(|number| number >= 0.0);
+    if is_plain { value.to_string() } else { format!("({value})") }
+}
+
+/// Whether a loop or variables inside bind this name.
+fn binds(node: &Node, variable: &str) -> bool {
+    let by_entry = |Entry { key, value, .. }: &Entry| {
+        let is_bound = match (&value.content, key.as_str()) {
+            (Content::Text(text), "for") => {
+                text.split_once(" in ").is_some_and(|(names, _)| names.split(',').any(|one| one.trim() == variable))
+            }
+            (Content::Map(_), "variables") => value.get(variable).is_some(),
+            _ => false,
+        };
+        is_bound || binds(value, variable)
+    };
+    match &node.content {
+        Content::List(items) => items.iter().any(|item| binds(item, variable)),
+        Content::Map(entries) => entries.iter().any(by_entry),
+        _ => false,
+    }
+}
+
+/// A node with a text in place of a variable, in keys and values.
+fn with(node: &Node, variable: &str, text: &str) -> Node {
+    let entry = |one: &Entry| {
+        let (key, value) = (replaced(&one.key, variable, text), with(&one.value, variable, text));
+        Entry { key, at: one.at, value }
+    };
+    let content = match &node.content {
+        Content::Text(old) => Content::Text(replaced(old, variable, text)),
+        Content::List(items) => Content::List(items.iter().map(|item| with(item, variable, text)).collect()),
+        Content::Map(entries) => Content::Map(entries.iter().map(entry).collect()),
+        other => other.clone(),
+    };
+    Node { at: node.at, offset: node.offset.filter(|_| content == node.content), content }
+}
+
+fn replaced(old: &str, variable: &str, text: &str) -> String {
+    let (mut new, mut rest) = (String::new(), old);
+    while let Some(place) = rest.find('$') {
+        let (before, name) = (&rest[..place], &rest[place + 1..]);
+        let end = name.find(|c: char| !(c.is_alphanumeric() || c == '_')).unwrap_or(name.len());
+        new.push_str(before);
+        match &name[..end] {
+            name if name == variable => new.push_str(text),
+            other => new.extend(["$", other]),
+        }
+        rest = &name[end..];
+    }
+    new + rest
 }
 
 /// The name of a state of a list, where it has one.
