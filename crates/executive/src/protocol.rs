@@ -46,6 +46,9 @@ pub struct Origin {
     /// The task file, as an absolute path.
     #[serde(default)]
     pub file: String,
+    /// The state of the task's own list at which it began, where that is not the first.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub from: Option<String>,
     /// When it began, in milliseconds since 1970.
     #[serde(default)]
     pub began_unix_ms: u64,

@@ -44,6 +44,8 @@ pub(crate) struct Subject<'a> {
     pub(crate) catalogue: &'a Catalogue,
     /// The task says what holds at the start.
     pub(crate) declares_world: bool,
+    /// Whether a run of it begins at another state than the first: what nothing leads to then is no mistake.
+    pub(crate) begins_elsewhere: bool,
     pub(crate) places: &'a Places,
     /// The functions of the file: name, how it is called, with how many arguments.
     pub(crate) functions: &'a [(String, String, usize)],
@@ -54,6 +56,8 @@ pub(crate) struct Subject<'a> {
 pub(crate) struct Said<'a> {
     /// The task says what holds at the start.
     pub(crate) declares_world: bool,
+    /// Whether a run of it begins at another state than the first: what nothing leads to then is no mistake.
+    pub(crate) begins_elsewhere: bool,
     pub(crate) places: &'a Places,
     /// As in [`Subject`].
     pub(crate) functions: &'a [(String, String, usize)],
@@ -62,8 +66,9 @@ pub(crate) struct Said<'a> {
 /// Applies every rule.
 pub(crate) fn check(program: &Program, catalogue: &Catalogue, said: &Said<'_>, findings: &mut Findings) {
     let control = ControlFlow::of(program);
-    let Said { declares_world, places, functions } = *said;
-    let subject = Subject { program, catalogue, declares_world, places, functions, control: &control };
+    let Said { declares_world, begins_elsewhere, places, functions } = *said;
+    let subject =
+        Subject { program, catalogue, declares_world, begins_elsewhere, places, functions, control: &control };
     actions::check(&subject, findings);
     types::check(&subject, findings);
     flows::check(&subject, findings);

@@ -107,7 +107,23 @@ pub fn load_with(
     catalogue: &Catalogue,
     files: &dyn Files,
 ) -> Result<Loaded, Vec<Diagnostic>> {
-    load_within(source, &Loading { file, catalogue, files, known: &library::Known::default(), around: Vec::new() })
+    load_beginning(source, file, catalogue, files, None)
+}
+
+/// As [`load_with`], of a run that begins at the state of this name of the task's own list, in the world as it is then: what the task says of the
+/// initial world is not written, and what earlier states give may not be needed.
+///
+/// # Errors
+/// As [`load_with`]; and where there is no such state.
+pub fn load_beginning(
+    source: &str,
+    file: &str,
+    catalogue: &Catalogue,
+    files: &dyn Files,
+    from: Option<&str>,
+) -> Result<Loaded, Vec<Diagnostic>> {
+    let known = library::Known::default();
+    load_within(source, &Loading { file, catalogue, files, known: &known, around: Vec::new(), from })
 }
 
 /// What a file is loaded with.
@@ -121,6 +137,8 @@ pub(crate) struct Loading<'a> {
     pub(crate) known: &'a library::Known,
     /// The files that use it, outermost first.
     pub(crate) around: Vec<String>,
+    /// The state at which it begins; the first one unless said.
+    pub(crate) from: Option<&'a str>,
 }
 
 pub(crate) fn load_within(source: &str, loading: &Loading<'_>) -> Result<Loaded, Vec<Diagnostic>> {
@@ -130,7 +148,8 @@ pub(crate) fn load_within(source: &str, loading: &Loading<'_>) -> Result<Loaded,
     if let Some(program) = &program
         && !out.findings.has_errors()
     {
-        let said = check::Said { declares_world: out.declares_world, places: &out.places, functions: &out.functions };
+        let (declares_world, begins_elsewhere) = (out.declares_world, loading.from.is_some());
+        let said = check::Said { declares_world, begins_elsewhere, places: &out.places, functions: &out.functions };
         check::check(program, loading.catalogue, &said, &mut out.findings);
     }
     let refused = out.findings.has_errors();
@@ -180,6 +199,9 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
         && let Some(states) = entries.iter_mut().find(|entry| entry.key == "states")
     {
         written_out::write_out(&mut states.value, &mut out.findings);
+        if let Some(from) = loading.from {
+            written_out::begin_at(&mut states.value, from, &mut out.findings);
+        }
     }
     let outline = outline::outline(&name, &root, &mut out.findings);
     let libraries = library::load_all(&outline, loading, &mut out.findings, of_libraries);
@@ -202,8 +224,11 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     let exceptions = root.get("exceptions").and_then(|node| flow::exceptions(&mut fields, node));
     let tolerances = tolerance::tolerances(&mut fields, &root);
     let parameters = read_parameters(&mut fields, &root);
-    let initial = root.get("world").map(|node| world(&mut fields, node)).unwrap_or_default();
+    let mut initial = root.get("world").map(|node| world(&mut fields, node)).unwrap_or_default();
     out.declares_world = root.get("world").is_some();
+    if loading.from.is_some() {
+        (initial, out.declares_world) = (Vec::new(), false);
+    }
     let ids = (0..task.outline.steps.len()).map(|i| crate::id::StateId(i as u64));
     let mut states: Vec<_> = ids.map(|id| state::state(&task, id, out)).collect();
     // The task's outputs are the root's.
@@ -214,6 +239,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     let mut hasher = blake3::Hasher::new();
     hasher.update(source.as_bytes());
     hasher.update(ontology_text.unwrap_or_default().as_bytes());
+    hasher.update(loading.from.unwrap_or_default().as_bytes());
     // What actions say belongs to the task, as what its libraries say does.
     for (action, said) in said_by_actions(&states, catalogue) {
         hasher.update(action.as_bytes());

@@ -4,9 +4,10 @@
 
 mod support;
 
+use ratn_model::catalogue::Catalogue;
 use ratn_model::expression::Expr;
 use ratn_model::id::StateId;
-use ratn_model::load::{Files, Loaded, load_with};
+use ratn_model::load::{Files, Loaded, load_beginning, load_with};
 use ratn_model::program::{StateKind, Target};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
@@ -237,4 +238,28 @@ states: []
 fn what_a_library_is_given_is_a_mapping() {
     let refusal = load("task: t\nstates:\n  - a: { library: part.yaml, with: 3 }\n", PART).unwrap_err();
     assert!(refusal.contains("error[invalid-state] in a: `with` is a mapping, found a number"), "{refusal}");
+}
+
+#[test]
+fn a_run_may_begin_at_a_state_in_the_middle_in_the_world_as_it_is() {
+    let task = "
+task: t
+world: [lit(lamp)]
+states:
+  - first: { action: gripper/release, resources: [{ block: Gripper }] }
+  - begin: { action: pan_tilt/look_at, in: { target: 'pose(0.80, 0, 0.70)' }, resources: [{ block: PanTilt }] }
+  - any: { condition: begin.pan > 0, then: [] }
+  - last: { states: [] }
+";
+    let begins = |from: &str| {
+        let loaded = load_beginning(task, "t.yaml", &Catalogue::standard(), &Shelf(BTreeMap::new()), Some(from));
+        loaded.map(|loaded| loaded.program).map_err(|findings| findings[0].to_string())
+    };
+    let program = begins("begin").unwrap();
+    assert!(program.initial.is_empty());
+    let paths: Vec<&str> = program.states.iter().skip(1).map(|state| state.path.as_str()).collect();
+    assert_eq!(paths[..2], ["begin_2", "first"]);
+    assert!(begins("any").unwrap_err().contains("`begin.pan` may not have been written"));
+    assert!(begins("lst").unwrap_err().contains("no state `lst` in its own list"));
+    assert_ne!(begins("begin").unwrap().digest, begins("last").unwrap().digest);
 }

@@ -49,6 +49,11 @@ impl History {
         (!origin.file.is_empty()).then(|| PathBuf::from(&origin.file))
     }
 
+    /// The state at which the run began, where that was not the first.
+    pub fn from(&self) -> Option<String> {
+        self.started()?.0.from.clone()
+    }
+
     /// How the run is executed, and what its random choices are derived from.
     pub(crate) fn mode_and_seed(&self) -> (Mode, u64) {
         match &self.first.entry {

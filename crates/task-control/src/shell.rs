@@ -56,6 +56,8 @@ pub struct Run {
     pub program: Arc<Program>,
     /// The task file, as an absolute path; empty where there is none.
     pub file: String,
+    /// The state at which it begins, where the program was loaded so.
+    pub from: Option<String>,
     /// Its parameters, bound.
     pub parameters: BTreeMap<String, Value>,
     /// How it is executed.
@@ -171,6 +173,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
                 run: id,
                 version: VERSION.to_owned(),
                 file: run.file,
+                from: run.from,
                 began_unix_ms,
                 imprecise: imprecise(&run.program),
                 natures: Box::new(natures(&run.program, &place.catalogue)),

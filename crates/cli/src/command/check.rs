@@ -12,7 +12,7 @@ use crate::{input, output};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
 use ratn_model::expression::scope::NothingKnown;
-use ratn_model::load::Files;
+use ratn_model::load::{Files, Loaded};
 use ratn_model::parameters::ParameterError;
 use ratn_model::program::Program;
 use ratn_model::resource::Quantity;
@@ -230,24 +230,24 @@ fn refused(findings: &[Diagnostic]) -> Failure {
     Failure::Refused(lines.join("\n"))
 }
 
-/// Loads a task file; errors refuse it, warnings go to standard error.
-pub(crate) fn load(path: &Path, catalogue: &Catalogue) -> Result<Program, Failure> {
-    load_text(&read(path)?, &path.display().to_string(), catalogue)
+/// The program of a task file, which begins at a state of its own list where one is said; warnings go to standard error.
+pub(crate) fn load(path: &Path, from: Option<&str>, catalogue: &Catalogue) -> Result<Program, Failure> {
+    let (text, file) = (read(path)?, path.display().to_string());
+    accepted(ratn_model::load::load_beginning(&text, &file, catalogue, &input::Libraries, from))
 }
 
-/// Loads a task file's text; `file` is its name in messages.
-fn load_text(text: &str, file: &str, catalogue: &Catalogue) -> Result<Program, Failure> {
-    load_from(&input::Libraries, text, file, catalogue)
-}
-
-/// As [`load_text`], with libraries from elsewhere.
+/// The program of a task file's text, with libraries from elsewhere; `file` is its name in messages.
 pub(super) fn load_from(
     libraries: &impl Files,
     text: &str,
     file: &str,
     catalogue: &Catalogue,
 ) -> Result<Program, Failure> {
-    match ratn_model::load::load_with(text, file, catalogue, libraries) {
+    accepted(ratn_model::load::load_with(text, file, catalogue, libraries))
+}
+
+fn accepted(loaded: Result<Loaded, Vec<Diagnostic>>) -> Result<Program, Failure> {
+    match loaded {
         Ok(loaded) => {
             loaded.warnings.iter().for_each(output::progress);
             Ok(loaded.program)

@@ -249,6 +249,7 @@ impl Setup<'_> {
         let run = Run {
             program: program.clone(),
             // Its task file is built in.
+            from: None,
             file: String::new(),
             parameters: program.bind_parameters(&set)?,
             mode: plan.mode,

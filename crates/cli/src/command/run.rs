@@ -81,7 +81,7 @@ async fn begin(
     if let Some(system) = &found {
         system.mismatches.iter().for_each(|what| output::progress(format_args!("warning: {what}")));
     }
-    let program = check::load(task, &config.catalogue)?;
+    let program = check::load(task, arguments.from.as_deref(), &config.catalogue)?;
     let parameters = program
         .bind_parameters(&arguments.set)
         .map_err(|error| Failure::Refused(format!("{}: error[invalid-parameter]: {error}", task.display())))?;
@@ -130,6 +130,7 @@ async fn begin(
     let run = Run {
         program: Arc::new(program),
         file: std::path::absolute(task)?.display().to_string(),
+        from: arguments.from.clone(),
         parameters,
         mode: arguments.mode.into(),
         seed: arguments.seed,

@@ -23,6 +23,9 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
 }
 
 fn unreachable(subject: &Subject<'_>, findings: &mut Findings) {
+    if subject.begins_elsewhere {
+        return;
+    }
     for state in &subject.program.states {
         let reached = |id| subject.control.is_reached(Point::Begin(id));
         // Of what is inside of an unreachable state nothing more is said.

@@ -35,6 +35,7 @@ impl Bench {
         let run = Run {
             parameters: program.bind_parameters(&[])?,
             program: Arc::new(program),
+            from: None,
             file: String::new(),
             mode: Mode::Cdtn,
             seed: 1,

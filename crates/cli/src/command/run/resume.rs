@@ -43,7 +43,7 @@ pub(super) async fn run(
             "no system runs in {place}: a run goes on where it was, on a system that outlives it (`ratn up`)"
         )));
     };
-    let program = check::load(&task, &system.config.catalogue)?;
+    let program = check::load(&task, history.from().as_deref(), &system.config.catalogue)?;
     let resumption = Resumption::new(program, history, writer, arguments.checkpoint_every)
         .map_err(|error| refused(&format_args!("{:#}", anyhow::Error::from(error))))?;
     output::progress(format_args!("on the system in {}", directory.display()));
