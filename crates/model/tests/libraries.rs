@@ -259,7 +259,7 @@ states:
     assert!(program.initial.is_empty());
     let paths: Vec<&str> = program.states.iter().skip(1).map(|state| state.path.as_str()).collect();
     assert_eq!(paths[..2], ["begin_2", "first"]);
-    assert!(begins("any").unwrap_err().contains("`begin.pan` may not have been written"));
+    assert!(begins("any").unwrap_err().contains("`begin.pan` is not there: the run begins behind `begin`"));
     assert!(begins("lst").unwrap_err().contains("no state `lst` in its own list"));
     assert_ne!(begins("begin").unwrap().digest, begins("last").unwrap().digest);
 }

@@ -48,6 +48,12 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
             continue;
         }
         match relation {
+            // A run that begins behind the state that writes it.
+            Relation::Before if subject.begins_elsewhere && control.is_reached(Point::Begin(to.id)) => {
+                let message = format!("{flow} is not there: the run begins behind `{}`, which writes it", source.path);
+                let help = "let it begin there, or before it";
+                findings.error("branch-may-not-have-written", at, &to.path, message, help);
+            }
             Relation::Before => {}
             Relation::Beside => {
                 let message = format!("{flow} is written in another region, which may come before or after this one");
