@@ -14,7 +14,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 /// So many logs are looked at, those of the command line and those that runs write meanwhile.
-pub const MAX_LOGS: usize = 16;
+pub const MAX_LOGS: usize = 80;
 /// So much of a log is read before the moment that is shown; a shorter log is read from its start.
 const BEFORE_BYTES: u64 = 16 << 20;
 /// So much is read for one answer.
@@ -228,7 +228,9 @@ impl All {
     /// Its place. Where there are as many as there may be, one that was not named by the user is given up for it.
     fn add(&mut self, path: PathBuf, named: bool) -> usize {
         if self.logs.len() >= MAX_LOGS {
-            let Some(oldest) = self.logs.iter().position(|one| !one.named) else { return usize::MAX };
+            let Some(oldest) = self.logs.iter().position(|one| !one.named && one.heard.is_none()) else {
+                return usize::MAX;
+            };
             let given_up = self.logs.remove(oldest).id;
             self.replays.retain(|replay| replay.log != given_up);
         }

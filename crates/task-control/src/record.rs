@@ -11,6 +11,7 @@ use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_proto::types::Resource;
 use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{CallError, Commit, Projection, ResourceClient, WorldClient};
+use ratn_worker::session::Trust;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -88,6 +89,8 @@ pub(super) struct Recorder {
     pub(super) cancelled: Cancelled,
     pub(super) done: Recorded,
     pub(super) events: mpsc::Sender<Answer>,
+    /// The run's session: what it no longer holds others may have changed since.
+    pub(super) trust: Trust,
     /// The pool's root as far as it is known: what the run's own revisions come to there, and what it was told of others'.
     pub(super) root: Revision,
 }
@@ -157,6 +160,12 @@ impl Recorder {
     }
 
     async fn commit(&mut self, instance: InstanceId, commit: Commit) -> Option<Event> {
+        if !self.trust.is_kept().await {
+            let reason = "its effects are not recorded: the run's session was lost before, and whoever had its resources since may have \
+                changed the same"
+                .to_owned();
+            return Some(Event::RetirementFailed { instance, reason });
+        }
         match commit_next(&self.world, self.root, commit).await {
             Ok(revision) => {
                 self.root = self.root.max(revision);

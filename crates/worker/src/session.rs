@@ -37,6 +37,8 @@ const PINGS_PER_TTL: u32 = 4;
 const BACKOFF: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(500));
 /// The reason of a refusal to speak for a session of another caller.
 const NOT_YOURS: &str = "NOT_YOURS";
+/// From the time to live of an answer to what else it says.
+const MOMENT: Duration = Duration::from_millis(5);
 /// The last ping, which ends the session, is given this long.
 const FAREWELL: Duration = Duration::from_millis(200);
 
@@ -184,25 +186,12 @@ impl Session {
     /// Returns once everything that the session owned or held is gone for good: the manager has made the session anew, or has not answered
     /// for [`GIVEN_UP_AFTER`] further times to live after the session had expired here. Counts from the session's beginning.
     pub async fn gone(&self) {
-        let mut state = self.state.clone();
-        loop {
-            let now = *state.borrow_and_update();
-            if now.generation > 1 {
-                return;
-            }
-            let given_up = async {
-                match now.unheard_since {
-                    Some(since) => tokio::time::sleep_until(since + self.ttl * GIVEN_UP_AFTER).await,
-                    None => std::future::pending().await,
-                }
-            };
-            tokio::select! {
-                changed = state.changed() => if changed.is_err() {
-                    return;
-                },
-                () = given_up => return,
-            }
-        }
+        gone(self.state.clone(), self.ttl).await;
+    }
+
+    /// For whoever does, on its own, what only the holder of this session's leases may do.
+    pub fn trust(&self) -> Trust {
+        Trust { state: self.state.clone(), belief: self.belief.clone(), ttl: self.ttl }
     }
 
     /// Returns once the manager says that the session's id belongs to another caller. Everything that the session owned or held is gone, or
@@ -244,6 +233,54 @@ impl Session {
         self.end.cancel();
         if let Some(task) = self.task.take() {
             let _ = task.await;
+        }
+    }
+}
+
+/// Whether a session has what it had. Clones share everything.
+#[derive(Debug, Clone)]
+pub struct Trust {
+    state: watch::Receiver<SessionState>,
+    belief: Belief,
+    ttl: Duration,
+}
+
+impl Trust {
+    /// Whether everything that the session owned and held is its own still. While that is not known (the manager is not heard, or this process
+    /// was suspended) it waits until it is; what is gone is gone as [`Session::gone`] says.
+    pub async fn is_kept(&mut self) -> bool {
+        while !self.belief.holds() {
+            tokio::select! {
+                // What the answer says of the session is told a moment after it.
+                changed = self.belief.until.changed() => match changed {
+                    Ok(()) => tokio::time::sleep(MOMENT).await,
+                    Err(_) => return false,
+                },
+                () = gone(self.state.clone(), self.ttl) => return false,
+            }
+        }
+        self.state.borrow().generation <= 1
+    }
+}
+
+/// As [`Session::gone`].
+async fn gone(mut state: watch::Receiver<SessionState>, ttl: Duration) {
+    loop {
+        let now = *state.borrow_and_update();
+        if now.generation > 1 {
+            return;
+        }
+        let given_up = async {
+            match now.unheard_since {
+                Some(since) => tokio::time::sleep_until(since + ttl * GIVEN_UP_AFTER).await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            changed = state.changed() => if changed.is_err() {
+                return;
+            },
+            () = given_up => return,
         }
     }
 }

@@ -10,7 +10,6 @@ use crate::columns::aligned;
 use crate::failure::Failure;
 use crate::repainting::{self, json_text};
 use crate::system::public_directory;
-use anyhow::Context;
 use ratn_daemon::resource_manager;
 use ratn_model::program::WORLD_MODEL;
 use ratn_model::resource::Quantity;
@@ -79,7 +78,6 @@ pub(crate) fn run(arguments: &StatusArguments, tls: &ClientTls) -> Result<(), Fa
 impl Status {
     pub(super) async fn of(directory: &Path, client: &ResourceClient) -> Result<Status, Failure> {
         let runs = control::statuses(directory).await;
-        let runs = runs.with_context(|| format!("the run in {} does not say what it is doing", directory.display()))?;
         let resources = client.list(&[]).await?;
         let waiting = client.explain("").await?;
         Ok(Status::from(runs, &resources, waiting))

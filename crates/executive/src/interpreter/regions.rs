@@ -4,6 +4,7 @@ use super::{Interpreter, Thread, Todo};
 use crate::context::Context;
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind, VIOLATED};
+use ratn_model::wait::Wait;
 use std::sync::Arc;
 
 impl Interpreter {
@@ -69,6 +70,7 @@ impl Interpreter {
         let first = regions.iter().position(|region| self.region_end(*region).is_some());
         let last = regions.last().and_then(|last| self.threads.get(last));
         let is_entered = last.is_none_or(|last| !matches!(last.todo, Todo::Enter(..)) || last.frames.len() > 1);
+        let watches = states.first().is_some_and(|first| matches!(program.state(*first).wait(), Some(Wait::Watch(_))));
         let mut outcomes = Vec::new();
         let mut reasons = Vec::new();
         for (region, state) in regions.iter().zip(states) {
@@ -115,7 +117,7 @@ impl Interpreter {
             reason.clear();
         }
         self.decided(context, &path, outcome.clone());
-        if outcome == VIOLATED && !is_entered {
+        if outcome == VIOLATED && watches && !is_entered {
             // What is watched has not begun: it has changed nothing.
             if let Some(thread) = self.threads.get_mut(&thread) {
                 thread.variables.truncate(base);

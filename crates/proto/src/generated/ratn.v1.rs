@@ -740,10 +740,20 @@ pub struct AcquireResponse {
     /// The lease.
     #[prost(message, optional, tag = "1")]
     pub lease: ::core::option::Option<Lease>,
-    /// What those who gave its resources back within the last two seconds have left to be told, each once. A resource manager that was started anew
+    /// What those who gave its resources back within the last minute have left to be told, each once. A resource manager that was started anew
     /// knows none.
-    #[prost(string, repeated, tag = "2")]
-    pub notes: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    #[prost(message, repeated, tag = "2")]
+    pub notes: ::prost::alloc::vec::Vec<HolderNote>,
+}
+/// What whoever gave a resource back has left to be told to its next holder.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct HolderNote {
+    /// The session that held it.
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+    /// What it left.
+    #[prost(string, tag = "2")]
+    pub note: ::prost::alloc::string::String,
 }
 /// Asks for the resources that are there.
 #[derive(Clone, PartialEq, ::prost::Message)]

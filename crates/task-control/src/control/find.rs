@@ -4,8 +4,11 @@ use super::{ANY_RUN, MAX_STATUS_BYTES, RunStatus, STATUS, is_nobody, say};
 use futures::future::join_all;
 use std::io::{Error, ErrorKind, Result};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 use tokio::net::UnixStream;
 
+/// A run that does not say what it is doing within this time keeps nobody waiting who asks about all of them.
+const PATIENCE: Duration = Duration::from_secs(1);
 /// Of a run's socket, behind its id.
 const ENDING: &str = "control";
 
@@ -23,24 +26,10 @@ pub(super) async fn sweep(directory: &Path) {
     }
 }
 
-/// What the runs of the system in `directory` are doing, in the order of their ids. One that does not say is left out where another one does.
-///
-/// # Errors
-/// Where a run listens and none says what it is doing.
-pub async fn statuses(directory: &Path) -> Result<Vec<RunStatus>> {
+/// What the runs of the system in `directory` are doing, in the order of their ids. One that does not say is left out.
+pub async fn statuses(directory: &Path) -> Vec<RunStatus> {
     let asked = sockets(directory).into_iter().map(async |(_, path)| ask(&path).await);
-    let (mut said, mut failed) = (Vec::new(), None);
-    for answer in join_all(asked).await {
-        match answer {
-            Ok(status) => said.push(status),
-            Err(error) if is_nobody(&error) => {}
-            Err(error) => failed = Some(error),
-        }
-    }
-    match failed {
-        Some(error) if said.is_empty() => Err(error),
-        _ => Ok(said),
-    }
+    join_all(asked).await.into_iter().filter_map(Result::ok).collect()
 }
 
 /// What one run is doing: of this id or this task, or whichever is under way. `None` where none is.
@@ -78,10 +67,15 @@ pub(super) async fn meant(directory: &Path, run: &str) -> Result<PathBuf> {
     let tasks = join_all(listening.iter().map(async |(_, path)| ask(path).await.map(|status| status.task))).await;
     let known = || listening.iter().zip(&tasks).filter_map(|((id, path), task)| Some((id, path, task.as_ref().ok()?)));
     let mut of_task = known().filter(|(.., task)| run == task.as_str());
-    if let (Some((_, path, _)), None) = (of_task.next(), of_task.next()) {
+    // One that does not say its task may be of this one, too.
+    if let (Some((_, path, _)), None, true) = (of_task.next(), of_task.next(), tasks.iter().all(Result::is_ok)) {
         return Ok(path.clone());
     }
-    let all: Vec<String> = known().map(|(id, _, task)| format!("{id} of the task {task}")).collect();
+    let of = |((id, _), task): (&(String, PathBuf), &Result<String>)| match task {
+        Ok(task) => format!("{id} of the task {task}"),
+        Err(_) => format!("{id}, which does not say what it is doing"),
+    };
+    let all: Vec<String> = listening.iter().zip(&tasks).map(of).collect();
     let all = all.join(", ");
     let message = match known().any(|(.., task)| run == ANY_RUN || run == task.as_str()) {
         true => format!("{} runs are under way: {all}; say the id of the one that is meant", listening.len()),
@@ -91,7 +85,8 @@ pub(super) async fn meant(directory: &Path, run: &str) -> Result<PathBuf> {
 }
 
 async fn ask(socket: &Path) -> Result<RunStatus> {
-    let answer = say(socket, STATUS, MAX_STATUS_BYTES).await?;
+    let asking = tokio::time::timeout(PATIENCE, say(socket, STATUS, MAX_STATUS_BYTES));
+    let answer = asking.await.unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()))?;
     serde_json::from_str(&answer).map_err(|_| Error::other(answer))
 }
 

@@ -82,6 +82,24 @@ fn holder(task: &str, path: &str) -> String {
     }
 }
 
+/// Who is asked where something is not told in time.
+struct Whom {
+    resources: ResourceClient,
+    world: WorldClient,
+    told: Told,
+}
+
+impl told::Ask for Whom {
+    async fn root(&self) -> Option<Revision> {
+        self.world.diff(self.told.revision(), None, &[]).await.ok().map(|(_, root)| root)
+    }
+
+    async fn is_under_way(&self, run: &str) -> Option<bool> {
+        let runs = self.resources.list(&[RUN_KIND]).await.ok()?;
+        Some(runs.iter().any(|other| other.id == run))
+    }
+}
+
 /// The priority of an acquire among those of all runs: certain or not, then the run's urgency, then its own order.
 fn beside_others(priority: i64, urgency: Urgency) -> i64 {
     const OWN_BITS: u32 = 60;
@@ -135,6 +153,8 @@ pub(super) struct Performer {
     cancelled: Cancelled,
     recorded: Recorded,
     asking: BTreeMap<InstanceId, Asking>,
+    /// Since when instances have waited that have not got what they need, however often they ask.
+    waiting_since: BTreeMap<InstanceId, Instant>,
     leases: Leases,
     /// What the instances of the window are called, for whoever asks who holds something.
     paths: BTreeMap<InstanceId, String>,
@@ -188,6 +208,11 @@ impl Performer {
         match claim(&resources, &run, task, place.alone).await {
             Ok(true) => told.beside_others(),
             Ok(false) => {}
+            // What a run that comes back holds is still its own.
+            Err(refused) if session.state().borrow().found => {
+                session.abandon().await;
+                return Err(refused);
+            }
             Err(refused) => {
                 session.close().await;
                 return Err(refused);
@@ -203,6 +228,7 @@ impl Performer {
             cancelled: cancelled.clone(),
             done: recorded.clone(),
             events: events.clone(),
+            trust: session.trust(),
             root: Revision::default(),
         };
         let trace = TraceContext::fresh();
@@ -230,6 +256,7 @@ impl Performer {
             cancelled,
             recorded,
             asking: BTreeMap::new(),
+            waiting_since: BTreeMap::new(),
             leases: Leases::default(),
             paths: BTreeMap::new(),
             handover: None,
@@ -282,6 +309,7 @@ impl Performer {
                 }
                 Command::Note(Note::Retired { instance } | Note::Squashed { instance }) => {
                     self.paths.remove(instance);
+                    self.waiting_since.remove(instance);
                 }
                 _ => {}
             }
@@ -383,6 +411,7 @@ impl Performer {
             since: Instant::now(),
             withdrawn: withdrawn.clone(),
         };
+        let waited = self.waiting_since.entry(instance).or_insert(asked.since).elapsed();
         self.asking.insert(instance, asked);
         let handed = self.handover.as_ref().filter(|handover| handover.to == instance).map(|one| one.lease.clone());
         let mut options = AcquireOptions {
@@ -394,6 +423,7 @@ impl Performer {
         let requirements: Vec<Requirement> = requirements.into_iter().map(|one| self.of_performers(one)).collect();
         let (resources, events) = (self.resources.clone(), self.events.clone());
         let (told, run) = (self.told.clone(), self.run.clone());
+        let whom = Whom { resources: self.resources.clone(), world: self.world.clone(), told: self.told.clone() };
         let mut asking = Box::pin(trace::within(self.trace.child(), async move {
             let unheard = AtomicBool::new(false);
             let answer = loop {
@@ -415,7 +445,7 @@ impl Performer {
                         return;
                     }
                     // Others are not let pass any more.
-                    () = told.others_after(LONG_BESIDE_OTHERS), if may_be_late => {
+                    () = told.others_after(LONG_BESIDE_OTHERS.saturating_sub(waited)), if may_be_late => {
                         let _ = retry_unanswered(|| resources.withdraw(&options.request)).await;
                         options.priority = OVERDUE;
                     }
@@ -427,8 +457,18 @@ impl Performer {
             }
             let event = match answer {
                 Ok((lease, notes)) => {
-                    told.until(&run, &notes).await;
-                    Event::Granted { instance, lease }
+                    let is_told = tokio::select! {
+                        told = told.until(&run, &notes, &whom) => told,
+                        // It goes back as it is.
+                        () = withdrawn.cancelled() => Ok(()),
+                    };
+                    match is_told {
+                        Ok(()) => Event::Granted { instance, lease },
+                        Err(reason) => {
+                            let _ = retry_unanswered(|| resources.release(lease.id)).await;
+                            Event::Refused { instance, reason }
+                        }
+                    }
                 }
                 Err(error) => Event::Refused { instance, reason: said(&error) },
             };
@@ -492,6 +532,7 @@ impl Performer {
             event => {
                 if let Event::Granted { instance, .. } | Event::Refused { instance, .. } = &event {
                     let asked = self.asking.remove(instance);
+                    self.waiting_since.remove(instance);
                     if let (Event::Granted { lease, .. }, Some(asked)) = (&event, asked) {
                         self.leases.granted(lease, asked.requirements, Instant::now());
                     }
@@ -613,18 +654,24 @@ impl Performer {
 /// # Errors
 /// Where it may not begin beside what is under way, it is under way already, or the resource manager cannot be asked.
 pub async fn claim(resources: &ResourceClient, run: &str, task: &str, alone: bool) -> anyhow::Result<bool> {
+    // Before it is seen by others: one that is refused is in nobody's way.
+    others(resources, run, alone).await?;
     let claim = Resource::new(run, ResourceClass::Task, RUN_KIND)
         .with_attribute(TASK, Value::String(task.to_owned()))
         .with_attribute(ALONE, Value::Bool(alone));
-    let refused = |message: String| Err(NotStarted(message).into());
     match retry_unanswered(|| resources.create(claim.clone())).await {
         Ok(_) => {}
         Err(error) if error.code() == Some(tonic::Code::AlreadyExists) => {
-            return refused(format!("{run} is under way on this system"));
+            return Err(NotStarted(format!("{run} is under way on this system")).into());
         }
         Err(error) => bail!("cannot begin the run: {}", said(&error)),
     }
     // Of two that begin at the same moment each sees the other one.
+    others(resources, run, alone).await
+}
+
+/// Whether other runs are under way, beside which this one may be.
+async fn others(resources: &ResourceClient, run: &str, alone: bool) -> anyhow::Result<bool> {
     let runs = retry_unanswered(|| resources.list(&[RUN_KIND])).await;
     let runs = runs.map_err(|error| anyhow::anyhow!("cannot begin the run: {}", said(&error)))?;
     let others: Vec<&Resource> = runs.iter().filter(|other| other.id != run).collect();
@@ -632,23 +679,21 @@ pub async fn claim(resources: &ResourceClient, run: &str, task: &str, alone: boo
         Some(Value::String(task)) => format!("`{task}`"),
         _ => other.id.clone(),
     };
-    if let Some(other) = others.iter().find(|other| other.attributes.get(ALONE) == Some(&Value::Bool(true))) {
-        let task = task_of(other);
-        return refused(format!(
-            "{task} is under way on this system and goes alone: wait for its end, or use a system of your own"
-        ));
-    }
-    if alone && !others.is_empty() {
-        let tasks: Vec<String> = others.iter().map(|other| task_of(other)).collect();
-        let tasks = tasks.join(", ");
-        return refused(format!(
-            "another run is under way on this system ({tasks}): wait for its end, or use a system of your own"
-        ));
-    }
-    if others.len() >= MOST_RUNS {
-        return refused(format!(
-            "{MOST_RUNS} runs are under way on this system, as many as there may be: wait for the end of one"
-        ));
-    }
-    Ok(!others.is_empty())
+    let goes_alone = others.iter().find(|other| other.attributes.get(ALONE) == Some(&Value::Bool(true)));
+    let message = match goes_alone {
+        Some(other) => {
+            let task = task_of(other);
+            format!("{task} is under way on this system and goes alone: wait for its end, or use a system of your own")
+        }
+        None if alone && !others.is_empty() => {
+            let tasks: Vec<String> = others.iter().map(|other| task_of(other)).collect();
+            let tasks = tasks.join(", ");
+            format!("another run is under way on this system ({tasks}): wait for its end, or use a system of your own")
+        }
+        None if others.len() >= MOST_RUNS => {
+            format!("{MOST_RUNS} runs are under way on this system, as many as there may be: wait for the end of one")
+        }
+        None => return Ok(!others.is_empty()),
+    };
+    Err(NotStarted(message).into())
 }

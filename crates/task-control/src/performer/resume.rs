@@ -8,7 +8,7 @@ use super::Performer;
 use super::goal::Given;
 use crate::ledger::{Confirmed, Ledger};
 use crate::outside;
-use crate::record::{Record, commit_next, operate_once, said};
+use crate::record::{Decided, Record, commit_next, operate_once, said};
 use crate::shell::Place;
 use anyhow::bail;
 use ratn_executive::protocol::Event;
@@ -117,6 +117,9 @@ impl Performer {
     async fn commit_again(&mut self, ledger: &Ledger, mirror: &World) -> anyhow::Result<Option<Event>> {
         let (mut root, _) = retry_unanswered(|| self.world.root()).await?;
         let there = self.commits_there(ledger, root).await?;
+        if !self.session.state().borrow().found {
+            self.refuse_what_came_between(ledger, there, root).await?;
+        }
         for decided in &ledger.commits[there..] {
             let commit = decided.clone().commit(&self.run);
             match commit_next(&self.world, root, commit).await {
@@ -128,6 +131,38 @@ impl Performer {
         let pool = World::from_facts(facts, revision);
         let facts = outside::differences(&pool, mirror);
         Ok((!facts.is_empty()).then_some(Event::WorldChanged { revision, facts }))
+    }
+
+    /// The run had lost what it held: where others have changed since what it has yet to commit, that is not true any more.
+    async fn refuse_what_came_between(&self, ledger: &Ledger, there: usize, root: Revision) -> anyhow::Result<()> {
+        let missing = &ledger.commits[there..];
+        if missing.is_empty() {
+            return Ok(());
+        }
+        let last = there.checked_sub(1).map(|last| ledger.commits[last].id(&self.run));
+        let (mut told, mut is_behind) = (ledger.first_revision, last.is_none());
+        let mut watch = retry_unanswered(|| self.world.watch(Some(told), &[])).await?;
+        while told < root {
+            let Some(WorldUpdate::Changed(change)) = watch.next().await? else {
+                bail!("the world pool does not tell of its revisions up to {root}");
+            };
+            told = change.revision;
+            if is_behind {
+                let written = change.written.iter().map(|fact| &fact.key);
+                for key in written.chain(&change.gone) {
+                    let is_meant = |decided: &&Decided| decided.changes.iter().any(|one| one.pattern().matches(key));
+                    if let Some(decided) = missing.iter().find(is_meant) {
+                        bail!(
+                            "{} had changed {key}, which is not in the world yet, and others have changed it since the run lost its \
+                             resources: run the task again, or begin it in the middle (`--from`)",
+                            decided.writer
+                        );
+                    }
+                }
+            }
+            is_behind |= last.as_ref() == Some(&change.commit);
+        }
+        Ok(())
     }
 
     async fn commits_there(&self, ledger: &Ledger, root: Revision) -> anyhow::Result<usize> {

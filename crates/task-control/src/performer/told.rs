@@ -8,15 +8,20 @@
 #[cfg(doc)]
 use crate::record::Decided;
 use ratn_model::id::Revision;
+use ratn_proto::v1::HolderNote;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
-/// A commit that was on its way for so long has failed, with its run.
-const PATIENCE: Duration = Duration::from_secs(2);
+/// What is told as usual takes less; after this it is asked for.
+const USUAL: Duration = Duration::from_millis(50);
+/// So often what is not told is asked for again.
+const AGAIN: Duration = Duration::from_millis(500);
+/// What is not known after this time never will be.
+const PATIENCE: Duration = Duration::from_secs(60);
 /// Of more runs beside each other nothing is kept.
 const MOST_RUNS: usize = 1024;
 
@@ -25,15 +30,13 @@ const MOST_RUNS: usize = 1024;
 pub(super) struct Left {
     /// The revision of the root that it had been told of.
     pub(super) told: Revision,
-    /// Its id.
-    pub(super) run: String,
     /// Its own number of its last commit, where it had not been told of that; else 0.
     pub(super) pending: Revision,
 }
 
 impl fmt::Display for Left {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} {} {}", self.told.0, self.pending.0, self.run)
+        write!(f, "{} {}", self.told.0, self.pending.0)
     }
 }
 
@@ -41,11 +44,18 @@ impl FromStr for Left {
     type Err = ();
 
     fn from_str(text: &str) -> Result<Left, ()> {
-        let mut words = text.splitn(3, ' ');
-        let mut number = || words.next().and_then(|word| word.parse().ok()).map(Revision).ok_or(());
-        let (told, pending) = (number()?, number()?);
-        Ok(Left { told, run: words.next().ok_or(())?.to_owned(), pending })
+        let (told, pending) = text.split_once(' ').ok_or(())?;
+        let number = |text: &str| text.parse().map(Revision).map_err(|_| ());
+        Ok(Left { told: number(told)?, pending: number(pending)? })
     }
+}
+
+/// What can be asked where something is not told in time.
+pub(super) trait Ask {
+    /// The revision of the pool's root; `None` where it does not answer.
+    async fn root(&self) -> Option<Revision>;
+    /// Whether a run is under way; `None` where nobody knows.
+    async fn is_under_way(&self, run: &str) -> Option<bool>;
 }
 
 /// How far the run was told. Clones share it.
@@ -86,6 +96,11 @@ impl Told {
         });
     }
 
+    /// The revision that was told last.
+    pub(super) fn revision(&self) -> Revision {
+        self.0.borrow().revision
+    }
+
     /// Another run is under way beside this one.
     pub(super) fn beside_others(&self) {
         self.0.send_modify(|heard| heard.has_others = true);
@@ -104,27 +119,60 @@ impl Told {
         let heard = self.0.borrow();
         let is_told = heard.runs.get(run).is_some_and(|told| *told >= decided);
         let pending = if is_told { Revision::default() } else { decided };
-        Left { told: heard.revision, run: run.to_owned(), pending }
+        Left { told: heard.revision, pending }
     }
 
-    /// Waits until everything is told that these notes, of others than `own`, speak of: for [`PATIENCE`] at the most.
-    pub(super) async fn until(&self, own: &str, notes: &[String]) {
-        let notes: Vec<Left> = notes.iter().filter_map(|note| note.parse().ok()).collect();
-        let others: Vec<&Left> = notes.iter().filter(|note| note.run != own).collect();
+    /// Waits until everything is told that these notes, of others than `own`, speak of. What a run had on its way that is not under way any more
+    /// is in the pool, or never will be.
+    ///
+    /// # Errors
+    /// Where that is not known after [`PATIENCE`]: the resources are not to be used.
+    pub(super) async fn until(&self, own: &str, notes: &[HolderNote], ask: &impl Ask) -> Result<(), String> {
+        let others = notes.iter().filter(|note| note.session_id != own);
+        let mut others: Vec<(&str, Left)> =
+            others.filter_map(|note| Some((note.session_id.as_str(), note.note.parse().ok()?))).collect();
         if others.is_empty() {
-            return;
+            return Ok(());
         }
         self.beside_others();
+        if self.is_told(&others, USUAL).await {
+            return Ok(());
+        }
+        let began = Instant::now();
+        while began.elapsed() < PATIENCE {
+            for (run, left) in &mut others {
+                if left.pending > Revision::default() && ask.is_under_way(run).await == Some(false) {
+                    left.pending = Revision::default();
+                    // What it had made until then.
+                    left.told = ask.root().await.unwrap_or(left.told);
+                }
+            }
+            // Nobody was told more than there is.
+            if let Some(root) = ask.root().await {
+                others.iter_mut().for_each(|(_, left)| left.told = left.told.min(root));
+            }
+            if self.is_told(&others, AGAIN).await {
+                return Ok(());
+            }
+        }
+        let runs: Vec<&str> = others.iter().map(|(run, _)| *run).collect();
+        Err(format!(
+            "what {} had committed when it gave them back was not told within {} s",
+            runs.join(", "),
+            PATIENCE.as_secs()
+        ))
+    }
+
+    /// Whether all of it is told, within this time.
+    async fn is_told(&self, others: &[(&str, Left)], within: Duration) -> bool {
         let is_told = |heard: &Heard| {
-            others.iter().all(|note| {
-                let of_run = heard.runs.get(&note.run).copied().unwrap_or_default();
-                heard.revision >= note.told && of_run >= note.pending
+            others.iter().all(|(run, left)| {
+                let of_run = heard.runs.get(*run).copied().unwrap_or_default();
+                heard.revision >= left.told && of_run >= left.pending
             })
         };
         let mut heard = self.0.subscribe();
-        if tokio::time::timeout(PATIENCE, heard.wait_for(is_told)).await.is_err() {
-            tracing::warn!(?others, "the world pool did not tell in time what the last holder had committed");
-        }
+        tokio::time::timeout(within, heard.wait_for(is_told)).await.is_ok()
     }
 }
 
@@ -142,30 +190,52 @@ mod tests {
     use crate::record::Decided;
     use ratn_model::id::InstanceId;
 
-    fn note(told: u64, pending: u64) -> String {
-        Left { told: Revision(told), run: "run-b".to_owned(), pending: Revision(pending) }.to_string()
+    /// A pool that is at a revision, and a run that is under way or not.
+    struct Known(u64, bool);
+
+    impl Ask for Known {
+        async fn root(&self) -> Option<Revision> {
+            Some(Revision(self.0))
+        }
+
+        async fn is_under_way(&self, _: &str) -> Option<bool> {
+            Some(self.1)
+        }
     }
 
-    async fn waits(told: &Told, note: String) -> bool {
-        tokio::time::timeout(Duration::from_millis(100), told.until("run-a", &[note])).await.is_err()
+    async fn waits_knowing(told: &Told, session: &str, note: &str, known: Known) -> bool {
+        let note = HolderNote { session_id: session.to_owned(), note: note.to_owned() };
+        tokio::time::timeout(Duration::from_millis(200), told.until("run-a", &[note], &known)).await.is_err()
+    }
+
+    async fn waits(told: &Told, note: &str) -> bool {
+        waits_knowing(told, "run-b", note, Known(100, true)).await
     }
 
     #[tokio::test]
     async fn a_resource_is_used_once_what_its_last_holder_had_committed_is_told() {
         let told = Told::new();
         told.root(Revision(5));
-        assert!(!waits(&told, note(5, 0)).await);
-        assert!(waits(&told, note(6, 0)).await);
+        assert!(!waits(&told, "5 0").await);
+        assert!(waits(&told, "6 0").await);
         told.hear(Revision(6), Some(("run-b".to_owned(), Revision(3))));
-        assert!(!waits(&told, note(6, 3)).await && waits(&told, note(6, 4)).await);
+        assert!(!waits(&told, "6 3").await && waits(&told, "6 4").await);
         told.hear(Revision(7), Some(("run-b".to_owned(), Revision(4))));
-        assert!(!waits(&told, note(6, 4)).await);
-        assert!(!waits(&told, "nonsense".to_owned()).await);
-        let own = Left { told: Revision(99), run: "run-a".to_owned(), pending: Revision(9) };
-        assert!(!waits(&told, own.to_string()).await);
-        assert_eq!(told.left("run-b", Revision(4)).to_string(), "7 0 run-b");
-        assert_eq!(told.left("run-b", Revision(5)).to_string(), "7 5 run-b");
-        assert_eq!(told.left("run-c", Revision::default()).to_string(), "7 0 run-c");
+        assert!(!waits(&told, "6 4").await);
+        assert!(!waits(&told, "nonsense").await);
+        assert!(!waits_knowing(&told, "run-a", "99 9", Known(100, true)).await, "its own");
+        assert_eq!(told.left("run-b", Revision(4)).to_string(), "7 0");
+        assert_eq!(told.left("run-b", Revision(5)).to_string(), "7 5");
+        assert_eq!(told.left("run-c", Revision::default()).to_string(), "7 0");
+    }
+
+    #[tokio::test]
+    async fn what_a_run_had_on_its_way_that_has_ended_is_there_or_never_will_be() {
+        let told = Told::new();
+        told.root(Revision(5));
+        assert!(!waits_knowing(&told, "run-b", "5 9", Known(5, false)).await);
+        assert!(waits_knowing(&told, "run-b", "5 9", Known(6, false)).await, "what there is by then is to be told");
+        assert!(!waits_knowing(&told, "liar", "18446744073709551615 0", Known(5, true)).await);
     }
 
     #[test]
@@ -174,12 +244,5 @@ mod tests {
         let decided = Decided { instance, writer, changes: Vec::new(), evidence: Vec::new(), revision: Revision(12) };
         assert_eq!(maker(&decided.id("run-1")), Some(("run-1".to_owned(), Revision(12))));
         assert_eq!(maker("by hand"), None);
-    }
-
-    #[tokio::test]
-    async fn what_is_never_told_is_waited_for_no_longer_than_a_while() {
-        let began = std::time::Instant::now();
-        Told::new().until("run-a", &[note(6, 4)]).await;
-        assert!(began.elapsed() >= PATIENCE);
     }
 }

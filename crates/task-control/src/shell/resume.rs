@@ -90,7 +90,9 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
     others.for_each(|command| kept.command(command));
     let checkpointer = Checkpointer::start(&log, &program.digest, checkpoint_every, kept, replayed);
     let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
+    // One that is refused takes no ear away from the run that listens.
     let performer = Performer::connect(place, &ledger.origin.run, &program.name, events).await;
+    let performer = performer.context("cannot go on with the run")?;
     let shell = Shell {
         executive,
         states,
@@ -108,7 +110,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         ask_at: None,
         look_at: Instant::now() + LOOK,
         confirm: Vec::new(),
-        performer: performer.context("cannot go on with the run")?,
+        performer,
         answers,
     };
     let begin = async |shell: &mut Shell| {

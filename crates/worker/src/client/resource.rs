@@ -199,7 +199,7 @@ impl ResourceClient {
         &self,
         requirements: Vec<Requirement>,
         options: AcquireOptions,
-    ) -> Result<(Lease, Vec<String>), CallError> {
+    ) -> Result<(Lease, Vec<v1::HolderNote>), CallError> {
         let (request_id, session_id) = self.mutation(&options.request);
         let question = v1::AcquireRequest {
             request_id,

@@ -1,15 +1,16 @@
-//! What whoever gives a resource back leaves to be told to its next holder. It is for a while, and in memory only: whoever starts anew knows
-//! of nothing.
+//! What whoever gives a resource back leaves to be told to its next holder, and the session that left it. It is kept in memory only: whoever
+//! starts anew knows of nothing.
 
 use ratn_model::id::LeaseId;
 use ratn_model::resource::Lease;
-use std::collections::{BTreeSet, HashMap};
+use ratn_proto::v1::HolderNote;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 /// What was left longer ago is not told: it is about what is on its way.
-const LIFE: Duration = Duration::from_secs(2);
-/// Of more leases or resources nothing is kept.
+const LIFE: Duration = Duration::from_secs(60);
+/// Of more leases or resources nothing is kept; the oldest are given up first.
 const MOST: usize = 65_536;
 
 /// The notes; clones share them.
@@ -18,52 +19,93 @@ pub(super) struct Notes(Arc<Mutex<Kept>>);
 
 #[derive(Debug, Default)]
 struct Kept {
-    /// The resources of leases that were granted.
-    held: HashMap<LeaseId, Vec<String>>,
+    /// Leases that were granted.
+    held: BTreeMap<LeaseId, Held>,
+    /// The last lease of each resource.
+    last: HashMap<String, LeaseId>,
     /// By resource.
-    notes: HashMap<String, (Arc<str>, Instant)>,
+    notes: HashMap<String, Note>,
+}
+
+#[derive(Debug, Clone)]
+struct Held {
+    session: String,
+    resources: Vec<String>,
+}
+
+#[derive(Debug, Clone)]
+struct Note {
+    session: String,
+    text: Arc<str>,
+    since: Instant,
+}
+
+/// What was done for a lease that is to be given back.
+#[derive(Debug, Default)]
+pub(super) struct Left {
+    held: Option<Held>,
+    before: Vec<(String, Option<Note>)>,
 }
 
 impl Notes {
-    /// A lease was granted: what is to be told of its resources, each note once.
-    pub(super) fn of(&self, lease: &Lease, now: Instant) -> Vec<String> {
+    /// A lease was granted to a session: what is to be told of its resources, each note once.
+    pub(super) fn of(&self, lease: &Lease, session: &str, now: Instant) -> Vec<HolderNote> {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let resources: Vec<String> = lease.resources.iter().map(|resource| resource.id.clone()).collect();
-        let left = resources.iter().filter_map(|id| kept.notes.get(id));
-        let fresh = left.filter(|(_, since)| now.saturating_duration_since(*since) < LIFE);
-        let notes: BTreeSet<String> = fresh.map(|(note, _)| note.to_string()).collect();
+        let mut told: Vec<HolderNote> = Vec::new();
+        for note in resources.iter().filter_map(|id| kept.notes.get(id)) {
+            let is_fresh = now.saturating_duration_since(note.since) < LIFE;
+            let note = HolderNote { session_id: note.session.clone(), note: note.text.to_string() };
+            if is_fresh && !told.contains(&note) {
+                told.push(note);
+            }
+        }
         // Leases that end by themselves are never given back.
         if kept.held.len() >= MOST {
-            kept.held.clear();
+            kept.held.pop_first();
         }
-        kept.held.insert(lease.id, resources);
-        notes.into_iter().collect()
+        if kept.last.len() >= MOST {
+            kept.last.clear();
+        }
+        for resource in &resources {
+            kept.last.insert(resource.clone(), lease.id);
+        }
+        kept.held.insert(lease.id, Held { session: session.to_owned(), resources });
+        told
     }
 
-    /// A lease is to be given back with this note; the resources of which it is.
-    pub(super) fn left(&self, lease: LeaseId, note: String, now: Instant) -> Vec<String> {
+    /// A lease is to be given back by this session with this note; an empty one leaves what there is. Of a lease that has ended, and whose
+    /// resources are another's by now, nothing is left.
+    pub(super) fn left(&self, lease: LeaseId, session: &str, note: &str, now: Instant) -> Left {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let resources = kept.held.remove(&lease).unwrap_or_default();
+        if kept.held.get(&lease).is_none_or(|held| held.session != session) {
+            return Left::default();
+        }
+        let held = kept.held.remove(&lease);
         if kept.notes.len() >= MOST {
             kept.notes.clear();
         }
-        let note: Arc<str> = note.into();
-        for resource in &resources {
-            match note.is_empty() {
-                true => drop(kept.notes.remove(resource)),
-                false => drop(kept.notes.insert(resource.clone(), (Arc::clone(&note), now))),
+        let text: Arc<str> = note.into();
+        let mut before = Vec::new();
+        for resource in held.iter().flat_map(|held| &held.resources) {
+            if !text.is_empty() && kept.last.get(resource) == Some(&lease) {
+                let note = Note { session: session.to_owned(), text: Arc::clone(&text), since: now };
+                before.push((resource.clone(), kept.notes.insert(resource.clone(), note)));
             }
         }
-        resources
+        Left { held, before }
     }
 
     /// It was not given back after all: not by whoever asked for that.
-    pub(super) fn take_back(&self, lease: LeaseId, resources: Vec<String>) {
+    pub(super) fn take_back(&self, lease: LeaseId, left: Left) {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        resources.iter().for_each(|resource| drop(kept.notes.remove(resource)));
-        if !resources.is_empty() {
-            kept.held.insert(lease, resources);
+        for (resource, note) in left.before {
+            match note {
+                Some(note) => drop(kept.notes.insert(resource, note)),
+                None => drop(kept.notes.remove(&resource)),
+            }
         }
+        kept.held.extend(left.held.map(|held| (lease, held)));
     }
 }
 
@@ -84,18 +126,27 @@ mod tests {
     }
 
     #[test]
-    fn the_next_holder_is_told_what_the_last_one_left_and_nothing_older() {
+    fn the_next_holder_is_told_what_the_last_one_left() {
         let (notes, now) = (Notes::default(), Instant::now());
-        assert!(notes.of(&lease(1, &["arm", "hand"]), now).is_empty());
-        notes.left(LeaseId(1), "one".to_owned(), now);
-        assert_eq!(notes.of(&lease(2, &["arm", "hand"]), now), ["one"], "each once");
-        notes.left(LeaseId(2), String::new(), now);
-        assert!(notes.of(&lease(3, &["arm"]), now).is_empty());
-        assert!(notes.left(LeaseId(9), "nobody's".to_owned(), now).is_empty());
-        let left = notes.left(LeaseId(3), "a stranger's".to_owned(), now);
-        notes.take_back(LeaseId(3), left);
-        notes.left(LeaseId(3), "three".to_owned(), now);
-        assert_eq!(notes.of(&lease(4, &["arm", "eye"]), now + LIFE / 2), ["three"]);
-        assert!(notes.of(&lease(5, &["arm"]), now + LIFE).is_empty());
+        let told = |id: u64, resources: &[&str], after: Duration| -> Vec<String> {
+            let told = notes.of(&lease(id, resources), "b", now + after);
+            told.into_iter().map(|note| format!("{}: {}", note.session_id, note.note)).collect()
+        };
+        let leaves = |id: u64, session: &str, note: &str| notes.left(LeaseId(id), session, note, now);
+        assert!(notes.of(&lease(1, &["arm", "hand"]), "a", now).is_empty());
+        leaves(1, "a", "one");
+        assert_eq!(told(2, &["arm", "hand"], Duration::ZERO), ["a: one"], "each once");
+        leaves(2, "b", "");
+        assert_eq!(told(3, &["arm"], LIFE / 2), ["a: one"], "who has nothing to tell takes nothing away");
+        assert_eq!(told(4, &["arm"], LIFE), [""; 0], "what is long ago");
+        // Lease 3 has ended by itself: its holder comes back too late.
+        leaves(3, "b", "late");
+        leaves(4, "a", "not its own");
+        assert_eq!(told(5, &["arm"], Duration::ZERO), ["a: one"]);
+        let refused = leaves(5, "b", "of a stranger in its name");
+        notes.take_back(LeaseId(5), refused);
+        assert_eq!(told(6, &["arm"], Duration::ZERO), ["a: one"]);
+        leaves(6, "b", "six");
+        assert_eq!(told(7, &["arm", "eye"], Duration::ZERO), ["b: six"]);
     }
 }
