@@ -162,7 +162,7 @@ impl Interpreter {
 
 impl Current {
     /// What it holds, to be given back.
-    fn take_held(&mut self) -> Current {
+    pub(super) fn take_held(&mut self) -> Current {
         let (lease, projection) = (self.lease.take(), self.projection.take());
         Current { lease, projection, path: String::new(), ..*self }
     }

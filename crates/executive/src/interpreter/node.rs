@@ -92,13 +92,16 @@ impl Interpreter {
         let held: Vec<u64> =
             self.threads.keys().copied().filter(|thread| self.phase(*thread) == Some(Phase::Held)).collect();
         for thread in held {
-            let Some(current) = self.current(thread) else { continue };
-            match (&current.lease, &current.projection) {
-                (_, Some(_)) => self.run(context, thread),
-                (Some(_), None) => self.go_on(context, thread),
-                (None, None) => self.try_now(context, thread),
-            }
+            self.try_now(context, thread);
         }
+    }
+
+    /// The pause began while it waited for its resources. It gives them back, for others may want them meanwhile, and asks anew when it may begin.
+    pub(super) fn hold_back(&mut self, context: &mut Context<'_>, thread: u64) {
+        let Some(current) = self.current(thread) else { return };
+        current.phase = Phase::Held;
+        let given = current.take_held();
+        self.give_back(context, &given);
     }
 
     /// Whether the operator lets a node not begin; where it stands at a breakpoint, nothing else begins from now on. A routine is one PIA: what it
@@ -178,9 +181,8 @@ impl Interpreter {
     }
 
     pub(super) fn run(&mut self, context: &mut Context<'_>, thread: u64) {
-        // The pause may have begun while it waited for its resources: it keeps them.
         if self.is_held(context, thread) {
-            return self.set_phase(thread, Phase::Held);
+            return self.hold_back(context, thread);
         }
         if self.ends_violated(context, thread) {
             return;

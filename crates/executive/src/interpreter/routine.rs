@@ -36,9 +36,8 @@ impl Interpreter {
 
     /// It has got its resources, and what it contains begins.
     pub(super) fn begin_routine(&mut self, context: &mut Context<'_>, thread: u64) {
-        // The pause may have begun while it waited for its resources: it keeps them.
         if self.is_held(context, thread) {
-            return self.set_phase(thread, super::Phase::Held);
+            return self.hold_back(context, thread);
         }
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let (id, instance, attempt, path) = (current.state, current.instance, current.attempt, current.path.clone());

@@ -8,11 +8,12 @@ use ratn_model::id::StateId;
 use ratn_model::program::PREEMPTED;
 
 impl Interpreter {
-    /// Ends everything under way; what composite states do at their ends is left undone.
+    /// Ends everything under way. What a motion says of being cut short is true; what composite states do at their ends is left undone.
     pub(crate) fn abort(&mut self, context: &mut Context<'_>) {
         let all: Vec<u64> = self.threads.keys().copied().collect();
         for thread in all {
-            self.cancel(context, thread);
+            // The run ends anyway.
+            let _ = self.cancel(context, thread);
             self.set(thread, Todo::Done { outcome: PREEMPTED.to_owned(), reason: String::new() });
         }
         self.give_up_routines(context);
@@ -24,9 +25,7 @@ impl Interpreter {
     /// # Errors
     /// Why an effect that they declare for that could not be made.
     pub(super) fn preempt(&mut self, context: &mut Context<'_>, id: u64) -> Result<(), String> {
-        let cut = self.cancel(context, id);
-        // What that did to the world is said as for any end.
-        let mut result = cut.map_or(Ok(()), |(state, path)| self.leave_preempted(context, id, state, &path));
+        let mut result = self.cancel(context, id);
         let Some(thread) = self.threads.get_mut(&id) else { return result };
         let todo = std::mem::replace(&mut thread.todo, Todo::Busy);
         if let Todo::Join { state, path, regions } = todo {
@@ -63,20 +62,24 @@ impl Interpreter {
         changed.map_err(|problem| format!("{path}: {problem}"))
     }
 
-    /// Ends the action that a thread has under way; its state and its path, where its goal had begun.
-    fn cancel(&mut self, context: &mut Context<'_>, id: u64) -> Option<(StateId, String)> {
-        let current = self.threads.get_mut(&id)?.current.take()?;
+    /// Ends the action that a thread has under way. What that did to the world is said as for any end.
+    fn cancel(&mut self, context: &mut Context<'_>, id: u64) -> Result<(), String> {
+        let Some(current) = self.threads.get_mut(&id).and_then(|thread| thread.current.take()) else { return Ok(()) };
         let has_begun = current.phase == Phase::Running && !context.program.state(current.state).is_pause();
+        let mut result = Ok(());
         match current.phase {
             Phase::Held | Phase::Stalled | Phase::Backoff(_) => {}
             Phase::Running if !has_begun => {}
             Phase::Acquiring => context.commands.push(Command::Withdraw { instance: current.instance }),
             Phase::Projecting | Phase::Running => {
                 context.commands.push(Command::Cancel { instance: current.instance, attempt: current.attempt });
+                if has_begun {
+                    result = self.leave_preempted(context, id, current.state, &current.path);
+                }
             }
         }
         self.give_back(context, &current);
         context.note(Note::Squashed { instance: current.instance });
-        has_begun.then_some((current.state, current.path))
+        result
     }
 }

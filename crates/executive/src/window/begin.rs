@@ -73,10 +73,10 @@ impl Window {
         true
     }
 
-    /// It has its resources, and keeps them where the operator lets it not begin.
+    /// It has its resources. Where the operator lets it not begin it gives them back, for others may want them meanwhile, and asks anew when it may.
     pub(super) fn proceed_unless_held_back(&mut self, context: &mut Context<'_>, id: InstanceId) {
         if self.is_held_back(context, id) {
-            return self.wait(id, Wait::Pause);
+            return self.step_back(context, id, Wait::Pause);
         }
         self.proceed(context, id);
     }

@@ -6,6 +6,7 @@ use super::growth::environment::assigned;
 use super::waits::{Timer, Wait};
 use crate::binding;
 use crate::context::Context;
+use crate::effects;
 use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
 use crate::plan::gives_outputs;
 use crate::protocol::{Command, Event, Note};
@@ -207,6 +208,19 @@ impl Window {
         }
     }
 
+    /// The run ends while a PIA is under way: what it says of being cut short is true.
+    fn say_cut_short(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return };
+        let Some(declared) = context.program.state(instance.state).annotations.effects.get(PREEMPTED) else { return };
+        let changes =
+            self.look(context, id, None, |_, view| effects::actual(Some(declared), PREEMPTED, &[], view).ok());
+        if let Some(changes) = changes.flatten() {
+            let writer = self.path(context.program, id);
+            // The run ends anyway.
+            let _ = context.commit(id, writer, changes.into());
+        }
+    }
+
     /// Takes back what was asked for a node; it holds nothing afterwards.
     pub(super) fn stop_node(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(node) = self.graph.node(id) else { return };
@@ -215,8 +229,12 @@ impl Window {
         match &node.status {
             Status::Running(_) if is_pause => {}
             Status::Acquiring { .. } => context.commands.push(Command::Withdraw { instance: id }),
-            Status::Projecting(_) | Status::Running(_) => {
+            Status::Projecting(_) => context.commands.push(Command::Cancel { instance: id, attempt }),
+            Status::Running(_) => {
                 context.commands.push(Command::Cancel { instance: id, attempt });
+                if self.is_ending {
+                    self.say_cut_short(context, id);
+                }
             }
             Status::RunningRoutine(..) => {
                 if let Some(interpreter) = self.graph.interpreter(id) {

@@ -206,7 +206,7 @@ impl Window {
         let has_ended = instance.ended().is_some();
         match (instance.role(), instance.node().map(|node| &node.status)) {
             (None, Some(Status::Expanded)) => self.begin(context, id),
-            // It got its resources during a pause, and keeps them.
+            // It has its resources.
             (None, Some(Status::Granted(_))) => self.proceed_unless_held_back(context, id),
             (None, Some(Status::Finished(_))) if instance.is_undecided() => self.decide_by_outcome(context, id),
             (Some(Role::Condition | Role::Test), _) if !has_ended => self.decide(context, id),

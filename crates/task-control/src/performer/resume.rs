@@ -140,7 +140,9 @@ impl Performer {
             return Ok(());
         }
         let last = there.checked_sub(1).map(|last| ledger.commits[last].id(&self.run));
-        let (mut told, mut is_behind) = (ledger.first_revision, last.is_none());
+        let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
+        let (_, oldest) = retry_unanswered(|| self.world.history(any.clone())).await?;
+        let (mut told, mut is_behind) = (oldest.max(ledger.first_revision), last.is_none());
         let mut watch = retry_unanswered(|| self.world.watch(Some(told), &[])).await?;
         while told < root {
             let Some(WorldUpdate::Changed(change)) = watch.next().await? else {
