@@ -57,7 +57,7 @@ pub struct Origin {
     pub imprecise: Vec<String>,
     /// What its actions are, so that a log can be read without the task. Nothing in logs of earlier versions.
     #[serde(default)]
-    pub natures: Box<Natures>,
+    pub natures: Natures,
 }
 
 /// What the actions of a run are.
@@ -106,7 +106,7 @@ pub enum Event {
         breakpoints: Box<[String]>,
         /// Which run this is.
         #[serde(default)]
-        origin: Origin,
+        origin: Box<Origin>,
     },
     /// Task control was gone and goes on from its log. Logged; changes nothing.
     Resumed,

@@ -9,7 +9,7 @@ pub use circumstances::{Circumstances, MAX_EVENTS, Mischief, Trigger};
 use crate::dice::Dice;
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::{Lookout, Memory, Problem, Search};
-use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Mode, Origin};
+use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Mode};
 use ratn_model::catalogue::ResourceOffer;
 use ratn_model::fact::{Change, FactKey, Footprint};
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
@@ -133,7 +133,6 @@ pub enum RunError {
 }
 
 /// What is going to happen.
-#[expect(clippy::large_enum_variant, reason = "nearly all entries are events")]
 enum Entry {
     /// This event.
     Event(Event),
@@ -263,7 +262,7 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
             capacity: setup.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
             learned,
             breakpoints: Box::default(),
-            origin: Origin::default(),
+            origin: Box::default(),
         },
     );
     simulation.bring_from_outside(|trigger| match trigger {

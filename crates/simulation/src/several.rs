@@ -6,7 +6,7 @@
 use crate::dice::Dice;
 use crate::run::{Answer, MAX_EVENTS, Oracle, Performance, RunError};
 use ratn_executive::executive::Executive;
-use ratn_executive::protocol::{Command, Event, Learned, Mode, Note, Origin};
+use ratn_executive::protocol::{Command, Event, Learned, Mode, Note};
 use ratn_model::catalogue::ResourceOffer;
 use ratn_model::fact::{FactKey, Footprint};
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId};
@@ -170,7 +170,7 @@ impl System<'_> {
                     capacity: shared.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
                     learned: Learned::default(),
                     breakpoints: Box::default(),
-                    origin: Origin::default(),
+                    origin: Box::default(),
                 },
                 Due::Event(event) => match *event {
                     // Word of what was given back meanwhile is none.

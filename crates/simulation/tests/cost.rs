@@ -8,7 +8,7 @@
 mod support;
 
 use ratn_executive::executive::Executive;
-use ratn_executive::protocol::{Command, Event, Goal, Learned, Mode, Origin};
+use ratn_executive::protocol::{Command, Event, Goal, Learned, Mode};
 use ratn_model::fact::FactKey;
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::program::Program;
@@ -179,7 +179,7 @@ fn started(program: &Program) -> Event {
         capacity: BTreeMap::new(),
         learned: Learned::default(),
         breakpoints: Box::default(),
-        origin: Origin::default(),
+        origin: Box::default(),
     }
 }
 

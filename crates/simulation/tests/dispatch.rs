@@ -7,7 +7,7 @@ mod support;
 
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::Task;
-use ratn_executive::protocol::{Command, Event, Learned, Mode, Note, Origin};
+use ratn_executive::protocol::{Command, Event, Learned, Mode, Note};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
 use ratn_model::resource::{Lease, Quantity};
 use ratn_model::time::Timestamp;
@@ -41,7 +41,7 @@ impl Begun {
             capacity: BTreeMap::from([("Brain".to_owned(), Quantity::whole(2))]),
             learned: Learned { durations_s, ..Learned::default() },
             breakpoints: Box::default(),
-            origin: Origin::default(),
+            origin: Box::default(),
         };
         let (asked, paths, attempts) = Default::default();
         let mut begun = Begun { executive: Executive::new(program, Tolerance::EXACT), asked, paths, attempts };

@@ -6,7 +6,7 @@
 mod support;
 
 use ratn_executive::executive::Executive;
-use ratn_executive::protocol::{Command, Event, Goal, Learned, Mode, Origin};
+use ratn_executive::protocol::{Command, Event, Goal, Learned, Mode};
 use ratn_model::expression::Expr;
 use ratn_model::fact::{FactKey, Term};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
@@ -187,7 +187,7 @@ impl Bench {
             capacity: BTreeMap::new(),
             learned: Learned::default(),
             breakpoints: Box::default(),
-            origin: Origin::default(),
+            origin: Box::default(),
         });
         bench
     }

@@ -5,7 +5,7 @@
 mod support;
 
 use ratn_executive::executive::Executive;
-use ratn_executive::protocol::{Command, Event, Learned, Mode, Note, Origin};
+use ratn_executive::protocol::{Command, Event, Learned, Mode, Note};
 use ratn_model::id::{InstanceId, Revision};
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
@@ -28,7 +28,7 @@ fn begun(task: &str, mode: Mode) -> (Executive, Vec<Command>) {
         capacity: BTreeMap::new(),
         learned: Learned::default(),
         breakpoints: Box::default(),
-        origin: Origin::default(),
+        origin: Box::default(),
     };
     let mut executive = Executive::new(Arc::new(program), Tolerance::ROBOT);
     let commands = executive.handle(Timestamp(0), started);

@@ -105,7 +105,7 @@ impl Ledger {
         self.last = self.last.max(at);
         match event {
             Event::Started { origin, revision, .. } => {
-                self.origin = origin.clone();
+                self.origin = (**origin).clone();
                 self.first_revision = *revision;
             }
             Event::Resumed => {

@@ -262,7 +262,7 @@ pub(super) mod tests {
         };
         let mut lines = ratn_simulation::run::run(setup, &mut TimedProviders { boxes: 2 }).unwrap().log;
         let LogEntry::Event(Event::Started { origin, .. }) = &mut lines[0].entry else { panic!("no start") };
-        *origin = Origin { run: "run-1".into(), version: VERSION.into(), ..Origin::default() };
+        **origin = Origin { run: "run-1".into(), version: VERSION.into(), ..Origin::default() };
         lines
     }
 

@@ -169,15 +169,15 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
             capacity: place.catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
             learned: run.learned,
             breakpoints: run.breakpoints.into_boxed_slice(),
-            origin: Origin {
+            origin: Box::new(Origin {
                 run: id,
                 version: VERSION.to_owned(),
                 file: run.file,
                 from: run.from,
                 began_unix_ms,
                 imprecise: imprecise(&run.program),
-                natures: Box::new(natures(&run.program, &place.catalogue)),
-            },
+                natures: natures(&run.program, &place.catalogue),
+            }),
         };
         shell.step(begun)
     };
