@@ -133,6 +133,7 @@ impl Interpreter {
         path: &str,
         made: Made,
     ) -> Result<(), String> {
+        self.has_changed |= !made.changes.is_empty();
         match &mut self.target {
             Target::Actual => context.commit(instance, path.to_owned(), made),
             Target::Projection { changes, writers, evidence, world, .. } => {

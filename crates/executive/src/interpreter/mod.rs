@@ -175,6 +175,9 @@ pub(crate) struct Interpreter {
     last_routine: u64,
     target: Target,
     hold: Hold,
+    /// Whether the world has changed since what it may end was looked at.
+    #[serde(skip, default)]
+    has_changed: bool,
     /// Why everything ends: a thread goes in circles.
     in_circles: Option<String>,
 }
@@ -224,6 +227,7 @@ impl Interpreter {
             last_routine: MAIN,
             target,
             hold: Hold::default(),
+            has_changed: false,
             in_circles: None,
         }
     }
@@ -287,6 +291,7 @@ impl Interpreter {
         if let Event::Answered { instance, choice } = &event {
             self.answered(context, *instance, choice);
         }
+        self.has_changed = true;
         let progress = self.look_at_the_time(context);
         if progress != Progress::Busy {
             return progress;

@@ -23,7 +23,10 @@ impl Interpreter {
             let id = match (self.first(follows), self.first(|_, todo| matches!(todo, Todo::Enter(..)))) {
                 (Some(id), _) => id,
                 (None, None) => return Progress::Busy,
-                (None, Some(_)) if self.look_at_waits(context) => continue,
+                (None, Some(_)) if std::mem::take(&mut self.has_changed) && self.look_at_waits(context) => {
+                    self.has_changed = true;
+                    continue;
+                }
                 (None, Some(id)) => id,
             };
             let Some(thread) = self.threads.get_mut(&id) else { return Progress::Busy };
