@@ -49,3 +49,36 @@ fn runs_beside_each_other_leave_what_all_of_them_did_also_where_one_is_killed_an
     ensure!(code == Some(0), "{code:?}\n{said}");
     place.wait_until_empty()
 }
+
+/// A run that was suspended longer than its session lives comes back to a world in which another one has had its gripper.
+#[test]
+fn a_run_that_was_suspended_for_too_long_changes_nothing_of_what_came_after_it() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let mut up = place.start_as("up", &["up", "--speed", "1", "--boxes", "1"])?;
+    wait_for("the system", || Ok(up.said().contains("is ready").then_some(()))).with_context(|| up.said())?;
+    let task = |name: &str| -> anyhow::Result<String> {
+        let file = place.path().join(format!("{name}.yaml"));
+        let effect = format!(r#"effects: ['by() = "{name}"'], resources: [Gripper]"#);
+        let text =
+            format!("task: {name}\nstates:\n  - open: {{ action: gripper/release, pia: true, reads: [], {effect} }}\n");
+        std::fs::write(&file, text)?;
+        Ok(file.display().to_string())
+    };
+    let (first, second, log) = (task("first")?, task("second")?, place.path().join("first.jsonl"));
+    let mut suspended = place.start_as("suspended", &["run", &first, "--log", &log.display().to_string()])?;
+    wait_for("its motion", || {
+        let text = std::fs::read_to_string(&log).unwrap_or_default();
+        Ok(text.contains("\"command\":\"start\"").then_some(()))
+    })?;
+    suspended.signal(nix::sys::signal::Signal::SIGSTOP)?;
+    let (code, _, said) = place.start_as("second", &["run", &second])?.finish()?;
+    ensure!(code == Some(0), "{code:?}\n{said}");
+    suspended.signal(nix::sys::signal::Signal::SIGCONT)?;
+    let (code, _, said) = suspended.finish()?;
+    ensure!(code == Some(1) && said.contains("session") && said.contains("lost"), "{code:?}\n{said}");
+    let (facts, err) = texts(&place.ratn(&["world", "facts", "by()"]).output()?);
+    ensure!(facts.lines().any(|line| line.split_whitespace().nth(1) == Some("second")), "{facts}{err}");
+    up.signal(nix::sys::signal::Signal::SIGTERM)?;
+    up.finish()?;
+    place.wait_until_empty()
+}
