@@ -30,6 +30,8 @@ pub struct Together {
     pub mode: Mode,
     /// When it begins, in virtual seconds.
     pub begins_s: f64,
+    /// What an operator tells it, and so many virtual seconds after the start.
+    pub told: Vec<(f64, Event)>,
 }
 
 /// What all of them are on.
@@ -102,6 +104,10 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
             end: None,
         });
         system.at(number, Duration::from_secs_f64(together.begins_s.max(0.0)), Due::Begin);
+        for (at_s, event) in &together.told {
+            let at = Duration::from_secs_f64(at_s.max(together.begins_s).max(0.0));
+            system.at(number, at, Due::Event(Box::new(event.clone())));
+        }
     }
     system.until_all_have_ended(shared, runs)
 }
