@@ -13,8 +13,10 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// So many logs are looked at, those of the command line and those that runs write meanwhile.
-pub const MAX_LOGS: usize = 80;
+/// So many logs of the command line are looked at,
+pub const MAX_LOGS: usize = 16;
+/// and beside them so many that runs write meanwhile: as many as there may be runs.
+const MAX_LOGS_OF_RUNS: usize = 64;
 /// So much of a log is read before the moment that is shown; a shorter log is read from its start.
 const BEFORE_BYTES: u64 = 16 << 20;
 /// So much is read for one answer.
@@ -227,7 +229,7 @@ fn replay(
 impl All {
     /// Its place. Where there are as many as there may be, one that was not named by the user is given up for it.
     fn add(&mut self, path: PathBuf, named: bool) -> usize {
-        if self.logs.len() >= MAX_LOGS {
+        if self.logs.len() >= MAX_LOGS + MAX_LOGS_OF_RUNS {
             let Some(oldest) = self.logs.iter().position(|one| !one.named && one.heard.is_none()) else {
                 return usize::MAX;
             };

@@ -131,12 +131,14 @@ impl Interpreter {
         context.commands.push(Command::Acquire { instance, requirements, priority: i64::MAX });
     }
 
-    /// Who has asked for the routine goes on, and whoever waited with it.
+    /// Who has asked for the routine goes on, and whoever waited with it, unless what they require has been changed meanwhile.
     pub(super) fn go_on_under_new_lease(&mut self, context: &mut Context<'_>, thread: u64) {
-        self.project_or_run(context, thread);
-        let Some(routine) = self.threads.get(&thread).and_then(|thread| thread.routine) else { return };
-        for thread in self.stalled(routine) {
-            self.project_or_run(context, thread);
+        let routine = self.threads.get(&thread).and_then(|thread| thread.routine);
+        let stalled = routine.map(|routine| self.stalled(routine)).unwrap_or_default();
+        for thread in std::iter::once(thread).chain(stalled) {
+            if self.may_try(context, thread) {
+                self.project_or_run(context, thread);
+            }
         }
     }
 
