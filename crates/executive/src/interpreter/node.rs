@@ -92,15 +92,24 @@ impl Interpreter {
         let held: Vec<u64> =
             self.threads.keys().copied().filter(|thread| self.phase(*thread) == Some(Phase::Held)).collect();
         for thread in held {
-            self.try_now(context, thread);
+            let keeps = self.current(thread).is_some_and(|current| current.lease.is_some());
+            if !keeps {
+                self.try_now(context, thread);
+            } else if self.may_try(context, thread) {
+                self.go_on(context, thread);
+            }
         }
     }
 
-    /// The pause began while it waited for its resources. It gives them back, for others may want them meanwhile, and asks anew when it may begin.
+    /// The pause began while it waited for its resources. It gives them back, for others may want them meanwhile, and asks anew when it may begin;
+    /// what it has used up by that it keeps. What it was shown of the world may be otherwise then.
     pub(super) fn hold_back(&mut self, context: &mut Context<'_>, thread: u64) {
         let Some(current) = self.current(thread) else { return };
         current.phase = Phase::Held;
-        let given = current.take_held();
+        let mut given = current.take_held();
+        if context.plan.state(given.state).uses_up {
+            current.lease = given.lease.take();
+        }
         self.give_back(context, &given);
     }
 

@@ -29,6 +29,7 @@ pub(crate) use written::{Chain, Written};
 use ratn_model::expression::{EffectExpr, FactExpr};
 use ratn_model::id::StateId;
 use ratn_model::program::{Exceptions, Program, ResourceExpr, State, StateKind, Target, WORLD_MODEL};
+use ratn_model::resource::ResourceOperation;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -88,6 +89,8 @@ pub(crate) struct StatePlan {
     pub(crate) requirements: Vec<ResourceExpr>,
     /// What it does to resources when it ends with success.
     pub(crate) operations: Vec<ResourceExpr>,
+    /// Whether something is used up when it gets what it acquires: that is not given back.
+    pub(crate) uses_up: bool,
     /// Whether it works on a projection of the world model.
     pub(crate) needs_world: bool,
     /// The kinds of task resources that it depends on: those it blocks, consumes, creates, deletes or looks for.
@@ -216,6 +219,7 @@ impl StatePlan {
             effect_predicates: ends.predicates,
             exits,
             repeats: transitions.repeats(state.id),
+            uses_up: resources.requirements.iter().any(|r| r.operation == ResourceOperation::Consume),
             needs_world: resources.requirements.iter().any(|r| r.kind == WORLD_MODEL),
             kinds: resources.kinds,
             operated: resources.operated,

@@ -73,10 +73,12 @@ impl Window {
         true
     }
 
-    /// It has its resources. Where the operator lets it not begin it gives them back, for others may want them meanwhile, and asks anew when it may.
+    /// It has its resources. Where the operator lets it not begin it gives them back, for others may want them meanwhile, and asks anew when it may;
+    /// what it has used up by that it keeps.
     pub(super) fn proceed_unless_held_back(&mut self, context: &mut Context<'_>, id: InstanceId) {
         if self.is_held_back(context, id) {
-            return self.step_back(context, id, Wait::Pause);
+            let uses_up = self.graph.get(id).is_some_and(|instance| context.plan.state(instance.state).uses_up);
+            return if uses_up { self.wait(id, Wait::Pause) } else { self.step_back(context, id, Wait::Pause) };
         }
         self.proceed(context, id);
     }
