@@ -206,19 +206,7 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
     let session = SessionId::from("task");
     let forever = Duration::from_secs(10 * 365 * 24 * 3600);
     pool.keep_alive(Timestamp(0), &session, "simulation", forever).map_err(|e| broken(Timestamp(0), e.to_string()))?;
-    for (kind, offer) in &setup.resources {
-        let shared = offer.class == ResourceClass::World || offer.divisible;
-        let (count, capacity) = if shared { (1, offer.count) } else { (offer.count.units(), Quantity::ONE) };
-        for number in 1..=count {
-            let mut spec =
-                ResourceSpec::new(offer.class, kind.clone()).id(format!("{kind}-{number}")).capacity(capacity);
-            (spec.divisible, spec.renewable) = (offer.divisible, offer.renewable);
-            let attributes = circumstances.attributes.get(kind).and_then(|all| all.get(number as usize - 1));
-            spec.attributes.extend(attributes.cloned().unwrap_or_default());
-            pool.create(Timestamp(0), None, spec).map_err(|e| broken(Timestamp(0), e.to_string()))?;
-        }
-    }
-    let _ = pool.take_notices();
+    offer(&mut pool, &setup.resources, &circumstances.attributes).map_err(|e| broken(Timestamp(0), e))?;
     let mut simulation = Simulation {
         now: Timestamp(0),
         pool,
@@ -695,8 +683,30 @@ impl Simulation<'_> {
     }
 }
 
+/// Puts everything that there is into a pool; the attributes of resources by kind, one after the other.
+pub(crate) fn offer(
+    pool: &mut Pool,
+    resources: &[(String, ResourceOffer)],
+    attributes: &BTreeMap<String, Vec<BTreeMap<String, Value>>>,
+) -> Result<(), String> {
+    for (kind, offer) in resources {
+        let shared = offer.class == ResourceClass::World || offer.divisible;
+        let (count, capacity) = if shared { (1, offer.count) } else { (offer.count.units(), Quantity::ONE) };
+        for number in 1..=count {
+            let mut spec =
+                ResourceSpec::new(offer.class, kind.clone()).id(format!("{kind}-{number}")).capacity(capacity);
+            (spec.divisible, spec.renewable) = (offer.divisible, offer.renewable);
+            let attributes = attributes.get(kind).and_then(|all| all.get(number as usize - 1));
+            spec.attributes.extend(attributes.cloned().unwrap_or_default());
+            pool.create(Timestamp(0), None, spec).map_err(|error| error.to_string())?;
+        }
+    }
+    let _ = pool.take_notices();
+    Ok(())
+}
+
 /// What a projection shows of a world, as the world pool does it: the facts that are read, and no others.
-fn shown(world: World, reads: &Footprint) -> World {
+pub(crate) fn shown(world: World, reads: &Footprint) -> World {
     let Footprint::Patterns(patterns) = reads else { return world };
     let facts = patterns.iter().flat_map(|read| world.matching(read));
     World::from_facts(facts.map(|(key, fact)| (key.clone(), fact.value.clone())), world.revision())

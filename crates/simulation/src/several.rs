@@ -4,18 +4,17 @@
 //! tells in time is not seen here: who gets a lease there has been told what its last holder committed (`ratn-task-control`).
 
 use crate::dice::Dice;
-use crate::run::{Answer, MAX_EVENTS, Oracle, Performance, RunError};
+use crate::run::{Answer, MAX_EVENTS, Oracle, Performance, RunError, offer, shown};
 use ratn_executive::executive::Executive;
 use ratn_executive::protocol::{Command, Event, Learned, Mode, Note};
 use ratn_model::catalogue::ResourceOffer;
-use ratn_model::fact::{FactKey, Footprint};
+use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId};
 use ratn_model::program::Program;
-use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
-use ratn_resources::{AcquireRequest, Limits, Notice, Pool, ResourceSpec, SessionId, WaiterId};
+use ratn_resources::{AcquireRequest, Limits, Notice, Pool, SessionId, WaiterId};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -63,16 +62,7 @@ pub struct AllEnded {
 pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Result<AllEnded, RunError> {
     let broken = |problem: String| RunError::Broken { at_s: 0.0, problem };
     let mut pool = Pool::new(Limits::default());
-    for (kind, offer) in &shared.resources {
-        let is_one = offer.class == ResourceClass::World || offer.divisible;
-        let (count, capacity) = if is_one { (1, offer.count) } else { (offer.count.units(), Quantity::ONE) };
-        for number in 1..=count {
-            let mut spec =
-                ResourceSpec::new(offer.class, kind.clone()).id(format!("{kind}-{number}")).capacity(capacity);
-            (spec.divisible, spec.renewable) = (offer.divisible, offer.renewable);
-            pool.create(Timestamp(0), None, spec).map_err(|error| broken(error.to_string()))?;
-        }
-    }
+    offer(&mut pool, &shared.resources, &BTreeMap::new()).map_err(broken)?;
     let mut root = World::default();
     root.overwrite(shared.world.iter().map(|(fact, value)| (fact.clone(), Some(value.clone()))));
     let (agenda, next, projections) = Default::default();
@@ -88,7 +78,6 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
         runs: Vec::new(),
         oracle,
     };
-    let _ = system.pool.take_notices();
     for (number, together) in runs.iter().enumerate() {
         let session = SessionId::from(format!("run-{number}").as_str());
         let forever = Duration::from_secs(10 * 365 * 24 * 3600);
@@ -257,18 +246,9 @@ impl System<'_> {
             }
             Command::Project { instance, attempt, changes, reads, .. } => {
                 let world = self.root.project(&changes).map_err(|error| self.broken(error))?;
-                let facts: Vec<_> = match &reads {
-                    Footprint::Everything => {
-                        world.iter().map(|(key, fact)| (key.clone(), fact.value.clone())).collect()
-                    }
-                    Footprint::Patterns(patterns) => {
-                        let seen = patterns.iter().flat_map(|read| world.matching(read));
-                        seen.map(|(key, fact)| (key.clone(), fact.value.clone())).collect()
-                    }
-                };
                 self.next += 1;
                 let projection = ProjectionId(self.next);
-                self.projections.insert(projection, World::from_facts(facts, world.revision()));
+                self.projections.insert(projection, shown(world, &reads));
                 let late = self.late();
                 self.at(run, late, Due::Event(Box::new(Event::Projected { instance, attempt, projection })));
             }

@@ -37,7 +37,7 @@ const PINGS_PER_TTL: u32 = 4;
 const BACKOFF: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(500));
 /// The reason of a refusal to speak for a session of another caller.
 const NOT_YOURS: &str = "NOT_YOURS";
-/// From the time to live of an answer to what else it says.
+/// So soon after the time to live of an answer the rest of what it says is known, too.
 const MOMENT: Duration = Duration::from_millis(5);
 /// The last ping, which ends the session, is given this long.
 const FAREWELL: Duration = Duration::from_millis(200);
@@ -189,7 +189,7 @@ impl Session {
         gone(self.state.clone(), self.ttl).await;
     }
 
-    /// For whoever does, on its own, what only the holder of this session's leases may do.
+    /// A handle that says whether the session still has what it had: for a task of its own that does what only the holder of its leases may do.
     pub fn trust(&self) -> Trust {
         Trust { state: self.state.clone(), belief: self.belief.clone(), ttl: self.ttl }
     }

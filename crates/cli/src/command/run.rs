@@ -187,7 +187,8 @@ pub(super) async fn starting<T>(
     }
 }
 
-/// Runs a task, alone on its system or beside others and how urgent, asks `afterwards` what has become of the system, and ends the system if it was started for this.
+/// Runs a task, alone on its system or beside others and as urgent as is said. Asks `afterwards` what has become of the system, and ends the
+/// system if it was started for this.
 pub(super) async fn on_system<T>(
     run: Run,
     mut system: System,

@@ -29,7 +29,7 @@ const MOST_LINES: usize = 40;
 /// What is shown.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(super) struct Status {
-    /// What the runs here are doing, in the order in which they began.
+    /// What the runs here are doing, in the order of their ids.
     runs: Vec<RunStatus>,
     /// The ids of runs that are under way elsewhere, or do not say what they are doing.
     elsewhere: Vec<String>,

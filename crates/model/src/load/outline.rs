@@ -32,7 +32,7 @@ const FOREIGN_FORMS: [(&str, &str); 10] = [
     ("sequence", "write `- name:`, with `states: […]`"),
     (
         "parallel",
-        "write `- name:`, with `concurrency: barrier` and `regions: […]`, or `regions: { for: arm in [left, right], do: […] }`",
+        "write `- name:`, with `concurrency: barrier` and `regions: […]`, or `regions: { for: 'arm in [left, right]', do: […] }`",
     ),
     ("sleep", "write `- wait: { seconds: 1 }`"),
     ("call", "write `- name:`, with `action: provider/action` and `in: {…}`"),

@@ -241,7 +241,7 @@ fn alike(node: &mut Node, name: &str, findings: &mut Findings) {
             _ => rest.push(entry),
         }
     }
-    let help = "write `regions: { for: arm in [left, right], do: […] }`, or a list of states";
+    let help = "write `regions: { for: 'arm in [left, right]', do: […] }`, or a list of states";
     let listed = |node: &Node| {
         let Content::Text(text) = &node.content else { return None };
         let (variable, list) = text.split_once(" in ")?;

@@ -1,6 +1,7 @@
 //! Performs the executive's commands: asks the resource manager, gives goals to providers, hands what needs an order to
 //! [`super::record`]. Never waits: every answer comes back as an event.
 
+mod claim;
 mod goal;
 mod handover;
 mod resume;
@@ -15,10 +16,10 @@ use super::ledger::{Confirmed, acquire_request};
 use super::outside::Outside;
 use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Record, Recorded, Recorder, said};
 use super::shell::{Place, Urgency};
-use crate::NotStarted;
 use crate::background_runtime::BackgroundRuntime;
 use crate::messages::Messages;
 use anyhow::{Context, bail};
+pub use claim::{RUN_KIND, claim};
 use futures::FutureExt;
 use goal::{Given, Performing};
 use handover::{Handover, Leases};
@@ -27,10 +28,10 @@ use ratn_model::catalogue::Catalogue;
 use ratn_model::condition::Condition;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
-use ratn_model::resource::{LeasedResource, Requirement, ResourceClass, ResourceOperation};
+use ratn_model::resource::{LeasedResource, Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
-use ratn_proto::types::{self, ENDPOINT_ATTRIBUTE, Resource, WorldChange};
+use ratn_proto::types::{self, ENDPOINT_ATTRIBUTE, WorldChange};
 use ratn_worker::client::{AcquireOptions, ActionClient, CallError, Channels, ResourceClient, WorldClient};
 use ratn_worker::client::{retry_unanswered, retry_until_answered};
 use ratn_worker::session::{DEFAULT_TTL, Session};
@@ -54,14 +55,6 @@ const ACQUIRE_DEADLINE: Duration = Duration::from_secs(3600);
 const LONG_WHILE_IDLE: Duration = Duration::from_secs(4);
 /// what waits longer than this in any case.
 const LONG: Duration = Duration::from_secs(30);
-/// So many runs are under way on a system at the most.
-const MOST_RUNS: usize = 64;
-/// The attributes of the resource that says that a run is under way: its task,
-const TASK: &str = "task";
-/// and whether no other run may be.
-const ALONE: &str = "alone";
-/// The kind of that resource, whose id is the run's.
-pub const RUN_KIND: &str = "Run";
 /// What is needed and waits longer than this beside other runs comes next: of what does, what waits longest.
 const LONG_BESIDE_OTHERS: Duration = Duration::from_secs(2);
 /// The priority with which it asks then; nobody else does.
@@ -646,54 +639,4 @@ impl Performer {
             }
         });
     }
-}
-
-/// A run begins on a system; whether others are under way. It goes beside them, unless it or one of them is to be `alone`. The resource that
-/// says so, of its id, goes with its session.
-///
-/// # Errors
-/// Where it may not begin beside what is under way, it is under way already, or the resource manager cannot be asked.
-pub async fn claim(resources: &ResourceClient, run: &str, task: &str, alone: bool) -> anyhow::Result<bool> {
-    // Before it is seen by others: one that is refused is in nobody's way.
-    others(resources, run, alone).await?;
-    let claim = Resource::new(run, ResourceClass::Task, RUN_KIND)
-        .with_attribute(TASK, Value::String(task.to_owned()))
-        .with_attribute(ALONE, Value::Bool(alone));
-    match retry_unanswered(|| resources.create(claim.clone())).await {
-        Ok(_) => {}
-        Err(error) if error.code() == Some(tonic::Code::AlreadyExists) => {
-            return Err(NotStarted(format!("{run} is under way on this system")).into());
-        }
-        Err(error) => bail!("cannot begin the run: {}", said(&error)),
-    }
-    // Of two that begin at the same moment each sees the other one.
-    others(resources, run, alone).await
-}
-
-/// Whether other runs are under way, beside which this one may be.
-async fn others(resources: &ResourceClient, run: &str, alone: bool) -> anyhow::Result<bool> {
-    let runs = retry_unanswered(|| resources.list(&[RUN_KIND])).await;
-    let runs = runs.map_err(|error| anyhow::anyhow!("cannot begin the run: {}", said(&error)))?;
-    let others: Vec<&Resource> = runs.iter().filter(|other| other.id != run).collect();
-    let task_of = |other: &Resource| match other.attributes.get(TASK) {
-        Some(Value::String(task)) => format!("`{task}`"),
-        _ => other.id.clone(),
-    };
-    let goes_alone = others.iter().find(|other| other.attributes.get(ALONE) == Some(&Value::Bool(true)));
-    let message = match goes_alone {
-        Some(other) => {
-            let task = task_of(other);
-            format!("{task} is under way on this system and goes alone: wait for its end, or use a system of your own")
-        }
-        None if alone && !others.is_empty() => {
-            let tasks: Vec<String> = others.iter().map(|other| task_of(other)).collect();
-            let tasks = tasks.join(", ");
-            format!("another run is under way on this system ({tasks}): wait for its end, or use a system of your own")
-        }
-        None if others.len() >= MOST_RUNS => {
-            format!("{MOST_RUNS} runs are under way on this system, as many as there may be: wait for the end of one")
-        }
-        None => return Ok(!others.is_empty()),
-    };
-    Err(NotStarted(message).into())
 }

@@ -3,7 +3,7 @@
 //! Runs on one system see what each other commits as changes from outside, in the order of the world pool, a moment later. A resource may change
 //! hands within that moment: whoever gives one back leaves word with the resource manager of what it had committed and had been told ([`Left`]), and
 //! whoever gets it next waits until it has been told as much. So runs that hold the same resource one after the other see each other's
-//! doing as one program would, and no call is needed for it.
+//! doing as one program would. Only where that is late is anybody asked ([`Ask`]).
 
 #[cfg(doc)]
 use crate::record::Decided;
@@ -16,13 +16,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
-/// What is told as usual takes less; after this it is asked for.
+/// Usually everything is told by then; after this it is asked for.
 const USUAL: Duration = Duration::from_millis(50);
 /// So often what is not told is asked for again.
 const AGAIN: Duration = Duration::from_millis(500);
 /// What is not known after this time never will be.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Of more runs beside each other nothing is kept.
+/// When so many runs were heard of, they are forgotten: who has to know of one of them asks.
 const MOST_RUNS: usize = 1024;
 
 /// What a run had committed and had been told when it gave a lease back.

@@ -1,0 +1,68 @@
+//! Which runs may be under way beside each other: each is a resource of its session, which the others see.
+
+use crate::NotStarted;
+use crate::record::said;
+use anyhow::bail;
+use ratn_model::resource::ResourceClass;
+use ratn_model::value::Value;
+use ratn_proto::types::Resource;
+use ratn_worker::client::{ResourceClient, retry_unanswered};
+
+/// So many runs are under way on a system at the most.
+const MOST_RUNS: usize = 64;
+/// The attributes of the resource that says that a run is under way: its task,
+const TASK: &str = "task";
+/// and whether no other run may be.
+const ALONE: &str = "alone";
+/// The kind of that resource, whose id is the run's.
+pub const RUN_KIND: &str = "Run";
+
+/// A run begins on a system; whether others are under way. It goes beside them, unless it or one of them is to be `alone`. The resource that
+/// says so, of its id, goes with its session.
+///
+/// # Errors
+/// Where it may not begin beside what is under way, it is under way already, or the resource manager cannot be asked.
+pub async fn claim(resources: &ResourceClient, run: &str, task: &str, alone: bool) -> anyhow::Result<bool> {
+    // Before it is seen by others: one that is refused is in nobody's way.
+    others(resources, run, alone).await?;
+    let claim = Resource::new(run, ResourceClass::Task, RUN_KIND)
+        .with_attribute(TASK, Value::String(task.to_owned()))
+        .with_attribute(ALONE, Value::Bool(alone));
+    match retry_unanswered(|| resources.create(claim.clone())).await {
+        Ok(_) => {}
+        Err(error) if error.code() == Some(tonic::Code::AlreadyExists) => {
+            return Err(NotStarted(format!("{run} is under way on this system")).into());
+        }
+        Err(error) => bail!("cannot begin the run: {}", said(&error)),
+    }
+    // Of two that begin at the same moment each sees the other one.
+    others(resources, run, alone).await
+}
+
+/// Whether other runs are under way, beside which this one may be.
+async fn others(resources: &ResourceClient, run: &str, alone: bool) -> anyhow::Result<bool> {
+    let runs = retry_unanswered(|| resources.list(&[RUN_KIND])).await;
+    let runs = runs.map_err(|error| anyhow::anyhow!("cannot begin the run: {}", said(&error)))?;
+    let others: Vec<&Resource> = runs.iter().filter(|other| other.id != run).collect();
+    let task_of = |other: &Resource| match other.attributes.get(TASK) {
+        Some(Value::String(task)) => format!("`{task}`"),
+        _ => other.id.clone(),
+    };
+    let goes_alone = others.iter().find(|other| other.attributes.get(ALONE) == Some(&Value::Bool(true)));
+    let message = match goes_alone {
+        Some(other) => {
+            let task = task_of(other);
+            format!("{task} is under way on this system and goes alone: wait for its end, or use a system of your own")
+        }
+        None if alone && !others.is_empty() => {
+            let tasks: Vec<String> = others.iter().map(|other| task_of(other)).collect();
+            let tasks = tasks.join(", ");
+            format!("another run is under way on this system ({tasks}): wait for its end, or use a system of your own")
+        }
+        None if others.len() >= MOST_RUNS => {
+            format!("{MOST_RUNS} runs are under way on this system, as many as there may be: wait for the end of one")
+        }
+        None => return Ok(!others.is_empty()),
+    };
+    Err(NotStarted(message).into())
+}
