@@ -9,6 +9,7 @@ mod error;
 mod goal;
 mod log;
 mod task;
+mod threads;
 mod value;
 mod worker;
 

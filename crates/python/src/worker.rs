@@ -1,8 +1,9 @@
-//! A worker whose actions are Python functions. Each goal is performed in a thread of its own, which has Python's lock only while Python
+//! A worker whose actions are Python functions. Each goal is performed in a thread that it has for itself, which has Python's lock only while Python
 //! runs; the daemon's questions are answered meanwhile.
 
 use crate::error::{Aborted, Cancelled, Error, Lost, line};
 use crate::goal::Goal;
+use crate::threads::Threads;
 use crate::value::{fields_from_python, fields_to_python, from_python};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -75,8 +76,9 @@ pub(crate) fn serve(
     let pooled = std::env::var_os("RATN_PROVIDER_SESSION").is_some_and(|session| !session.is_empty());
     let arguments = Arguments::of(arguments, pooled).and_then(Arguments::worker);
     let mut worker = arguments.map_err(|error| PyValueError::new_err(line(&error)))?.provides(provider, kind);
+    let threads = Threads::default();
     for action in actions {
-        worker = worker.action(PythonAction::of(py, action, kind)?);
+        worker = worker.action(PythonAction::of(py, action, kind, &threads)?);
     }
     if without_leases {
         worker = worker.without_leases();
@@ -91,7 +93,8 @@ pub(crate) fn serve(
         worker = worker.standstill(bound);
     }
     let ended = py.detach(|| {
-        let runtime = Builder::new_multi_thread().worker_threads(2).enable_all().build();
+        // More than one would wake each other for every goal, and have nothing to do.
+        let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build();
         let runtime = runtime.map_err(|source| WorkerError::System { what: "start its runtime".to_owned(), source })?;
         let ended = runtime.block_on(async {
             let worker = match driven {
@@ -100,6 +103,7 @@ pub(crate) fn serve(
             };
             worker.run().await
         });
+        threads.end(LAST_THREADS);
         runtime.shutdown_timeout(LAST_THREADS);
         ended
     });
@@ -148,10 +152,11 @@ struct PythonAction {
     description: String,
     signature: Signature,
     perform: Arc<Py<PyAny>>,
+    threads: Threads,
 }
 
 impl PythonAction {
-    fn of(py: Python<'_>, described: Described, kind: &str) -> PyResult<PythonAction> {
+    fn of(py: Python<'_>, described: Described, kind: &str, threads: &Threads) -> PyResult<PythonAction> {
         let Described { name, description, inputs, outputs, outcomes, perform, .. } = described;
         let of_type = |port: &str, text: String| {
             let read = Type::try_from(text);
@@ -192,7 +197,8 @@ impl PythonAction {
         if let Some(takes) = &described.takes {
             signature = signature.takes(takes);
         }
-        Ok(PythonAction { suspends: described.suspends, name, description, signature, perform: Arc::new(perform) })
+        let (suspends, perform, threads) = (described.suspends, Arc::new(perform), threads.clone());
+        Ok(PythonAction { suspends, name, description, signature, perform, threads })
     }
 }
 
@@ -216,9 +222,9 @@ impl Action for PythonAction {
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let (goal, function, runtime) = (Arc::new(goal), Arc::clone(&self.perform), Handle::current());
-        let performed =
-            tokio::task::spawn_blocking(move || Python::attach(|py| perform(py, &goal, &function, runtime)));
-        performed.await.unwrap_or_else(|error| Err(ActionFailure::Aborted(line(&error))))
+        let performed = self.threads.run(move |py| perform(py, &goal, &function, runtime));
+        let performed = performed.map_err(|error| ActionFailure::Aborted(format!("no thread for it: {error}")))?;
+        performed.await.unwrap_or_else(|_| Err(ActionFailure::Aborted("its thread has panicked".to_owned())))
     }
 }
 

@@ -5,7 +5,7 @@
 //! |---|---|
 //! | `--id` | the id of its resource |
 //! | `--endpoint-file` | the file into which the worker writes its endpoint |
-//! | `--listen` | the address that it listens on; `127.0.0.1:0` unless given |
+//! | `--listen` | the address that it listens on; unless given, a socket that its process manager has named, or `127.0.0.1:0` |
 //! | `--kind`, `--host` | kind and host of its resource, where the worker offers that itself |
 //! | `--resource-manager` | the resource manager at which the worker offers its resource itself; not for a pooled worker |
 //! | `--config` | the system's config, with the roles of callers |
@@ -13,7 +13,7 @@
 //! | `--insecure` | it may listen beyond loopback without TLS |
 
 use crate::endpoint::EndpointError;
-use crate::pooled::PROVIDER_SESSION_VARIABLE;
+use crate::pooled::{self, PROVIDER_SESSION_VARIABLE};
 use crate::server::Exposure;
 use crate::tls;
 use crate::worker::{Worker, WorkerOptions};
@@ -169,7 +169,7 @@ impl Arguments {
             host: text("--host").unwrap_or_default(),
             endpoint_file: text("--endpoint-file").map(Into::into),
             access: text("--config").map(Into::into),
-            listen: listen.unwrap_or(defaults.listen),
+            listen: listen.unwrap_or_else(|| if self.pooled { pooled::listen() } else { defaults.listen }),
             resource_manager,
             exit_with_parent: text("--exit-with-parent").is_some() || self.pooled,
             exposure: Exposure {

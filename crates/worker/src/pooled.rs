@@ -1,7 +1,7 @@
 //! The environment variables that a process manager sets for its workers: where leases are confirmed, which session offers the worker's
-//! resource, and within which time the worker has to stand still.
+//! resource, within which time the worker has to stand still, and where it listens unless its arguments say that.
 
-use crate::endpoint::EndpointError;
+use crate::endpoint::{Endpoint, EndpointError};
 use crate::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use std::time::Duration;
 
@@ -11,6 +11,16 @@ pub const PROVIDER_SESSION_VARIABLE: &str = "RATN_PROVIDER_SESSION";
 
 /// The environment variable with the `standstill_ms` that the worker's resource is offered with.
 pub const STANDSTILL_VARIABLE: &str = "RATN_STANDSTILL_MS";
+
+/// The environment variable with where the worker listens unless it is told otherwise: a Unix socket, where its process manager and the
+/// resource manager are reached by Unix sockets of the runtime directory alone.
+pub const LISTEN_VARIABLE: &str = "RATN_WORKER_LISTEN";
+
+/// Where a worker listens that was not told: as the process manager says that started it, and else somewhere on loopback.
+pub fn listen() -> Endpoint {
+    let said = std::env::var(LISTEN_VARIABLE).ok().and_then(|said| said.parse().ok());
+    said.unwrap_or_else(Endpoint::loopback)
+}
 
 /// See the module.
 #[derive(Debug, Clone, PartialEq, Eq)]

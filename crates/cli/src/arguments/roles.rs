@@ -102,9 +102,9 @@ pub(crate) struct WorkerArguments {
     /// The host that it is on
     #[arg(long, value_name = "NAME", default_value = "")]
     pub(crate) host: String,
-    /// Where to listen: `127.0.0.1:0`, `unix:/path`
-    #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:0")]
-    pub(crate) listen: Endpoint,
+    /// Where to listen: `127.0.0.1:0`, `unix:/path`; unless given, at a socket that its process manager has named, or on loopback
+    #[arg(long, value_name = "ADDRESS")]
+    pub(crate) listen: Option<Endpoint>,
     /// Write where it serves to this file once it is ready
     #[arg(long, value_name = "FILE")]
     pub(crate) endpoint_file: Option<PathBuf>,

@@ -20,6 +20,7 @@ use ratn_storage::OpenError;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use ratn_worker::panic::exit_on_panic;
+use ratn_worker::pooled;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::server::{BindError, Exposure, Serving};
 use ratn_worker::tls::ClientTls;
@@ -158,7 +159,7 @@ pub(super) fn worker(arguments: &WorkerArguments, tls: &ClientTls) -> Result<(),
     let options = WorkerOptions {
         id: arguments.id.clone(),
         kind: arguments.kind.clone(),
-        listen: arguments.listen.clone(),
+        listen: arguments.listen.clone().unwrap_or_else(pooled::listen),
         endpoint_file: arguments.endpoint_file.clone(),
         exit_with_parent: arguments.exit_with_parent,
         resource_manager: arguments.resource_manager.clone(),

@@ -18,6 +18,7 @@ use super::template::Template;
 use super::tracking::Tracker;
 use nix::sys::signal::Signal;
 use ratn_proto::types::{WorkerState, WorkerStatus};
+use ratn_worker::endpoint::Endpoint;
 use ratn_worker::panic::exit_on_panic_blocking;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::os::fd::OwnedFd;
@@ -218,9 +219,16 @@ fn clear_up(entry: &Entry, directory: &RuntimeDirectory) {
 }
 
 fn remove_files(id: &str, template: &Template, directory: &RuntimeDirectory) {
-    let directory = &account::directory_of(directory, template);
-    let files = [directory.endpoint_file(id), adopt_socket(directory, id)];
-    for file in files {
+    remove_files_in(&account::directory_of(directory, template), id);
+}
+
+/// What a worker leaves that was killed.
+pub(super) fn remove_files_in(directory: &RuntimeDirectory, id: &str) {
+    let served = match directory.socket(id) {
+        Endpoint::Unix(path) => Some(path),
+        _ => None,
+    };
+    for file in [directory.endpoint_file(id), adopt_socket(directory, id)].into_iter().chain(served) {
         let _ = std::fs::remove_file(file);
     }
 }

@@ -19,9 +19,10 @@ use nix::sys::signal::Signal;
 use ratn_model::catalogue::Catalogue;
 use ratn_panic_point::panic_point;
 use ratn_worker::adoption;
+use ratn_worker::endpoint::Endpoint;
 use ratn_worker::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use ratn_worker::panic::{exit_on_panic, exit_on_panic_blocking};
-use ratn_worker::pooled::{PROVIDER_SESSION_VARIABLE, STANDSTILL_VARIABLE};
+use ratn_worker::pooled::{LISTEN_VARIABLE, PROVIDER_SESSION_VARIABLE, STANDSTILL_VARIABLE};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
 use std::collections::BTreeMap;
@@ -75,6 +76,8 @@ pub(super) struct Processes {
     host: String,
     tls: ClientTls,
     told: ManagerContact,
+    /// Whether the process manager itself is reached by its socket in the runtime directory alone.
+    is_local: bool,
     /// Variables in the environment of every worker.
     worker_environment: BTreeMap<&'static str, PathBuf>,
     /// What workers are compared with, where that is known.
@@ -148,6 +151,7 @@ impl Processes {
             host: config.host.clone(),
             tls,
             told,
+            is_local: config.listen.is_local(),
             worker_environment: config.worker_environment.clone(),
             catalogue: config.catalogue.clone(),
             max_log_bytes: config.max_log_bytes,
@@ -213,6 +217,9 @@ impl Processes {
         env.remove(OsStr::new(STANDSTILL_VARIABLE));
         env.extend(template.standstill_ms.map(|bound| (STANDSTILL_VARIABLE.into(), bound.to_string().into())));
         env.extend(self.worker_environment.iter().map(|(name, file)| ((*name).into(), file.into())));
+        env.remove(OsStr::new(LISTEN_VARIABLE));
+        let listen = account.is_none().then(|| self.socket_for(id, &directory)).flatten();
+        env.extend(listen.map(|socket| (LISTEN_VARIABLE.into(), socket.to_string().into())));
         env.extend(account.iter().flat_map(Account::environment));
         env.extend(template.env.iter().map(|(name, value)| (name.into(), fill(value).into())));
         if template.adopt {
@@ -295,6 +302,17 @@ impl Processes {
         }
     }
 
+    /// The socket that a worker listens on unless its template says otherwise: where both managers are reached by their sockets in the runtime
+    /// directory alone, so is it. On loopback a call costs more, and other users could make one.
+    fn socket_for(&self, id: &str, directory: &RuntimeDirectory) -> Option<Endpoint> {
+        let manager = directory.find(resource_manager::ROLE).ok()?;
+        let is_meant = self.is_local
+            && matches!(self.told.manager, ManagerLocation::File(_))
+            && directory.listen(&Endpoint::local(), resource_manager::ROLE).is_ok_and(|own| own == manager);
+        // One that is too long for a socket's path does not read.
+        is_meant.then(|| directory.socket(id).to_string().parse().ok()).flatten()
+    }
+
     /// The worker serves at this endpoint.
     pub(super) fn serves(&mut self, id: &str, endpoint: &str) {
         self.roster.serves(id, endpoint);
@@ -337,10 +355,8 @@ impl Processes {
                 attended.abort();
             }
             // A worker that was killed could not remove its files itself.
-            let left = [directory.endpoint_file(id), notify_socket(&directory, id), adopt_socket(&directory, id)];
-            for file in left {
-                let _ = std::fs::remove_file(file);
-            }
+            let _ = std::fs::remove_file(notify_socket(&directory, id));
+            predecessor::remove_files_in(&directory, id);
         }
         self.roster.gone(id);
         self.ended_logs.add(self.log_file(id));

@@ -1,10 +1,12 @@
 //! Leases that go from one node to the next without the resource manager: where a goal ends well and the next node wants exactly what
 //! it had, giving it back and asking for it again would cost two calls and come to the same.
 //!
-//! The resource manager sees one lease that lives longer, so others get their turn: nobody of this run may wait for any of it, nothing of
-//! higher priority may want it, and after [`TURN`] it goes back all the same. What depends on the state of a resource (attributes,
+//! The resource manager sees one lease that lives longer, so others get their turn: after [`TURN`] it goes back all the same. Within the run the
+//! order is the resource manager's: who comes first of those that want any of it takes it over, also one that waits there already, whose
+//! request is then withdrawn ([`super::acquiring`]); where that one wants something else, too, nothing is handed over. What depends on the state of a resource (attributes,
 //! conditions, what is there or is used up) is asked anew every time.
 
+use super::acquiring::Waiting;
 use ratn_executive::protocol::{Command, Event};
 use ratn_model::id::{InstanceId, LeaseId};
 use ratn_model::program::SUCCESS;
@@ -44,12 +46,13 @@ impl Leases {
         self.0.remove(&lease);
     }
 
-    /// Who takes over the lease that is given back for this event, if anybody does. `waiting` is what the run has asked for before.
-    pub(super) fn handover<'a>(
+    /// Who takes over the lease that is given back for this event, if anybody does: whoever comes first of those that wait already and those
+    /// that ask now.
+    pub(super) fn handover(
         &self,
         event: &Event,
         commands: &[Command],
-        mut waiting: impl Iterator<Item = &'a [Requirement]>,
+        waiting: &Waiting,
         now: Instant,
     ) -> Option<Handover> {
         let Event::Finished { instance: ended, outcome, .. } = event else { return None };
@@ -58,18 +61,23 @@ impl Leases {
             _ => None,
         });
         let held = self.0.get(&given_back?)?;
-        if outcome != SUCCESS || now.duration_since(held.granted) >= TURN || waiting.any(|asked| held.is_wanted(asked))
-        {
+        if outcome != SUCCESS || now.duration_since(held.granted) >= TURN {
             return None;
         }
+        let is_withdrawn = |instance: InstanceId| {
+            commands.iter().any(|command| matches!(command, Command::Withdraw { instance: one } if *one == instance))
+        };
+        let mut waits = waiting.in_order().map(|(id, asking)| (id, asking.requirements.as_slice(), asking.priority));
+        let waits = waits.find(|(id, requirements, _)| held.is_wanted(requirements) && !is_withdrawn(*id));
         let asks = commands.iter().rev().filter_map(|command| match command {
-            Command::Acquire { instance, requirements, priority } => Some((*instance, requirements, *priority)),
+            Command::Acquire { instance, requirements, priority } => {
+                Some((*instance, requirements.as_slice(), *priority))
+            }
             _ => None,
         });
-        // Of equals the first.
-        let next =
-            asks.filter(|(_, requirements, _)| held.is_wanted(requirements)).max_by_key(|(_, _, priority)| *priority);
-        let (to, requirements, _) = next?;
+        // Of equals the first, and who waits already is before who asks now.
+        let first = asks.filter(|(_, requirements, _)| held.is_wanted(requirements)).chain(waits);
+        let (to, requirements, _) = first.max_by_key(|(.., priority)| *priority)?;
         held.serves(requirements).then(|| Handover { to, lease: held.lease.clone() })
     }
 }
@@ -90,11 +98,11 @@ impl Held {
 
 #[cfg(test)]
 mod tests {
+    use super::super::acquiring::Asking;
     use super::*;
     use ratn_model::id::FencingToken;
     use ratn_model::resource::LeasedResource;
     use ratn_model::value::Value;
-    use std::slice::from_ref;
 
     const FIRST: InstanceId = InstanceId(1);
 
@@ -118,8 +126,23 @@ mod tests {
         Command::Acquire { instance: InstanceId(instance), requirements, priority }
     }
 
+    /// Those that wait already, with their priorities; the first has the id 11.
+    fn waiting(all: &[(Vec<Requirement>, i64)]) -> Waiting {
+        let mut waiting = Waiting::default();
+        for ((requirements, priority), number) in all.iter().zip(1..) {
+            let (asking, _) = Asking::for_tests(number, requirements.clone(), *priority);
+            waiting.insert(InstanceId(10 + number), asking);
+        }
+        waiting
+    }
+
     /// Of a planner's lease that is given back after so many milliseconds, in a step with these acquires.
-    fn handover(event: &Event, asks: &[Command], waiting: &[Vec<Requirement>], after_ms: u64) -> Option<InstanceId> {
+    fn handover(
+        event: &Event,
+        asks: &[Command],
+        waits: &[(Vec<Requirement>, i64)],
+        after_ms: u64,
+    ) -> Option<InstanceId> {
         let resource = LeasedResource {
             id: "path-planner-1".to_owned(),
             kind: "PathPlanner".to_owned(),
@@ -131,8 +154,7 @@ mod tests {
         leases.granted(&lease, planner(), now);
         let mut commands = asks.to_vec();
         commands.push(Command::Release { instance: FIRST, lease: Some(lease.id), projection: None });
-        let waiting = waiting.iter().map(Vec::as_slice);
-        let handover = leases.handover(event, &commands, waiting, now + Duration::from_millis(after_ms))?;
+        let handover = leases.handover(event, &commands, &waiting(waits), now + Duration::from_millis(after_ms))?;
         assert_eq!(handover.lease, lease);
         Some(handover.to)
     }
@@ -151,13 +173,48 @@ mod tests {
     fn who_waits_already_or_has_a_higher_priority_comes_first() {
         let arm = vec![Requirement::new(ResourceOperation::Block, "Arm")];
         let any_planner = vec![Requirement::new(ResourceOperation::Block, "Planner")];
+        let both = vec![planner().remove(0), arm[0].clone()];
         let next = asks(2, planner(), 5);
         let one = [next.clone()];
-        assert_eq!(handover(&ended(SUCCESS), &one, from_ref(&arm), 1), Some(InstanceId(2)));
-        assert_eq!(handover(&ended(SUCCESS), &one, from_ref(&any_planner), 1), None);
+        assert_eq!(handover(&ended(SUCCESS), &one, &[(arm.clone(), 9)], 1), Some(InstanceId(2)));
+        for wanted in [&any_planner, &both] {
+            assert_eq!(handover(&ended(SUCCESS), &one, &[(wanted.clone(), 4)], 1), Some(InstanceId(2)));
+            assert_eq!(
+                handover(&ended(SUCCESS), &one, &[(wanted.clone(), 5)], 1),
+                None,
+                "it comes first, and wants another thing"
+            );
+        }
         let others = [asks(3, arm, 9), next.clone(), asks(4, any_planner.clone(), 5)];
         assert_eq!(handover(&ended(SUCCESS), &others, &[], 1), Some(InstanceId(2)), "of equals the first");
         assert_eq!(handover(&ended(SUCCESS), &[next, asks(4, any_planner, 6)], &[], 1), None);
+    }
+
+    #[test]
+    fn one_that_waits_already_takes_the_lease_over() {
+        let queue = [(planner(), 3), (planner(), 7), (planner(), 7)];
+        assert_eq!(handover(&ended(SUCCESS), &[], &queue, 1), Some(InstanceId(12)), "the first of the most urgent");
+        assert_eq!(handover(&ended(SUCCESS), &[asks(2, planner(), 7)], &queue, 1), Some(InstanceId(12)));
+        assert_eq!(handover(&ended(SUCCESS), &[asks(2, planner(), 8)], &queue, 1), Some(InstanceId(2)));
+        let withdrawn = Command::Withdraw { instance: InstanceId(12) };
+        assert_eq!(handover(&ended(SUCCESS), &[withdrawn], &queue, 1), Some(InstanceId(13)));
+        assert_eq!(handover(&ended(SUCCESS), &[], &queue, 100), None, "its turn is over");
+    }
+
+    #[test]
+    fn nothing_is_handed_to_one_that_has_its_answer() {
+        let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: Vec::new() };
+        let mut waiting = Waiting::default();
+        let (asking, handed) = Asking::for_tests(1, planner(), 1);
+        waiting.insert(FIRST, asking);
+        assert_eq!(waiting.hand(InstanceId(2), &lease), None, "it does not wait");
+        drop(handed);
+        assert_eq!(waiting.hand(FIRST, &lease), Some(Err(())));
+        let (asking, mut handed) = Asking::for_tests(2, planner(), 1);
+        waiting.insert(FIRST, asking);
+        assert_eq!(waiting.hand(FIRST, &lease), Some(Ok(())));
+        assert_eq!(waiting.hand(FIRST, &lease), Some(Err(())), "it has one");
+        assert_eq!(handed.try_recv(), Ok(lease));
     }
 
     #[test]

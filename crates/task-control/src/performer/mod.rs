@@ -1,6 +1,7 @@
 //! Performs the executive's commands: asks the resource manager, gives goals to providers, hands what needs an order to
 //! [`super::record`]. Never waits: every answer comes back as an event.
 
+mod acquiring;
 mod claim;
 mod goal;
 mod handover;
@@ -18,6 +19,7 @@ use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Record, Recorded, R
 use super::shell::{Place, Urgency};
 use crate::background_runtime::BackgroundRuntime;
 use crate::messages::Messages;
+use acquiring::{Acquiring, Asking, Waiting};
 use anyhow::{Context, bail};
 pub use claim::{RUN_KIND, claim};
 use futures::FutureExt;
@@ -32,13 +34,12 @@ use ratn_model::resource::{LeasedResource, Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_proto::types::{self, ENDPOINT_ATTRIBUTE, WorldChange};
-use ratn_worker::client::{AcquireOptions, ActionClient, CallError, Channels, ResourceClient, WorldClient};
-use ratn_worker::client::{retry_unanswered, retry_until_answered};
+use ratn_worker::client::retry_unanswered;
+use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
 use ratn_worker::session::{DEFAULT_TTL, Session};
 use ratn_worker::trace::{self, TraceContext};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
@@ -145,7 +146,7 @@ pub(super) struct Performer {
     following: Option<AbortOnDropHandle<()>>,
     cancelled: Cancelled,
     recorded: Recorded,
-    asking: BTreeMap<InstanceId, Asking>,
+    asking: Waiting,
     /// Since when instances have waited that have not got what they need, however often they ask.
     waiting_since: BTreeMap<InstanceId, Instant>,
     leases: Leases,
@@ -161,14 +162,6 @@ pub(super) struct Performer {
     resumptions: u32,
     /// Of the run.
     trace: TraceContext,
-}
-
-/// An acquire under way.
-struct Asking {
-    request: String,
-    requirements: Vec<Requirement>,
-    since: Instant,
-    withdrawn: CancellationToken,
 }
 
 struct Job {
@@ -248,7 +241,7 @@ impl Performer {
             following: None,
             cancelled,
             recorded,
-            asking: BTreeMap::new(),
+            asking: Waiting::default(),
             waiting_since: BTreeMap::new(),
             leases: Leases::default(),
             paths: BTreeMap::new(),
@@ -307,8 +300,9 @@ impl Performer {
                 _ => {}
             }
         }
-        let waiting = self.asking.values().map(|asking| asking.requirements.as_slice());
-        self.handover = self.leases.handover(event, commands, waiting, Instant::now());
+        self.handover = self.leases.handover(event, commands, &self.asking, Instant::now());
+        // To one whose answer is on its way nothing is handed over: the lease goes back.
+        self.handover.take_if(|handover| self.asking.hand(handover.to, &handover.lease) == Some(Err(())));
     }
 
     /// What instances are called that were expanded before this performer was there.
@@ -332,7 +326,7 @@ impl Performer {
                 self.acquire(instance, self.acquires, requirements, priority);
             }
             Command::Withdraw { instance } => {
-                if let Some(asking) = self.asking.remove(&instance) {
+                if let Some(asking) = self.asking.remove(instance) {
                     asking.withdrawn.cancel();
                 }
             }
@@ -397,76 +391,35 @@ impl Performer {
 
     fn acquire(&mut self, instance: InstanceId, number: u64, requirements: Vec<Requirement>, priority: i64) {
         let withdrawn = CancellationToken::new();
+        let (hand, handed) = oneshot::channel();
         let request = acquire_request(&self.run, instance, number, self.resumptions);
-        let asked = Asking {
+        let since = Instant::now();
+        let waited = self.waiting_since.entry(instance).or_insert(since).elapsed();
+        let options = AcquireOptions {
             request: request.clone(),
-            requirements: requirements.clone(),
-            since: Instant::now(),
-            withdrawn: withdrawn.clone(),
-        };
-        let waited = self.waiting_since.entry(instance).or_insert(asked.since).elapsed();
-        self.asking.insert(instance, asked);
-        let handed = self.handover.as_ref().filter(|handover| handover.to == instance).map(|one| one.lease.clone());
-        let mut options = AcquireOptions {
-            request,
             priority: beside_others(priority, self.urgency),
             deadline: ACQUIRE_DEADLINE,
             holder: holder(&self.task, self.paths.get(&instance).map_or(&instance.to_string(), |path| path)),
         };
-        let requirements: Vec<Requirement> = requirements.into_iter().map(|one| self.of_performers(one)).collect();
-        let (resources, events) = (self.resources.clone(), self.events.clone());
-        let (told, run) = (self.told.clone(), self.run.clone());
-        let whom = Whom { resources: self.resources.clone(), world: self.world.clone(), told: self.told.clone() };
-        let mut asking = Box::pin(trace::within(self.trace.child(), async move {
-            let unheard = AtomicBool::new(false);
-            let answer = loop {
-                if let Some(lease) = handed {
-                    break Ok((lease, Vec::new()));
-                }
-                let ask = || async {
-                    let answer = resources.acquire_with_notes(requirements.clone(), options.clone()).await;
-                    unheard.fetch_or(answer.as_ref().is_err_and(CallError::is_crash), Ordering::Relaxed);
-                    answer
-                };
-                let may_be_late = (CERTAIN..OVERDUE).contains(&options.priority);
-                tokio::select! {
-                    // A manager that does not answer is waited for until the run gives its session up ([`Performer::lost`]).
-                    answer = retry_until_answered(ask) => break answer,
-                    () = withdrawn.cancelled() => {
-                        // The call is dropped; what was granted meanwhile goes back.
-                        let _ = retry_unanswered(|| resources.withdraw(&options.request)).await;
-                        return;
-                    }
-                    // Others are not let pass any more.
-                    () = told.others_after(LONG_BESIDE_OTHERS.saturating_sub(waited)), if may_be_late => {
-                        let _ = retry_unanswered(|| resources.withdraw(&options.request)).await;
-                        options.priority = OVERDUE;
-                    }
-                }
-            };
-            if answer.is_err() && unheard.into_inner() {
-                // An answer that was lost before the refusal may have been a grant.
-                let _ = retry_unanswered(|| resources.withdraw(&options.request)).await;
-            }
-            let event = match answer {
-                Ok((lease, notes)) => {
-                    let is_told = tokio::select! {
-                        told = told.until(&run, &notes, &whom) => told,
-                        // It goes back as it is.
-                        () = withdrawn.cancelled() => Ok(()),
-                    };
-                    match is_told {
-                        Ok(()) => Event::Granted { instance, lease },
-                        Err(reason) => {
-                            let _ = retry_unanswered(|| resources.release(lease.id)).await;
-                            Event::Refused { instance, reason }
-                        }
-                    }
-                }
-                Err(error) => Event::Refused { instance, reason: said(&error) },
-            };
-            let _ = events.send(Answer::Event { event: Box::new(event), withdrawn: Some(withdrawn) }).await;
-        }));
+        let asked = requirements.iter().map(|one| self.of_performers(one.clone())).collect();
+        let (hand, withdrawal) = (Some(hand), withdrawn.clone());
+        self.asking.insert(instance, Asking { request, number, priority, requirements, since, withdrawn, hand });
+        if let Some(handover) = self.handover.as_ref().filter(|handover| handover.to == instance) {
+            let _ = self.asking.hand(instance, &handover.lease);
+        }
+        let acquiring = Acquiring {
+            instance,
+            run: self.run.clone(),
+            requirements: asked,
+            options,
+            waited,
+            withdrawn: withdrawal,
+            handed,
+            resources: self.resources.clone(),
+            told: self.told.clone(),
+            whom: Whom { resources: self.resources.clone(), world: self.world.clone(), told: self.told.clone() },
+        };
+        let mut asking = Box::pin(trace::within(self.trace.child(), acquiring.ask(self.events.clone())));
         // The request leaves here and now: tasks would be run, and requests arrive, in any order.
         if asking.as_mut().now_or_never().is_none() {
             tokio::spawn(asking);
@@ -477,13 +430,13 @@ impl Performer {
     pub(super) fn waits(&self) -> Option<InstanceId> {
         let idle = self.jobs.values().all(|job| job.ended.is_finished());
         let bound = if idle { LONG_WHILE_IDLE } else { LONG };
-        let (instance, longest) = self.asking.iter().min_by_key(|(_, asking)| asking.since)?;
-        (longest.since.elapsed() >= bound).then_some(*instance)
+        let (instance, longest) = self.asking.longest()?;
+        (longest.since.elapsed() >= bound).then_some(instance)
     }
 
     /// Says what is in the way of an instance that waits, in the resource manager's words.
     pub(super) fn say_why(&self, at: Timestamp, instance: InstanceId, path: String) {
-        let Some(Asking { request, since, .. }) = self.asking.get(&instance) else { return };
+        let Some(Asking { request, since, .. }) = self.asking.get(instance) else { return };
         let (resources, request, waited_s) = (self.resources.clone(), request.clone(), since.elapsed().as_secs());
         let messages = self.messages.clone();
         tokio::spawn(async move {
@@ -524,7 +477,7 @@ impl Performer {
             Event::Crashed { instance, attempt, .. } if self.was_cancelled(instance, attempt) => None,
             event => {
                 if let Event::Granted { instance, .. } | Event::Refused { instance, .. } = &event {
-                    let asked = self.asking.remove(instance);
+                    let asked = self.asking.remove(*instance);
                     self.waiting_since.remove(instance);
                     if let (Event::Granted { lease, .. }, Some(asked)) = (&event, asked) {
                         self.leases.granted(lease, asked.requirements, Instant::now());

@@ -84,8 +84,8 @@ impl Bench {
         self.performer.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })
     }
 
-    /// What the executive makes of the end of `ended`: `next` wants what that had.
-    fn goes_on(&mut self, ended: InstanceId, lease: LeaseId, next: InstanceId) -> anyhow::Result<()> {
+    /// What the executive makes of the end of `ended`: `next`, if anybody, wants what that had.
+    fn goes_on(&mut self, ended: InstanceId, lease: LeaseId, next: Option<InstanceId>) -> anyhow::Result<()> {
         let event = Event::Finished {
             instance: ended,
             attempt: 1,
@@ -95,10 +95,9 @@ impl Bench {
             evidence: Vec::new(),
             reason: String::new(),
         };
-        let commands = [
-            Command::Acquire { instance: next, requirements: arm(), priority: 0 },
-            Command::Release { instance: ended, lease: Some(lease), projection: None },
-        ];
+        let asks = next.map(|instance| Command::Acquire { instance, requirements: arm(), priority: 0 });
+        let release = Command::Release { instance: ended, lease: Some(lease), projection: None };
+        let commands: Vec<Command> = asks.into_iter().chain([release]).collect();
         self.performer.prepare(&event, &commands);
         commands.into_iter().try_for_each(|command| self.performer.perform(command))
     }
@@ -164,19 +163,53 @@ async fn the_next_node_takes_a_lease_over_until_others_get_their_turn() -> anyho
     let [first, second, third, fourth] = [1, 2, 3, 4].map(InstanceId);
     bench.ask(first)?;
     let lease = bench.granted(first).await?;
-    bench.goes_on(first, lease, second)?;
+    bench.goes_on(first, lease, Some(second))?;
     assert_eq!(bench.granted(second).await?, lease);
     // Longer than a turn.
     tokio::time::sleep(Duration::from_millis(150)).await;
-    bench.goes_on(second, lease, third)?;
+    bench.goes_on(second, lease, Some(third))?;
     let other = bench.granted(third).await?;
     assert_ne!(other, lease);
 
     // One that is not wanted any more when it is taken over goes back.
-    bench.goes_on(third, other, fourth)?;
+    bench.goes_on(third, other, Some(fourth))?;
     bench.performer.perform(Command::Withdraw { instance: fourth })?;
     let handed = bench.answers.recv().await;
     assert_eq!(bench.performer.accept(handed.context("no answer")?, &World::default())?, None);
+    bench.ask(first)?;
+    bench.granted(first).await?;
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn one_that_waits_takes_the_lease_over_and_leaves_the_queue() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let [first, second, third, fourth] = [1, 2, 3, 4].map(InstanceId);
+    bench.ask(first)?;
+    let lease = bench.granted(first).await?;
+    for waits in [second, third, fourth] {
+        bench.ask(waits)?;
+    }
+    // All three wait at the manager before the lease is there again.
+    let deadline = Instant::now() + SESSION_DEADLINE;
+    let manager = bench.performer.resources.clone();
+    while manager.explain("").await?.len() < 3 && Instant::now() < deadline {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    bench.goes_on(first, lease, None)?;
+    assert_eq!(bench.granted(second).await?, lease);
+    bench.goes_on(second, lease, None)?;
+    // What was handed over and is not wanted any more goes to the next.
+    bench.performer.perform(Command::Withdraw { instance: third })?;
+    let handed = bench.answers.recv().await.context("no answer")?;
+    assert_eq!(bench.performer.accept(handed, &World::default())?, None);
+    let last = bench.granted(fourth).await?;
+    assert_ne!(last, lease);
+    while !manager.explain("").await?.is_empty() {
+        assert!(Instant::now() < deadline, "somebody has left a request behind");
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    bench.performer.perform(Command::Release { instance: fourth, lease: Some(last), projection: None })?;
     bench.ask(first)?;
     bench.granted(first).await?;
     bench.performer.close().await

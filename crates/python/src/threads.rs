@@ -1,0 +1,149 @@
+//! The threads in which goals run Python. What the interpreter keeps for a thread is made once for each of them and not for every
+//! goal, so also `threading.local` lasts from one goal to the next.
+
+use pyo3::prelude::*;
+use std::sync::mpsc::{Sender, channel};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::time::Duration;
+use tokio::sync::oneshot;
+
+type Work = Box<dyn FnOnce(Python<'_>, Finished) + Send>;
+
+/// As many threads as goals ever ran at once. Clones share them.
+#[derive(Clone, Default)]
+pub(crate) struct Threads(Arc<Shared>);
+
+#[derive(Default)]
+struct Shared {
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    /// Of those that wait for work, the last one first.
+    idle: Vec<Sender<Work>>,
+    /// How many there are.
+    alive: usize,
+    is_over: bool,
+}
+
+/// A thread whose work is done waits for more.
+struct Finished {
+    shared: Arc<Shared>,
+    thread: Sender<Work>,
+}
+
+impl Finished {
+    fn rest(self) {
+        let mut state = self.shared.state();
+        if !state.is_over {
+            state.idle.push(self.thread);
+        }
+    }
+}
+
+impl Shared {
+    fn state(&self) -> std::sync::MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Threads {
+    /// Runs it in a thread that nothing else runs in meanwhile. Nothing comes back where it panicked, and an error where there can be no
+    /// further thread.
+    pub(crate) fn run<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(Python<'_>) -> T + Send + 'static,
+    ) -> std::io::Result<oneshot::Receiver<T>> {
+        let (say, done) = oneshot::channel();
+        let work: Work = Box::new(move |py, finished| {
+            let result = work(py);
+            // Before anybody hears of it, who may have the next at once.
+            finished.rest();
+            let _ = say.send(result);
+        });
+        let idle = self.0.state().idle.pop();
+        match idle {
+            // It ends only when nothing can be sent to it any more.
+            Some(thread) => drop(thread.send(work)),
+            None => self.begin(work)?,
+        }
+        Ok(done)
+    }
+
+    fn begin(&self, first: Work) -> std::io::Result<()> {
+        let shared = Arc::clone(&self.0);
+        let alive = Alive::new(Arc::clone(&self.0));
+        std::thread::Builder::new().name("goal".to_owned()).spawn(move || {
+            let _alive = alive;
+            Python::attach(|py| {
+                let mut next = Some(first);
+                while let Some(work) = next {
+                    let (thread, more) = channel();
+                    work(py, Finished { shared: Arc::clone(&shared), thread });
+                    // It hears of the end when all that could send are gone.
+                    next = py.detach(move || more.recv().ok());
+                }
+            });
+        })?;
+        Ok(())
+    }
+
+    /// Ends all that wait for work, and waits so long for those that do not.
+    pub(crate) fn end(&self, patience: Duration) {
+        let mut state = self.0.state();
+        state.is_over = true;
+        state.idle.clear();
+        let waited = self.0.changed.wait_timeout_while(state, patience, |state| state.alive > 0);
+        drop(waited);
+    }
+}
+
+/// One of the threads that there are.
+struct Alive(Arc<Shared>);
+
+impl Alive {
+    fn new(shared: Arc<Shared>) -> Alive {
+        shared.state().alive += 1;
+        Alive(shared)
+    }
+}
+
+impl Drop for Alive {
+    fn drop(&mut self) {
+        self.0.state().alive -= 1;
+        self.0.changed.notify_all();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// In which thread it runs.
+    async fn thread(threads: &Threads) -> std::thread::ThreadId {
+        threads.run(|_| std::thread::current().id()).unwrap().await.unwrap()
+    }
+
+    #[tokio::test]
+    async fn a_thread_serves_one_after_the_other_and_another_one_beside_it() {
+        Python::initialize();
+        let threads = Threads::default();
+        let first = thread(&threads).await;
+        assert_eq!(thread(&threads).await, first);
+        let (go_on, wait) = channel::<()>();
+        let busy = threads.run(move |py| py.detach(|| wait.recv().is_ok())).unwrap();
+        assert_ne!(thread(&threads).await, first);
+        go_on.send(()).unwrap();
+        assert!(busy.await.unwrap());
+        let fallen = threads.run(|_| -> () { std::panic::resume_unwind(Box::new(())) }).unwrap();
+        assert!(fallen.await.is_err(), "who panics says nothing");
+        tokio::task::spawn_blocking(move || {
+            threads.end(Duration::from_secs(10));
+            assert_eq!(threads.0.state().alive, 0);
+        })
+        .await
+        .unwrap();
+    }
+}

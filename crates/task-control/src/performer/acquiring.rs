@@ -1,0 +1,207 @@
+//! What a run has asked for and has no answer to, and each acquire's way: from asking the resource manager to the event of its answer, or
+//! of the lease that another node of the run has handed over meanwhile.
+
+use super::{Answer, LONG_BESIDE_OTHERS, OVERDUE, Whom};
+use crate::performer::told::Told;
+use crate::record::said;
+use ratn_executive::protocol::{CERTAIN, Event};
+use ratn_model::id::InstanceId;
+use ratn_model::resource::{Lease, Requirement};
+use ratn_proto::v1::HolderNote;
+use ratn_worker::client::{AcquireOptions, CallError, ResourceClient};
+use ratn_worker::client::{retry_unanswered, retry_until_answered};
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
+
+/// An acquire under way.
+#[derive(Debug)]
+pub(super) struct Asking {
+    pub(super) request: String,
+    /// Of the run's acquires.
+    pub(super) number: u64,
+    pub(super) priority: i64,
+    pub(super) requirements: Vec<Requirement>,
+    pub(super) since: Instant,
+    pub(super) withdrawn: CancellationToken,
+    /// Takes a lease in place of the manager's answer; `None` once it has one.
+    pub(super) hand: Option<oneshot::Sender<Lease>>,
+}
+
+#[cfg(test)]
+impl Asking {
+    pub(super) fn for_tests(
+        number: u64,
+        requirements: Vec<Requirement>,
+        priority: i64,
+    ) -> (Asking, oneshot::Receiver<Lease>) {
+        let (hand, handed) = oneshot::channel();
+        let (since, withdrawn) = (Instant::now(), CancellationToken::new());
+        let request = format!("r/{number}");
+        (Asking { request, number, priority, requirements, since, withdrawn, hand: Some(hand) }, handed)
+    }
+}
+
+/// All acquires under way.
+#[derive(Debug, Default)]
+pub(super) struct Waiting {
+    asking: BTreeMap<InstanceId, Asking>,
+    /// In the order in which the resource manager serves those that want the same.
+    order: BTreeMap<(Reverse<i64>, u64), InstanceId>,
+}
+
+impl Waiting {
+    pub(super) fn insert(&mut self, instance: InstanceId, asking: Asking) {
+        self.remove(instance);
+        self.order.insert((Reverse(asking.priority), asking.number), instance);
+        self.asking.insert(instance, asking);
+    }
+
+    pub(super) fn remove(&mut self, instance: InstanceId) -> Option<Asking> {
+        let asking = self.asking.remove(&instance)?;
+        self.order.remove(&(Reverse(asking.priority), asking.number));
+        Some(asking)
+    }
+
+    pub(super) fn get(&self, instance: InstanceId) -> Option<&Asking> {
+        self.asking.get(&instance)
+    }
+
+    /// Who waits, whoever comes first before the others.
+    pub(super) fn in_order(&self) -> impl Iterator<Item = (InstanceId, &Asking)> {
+        self.order.values().filter_map(|instance| Some((*instance, self.asking.get(instance)?)))
+    }
+
+    /// Who has waited longest for an answer.
+    pub(super) fn longest(&self) -> Option<(InstanceId, &Asking)> {
+        let longest = self.asking.iter().min_by_key(|(_, asking)| asking.since)?;
+        Some((*longest.0, longest.1))
+    }
+
+    /// Hands a lease to one that waits; nothing where it does not.
+    ///
+    /// # Errors
+    /// Where it has its answer, or another lease, already.
+    pub(super) fn hand(&mut self, to: InstanceId, lease: &Lease) -> Option<Result<(), ()>> {
+        let hand = self.asking.get_mut(&to)?.hand.take();
+        Some(hand.ok_or(()).and_then(|hand| hand.send(lease.clone()).map_err(drop)))
+    }
+}
+
+/// One acquire's way.
+pub(super) struct Acquiring {
+    pub(super) instance: InstanceId,
+    pub(super) run: String,
+    pub(super) requirements: Vec<Requirement>,
+    pub(super) options: AcquireOptions,
+    /// So long its instance has waited before, with other priorities.
+    pub(super) waited: Duration,
+    pub(super) withdrawn: CancellationToken,
+    pub(super) handed: oneshot::Receiver<Lease>,
+    pub(super) resources: ResourceClient,
+    pub(super) told: Told,
+    pub(super) whom: Whom,
+}
+
+enum Got {
+    Handed(Lease),
+    Answer(Result<(Lease, Vec<HolderNote>), CallError>),
+    /// It is not wanted any more.
+    Nothing,
+}
+
+impl Acquiring {
+    /// Until its answer, which goes to the shell. The resource manager is not asked where a lease is handed over at once.
+    pub(super) async fn ask(mut self, events: mpsc::Sender<Answer>) {
+        if let Ok(lease) = self.handed.try_recv() {
+            self.tell(Event::Granted { instance: self.instance, lease }, &events).await;
+            return;
+        }
+        let unheard = AtomicBool::new(false);
+        let got = self.got(&unheard).await;
+        // Whoever hands something over from now on keeps it.
+        self.handed.close();
+        let got = match (self.handed.try_recv(), got) {
+            // What the manager granted at the same moment goes back with the withdrawal.
+            (Ok(lease), _) | (_, Got::Handed(lease)) => Got::Handed(lease),
+            (_, got) => got,
+        };
+        let event = match got {
+            Got::Nothing => {
+                self.withdraw().await;
+                return;
+            }
+            Got::Handed(lease) => {
+                self.tell(Event::Granted { instance: self.instance, lease }, &events).await;
+                self.withdraw().await;
+                return;
+            }
+            Got::Answer(answer) => {
+                if answer.is_err() && unheard.into_inner() {
+                    // An answer that was lost before the refusal may have been a grant.
+                    self.withdraw().await;
+                }
+                self.event_of(answer).await
+            }
+        };
+        self.tell(event, &events).await;
+    }
+
+    async fn tell(&self, event: Event, events: &mpsc::Sender<Answer>) {
+        let withdrawn = Some(self.withdrawn.clone());
+        let _ = events.send(Answer::Event { event: Box::new(event), withdrawn }).await;
+    }
+
+    async fn got(&mut self, unheard: &AtomicBool) -> Got {
+        loop {
+            let ask = || async {
+                let asked = self.resources.acquire_with_notes(self.requirements.clone(), self.options.clone());
+                let answer = asked.await;
+                unheard.fetch_or(answer.as_ref().is_err_and(CallError::is_crash), Ordering::Relaxed);
+                answer
+            };
+            let may_be_late = (CERTAIN..OVERDUE).contains(&self.options.priority);
+            let late = LONG_BESIDE_OTHERS.saturating_sub(self.waited);
+            tokio::select! {
+                biased;
+                Ok(lease) = &mut self.handed, if !self.handed.is_terminated() => return Got::Handed(lease),
+                () = self.withdrawn.cancelled() => return Got::Nothing,
+                // A manager that does not answer is waited for until the run gives its session up ([`super::Performer::lost`]).
+                answer = retry_until_answered(ask) => return Got::Answer(answer),
+                // Others are not let pass any more.
+                () = self.told.others_after(late), if may_be_late => {}
+            }
+            self.withdraw().await;
+            self.options.priority = OVERDUE;
+        }
+    }
+
+    /// The call is dropped; what was granted meanwhile goes back.
+    async fn withdraw(&self) {
+        let _ = retry_unanswered(|| self.resources.withdraw(&self.options.request)).await;
+    }
+
+    /// What an answer of the resource manager is to the executive, once the run has been told what whoever had the resources before left.
+    async fn event_of(&self, answer: Result<(Lease, Vec<HolderNote>), CallError>) -> Event {
+        let instance = self.instance;
+        let (lease, notes) = match answer {
+            Ok(granted) => granted,
+            Err(error) => return Event::Refused { instance, reason: said(&error) },
+        };
+        let is_told = tokio::select! {
+            told = self.told.until(&self.run, &notes, &self.whom) => told,
+            // It goes back as it is.
+            () = self.withdrawn.cancelled() => Ok(()),
+        };
+        match is_told {
+            Ok(()) => Event::Granted { instance, lease },
+            Err(reason) => {
+                let _ = retry_unanswered(|| self.resources.release(lease.id)).await;
+                Event::Refused { instance, reason }
+            }
+        }
+    }
+}
