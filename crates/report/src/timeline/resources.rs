@@ -10,7 +10,7 @@ use ratn_model::resource::{Lease, LeasedResource, Quantity, Requirement, Resourc
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Of a wait so many who held what was waited for are kept, the last ones.
+/// Of a kind so many holders are kept for those who wait, the last ones, beside those that still hold.
 const MOST_BEHIND: usize = 64;
 
 /// A resource in the hands of an instance.
@@ -50,7 +50,34 @@ pub struct Asked {
     pub priority: i64,
     /// The kinds of which it wants something for itself, room for projections left out.
     pub kinds: Vec<String>,
-    behind: Vec<Behind>,
+}
+
+/// Who has held resources of one kind, in the order of their grants.
+#[derive(Debug, Clone, Default)]
+struct History(Vec<(Holding, Released)>);
+
+type Released = bool;
+
+impl History {
+    fn takes(&mut self, holding: Holding) {
+        if self.0.len() >= MOST_BEHIND
+            && let Some(oldest) = self.0.iter().position(|(_, released)| *released)
+        {
+            self.0.remove(oldest);
+        }
+        self.0.push((holding, false));
+    }
+
+    fn releases(&mut self, over: &Holding) {
+        let is_it = |one: &Holding| one.instance == over.instance && one.resource == over.resource;
+        if let Some((one, released)) = self.0.iter_mut().rev().find(|(one, released)| !released && is_it(one)) {
+            (one.to_s, *released) = (over.to_s, true);
+        }
+    }
+
+    fn is_a(&self, kind: &str) -> bool {
+        self.0.first().is_some_and(|(one, _)| one.is_a(kind))
+    }
 }
 
 /// Holders and queues of a run.
@@ -60,6 +87,8 @@ pub struct Resources {
     /// Every resource that was held once, by id.
     seen: BTreeMap<Arc<str>, Holding>,
     held: BTreeMap<LeaseId, Vec<Holding>>,
+    /// By kind.
+    history: BTreeMap<Arc<str>, History>,
     queue: BTreeMap<InstanceId, Asked>,
 }
 
@@ -107,9 +136,7 @@ impl Resources {
             }
         }
         let kinds: Vec<String> = kinds.into_iter().collect();
-        let wanted = self.held().filter(|holding| kinds.iter().any(|kind| holding.is_a(kind)));
-        let behind = wanted.map(|holding| behind(holding, f64::INFINITY, false)).collect();
-        self.queue.insert(instance, Asked { instance, from_s: at_s, priority, kinds, behind });
+        self.queue.insert(instance, Asked { instance, from_s: at_s, priority, kinds });
     }
 
     /// Asks no more.
@@ -126,16 +153,11 @@ impl Resources {
         lease: &Lease,
     ) -> (Option<Wait>, Vec<Holding>) {
         let over = self.releases(lease.id, at_s);
-        let wait = self.queue.remove(&instance).map(|asked| wait(asked, at_s, &lease.resources));
+        let wait = self.queue.remove(&instance).map(|asked| self.wait(asked, at_s, &lease.resources));
         let holdings: Vec<Holding> =
             lease.resources.iter().map(|one| self.held_by(one, instance, holder, at_s)).collect();
         for holding in &holdings {
-            for asked in self.queue.values_mut().filter(|asked| asked.kinds.iter().any(|kind| holding.is_a(kind))) {
-                if asked.behind.len() >= MOST_BEHIND {
-                    asked.behind.remove(0);
-                }
-                asked.behind.push(behind(holding, f64::INFINITY, false));
-            }
+            self.history.entry(holding.kind.clone()).or_default().takes(holding.clone());
         }
         self.held.insert(lease.id, holdings);
         (wait, over)
@@ -151,14 +173,8 @@ impl Resources {
         let mut over = self.held.remove(&lease).unwrap_or_default();
         for holding in &mut over {
             holding.to_s = at_s;
-            for asked in self.queue.values_mut() {
-                let open = asked
-                    .behind
-                    .iter_mut()
-                    .find(|one| !one.released && one.instance == holding.instance && one.resource == holding.resource);
-                if let Some(one) = open {
-                    (one.to_s, one.released) = (at_s, true);
-                }
+            if let Some(history) = self.history.get_mut(&holding.kind) {
+                history.releases(holding);
             }
         }
         over
@@ -168,6 +184,25 @@ impl Resources {
     pub(super) fn close(&mut self, at_s: f64) -> Vec<Holding> {
         let leases: Vec<LeaseId> = self.held.keys().copied().collect();
         leases.into_iter().flat_map(|lease| self.releases(lease, at_s)).collect()
+    }
+
+    /// How an instance waited that has what it asked for, and for whom: those first who kept it waiting longest.
+    fn wait(&self, asked: Asked, at_s: f64, granted: &[LeasedResource]) -> Wait {
+        let wanted = self.history.values().filter(|history| asked.kinds.iter().any(|kind| history.is_a(kind)));
+        let behind = wanted.flat_map(|history| &history.0).map(|(one, released)| Behind {
+            instance: one.instance,
+            holder: one.holder.clone(),
+            resource: one.resource.clone(),
+            from_s: one.from_s,
+            to_s: one.to_s.min(at_s),
+            released: *released,
+        });
+        // Whoever gave it back before it was asked for, or at that moment, kept nobody waiting.
+        let mut behind: Vec<Behind> = behind.filter(|one| one.to_s > asked.from_s).collect();
+        let overlap_s = |one: &Behind| one.to_s - one.from_s.max(asked.from_s);
+        behind.sort_by(|a, b| overlap_s(b).total_cmp(&overlap_s(a)).then(a.instance.cmp(&b.instance)));
+        behind.truncate(MOST_BEHIND);
+        Wait { from_s: asked.from_s, to_s: at_s, kinds: asked.kinds, resources: named(granted.iter()), behind }
     }
 
     fn held_by(&mut self, one: &LeasedResource, instance: InstanceId, holder: &Arc<str>, at_s: f64) -> Holding {
@@ -181,29 +216,6 @@ impl Resources {
         self.seen.insert(holding.resource.clone(), holding.clone());
         holding
     }
-}
-
-fn behind(holding: &Holding, to_s: f64, released: bool) -> Behind {
-    Behind {
-        instance: holding.instance,
-        holder: holding.holder.clone(),
-        resource: holding.resource.clone(),
-        from_s: holding.from_s,
-        to_s,
-        released,
-    }
-}
-
-fn wait(asked: Asked, at_s: f64, granted: &[LeasedResource]) -> Wait {
-    let mut behind = asked.behind;
-    for one in behind.iter_mut().filter(|one| !one.released) {
-        one.to_s = at_s;
-    }
-    // Whoever gave it back at the moment in which it was asked for kept nobody waiting.
-    behind.retain(|one| one.to_s > asked.from_s);
-    let overlap_s = |one: &Behind| one.to_s - one.from_s.max(asked.from_s);
-    behind.sort_by(|a, b| overlap_s(b).total_cmp(&overlap_s(a)).then(a.instance.cmp(&b.instance)));
-    Wait { from_s: asked.from_s, to_s: at_s, kinds: asked.kinds, resources: named(granted.iter()), behind }
 }
 
 /// Ids of resources; room for projections is no place where something happens.
