@@ -186,3 +186,128 @@ impl<S: Fn(&str)> Work<S> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::{Kind, decode};
+    use std::sync::Mutex;
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::net::TcpListener;
+
+    fn span(id: u64) -> Span {
+        Span {
+            trace: 7,
+            id,
+            parent: Some(1),
+            name: "work".to_owned(),
+            kind: Kind::Server,
+            from_unix_ns: 1,
+            to_unix_ns: 2,
+            attributes: vec![("said", "yes".to_owned()), ("unsaid", String::new())],
+            links: vec![crate::Link { to: 3, waited_for: "result" }],
+            error: None,
+        }
+    }
+
+    fn to(port: u16, timeout_ms: u64) -> (Sender, Arc<Mutex<Vec<String>>>) {
+        let endpoint = Some(format!("http://127.0.0.1:{port}"));
+        let config = OtlpConfig { endpoint, timeout_ms, ..OtlpConfig::default() };
+        let heard: Arc<Mutex<Vec<String>>> = Arc::default();
+        let say = {
+            let heard = Arc::clone(&heard);
+            move |said: &str| heard.lock().unwrap().push(said.to_owned())
+        };
+        let resource = vec![("service.name", "test".to_owned())];
+        (Sender::start(config.target().unwrap().unwrap(), timeout_ms, resource, say), heard)
+    }
+
+    /// Answers one request; its head and its body.
+    async fn answer(listener: &TcpListener, status: &str) -> (String, Vec<u8>) {
+        let (mut connection, _) = listener.accept().await.unwrap();
+        let mut read = Vec::new();
+        loop {
+            let mut some = [0; 4096];
+            let count = connection.read(&mut some).await.unwrap();
+            read.extend(&some[..count]);
+            let Some(end) = read.windows(4).position(|four| four == b"\r\n\r\n") else { continue };
+            let head = String::from_utf8(read[..end].to_vec()).unwrap().to_lowercase();
+            let length = head.lines().find_map(|line| line.strip_prefix("content-length: ")).unwrap();
+            let body = read[end + 4..].to_vec();
+            if body.len() == length.parse::<usize>().unwrap() {
+                let answer = format!("HTTP/1.1 {status}\r\ncontent-length: 0\r\n\r\n");
+                connection.write_all(answer.as_bytes()).await.unwrap();
+                return (head, body);
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn a_span_arrives_as_it_was_recorded() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let (sender, heard) = to(listener.local_addr().unwrap().port(), 2_000);
+        sender.record(span(2));
+        let (answered, ()) = tokio::join!(answer(&listener, "200 OK"), sender.flush(END_OF_RUN));
+        let (head, body) = answered;
+        assert!(head.starts_with("post /v1/traces http/1.1"), "{head}");
+        assert!(head.contains("content-type: application/x-protobuf"), "{head}");
+        let [there] = &decode(&body).unwrap()[..] else { panic!("not one span") };
+        assert_eq!((there.service.as_str(), there.name.as_str()), ("test", "work"));
+        assert_eq!(there.trace, format!("{:032x}", 7));
+        assert_eq!((there.id.as_str(), there.parent.as_str()), ("0000000000000002", "0000000000000001"));
+        assert_eq!(there.attributes, [("said".to_owned(), "yes".to_owned())]);
+        assert_eq!(there.links, ["0000000000000003"]);
+        assert_eq!((sender.counts().sent(), sender.counts().dropped()), (1, 0));
+        assert!(heard.lock().unwrap().is_empty());
+    }
+
+    #[tokio::test]
+    async fn an_answer_that_is_an_error_is_said_once_and_its_spans_are_counted() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let (sender, heard) = to(listener.local_addr().unwrap().port(), 2_000);
+        for round in 1..=3 {
+            sender.record(span(round));
+            tokio::join!(answer(&listener, "503 Service Unavailable"), sender.flush(END_OF_RUN));
+            assert_eq!((sender.counts().sent(), sender.counts().dropped()), (0, round));
+        }
+        let heard = heard.lock().unwrap();
+        assert!(heard.len() == 1 && heard[0].contains("503") && heard[0].contains("/v1/traces"), "{heard:?}");
+    }
+
+    #[tokio::test]
+    async fn one_that_is_away_is_said_once() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let port = listener.local_addr().unwrap().port();
+        drop(listener);
+        let (sender, heard) = to(port, 2_000);
+        for round in 1..=3 {
+            sender.record(span(round));
+            sender.flush(END_OF_RUN).await;
+            assert_eq!(sender.counts().dropped(), round);
+        }
+        let heard = heard.lock().unwrap();
+        assert!(heard.len() == 1 && heard[0].contains("cannot connect"), "{heard:?}");
+    }
+
+    #[tokio::test]
+    async fn one_that_hangs_keeps_nobody_waiting_and_what_has_no_room_is_dropped() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let (sender, heard) = to(listener.local_addr().unwrap().port(), 60_000);
+        let began = Instant::now();
+        // What is on its way is no longer in the queue.
+        let most = (QUEUE + 2 * BATCH) as u64;
+        for id in 1..=2 * most {
+            sender.record(span(id));
+        }
+        assert!(began.elapsed() < Duration::from_secs(1), "{:?}", began.elapsed());
+        assert!(sender.counts().dropped() >= most, "{}", sender.counts().dropped());
+        let patience = Duration::from_millis(100);
+        let began = Instant::now();
+        sender.flush(patience).await;
+        assert!((patience..patience * 10).contains(&began.elapsed()), "{:?}", began.elapsed());
+        assert_eq!(sender.counts().sent(), 0);
+        // It is not yet known that the collector hangs.
+        assert!(heard.lock().unwrap().is_empty());
+    }
+}

@@ -206,7 +206,7 @@ impl Drop for Answering {
                 ("rpc.system", "grpc".to_owned()),
                 ("rpc.service", service.to_owned()),
                 ("rpc.method", method.to_owned()),
-                ("rpc.grpc.status_code", (code as i32).to_string()),
+                ("ratn.code", format!("{code:?}")),
             ],
             links: Vec::new(),
             error: (!matches!(code, Code::Ok | Code::Cancelled)).then(|| code.description().to_owned()),
