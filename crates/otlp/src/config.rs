@@ -66,7 +66,7 @@ impl OtlpConfig {
                 return Err(fault(key(), "none of those that every request has anyway: leave it out"));
             }
             let rule = "a header's value, of visible ASCII characters and spaces";
-            let mut value = HeaderValue::try_from(value).map_err(|_| fault(key(), rule))?;
+            let mut value = HeaderValue::from_str(value).map_err(|_| fault(key(), rule))?;
             value.set_sensitive(true);
             headers.push((header, value));
         }
