@@ -13,9 +13,9 @@ pub fn trace(run: &str, task: &str, seed: u64, began_unix_ms: u64) -> u128 {
     (u128::from(number_of(&named)) << 64) | u128::from(began_unix_ms)
 }
 
-/// The span of an instance of a run.
+/// The span of an instance of a run. Number 0 stands for no instance: what the run does itself is of its own span.
 pub fn instance(instance: u64) -> u64 {
-    (instance + 1).wrapping_mul(PARTS)
+    if instance == 0 { ROOT } else { (instance + 1).wrapping_mul(PARTS) }
 }
 
 /// A number that is always the same for a name (FNV-1a), never 0.
