@@ -9,6 +9,7 @@ use crate::config::{Check, ConfigError, rule};
 use crate::metrics::Metrics;
 use crate::quota::{QuotaConfig, Quotas};
 use crate::telemetry::{self, LogConfig};
+use ratn_otlp::OtlpConfig;
 use ratn_worker::connections::OutOfConnections;
 use ratn_worker::gate::{Gate, Identity};
 use ratn_worker::server::{Exposure, Serving};
@@ -46,6 +47,8 @@ pub struct ServiceConfig {
     pub access: AccessConfig,
     /// How much of it one caller may do at the same time.
     pub quotas: QuotaConfig,
+    /// Where spans go, for OpenTelemetry.
+    pub otlp: OtlpConfig,
 }
 
 impl Default for ServiceConfig {
@@ -60,6 +63,7 @@ impl Default for ServiceConfig {
             socket: SocketAccess::default(),
             access: AccessConfig::default(),
             quotas: QuotaConfig::default(),
+            otlp: OtlpConfig::default(),
         }
     }
 }
@@ -69,6 +73,7 @@ impl Check for ServiceConfig {
         rule("drain_ms", (1..=600_000).contains(&self.drain_ms), "from 1 ms to 10 minutes")?;
         rule("log.filter", telemetry::is_filter(&self.log.filter), "a filter, as `info,ratn_daemon=debug`")?;
         self.quotas.check()?;
+        self.otlp.fault().map_or(Ok(()), |fault| rule(fault.key, false, fault.rule))?;
         self.socket.fault().map_or(Ok(()), |(key, broken)| rule(key, false, broken))?;
         self.access.check()
     }

@@ -8,6 +8,7 @@
 mod csv;
 mod graph;
 mod lanes;
+pub mod live;
 mod mcap;
 mod otlp;
 mod perfetto;
@@ -98,12 +99,4 @@ pub fn export<E>(
 fn unix_ns(run: &Timeline, at_s: f64) -> u64 {
     // A moment of a run is never negative.
     run.began_unix_ms.saturating_mul(1_000_000).saturating_add((at_s.max(0.0) * 1e9).round() as u64)
-}
-
-/// A number that is always the same for a name (FNV-1a), never 0.
-fn number_of(name: &str) -> u64 {
-    let hash = name
-        .bytes()
-        .fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3));
-    hash.max(1)
 }

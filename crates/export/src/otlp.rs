@@ -1,28 +1,30 @@
 //! Spans for OpenTelemetry: one for the run, one for each instance in it, one for each attempt and each wait for resources in that.
 //!
 //! OTLP/JSON, one `ExportTraceServiceRequest` a line: the form of the collector's `otlpjsonfile` receiver, and each line can be sent to
-//! `/v1/traces` as it is. What an instance waited for is linked. Ids follow from the run, so the same log gives the same spans.
+//! `/v1/traces` as it is. What an instance waited for is linked. Ids follow from the run, so the same log gives the same spans, and those
+//! that a run sends while it goes on ([`crate::live`]) are the same ones.
 
-use super::{Writer, number_of, unix_ns};
+use super::{Writer, unix_ns};
 use ratn_executive::protocol::LogLine;
 use ratn_model::id::InstanceId;
 use ratn_model::program::SUCCESS;
+use ratn_otlp::ids::{self, PARTS, ROOT};
+use ratn_otlp::{Kind, Link, Span, json_request};
 use ratn_report::statistics::mode_name;
 use ratn_report::timeline::{Cause, Changed, Ending, Instance, Job, Timeline, Wait};
-use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::io::{self, Write};
 
 /// As many spans are one request.
 const BATCH: usize = 512;
-/// The run's own span; those of instances are behind it.
-const ROOT: u64 = 1;
-const ERROR: u32 = 2;
 
 pub(crate) struct Otlp<W> {
     out: W,
-    spans: Vec<Value>,
+    spans: Vec<Span>,
 }
+
+/// When a moment of a run was, in nanoseconds since 1970.
+pub(crate) type Laid<'a> = &'a dyn Fn(f64) -> u64;
 
 impl<W: Write> Otlp<W> {
     pub(crate) fn new(out: W) -> Otlp<W> {
@@ -31,7 +33,7 @@ impl<W: Write> Otlp<W> {
 
     fn add(&mut self, run: &Timeline, left: &[Instance]) -> io::Result<()> {
         for instance in left {
-            spans_of(run, instance, &mut self.spans);
+            spans_of(run, &|at_s| unix_ns(run, at_s), instance, &mut self.spans);
             if self.spans.len() >= BATCH {
                 self.send(run)?;
             }
@@ -41,17 +43,9 @@ impl<W: Write> Otlp<W> {
 
     fn send(&mut self, run: &Timeline) -> io::Result<()> {
         let spans = std::mem::take(&mut self.spans);
-        let resource = attributes([
-            ("service.name", "ratn".to_owned()),
-            ("ratn.task", run.task.clone()),
-            ("ratn.mode", mode_name(run.mode).to_owned()),
-            ("ratn.run", run.run.clone()),
-        ]);
-        let request = json!({"resourceSpans": [{
-            "resource": {"attributes": resource},
-            "scopeSpans": [{"scope": {"name": "ratn.event-log"}, "spans": spans}],
-        }]});
-        serde_json::to_writer(&mut self.out, &request)?;
+        let mut resource = vec![("service.name", "ratn".to_owned())];
+        resource.extend(about(run));
+        serde_json::to_writer(&mut self.out, &json_request(&resource, "ratn.event-log", &spans))?;
         self.out.write_all(b"\n")
     }
 }
@@ -63,28 +57,31 @@ impl<W: Write> Writer for Otlp<W> {
 
     fn end(&mut self, run: &Timeline, changed: &Changed) -> io::Result<()> {
         self.add(run, &changed.left)?;
-        let outcome = run.outcome.clone().unwrap_or_else(|| "unfinished".to_owned());
-        let mut root = span(run, ROOT, None, &run.task, (0.0, run.end_s), [("ratn.outcome", outcome.clone())]);
-        if outcome != SUCCESS {
-            root["status"] = json!({"code": ERROR, "message": run.reason});
-        }
-        self.spans.push(root);
+        self.spans.push(root(run, &|at_s| unix_ns(run, at_s)));
         self.send(run)
     }
 }
 
-/// Jobs and waits have ids of their own: of one instance there are at most so many.
-const PARTS: u64 = 1 << 16;
-
-fn id_of(instance: InstanceId) -> u64 {
-    (instance.0 + 1) * PARTS
+/// What is said of a run.
+pub(crate) fn about(run: &Timeline) -> [(&'static str, String); 3] {
+    [("ratn.task", run.task.clone()), ("ratn.mode", mode_name(run.mode).to_owned()), ("ratn.run", run.run.clone())]
 }
 
-fn spans_of(run: &Timeline, one: &Instance, spans: &mut Vec<Value>) {
-    let id = id_of(one.id);
+/// The run's own span.
+pub(crate) fn root(run: &Timeline, laid: Laid<'_>) -> Span {
+    let outcome = run.outcome.clone().unwrap_or_else(|| "unfinished".to_owned());
+    let error = (outcome != SUCCESS).then(|| run.reason.clone());
+    let root = span(run, laid, ROOT, None, &run.task, (0.0, run.end_s), [("ratn.outcome", outcome)]);
+    Span { error, ..root }
+}
+
+/// The spans of an instance.
+pub(crate) fn spans_of(run: &Timeline, laid: Laid<'_>, one: &Instance, spans: &mut Vec<Span>) {
+    let id = ids::instance(one.id.0);
     let to_s = if one.has_left() { one.since_s } else { run.end_s };
-    let mut whole = span(
+    let whole = span(
         run,
+        laid,
         id,
         Some(ROOT),
         &one.path,
@@ -96,21 +93,16 @@ fn spans_of(run: &Timeline, one: &Instance, spans: &mut Vec<Value>) {
             ("ratn.invalidated", one.invalidations.join("; ")),
         ],
     );
-    whole["links"] = links(run, one);
-    if one.outcome.as_deref().is_some_and(|outcome| *outcome != *SUCCESS) {
-        whole["status"] = json!({"code": ERROR, "message": one.outcome.as_deref()});
-    }
-    spans.push(whole);
-    let jobs = one.jobs.iter().map(|job| job_span(run, id, job));
-    let waits = one.waits.iter().map(|wait| wait_span(run, wait));
-    for (part, mut part_span) in jobs.chain(waits).take(PARTS as usize - 1).enumerate() {
-        part_span["spanId"] = hex(id + 1 + part as u64).into();
-        part_span["parentSpanId"] = hex(id).into();
-        spans.push(part_span);
+    let error = one.outcome.as_deref().filter(|outcome| **outcome != *SUCCESS).map(str::to_owned);
+    spans.push(Span { links: links(one), error, ..whole });
+    let jobs = one.jobs.iter().map(|job| job_span(run, laid, id, job));
+    let waits = one.waits.iter().map(|wait| wait_span(run, laid, id, wait));
+    for (part, part_span) in jobs.chain(waits).take(PARTS as usize - 1).enumerate() {
+        spans.push(Span { id: id + 1 + part as u64, ..part_span });
     }
 }
 
-fn job_span(run: &Timeline, parent: u64, job: &Job) -> Value {
+fn job_span(run: &Timeline, laid: Laid<'_>, of: u64, job: &Job) -> Span {
     let name = format!("{}/{}", job.provider, job.action);
     let (ending, error) = match &job.ending {
         Ending::Outcome(outcome, reason) => (outcome.clone(), (outcome != SUCCESS).then(|| reason.clone())),
@@ -118,10 +110,11 @@ fn job_span(run: &Timeline, parent: u64, job: &Job) -> Value {
         Ending::Cancelled => ("cancelled".to_owned(), None),
         Ending::Open => ("open".to_owned(), None),
     };
-    let mut span = span(
+    let span = span(
         run,
-        parent,
-        Some(parent),
+        laid,
+        of,
+        Some(of),
         &name,
         (job.from_s, job.to_s),
         [
@@ -131,25 +124,21 @@ fn job_span(run: &Timeline, parent: u64, job: &Job) -> Value {
             ("ratn.ahead_of_time", job.ahead_of_time.to_string()),
         ],
     );
-    if let Some(message) = error {
-        span["status"] = json!({"code": ERROR, "message": message});
-    }
-    span
+    Span { error, ..span }
 }
 
-fn wait_span(run: &Timeline, wait: &Wait) -> Value {
+fn wait_span(run: &Timeline, laid: Laid<'_>, of: u64, wait: &Wait) -> Span {
     let behind: Vec<String> = wait.behind.iter().map(|one| format!("{} of {}", one.resource, one.holder)).collect();
     let kinds = wait.kinds.join(", ");
     let name = format!("waits for {}", if kinds.is_empty() { "nothing of its own" } else { &kinds });
-    let mut span = span(run, ROOT, Some(ROOT), &name, (wait.from_s, wait.to_s), [("ratn.behind", behind.join(", "))]);
-    let linked: Vec<Value> = wait.behind.iter().map(|one| link(run, one.instance, "resource")).collect();
-    span["links"] = linked.into();
-    span
+    let span = span(run, laid, of, Some(of), &name, (wait.from_s, wait.to_s), [("ratn.behind", behind.join(", "))]);
+    let links = wait.behind.iter().map(|one| link(one.instance, "resource")).collect();
+    Span { links, ..span }
 }
 
 /// What it waited for: results of others, and what its projection shows of them.
-fn links(run: &Timeline, one: &Instance) -> Value {
-    let mut by_id: BTreeMap<InstanceId, &str> = BTreeMap::new();
+fn links(one: &Instance) -> Vec<Link> {
+    let mut by_id: BTreeMap<InstanceId, &'static str> = BTreeMap::new();
     for phase in one.awaited() {
         if let Cause::Result(id, _) = &phase.ended_by
             && *id != one.id
@@ -157,45 +146,32 @@ fn links(run: &Timeline, one: &Instance) -> Value {
             by_id.insert(*id, "result");
         }
     }
-    by_id.into_iter().map(|(id, why)| link(run, id, why)).collect()
+    by_id.into_iter().map(|(id, why)| link(id, why)).collect()
 }
 
-fn link(run: &Timeline, to: InstanceId, why: &str) -> Value {
-    json!({"traceId": trace(run), "spanId": hex(id_of(to)), "attributes": attributes([("ratn.waited_for", why.to_owned())])})
+fn link(to: InstanceId, waited_for: &'static str) -> Link {
+    Link { to: ids::instance(to.0), waited_for }
 }
 
 fn span<const N: usize>(
     run: &Timeline,
+    laid: Laid<'_>,
     id: u64,
     parent: Option<u64>,
     name: &str,
     (from_s, to_s): (f64, f64),
-    said: [(&str, String); N],
-) -> Value {
-    // Numbers of 64 bits are strings in OTLP/JSON.
-    json!({
-        "traceId": trace(run),
-        "spanId": hex(id),
-        "parentSpanId": parent.map(hex).unwrap_or_default(),
-        "name": name,
-        "kind": 1,
-        "startTimeUnixNano": unix_ns(run, from_s).to_string(),
-        "endTimeUnixNano": unix_ns(run, to_s.max(from_s)).to_string(),
-        "attributes": attributes(said),
-    })
-}
-
-/// Those that say something.
-fn attributes<const N: usize>(said: [(&str, String); N]) -> Value {
-    let said = said.into_iter().filter(|(_, value)| !value.is_empty());
-    said.map(|(key, value)| json!({"key": key, "value": {"stringValue": value}})).collect()
-}
-
-fn trace(run: &Timeline) -> String {
-    let named = format!("{} {} {}", run.run, run.task, run.seed);
-    format!("{:016x}{:016x}", number_of(&named), run.began_unix_ms)
-}
-
-fn hex(id: u64) -> String {
-    format!("{id:016x}")
+    said: [(&'static str, String); N],
+) -> Span {
+    Span {
+        trace: ids::trace(&run.run, &run.task, run.seed, run.began_unix_ms),
+        id,
+        parent,
+        name: name.to_owned(),
+        kind: Kind::Internal,
+        from_unix_ns: laid(from_s),
+        to_unix_ns: laid(to_s.max(from_s)),
+        attributes: said.into(),
+        links: Vec::new(),
+        error: None,
+    }
 }

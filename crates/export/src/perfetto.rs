@@ -7,10 +7,11 @@
 use super::lanes::Lanes;
 use super::wire::perfetto::track_event::Type;
 use super::wire::perfetto::{DebugAnnotation, ProcessDescriptor, Trace, TracePacket, TrackDescriptor, TrackEvent};
-use super::{Writer, number_of, unix_ns};
+use super::{Writer, unix_ns};
 use prost::Message;
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_model::id::InstanceId;
+use ratn_otlp::ids::number_of;
 use ratn_report::statistics::mode_name;
 use ratn_report::timeline::{Cause, Changed, Ending, Holding, Stage, Timeline};
 use std::collections::BTreeMap;

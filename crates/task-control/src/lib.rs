@@ -24,6 +24,7 @@ pub mod progress;
 mod record;
 mod replay;
 pub mod shell;
+mod spans;
 #[cfg(test)]
 mod task_for_tests;
 

@@ -8,10 +8,12 @@ use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
 use ratn_model::measurement::Evidence;
 use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
+use ratn_otlp::ids;
 use ratn_proto::types::Resource;
 use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{CallError, Commit, Projection, ResourceClient, WorldClient};
 use ratn_worker::session::Trust;
+use ratn_worker::trace::{self, TraceContext};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -91,6 +93,8 @@ pub(super) struct Recorder {
     pub(super) events: mpsc::Sender<Answer>,
     /// The run's session: what it no longer holds others may have changed since.
     pub(super) trust: Trust,
+    /// The run's place in its trace.
+    pub(super) trace: TraceContext,
     /// The pool's root as far as it is known: what the run's own revisions come to there, and what it was told of others'.
     pub(super) root: Revision,
 }
@@ -107,14 +111,20 @@ impl Recorder {
                     // What the run knows is real there by now, whatever number it has.
                     let base = base.max(self.root);
                     let wanted = Projection { request, base, changes, writers, reads, lease };
-                    self.project(instance, attempt, wanted).await
+                    trace::within(self.of(instance), self.project(instance, attempt, wanted)).await
                 }
-                Record::Commit(decided) => self.commit(decided.instance, decided.commit(&self.run)).await,
+                Record::Commit(decided) => {
+                    let (instance, own) = (decided.instance, self.of(decided.instance));
+                    let commit = decided.commit(&self.run);
+                    trace::within(own, self.commit(instance, commit)).await
+                }
                 Record::Known(revision) => {
                     self.root = self.root.max(revision);
                     None
                 }
-                Record::Operate { instance, number, operations } => self.operate(instance, number, operations).await,
+                Record::Operate { instance, number, operations } => {
+                    trace::within(self.of(instance), self.operate(instance, number, operations)).await
+                }
                 Record::Flush(done) => {
                     let _ = done.send(recorded.clone());
                     None
@@ -133,6 +143,11 @@ impl Recorder {
                 return;
             }
         }
+    }
+
+    /// The place of an instance in the trace.
+    fn of(&self, instance: InstanceId) -> TraceContext {
+        self.trace.at(ids::instance(instance.0))
     }
 
     fn confirm(&self, confirmed: Confirmed) {

@@ -16,6 +16,7 @@ use super::messages::Messages;
 use super::performer::{self, Performer};
 use super::progress::Progress;
 use super::replay::{self, VERSION};
+use super::spans::{Spans, trace_of};
 use crate::interrupt::Interrupt;
 use anyhow::{Context, bail};
 use ratn_event_log::{LogWriter, without_visits};
@@ -130,7 +131,10 @@ pub struct Ended {
 pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
     let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
     let id = fresh_id("run");
-    let performer = Performer::connect(place, &id, &run.program.name, events).await.context("cannot begin the run")?;
+    let began_unix_ms = unix_ms();
+    let trace = trace_of(&id, &run.program.name, run.seed, began_unix_ms);
+    let performer = Performer::connect(place, &id, &run.program.name, trace, events).await;
+    let performer = performer.context("cannot begin the run")?;
     // A run that is refused leaves no log.
     let log = LogWriter::create(&run.log)?;
     let checkpointer = Checkpointer::start(&log, &run.program.digest, run.checkpoint_every, Ledger::default(), 0);
@@ -153,11 +157,12 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
         confirm: Vec::new(),
         performer,
         answers,
+        spans: None,
     };
-    let began_unix_ms = unix_ms();
     let begin = async |shell: &mut Shell| {
         let (revision, world) = shell.performer.root().await.context("cannot read the root world")?;
         shell.clock = RobotClock::start(place.speed);
+        shell.spans = Spans::of_a_run_that_begins(place.speed);
         let begun = Event::Started {
             task: run.program.name.clone(),
             digest: run.program.digest.clone(),
@@ -235,6 +240,8 @@ struct Shell {
     confirm: Vec<(oneshot::Sender<Result<String, String>>, String)>,
     performer: Performer,
     answers: mpsc::Receiver<performer::Answer>,
+    /// Where the process sends its spans.
+    spans: Option<Spans>,
 }
 
 impl Shell {
@@ -245,7 +252,9 @@ impl Shell {
         interrupt: &Interrupt,
     ) -> anyhow::Result<Ended> {
         let ended = self.until_ended(begin, interrupt).await;
+        let spans = self.spans.take();
         let closed = self.performer.close().await;
+        Spans::end(spans).await;
         match (ended, closed) {
             // A success of which not everything is known afterwards is none.
             (Ok(ended), Err(error)) if ended.outcome == SUCCESS => Err(error),
@@ -297,6 +306,9 @@ impl Shell {
         }
         if let Some(checkpointer) = &mut self.checkpointer {
             checkpointer.follow(now, event, &commands);
+        }
+        if let Some(spans) = &mut self.spans {
+            spans.follow(now, event, &commands);
         }
         for line in self.progress.follow(now, event, &commands) {
             self.messages.say(line);

@@ -169,6 +169,9 @@ impl Calls {
     }
 }
 
+/// Streams that carry calls, each of which has a span of its own.
+const CARRIERS: [&str; 2] = ["/ratn.v1.ResourceService/Session", "/ratn.v1.ActionService/Perform"];
+
 /// Whether a call is one of the daemon's own services.
 fn is_counted(path: &str) -> bool {
     !path.starts_with("/grpc.")
@@ -220,7 +223,11 @@ where
                 return Box::pin(std::future::ready(Ok(status.into_http())));
             }
         };
-        let context = TraceContext::from_headers(request.headers());
+        let caller = TraceContext::from_headers(request.headers());
+        let own = caller.map(TraceContext::child);
+        let traced = caller.zip(own).filter(|_| !CARRIERS.contains(&path.path()));
+        let mut span = traced.and_then(|(caller, own)| trace::answering(path.path(), caller, own));
+        let mut ended_with = move |code| span.take().into_iter().for_each(|mut span| span.ended(code));
         request.extensions_mut().insert(Draining(calls.draining));
         let answer = self.inner.call(request);
         let answered = async move {
@@ -228,20 +235,19 @@ where
                 Ok(answer) => answer,
                 Err(ended) => {
                     gate.answered(path.path(), ended.code(), began.elapsed());
+                    ended_with(ended.code());
                     return Ok(ended.into_http());
                 }
             };
             if let Ok(answer) = &answer {
                 gate.answered(path.path(), code_of(answer), began.elapsed());
+                ended_with(code_of(answer));
             }
             answer.map(|answer| answer.map(|body| Body::new(Answer { body, held: Some(held) })))
         };
-        match context {
+        match own {
             None => Box::pin(answered),
-            Some(context) => {
-                let own = context.child();
-                Box::pin(trace::within(own, answered).instrument(own.entered()))
-            }
+            Some(own) => Box::pin(trace::within(own, answered).instrument(own.entered())),
         }
     }
 }

@@ -45,6 +45,7 @@ pub mod gate;
 mod leader;
 pub mod lease_watch;
 pub mod multiplex;
+mod otlp;
 pub mod panic;
 pub mod pooled;
 pub mod prelude;

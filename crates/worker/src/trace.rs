@@ -3,21 +3,27 @@
 //! ```text
 //!   traceparent: 00-<trace id, 32 hex digits>-<span id of the caller, 16>-<flags, 2>
 //! ```
-//! A task's context ([`within`]) goes into every call that it makes over [`crate::client::Channels`]. Nothing is exported: the ids
-//! are in the logs, for whoever puts them together.
+//! A task's context ([`within`]) goes into every call that it makes over [`crate::client::Channels`]; the span of the answering side is a
+//! child of it. The ids are in the logs, and where the process sends its spans ([`ratn_otlp::sender`]), each answer is one ([`answering`]).
 
 use crate::protocol;
 use rand::RngExt;
+use ratn_otlp::{Kind, Sender, Span};
 use std::fmt;
 use std::future::Future;
 use std::str::FromStr;
 use std::task::{Context, Poll};
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use tonic::Code;
 use tonic::body::Body;
 use tonic::codegen::{Service, http};
 use tonic::transport::Channel;
 
 /// The header and metadata key.
 pub const HEADER: &str = "traceparent";
+
+/// Whoever began the trace wants its spans to be kept.
+const SAMPLED: u8 = 1;
 
 /// A place in a trace.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,7 +46,18 @@ impl TraceContext {
     /// A new trace.
     pub fn fresh() -> TraceContext {
         let mut random = rand::rng();
-        TraceContext { trace: random.random::<u128>().max(1), span: random.random::<u64>().max(1), flags: 1 }
+        TraceContext { trace: random.random::<u128>().max(1), span: random.random::<u64>().max(1), flags: SAMPLED }
+    }
+
+    /// A place in a trace whose ids are known; neither is 0.
+    pub fn of(trace: u128, span: u64) -> TraceContext {
+        TraceContext { trace: trace.max(1), span: span.max(1), flags: SAMPLED }
+    }
+
+    /// A span of the same trace whose id is known.
+    #[must_use]
+    pub fn at(self, span: u64) -> TraceContext {
+        TraceContext { span: span.max(1), ..self }
     }
 
     /// Another span of the same trace.
@@ -107,7 +124,7 @@ impl fmt::Display for Hex {
     }
 }
 
-/// A channel whose calls carry the context of the task that makes them, each as a span of its own, and the protocol of this program.
+/// A channel whose calls carry the context of the task that makes them, and the protocol of this program.
 #[derive(Debug, Clone)]
 pub struct Traced(Channel);
 
@@ -133,12 +150,71 @@ impl Service<http::Request<Body>> for Traced {
     }
 
     fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
-        let header = current().map(|context| http::HeaderValue::try_from(context.child().to_string()));
+        let header = current().map(|context| http::HeaderValue::try_from(context.to_string()));
         if let Some(Ok(header)) = header {
             request.headers_mut().insert(HEADER, header);
         }
         protocol::say(request.headers_mut());
         self.0.call(request)
+    }
+}
+
+/// The answer to a call, a span once it is dropped.
+#[derive(Debug)]
+pub struct Answering {
+    sender: &'static Sender,
+    path: String,
+    caller: TraceContext,
+    own: TraceContext,
+    began: (SystemTime, Instant),
+    code: Option<Code>,
+}
+
+/// An answer begins to a call of this path, `own` being its place in the trace and `caller` that of the call. `None` where nobody wants
+/// its span.
+#[allow(
+    clippy::disallowed_methods,
+    reason = "a span is at a moment of the wall clock; how long it took is measured by Instant"
+)]
+pub fn answering(path: &str, caller: TraceContext, own: TraceContext) -> Option<Answering> {
+    let sender = ratn_otlp::sender().filter(|_| caller.flags & SAMPLED != 0)?;
+    let (path, began) = (path.trim_start_matches('/').to_owned(), (SystemTime::now(), Instant::now()));
+    Some(Answering { sender, path, caller, own, began, code: None })
+}
+
+impl Answering {
+    /// How it ended.
+    pub fn ended(&mut self, code: Code) {
+        self.code = Some(code);
+    }
+}
+
+impl Drop for Answering {
+    fn drop(&mut self) {
+        let (since, began) = self.began;
+        let since_1970 = since.duration_since(UNIX_EPOCH).unwrap_or_default();
+        let from_unix_ns = u64::try_from(since_1970.as_nanos()).unwrap_or(u64::MAX);
+        let took_ns = u64::try_from(began.elapsed().as_nanos()).unwrap_or(u64::MAX);
+        // Nobody waited for the end of one that is dropped before.
+        let code = self.code.unwrap_or(Code::Cancelled);
+        let (service, method) = self.path.rsplit_once('/').unwrap_or(("", &self.path));
+        self.sender.record(Span {
+            trace: self.own.trace,
+            id: self.own.span,
+            parent: Some(self.caller.span),
+            name: self.path.clone(),
+            kind: Kind::Server,
+            from_unix_ns,
+            to_unix_ns: from_unix_ns.saturating_add(took_ns),
+            attributes: vec![
+                ("rpc.system", "grpc".to_owned()),
+                ("rpc.service", service.to_owned()),
+                ("rpc.method", method.to_owned()),
+                ("ratn.code", format!("{code:?}")),
+            ],
+            links: Vec::new(),
+            error: (!matches!(code, Code::Ok | Code::Cancelled)).then(|| code.description().to_owned()),
+        });
     }
 }
 

@@ -347,6 +347,7 @@ impl Worker {
             Some(file) => LiveAccess::of_file(file)?,
             None => LiveAccess::from_environment()?,
         };
+        crate::otlp::start(options.access.as_deref(), &options.id);
         let vitals = Vitals::default();
         let _hearing = confirms.then(|| serve_once_heard(&leases, &vitals));
         let serving = Serving { gate: Arc::new(RoleGate::new(access)), vitals, ..Serving::default() };
@@ -394,6 +395,9 @@ impl Worker {
         // What the goals move stays this worker's until nothing moves any more.
         let (served, stopped) =
             tokio::join!(serving, tokio::time::timeout(crate::server::DRAIN_DEADLINE, server.shut_down()));
+        if let Some(sender) = ratn_otlp::sender() {
+            sender.flush(ratn_otlp::END_OF_SERVER).await;
+        }
         drop(watching);
         if let Some(Offered { session, provider, watching }) = offered {
             drop((provider, watching));

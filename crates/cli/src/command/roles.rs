@@ -245,7 +245,11 @@ fn daemon_on(
         }
         let directory = RuntimeDirectory::create(&directory)
             .with_context(|| format!("cannot make the runtime directory {}", directory.display()))?;
-        let metrics = Arc::new(Metrics::new(role));
+        let resource = vec![("service.name", format!("ratn-{role}"))];
+        let spans = ratn_otlp::start(&service.otlp, resource, |said| tracing::warn!("{said}"));
+        // The config was checked.
+        let spans = spans.ok().flatten();
+        let metrics = Arc::new(Metrics::new(role).with_spans());
         if let Some(address) = arguments.metrics.or_else(|| service.metrics.get(role).copied()) {
             let listening = metrics::listen(metrics.clone(), address, service.insecure).await;
             let address = listening.map_err(|error| refused(error.into()))?;
@@ -276,6 +280,9 @@ fn daemon_on(
             ended = exit_on_panic(role, run(system, host)) => ended,
             failure = overdue => core_ended(&failure),
         };
+        if let Some(spans) = spans {
+            spans.flush(ratn_otlp::END_OF_SERVER).await;
+        }
         // Also where it ended so during the drain.
         let failure = vitals.condition().borrow().failure.clone();
         if let Some(failure) = failure {

@@ -147,8 +147,13 @@ impl System {
         }))
     }
 
-    /// Where a run finds what it needs of it.
+    /// Where a run finds what it needs of it. From here on the run sends its spans where the daemons send theirs.
     pub(crate) fn place(&self) -> Place {
+        let resource = vec![("service.name", "ratn".to_owned())];
+        // The config was checked.
+        let _ = ratn_otlp::start(&self.config.service.otlp, resource, |said| {
+            output::progress(format_args!("warning: {said}"));
+        });
         Place {
             endpoints: self.endpoints.clone(),
             tls: self.tls.clone(),

@@ -6,15 +6,17 @@ mod listener;
 
 pub use listener::{ListenError, listen};
 
-use prometheus_client::encoding::EncodeLabelSet;
+use prometheus_client::collector::Collector;
 use prometheus_client::encoding::text::encode;
-use prometheus_client::metrics::counter::Counter;
+use prometheus_client::encoding::{DescriptorEncoder, EncodeLabelSet, EncodeMetric};
+use prometheus_client::metrics::counter::{ConstCounter, Counter};
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 use ratn_proto::access::method_of;
+use std::fmt;
 use std::time::Duration;
 use tonic::Code;
 
@@ -72,6 +74,24 @@ struct Refusal {
     reason: String,
 }
 
+/// What became of the spans of this process.
+#[derive(Debug)]
+struct Spans(ratn_otlp::Counts);
+
+impl Collector for Spans {
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
+        let Spans(counts) = self;
+        for (name, help, count) in [
+            ("otlp_spans_sent", "Spans that the OTLP collector has taken", counts.sent()),
+            ("otlp_spans_dropped", "Spans that no OTLP collector has taken", counts.dropped()),
+        ] {
+            let counter = ConstCounter::new(count);
+            counter.encode(encoder.encode_descriptor(name, help, None, counter.metric_type())?)?;
+        }
+        Ok(())
+    }
+}
+
 impl JournalMetrics {
     fn register(&self, registry: &mut Registry) {
         let JournalMetrics { entries, bytes, commits, failed } = self;
@@ -101,6 +121,15 @@ impl Metrics {
             journal: JournalMetrics::default(),
         };
         metrics.registered(role)
+    }
+
+    /// With what became of the spans of this process, where it sends any.
+    #[must_use]
+    pub fn with_spans(mut self) -> Metrics {
+        if let Some(sender) = ratn_otlp::sender() {
+            self.registry.register_collector(Box::new(Spans(sender.counts().clone())));
+        }
+        self
     }
 
     fn registered(mut self, role: &str) -> Metrics {

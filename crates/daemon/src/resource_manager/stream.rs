@@ -14,8 +14,8 @@ use ratn_proto::v1;
 use ratn_proto::v1::resource_service_server::ResourceService;
 use ratn_proto::v1::session_request::Kind as Asked;
 use ratn_proto::v1::session_response::Kind;
-use ratn_worker::multiplex::SessionCalls;
 use ratn_worker::multiplex::server::{CallAnswers, Serve};
+use ratn_worker::multiplex::{Protocol, SessionCalls};
 use ratn_worker::trace::{self, TraceContext};
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -131,13 +131,7 @@ async fn measured(
     call: Option<Asked>,
 ) -> Result<Kind, Status> {
     let began = Instant::now();
-    let path = match &call {
-        Some(Asked::Block(_)) => "/ratn.v1.ResourceService/Block",
-        Some(Asked::Acquire(_)) => "/ratn.v1.ResourceService/Acquire",
-        Some(Asked::Withdraw(_)) => WITHDRAW,
-        Some(Asked::Release(_)) => "/ratn.v1.ResourceService/Release",
-        Some(Asked::KeepAlive(_)) | None => "/ratn.v1.ResourceService/KeepAlive",
-    };
+    let path = call.as_ref().map_or("/ratn.v1.ResourceService/KeepAlive", SessionCalls::path);
     caller.admit(path)?;
     let _permit = quotas.map(|quotas| quotas.admit(&caller, path, began)).transpose()?;
     let metrics = service.metrics().clone();

@@ -33,6 +33,7 @@ use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::resource::{LeasedResource, Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
+use ratn_otlp::ids;
 use ratn_proto::types::{self, ENDPOINT_ATTRIBUTE, WorldChange};
 use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
@@ -174,11 +175,12 @@ struct Job {
 
 impl Performer {
     /// Opens the run's session and begins to listen to commands. The session has the run's id, so that whoever resumes the run
-    /// goes on with it.
+    /// goes on with it. `trace` is the place of the run in its trace.
     pub(super) async fn connect(
         place: &Place,
         run: &str,
         task: &str,
+        trace: TraceContext,
         events: mpsc::Sender<Answer>,
     ) -> anyhow::Result<Performer> {
         let channels = Channels::new(&place.tls);
@@ -215,11 +217,11 @@ impl Performer {
             done: recorded.clone(),
             events: events.clone(),
             trust: session.trust(),
+            trace,
             root: Revision::default(),
         };
-        let trace = TraceContext::fresh();
         tracing::debug!(run, trace = %trace.trace_id(), "calls of this run are of one trace");
-        tokio::spawn(trace::within(trace.child(), recorder.work(work)));
+        tokio::spawn(trace::within(trace, recorder.work(work)));
         Ok(Performer {
             run,
             task: task.to_owned(),
@@ -419,7 +421,7 @@ impl Performer {
             told: self.told.clone(),
             whom: Whom { resources: self.resources.clone(), world: self.world.clone(), told: self.told.clone() },
         };
-        let mut asking = Box::pin(trace::within(self.trace.child(), acquiring.ask(self.events.clone())));
+        let mut asking = Box::pin(trace::within(self.of(instance), acquiring.ask(self.events.clone())));
         // The request leaves here and now: tasks would be run, and requests arrive, in any order.
         if asking.as_mut().now_or_never().is_none() {
             tokio::spawn(asking);
@@ -488,6 +490,11 @@ impl Performer {
         })
     }
 
+    /// The place of an instance in the trace of the run.
+    fn of(&self, instance: InstanceId) -> TraceContext {
+        self.trace.at(ids::instance(instance.0))
+    }
+
     fn was_cancelled(&self, instance: InstanceId, attempt: u32) -> bool {
         self.cancelled.lock().unwrap_or_else(PoisonError::into_inner).remove(&(instance, attempt))
     }
@@ -529,7 +536,7 @@ impl Performer {
                 grace_ms: goal::GRACE_MS,
             },
         };
-        let ended = tokio::spawn(trace::within(self.trace.child(), performing.perform(given)));
+        let ended = tokio::spawn(trace::within(self.of(instance), performing.perform(given)));
         self.jobs.insert(instance, Job { attempt, lease, stop, ended });
     }
 
@@ -575,7 +582,7 @@ impl Performer {
         }
         let (resources, world) = (self.resources.clone(), self.world.clone());
         let note = self.told.left(&self.run, self.decided).to_string();
-        self.giving_back.spawn(async move {
+        let returning = async move {
             // Whoever gets the resources next finds them idle.
             for job in jobs {
                 let _ = job.ended.await;
@@ -590,6 +597,7 @@ impl Performer {
             {
                 tracing::warn!(%instance, "a lease was not given back: {}", said(&error));
             }
-        });
+        };
+        self.giving_back.spawn(trace::within(self.of(instance), returning));
     }
 }

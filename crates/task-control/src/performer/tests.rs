@@ -28,7 +28,7 @@ async fn connect_as(
     task: &str,
     events: mpsc::Sender<Answer>,
 ) -> anyhow::Result<Performer> {
-    Performer::connect(&place_of(endpoints), run, task, events).await
+    Performer::connect(&place_of(endpoints), run, task, TraceContext::fresh(), events).await
 }
 
 fn place_of(endpoints: &Endpoints) -> Place {
@@ -221,11 +221,12 @@ async fn a_run_goes_beside_others_and_one_that_goes_alone_does_not() -> anyhow::
     let events = || mpsc::channel(1).0;
     let second = connect(&bench.endpoints, "second", events()).await?;
     let alone = Place { alone: true, ..place_of(&bench.endpoints) };
-    let refused = Performer::connect(&alone, "run-3", "third", events()).await.err().context("it went")?;
+    let refused =
+        Performer::connect(&alone, "run-3", "third", TraceContext::fresh(), events()).await.err().context("it went")?;
     assert!(refused.to_string().contains("another run is under way on this system (`"), "{refused}");
     second.close().await?;
     bench.performer.close().await?;
-    let third = Performer::connect(&alone, "run-3", "third", events()).await?;
+    let third = Performer::connect(&alone, "run-3", "third", TraceContext::fresh(), events()).await?;
     let fourth = connect(&bench.endpoints, "fourth", events()).await.err().context("it went")?;
     assert!(fourth.to_string().starts_with("`third` is under way on this system and goes alone"), "{fourth}");
     third.close().await

@@ -9,6 +9,7 @@ use crate::interrupt::Interrupt;
 use crate::performer::{self, Performer};
 use crate::replay::{self, Replayed};
 use crate::shell::MAX_PENDING_EVENTS;
+use crate::spans::trace_of;
 use anyhow::Context;
 use ratn_event_log::{Log, LogWriter};
 use ratn_executive::lookahead::Lookout;
@@ -91,7 +92,10 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
     let checkpointer = Checkpointer::start(&log, &program.digest, checkpoint_every, kept, replayed);
     let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
     // One that is refused takes no ear away from the run that listens.
-    let performer = Performer::connect(place, &ledger.origin.run, &program.name, events).await;
+    let origin = &ledger.origin;
+    // Of the same trace as before. What the nodes were before is in the log, and its export has their spans.
+    let trace = trace_of(&origin.run, &program.name, seed, origin.began_unix_ms);
+    let performer = Performer::connect(place, &origin.run, &program.name, trace, events).await;
     let performer = performer.context("cannot go on with the run")?;
     let shell = Shell {
         executive,
@@ -112,6 +116,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         confirm: Vec::new(),
         performer,
         answers,
+        spans: None,
     };
     let begin = async |shell: &mut Shell| {
         let mirror = shell.executive.root().clone();

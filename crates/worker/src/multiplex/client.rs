@@ -131,7 +131,7 @@ impl<P: Protocol> Stream<P> {
         let id = self.calls().begin(Waiting { progress, last })?;
         let told = P::when_dropped(id, &call).map(|(id, call)| (id, call, when_dropped));
         let mut under_way = UnderWay { stream: self, id, when_dropped: told };
-        let traceparent = trace::current().map_or_else(String::new, |context| context.child().to_string());
+        let traceparent = trace::current().map_or_else(String::new, |context| context.to_string());
         // Where that fails the stream has broken, and `answered` says why.
         let _ = self.requests.send(P::request(id, call, traceparent)).await;
         let answer = answered.await;

@@ -39,6 +39,9 @@ pub trait Protocol: 'static {
     /// The parts of a response.
     fn answer(response: Self::Response) -> (u64, Result<Self::Answer, Status>);
 
+    /// The path of the method that this call is, as if it came alone.
+    fn path(call: &Self::Call) -> &'static str;
+
     /// Whether no other answer of the same call follows.
     fn is_last(_: &Self::Answer) -> bool {
         true
@@ -90,6 +93,17 @@ pub enum SessionCalls {}
 impl Protocol for SessionCalls {
     messages!(SessionRequest session_request, SessionResponse session_response);
 
+    fn path(call: &session_request::Kind) -> &'static str {
+        use session_request::Kind;
+        match call {
+            Kind::Block(_) => "/ratn.v1.ResourceService/Block",
+            Kind::Acquire(_) => "/ratn.v1.ResourceService/Acquire",
+            Kind::Withdraw(_) => "/ratn.v1.ResourceService/Withdraw",
+            Kind::Release(_) => "/ratn.v1.ResourceService/Release",
+            Kind::KeepAlive(_) => "/ratn.v1.ResourceService/KeepAlive",
+        }
+    }
+
     fn ends_call(_: u64, call: &session_request::Kind) -> Option<u64> {
         match call {
             session_request::Kind::Withdraw(withdraw) if withdraw.call != 0 => Some(withdraw.call),
@@ -116,6 +130,10 @@ pub enum GoalCalls {}
 
 impl Protocol for GoalCalls {
     messages!(PerformRequest perform_request, PerformResponse perform_response);
+
+    fn path(_: &perform_request::Kind) -> &'static str {
+        "/ratn.v1.ActionService/Execute"
+    }
 
     fn is_last(answer: &perform_response::Kind) -> bool {
         !matches!(answer, perform_response::Kind::Progress(_))

@@ -6,14 +6,14 @@
 
 use super::Protocol;
 use crate::gate::ending;
-use crate::trace::TraceContext;
+use crate::trace::{self, Answering, TraceContext};
 use futures::FutureExt;
 use futures::stream::{AbortHandle, Abortable, BoxStream, SelectAll, Stream, StreamExt, abortable};
 use std::collections::BTreeMap;
 use std::pin::Pin;
 use std::task::{Context, Poll};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
-use tonic::{Status, Streaming};
+use tonic::{Code, Status, Streaming};
 
 /// Requests taken in before answers get their turn.
 const AT_ONCE: usize = 64;
@@ -56,6 +56,8 @@ pub struct Answers<P: Protocol, S> {
 struct Call<P: Protocol> {
     id: u64,
     answers: Abortable<CallAnswers<P>>,
+    /// Ends with the last answer.
+    span: Option<Answering>,
 }
 
 impl<P: Protocol, S: Serve<P>> Answers<P, S> {
@@ -93,9 +95,12 @@ impl<P: Protocol, S: Serve<P>> Answers<P, S> {
         if self.under_way >= S::MAX_CALLS {
             return Some((id, Err(self.serve.too_many())));
         }
-        let context = traceparent.parse::<TraceContext>().ok().map(TraceContext::child);
-        let (answers, abort) = abortable(self.serve.begin(call, context));
-        self.calls.push(Call { id, answers });
+        let caller = traceparent.parse::<TraceContext>().ok();
+        let own = caller.map(TraceContext::child);
+        let traced = caller.zip(own).zip(call.as_ref());
+        let span = traced.and_then(|((caller, own), call)| trace::answering(P::path(call), caller, own));
+        let (answers, abort) = abortable(self.serve.begin(call, own));
+        self.calls.push(Call { id, answers, span });
         self.under_way += 1;
         if id != 0 {
             self.by_id.insert(id, abort);
@@ -160,7 +165,14 @@ impl<P: Protocol> Stream for Call<P> {
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         let id = self.id;
-        self.answers.poll_next_unpin(context).map(|answer| answer.map(|answer| (id, answer)))
+        let answer = self.answers.poll_next_unpin(context);
+        if let (Some(span), Poll::Ready(Some(answer))) = (&mut self.span, &answer)
+            && answer.as_ref().map_or(true, P::is_last)
+        {
+            span.ended(answer.as_ref().map_or_else(Status::code, |_| Code::Ok));
+            self.span = None;
+        }
+        answer.map(|answer| answer.map(|answer| (id, answer)))
     }
 }
 

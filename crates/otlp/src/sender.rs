@@ -1,0 +1,313 @@
+//! The sender of a process: a bounded queue, and a thread that sends what is in it in batches.
+//!
+//! What cannot be sent is dropped and counted, and is not tried again: spans tell what went on, and nobody's work may depend on them.
+
+use super::config::{Fault, OtlpConfig, Target};
+use super::post::{PostError, post};
+use super::span::Span;
+use super::wire;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+use tokio::sync::{mpsc, oneshot};
+use tokio::time::Instant;
+
+/// Spans that were not sent yet.
+const QUEUE: usize = 4_096;
+/// As many spans are one request, …
+const BATCH: usize = 512;
+/// … or what came in this time.
+const PAUSE: Duration = Duration::from_millis(500);
+/// What is queued at the end of a run is sent in this time, …
+pub const END_OF_RUN: Duration = Duration::from_secs(2);
+/// … and at the end of a daemon or a worker, which its manager waits for, in this.
+pub const END_OF_SERVER: Duration = Duration::from_millis(500);
+/// The scope of what a process tells of itself.
+const SCOPE: &str = "ratn";
+
+static SENDER: OnceLock<Sender> = OnceLock::new();
+
+/// Sends the spans of this process; clones share the queue.
+#[derive(Debug, Clone)]
+pub struct Sender {
+    queue: mpsc::Sender<Message>,
+    counts: Counts,
+}
+
+/// How many spans were sent, and how many dropped. Clones count together.
+#[derive(Debug, Clone, Default)]
+pub struct Counts(Arc<[AtomicU64; 2]>);
+
+#[derive(Debug)]
+enum Message {
+    Span(Box<Span>),
+    Flush(oneshot::Sender<()>),
+}
+
+impl Counts {
+    /// Those that a collector has taken.
+    pub fn sent(&self) -> u64 {
+        self.0[0].load(Ordering::Relaxed)
+    }
+
+    /// Those that no collector has taken, or that found the queue full.
+    pub fn dropped(&self) -> u64 {
+        self.0[1].load(Ordering::Relaxed)
+    }
+
+    fn add(&self, sent: usize, dropped: usize) {
+        self.0[0].fetch_add(sent as u64, Ordering::Relaxed);
+        self.0[1].fetch_add(dropped as u64, Ordering::Relaxed);
+    }
+}
+
+/// The sender of this process, if there is one.
+pub fn sender() -> Option<&'static Sender> {
+    SENDER.get()
+}
+
+/// Starts the sender of this process, where the config says so and none was started before. `resource` says which process it is; `say`
+/// is told once, on the first trouble, that spans are dropped and why.
+///
+/// # Errors
+/// What is wrong with the config.
+pub fn start(
+    config: &OtlpConfig,
+    resource: Vec<(&'static str, String)>,
+    say: impl Fn(&str) + Send + 'static,
+) -> Result<Option<&'static Sender>, Fault> {
+    let Some(target) = config.target()? else { return Ok(sender()) };
+    if let Some(sender) = sender() {
+        return Ok(Some(sender));
+    }
+    let started = Sender::start(target, config.timeout_ms, resource, say);
+    Ok(Some(SENDER.get_or_init(|| started)))
+}
+
+impl Sender {
+    fn start(
+        target: Target,
+        timeout_ms: u64,
+        resource: Vec<(&'static str, String)>,
+        say: impl Fn(&str) + Send + 'static,
+    ) -> Sender {
+        let (queue, spans) = mpsc::channel(QUEUE);
+        let sender = Sender { queue, counts: Counts::default() };
+        let counts = sender.counts.clone();
+        let work = Work { target, timeout_ms, resource, counts, said: false, say };
+        let sending = move || match tokio::runtime::Builder::new_current_thread().enable_all().build() {
+            Ok(runtime) => runtime.block_on(work.send_all(spans)),
+            Err(error) => (work.say)(&format!("OTLP: no spans are sent: {error}")),
+        };
+        // Without the thread the queue is closed, and everything is dropped.
+        let _ = std::thread::Builder::new().name("otlp".to_owned()).spawn(sending);
+        sender
+    }
+
+    /// Takes a span, or drops it where there is no room; never waits.
+    pub fn record(&self, span: Span) {
+        if self.queue.try_send(Message::Span(Box::new(span))).is_err() {
+            self.counts.add(0, 1);
+        }
+    }
+
+    /// How many were sent and dropped until now.
+    pub fn counts(&self) -> &Counts {
+        &self.counts
+    }
+
+    /// Waits until what was recorded before is sent or dropped, for so long at the most.
+    pub async fn flush(&self, patience: Duration) {
+        let flushing = async {
+            let (done, is_done) = oneshot::channel();
+            if self.queue.send(Message::Flush(done)).await.is_ok() {
+                let _ = is_done.await;
+            }
+        };
+        let _ = tokio::time::timeout(patience, flushing).await;
+    }
+}
+
+struct Work<S> {
+    target: Target,
+    timeout_ms: u64,
+    resource: Vec<(&'static str, String)>,
+    counts: Counts,
+    said: bool,
+    say: S,
+}
+
+impl<S: Fn(&str)> Work<S> {
+    async fn send_all(mut self, mut queue: mpsc::Receiver<Message>) {
+        let mut batch = Vec::with_capacity(BATCH);
+        while let Some(first) = queue.recv().await {
+            let mut flushed = match first {
+                Message::Flush(done) => Some(done),
+                Message::Span(span) => {
+                    batch.push(*span);
+                    None
+                }
+            };
+            let until = Instant::now() + PAUSE;
+            while flushed.is_none() && batch.len() < BATCH {
+                match tokio::time::timeout_at(until, queue.recv()).await {
+                    Ok(Some(Message::Span(span))) => batch.push(*span),
+                    Ok(Some(Message::Flush(done))) => flushed = Some(done),
+                    Ok(None) | Err(_) => break,
+                }
+            }
+            if !batch.is_empty() {
+                self.send(&batch).await;
+                batch.clear();
+            }
+            if let Some(done) = flushed {
+                let _ = done.send(());
+            }
+        }
+    }
+
+    async fn send(&mut self, batch: &[Span]) {
+        let body = wire::request(&self.resource, SCOPE, batch);
+        let patience = Duration::from_millis(self.timeout_ms);
+        let sent = tokio::time::timeout(patience, post(&self.target, body)).await;
+        match sent.unwrap_or(Err(PostError::Late(self.timeout_ms))) {
+            Ok(()) => self.counts.add(batch.len(), 0),
+            Err(why) => {
+                self.counts.add(0, batch.len());
+                if !self.said {
+                    self.said = true;
+                    let collector = &self.target.uri;
+                    (self.say)(&format!(
+                        "the OTLP collector at {collector} does not take spans: {why}; what it does not take is dropped and counted, \
+                         and not said again: start a collector there, or leave [service.otlp] out"
+                    ));
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::{Kind, decode};
+    use std::sync::Mutex;
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::net::TcpListener;
+
+    fn span(id: u64) -> Span {
+        Span {
+            trace: 7,
+            id,
+            parent: Some(1),
+            name: "work".to_owned(),
+            kind: Kind::Server,
+            from_unix_ns: 1,
+            to_unix_ns: 2,
+            attributes: vec![("said", "yes".to_owned()), ("unsaid", String::new())],
+            links: vec![crate::Link { to: 3, waited_for: "result" }],
+            error: None,
+        }
+    }
+
+    fn to(port: u16, timeout_ms: u64) -> (Sender, Arc<Mutex<Vec<String>>>) {
+        let endpoint = Some(format!("http://127.0.0.1:{port}"));
+        let config = OtlpConfig { endpoint, timeout_ms, ..OtlpConfig::default() };
+        let heard: Arc<Mutex<Vec<String>>> = Arc::default();
+        let say = {
+            let heard = Arc::clone(&heard);
+            move |said: &str| heard.lock().unwrap().push(said.to_owned())
+        };
+        let resource = vec![("service.name", "test".to_owned())];
+        (Sender::start(config.target().unwrap().unwrap(), timeout_ms, resource, say), heard)
+    }
+
+    /// Answers one request; its head and its body.
+    async fn answer(listener: &TcpListener, status: &str) -> (String, Vec<u8>) {
+        let (mut connection, _) = listener.accept().await.unwrap();
+        let mut read = Vec::new();
+        loop {
+            let mut some = [0; 4096];
+            let count = connection.read(&mut some).await.unwrap();
+            read.extend(&some[..count]);
+            let Some(end) = read.windows(4).position(|four| four == b"\r\n\r\n") else { continue };
+            let head = String::from_utf8(read[..end].to_vec()).unwrap().to_lowercase();
+            let length = head.lines().find_map(|line| line.strip_prefix("content-length: ")).unwrap();
+            let body = read[end + 4..].to_vec();
+            if body.len() == length.parse::<usize>().unwrap() {
+                let answer = format!("HTTP/1.1 {status}\r\ncontent-length: 0\r\n\r\n");
+                connection.write_all(answer.as_bytes()).await.unwrap();
+                return (head, body);
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn a_span_arrives_as_it_was_recorded() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let (sender, heard) = to(listener.local_addr().unwrap().port(), 2_000);
+        sender.record(span(2));
+        let (answered, ()) = tokio::join!(answer(&listener, "200 OK"), sender.flush(END_OF_RUN));
+        let (head, body) = answered;
+        assert!(head.starts_with("post /v1/traces http/1.1"), "{head}");
+        assert!(head.contains("content-type: application/x-protobuf"), "{head}");
+        let [there] = &decode(&body).unwrap()[..] else { panic!("not one span") };
+        assert_eq!((there.service.as_str(), there.name.as_str()), ("test", "work"));
+        assert_eq!(there.trace, format!("{:032x}", 7));
+        assert_eq!((there.id.as_str(), there.parent.as_str()), ("0000000000000002", "0000000000000001"));
+        assert_eq!(there.attributes, [("said".to_owned(), "yes".to_owned())]);
+        assert_eq!(there.links, ["0000000000000003"]);
+        assert_eq!((sender.counts().sent(), sender.counts().dropped()), (1, 0));
+        assert!(heard.lock().unwrap().is_empty());
+    }
+
+    #[tokio::test]
+    async fn an_answer_that_is_an_error_is_said_once_and_its_spans_are_counted() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let (sender, heard) = to(listener.local_addr().unwrap().port(), 2_000);
+        for round in 1..=3 {
+            sender.record(span(round));
+            tokio::join!(answer(&listener, "503 Service Unavailable"), sender.flush(END_OF_RUN));
+            assert_eq!((sender.counts().sent(), sender.counts().dropped()), (0, round));
+        }
+        let heard = heard.lock().unwrap();
+        assert!(heard.len() == 1 && heard[0].contains("503") && heard[0].contains("/v1/traces"), "{heard:?}");
+    }
+
+    #[tokio::test]
+    async fn one_that_is_away_is_said_once() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let port = listener.local_addr().unwrap().port();
+        drop(listener);
+        let (sender, heard) = to(port, 2_000);
+        for round in 1..=3 {
+            sender.record(span(round));
+            sender.flush(END_OF_RUN).await;
+            assert_eq!(sender.counts().dropped(), round);
+        }
+        let heard = heard.lock().unwrap();
+        assert!(heard.len() == 1 && heard[0].contains("cannot connect"), "{heard:?}");
+    }
+
+    #[tokio::test]
+    async fn one_that_hangs_keeps_nobody_waiting_and_what_has_no_room_is_dropped() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let (sender, heard) = to(listener.local_addr().unwrap().port(), 60_000);
+        let began = Instant::now();
+        // What is on its way is no longer in the queue.
+        let most = (QUEUE + 2 * BATCH) as u64;
+        for id in 1..=2 * most {
+            sender.record(span(id));
+        }
+        assert!(began.elapsed() < Duration::from_secs(1), "{:?}", began.elapsed());
+        assert!(sender.counts().dropped() >= most, "{}", sender.counts().dropped());
+        let patience = Duration::from_millis(100);
+        let began = Instant::now();
+        sender.flush(patience).await;
+        assert!((patience..patience * 10).contains(&began.elapsed()), "{:?}", began.elapsed());
+        assert_eq!(sender.counts().sent(), 0);
+        // It is not yet known that the collector hangs.
+        assert!(heard.lock().unwrap().is_empty());
+    }
+}
