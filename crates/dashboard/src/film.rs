@@ -17,6 +17,9 @@ use std::collections::VecDeque;
 const MOST_TRACKS: usize = 96;
 /// Points of a track; of a trajectory with more some are left out.
 const MOST_POINTS: usize = 600;
+/// Kinds of resources, as the standard catalogue has them.
+const ARM_KIND: &str = "Arm";
+const BASE_KIND: &str = "Base";
 /// Joints of a track; one with more is not kept.
 const MOST_JOINTS: usize = 64;
 
@@ -32,6 +35,8 @@ pub(crate) struct Film {
     /// Tracks so far.
     numbers: u64,
     base: Option<Pose>,
+    /// Whether the system of the run has a base that drives, where the log tells what it has for an arm.
+    drives: Option<bool>,
 }
 
 /// Which joints.
@@ -73,6 +78,11 @@ impl Film {
     /// Takes the next line.
     pub(crate) fn apply(&mut self, line: &LogLine) {
         let at_s = line.at.seconds();
+        if let LogEntry::Event(Event::Started { capacity, .. }) = &line.entry
+            && capacity.contains_key(ARM_KIND)
+        {
+            self.drives = Some(capacity.contains_key(BASE_KIND));
+        }
         if self.believed.follow(line) {
             self.version += 1;
             self.world_changed = self.version;
@@ -110,6 +120,11 @@ impl Film {
         if let Some(track) = begun {
             self.add(track);
         }
+    }
+
+    /// Whether the robot of the run has a base that drives; none where the log does not tell.
+    pub(crate) fn drives(&self) -> Option<bool> {
+        self.drives
     }
 
     /// Up to which change this is.

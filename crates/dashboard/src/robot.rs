@@ -116,6 +116,16 @@ impl Shown {
         self.told.clone()
     }
 
+    /// Why a log is of another robot.
+    fn may_be_of(&self, film: &Film) -> Result<(), String> {
+        let name = &self.told.name;
+        match (film.drives(), self.base.is_empty()) {
+            (Some(false), false) => Err(format!("{name} has a base that drives, and the system of the run had none")),
+            (Some(true), true) => Err(format!("the system of the run had a base that drives, and {name} has none")),
+            _ => film.tracks().try_for_each(|track| self.joints_of(&track.part).map(drop)),
+        }
+    }
+
     /// The joints of a part, or why it is not one of this robot.
     fn joints_of(&self, part: &Part) -> Result<Vec<usize>, String> {
         let name = &self.told.name;
@@ -182,7 +192,7 @@ pub(crate) fn cell(
     // A log that moves what the robot does not have is of another one, whenever it does.
     let (fits, note, tracks) = match robot {
         Err(note) => (false, note.to_owned(), Vec::new()),
-        Ok(shown) => match film.tracks().try_for_each(|one| shown.joints_of(&one.part).map(drop)) {
+        Ok(shown) => match shown.may_be_of(film) {
             Err(note) => (false, note, Vec::new()),
             Ok(()) => match film.since(version).map(|one| track(shown, one)).collect::<Result<Vec<_>, String>>() {
                 Ok(tracks) => (true, String::new(), tracks),
@@ -341,6 +351,9 @@ mod tests {
         let six = shown("ur5");
         let seven = cell(&film(&[MOVE_TO]), 0, Ok(&six), |_| String::new());
         assert_eq!(seven.note, "the log has positions for 7 joints where ur5 has 6");
+        let standing = r#"{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":1,"world":[],"revision":1,"capacity":{"Arm":1,"Gripper":1}}"#;
+        let of_panda = cell(&film(&[standing]), 0, Ok(&shown_robot), |_| String::new());
+        assert_eq!(of_panda.note, "aimm has a base that drives, and the system of the run had none");
         let unknown = cell(&film(&[MOVE_TO]), 0, Err("no robot was named"), |_| String::new());
         assert_eq!((unknown.fits, unknown.note.as_str(), unknown.tracks.len()), (false, "no robot was named", 0));
     }
