@@ -167,7 +167,11 @@ impl Film {
 
     fn add(&mut self, track: Track) {
         let is_long = |point: &TrajectoryPoint| point.positions.len() > MOST_JOINTS;
-        if track.points.iter().any(is_long) {
+        let names = match &track.part {
+            Part::Named(names) => names.len(),
+            _ => 0,
+        };
+        if names > MOST_JOINTS || track.points.iter().any(is_long) {
             return;
         }
         self.version += 1;

@@ -188,7 +188,8 @@ pub(crate) fn cell(
     path: impl Fn(InstanceId) -> String,
 ) -> wire::Cell {
     let version = if version > film.version() { 0 } else { version };
-    let track = |shown: &Shown, track: &Track| shown.track(track, track.instance.map_or_else(String::new, &path));
+    let track =
+        |shown: &Shown, track: &Track| shown.track(track, track.instance.map_or_else(String::new, |id| cut(&path(id))));
     // A log that moves what the robot does not have is of another one, whenever it does.
     let (fits, note, tracks) = match robot {
         Err(note) => (false, note.to_owned(), Vec::new()),

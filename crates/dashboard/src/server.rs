@@ -27,7 +27,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::AbortHandle;
@@ -44,6 +44,8 @@ const PATIENCE: Duration = Duration::from_secs(10);
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
 /// Folds that are read at the same time.
 const MAX_READING: usize = 4;
+/// A robot that could not be read is not tried again for so long.
+const ROBOT_AGAIN: Duration = Duration::from_secs(3);
 const JSON: &str = "application/json";
 
 /// The pages, as `scripts/build-dashboard` makes them of `web/`.
@@ -184,20 +186,23 @@ struct Shown {
 #[derive(Debug)]
 struct KnownRobot {
     robots: Robots,
-    shown: Mutex<Option<Arc<robot::Shown>>>,
+    shown: Mutex<Option<(Instant, Loaded)>>,
 }
+
+type Loaded = Result<Arc<robot::Shown>, String>;
 
 impl KnownRobot {
     /// May read files.
-    fn get(&self) -> Result<Arc<robot::Shown>, String> {
+    fn get(&self) -> Loaded {
         // What a panic left is whole.
         let mut shown = self.shown.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(shown) = &*shown {
-            return Ok(shown.clone());
+        match &*shown {
+            Some((at, loaded)) if loaded.is_ok() || at.elapsed() < ROBOT_AGAIN => return loaded.clone(),
+            _ => {}
         }
-        let loaded = Arc::new(self.robots.load()?);
-        *shown = Some(loaded.clone());
-        Ok(loaded)
+        let loaded = self.robots.load().map(Arc::new);
+        *shown = Some((Instant::now(), loaded.clone()));
+        loaded
     }
 }
 

@@ -47,6 +47,7 @@ export class CellView {
   private log: number | null = null;
   private dirty = false;
   private listed = 0;
+  private listedOf: { cell: Cell | null; moment: number } | null = null;
   private paths = new Map<number, Path>();
 
   constructor(
@@ -109,7 +110,7 @@ export class CellView {
 
   begin(): void {
     if (this.robot?.known === false) this.robot = null;
-    this.listed = 0;
+    this.listedOf = null;
     this.repaint();
   }
 
@@ -122,8 +123,10 @@ export class CellView {
       const moment = this.clock.at(now);
       if (!this.element.isConnected) return;
       this.paint(moment);
-      if (now - this.listed > LIST_MS || !this.clock.runs(now)) {
-        this.listed = now;
+      // Whoever turns the view does not change what is listed.
+      const isOther = this.listedOf === null || this.listedOf.cell !== this.cell || this.listedOf.moment !== moment;
+      if (isOther && (now - this.listed > LIST_MS || !this.clock.runs(now))) {
+        [this.listed, this.listedOf] = [now, { cell: this.cell, moment }];
         this.list(moment);
       }
       if (this.clock.runs(now)) this.repaint();
@@ -251,14 +254,14 @@ export class CellView {
       const slides = robot.joints[index]?.slides === true;
       const value = positions[index] ?? 0;
       const said = this.film.knows(index, moment);
-      return [name, slides ? `${metres(value)}` : `${Math.round((value * 180) / Math.PI)}°`, said ? "" : "assumed"];
+      return [name, slides ? `${metres(value)}` : `${Math.round((value * 180) / Math.PI)}°`, said ? "the log" : "assumed"];
     };
     return [
       h("p", {}, `${robot.name}, ${robot.note}. Joints are as commanded.`),
       h("p", {}, `The tool is at ${tools.join("; ")}. The base is at ${where(this.cell?.base.position ?? [])}.`),
       h("h2", {}, "What moves"),
       moving.length === 0 ? h("p", { class: "faint" }, "Nothing moves.") : h("ul", { class: "plain", id: "moving" }, ...moving.map(item)),
-      table("Joints", ["joint", "position", ""], robot.joints.map((joint, index) => row(joint.name, index)), [1]),
+      table("Joints", ["joint", "position", "from"], robot.joints.map((joint, index) => row(joint.name, index)), [1]),
     ];
   }
 }
