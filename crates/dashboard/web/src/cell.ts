@@ -220,7 +220,7 @@ export class CellView {
     const bound = (axis: 0 | 1 | 2, pick: (...all: number[]) => number) => places.map((place) => place[axis]).reduce((a, b) => pick(a, b));
     const [low, high] = [Math.min, Math.max].map((pick): Vector => [bound(0, pick), bound(1, pick), bound(2, pick)]) as [Vector, Vector];
     const at: Vector = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2];
-    return { at, distance: Math.min(Math.max(length(minus(high, low)) * 1.35 + 0.8, 1), 40) };
+    return { at, distance: Math.min(Math.max(length(minus(high, low)) * 1.15 + 0.8, 1), 40) };
   }
 
   private list(moment: number): void {
@@ -278,7 +278,7 @@ function truthList(truth: Truth | null, believed: Thing[]): Child[] {
   return [table("Objects as they are", ["object", "where", "size", "to the nearest believed"], truth.objects.map((object) => [...thing(object), near(object)]), [3])];
 }
 
-const METRES = new Intl.NumberFormat(navigator.language, { minimumFractionDigits: 2, maximumFractionDigits: 2 });
+const METRES = new Intl.NumberFormat(navigator.language, { minimumFractionDigits: 2, maximumFractionDigits: 2, signDisplay: "negative" });
 const metres = (value: number) => `${METRES.format(value)}\u00a0m`;
 const where = (position: readonly number[]) => position.map((value) => METRES.format(value)).join(" / ");
 
