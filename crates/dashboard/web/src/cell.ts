@@ -4,11 +4,11 @@ import { api } from "./api";
 import { type Child, count, fill, h, seconds, table } from "./dom";
 import { Clock, Film, lasts } from "./film";
 import { forward } from "./kinematics";
-import { type Matrix, type Vector, along, compose, identity, length, minus, origin, placed, shifted } from "./matrix";
+import { type Matrix, type Vector, along, compose, identity, length, minus, origin, placed, plus, shifted } from "./matrix";
 import { Orbit } from "./orbit";
 import type { Site } from "./pages";
 import { type Colour, type Lines, Painter, type Solid, outline } from "./webgl";
-import type { Cell, Object as Thing, Robot, Track, Truth } from "./wire";
+import type { Cell, Object as Thing, Robot, Shape, Track, Truth } from "./wire";
 
 /** Places of the tool between which its path is drawn straight. */
 const STEPS = 80;
@@ -20,6 +20,8 @@ const LIST_MS = 400;
 const FURNITURE_M = 0.5;
 /** The floor is drawn so far, with a line for each half metre. */
 const FLOOR_M = 3;
+/** An outline stands out from what is solid at the same place. */
+const AROUND_M = 0.006;
 const KEYS = "Arrow keys turn it, Shift and arrow keys move, plus and minus zoom, 0 shows all. What it shows is listed beside it.";
 const NO_WEBGL = "This browser draws no 3D view: it has no WebGL 2, or that is switched off. What would be shown is listed.";
 
@@ -166,7 +168,7 @@ export class CellView {
       const large = Math.max(...size) >= FURNITURE_M;
       solids.push({ kind, size, frame, colour: colour(object.held ? "cell-held" : large ? "cell-furniture" : "cell-object") });
     }
-    const outlines = this.truth().flatMap((object) => outline(object.shape.kind, object.shape.size, placed(object.shape.at)));
+    const outlines = this.truth().flatMap((object) => outline(object.shape.kind, object.shape.size.map((edge) => edge + AROUND_M), placed(object.shape.at)));
     lines.push({ points: Float32Array.from(outlines), colour: colour("cell-truth") });
     if (shown !== null) solids.push(...this.ways(shown.robot, moment, colour("cell-path")));
     painter.paint(this.orbit.view(w / t), this.orbit.back, colour("paper"), solids, lines);
@@ -212,15 +214,23 @@ export class CellView {
   /** Where to look so that everything is in view. */
   private middle(): { at: Vector; distance: number } | null {
     const shown = this.frames(this.clock.at(performance.now()));
-    const places = this.objects.filter((object) => !object.held).map((object) => origin(placed(object.shape.at)));
+    const places: Vector[] = [];
+    const add = (frame: Matrix, { kind, size }: Shape) => {
+      const [a, b] = [size[0] ?? 0, size[1] ?? 0];
+      const radius = kind === "box" ? Math.hypot(...size) / 2 : a + b / 2;
+      // What reaches far along one axis does so along one alone: most of its sphere is empty.
+      for (const way of [-0.7, 0.7]) places.push(plus(origin(frame), [radius, radius, radius], way));
+    };
+    if (this.cell !== null) places.push(origin(placed(this.cell.base)));
+    for (const { held, shape } of this.objects) if (!held) add(placed(shape.at), shape);
     shown?.robot.links.forEach((link, index) => {
-      for (const { at } of link.shapes) places.push(origin(compose(shown.frames[index] ?? identity(), placed(at))));
+      for (const shape of link.shapes) add(compose(shown.frames[index] ?? identity(), placed(shape.at)), shape);
     });
-    if (places.length === 0) return null;
+    if (places.length < 2) return null;
     const bound = (axis: 0 | 1 | 2, pick: (...all: number[]) => number) => places.map((place) => place[axis]).reduce((a, b) => pick(a, b));
     const [low, high] = [Math.min, Math.max].map((pick): Vector => [bound(0, pick), bound(1, pick), bound(2, pick)]) as [Vector, Vector];
     const at: Vector = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2];
-    return { at, distance: Math.min(Math.max(length(minus(high, low)) * 1.15 + 0.8, 1), 40) };
+    return { at, distance: Math.min(Math.max(length(minus(high, low)) * 1.25, 1), 40) };
   }
 
   private list(moment: number): void {
