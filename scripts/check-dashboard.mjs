@@ -50,7 +50,7 @@ function step(text) {
 }
 const began = performance.now();
 
-const browser = await chromium.launch({ executablePath: CHROMIUM, args: ["--no-sandbox", "--disable-dev-shm-usage"] });
+const browser = await chromium.launch({ executablePath: CHROMIUM, args: ["--no-sandbox", "--disable-dev-shm-usage", "--enable-unsafe-swiftshader"] });
 
 async function open(url, options = {}) {
   const context = await browser.newContext({ viewport: { width: 1280, height: 760 }, colorScheme: "light", ...options });
@@ -72,7 +72,7 @@ async function open(url, options = {}) {
 async function go(page, name) {
   await page.click(`nav a[href="#/${name}"]`);
   await page.waitForFunction((name) => document.querySelector(`nav a[href="#/${name}"]`)?.getAttribute("aria-current") === "page", name);
-  await page.waitForTimeout(name === "hosts" || name === "resources" || name === "world" ? 1500 : 500);
+  await page.waitForTimeout(["hosts", "resources", "world", "cell"].includes(name) ? 1500 : 500);
 }
 
 async function axe(page, what) {
@@ -210,6 +210,12 @@ async function control() {
   await page.waitForFunction(() => document.querySelectorAll("tbody tr").length > 5);
   await axe(page, "the world");
   await shot(page, "world");
+  await go(page, "cell");
+  await page.waitForFunction(() => document.querySelector("aside")?.textContent.includes("Objects as they are"));
+  await page.waitForFunction(() => Number(document.querySelector("canvas")?.dataset.solids) > 15);
+  await axe(page, "the cell of a run");
+  await shot(page, "cell-live");
+  step("the cell is shown in 3D, with the objects as the running cell says that they are");
   await go(page, "run");
 
   await page.click("text=Step");
@@ -326,7 +332,7 @@ async function replay(log) {
 
   const dark = await open(shown.url, { colorScheme: "dark", locale: "de-DE", viewport: { width: 844, height: 390 } });
   await dark.waitForFunction(() => /\d,\d/.test(document.querySelector("footer output").textContent));
-  for (const name of ["run", "network", "resources", "world"]) {
+  for (const name of ["run", "network", "resources", "world", "cell"]) {
     await go(dark, name);
     await axe(dark, `${name}, dark, on a phone`);
     await shot(dark, `dark-phone-${name}`);
@@ -347,7 +353,7 @@ async function injected() {
   const key = { predicate: INJECTED, arguments: [INJECTED] };
   writeFileSync(
     log,
-    startedLine(INJECTED, { world: [[key, { string: INJECTED }]] }) +
+    startedLine(INJECTED, { world: [[key, { string: INJECTED }], ...boxAt(INJECTED, [0.6, 0, 0.8])] }) +
       line({ at: 1, command: "note", note: "expanded", instance: 1, state: 1, path: `${INJECTED}/${INJECTED}`, speculative: true }) +
       line({ at: 1, command: "acquire", instance: 1, requirements: [{ operation: "block", kind: INJECTED, class: null, attributes: {}, count: 1 }], priority: 1 }) +
       line({ at: at(1), event: "granted", instance: 1, lease: { id: 1, token: 1, resources: [{ id: INJECTED, kind: INJECTED, endpoint: "" }] } }) +
@@ -359,7 +365,7 @@ async function injected() {
   const shown = await dashboard([log, "--runtime-dir", join(PLACE, "nothing")]);
   const page = await open(shown.url);
   await page.waitForFunction(() => document.querySelector(".summary b") !== null);
-  for (const name of ["run", "network", "resources", "hosts", "world"]) {
+  for (const name of ["run", "network", "resources", "hosts", "world", "cell"]) {
     await go(page, name);
     if (name === "run" || name === "network") {
       await page.locator("canvas").focus();
@@ -375,6 +381,151 @@ async function injected() {
   shown.child.kill("SIGTERM");
   await shown.ended;
   step("names that would do something are text on every page");
+}
+
+const UPRIGHT = [0, 0, 0, 1];
+const fact = (predicate, individual, value) => [{ predicate, arguments: [individual] }, value];
+const boxAt = (name, position, size = [0.1, 0.08, 0.1]) => [
+  fact("shape", name, { map: { type: { string: "box" }, size: { list: size.map((float) => ({ float })) } } }),
+  fact("at", name, { pose: { position, quaternion_xyzw: UPRIGHT } }),
+];
+
+/** A box is taken and brought to the side, along two trajectories of 4 s each. */
+function pickAndPlace() {
+  const joints = [1, 2, 3, 4, 5, 6, 7].map((n) => `arm_joint_${n}`);
+  const [home, taking, giving] = [[-1.57, -0.35, 0, 1.4, 0, -1.39, 0], [-1.57, -0.9, 0, 1.2, 0, -1.0, 0], [0.5, -0.9, 0, 1.2, 0, -1.0, 0]];
+  const rest = Array(7).fill(0);
+  const points = (from, to) => [{ time_s: 0, positions: from, velocities: rest }, { time_s: 4, positions: to, velocities: rest }];
+  const lease = (id, kind) => ({ id: 1, token: 1, resources: [{ id, kind, endpoint: "" }] });
+  const begin = (when, instance, path, provider, action, inputs, kind) =>
+    line({ at: at(when), command: "note", note: "expanded", instance, state: instance, path, speculative: false }) +
+    line({ at: at(when), command: "start", instance, attempt: 1, goal: { provider, action, inputs, seed: 1, lease: lease(`${provider}@sim`, kind), projection: null, expected_s: null } });
+  const end = (when, instance, outputs) =>
+    line({ at: at(when), event: "finished", instance, attempt: 1, outcome: "success", outputs, measured: [], reason: "" }) + line({ at: at(when), command: "note", note: "retired", instance });
+  const follow = (when, instance, path, from, to) => begin(when, instance, path, "arm", "follow", { trajectory: { trajectory: { joints, points: points(from, to) } } }, "Arm") + end(when + 4, instance, { end: { joints: to } });
+  const held = [...boxAt("parcel", [0.75, 0.2, 0.75]).slice(0, 1), fact("in_gripper", "parcel", { pose: { position: [0, 0, 0.02], quaternion_xyzw: UPRIGHT } })];
+  return (
+    startedLine("pick and place", { world: [fact("at", "base", { pose: { position: [0, 0, 0], quaternion_xyzw: UPRIGHT } }), ...boxAt("table", [0.8, 0, 0.675], [0.6, 1.2, 0.05]), ...boxAt("parcel", [0.75, 0.2, 0.75])], capacity: { Arm: 1, Base: 1 } }) +
+    follow(1, 1, "approach", home, taking) +
+    begin(5.1, 2, "grasp", "gripper", "grasp", { object: { string: "parcel" } }, "Gripper") +
+    end(6, 2, { width_m: { float: 0.08 } }) +
+    line({ at: at(6), event: "world_changed", revision: 1, facts: held }) +
+    follow(6.5, 3, "transfer", taking, giving) +
+    line({ at: at(12), command: "end", outcome: "success", outputs: {}, reason: "" })
+  );
+}
+
+/** How many colours there are on the canvas in 3D, and what its pixels add up to, in the frame in which it was painted. */
+const painted = (page) =>
+  page.evaluate(async () => {
+    const canvas = document.querySelector("canvas");
+    // It paints in the next frame, before what is asked for after it.
+    canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "+", bubbles: true, cancelable: true }));
+    await new Promise(requestAnimationFrame);
+    const gl = canvas.getContext("webgl2");
+    const data = new Uint8Array(4 * gl.drawingBufferWidth * gl.drawingBufferHeight);
+    gl.readPixels(0, 0, gl.drawingBufferWidth, gl.drawingBufferHeight, gl.RGBA, gl.UNSIGNED_BYTE, data);
+    const counts = new Map();
+    let sum = 0;
+    for (let index = 0; index < data.length; index += 4) {
+      const colour = (data[index] << 16) | (data[index + 1] << 8) | data[index + 2];
+      counts.set(colour, (counts.get(colour) ?? 0) + 1);
+      sum = (sum * 31 + colour) >>> 0;
+    }
+    return { colours: counts.size, background: Math.max(...counts.values()) / (data.length / 4), sum };
+  });
+
+async function cell() {
+  const log = join(PLACE, "pick.jsonl");
+  writeFileSync(log, pickAndPlace());
+  const shown = await dashboard([log, "--runtime-dir", join(PLACE, "nothing")]);
+  const page = await open(shown.url);
+  const asked = [];
+  page.on("request", (request) => asked.push(new URL(request.url()).pathname));
+  await page.waitForFunction(() => document.querySelector("footer output").textContent.length > 3);
+  assert.ok(!asked.includes("/cell.js"), "only its page loads it");
+  await go(page, "cell");
+  assert.ok(asked.includes("/cell.js"));
+  await page.waitForFunction(() => Number(document.querySelector("canvas")?.dataset.solids) > 15);
+  const whole = await painted(page);
+  assert.ok(whole.colours > 50 && whole.background < 0.97, JSON.stringify(whole));
+  assert.notEqual((await painted(page)).sum, whole.sum, "a key zooms");
+  await page.keyboard.press("0");
+  step(`the cell is painted: ${whole.colours} colours, ${((1 - whole.background) * 100).toFixed(0)} % of the canvas are not background`);
+
+  const to = (seconds) =>
+    page.locator("footer input[type=range]").evaluate((slider, seconds) => {
+      slider.value = String(seconds);
+      slider.dispatchEvent(new Event("input"));
+    }, seconds);
+  await to(8.5);
+  await page.waitForFunction(() => document.querySelector("#moving")?.textContent.includes("transfer"));
+  await page.waitForFunction(() => document.querySelector("aside").textContent.includes("Held: parcel"));
+  const there = await painted(page);
+  await page.locator("canvas").focus();
+  await page.keyboard.press("0");
+  await axe(page, "the cell");
+  await shot(page, "cell");
+  await to(7);
+  await page.waitForFunction(() => Math.abs(Number(document.querySelector("canvas").dataset.moment) - 7) < 0.01);
+  assert.notEqual((await painted(page)).sum, there.sum, "at another moment the arm is elsewhere");
+  step("what moves is named, the box is held, and the arm is elsewhere at another moment");
+
+  // Replayed, the arm goes on with every frame, by less than is seen.
+  await page.click("footer >> text=Play");
+  const moments = await page.evaluate(async () => {
+    const moments = [];
+    for (const end = performance.now() + 3000; performance.now() < end; ) {
+      await new Promise(requestAnimationFrame);
+      moments.push(Number(document.querySelector("canvas").dataset.moment));
+    }
+    return moments.slice(Math.floor(moments.length / 3));
+  });
+  await page.click("footer >> text=Stop");
+  const steps = moments.slice(1).map((moment, index) => moment - moments[index]);
+  assert.ok(steps.every((one) => one >= 0 && one < 0.5), `it jumps: ${steps.join(" ")}`);
+  const distinct = new Set(moments).size;
+  assert.ok(distinct > 8, `${distinct} pictures in 2 s`);
+  step(`a replay shows ${distinct} pictures in 2 s; from one to the next it goes on by ${Math.max(...steps).toFixed(2)} s at the most`);
+  assert.deepEqual(page.problems, []);
+  await page.context().close();
+
+  const dark = await open(shown.url, { colorScheme: "dark", hasTouch: true });
+  await go(dark, "cell");
+  await dark.waitForFunction(() => Number(document.querySelector("canvas")?.dataset.solids) > 15);
+  assert.notEqual((await painted(dark)).sum, whole.sum, "it follows the colours of the system");
+  await axe(dark, "the cell, dark");
+  await shot(dark, "cell-dark");
+  await dark.context().close();
+
+  const without = await open(shown.url);
+  await without.addInitScript(() => {
+    const own = HTMLCanvasElement.prototype.getContext;
+    HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+      return kind === "webgl2" ? null : own.call(this, kind, ...more);
+    };
+  });
+  await without.reload();
+  await go(without, "cell");
+  await without.waitForSelector("#no-webgl");
+  await without.waitForFunction(() => document.querySelector("aside").textContent.includes("parcel"));
+  await axe(without, "the cell without WebGL");
+  assert.deepEqual(without.problems, []);
+  await without.context().close();
+  shown.child.kill("SIGTERM");
+  await shown.ended;
+  step("a browser without WebGL says so, and lists what would be shown");
+
+  const other = await dashboard([log, "--robot", "ur5", "--runtime-dir", join(PLACE, "nothing")]);
+  const unknown = await open(other.url);
+  await go(unknown, "cell");
+  await unknown.waitForFunction(() => document.querySelector("main .warn")?.textContent.includes("only objects and the base are shown"));
+  await shot(unknown, "cell-unknown");
+  assert.deepEqual(unknown.problems, []);
+  await unknown.context().close();
+  other.child.kill("SIGTERM");
+  await other.ended;
+  step("of a log of another robot only the objects and the base are shown, and why");
 }
 
 async function large() {
@@ -473,6 +624,7 @@ try {
   const wants = (name) => only === undefined || only.includes(name);
   const live = wants("control") ? await control() : "crates/report/src/fixtures/two_boxes.jsonl";
   if (wants("replay")) await replay(live);
+  if (wants("cell")) await cell();
   if (wants("injected")) await injected();
   if (wants("large")) await large();
   if (wants("long")) await long();

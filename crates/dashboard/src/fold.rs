@@ -3,6 +3,7 @@
 //! It reads a bounded part of the file at a time and keeps a bounded number of instances, so that neither a long log nor a run without
 //! end costs more than a short one. It does not decide where to begin to read (`logs.rs`) nor how it is told (`tell.rs`).
 
+use crate::film::Film;
 use crate::world::World;
 use ratn_event_log::{Lines, LogError};
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
@@ -29,6 +30,8 @@ pub(crate) struct Fold {
     pub(crate) run: Timeline,
     /// Its world.
     pub(crate) world: World,
+    /// What of it can be seen in the cell.
+    pub(crate) film: Film,
     /// Why it cannot be read on; empty where it can.
     pub(crate) problem: String,
     /// The digest of the texts of its task.
@@ -97,6 +100,7 @@ impl Fold {
             from_s: if byte == 0 { 0.0 } else { from.seconds() },
             run: Timeline::following(KEPT),
             world: World::default(),
+            film: Film::default(),
             problem: String::new(),
             digest: String::new(),
             position: (byte, 0),
@@ -112,6 +116,7 @@ impl Fold {
             let line = ratn_event_log::first(path)?;
             fold.digest = digest(&line).unwrap_or_default();
             fold.world.apply(&line);
+            fold.film.apply(&line);
             fold.run.apply(&line);
             fold.run.wait_until(fold.from_s);
         }
@@ -147,6 +152,7 @@ impl Fold {
                 self.digest = digest;
             }
             self.world.apply(&line);
+            self.film.apply(&line);
             let changed = self.run.apply(&line);
             self.version += 1;
             if let LogEntry::Command(Command::Project { instance, writers, .. }) = &line.entry {

@@ -6,10 +6,12 @@
 //!
 //! Pages ask, a few times a second while somebody looks at them, for what has changed; nothing is pushed, so nothing queues up.
 
+mod film;
 mod fold;
 mod gate;
 mod logs;
 mod patience;
+mod robot;
 mod server;
 mod system;
 mod task;
@@ -18,4 +20,5 @@ pub mod wire;
 mod world;
 
 pub use logs::MAX_LOGS;
+pub use robot::Robots;
 pub use server::{Dashboard, DashboardError, Options, Tasks};

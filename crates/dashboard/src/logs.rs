@@ -4,7 +4,7 @@
 //! nothing. A long log is not read from its start: enough of it before the moment that is shown is ([`Parts`]).
 
 use crate::fold::{Bond, Fold};
-use crate::{tell, wire};
+use crate::{robot, tell, wire};
 use ratn_event_log::{LogError, Parts};
 use ratn_model::id::InstanceId;
 use ratn_model::time::Timestamp;
@@ -162,6 +162,27 @@ impl Logs {
             let world = fold.world.told(filter, path);
             wire::World { at_s: fold.run.end_s, from_s: fold.from_s, ..world }
         })
+    }
+
+    /// The cell of a log at a moment, with a robot or why none is known.
+    pub(crate) fn cell(
+        &self,
+        id: u64,
+        asked: &Asked,
+        shown: Result<&robot::Shown, &str>,
+    ) -> Result<wire::Cell, NotTold> {
+        self.at(id, asked, |fold, there, _| {
+            let version = if fold.epoch == asked.epoch { asked.version } else { 0 };
+            let path =
+                |id: InstanceId| fold.run.instance(id).map_or_else(|| id.to_string(), |one| one.path.to_string());
+            let cell = robot::cell(&fold.film, version, shown, path);
+            wire::Cell { epoch: fold.epoch, more: !there, at_s: fold.run.end_s, ..cell }
+        })
+    }
+
+    /// A run writes this log.
+    pub(crate) fn is_live(&self, id: u64) -> bool {
+        self.run_of(id).is_some()
     }
 
     fn lock(&self) -> std::sync::MutexGuard<'_, All> {

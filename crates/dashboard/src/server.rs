@@ -3,6 +3,7 @@
 use crate::gate::{self, HEADERS, Refused, Token};
 use crate::logs::{Asked, Logs, MAX_LOGS, NotTold, absolute};
 use crate::patience::Patient;
+use crate::robot::{self, Robots};
 use crate::system::{Heard, System};
 use crate::{task, wire};
 use hyper::body::Incoming;
@@ -24,9 +25,9 @@ use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::AbortHandle;
@@ -43,12 +44,16 @@ const PATIENCE: Duration = Duration::from_secs(10);
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
 /// Folds that are read at the same time.
 const MAX_READING: usize = 4;
+/// A robot that could not be read is not tried again for so long.
+const ROBOT_AGAIN: Duration = Duration::from_secs(3);
 const JSON: &str = "application/json";
 
 /// The pages, as `scripts/build-dashboard` makes them of `web/`.
-const PAGES: [(&str, &str, &str); 4] = [
+const PAGES: [(&str, &str, &str); 5] = [
     ("/", "text/html; charset=utf-8", include_str!("../assets/index.html")),
     ("/app.js", "text/javascript; charset=utf-8", include_str!("../assets/app.js")),
+    // Only the page that needs it loads it.
+    ("/cell.js", "text/javascript; charset=utf-8", include_str!("../assets/cell.js")),
     ("/app.css", "text/css; charset=utf-8", include_str!("../assets/app.css")),
     ("/icon.svg", "image/svg+xml", include_str!("../assets/icon.svg")),
 ];
@@ -92,6 +97,8 @@ pub struct Options {
     pub tls: ClientTls,
     /// How tasks are loaded.
     pub tasks: Tasks,
+    /// How the robot of the logs is known.
+    pub robots: Robots,
     /// A browser that says or takes nothing for so long is cut off.
     pub patience: Duration,
 }
@@ -100,7 +107,16 @@ impl Options {
     /// Of a system's runtime directory, at a free port, without logs, to look at only.
     pub fn of(directory: PathBuf, tls: ClientTls) -> Options {
         let address = SocketAddr::from(([127, 0, 0, 1], 0));
-        Options { address, logs: Vec::new(), directory, control: false, tls, tasks: Tasks::none(), patience: PATIENCE }
+        Options {
+            address,
+            logs: Vec::new(),
+            directory,
+            control: false,
+            tls,
+            tasks: Tasks::none(),
+            robots: Robots::none(),
+            patience: PATIENCE,
+        }
     }
 }
 
@@ -162,7 +178,32 @@ struct Shown {
     system: System,
     control: bool,
     tasks: Tasks,
+    robot: Arc<KnownRobot>,
     reading: Semaphore,
+}
+
+/// The robot, once it was asked for: it is read then, and kept.
+#[derive(Debug)]
+struct KnownRobot {
+    robots: Robots,
+    shown: Mutex<Option<(Instant, Loaded)>>,
+}
+
+type Loaded = Result<Arc<robot::Shown>, String>;
+
+impl KnownRobot {
+    /// May read files.
+    fn get(&self) -> Loaded {
+        // What a panic left is whole.
+        let mut shown = self.shown.lock().unwrap_or_else(PoisonError::into_inner);
+        match &*shown {
+            Some((at, loaded)) if loaded.is_ok() || at.elapsed() < ROBOT_AGAIN => return loaded.clone(),
+            _ => {}
+        }
+        let loaded = self.robots.load().map(Arc::new);
+        *shown = Some((Instant::now(), loaded.clone()));
+        loaded
+    }
 }
 
 /// What a question is.
@@ -194,7 +235,7 @@ impl Dashboard {
     /// # Errors
     /// [`DashboardError`].
     pub async fn bind(options: Options) -> Result<Dashboard, DashboardError> {
-        let Options { address, logs, directory, control, tls, tasks, patience } = options;
+        let Options { address, logs, directory, control, tls, tasks, robots, patience } = options;
         if !address.ip().is_loopback() {
             return Err(DashboardError::Exposed { address });
         }
@@ -221,7 +262,8 @@ impl Dashboard {
         let address = listener.local_addr().map_err(refused)?;
         let (logs, system) = (Arc::new(Logs::of(&paths)), System::of(directory, &tls));
         let reading = Semaphore::new(MAX_READING);
-        let shown = Arc::new(Shown { token, logs, system, control, tasks, reading });
+        let robot = Arc::new(KnownRobot { robots, shown: Mutex::default() });
+        let shown = Arc::new(Shown { token, logs, system, control, tasks, robot, reading });
         Ok(Dashboard { listener, address, shown, patience })
     }
 
@@ -313,12 +355,18 @@ impl Shown {
             (&Method::GET, "/api/run") => self.run(&query).await,
             (&Method::GET, "/api/task") => self.task(&query).await,
             (&Method::GET, "/api/world") => self.world(&query).await,
+            (&Method::GET, "/api/robot") => self.robot().await,
+            (&Method::GET, "/api/cell") => self.cell(&query).await,
             (&Method::GET, "/api/system") => json(&self.system.told().await),
             (&Method::GET, "/api/tail") => self.tail(&query).await,
             (&Method::POST, "/api/control") => self.control(&query).await,
             (&Method::POST, "/api/scale") => self.scale(&query).await,
             (_, "/api/control" | "/api/scale") => return not_allowed("POST"),
-            (_, "/api/about" | "/api/run" | "/api/task" | "/api/world" | "/api/system" | "/api/tail") => {
+            (
+                _,
+                "/api/about" | "/api/run" | "/api/task" | "/api/world" | "/api/robot" | "/api/cell" | "/api/system"
+                | "/api/tail",
+            ) => {
                 return not_allowed("GET");
             }
             _ => Answer::Refused(StatusCode::NOT_FOUND, "there is nothing of this name".to_owned()),
@@ -390,6 +438,32 @@ impl Shown {
         };
         let filter = query.text("filter");
         self.reading(move |logs| Ok(serde_json::to_string(&logs.world(id, &asked, &filter)?))).await
+    }
+
+    async fn robot(&self) -> Answer {
+        let robot = self.robot.clone();
+        self.reading(move |_| Ok(serde_json::to_string(&robot.get().map_or_else(robot::unknown, |shown| shown.told()))))
+            .await
+    }
+
+    async fn cell(&self, query: &Query<'_>) -> Answer {
+        let (id, asked) = match query.asked() {
+            Ok(asked) => asked,
+            Err(problem) => return Answer::Refused(StatusCode::BAD_REQUEST, problem),
+        };
+        // How things are is known of now alone.
+        let truth = match asked.at_s.is_none() && self.logs.is_live(id) {
+            true => self.system.truth().await,
+            false => None,
+        };
+        let robot = self.robot.clone();
+        self.reading(move |logs| {
+            let known = robot.get();
+            let shown = known.as_deref().map_err(String::as_str);
+            let cell = logs.cell(id, &asked, shown)?;
+            Ok(serde_json::to_string(&wire::Cell { truth, ..cell }))
+        })
+        .await
     }
 
     /// Reads a log in a thread in which that keeps nobody waiting.

@@ -3,11 +3,14 @@
 //! It asks the daemons as every client does, no more often than once in [`FRESH`] however many pages there are, and says what is wrong
 //! where they do not answer. What somebody may see and do is theirs to decide (`docs/who-may-speak.md`).
 
-use crate::wire;
+use crate::{robot, wire};
 use futures::future::join_all;
 use ratn_daemon::{process_manager, resource_manager};
+use ratn_model::pose::Pose;
 use ratn_model::program::WORLD_MODEL;
 use ratn_proto::types::{HostPools, PoolStatus, Resource, Scale, SessionStatus, WaitingAcquire, WorkerStatus};
+use ratn_proto::v1::cell_service_client::CellServiceClient;
+use ratn_proto::v1::{GetGroundTruthRequest, TrueObject};
 use ratn_task_control::control::{self, Message, RunStatus, Word};
 use ratn_worker::client::{CallError, Channels, ProcessClient, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
@@ -21,9 +24,12 @@ use tokio::sync::Mutex;
 /// What was heard is not asked again for so long.
 const FRESH: Duration = Duration::from_millis(900);
 const RUN_FRESH: Duration = Duration::from_millis(250);
+const TRUTH_FRESH: Duration = Duration::from_millis(250);
 /// Who has not answered by then does not count.
 const PATIENCE: Duration = Duration::from_secs(3);
-/// Resources, acquires, sessions and workers that are told of.
+/// The simulated cell, by the name of its endpoint file.
+const CELL: &str = "cell";
+/// Resources, acquires, sessions, workers and things in the cell that are told of.
 const MOST: usize = 1_000;
 /// The end of what a worker has written.
 const TAIL_BYTES: usize = 16 << 10;
@@ -46,12 +52,19 @@ pub(crate) struct System {
     channels: Channels,
     seen: Mutex<Option<(Instant, wire::System)>>,
     run: Mutex<Option<Instant>>,
+    truth: Mutex<Option<(Instant, wire::Truth)>>,
 }
 
 impl System {
     /// Of what has its endpoint files here; it need not be up.
     pub(crate) fn of(directory: PathBuf, tls: &ClientTls) -> System {
-        System { directory, channels: Channels::new(tls), seen: Mutex::default(), run: Mutex::default() }
+        System {
+            directory,
+            channels: Channels::new(tls),
+            seen: Mutex::default(),
+            run: Mutex::default(),
+            truth: Mutex::default(),
+        }
     }
 
     /// Where its endpoint files are.
@@ -83,6 +96,28 @@ impl System {
         let sent = control::send(&self.directory, message).await;
         *self.run.lock().await = None;
         sent
+    }
+
+    /// Where things are, as the simulated cell knows; none where there is no such cell.
+    pub(crate) async fn truth(&self) -> Option<wire::Truth> {
+        let cell = RuntimeDirectory::at(&self.directory).find(CELL).ok()?;
+        let mut seen = self.truth.lock().await;
+        if let Some((_, truth)) = seen.as_ref().filter(|(at, _)| at.elapsed() < TRUTH_FRESH) {
+            return Some(truth.clone());
+        }
+        let asked = async {
+            let mut cell = CellServiceClient::new(self.channels.get(&cell).map_err(|error| error.to_string())?);
+            let told = cell.get_ground_truth(GetGroundTruthRequest {}).await;
+            told.map(|told| told.into_inner().objects).map_err(|status| status.message().to_owned())
+        };
+        let (objects, problem) = match tokio::time::timeout(PATIENCE, Box::pin(asked)).await {
+            Ok(Ok(objects)) => (objects.iter().take(MOST).filter_map(true_object).collect(), String::new()),
+            Ok(Err(problem)) => (Vec::new(), format!("the cell does not say where things are: {problem}")),
+            Err(_) => (Vec::new(), format!("no answer from the cell within {} s", PATIENCE.as_secs())),
+        };
+        let truth = wire::Truth { objects, problem };
+        *seen = Some((Instant::now(), truth.clone()));
+        Some(truth)
     }
 
     /// As the pages know it.
@@ -226,6 +261,13 @@ fn hosts_in(directory: &RuntimeDirectory, resources: &[Resource]) -> Vec<(String
         hosts.push((String::new(), own));
     }
     hosts
+}
+
+/// None of what has no place or no size.
+fn true_object(one: &TrueObject) -> Option<wire::Object> {
+    let pose = one.pose.as_ref().and_then(|pose| Pose::try_from(pose.clone()).ok())?;
+    let size = one.size_m.clone().try_into().ok()?;
+    Some(robot::true_object(&one.id, size, &pose, one.held))
 }
 
 fn resource(one: &Resource, expires: &BTreeMap<&str, u64>) -> wire::Resource {

@@ -581,6 +581,146 @@ wire! {
         cut: bool,
     }
 
+    /// A robot as a tree of links, to be drawn.
+    Robot {
+        /// It is known.
+        known: bool,
+        /// Its name.
+        name: String,
+        /// Whence it is known, or why it is not.
+        note: String,
+        /// Parents before children; the first one is where the world's origin is.
+        links: Vec<Link>,
+        /// The joints that have a position of their own; the links say which of them moves what.
+        joints: Vec<Joint>,
+        /// The tool of each arm, by its link; the first one carries what is held.
+        tools: Vec<usize>,
+    }
+
+    /// A rigid link.
+    Link {
+        /// Its name.
+        name: String,
+        /// The link on which it hangs.
+        parent: Option<usize>,
+        /// Where its joint sits in the parent's frame.
+        at: Place,
+        /// The joint that moves it; one that mimics another is moved by that.
+        joint: Option<usize>,
+        /// Along or about which that moves it: x, y, z.
+        axis: Vec<f64>,
+        /// Along, not about.
+        slides: bool,
+        /// How far it moves for one radian or metre of the joint.
+        factor: f64,
+        /// What of it can collide.
+        shapes: Vec<Shape>,
+    }
+
+    /// A joint.
+    Joint {
+        /// Its name.
+        name: String,
+        /// Its position is in metres, not in radians.
+        slides: bool,
+        /// Where it is taken to be before the log says something.
+        start: f64,
+    }
+
+    /// A position and a rotation.
+    Place {
+        /// x, y, z in metres.
+        position: Vec<f64>,
+        /// A unit quaternion: x, y, z, w.
+        quaternion: Vec<f64>,
+    }
+
+    /// A primitive, its axis along z.
+    Shape {
+        /// `box`, `cylinder`, `capsule` or `sphere`.
+        kind: &'static str,
+        /// Of a box its edges along x, y, z; else the radius and the length along z, of a capsule that of its straight part.
+        size: Vec<f64>,
+        /// Where its centre is.
+        at: Place,
+    }
+
+    /// The robot and the objects at a moment of a log, as the run believes them.
+    Cell {
+        /// Which fold of the log it is.
+        epoch: u64,
+        /// Up to which change it tells.
+        version: u64,
+        /// What was known before does not count any more.
+        fresh: bool,
+        /// The log is not read up to the moment yet: ask again.
+        more: bool,
+        /// The moment.
+        at_s: f64,
+        /// The log's joints are those of the robot: it is shown.
+        fits: bool,
+        /// Why the robot is not shown, or what is not known of it; empty where there is nothing to say.
+        note: String,
+        /// Where joints go, what is new or otherwise than before; a later one counts.
+        tracks: Vec<Track>,
+        /// The ids of all tracks that are still of interest, in their order.
+        kept: Vec<u64>,
+        /// Where the base of the robot is believed to stand.
+        base: Place,
+        /// The objects as they are believed to be; none where they are as before.
+        objects: Option<Vec<Object>>,
+        /// How many more there are than are told.
+        untold: usize,
+        /// The objects as they are, where the cell of a run that is under way tells it.
+        truth: Option<Truth>,
+    }
+
+    /// Where some joints are, or go.
+    Track {
+        /// Its number.
+        id: u64,
+        /// The joints, by their indices.
+        joints: Vec<usize>,
+        /// When it begins.
+        from_s: f64,
+        /// When it was over, wherever the joints were then; none while it goes on.
+        until_s: Option<f64>,
+        /// The times of its points are what is expected, not what was commanded.
+        estimated: bool,
+        /// Which state that is, by path; empty where none moves.
+        path: String,
+        /// In order. Where the first one is not at 0 it begins where the joints are.
+        points: Vec<Point>,
+    }
+
+    /// A point of a track.
+    Point {
+        /// Seconds from the start of the track.
+        after_s: f64,
+        /// A position for each joint.
+        positions: Vec<f64>,
+        /// A speed for each joint; empty where that is not said.
+        velocities: Vec<f64>,
+    }
+
+    /// An object.
+    Object {
+        /// Its name.
+        name: String,
+        /// Its form, and where it is: in the world, or, where it is held, seen from the tool.
+        shape: Shape,
+        /// The gripper holds it.
+        held: bool,
+    }
+
+    /// Objects as they are.
+    Truth {
+        /// Where they are, all in the world.
+        objects: Vec<Object>,
+        /// Why the cell does not tell; empty where it does.
+        problem: String,
+    }
+
     /// What became of what a run was told.
     Told {
         /// In a sentence.

@@ -2,7 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
-use ratn_dashboard::{Dashboard, DashboardError, MAX_LOGS, Options};
+use ratn_dashboard::{Dashboard, DashboardError, MAX_LOGS, Options, Robots};
+use ratn_motion::robot::Robot;
 use ratn_worker::tls::ClientTls;
 use serde_json::Value;
 use std::io::Write;
@@ -37,7 +38,8 @@ impl Answer {
 
 fn options(logs: &[&Path], directory: &Path) -> Options {
     let logs = logs.iter().map(|path| path.to_path_buf()).collect();
-    Options { logs, patience: PATIENCE, ..Options::of(directory.to_owned(), ClientTls::none()) }
+    let robots = Robots::by(|| Ok((Robot::aimm(), "the built-in robot".to_owned())));
+    Options { logs, robots, patience: PATIENCE, ..Options::of(directory.to_owned(), ClientTls::none()) }
 }
 
 async fn serve(logs: &[&Path], control: bool) -> Served {
@@ -134,7 +136,7 @@ fn visit(id: u64) -> [String; 4] {
 #[tokio::test]
 async fn pages_run_nothing_of_others_and_are_had_by_this_machines_names_only() {
     let served = serve(&[&two_boxes()], false).await;
-    for path in ["/", "/app.js", "/app.css", "/icon.svg"] {
+    for path in ["/", "/app.js", "/cell.js", "/app.css", "/icon.svg"] {
         let page = served.get(path).await;
         assert_eq!(page.status, 200, "{path}");
         assert!(page.head.contains("content-security-policy: default-src 'none'; script-src 'self'"), "{}", page.head);
@@ -155,6 +157,8 @@ async fn nothing_is_told_without_the_token_nor_to_pages_of_others() {
     for (method, path) in [
         ("GET", "/api/about"),
         ("GET", "/api/run?log=1"),
+        ("GET", "/api/robot"),
+        ("GET", "/api/cell?log=1"),
         ("GET", "/api/system"),
         ("POST", "/api/control?log=1&word=abort"),
     ] {
@@ -237,6 +241,64 @@ async fn a_moment_is_shown_as_it_was_then_and_goes_on_from_there() {
     assert_eq!((at(&back), back["fresh"].as_bool()), ((2.0, 2), Some(true)));
     // The newest is another fold, which no replay disturbs.
     assert_eq!(at(served.frames(&format!("log={log}")).await.last().unwrap()), (20.5, 20));
+}
+
+/// A motion of a joint of the arm from second `id` on, which lasts half of one.
+fn motion(id: u64) -> [String; 2] {
+    let (at, then) = (id * 1_000_000_000, id * 1_000_000_000 + 500_000_000);
+    [
+        format!(
+            r#"{{"at":{at},"command":"start","instance":{id},"attempt":1,"goal":{{"provider":"arm","action":"follow","inputs":{{"trajectory":{{"trajectory":{{"joints":["arm_joint_1"],"points":[{{"time_s":0.0,"positions":[0.0],"velocities":[0.0]}},{{"time_s":0.5,"positions":[1.0],"velocities":[0.0]}}]}}}}}},"seed":1,"lease":null,"projection":null,"expected_s":null}}}}"#
+        ),
+        format!(
+            r#"{{"at":{then},"event":"finished","instance":{id},"attempt":1,"outcome":"success","outputs":{{"end":{{"joints":[1.0]}}}},"measured":[],"reason":""}}"#
+        ),
+    ]
+}
+
+#[tokio::test]
+async fn the_robot_is_told_once_and_where_its_joints_go_as_far_as_a_moment() {
+    let lines: Vec<String> = [vec![started("moves")], (1..=5).flat_map(motion).collect()].concat();
+    let file = log_of(&lines);
+    let served = serve(&[file.path()], false).await;
+    let log = served.log().await;
+    let robot = served.get("/api/robot").await.json();
+    assert_eq!((&robot["known"], &robot["name"]), (&Value::from(true), &Value::from("aimm")));
+    let joint = robot["joints"].as_array().unwrap().iter().position(|one| one["name"] == "arm_joint_1").unwrap();
+    let tracks = |cell: &Value| cell["tracks"].as_array().unwrap().len();
+    let then = served.get(&format!("/api/cell?log={log}&at=2.25")).await.json();
+    // The first motion, where it ended, and the second one, which goes on.
+    assert_eq!((tracks(&then), then["at_s"].as_f64(), then["fits"].as_bool()), (3, Some(2.25), Some(true)));
+    let last = &then["tracks"][2];
+    assert_eq!((&last["joints"][0], &last["until_s"]), (&Value::from(joint), &Value::Null));
+    assert_eq!(last["points"][1]["positions"][0].as_f64(), Some(1.0));
+    // What goes on from there is told, and nothing else; it is the fold that the run's page has.
+    let (epoch, version) = (&then["epoch"], &then["version"]);
+    let on = served.get(&format!("/api/cell?log={log}&at=3.25&epoch={epoch}&version={version}")).await.json();
+    assert_eq!((tracks(&on), on["fresh"].as_bool(), on["kept"].as_array().unwrap().len()), (3, Some(false), 5));
+    let run = served.get(&format!("/api/run?log={log}&at=3.25&epoch={epoch}&version=0")).await.json();
+    assert_eq!(run["epoch"], *epoch);
+    assert_eq!(served.get(&format!("/api/cell?log={log}&at=soon")).await.status, 400);
+    assert_eq!(served.get("/api/cell?log=99").await.status, 404);
+    assert_eq!(served.ask("POST", &format!("/api/cell?log={log}")).await.status, 405);
+}
+
+#[tokio::test]
+async fn without_a_robot_the_objects_are_told_and_why_it_is_not() {
+    let place = tempfile::tempdir().unwrap();
+    let world = r#"[[{"predicate":"shape","arguments":["box"]},{"map":{"type":{"string":"box"},"size":{"list":[{"float":0.1},{"float":0.2},{"float":0.3}]}}}],[{"predicate":"at","arguments":["box"]},{"pose":{"position":[1.0,0.0,0.5],"quaternion_xyzw":[0.0,0.0,0.0,1.0]}}]]"#;
+    let file = log_of(&[started("seen").replace(r#""world":[]"#, &format!(r#""world":{world}"#))]);
+    let robots = Robots::by(|| Err("the robot `mine` is not known".to_owned()));
+    let dashboard = Dashboard::bind(Options { robots, ..options(&[file.path()], place.path()) }).await.unwrap();
+    let url = dashboard.url();
+    let (address, token) = url.strip_prefix("http://").unwrap().split_once("/#token=").unwrap();
+    let served = Served { address: address.to_owned(), token: token.to_owned(), _place: place };
+    tokio::spawn(dashboard.serve());
+    assert_eq!(served.get("/api/robot").await.json()["known"], false);
+    let log = served.log().await;
+    let cell = served.get(&format!("/api/cell?log={log}")).await.json();
+    assert_eq!((&cell["fits"], &cell["note"]), (&Value::from(false), &Value::from("the robot `mine` is not known")));
+    assert_eq!((&cell["objects"][0]["name"], &cell["truth"]), (&Value::from("box"), &Value::Null));
 }
 
 #[tokio::test]

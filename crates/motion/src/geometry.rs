@@ -43,7 +43,7 @@ pub enum Geometry {
 
 impl Body {
     /// Its pose with the axis along z, for cylinders too.
-    pub(crate) fn upright(&self) -> Pose {
+    pub fn upright(&self) -> Pose {
         self.pose.compose(&self.geometry.turn().inverse())
     }
 }

@@ -391,7 +391,7 @@ impl Robot {
     }
 
     /// Positions of the model's joints.
-    fn positions(&self, configuration: &Configuration) -> Vec<f64> {
+    pub fn positions(&self, configuration: &Configuration) -> Vec<f64> {
         let mut positions = self.neutral.clone();
         let Configuration { base, arm, pan, tilt, finger, others } = configuration;
         let mut put = |part: Option<&Part>, values: &[f64]| {

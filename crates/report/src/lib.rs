@@ -2,11 +2,13 @@
 //!
 //! It owns the fold of a log's lines into what each instance did when and why ([`timeline`]), the figures made of that ([`statistics`]),
 //! what the run waited for ([`critical`], [`waiting`]), what several runs have in common ([`report`]) and the chart drawn of them
-//! ([`gantt`]). It needs no task file, no system that runs and no network, and prints nothing: the same
+//! ([`gantt`]); which motions there were ([`motions`]) and what the world was believed to be ([`believed`]). It needs no task file, no system that runs and no network, and prints nothing: the same
 //! lines give the same bytes. Reading the lines from a file is `ratn_event_log`'s.
 
+pub mod believed;
 pub mod critical;
 pub mod gantt;
+pub mod motions;
 pub mod report;
 pub mod statistics;
 pub mod timeline;

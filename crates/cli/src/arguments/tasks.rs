@@ -230,6 +230,9 @@ pub(crate) struct DashboardArguments {
     /// Let the pages pause a run, let it step and go on, and end it; without it they only look
     #[arg(long)]
     pub(crate) control: bool,
+    /// The robot of the logs: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml; the system's unless given
+    #[arg(long, value_name = "ROBOT")]
+    pub(crate) robot: Option<String>,
     /// Where pages are served: an address of this machine alone, with port 0 at one that is free
     #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:0")]
     pub(crate) listen: SocketAddr,

@@ -7,11 +7,12 @@ use crate::interrupt::Interrupt;
 use crate::system::config::SystemConfig;
 use crate::system::{CONFIG_FILE, public_directory};
 use crate::{input, output};
-use ratn_dashboard::{Dashboard, DashboardError, Options, Tasks};
+use ratn_dashboard::{Dashboard, DashboardError, Options, Robots, Tasks};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::load::load_with;
+use ratn_motion::robot::Robot;
 use ratn_worker::tls::ClientTls;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Serves the pages until the user has seen enough.
 pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(), Failure> {
@@ -21,6 +22,7 @@ pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(),
         logs: arguments.logs.clone(),
         control: arguments.control,
         tasks: tasks(catalogue(&directory)?),
+        robots: robots(directory.clone(), arguments.robot.clone()),
         ..Options::of(directory, tls.clone())
     };
     blocking(async {
@@ -40,7 +42,8 @@ pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(),
 /// The pages of a system that is up, to look at only; the address is said.
 pub(super) async fn of_system(directory: &Path, tls: &ClientTls) -> anyhow::Result<Dashboard> {
     let catalogue = catalogue(directory).map_err(|failure| anyhow::anyhow!("{failure}"))?;
-    let options = Options { tasks: tasks(catalogue), ..Options::of(directory.to_owned(), tls.clone()) };
+    let (tasks, robots) = (tasks(catalogue), robots(directory.to_owned(), None));
+    let options = Options { tasks, robots, ..Options::of(directory.to_owned(), tls.clone()) };
     let dashboard = Dashboard::bind(options).await?;
     output::progress(format_args!("its dashboard is at {}", dashboard.url()));
     Ok(dashboard)
@@ -51,6 +54,21 @@ fn catalogue(directory: &Path) -> Result<Catalogue, Failure> {
     let file = directory.join(CONFIG_FILE);
     let own = SystemConfig::read(&file).ok();
     Ok(own.map_or_else(|| SystemConfig::load(None), Ok)?.catalogue)
+}
+
+/// The robot that the user names, else that of the system that runs, or ran, in a directory, else the one that is built in. A log does not say
+/// which one it is of; what it moves is held against the robot.
+fn robots(directory: PathBuf, named: Option<String>) -> Robots {
+    Robots::by(move || {
+        let own = SystemConfig::read(&directory.join(CONFIG_FILE)).ok().map(|config| config.robot);
+        let (robot, whence) = match (&named, own) {
+            (Some(named), _) => (named.clone(), "as --robot says".to_owned()),
+            (None, Some(own)) => (own, format!("the robot of the system in {}", directory.display())),
+            (None, None) => (SystemConfig::default().robot, "the built-in robot: --robot names another one".to_owned()),
+        };
+        let read = Robot::named_or_file(&robot);
+        read.map(|read| (read, whence)).map_err(|error| format!("the robot {robot} is not known: {error}"))
+    })
 }
 
 /// Task files are read again whenever somebody asks: they are small, and may have been put back.

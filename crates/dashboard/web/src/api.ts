@@ -1,6 +1,6 @@
 // What the pages ask the program that served them.
 
-import type { About, Frame, System, Tail, Task, Told, World } from "./wire";
+import type { About, Cell, Frame, Robot, System, Tail, Task, Told, World } from "./wire";
 
 const TOKEN = "ratn-token";
 
@@ -45,6 +45,8 @@ export const api = {
     ask<Frame>("run", { log, at, epoch, version, about }),
   task: (log: number) => ask<Task>("task", { log }),
   world: (log: number, at: number | null, epoch: number, filter: string) => ask<World>("world", { log, at, epoch, filter }),
+  robot: () => ask<Robot>("robot", {}),
+  cell: (log: number, at: number | null, epoch: number, version: number) => ask<Cell>("cell", { log, at, epoch, version }),
   system: () => ask<System>("system", {}),
   tail: (worker: string) => ask<Tail>("tail", { worker }),
   scale: (host: string, template: string, min: string, max: string, spares: string) =>

@@ -3,15 +3,15 @@
 import { Refused, api, takeToken } from "./api";
 import { confirm } from "./confirm";
 import { count, fill, h, seconds } from "./dom";
-import { type Page, type Site, comparePage, hostsPage, networkPage, resourcesPage, runPage, worldPage } from "./pages";
+import { type Page, type Site, cellPage, comparePage, hostsPage, networkPage, resourcesPage, runPage, worldPage } from "./pages";
 import { Store } from "./store";
-import { applyTheme, nextTheme, theme } from "./theme";
+import { applyTheme, colour, nextTheme, theme } from "./theme";
 import type { About, Awaits, Run, Told } from "./wire";
 
 const PERIOD_MS = 300;
 const SLOW_MS = 1_000;
 const SPEEDS = [0.5, 1, 2, 5, 10, 50, 200];
-const NAMES = { run: "Run", network: "Network", resources: "Resources", hosts: "Hosts and pools", world: "World", compare: "Compare" } as const;
+const NAMES = { run: "Run", network: "Network", resources: "Resources", hosts: "Hosts and pools", world: "World", cell: "Cell", compare: "Compare" } as const;
 type Name = keyof typeof NAMES;
 
 takeToken();
@@ -35,6 +35,8 @@ const site: Site = {
   controls: () => about?.control ?? false,
   told,
   moment: () => moment,
+  plays: () => playing !== null,
+  colour,
   choose: (id) => {
     store.selected = id < 0 ? null : id;
     page.update();
@@ -51,6 +53,7 @@ const pages: Record<Name, Page> = {
   resources: resourcesPage(site),
   hosts: hostsPage(site),
   world: worldPage(site),
+  cell: cellPage(site),
   compare: comparePage(site),
 };
 page = pages.run;
@@ -345,6 +348,7 @@ async function look(): Promise<boolean> {
   showSummary(frame.run);
   showSlider(frame.run);
   page.update();
+  await page.follow?.();
   return frame.more;
 }
 

@@ -1,6 +1,7 @@
 // The pages. Each has an element that is made once, and is told when something has changed.
 
 import { Refused, api } from "./api";
+import type { CellView } from "./cell";
 import { confirm } from "./confirm";
 import { details, waitingList } from "./details";
 import { append, bytes, count, fill, h, percent, sample, seconds, table } from "./dom";
@@ -19,6 +20,8 @@ export interface Page {
   begin(): void;
   /** Asks for what the run does not tell; no more often than once a second. */
   poll?(): Promise<void>;
+  /** As `poll`, but each time that the run was asked. */
+  follow?(): Promise<void>;
 }
 
 /** What the pages want of the whole. */
@@ -31,6 +34,10 @@ export interface Site {
   /** Says what came of it. */
   told(answer: Promise<Told>): void;
   moment(): number | null;
+  /** A replay goes on. */
+  plays(): boolean;
+  /** A colour of the style sheet. */
+  colour(name: string): string;
   choose(id: number): void;
   go(page: string): void;
 }
@@ -469,5 +476,25 @@ export function worldPage(site: Site): Page {
     begin: () => undefined,
     update: () => undefined,
     poll: ask,
+  };
+}
+
+/** What only this page needs, from a file of its own. */
+const CELL = "/cell.js";
+
+export function cellPage(site: Site): Page {
+  const element = h("main", { id: "page", class: "wide", tabindex: -1 });
+  let view: Promise<CellView> | null = null;
+  const load = async () => {
+    const { CellView } = (await import(CELL)) as typeof import("./cell");
+    return new CellView(element, site);
+  };
+  const shown = () => (view ??= load());
+  return {
+    element,
+    wide: true,
+    begin: () => void shown().then((view) => view.begin(), () => (view = null)),
+    update: () => void view?.then((view) => view.repaint(), () => undefined),
+    follow: async () => (await shown()).follow(),
   };
 }

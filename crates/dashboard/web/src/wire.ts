@@ -506,6 +506,146 @@ export interface Tail {
   cut: boolean;
 }
 
+/** A robot as a tree of links, to be drawn. */
+export interface Robot {
+  /** It is known. */
+  known: boolean;
+  /** Its name. */
+  name: string;
+  /** Whence it is known, or why it is not. */
+  note: string;
+  /** Parents before children; the first one is where the world's origin is. */
+  links: Link[];
+  /** The joints that have a position of their own; the links say which of them moves what. */
+  joints: Joint[];
+  /** The tool of each arm, by its link; the first one carries what is held. */
+  tools: number[];
+}
+
+/** A rigid link. */
+export interface Link {
+  /** Its name. */
+  name: string;
+  /** The link on which it hangs. */
+  parent: number | null;
+  /** Where its joint sits in the parent's frame. */
+  at: Place;
+  /** The joint that moves it; one that mimics another is moved by that. */
+  joint: number | null;
+  /** Along or about which that moves it: x, y, z. */
+  axis: number[];
+  /** Along, not about. */
+  slides: boolean;
+  /** How far it moves for one radian or metre of the joint. */
+  factor: number;
+  /** What of it can collide. */
+  shapes: Shape[];
+}
+
+/** A joint. */
+export interface Joint {
+  /** Its name. */
+  name: string;
+  /** Its position is in metres, not in radians. */
+  slides: boolean;
+  /** Where it is taken to be before the log says something. */
+  start: number;
+}
+
+/** A position and a rotation. */
+export interface Place {
+  /** x, y, z in metres. */
+  position: number[];
+  /** A unit quaternion: x, y, z, w. */
+  quaternion: number[];
+}
+
+/** A primitive, its axis along z. */
+export interface Shape {
+  /** `box`, `cylinder`, `capsule` or `sphere`. */
+  kind: string;
+  /** Of a box its edges along x, y, z; else the radius and the length along z, of a capsule that of its straight part. */
+  size: number[];
+  /** Where its centre is. */
+  at: Place;
+}
+
+/** The robot and the objects at a moment of a log, as the run believes them. */
+export interface Cell {
+  /** Which fold of the log it is. */
+  epoch: number;
+  /** Up to which change it tells. */
+  version: number;
+  /** What was known before does not count any more. */
+  fresh: boolean;
+  /** The log is not read up to the moment yet: ask again. */
+  more: boolean;
+  /** The moment. */
+  at_s: number;
+  /** The log's joints are those of the robot: it is shown. */
+  fits: boolean;
+  /** Why the robot is not shown, or what is not known of it; empty where there is nothing to say. */
+  note: string;
+  /** Where joints go, what is new or otherwise than before; a later one counts. */
+  tracks: Track[];
+  /** The ids of all tracks that are still of interest, in their order. */
+  kept: number[];
+  /** Where the base of the robot is believed to stand. */
+  base: Place;
+  /** The objects as they are believed to be; none where they are as before. */
+  objects: Object[] | null;
+  /** How many more there are than are told. */
+  untold: number;
+  /** The objects as they are, where the cell of a run that is under way tells it. */
+  truth: Truth | null;
+}
+
+/** Where some joints are, or go. */
+export interface Track {
+  /** Its number. */
+  id: number;
+  /** The joints, by their indices. */
+  joints: number[];
+  /** When it begins. */
+  from_s: number;
+  /** When it was over, wherever the joints were then; none while it goes on. */
+  until_s: number | null;
+  /** The times of its points are what is expected, not what was commanded. */
+  estimated: boolean;
+  /** Which state that is, by path; empty where none moves. */
+  path: string;
+  /** In order. Where the first one is not at 0 it begins where the joints are. */
+  points: Point[];
+}
+
+/** A point of a track. */
+export interface Point {
+  /** Seconds from the start of the track. */
+  after_s: number;
+  /** A position for each joint. */
+  positions: number[];
+  /** A speed for each joint; empty where that is not said. */
+  velocities: number[];
+}
+
+/** An object. */
+export interface Object {
+  /** Its name. */
+  name: string;
+  /** Its form, and where it is: in the world, or, where it is held, seen from the tool. */
+  shape: Shape;
+  /** The gripper holds it. */
+  held: boolean;
+}
+
+/** Objects as they are. */
+export interface Truth {
+  /** Where they are, all in the world. */
+  objects: Object[];
+  /** Why the cell does not tell; empty where it does. */
+  problem: string;
+}
+
 /** What became of what a run was told. */
 export interface Told {
   /** In a sentence. */

@@ -17,7 +17,7 @@ use prost_types::Timestamp;
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Note};
 use ratn_model::program::SUCCESS;
 use ratn_report::timeline::{Changed, Timeline};
-use scene::Believed;
+use scene::Shown;
 use std::io::{self, Write};
 
 /// Whatever else a line of an event log says, it is one object.
@@ -28,7 +28,7 @@ pub(crate) struct Mcap<W> {
     /// None until the first line.
     file: Option<(File<W>, Topics)>,
     out: Option<W>,
-    believed: Believed,
+    believed: Shown,
     joints: Joints,
 }
 
@@ -43,7 +43,7 @@ struct Topics {
 
 impl<W: Write> Mcap<W> {
     pub(crate) fn new(out: W) -> Mcap<W> {
-        Mcap { file: None, out: Some(out), believed: Believed::default(), joints: Joints::default() }
+        Mcap { file: None, out: Some(out), believed: Shown::default(), joints: Joints::default() }
     }
 
     fn file(&mut self) -> io::Result<(&mut File<W>, Topics)> {

@@ -1,13 +1,13 @@
-//! The objects as the task believes them: the facts of the log as a world, and the scene that follows from it.
+//! The objects as the task believes them, as a viewer draws them.
 
 use crate::wire::foxglove::{
     Color, CubePrimitive, CylinderPrimitive, FrameTransform, FrameTransforms, Pose, Quaternion, SceneEntity,
     SceneEntityDeletion, SceneUpdate, Vector3,
 };
 use prost_types::Timestamp;
-use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
+use ratn_executive::protocol::LogLine;
+use ratn_report::believed::Believed;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
-use ratn_world::world::World;
 
 /// Frames: of the world, of the robot's base, and of what the gripper holds.
 const WORLD: &str = "world";
@@ -19,49 +19,37 @@ const BLUE: Color = Color { r: 0.25, g: 0.5, b: 0.85, a: 1.0 };
 /// What has an edge as long as this is furniture.
 const FURNITURE_M: f64 = 0.5;
 
-/// The root world, and what was shown of it.
+/// What was shown of the world as the run believes it.
 #[derive(Debug, Default)]
-pub(super) struct Believed {
-    world: World,
-    shown: Option<Scene>,
+pub(super) struct Shown {
+    believed: Believed,
+    scene: Option<Scene>,
 }
 
-impl Believed {
+impl Shown {
     /// Whether a line says something of the root world.
     pub(super) fn follow(&mut self, line: &LogLine) -> bool {
-        match &line.entry {
-            LogEntry::Event(Event::Started { world, .. }) => {
-                self.world.overwrite(world.iter().map(|(fact, value)| (fact.clone(), Some(value.clone()))));
-                !world.is_empty()
-            }
-            LogEntry::Event(Event::WorldChanged { facts, .. }) => {
-                self.world.overwrite(facts.iter().cloned());
-                true
-            }
-            // The run has made the same changes. What does not fit here is left out, and what is known is shown.
-            LogEntry::Command(Command::Commit { changes, .. }) => self.world.apply(changes).is_ok(),
-            _ => false,
-        }
+        self.believed.follow(line)
     }
 
     /// What is otherwise than was shown. A world that makes no scene, because a fact has another form, shows nothing new.
     pub(super) fn update(&mut self, at: Timestamp) -> Option<SceneUpdate> {
-        let scene = Scene::of(&self.world).ok()?;
-        let before = self.shown.as_ref().map_or(&[][..], |shown| &shown.objects);
+        let scene = self.believed.scene()?;
+        let before = self.scene.as_ref().map_or(&[][..], |shown| &shown.objects);
         let gone = before.iter().filter(|old| !scene.objects.iter().any(|new| new.name == old.name));
         let changed = scene.objects.iter().filter(|new| !before.contains(new));
         let deletions: Vec<SceneEntityDeletion> =
             gone.map(|old| SceneEntityDeletion { timestamp: Some(at), r#type: 0, id: old.name.clone() }).collect();
         let entities: Vec<SceneEntity> = changed.map(|object| entity(object, at)).collect();
-        let is_new = self.shown.as_ref().is_none_or(|shown| shown.base != scene.base);
-        self.shown = Some(scene);
+        let is_new = self.scene.as_ref().is_none_or(|shown| shown.base != scene.base);
+        self.scene = Some(scene);
         let update = SceneUpdate { deletions, entities };
         (is_new || !update.deletions.is_empty() || !update.entities.is_empty()).then_some(update)
     }
 
     /// Where the base stands.
     pub(super) fn base(&self, at: Timestamp) -> Option<FrameTransforms> {
-        let base = self.shown.as_ref()?.base;
+        let base = self.scene.as_ref()?.base;
         Some(FrameTransforms {
             transforms: vec![FrameTransform {
                 timestamp: Some(at),

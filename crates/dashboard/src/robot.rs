@@ -1,0 +1,379 @@
+//! A robot as the pages draw it: its links, its joints, and which of those an arm, a head, fingers or a base are. Pure.
+
+use crate::film::{Film, Part, Track};
+use crate::wire;
+use ratn_model::id::InstanceId;
+use ratn_model::pose::Pose;
+use ratn_motion::geometry::{Body, Geometry};
+use ratn_motion::robot::{Configuration, Robot};
+use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// A robot with more links, joints or shapes is not shown.
+const MOST_LINKS: usize = 512;
+const MOST_SHAPES: usize = 4_096;
+/// Objects that are told.
+const MOST_OBJECTS: usize = 400;
+/// A longer name is cut.
+const MOST_CHARACTERS: usize = 200;
+/// The posture in which a cell begins.
+const HOME: &str = "home";
+
+/// How the robot of the logs is known: the robot, and whence, or why it is not known. It may read files.
+#[derive(Clone)]
+pub struct Robots(Arc<Load>);
+
+type Load = dyn Fn() -> Result<(Robot, String), String> + Send + Sync;
+
+impl Robots {
+    /// Loads it so. Beside the robot stands whence it is known, in a few words.
+    pub fn by(load: impl Fn() -> Result<(Robot, String), String> + Send + Sync + 'static) -> Robots {
+        Robots(Arc::new(load))
+    }
+
+    /// None is known.
+    pub fn none() -> Robots {
+        Robots::by(|| Err("no robot was named".to_owned()))
+    }
+
+    pub(crate) fn load(&self) -> Result<Shown, String> {
+        (self.0)().and_then(|(robot, whence)| Shown::of(&robot, whence))
+    }
+}
+
+impl std::fmt::Debug for Robots {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Robots(…)")
+    }
+}
+
+/// A robot that is shown.
+#[derive(Debug)]
+pub(crate) struct Shown {
+    told: wire::Robot,
+    joints: BTreeMap<String, usize>,
+    arms: Vec<Arm>,
+    head: Vec<usize>,
+    base: Vec<usize>,
+}
+
+#[derive(Debug)]
+struct Arm {
+    name: String,
+    joints: Vec<usize>,
+    /// The joint of its fingers, and where they are open.
+    fingers: Option<(usize, f64)>,
+}
+
+impl Shown {
+    fn of(robot: &Robot, whence: String) -> Result<Shown, String> {
+        let model = &robot.model;
+        let shapes: usize = model.links.iter().map(|link| link.bodies.len()).sum();
+        if model.links.len() > MOST_LINKS || model.joints.len() > MOST_LINKS || shapes > MOST_SHAPES {
+            return Err(format!(
+                "{} has {} links and {shapes} shapes: at most {MOST_LINKS} and {MOST_SHAPES} are shown",
+                robot.name(),
+                model.links.len()
+            ));
+        }
+        let joints: BTreeMap<String, usize> =
+            model.joints.iter().enumerate().map(|(index, joint)| (joint.name.clone(), index)).collect();
+        let indices =
+            |of: &[ratn_motion::robot::Joint]| of.iter().filter_map(|joint| joints.get(&joint.name).copied()).collect();
+        let (mut arms, mut tools) = (Vec::new(), Vec::new());
+        for name in robot.arm_names() {
+            let view = robot.with_arm(name).map_err(|error| error.to_string())?;
+            let fingers = view.finger().and_then(|joint| Some((*joints.get(&joint.name)?, view.open_finger_m())));
+            arms.push(Arm { name: name.to_owned(), joints: indices(view.arm_joints()), fingers });
+            tools.push(view.tool);
+        }
+        let at_zero = robot.at_zero();
+        let arm = robot.posture(HOME).unwrap_or(at_zero.arm);
+        let start = robot.positions(&Configuration { arm, finger: robot.open_finger_m(), ..at_zero });
+        let slides = |index: usize| {
+            model.links.iter().filter_map(|link| link.drive).any(|drive| drive.joint == index && drive.slides)
+        };
+        let told = wire::Robot {
+            known: true,
+            name: robot.name().to_owned(),
+            note: whence,
+            links: model.links.iter().map(link).collect(),
+            joints: (model.joints.iter().enumerate())
+                .map(|(index, joint)| wire::Joint {
+                    name: joint.name.clone(),
+                    slides: slides(index),
+                    start: round(start[index]),
+                })
+                .collect(),
+            tools,
+        };
+        Ok(Shown { told, arms, head: indices(robot.head_joints()), base: indices(robot.base_joints()), joints })
+    }
+
+    /// As the pages know it.
+    pub(crate) fn told(&self) -> wire::Robot {
+        self.told.clone()
+    }
+
+    /// Why a log is of another robot.
+    fn may_be_of(&self, film: &Film) -> Result<(), String> {
+        let name = &self.told.name;
+        match (film.drives(), self.base.is_empty()) {
+            (Some(false), false) => Err(format!("{name} has a base that drives, and the system of the run had none")),
+            (Some(true), true) => Err(format!("the system of the run had a base that drives, and {name} has none")),
+            _ => film.tracks().try_for_each(|track| self.joints_of(&track.part).map(drop)),
+        }
+    }
+
+    /// The joints of a part, or why it is not one of this robot.
+    fn joints_of(&self, part: &Part) -> Result<Vec<usize>, String> {
+        let name = &self.told.name;
+        match part {
+            Part::Named(names) => names
+                .iter()
+                .map(|joint| {
+                    self.joints.get(joint).copied().ok_or_else(|| format!("{name} has no joint `{}`", cut(joint)))
+                })
+                .collect(),
+            Part::Arm(arm) => Ok(self.arm(arm.as_deref())?.joints.clone()),
+            Part::Fingers(arm) => {
+                Ok(self.arm(arm.as_deref())?.fingers.map(|(joint, _)| vec![joint]).unwrap_or_default())
+            }
+            // What it does not have, the log may have from somewhere else.
+            Part::Head => Ok(self.head.clone()),
+            Part::Base => Ok(self.base.clone()),
+        }
+    }
+
+    /// A robot with one arm takes every name for it.
+    fn arm(&self, name: Option<&str>) -> Result<&Arm, String> {
+        let found = match (name, self.arms.as_slice()) {
+            (_, [only]) => Some(only),
+            (Some(name), arms) => arms.iter().find(|arm| arm.name == name),
+            (None, arms) => arms.first(),
+        };
+        found.ok_or_else(|| format!("{} has no arm `{}`", self.told.name, cut(name.unwrap_or_default())))
+    }
+
+    fn track(&self, track: &Track, path: String) -> Result<wire::Track, String> {
+        let joints = self.joints_of(&track.part)?;
+        let mut points: Vec<wire::Point> = track.points.iter().map(point).collect();
+        if let (Part::Fingers(arm), [open]) = (&track.part, points.as_mut_slice())
+            && open.positions.is_empty()
+        {
+            open.positions.extend(self.arm(arm.as_deref())?.fingers.map(|(_, open_m)| open_m));
+        }
+        if !joints.is_empty()
+            && let Some(other) = points.iter().find(|point| point.positions.len() != joints.len())
+        {
+            let (has, name) = (other.positions.len(), &self.told.name);
+            return Err(format!("the log has positions for {has} joints where {name} has {}", joints.len()));
+        }
+        let (id, from_s, until_s, estimated) = (track.id, track.from_s, track.until_s, track.estimated);
+        Ok(wire::Track { id, joints, from_s, until_s, estimated, path, points })
+    }
+}
+
+/// A robot that is not known.
+pub(crate) fn unknown(note: String) -> wire::Robot {
+    wire::Robot { note, ..wire::Robot::default() }
+}
+
+/// The cell as the pages know it, from a version on.
+pub(crate) fn cell(
+    film: &Film,
+    version: u64,
+    robot: Result<&Shown, &str>,
+    path: impl Fn(InstanceId) -> String,
+) -> wire::Cell {
+    let version = if version > film.version() { 0 } else { version };
+    let track =
+        |shown: &Shown, track: &Track| shown.track(track, track.instance.map_or_else(String::new, |id| cut(&path(id))));
+    // A log that moves what the robot does not have is of another one, whenever it does.
+    let (fits, note, tracks) = match robot {
+        Err(note) => (false, note.to_owned(), Vec::new()),
+        Ok(shown) => match shown.may_be_of(film) {
+            Err(note) => (false, note, Vec::new()),
+            Ok(()) => match film.since(version).map(|one| track(shown, one)).collect::<Result<Vec<_>, String>>() {
+                Ok(tracks) => (true, String::new(), tracks),
+                Err(note) => (false, note, Vec::new()),
+            },
+        },
+    };
+    let scene = film.scene(version);
+    let of = |scene: &Option<Scene>| scene.as_ref().map_or(0, |scene| scene.objects.len());
+    let untold = scene.as_ref().map_or(0, of).saturating_sub(MOST_OBJECTS);
+    let note = match &scene {
+        Some(None) if note.is_empty() => "the facts of the log make no scene: objects are not shown".to_owned(),
+        _ => note,
+    };
+    wire::Cell {
+        version: film.version(),
+        fresh: version == 0,
+        fits,
+        note,
+        tracks,
+        kept: film.tracks().map(|track| track.id).collect(),
+        base: place(&film.base()),
+        objects: scene.map(|scene| scene.map_or_else(Vec::new, |scene| objects(&scene))),
+        untold,
+        ..wire::Cell::default()
+    }
+}
+
+fn objects(scene: &Scene) -> Vec<wire::Object> {
+    let told = |object: &SceneObject| {
+        let (pose, held) = match object.placement {
+            Placement::World(pose) => (pose, false),
+            Placement::Gripper(pose) => (pose, true),
+        };
+        let (kind, size) = match object.shape {
+            Shape::Box { size } => ("box", size.to_vec()),
+            Shape::Cylinder { radius, length } => ("cylinder", vec![radius, length]),
+        };
+        wire::Object { name: cut(&object.name), shape: shape(kind, &size, &pose), held }
+    };
+    scene.objects.iter().take(MOST_OBJECTS).map(told).collect()
+}
+
+/// What the cell says of a thing: its bounding box.
+pub(crate) fn true_object(name: &str, size: [f64; 3], pose: &Pose, held: bool) -> wire::Object {
+    wire::Object { name: cut(name), shape: shape("box", &size, pose), held }
+}
+
+fn link(link: &ratn_motion::robot::Link) -> wire::Link {
+    wire::Link {
+        name: link.name.clone(),
+        parent: link.parent,
+        at: place(&link.origin),
+        joint: link.drive.map(|drive| drive.joint),
+        axis: link.drive.map_or_else(|| vec![0.0, 0.0, 1.0], |drive| drive.axis.map(round).to_vec()),
+        slides: link.drive.is_some_and(|drive| drive.slides),
+        factor: link.drive.map_or(1.0, |drive| drive.factor),
+        shapes: link.bodies.iter().map(body).collect(),
+    }
+}
+
+fn body(body: &Body) -> wire::Shape {
+    let (kind, size) = match body.geometry {
+        Geometry::Box { half } => ("box", half.map(|half| 2.0 * half).to_vec()),
+        Geometry::Cylinder { radius, half_length } => ("cylinder", vec![radius, 2.0 * half_length]),
+        Geometry::Capsule { radius, half_length } => ("capsule", vec![radius, 2.0 * half_length]),
+        Geometry::Sphere { radius } => ("sphere", vec![radius, 0.0]),
+    };
+    shape(kind, &size, &body.upright())
+}
+
+fn shape(kind: &'static str, size: &[f64], at: &Pose) -> wire::Shape {
+    wire::Shape { kind, size: size.iter().copied().map(round).collect(), at: place(at) }
+}
+
+fn place(pose: &Pose) -> wire::Place {
+    wire::Place { position: pose.position.map(round).to_vec(), quaternion: pose.quaternion_xyzw.map(round).to_vec() }
+}
+
+fn point(point: &ratn_model::value::TrajectoryPoint) -> wire::Point {
+    let rounded = |values: &[f64]| values.iter().copied().map(round).collect();
+    // Speeds of another number than there are joints say nothing.
+    let velocities =
+        if point.velocities.len() == point.positions.len() { rounded(&point.velocities) } else { Vec::new() };
+    wire::Point { after_s: point.time_s, positions: rounded(&point.positions), velocities }
+}
+
+/// To a micrometre, or a millionth of a radian: shorter to tell, and nobody sees it.
+fn round(value: f64) -> f64 {
+    let rounded = (value * 1e6).round() / 1e6;
+    if rounded == 0.0 { 0.0 } else { rounded }
+}
+
+fn cut(text: &str) -> String {
+    text.chars().take(MOST_CHARACTERS).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    fn shown(name: &str) -> Shown {
+        Shown::of(&Robot::built_in(name).unwrap(), "the test".to_owned()).unwrap()
+    }
+
+    fn film(lines: &[&str]) -> Film {
+        let mut film = Film::default();
+        lines.iter().for_each(|line| film.apply(&serde_json::from_str(line).unwrap()));
+        film
+    }
+
+    const MOVE_TO: &str = r#"{"at":1000000000,"command":"start","instance":1,"attempt":1,"goal":{"provider":"arm","action":"move_to","inputs":{"joints":{"joints":[0.1,0.2,0.3,0.4,0.5,0.6,0.7]}},"seed":1,"lease":{"id":1,"token":1,"resources":[{"id":"arm@sim","kind":"Arm","endpoint":""}]},"projection":null,"expected_s":4.0}}"#;
+    const GRASPED: [&str; 2] = [
+        r#"{"at":1,"command":"start","instance":2,"attempt":1,"goal":{"provider":"gripper","action":"grasp","inputs":{},"seed":1,"lease":null,"projection":null,"expected_s":null}}"#,
+        r#"{"at":2000000000,"event":"finished","instance":2,"attempt":1,"outcome":"success","outputs":{"width_m":{"float":0.07}},"measured":[],"reason":""}"#,
+    ];
+    const FOREIGN: &str = r#"{"at":1000000000,"command":"start","instance":3,"attempt":1,"goal":{"provider":"arm","action":"follow","inputs":{"trajectory":{"trajectory":{"joints":["elbow"],"points":[{"time_s":0.0,"positions":[0.0],"velocities":[]}]}}},"seed":1,"lease":null,"projection":null,"expected_s":null}}"#;
+
+    #[test]
+    fn a_robot_is_told_as_a_tree_whose_mimics_follow_the_joint_that_they_mimic() {
+        for name in Robot::built_in_names() {
+            let robot = shown(name).told();
+            assert!(robot.links[0].parent.is_none() && robot.links.iter().skip(1).all(|link| link.parent.is_some()));
+            let after = |(index, link): (usize, &wire::Link)| link.parent.is_none_or(|parent| parent < index);
+            assert!(robot.links.iter().enumerate().all(after), "parents come first");
+            let finger = robot.joints.iter().position(|joint| joint.name == "finger").unwrap();
+            assert_eq!(robot.links.iter().filter(|link| link.joint == Some(finger)).count(), 2, "{name}");
+            assert!(robot.joints[finger].slides && robot.joints[finger].start > 0.0, "the fingers begin open");
+            assert_eq!(robot.links[robot.tools[0]].name, "tool");
+        }
+        let aimm = shown("aimm").told();
+        let mast = aimm.links.iter().find(|link| link.name == "mast").unwrap();
+        assert_eq!((mast.shapes[0].kind, mast.shapes[0].size.as_slice()), ("cylinder", &[0.03, 1.4][..]));
+        assert_eq!(mast.shapes[0].at.quaternion, [0.0, 0.0, 0.0, 1.0], "it stands upright");
+    }
+
+    #[test]
+    fn a_motion_to_a_posture_takes_as_long_as_is_expected_and_fingers_half_of_their_opening() {
+        let lines = [&[MOVE_TO][..], &GRASPED].concat();
+        let shown = shown("aimm");
+        let cell = cell(&film(&lines), 0, Ok(&shown), |id| format!("state {}", id.0));
+        assert!(cell.fits && cell.fresh, "{}", cell.note);
+        let [moved, fingers] = cell.tracks.as_slice() else { panic!("{:?}", cell.tracks) };
+        assert_eq!((moved.path.as_str(), moved.estimated, moved.joints.len()), ("state 1", true, 7));
+        assert_eq!((moved.from_s, moved.points[0].after_s, moved.points[0].positions[6]), (1.0, 4.0, 0.7));
+        let name = &shown.told.joints[fingers.joints[0]].name;
+        assert_eq!((name.as_str(), fingers.points[0].positions.as_slice()), ("finger", &[0.035][..]));
+    }
+
+    #[test]
+    fn a_log_of_another_robot_shows_no_robot_and_says_why() {
+        let shown_robot = shown("aimm");
+        let other = cell(&film(&[FOREIGN]), 0, Ok(&shown_robot), |_| String::new());
+        assert_eq!((other.fits, other.note.as_str()), (false, "aimm has no joint `elbow`"));
+        let six = shown("ur5");
+        let seven = cell(&film(&[MOVE_TO]), 0, Ok(&six), |_| String::new());
+        assert_eq!(seven.note, "the log has positions for 7 joints where ur5 has 6");
+        let standing = r#"{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":1,"world":[],"revision":1,"capacity":{"Arm":1,"Gripper":1}}"#;
+        let of_panda = cell(&film(&[standing]), 0, Ok(&shown_robot), |_| String::new());
+        assert_eq!(of_panda.note, "aimm has a base that drives, and the system of the run had none");
+        let unknown = cell(&film(&[MOVE_TO]), 0, Err("no robot was named"), |_| String::new());
+        assert_eq!((unknown.fits, unknown.note.as_str(), unknown.tracks.len()), (false, "no robot was named", 0));
+    }
+
+    #[test]
+    fn objects_are_told_once_until_one_of_them_changes() {
+        let started = r#"{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":1,"world":[[{"predicate":"shape","arguments":["box"]},{"map":{"type":{"string":"box"},"size":{"list":[{"float":0.1},{"float":0.2},{"float":0.3}]}}}],[{"predicate":"at","arguments":["box"]},{"pose":{"position":[1.0,0.0,0.5],"quaternion_xyzw":[0.0,0.0,0.0,1.0]}}]],"revision":1}"#;
+        let held = r#"{"at":1,"event":"world_changed","revision":2,"facts":[[{"predicate":"in_gripper","arguments":["box"]},{"pose":{"position":[0.0,0.0,0.05],"quaternion_xyzw":[0.0,0.0,0.0,1.0]}}]]}"#;
+        let mut film = film(&[started]);
+        let shown = shown("aimm");
+        let first = cell(&film, 0, Ok(&shown), |_| String::new());
+        let objects = first.objects.unwrap();
+        assert_eq!(
+            (objects[0].name.as_str(), objects[0].shape.size.as_slice(), objects[0].held),
+            ("box", &[0.1, 0.2, 0.3][..], false)
+        );
+        assert_eq!(cell(&film, first.version, Ok(&shown), |_| String::new()).objects, None);
+        film.apply(&serde_json::from_str(held).unwrap());
+        let after = cell(&film, first.version, Ok(&shown), |_| String::new());
+        assert!(!after.fresh && after.objects.unwrap()[0].held);
+    }
+}
