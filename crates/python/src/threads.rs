@@ -133,7 +133,7 @@ mod tests {
         let first = thread(&threads).await;
         assert_eq!(thread(&threads).await, first);
         let (go_on, wait) = channel::<()>();
-        let busy = threads.run(move |py| py.detach(|| wait.recv().is_ok())).unwrap();
+        let busy = threads.run(move |py| py.detach(move || wait.recv().is_ok())).unwrap();
         assert_ne!(thread(&threads).await, first);
         go_on.send(()).unwrap();
         assert!(busy.await.unwrap());

@@ -16,7 +16,7 @@ pub(super) fn trace_of(run: &str, task: &str, seed: u64, began_unix_ms: u64) -> 
 #[derive(Debug)]
 pub(super) struct Spans {
     sender: &'static Sender,
-    live: Live,
+    live: Box<Live>,
 }
 
 impl Spans {
@@ -29,7 +29,7 @@ impl Spans {
         let sender = ratn_otlp::sender()?;
         let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let now_unix_ns = u64::try_from(since_1970.as_nanos()).unwrap_or(u64::MAX);
-        Some(Spans { sender, live: Live::new(now_unix_ns, speed) })
+        Some(Spans { sender, live: Box::new(Live::new(now_unix_ns, speed)) })
     }
 
     pub(super) fn follow(&mut self, at: Timestamp, event: &Event, commands: &[Command]) {
