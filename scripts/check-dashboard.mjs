@@ -420,7 +420,7 @@ const painted = (page) =>
   page.evaluate(async () => {
     const canvas = document.querySelector("canvas");
     // It paints in the next frame, before what is asked for after it.
-    canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "+", bubbles: true, cancelable: true }));
+    for (const key of ["+", "-"]) canvas.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
     await new Promise(requestAnimationFrame);
     const gl = canvas.getContext("webgl2");
     const data = new Uint8Array(4 * gl.drawingBufferWidth * gl.drawingBufferHeight);
@@ -435,11 +435,21 @@ const painted = (page) =>
     return { colours: counts.size, background: Math.max(...counts.values()) / (data.length / 4), sum };
   });
 
+/** Two fingers go apart. */
+async function pinch(page, x, y) {
+  const world = await page.context().newCDPSession(page);
+  const fingers = (apart) => [x - apart, x + apart].map((x, id) => ({ x, y, id }));
+  await world.send("Input.dispatchTouchEvent", { type: "touchStart", touchPoints: fingers(40) });
+  for (const apart of [60, 80, 100]) await world.send("Input.dispatchTouchEvent", { type: "touchMove", touchPoints: fingers(apart) });
+  await world.send("Input.dispatchTouchEvent", { type: "touchEnd", touchPoints: [] });
+  await world.detach();
+}
+
 async function cell() {
   const log = join(PLACE, "pick.jsonl");
   writeFileSync(log, pickAndPlace());
   const shown = await dashboard([log, "--runtime-dir", join(PLACE, "nothing")]);
-  const page = await open(shown.url);
+  const page = await open(shown.url, { hasTouch: true });
   const asked = [];
   page.on("request", (request) => asked.push(new URL(request.url()).pathname));
   await page.waitForFunction(() => document.querySelector("footer output").textContent.length > 3);
@@ -449,8 +459,35 @@ async function cell() {
   await page.waitForFunction(() => Number(document.querySelector("canvas")?.dataset.solids) > 15);
   const whole = await painted(page);
   assert.ok(whole.colours > 50 && whole.background < 0.97, JSON.stringify(whole));
-  assert.notEqual((await painted(page)).sum, whole.sum, "a key zooms");
+  assert.equal((await painted(page)).sum, whole.sum, "what does not change is painted as before");
+  const canvas = await page.locator("canvas").boundingBox();
+  const [x, y] = [canvas.x + canvas.width / 2, canvas.y + canvas.height / 2];
+  const drag = async () => {
+    await page.mouse.move(x, y);
+    await page.mouse.down();
+    await page.mouse.move(x + 80, y + 30, { steps: 4 });
+    await page.mouse.up();
+  };
+  await page.locator("canvas").focus();
+  let before = whole.sum;
+  for (const [what, act] of [
+    ["a drag turns", drag],
+    ["with Shift it moves", async () => (await page.keyboard.down("Shift"), await drag(), await page.keyboard.up("Shift"))],
+    ["the wheel zooms", () => page.mouse.wheel(0, -300)],
+    ["an arrow key turns", () => page.keyboard.press("ArrowLeft")],
+    ["with Shift it moves", () => page.keyboard.press("Shift+ArrowLeft")],
+    ["a key zooms", () => page.keyboard.press("+")],
+    ["two fingers zoom", () => pinch(page, x, y)],
+  ]) {
+    await act();
+    await page.waitForTimeout(150);
+    const { sum } = await painted(page);
+    assert.notEqual(sum, before, what);
+    before = sum;
+  }
   await page.keyboard.press("0");
+  await page.waitForTimeout(150);
+  assert.equal((await painted(page)).sum, whole.sum, "0 shows all, as at first");
   step(`the cell is painted: ${whole.colours} colours, ${((1 - whole.background) * 100).toFixed(0)} % of the canvas are not background`);
 
   const to = (seconds) =>

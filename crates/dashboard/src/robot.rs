@@ -331,6 +331,41 @@ mod tests {
         assert_eq!(mast.shapes[0].at.quaternion, [0.0, 0.0, 0.0, 1.0], "it stands upright");
     }
 
+    /// As the pages do it.
+    fn frames(robot: &wire::Robot, positions: &[f64]) -> Vec<Pose> {
+        let three = |values: &[f64]| <[f64; 3]>::try_from(values).unwrap();
+        let mut frames: Vec<Pose> = Vec::new();
+        for link in &robot.links {
+            let quaternion_xyzw = link.at.quaternion.as_slice().try_into().unwrap();
+            let at = Pose { position: three(&link.at.position), quaternion_xyzw };
+            let drive = |joint| ratn_motion::robot::Drive {
+                joint,
+                axis: three(&link.axis),
+                slides: link.slides,
+                factor: link.factor,
+            };
+            let moved = link.joint.map_or(at, |joint| at.compose(&drive(joint).moved(positions[joint])));
+            frames.push(link.parent.map_or(moved, |parent| frames[parent].compose(&moved)));
+        }
+        frames
+    }
+
+    #[test]
+    fn the_links_that_are_told_stand_where_those_of_the_robot_do() {
+        for name in Robot::built_in_names() {
+            let robot = Robot::built_in(name).unwrap();
+            let at_zero = robot.at_zero();
+            let mut arm = robot.posture("home").unwrap();
+            arm.iter_mut().enumerate().for_each(|(index, joint)| *joint += 0.1 * index as f64);
+            let there = Configuration { base: [1.0, -2.0, 0.7], arm, pan: 0.3, tilt: 0.2, finger: 0.02, ..at_zero };
+            let told = frames(&shown(name).told(), &robot.positions(&there));
+            for (own, told) in robot.poses(&there).iter().zip(&told) {
+                let apart = own.inverse().compose(told).position;
+                assert!(apart.iter().all(|metres| metres.abs() < 1e-4), "{name}: {apart:?}");
+            }
+        }
+    }
+
     #[test]
     fn a_motion_to_a_posture_takes_as_long_as_is_expected_and_fingers_half_of_their_opening() {
         let lines = [&[MOVE_TO][..], &GRASPED].concat();
