@@ -119,6 +119,7 @@ impl Drop for Alive {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
 
     /// In which thread it runs.
