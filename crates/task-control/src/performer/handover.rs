@@ -33,6 +33,8 @@ struct Held {
 pub(super) struct Handover {
     pub(super) to: InstanceId,
     pub(super) lease: Lease,
+    /// Whether that waits already; else it asks in this very step.
+    pub(super) waits: bool,
 }
 
 impl Leases {
@@ -67,18 +69,20 @@ impl Leases {
         let is_withdrawn = |instance: InstanceId| {
             commands.iter().any(|command| matches!(command, Command::Withdraw { instance: one } if *one == instance))
         };
-        let mut waits = waiting.in_order().map(|(id, asking)| (id, asking.requirements.as_slice(), asking.priority));
-        let waits = waits.find(|(id, requirements, _)| held.is_wanted(requirements) && !is_withdrawn(*id));
+        // One that asks again with another priority is withdrawn before.
+        let mut waits =
+            waiting.in_order().map(|(id, asking)| (id, asking.requirements.as_slice(), true, asking.priority));
+        let waits = waits.find(|(id, requirements, ..)| held.is_wanted(requirements) && !is_withdrawn(*id));
         let asks = commands.iter().rev().filter_map(|command| match command {
             Command::Acquire { instance, requirements, priority } => {
-                Some((*instance, requirements.as_slice(), *priority))
+                Some((*instance, requirements.as_slice(), false, *priority))
             }
             _ => None,
         });
         // Of equals the first, and who waits already is before who asks now.
-        let first = asks.filter(|(_, requirements, _)| held.is_wanted(requirements)).chain(waits);
-        let (to, requirements, _) = first.max_by_key(|(.., priority)| *priority)?;
-        held.serves(requirements).then(|| Handover { to, lease: held.lease.clone() })
+        let first = asks.filter(|(_, requirements, ..)| held.is_wanted(requirements)).chain(waits);
+        let (to, requirements, waits, _) = first.max_by_key(|(.., priority)| *priority)?;
+        held.serves(requirements).then(|| Handover { to, lease: held.lease.clone(), waits })
     }
 }
 
@@ -197,7 +201,9 @@ mod tests {
         assert_eq!(handover(&ended(SUCCESS), &[asks(2, planner(), 7)], &queue, 1), Some(InstanceId(12)));
         assert_eq!(handover(&ended(SUCCESS), &[asks(2, planner(), 8)], &queue, 1), Some(InstanceId(2)));
         let withdrawn = Command::Withdraw { instance: InstanceId(12) };
-        assert_eq!(handover(&ended(SUCCESS), &[withdrawn], &queue, 1), Some(InstanceId(13)));
+        assert_eq!(handover(&ended(SUCCESS), &[withdrawn.clone()], &queue, 1), Some(InstanceId(13)));
+        let again = [withdrawn, asks(12, planner(), 9)];
+        assert_eq!(handover(&ended(SUCCESS), &again, &queue, 1), Some(InstanceId(12)), "what it asks for now");
         assert_eq!(handover(&ended(SUCCESS), &[], &queue, 100), None, "its turn is over");
     }
 

@@ -304,7 +304,7 @@ impl Performer {
         }
         self.handover = self.leases.handover(event, commands, &self.asking, Instant::now());
         // To one whose answer is on its way nothing is handed over: the lease goes back.
-        self.handover.take_if(|handover| self.asking.hand(handover.to, &handover.lease) == Some(Err(())));
+        self.handover.take_if(|one| one.waits && self.asking.hand(one.to, &one.lease) != Some(Ok(())));
     }
 
     /// What instances are called that were expanded before this performer was there.
@@ -406,7 +406,7 @@ impl Performer {
         let asked = requirements.iter().map(|one| self.of_performers(one.clone())).collect();
         let (hand, withdrawal) = (Some(hand), withdrawn.clone());
         self.asking.insert(instance, Asking { request, number, priority, requirements, since, withdrawn, hand });
-        if let Some(handover) = self.handover.as_ref().filter(|handover| handover.to == instance) {
+        if let Some(handover) = self.handover.as_ref().filter(|one| one.to == instance && !one.waits) {
             let _ = self.asking.hand(instance, &handover.lease);
         }
         let acquiring = Acquiring {

@@ -48,6 +48,18 @@ fn arm() -> Vec<Requirement> {
     vec![Requirement::new(ResourceOperation::Block, "Arm")]
 }
 
+fn finished(instance: InstanceId) -> Event {
+    Event::Finished {
+        instance,
+        attempt: 1,
+        outcome: SUCCESS.to_owned(),
+        outputs: BTreeMap::new(),
+        measured: Vec::new(),
+        evidence: Vec::new(),
+        reason: String::new(),
+    }
+}
+
 /// A performer with a resource manager, a world pool and one arm.
 struct Bench {
     performer: Performer,
@@ -86,19 +98,15 @@ impl Bench {
 
     /// What the executive makes of the end of `ended`: `next`, if anybody, wants what that had.
     fn goes_on(&mut self, ended: InstanceId, lease: LeaseId, next: Option<InstanceId>) -> anyhow::Result<()> {
-        let event = Event::Finished {
-            instance: ended,
-            attempt: 1,
-            outcome: SUCCESS.to_owned(),
-            outputs: BTreeMap::new(),
-            measured: Vec::new(),
-            evidence: Vec::new(),
-            reason: String::new(),
-        };
+        let event = finished(ended);
         let asks = next.map(|instance| Command::Acquire { instance, requirements: arm(), priority: 0 });
         let release = Command::Release { instance: ended, lease: Some(lease), projection: None };
         let commands: Vec<Command> = asks.into_iter().chain([release]).collect();
-        self.performer.prepare(&event, &commands);
+        self.steps(&event, commands)
+    }
+
+    fn steps(&mut self, event: &Event, commands: Vec<Command>) -> anyhow::Result<()> {
+        self.performer.prepare(event, &commands);
         commands.into_iter().try_for_each(|command| self.performer.perform(command))
     }
 
@@ -212,6 +220,29 @@ async fn one_that_waits_takes_the_lease_over_and_leaves_the_queue() -> anyhow::R
     bench.performer.perform(Command::Release { instance: fourth, lease: Some(last), projection: None })?;
     bench.ask(first)?;
     bench.granted(first).await?;
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn one_that_asks_again_in_the_step_that_gives_it_a_lease_has_it_once() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let [first, second] = [1, 2].map(InstanceId);
+    bench.ask(first)?;
+    let lease = bench.granted(first).await?;
+    bench.ask(second)?;
+    // What the first one decided makes the second one certain: it asks anew.
+    let commands = vec![
+        Command::Withdraw { instance: second },
+        Command::Acquire { instance: second, requirements: arm(), priority: CERTAIN },
+        Command::Release { instance: first, lease: Some(lease), projection: None },
+    ];
+    bench.steps(&finished(first), commands)?;
+    assert_eq!(bench.granted(second).await?, lease);
+    // Nothing is given back behind its back.
+    let more = tokio::time::timeout(Duration::from_millis(100), bench.event()).await;
+    assert!(more.is_err(), "{more:?}");
+    let held = bench.performer.resources.list(&["Arm"]).await?;
+    assert_eq!(held.iter().flat_map(|arm| &arm.holdings).map(|one| one.lease).collect::<Vec<_>>(), [lease]);
     bench.performer.close().await
 }
 
