@@ -15,6 +15,7 @@ use super::{state, written_out};
 use crate::diagnostic::Findings;
 use crate::program::Location;
 use scan::{Lines, comments, flow_end, has_anchor};
+use std::collections::BTreeMap;
 
 /// The annotations that can be changed.
 pub const KEYS: [&str; 7] = ["computes", "reads", "senses", "requires", "effects", "resources", "duration"];
@@ -36,6 +37,8 @@ pub struct Written {
     pub location: Location,
     /// The annotations that it may have, with what it says itself.
     pub keys: Vec<(&'static str, Option<Document>)>,
+    /// Where each of all its keys stands.
+    pub places: Vec<(Location, String)>,
     /// Why it cannot be changed here.
     pub fixed: Option<EditError>,
 }
@@ -95,6 +98,14 @@ pub enum EditError {
     },
 }
 
+impl Written {
+    /// The key at, or below which a place is; of findings, to show them where they belong.
+    pub fn key_at(&self, at: Location) -> Option<&str> {
+        let before = self.places.iter().filter(|(place, _)| *place <= at);
+        before.max_by_key(|(place, _)| *place).map(|(_, key)| key.as_str())
+    }
+}
+
 /// A state with its place in the tree.
 struct Found<'n> {
     written: Written,
@@ -146,14 +157,6 @@ pub fn edited(text: &str, path: &str, key: &str, value: Option<&Document>) -> Re
     Ok(new)
 }
 
-/// The key of a state at, or below, which a place of the text is; of findings, to show them where they belong.
-pub fn key_at(text: &str, path: &str, at: Location) -> Option<String> {
-    let root = read(text).ok()?;
-    let found = states(&root).into_iter().find(|found| found.written.path == path)?;
-    let before = found.body?.entries().iter().filter(|entry| entry.at <= at);
-    before.max_by_key(|entry| entry.at).map(|entry| entry.key.clone())
-}
-
 /// A value on one line, as YAML has it.
 pub fn flow(value: &Document) -> String {
     match value {
@@ -185,15 +188,16 @@ fn states(root: &Node) -> Vec<Found<'_>> {
         written_out::write_out(&mut states.value, &mut findings);
     }
     let outline = outline("", &whole, &mut findings);
+    let mut places = BTreeMap::new();
+    mappings(root, false, &mut places);
     let mut found = Vec::new();
     for step in outline.steps.iter().skip(1) {
         let own = state::known_keys(&step.form);
         let keys = KEYS.into_iter().filter(|key| own.contains(key));
         let keys = keys.map(|key| (key, step.body.get(key).cloned().map(Document::of))).collect();
-        let mut places = Vec::new();
-        with_place(root, step.body.at, false, &mut places);
+        let places = places.get(&step.body.at).map_or(&[][..], Vec::as_slice);
         let shared = |why| Some(EditError::Shared { path: step.path.clone(), at: step.at, why });
-        let (body, fixed) = match places.as_slice() {
+        let (body, fixed) = match places {
             [] => (None, shared("it is written out from a shorter form")),
             [(_, true)] => (None, shared("it is made by `regions: { for: … }`")),
             [(body, false)] => (Some(*body), None),
@@ -205,6 +209,7 @@ fn states(root: &Node) -> Vec<Found<'_>> {
             form: form(&step.form, step.body),
             location: step.at,
             keys,
+            places: step.body.entries().iter().map(|entry| (entry.at, entry.key.clone())).collect(),
             fixed,
         };
         found.push(Found { written, body });
@@ -232,17 +237,15 @@ fn form(form: &Form<'_>, body: &Node) -> String {
     }
 }
 
-/// The mappings that begin at a place, each with whether regions are made of it.
-fn with_place<'n>(node: &'n Node, at: Location, is_made: bool, found: &mut Vec<(&'n Node, bool)>) {
+/// All mappings by where they begin, each with whether regions are made of it.
+fn mappings<'n>(node: &'n Node, is_made: bool, found: &mut BTreeMap<Location, Vec<(&'n Node, bool)>>) {
     match &node.content {
-        Content::List(items) => items.iter().for_each(|item| with_place(item, at, is_made, found)),
+        Content::List(items) => items.iter().for_each(|item| mappings(item, is_made, found)),
         Content::Map(entries) => {
-            if node.at == at {
-                found.push((node, is_made));
-            }
+            found.entry(node.at).or_default().push((node, is_made));
             for Entry { key, value, .. } in entries {
                 let is_made = is_made || (key == "regions" && matches!(value.content, Content::Map(_)));
-                with_place(value, at, is_made, found);
+                mappings(value, is_made, found);
             }
         }
         _ => {}
@@ -416,6 +419,11 @@ impl Change<'_> {
             text[at - gap..first_line_end].to_owned()
         });
         let rest: Vec<&str> = comments(&text[key..end]).into_iter().skip(usize::from(behind.is_some())).collect();
+        if let (Some(Document::List(new)), Content::List(old)) = (self.value, &self.body.entries()[place].value.content)
+            && let Some(new) = self.list_kept(key, end, old, new)
+        {
+            return Ok((self.splice(key, end, &new), place));
+        }
         let starts_line = self.lines.starts_line(key);
         match self.value {
             Some(value) => {
@@ -458,6 +466,56 @@ impl Change<'_> {
                 _ => Err("it is the first key of its list item, and a comment stands behind it"),
             },
         }
+    }
+
+    /// A list with an item on a line of its own each: those that it has already stay as they are written. Nothing where it has none of them.
+    fn list_kept(&self, key: usize, end: usize, old: &[Node], new: &[Document]) -> Option<String> {
+        let (text, lines, newline) = (self.lines.text, &self.lines, self.lines.newline());
+        let (first, last) = (lines.line_of(key), lines.line_of(end));
+        let head = &text[key..lines.end(first).min(end)];
+        let value_begins = scan::without_comments_end(head, 0, head.len());
+        if !head[..value_begins].ends_with(':') {
+            return None;
+        }
+        // Of each item the line of its dash, and the first of the comments above.
+        let mut items: Vec<(usize, usize)> = Vec::new();
+        let (mut depth, mut above) = (None, first + 1);
+        for line in first + 1..=last {
+            let content = lines.content(line);
+            let own = content.trim_start_matches(' ');
+            let is_dash = own == "-" || own.starts_with("- ");
+            if is_dash && *depth.get_or_insert(content.len() - own.len()) == content.len() - own.len() {
+                items.push((above, line));
+            }
+            if !(own.trim().is_empty() || own.starts_with('#')) {
+                above = line + 1;
+            }
+        }
+        if items.len() != old.len() {
+            return None;
+        }
+        let margin = " ".repeat(depth?);
+        let until = |item: usize| items.get(item + 1).map_or(last + 1, |next| next.0);
+        let span = |item: usize| &text[lines.start(items[item].0)..lines.end(until(item) - 1)];
+        let mut made = head.to_owned();
+        let drop_items = |made: &mut String, from: usize, to: usize| {
+            for comment in (from..to).flat_map(|item| comments(span(item))) {
+                made.extend([newline, &margin, comment]);
+            }
+        };
+        let mut next = 0;
+        for item in new {
+            match (next..old.len()).find(|place| Document::of(old[*place].clone()) == *item) {
+                Some(place) => {
+                    drop_items(&mut made, next, place);
+                    made.extend([newline, span(place)]);
+                    next = place + 1;
+                }
+                None => made.extend([newline, &margin, "- ", &flow(item)]),
+            }
+        }
+        drop_items(&mut made, next, old.len());
+        (next > 0).then_some(made)
     }
 
     /// `key: value`, with what stands behind the key; on one line where it has been, or is short.
