@@ -656,12 +656,47 @@ async function long() {
   await shown.ended;
 }
 
+/** A task file is looked at, changed in a form, and written. */
+async function annotations() {
+  const file = join(PLACE, "edited.yaml");
+  const text = `task: edited # <b>\nstates:\n  - plan: # it plans\n      action: path_planner/plan\n      in: { start: "joints(0, 0, 0, 0, 0, 0, 0)", goal: "joints(1, 0, 0, 0, 0, 0, 0)" }\n      duration: 2 # s\n  - open: { action: gripper/release }\n`;
+  writeFileSync(file, text);
+  const shown = await dashboard(["--edit", file, "--runtime-dir", join(PLACE, "nothing")]);
+  const page = await open(shown.url);
+  await go(page, "annotations");
+  const duration = page.locator('[data-key="duration 0"]');
+  await duration.fill("nothing.here");
+  await page.waitForSelector("#findings-duration .bad");
+  assert.ok(await page.locator('[data-key="save"]').isDisabled());
+  await duration.fill("4");
+  await page.waitForFunction(() => document.querySelector("main")?.textContent.includes("by simulation in CDTN mode"));
+  await axe(page, "Annotations");
+  await shot(page, "annotations");
+  assert.equal(readFileSync(file, "utf8"), text);
+  await page.locator('[data-key="save"]').press("Enter");
+  await page.locator("dialog button[value=yes]").press("Enter");
+  await until("the file is written", () => readFileSync(file, "utf8") === text.replace("duration: 2 #", "duration: 4 #"));
+  await page.waitForFunction(() => document.querySelector('[data-key="duration 0"]')?.value === "4");
+  // Somebody else writes it.
+  writeFileSync(file, text);
+  await page.locator('[data-key="duration 0"]').fill("5");
+  await page.waitForFunction(() => document.querySelector("main [role=alert]")?.textContent.includes("has changed on the disk"));
+  await page.locator("main [role=alert] button").click();
+  await page.waitForFunction(() => document.querySelector('[data-key="duration 0"]')?.value === "2");
+  assert.deepEqual(page.problems, []);
+  step("a task file's annotations are changed in a form and written");
+  await page.context().close();
+  shown.child.kill("SIGTERM");
+  await shown.ended;
+}
+
 const only = process.env.ONLY?.split(",");
 try {
   const wants = (name) => only === undefined || only.includes(name);
   const live = wants("control") ? await control() : "crates/report/src/fixtures/two_boxes.jsonl";
   if (wants("replay")) await replay(live);
   if (wants("cell")) await cell();
+  if (wants("annotations")) await annotations();
   if (wants("injected")) await injected();
   if (wants("large")) await large();
   if (wants("long")) await long();

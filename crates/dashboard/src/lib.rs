@@ -6,6 +6,7 @@
 //!
 //! Pages ask, a few times a second while somebody looks at them, for what has changed; nothing is pushed, so nothing queues up.
 
+mod annotations;
 mod film;
 mod fold;
 mod gate;
@@ -19,6 +20,7 @@ mod tell;
 pub mod wire;
 mod world;
 
+pub use annotations::Editing;
 pub use logs::MAX_LOGS;
 pub use robot::Robots;
 pub use server::{Dashboard, DashboardError, Options, Tasks};

@@ -1,12 +1,13 @@
 //! HTTP for the pages and what they ask. Bounded: few connections, little to read, and whoever does not read is given up.
 
+use crate::annotations::{self, Editing, MAX_BODY, Problem, Proposal};
 use crate::gate::{self, HEADERS, Refused, Token};
 use crate::logs::{Asked, Logs, MAX_LOGS, NotTold, absolute};
 use crate::patience::Patient;
 use crate::robot::{self, Robots};
 use crate::system::{Heard, System};
 use crate::{task, wire};
-use hyper::body::Incoming;
+use hyper::body::{Body, Incoming};
 use hyper::header::{ALLOW, CONTENT_TYPE, HeaderValue};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
@@ -25,6 +26,7 @@ use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -93,6 +95,8 @@ pub struct Options {
     pub directory: PathBuf,
     /// Whether pages may tell a run to pause, step, go on and end.
     pub control: bool,
+    /// The task file whose annotations pages may change.
+    pub edit: Option<Editing>,
     /// What the clients of the system trust and show.
     pub tls: ClientTls,
     /// How tasks are loaded.
@@ -112,6 +116,7 @@ impl Options {
             logs: Vec::new(),
             directory,
             control: false,
+            edit: None,
             tls,
             tasks: Tasks::none(),
             robots: Robots::none(),
@@ -177,6 +182,7 @@ struct Shown {
     logs: Arc<Logs>,
     system: System,
     control: bool,
+    edit: Option<Editing>,
     tasks: Tasks,
     robot: Arc<KnownRobot>,
     reading: Semaphore,
@@ -235,7 +241,7 @@ impl Dashboard {
     /// # Errors
     /// [`DashboardError`].
     pub async fn bind(options: Options) -> Result<Dashboard, DashboardError> {
-        let Options { address, logs, directory, control, tls, tasks, robots, patience } = options;
+        let Options { address, logs, directory, control, edit, tls, tasks, robots, patience } = options;
         if !address.ip().is_loopback() {
             return Err(DashboardError::Exposed { address });
         }
@@ -263,7 +269,7 @@ impl Dashboard {
         let (logs, system) = (Arc::new(Logs::of(&paths)), System::of(directory, &tls));
         let reading = Semaphore::new(MAX_READING);
         let robot = Arc::new(KnownRobot { robots, shown: Mutex::default() });
-        let shown = Arc::new(Shown { token, logs, system, control, tasks, robot, reading });
+        let shown = Arc::new(Shown { token, logs, system, control, edit, tasks, robot, reading });
         Ok(Dashboard { listener, address, shown, patience })
     }
 
@@ -313,17 +319,27 @@ async fn answer(
     let page = service_fn(move |request: Request<Incoming>| {
         let (shown, has_shown_token) = (shown.clone(), has_shown_token.clone());
         async move {
-            // Nothing stands in the body of any question.
             let head = Head {
                 method: request.method().clone(),
                 uri: request.uri().clone(),
                 headers: request.headers().clone(),
             };
-            drop(request);
-            if gate::may_look(&head.headers, &shown.token).is_ok() {
+            let may_look = gate::may_look(&head.headers, &shown.token).is_ok();
+            if may_look {
                 has_shown_token.store(true, Ordering::Relaxed);
             }
-            Ok::<_, Infallible>(shown.answer(&head).await)
+            // In the body of other questions nothing stands.
+            let has_body =
+                may_look && shown.edit.is_some() && head.method == Method::POST && is_change(head.uri.path());
+            let body = match has_body {
+                true => match tokio::time::timeout(patience, body(request.into_body())).await {
+                    Ok(Some(body)) => body,
+                    Ok(None) => return Ok(refusal(StatusCode::PAYLOAD_TOO_LARGE, TOO_LARGE)),
+                    Err(_) => return Ok(refusal(StatusCode::REQUEST_TIMEOUT, "the body of the question did not come")),
+                },
+                false => Vec::new(),
+            };
+            Ok::<_, Infallible>(shown.answer(&head, &body).await)
         }
     });
     http1::Builder::new()
@@ -335,8 +351,32 @@ async fn answer(
         .await
 }
 
+/// Of a body that is too long so many bytes are read.
+const MAX_FORGOTTEN: usize = 16 * MAX_BODY;
+const TOO_LARGE: &str = "a change has at most 64 KiB";
+
+/// Whether what is to be changed stands in the body.
+fn is_change(path: &str) -> bool {
+    matches!(path, "/api/annotations/check" | "/api/annotations/gain" | "/api/annotations/save")
+}
+
+/// A body of at most [`MAX_BODY`] bytes. Of a longer one some more is read and forgotten: who is still writing does not hear why it is refused.
+async fn body(mut incoming: Incoming) -> Option<Vec<u8>> {
+    let (mut bytes, mut length) = (Vec::new(), 0);
+    while let Some(frame) = std::future::poll_fn(|context| Pin::new(&mut incoming).poll_frame(context)).await {
+        let Ok(data) = frame.ok()?.into_data() else { continue };
+        length += data.len();
+        if length <= MAX_BODY {
+            bytes.extend_from_slice(&data);
+        } else if length > MAX_FORGOTTEN {
+            return None;
+        }
+    }
+    (length <= MAX_BODY).then_some(bytes)
+}
+
 impl Shown {
-    async fn answer(&self, head: &Head) -> Response<String> {
+    async fn answer(&self, head: &Head, body: &[u8]) -> Response<String> {
         let path = head.uri.path();
         if let Some((_, kind, page)) = PAGES.iter().find(|(name, _, _)| *name == path) {
             return match (gate::asks_here(&head.headers), &head.method) {
@@ -361,6 +401,16 @@ impl Shown {
             (&Method::GET, "/api/tail") => self.tail(&query).await,
             (&Method::POST, "/api/control") => self.control(&query).await,
             (&Method::POST, "/api/scale") => self.scale(&query).await,
+            (method, path)
+                if let Some(edit) = &self.edit
+                    && (path == "/api/annotations" || is_change(path)) =>
+            {
+                match (method, is_change(path)) {
+                    (&Method::GET, false) => self.editing(edit, |edit| annotations::told(&edit)).await,
+                    (&Method::POST, true) => self.change(edit, path, body).await,
+                    (_, is_change) => return not_allowed(if is_change { "POST" } else { "GET" }),
+                }
+            }
             (_, "/api/control" | "/api/scale") => return not_allowed("POST"),
             (
                 _,
@@ -389,6 +439,7 @@ impl Shown {
         json(&wire::About {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             control: self.control,
+            edit: self.edit.as_ref().map(Editing::name).unwrap_or_default(),
             directory: self.system.directory(),
             logs: self.logs.told(),
             problem: String::new(),
@@ -491,6 +542,42 @@ impl Shown {
         match self.system.tail(&worker).await {
             Ok(tail) => json(&tail),
             Err(problem) => Answer::Refused(StatusCode::NOT_FOUND, problem),
+        }
+    }
+
+    /// A change that is checked, simulated or written.
+    async fn change(&self, edit: &Editing, path: &str, body: &[u8]) -> Answer {
+        let proposal = match Proposal::read(body) {
+            Ok(proposal) => proposal,
+            Err(problem) => return not_edited(&problem),
+        };
+        match path {
+            "/api/annotations/check" => self.editing(edit, move |edit| annotations::proposed(&edit, &proposal)).await,
+            "/api/annotations/save" => self.editing(edit, move |edit| annotations::saved(&edit, &proposal)).await,
+            _ => match annotations::gained(edit, proposal).await {
+                Ok(gained) => json(&gained),
+                Err(problem) => not_edited(&problem),
+            },
+        }
+    }
+
+    /// Reads and checks the task file in a thread in which that keeps nobody waiting.
+    async fn editing<T: Serialize + Send + 'static>(
+        &self,
+        edit: &Editing,
+        work: impl FnOnce(Editing) -> Result<T, Problem> + Send + 'static,
+    ) -> Answer {
+        let Ok(_place) = self.reading.acquire().await else {
+            return Answer::Refused(StatusCode::SERVICE_UNAVAILABLE, "the dashboard ends".to_owned());
+        };
+        let edit = edit.clone();
+        match tokio::task::spawn_blocking(move || work(edit)).await {
+            Ok(Ok(told)) => json(&told),
+            Ok(Err(problem)) => not_edited(&problem),
+            Err(_) => {
+                let problem = "checking the task file ended with a panic".to_owned();
+                Answer::Refused(StatusCode::INTERNAL_SERVER_ERROR, problem)
+            }
         }
     }
 
@@ -608,6 +695,17 @@ impl<'q> Query<'q> {
         let about = self.number("about").map(InstanceId);
         Ok((id, Asked { at_s, epoch, version, about }))
     }
+}
+
+fn not_edited(problem: &Problem) -> Answer {
+    let status = match problem {
+        Problem::Question(_) => StatusCode::BAD_REQUEST,
+        Problem::Changed { .. } => StatusCode::CONFLICT,
+        Problem::File(_) | Problem::Edit(_) | Problem::Value { .. } | Problem::Refused { .. } => {
+            StatusCode::UNPROCESSABLE_ENTITY
+        }
+    };
+    Answer::Refused(status, problem.to_string())
 }
 
 fn json(value: &impl Serialize) -> Answer {

@@ -81,6 +81,8 @@ wire! {
         version: String,
         /// Whether the pages may tell a run something.
         control: bool,
+        /// The task file whose annotations may be changed; empty without one.
+        edit: String,
         /// The runtime directory of the system that is looked at; empty without one.
         directory: String,
         /// The logs, those of the command line first.
@@ -719,6 +721,114 @@ wire! {
         objects: Vec<Object>,
         /// Why the cell does not tell; empty where it does.
         problem: String,
+    }
+
+    /// A task file with what its states say of themselves, and what is in force for them.
+    Annotations {
+        /// Where it is.
+        file: String,
+        /// Of its text: what is changed is this text, and no other one.
+        digest: String,
+        /// Why there are no states to be shown; empty where there are.
+        problem: String,
+        /// Its states, in its order.
+        states: Vec<AnnotatedState>,
+        /// The kinds of resources of the catalogue.
+        kinds: Vec<String>,
+        /// The predicates of the ontology, and those that the file uses, with as many arguments as they have: `at(?)`.
+        predicates: Vec<String>,
+        /// The individuals of the ontology.
+        entities: Vec<String>,
+        /// What is wrong with it.
+        findings: Vec<Finding>,
+    }
+
+    /// A state of a task file.
+    AnnotatedState {
+        /// Its path.
+        path: String,
+        /// How many states are around it.
+        depth: usize,
+        /// What it is: `action: gripper/grasp`.
+        form: String,
+        /// The line of the file.
+        line: u32,
+        /// Why it cannot be changed here; empty where it can.
+        fixed: String,
+        /// The annotations that it may have.
+        keys: Vec<AnnotationKey>,
+        /// What is in force for it; nothing of a state that performs no action.
+        in_force: Vec<InForceLine>,
+    }
+
+    /// What a state says under a key.
+    AnnotationKey {
+        /// The key.
+        key: String,
+        /// The state says something under it.
+        said: bool,
+        /// What it says, an item each, as the file has it.
+        items: Vec<String>,
+        /// There may be several items.
+        listed: bool,
+    }
+
+    /// What is in force under a key.
+    InForceLine {
+        /// The key.
+        key: String,
+        /// As a task file says it, or `everything`, `nothing`, `unknown`.
+        text: String,
+        /// Who says so: the state, its action, or nobody.
+        from: String,
+    }
+
+    /// What is wrong with a task file.
+    Finding {
+        /// `error` or `warning`.
+        severity: String,
+        /// The name of the rule.
+        rule: String,
+        /// The state; empty for the task.
+        path: String,
+        /// The key of the state; empty where it is of none.
+        key: String,
+        /// The line of the file with the change in it.
+        line: u32,
+        /// What is wrong.
+        message: String,
+        /// What to do.
+        help: String,
+    }
+
+    /// What a change would lead to; nothing is written.
+    Proposed {
+        /// Why the text cannot be changed so; empty where it can.
+        problem: String,
+        /// The key that the problem is of; empty where it is of none.
+        key: String,
+        /// The task would be refused.
+        refused: bool,
+        /// What would be wrong with the file.
+        findings: Vec<Finding>,
+        /// What would be in force for the state.
+        in_force: Vec<InForceLine>,
+        /// The lines of the file that would be others, as they are.
+        before: Vec<String>,
+        /// These lines as they would be.
+        after: Vec<String>,
+        /// The number of the first of them.
+        line: u32,
+    }
+
+    /// What a change would gain, by simulation as a dataflow network.
+    Gained {
+        /// The makespan of the file as it is.
+        before_s: Option<f64>,
+        /// The makespan with the change.
+        after_s: Option<f64>,
+        /// Why there is none; empty where there is.
+        obstacle: String,
     }
 
     /// What became of what a run was told.

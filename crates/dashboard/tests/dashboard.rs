@@ -2,7 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
-use ratn_dashboard::{Dashboard, DashboardError, MAX_LOGS, Options, Robots};
+use ratn_dashboard::{Dashboard, DashboardError, Editing, MAX_LOGS, Options, Robots};
+use ratn_model::catalogue::Catalogue;
+use ratn_model::load::load;
 use ratn_motion::robot::Robot;
 use ratn_worker::tls::ClientTls;
 use serde_json::Value;
@@ -459,4 +461,106 @@ async fn a_browser_that_reads_nothing_is_cut_off_and_others_go_on() {
         tokio::time::sleep(PATIENCE / 10).await;
     }
     assert!(began.elapsed() >= PATIENCE, "it was given no time: {:?}", began.elapsed());
+}
+
+const TASK: &str = "\
+task: <img>
+states:
+  - plan: # it plans
+      action: path_planner/plan
+      in: { start: \"joints(0, 0, 0, 0, 0, 0, 0)\", goal: \"joints(1, 0, 0, 0, 0, 0, 0)\" }
+      duration: 2
+";
+
+/// A dashboard with a task file that may be changed.
+async fn serve_editor() -> (Served, PathBuf) {
+    let place = tempfile::tempdir().unwrap();
+    let file = place.path().join("task.yaml");
+    std::fs::write(&file, TASK).unwrap();
+    let check = |text: &str| load(text, "task.yaml", &Catalogue::standard());
+    let edit = Some(Editing::of(file.clone(), vec!["Arm".to_owned()], check, |_| Ok(7.5)));
+    let dashboard = Dashboard::bind(Options { edit, ..options(&[], place.path()) }).await.unwrap();
+    let url = dashboard.url();
+    let (address, token) = url.strip_prefix("http://").unwrap().split_once("/#token=").unwrap();
+    let served = Served { address: address.to_owned(), token: token.to_owned(), _place: place };
+    tokio::spawn(dashboard.serve());
+    (served, file)
+}
+
+impl Served {
+    async fn post(&self, path: &str, more: &str, body: &str) -> Answer {
+        let (address, length) = (&self.address, body.len());
+        self.say(&format!(
+            "POST {path} HTTP/1.1\r\nHost: {address}\r\n{more}Content-Length: {length}\r\nConnection: close\r\n\r\n{body}"
+        ))
+        .await
+    }
+
+    fn shown_token(&self) -> String {
+        format!("Authorization: Bearer {}\r\n", self.token)
+    }
+}
+
+fn change(digest: &Value, items: &str) -> String {
+    format!(r#"{{"digest":{digest},"state":"plan","changes":[{{"key":"duration","items":{items}}}]}}"#)
+}
+
+#[tokio::test]
+async fn without_a_task_file_to_change_nothing_of_the_editor_is_there() {
+    let served = serve(&[], true).await;
+    assert_eq!(served.get("/api/about").await.json()["edit"], "");
+    assert_eq!(served.get("/api/annotations").await.status, 404);
+    for path in ["check", "gain", "save"] {
+        assert_eq!(served.post(&format!("/api/annotations/{path}"), &served.shown_token(), "{}").await.status, 404);
+    }
+}
+
+#[tokio::test]
+async fn annotations_are_checked_without_being_written_and_written_once_the_page_says_so() {
+    let (served, file) = serve_editor().await;
+    let on_disk = || std::fs::read_to_string(&file).unwrap();
+    let told = served.get("/api/annotations").await.json();
+    assert_eq!((&told["states"][0]["path"], &told["kinds"][0]), (&Value::from("plan"), &Value::from("Arm")));
+    let (digest, token) = (&told["digest"], served.shown_token());
+    let checked = served.post("/api/annotations/check", &token, &change(digest, r#"["3.5"]"#)).await.json();
+    assert_eq!((&checked["refused"], &checked["after"][0]), (&Value::from(false), &Value::from("      duration: 3.5")));
+    let gained = served.post("/api/annotations/gain", &token, &change(digest, r#"["3.5"]"#)).await.json();
+    assert_eq!((gained["before_s"].as_f64(), gained["after_s"].as_f64()), (Some(7.5), Some(7.5)));
+    assert_eq!(on_disk(), TASK);
+    let saved = served.post("/api/annotations/save", &token, &change(digest, r#"["3.5"]"#)).await;
+    assert_eq!(saved.status, 200, "{}", saved.body);
+    assert_eq!(on_disk(), TASK.replace("duration: 2", "duration: 3.5"));
+    // The page has seen another text than is there now.
+    let again = served.post("/api/annotations/save", &token, &change(digest, "null")).await;
+    assert!(again.status == 409 && again.body.contains("read it again"), "{}", again.body);
+    assert_eq!(on_disk(), TASK.replace("duration: 2", "duration: 3.5"));
+}
+
+#[tokio::test]
+async fn nothing_is_written_without_the_token_for_pages_of_others_by_get_or_from_what_is_too_long() {
+    let (served, file) = serve_editor().await;
+    let (digest, token) = (served.get("/api/annotations").await.json()["digest"].clone(), served.shown_token());
+    let (path, good) = ("/api/annotations/save", change(&digest, "null"));
+    assert_eq!(served.post(path, "", &good).await.status, 401);
+    let foreign = format!("{token}Origin: http://evil.example\r\n");
+    assert_eq!(served.post(path, &foreign, &good).await.status, 403);
+    assert_eq!(served.post(path, &format!("{token}Sec-Fetch-Site: cross-site\r\n"), &good).await.status, 403);
+    assert_eq!(served.get(path).await.status, 405);
+    assert_eq!(served.ask("POST", "/api/annotations").await.status, 405);
+    let long = change(&digest, &format!("[\"{}\"]", "x".repeat(70_000)));
+    assert_eq!(served.post(path, &token, &long).await.status, 413);
+    for odd in ["", "[]", "{}", &change(&Value::from(7), "null"), &change(&digest, r#"null,"more":1"#)] {
+        assert_eq!(served.post(path, &token, odd).await.status, 400, "{odd}");
+    }
+    for (state, key, status) in [("nowhere", "reads", 422), ("plan", "action", 422), ("plan", "pia", 422)] {
+        let body = format!(r#"{{"digest":{digest},"state":"{state}","changes":[{{"key":"{key}","items":[]}}]}}"#);
+        assert_eq!(served.post(path, &token, &body).await.status, status, "{state} {key}");
+    }
+    assert_eq!(std::fs::read_to_string(&file).unwrap(), TASK);
+    // A body that does not come keeps nobody waiting for ever.
+    let (address, begun) = (&served.address, Instant::now());
+    let slow =
+        format!("POST {path} HTTP/1.1\r\nHost: {address}\r\n{token}Content-Length: 9\r\nConnection: close\r\n\r\n{{");
+    assert_eq!(served.say(&slow).await.status, 408);
+    assert!(begun.elapsed() < 10 * PATIENCE);
 }

@@ -20,6 +20,7 @@ mod action;
 mod advice;
 mod allowed;
 mod document;
+pub mod edit;
 mod effects;
 mod fields;
 mod flow;

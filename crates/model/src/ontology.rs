@@ -105,6 +105,11 @@ impl Ontology {
         self.predicates.get(name)
     }
 
+    /// The individuals that are declared by name.
+    pub fn individuals(&self) -> impl Iterator<Item = &str> {
+        self.individuals.keys().map(String::as_str)
+    }
+
     /// Every predicate by its name, in order.
     pub fn predicates(&self) -> impl Iterator<Item = (&str, &Predicate)> {
         self.predicates.iter().map(|(name, predicate)| (name.as_str(), predicate))

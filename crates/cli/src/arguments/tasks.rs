@@ -230,6 +230,9 @@ pub(crate) struct DashboardArguments {
     /// Let the pages pause a run, let it step and go on, and end it; without it they only look
     #[arg(long)]
     pub(crate) control: bool,
+    /// A task file whose annotations the page "Annotations" shows, checks while they are typed and, after a question, writes
+    #[arg(long, value_name = "TASK")]
+    pub(crate) edit: Option<PathBuf>,
     /// The robot of the logs: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml; the system's unless given
     #[arg(long, value_name = "ROBOT")]
     pub(crate) robot: Option<String>,

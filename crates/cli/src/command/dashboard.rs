@@ -7,12 +7,21 @@ use crate::interrupt::Interrupt;
 use crate::system::config::SystemConfig;
 use crate::system::{CONFIG_FILE, public_directory};
 use crate::{input, output};
-use ratn_dashboard::{Dashboard, DashboardError, Options, Robots, Tasks};
+use ratn_dashboard::{Dashboard, DashboardError, Editing, Options, Robots, Tasks};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::load::load_with;
+use ratn_model::program::Program;
+use ratn_model::resource::Quantity;
 use ratn_motion::robot::Robot;
+use ratn_simulation::sequential::{Assumptions, makespan_s};
 use ratn_worker::tls::ClientTls;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+
+/// How many elements a list has that an action answers, as `ratn check` assumes.
+const ASSUMED_ELEMENTS: usize = 3;
+/// What a change gains is simulated up to so many events: about two seconds.
+const MAX_EVENTS: usize = 20_000;
 
 /// Serves the pages until the user has seen enough.
 pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(), Failure> {
@@ -21,6 +30,7 @@ pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(),
         address: arguments.listen,
         logs: arguments.logs.clone(),
         control: arguments.control,
+        edit: arguments.edit.as_deref().map(|file| editing(file, &directory)).transpose()?,
         tasks: tasks(catalogue(&directory)?),
         robots: robots(directory.clone(), arguments.robot.clone()),
         ..Options::of(directory, tls.clone())
@@ -29,7 +39,12 @@ pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(),
         let interrupt = Interrupt::listen()?;
         let dashboard = Dashboard::bind(options).await.map_err(refused)?;
         output::result(dashboard.url())?;
-        let what = if arguments.control { "the pages may pause and end runs" } else { "the pages only look" };
+        let what = match (arguments.control, &arguments.edit) {
+            (true, None) => "the pages may pause and end runs".to_owned(),
+            (false, None) => "the pages only look".to_owned(),
+            (true, Some(file)) => format!("the pages may pause and end runs, and change {}", file.display()),
+            (false, Some(file)) => format!("the pages may change {}", file.display()),
+        };
         output::progress(format_args!("open this address in a browser on this machine; {what}; Ctrl-C ends it"));
         tokio::select! {
             () = dashboard.serve() => {}
@@ -49,11 +64,37 @@ pub(super) async fn of_system(directory: &Path, tls: &ClientTls) -> anyhow::Resu
     Ok(dashboard)
 }
 
+/// The task file whose annotations pages may change, checked as `ratn check` does.
+fn editing(file: &Path, directory: &Path) -> Result<Editing, Failure> {
+    let refused = |error| Failure::Refused(format!("{}: cannot be read: {error}", file.display()));
+    input::read(file).map_err(refused)?;
+    let config = config(directory)?;
+    let assumptions = Assumptions {
+        parameters: BTreeMap::new(),
+        elements: ASSUMED_ELEMENTS,
+        durations_s: BTreeMap::new(),
+        units: config.promised_resources().into_iter().map(|(kind, units)| (kind, units.max(Quantity::ONE))).collect(),
+        attributes: config.module_attributes().clone(),
+    };
+    let kinds = config.catalogue.resources.keys().cloned().collect();
+    let (catalogue, name) = (config.catalogue.clone(), file.display().to_string());
+    let check = move |text: &str| load_with(text, &name, &catalogue, &input::Libraries);
+    let makespan = move |program: &Program| {
+        let parameters = program.bind_parameters(&[]).map_err(|error| error.to_string())?;
+        let assumptions = Assumptions { parameters, ..assumptions.clone() };
+        makespan_s(program, &config.catalogue, &assumptions, MAX_EVENTS).map_err(|obstacle| obstacle.to_string())
+    };
+    Ok(Editing::of(file.to_owned(), kinds, check, makespan))
+}
+
 /// That of the system that runs, or ran, in a directory; else the one that is built in.
+fn config(directory: &Path) -> Result<SystemConfig, Failure> {
+    let own = SystemConfig::read(&directory.join(CONFIG_FILE)).ok();
+    own.map_or_else(|| SystemConfig::load(None), Ok)
+}
+
 fn catalogue(directory: &Path) -> Result<Catalogue, Failure> {
-    let file = directory.join(CONFIG_FILE);
-    let own = SystemConfig::read(&file).ok();
-    Ok(own.map_or_else(|| SystemConfig::load(None), Ok)?.catalogue)
+    Ok(config(directory)?.catalogue)
 }
 
 /// The robot that the user names, else that of the system that runs, or ran, in a directory, else the one that is built in. A log does not say

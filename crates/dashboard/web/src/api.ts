@@ -1,6 +1,7 @@
 // What the pages ask the program that served them.
 
-import type { About, Cell, Frame, Robot, System, Tail, Task, Told, World } from "./wire";
+import type { Proposal } from "./annotations";
+import type { About, Annotations, Cell, Frame, Gained, Proposed, Robot, System, Tail, Task, Told, World } from "./wire";
 
 const TOKEN = "ratn-token";
 
@@ -23,20 +24,21 @@ export class Refused extends Error {
   }
 }
 
-async function ask<T>(path: string, query: Record<string, string | number | null>, method = "GET"): Promise<T> {
+async function ask<T>(path: string, query: Record<string, string | number | null>, method = "GET", body: unknown = null): Promise<T> {
   const pairs = Object.entries(query).flatMap(([name, value]) => (value === null ? [] : [[name, String(value)]]));
   const text = new URLSearchParams(pairs).toString();
   const response = await fetch(`/api/${path}${text === "" ? "" : `?${text}`}`, {
     method,
     headers: { authorization: `Bearer ${sessionStorage.getItem(TOKEN) ?? ""}` },
     cache: "no-store",
+    ...(body === null ? {} : { body: JSON.stringify(body) }),
   });
-  const body: unknown = await response.json();
+  const answer: unknown = await response.json();
   if (!response.ok) {
-    const problem = typeof body === "object" && body !== null && "problem" in body ? String(body.problem) : response.statusText;
+    const problem = typeof answer === "object" && answer !== null && "problem" in answer ? String(answer.problem) : response.statusText;
     throw new Refused(response.status, problem);
   }
-  return body as T;
+  return answer as T;
 }
 
 export const api = {
@@ -51,6 +53,10 @@ export const api = {
   tail: (worker: string) => ask<Tail>("tail", { worker }),
   scale: (host: string, template: string, min: string, max: string, spares: string) =>
     ask<Told>("scale", { host, template, min, max, spares }, "POST"),
+  annotations: () => ask<Annotations>("annotations", {}),
+  checkAnnotations: (proposal: Proposal) => ask<Proposed>("annotations/check", {}, "POST", proposal),
+  gainOfAnnotations: (proposal: Proposal) => ask<Gained>("annotations/gain", {}, "POST", proposal),
+  saveAnnotations: (proposal: Proposal) => ask<Told>("annotations/save", {}, "POST", proposal),
   control: (log: number, word: string) => ask<Told>("control", { log, word }, "POST"),
   answer: (log: number, state: string, choice: string) => ask<Told>("control", { log, word: "answer", state, choice }, "POST"),
   signal: (log: number, signal: string) => ask<Told>("control", { log, word: "signal", signal }, "POST"),

@@ -1,5 +1,6 @@
 // The dashboard: which page is shown, of which log, at which moment, and asking for what has changed.
 
+import { annotationsPage } from "./annotations";
 import { Refused, api, takeToken } from "./api";
 import { confirm } from "./confirm";
 import { count, fill, h, seconds } from "./dom";
@@ -11,7 +12,7 @@ import type { About, Awaits, Run, Told } from "./wire";
 const PERIOD_MS = 300;
 const SLOW_MS = 1_000;
 const SPEEDS = [0.5, 1, 2, 5, 10, 50, 200];
-const NAMES = { run: "Run", network: "Network", resources: "Resources", hosts: "Hosts and pools", world: "World", cell: "Cell", compare: "Compare" } as const;
+const NAMES = { run: "Run", network: "Network", resources: "Resources", hosts: "Hosts and pools", world: "World", cell: "Cell", compare: "Compare", annotations: "Annotations" } as const;
 type Name = keyof typeof NAMES;
 
 takeToken();
@@ -55,13 +56,14 @@ const pages: Record<Name, Page> = {
   world: worldPage(site),
   cell: cellPage(site),
   compare: comparePage(site),
+  annotations: annotationsPage({ say: (text) => say(text) }),
 };
 page = pages.run;
 
 // What is around the page.
 const announcer = h("p", { class: "hidden-text", "aria-live": "polite" });
 const links = new Map<Name, HTMLAnchorElement>();
-for (const [key, text] of Object.entries(NAMES)) links.set(key as Name, h("a", { href: `#/${key}` }, text));
+for (const [key, text] of Object.entries(NAMES)) links.set(key as Name, h("a", { href: `#/${key}`, hidden: key === "annotations" }, text));
 const logs = h("select", { "aria-label": "Event log" });
 const themeButton = h("button", { onclick: () => showTheme(nextTheme()) });
 const controls = h("span", { class: "row", role: "group", "aria-label": "Control of the run" });
@@ -179,6 +181,9 @@ logs.addEventListener("change", () => {
 
 function showLogs(now: About): void {
   about = now;
+  const editor = links.get("annotations");
+  if (editor !== undefined) editor.hidden = now.edit === "";
+  if (now.edit === "" && name === "annotations") location.hash = "#/run";
   // A run that begins is what somebody wants to see who looks at one that has ended.
   const begun = now.logs.find((one) => one.live && one.id !== log && one.id !== declined);
   const gone = !now.logs.some((one) => one.id === log);

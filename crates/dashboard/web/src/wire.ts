@@ -6,6 +6,8 @@ export interface About {
   version: string;
   /** Whether the pages may tell a run something. */
   control: boolean;
+  /** The task file whose annotations may be changed; empty without one. */
+  edit: string;
   /** The runtime directory of the system that is looked at; empty without one. */
   directory: string;
   /** The logs, those of the command line first. */
@@ -644,6 +646,114 @@ export interface Truth {
   objects: Object[];
   /** Why the cell does not tell; empty where it does. */
   problem: string;
+}
+
+/** A task file with what its states say of themselves, and what is in force for them. */
+export interface Annotations {
+  /** Where it is. */
+  file: string;
+  /** Of its text: what is changed is this text, and no other one. */
+  digest: string;
+  /** Why there are no states to be shown; empty where there are. */
+  problem: string;
+  /** Its states, in its order. */
+  states: AnnotatedState[];
+  /** The kinds of resources of the catalogue. */
+  kinds: string[];
+  /** The predicates of the ontology, and those that the file uses, with as many arguments as they have: `at(?)`. */
+  predicates: string[];
+  /** The individuals of the ontology. */
+  entities: string[];
+  /** What is wrong with it. */
+  findings: Finding[];
+}
+
+/** A state of a task file. */
+export interface AnnotatedState {
+  /** Its path. */
+  path: string;
+  /** How many states are around it. */
+  depth: number;
+  /** What it is: `action: gripper/grasp`. */
+  form: string;
+  /** The line of the file. */
+  line: number;
+  /** Why it cannot be changed here; empty where it can. */
+  fixed: string;
+  /** The annotations that it may have. */
+  keys: AnnotationKey[];
+  /** What is in force for it; nothing of a state that performs no action. */
+  in_force: InForceLine[];
+}
+
+/** What a state says under a key. */
+export interface AnnotationKey {
+  /** The key. */
+  key: string;
+  /** The state says something under it. */
+  said: boolean;
+  /** What it says, an item each, as the file has it. */
+  items: string[];
+  /** There may be several items. */
+  listed: boolean;
+}
+
+/** What is in force under a key. */
+export interface InForceLine {
+  /** The key. */
+  key: string;
+  /** As a task file says it, or `everything`, `nothing`, `unknown`. */
+  text: string;
+  /** Who says so: the state, its action, or nobody. */
+  from: string;
+}
+
+/** What is wrong with a task file. */
+export interface Finding {
+  /** `error` or `warning`. */
+  severity: string;
+  /** The name of the rule. */
+  rule: string;
+  /** The state; empty for the task. */
+  path: string;
+  /** The key of the state; empty where it is of none. */
+  key: string;
+  /** The line of the file with the change in it. */
+  line: number;
+  /** What is wrong. */
+  message: string;
+  /** What to do. */
+  help: string;
+}
+
+/** What a change would lead to; nothing is written. */
+export interface Proposed {
+  /** Why the text cannot be changed so; empty where it can. */
+  problem: string;
+  /** The key that the problem is of; empty where it is of none. */
+  key: string;
+  /** The task would be refused. */
+  refused: boolean;
+  /** What would be wrong with the file. */
+  findings: Finding[];
+  /** What would be in force for the state. */
+  in_force: InForceLine[];
+  /** The lines of the file that would be others, as they are. */
+  before: string[];
+  /** These lines as they would be. */
+  after: string[];
+  /** The number of the first of them. */
+  line: number;
+}
+
+/** What a change would gain, by simulation as a dataflow network. */
+export interface Gained {
+  /** The makespan of the file as it is. */
+  before_s: number | null;
+  /** The makespan with the change. */
+  after_s: number | null;
+  /** Why there is none; empty where there is. */
+  obstacle: string;
 }
 
 /** What became of what a run was told. */

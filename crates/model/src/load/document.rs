@@ -39,7 +39,7 @@ impl Document {
         })
     }
 
-    fn of(node: Node) -> Document {
+    pub(super) fn of(node: Node) -> Document {
         match node.content {
             Content::Null => Document::Null,
             Content::Bool(truth) => Document::Bool(truth),

@@ -47,28 +47,7 @@ pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
     let view = View { state: Some(id), ..View::default() };
     let mut fields = Fields { task, view, path: step.path.clone(), out };
     if id.0 > 0 {
-        let own: &[&str] = match step.form {
-            Form::Action { .. } => &ACTION_KEYS,
-            Form::Sequence { .. } => &SEQUENCE_KEYS,
-            Form::ForEach { .. } => &LOOP_KEYS,
-            Form::While { .. } => &WHILE_KEYS,
-            Form::Condition { .. } => &CONDITION_KEYS,
-            Form::Concurrency { .. } => &CONCURRENCY_KEYS,
-            Form::Library { .. } => &LIBRARY_KEYS,
-            Form::Wait { asks, .. } => std::slice::from_ref(&WAIT_KEYS[usize::from(asks)]),
-        };
-        let of_all: &[&str] = if matches!(step.form, Form::Wait { .. }) { &WAITING_KEYS } else { &NODE_KEYS };
-        let mut known = [own, of_all].concat();
-        match step.form {
-            Form::Action { .. } => known.extend(NATURE_KEYS.into_iter().chain(BOUNDARY_KEYS)),
-            Form::Library { .. } => known.extend(BOUNDARY_KEYS),
-            Form::Sequence { .. } | Form::Concurrency { .. } => {
-                known.extend(BOUNDARY_KEYS.into_iter().chain(["outcomes"]))
-            }
-            Form::Wait { .. } => {}
-            _ => known.push("outcomes"),
-        }
-        fields.keys(step.body, &known);
+        fields.keys(step.body, &known_keys(&step.form));
     }
     let kind = kind(&mut fields, step);
     let outcomes = flow::outcomes(&mut fields, id);
@@ -96,6 +75,30 @@ pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
     };
     flow::lead_violated(&fields, id, &mut state);
     state
+}
+
+/// The keys that a state of this form may have.
+pub(crate) fn known_keys(form: &Form<'_>) -> Vec<&'static str> {
+    let own: &[&str] = match form {
+        Form::Action { .. } => &ACTION_KEYS,
+        Form::Sequence { .. } => &SEQUENCE_KEYS,
+        Form::ForEach { .. } => &LOOP_KEYS,
+        Form::While { .. } => &WHILE_KEYS,
+        Form::Condition { .. } => &CONDITION_KEYS,
+        Form::Concurrency { .. } => &CONCURRENCY_KEYS,
+        Form::Library { .. } => &LIBRARY_KEYS,
+        Form::Wait { asks, .. } => std::slice::from_ref(&WAIT_KEYS[usize::from(*asks)]),
+    };
+    let of_all: &[&str] = if matches!(form, Form::Wait { .. }) { &WAITING_KEYS } else { &NODE_KEYS };
+    let mut known = [own, of_all].concat();
+    match form {
+        Form::Action { .. } => known.extend(NATURE_KEYS.into_iter().chain(BOUNDARY_KEYS)),
+        Form::Library { .. } => known.extend(BOUNDARY_KEYS),
+        Form::Sequence { .. } | Form::Concurrency { .. } => known.extend(BOUNDARY_KEYS.into_iter().chain(["outcomes"])),
+        Form::Wait { .. } => {}
+        _ => known.push("outcomes"),
+    }
+    known
 }
 
 fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {

@@ -152,6 +152,20 @@ pub fn sequential(program: &Program, catalogue: &Catalogue, assumptions: &Assump
     })
 }
 
+/// How long a checked program takes as a dataflow network, in seconds, with what is assumed. It is given up after so many events, which bounds
+/// how long that takes.
+///
+/// # Errors
+/// [`Obstacle`] where the task does not come to a successful end with what is assumed.
+pub fn makespan_s(
+    program: &Program,
+    catalogue: &Catalogue,
+    assumptions: &Assumptions,
+    max_events: usize,
+) -> Result<f64, Obstacle> {
+    simulate_up_to(program, catalogue, assumptions, Mode::Cdtn, &mut BTreeSet::new(), max_events).map(|run| run.end_s)
+}
+
 /// The states whose failure is handled and could be exceptional, with what that gains.
 fn exceptional(program: &Program, run: &Run, mut ends_s: impl FnMut(&Program) -> Option<f64>) -> Vec<Gain> {
     let handled = executed(run, |id| !program.is_exceptional(id, ABORTED));
@@ -223,6 +237,18 @@ fn simulate(
     mode: Mode,
     unknown: &mut BTreeSet<String>,
 ) -> Result<Run, Obstacle> {
+    let max_events = Circumstances::default().max_events;
+    simulate_up_to(program, catalogue, assumptions, mode, unknown, max_events)
+}
+
+fn simulate_up_to(
+    program: &Program,
+    catalogue: &Catalogue,
+    assumptions: &Assumptions,
+    mode: Mode,
+    unknown: &mut BTreeSet<String>,
+    max_events: usize,
+) -> Result<Run, Obstacle> {
     let name = match mode {
         Mode::Hsm => "HSM",
         Mode::Cdtn => "CDTN",
@@ -247,7 +273,8 @@ fn simulate(
         latency: Duration::ZERO,
     };
     let mut providers = AssumedProviders::new(&program, assumptions);
-    let circumstances = Circumstances { attributes: assumptions.attributes.clone(), ..Circumstances::default() };
+    let circumstances =
+        Circumstances { attributes: assumptions.attributes.clone(), max_events, ..Circumstances::default() };
     let run = run_under(setup, &mut providers, circumstances).map_err(|source| Obstacle::Run { mode: name, source })?;
     unknown.extend(providers.unknown_durations());
     if run.outcome == SUCCESS {

@@ -1,0 +1,134 @@
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+use super::*;
+use ratn_model::catalogue::Catalogue;
+use ratn_model::load::load;
+use std::os::unix::fs::PermissionsExt;
+
+const TASK: &str = "\
+task: t
+states:
+  - plan: # it plans
+      action: path_planner/plan
+      in: { start: \"joints(0, 0, 0, 0, 0, 0, 0)\", goal: \"joints(1, 0, 0, 0, 0, 0, 0)\" }
+      duration: 2
+  - open: { action: gripper/release, retry: 1, effects: { success: [hand_empty(gripper)], aborted: [] } }
+";
+
+fn editing(folder: &tempfile::TempDir) -> Editing {
+    let file = folder.path().join("t.yaml");
+    std::fs::write(&file, TASK).unwrap();
+    let check = |text: &str| load(text, "t.yaml", &Catalogue::standard());
+    let makespan = |program: &Program| Ok(program.states.len() as f64);
+    Editing::of(file, vec!["Arm".to_owned()], check, makespan)
+}
+
+fn proposal(editing: &Editing, state: &str, key: &str, items: Option<&[&str]>) -> Proposal {
+    let items = items.map(|items| items.iter().map(|one| (*one).to_owned()).collect());
+    let digest = told(editing).unwrap().digest;
+    Proposal { digest, state: state.to_owned(), changes: vec![Setting { key: key.to_owned(), items }] }
+}
+
+fn on_disk(editing: &Editing) -> String {
+    std::fs::read_to_string(&editing.0.file).unwrap()
+}
+
+#[test]
+fn states_are_told_with_what_they_say_and_what_is_in_force() {
+    let folder = tempfile::tempdir().unwrap();
+    let told = told(&editing(&folder)).unwrap();
+    assert_eq!((told.states.len(), told.problem.as_str()), (2, ""));
+    let key = |state: usize, key: &str| told.states[state].keys.iter().find(|one| one.key == key).unwrap().clone();
+    assert_eq!(key(0, "duration").items, ["2"]);
+    assert_eq!((key(0, "computes").said, key(0, "computes").listed), (false, false));
+    assert_eq!(key(1, "effects").items, ["{ success: [hand_empty(gripper)], aborted: [] }"]);
+    let force = |state: usize, key: &str| {
+        let line = told.states[state].in_force.iter().find(|one| one.key == key).unwrap();
+        (line.text.clone(), line.from.clone())
+    };
+    assert_eq!(force(0, "duration"), ("2".to_owned(), "this state".to_owned()));
+    assert_eq!(force(0, "computes").1, "the catalogue, of path_planner/plan");
+    assert_eq!(force(0, "requires").1, "default: nobody says otherwise");
+    // Also of a state that is tried again.
+    assert!(force(1, "resources").0.contains("Gripper"));
+    assert!(told.predicates.iter().any(|one| one == "on(?, ?)"), "{:?}", told.predicates);
+}
+
+#[test]
+fn a_change_is_checked_and_nothing_is_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let editing = editing(&folder);
+    let good = proposed(&editing, &proposal(&editing, "plan", "reads", Some(&["at(table)", "shape(table)"]))).unwrap();
+    assert_eq!((good.problem.as_str(), good.refused, good.line), ("", false, 7));
+    assert_eq!((good.before.len(), good.after), (0, vec!["      reads: [at(table), shape(table)]".to_owned()]));
+    assert!(good.in_force.iter().any(|line| line.key == "reads" && line.from == "this state"));
+    let bad = proposed(&editing, &proposal(&editing, "plan", "requires", Some(&["nothing.here = 1"]))).unwrap();
+    assert!(bad.refused && bad.findings.iter().any(|one| one.path == "plan" && one.key == "requires"), "{bad:?}");
+    let none = proposed(&editing, &proposal(&editing, "plan", "resources", Some(&["{ block: "]))).unwrap();
+    assert!(none.problem.contains("is no value") && none.key == "resources", "{none:?}");
+    assert_eq!(on_disk(&editing), TASK);
+}
+
+#[test]
+fn a_change_is_written_and_all_else_and_the_mode_stay() {
+    let folder = tempfile::tempdir().unwrap();
+    let editing = editing(&folder);
+    std::fs::set_permissions(&editing.0.file, std::fs::Permissions::from_mode(0o640)).unwrap();
+    saved(&editing, &proposal(&editing, "plan", "duration", Some(&["3.5"]))).unwrap();
+    assert_eq!(on_disk(&editing), TASK.replace("duration: 2", "duration: 3.5"));
+    assert_eq!(std::fs::metadata(&editing.0.file).unwrap().permissions().mode() & 0o7777, 0o640);
+    saved(&editing, &proposal(&editing, "open", "effects", None)).unwrap();
+    assert!(on_disk(&editing).ends_with("retry: 1 }\n"));
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is left beside it");
+}
+
+#[test]
+fn what_has_changed_on_the_disk_is_not_overwritten() {
+    let folder = tempfile::tempdir().unwrap();
+    let editing = editing(&folder);
+    let seen = proposal(&editing, "plan", "duration", Some(&["3"]));
+    let other = format!("{TASK}# somebody else\n");
+    std::fs::write(&editing.0.file, &other).unwrap();
+    assert!(matches!(saved(&editing, &seen), Err(Problem::Changed { .. })));
+    assert!(matches!(proposed(&editing, &seen), Err(Problem::Changed { .. })));
+    // Also not what changes while it is written.
+    assert!(matches!(file::replace(&editing.0.file, TASK, "new", MAX_SOURCE), Err(FileError::Changed)));
+    assert_eq!(on_disk(&editing), other);
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+}
+
+#[test]
+fn what_check_would_refuse_is_not_written_nor_a_file_that_is_read_only() {
+    let folder = tempfile::tempdir().unwrap();
+    let editing = editing(&folder);
+    let bad = saved(&editing, &proposal(&editing, "plan", "duration", Some(&["nothing.here"])));
+    assert!(matches!(bad, Err(Problem::Refused { .. })), "{bad:?}");
+    std::fs::set_permissions(&editing.0.file, std::fs::Permissions::from_mode(0o444)).unwrap();
+    let locked = saved(&editing, &proposal(&editing, "plan", "duration", Some(&["3"])));
+    assert!(matches!(locked, Err(Problem::File(FileError::Write { .. }))), "{locked:?}");
+    assert_eq!(on_disk(&editing), TASK);
+}
+
+#[test]
+fn what_is_typed_is_read_as_it_was_shown() {
+    for text in
+        ["at(table)", "a.b = \"c, d\"", "{ block: Arm }", "3", "2.5", "true", "\"true\"", "\"{x: 1}\"", "[1, a]"]
+    {
+        let read = item(text).unwrap();
+        assert_eq!(item(&typed(&read)), Ok(read.clone()), "{text}: {read:?}");
+        assert_eq!(typed(&read), text);
+    }
+    assert!(item(" ").is_err() && item("{ a").is_err());
+}
+
+#[tokio::test]
+async fn what_it_would_gain_is_said_or_why_it_is_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let editing = editing(&folder);
+    let good = proposal(&editing, "plan", "duration", Some(&["3"]));
+    let told = gained(&editing, good.clone()).await.unwrap();
+    assert!(told.before_s.is_some() && told.before_s == told.after_s && told.obstacle.is_empty());
+    let bad = gained(&editing, proposal(&editing, "plan", "duration", Some(&["no.where"]))).await.unwrap();
+    assert!(bad.before_s.is_some() && bad.after_s.is_none() && bad.obstacle.contains("refuses"), "{bad:?}");
+    let _place = editing.0.simulating.clone().try_acquire_owned().unwrap();
+    assert!(gained(&editing, good).await.unwrap().obstacle.contains("under way"));
+}

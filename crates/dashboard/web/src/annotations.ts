@@ -1,0 +1,401 @@
+// The page "Annotations": the states of a task file with what is in force for each, and a form that changes what one says itself.
+//
+// What is typed is checked by the program that served the page, with the checks of `ratn check`; nothing is written before its user has
+// confirmed it.
+
+import { Refused, api } from "./api";
+import { confirm } from "./confirm";
+import { type Child, append, fill, h, percent, seconds } from "./dom";
+import type { Page } from "./pages";
+import type { AnnotatedState, AnnotationKey, Annotations, Finding, Gained, InForceLine, Proposed } from "./wire";
+
+/** What a state shall say under a key; without items the key is not there any more. */
+export interface Change {
+  key: string;
+  items: string[] | null;
+}
+
+export interface Proposal {
+  digest: string;
+  state: string;
+  changes: Change[];
+}
+
+/** What is in the form: of each key whether the state says something, and what. */
+export type Draft = Map<string, { said: boolean; items: string[] }>;
+
+const DEBOUNCE_MS = 350;
+const ABOUT: Record<string, string> = {
+  computes: "it only computes, and may run early, twice, or for nothing",
+  reads: "the facts that it depends on; scene for those that geometry comes from",
+  senses: "the facts that must be as at its place when it looks",
+  requires: "conditions that must hold before it begins",
+  effects: "what it changes: at(cup) = pose, not hand_empty(gripper)",
+  resources: "what it asks of the resource manager: { block: Arm }",
+  duration: "an estimate, in the robot's seconds",
+};
+
+export function draftOf(state: AnnotatedState): Draft {
+  return new Map(state.keys.map((one) => [one.key, { said: one.said, items: [...one.items] }]));
+}
+
+/** What of a draft is otherwise than the file. Items that are empty count for nothing. */
+export function changesOf(state: AnnotatedState, draft: Draft): Change[] {
+  return state.keys.flatMap((one) => {
+    const now = draft.get(one.key);
+    if (now === undefined) return [];
+    const items = now.items.map((item) => item.trim()).filter((item) => item !== "");
+    // A value of which nothing is left is not there.
+    const said = now.said && (one.listed || items.length > 0);
+    const isSame = said === one.said && (!said || JSON.stringify(items) === JSON.stringify(one.items));
+    return isSame ? [] : [{ key: one.key, items: said ? items : null }];
+  });
+}
+
+/** Findings of a state by key, those of the state that are of no key of the form, and all others. */
+export function sorted(findings: Finding[], state: string, keys: string[]): { byKey: Map<string, Finding[]>; own: Finding[]; others: Finding[] } {
+  const byKey = new Map<string, Finding[]>();
+  const [own, others]: [Finding[], Finding[]] = [[], []];
+  for (const one of findings) {
+    if (one.path !== state) others.push(one);
+    else if (!keys.includes(one.key)) own.push(one);
+    else byKey.set(one.key, [...(byKey.get(one.key) ?? []), one]);
+  }
+  return { byKey, own, others };
+}
+
+/** What a change gains, in a sentence. */
+export function gainText(gained: Gained): string {
+  const { before_s: before, after_s: after, obstacle } = gained;
+  if (before !== null && after !== null) {
+    const difference = before - after;
+    const now = `With the change ${seconds(after)}, without it ${seconds(before)}, by simulation in CDTN mode`;
+    if (Math.abs(difference) < 0.05) return `${now}: nothing is gained.`;
+    const share = before > 0 ? ` (${percent((Math.abs(difference) / before) * 100)})` : "";
+    return `${now}: ${seconds(Math.abs(difference))} ${difference > 0 ? "shorter" : "longer"}${share}.`;
+  }
+  const known = before !== null ? ` As it is: ${seconds(before)}.` : after !== null ? ` With the change: ${seconds(after)}.` : "";
+  return `What it gains cannot be said: ${obstacle}.${known}`;
+}
+
+/** Words for completion under a key. */
+export function wordsFor(key: string, all: Pick<Annotations, "kinds" | "predicates" | "entities">): string[] {
+  const { kinds, predicates, entities } = all;
+  switch (key) {
+    case "computes":
+      return ["true", "false"];
+    case "resources":
+      return ["world_model", ...["block", "consume", "exists"].flatMap((verb) => kinds.map((kind) => `{ ${verb}: ${kind} }`))];
+    case "reads":
+    case "senses": {
+      const facts = predicates.flatMap((one) => [one, ...(/^[^(]+\(\?\)$/.test(one) ? entities.map((entity) => one.replace("?", entity)) : [])]);
+      return key === "reads" ? ["scene", ...facts] : facts;
+    }
+    case "effects":
+    case "requires": {
+      const facts = predicates.flatMap((one) => (/^[^(]+\(\?\)$/.test(one) ? entities.map((entity) => one.replace("?", entity)) : [one]));
+      return key === "requires" ? [...facts, ...facts.map((fact) => `exists ${fact}`)] : [...facts, ...facts.map((fact) => `not ${fact}`)];
+    }
+    default:
+      return [];
+  }
+}
+
+function findingsList(findings: Finding[], where: boolean): HTMLElement | null {
+  if (findings.length === 0) return null;
+  const item = (one: Finding) =>
+    h(
+      "li",
+      { class: one.severity === "error" ? "bad" : "warn" },
+      `${one.severity}, line ${one.line}: ${where && one.path !== "" ? `${one.path}: ` : ""}${one.message}${one.help === "" ? "" : `. ${one.help}`}`,
+    );
+  return h("ul", { class: "plain" }, ...findings.map(item));
+}
+
+/** What is in force under a key: nature has one key of three. */
+function inForce(lines: InForceLine[], key: string): Child {
+  const line = lines.find((one) => one.key === key);
+  return line === undefined ? null : h("p", { class: "faint" }, `In force: ${line.text} (${line.from})`);
+}
+
+/** What the page wants of the whole. */
+export interface Desk {
+  /** Says it to screen readers. */
+  say(text: string): void;
+}
+
+export function annotationsPage(desk: Desk): Page {
+  let all: Annotations | null = null;
+  let chosen: string | null = null;
+  let draft: Draft = new Map();
+  let checked: Proposed | null = null;
+  let timer: ReturnType<typeof setTimeout> | undefined;
+  /** Answers to questions before the last one do not count. */
+  let question = 0;
+  let loading = false;
+
+  const notice = h("div", { role: "alert", class: "problem", hidden: true });
+  const head = h("p", {});
+  const list = h("ul", { class: "plain annotated" });
+  const form = h("section", { class: "annotations-form", "aria-label": "Annotations of the state" });
+  const others = h("section", { "aria-label": "What else is wrong" });
+  const result = h("section", { "aria-label": "What the change does", "aria-live": "polite" });
+  const fields = new Map<string, { findings: HTMLElement; force: HTMLElement }>();
+  const save = h("button", { class: "first", disabled: true, "data-key": "save", onclick: askToSave }, "Save …");
+  const undo = h("button", { disabled: true, "data-key": "undo", onclick: () => choose(chosen) }, "Undo all");
+  const again = h("button", { "data-key": "again", onclick: () => void load() }, "Read the file again");
+
+  const state = () => all?.states.find((one) => one.path === chosen) ?? null;
+  const changes = () => {
+    const now = state();
+    return now === null ? [] : changesOf(now, draft);
+  };
+  const proposal = (): Proposal => ({ digest: all?.digest ?? "", state: chosen ?? "", changes: changes() });
+
+  function complain(text: string): void {
+    notice.hidden = text === "";
+    fill(notice, text, text === "" ? null : h("button", { onclick: () => void load() }, "Read the file again"));
+  }
+
+  function failed(error: unknown): void {
+    const text = error instanceof Error ? error.message : String(error);
+    complain(error instanceof Refused && error.status === 409 ? text : `${text} `);
+  }
+
+  async function load(): Promise<void> {
+    if (loading) return;
+    loading = true;
+    try {
+      all = await api.annotations();
+      complain(all.problem);
+      fill(head, h("b", {}, all.file), ` ${all.states.length} states. What is typed is checked as by `, h("code", {}, "ratn check"), "; nothing is written before you save.");
+      showList();
+      const kept = all.states.some((one) => one.path === chosen) ? chosen : (all.states[0]?.path ?? null);
+      choose(kept);
+    } catch (error) {
+      failed(error);
+    } finally {
+      loading = false;
+    }
+  }
+
+  function showList(): void {
+    const item = (one: AnnotatedState) => {
+      const said = one.keys.filter((key) => key.said).map((key) => key.key);
+      const force = one.in_force.map((line) => `${line.key}: ${line.text} (${line.from})`).join("\n");
+      const button = h(
+        "button",
+        { class: "link", "data-key": `state ${one.path}`, title: force, "aria-pressed": String(one.path === chosen), onclick: () => leave(one.path) },
+        one.path.slice(one.path.lastIndexOf("/") + 1),
+      );
+      const line = h("li", {}, button, h("span", { class: "faint" }, ` ${one.form}${said.length === 0 ? "" : ` · says ${said.join(", ")}`}${one.fixed === "" ? "" : " · not changed here"}`));
+      // The policy of the page lets no attribute `style`, and this is none.
+      line.style.paddingInlineStart = `${Math.min(one.depth, 20) * 18}px`;
+      if (one.in_force.length > 0) {
+        const rows = one.in_force.map((row) => h("li", {}, `${row.key}: ${row.text} `, h("span", { class: "faint" }, `(${row.from})`)));
+        append(line, [h("details", {}, h("summary", { "aria-label": `what is in force for ${one.path}` }, "in force"), h("ul", { class: "plain" }, ...rows))]);
+      }
+      return line;
+    };
+    fill(list, ...(all?.states ?? []).map(item));
+  }
+
+  /** Chooses another state; what was typed is not lost without a question. */
+  function leave(path: string): void {
+    if (path === chosen) return;
+    const count = changes().length;
+    if (count === 0) choose(path);
+    else confirm("Leave without saving?", "Leave", [h("p", {}, `What was typed for ${chosen ?? ""} is not saved.`)], true, () => choose(path));
+  }
+
+  function choose(path: string | null): void {
+    chosen = path;
+    checked = null;
+    question += 1;
+    clearTimeout(timer);
+    const now = state();
+    draft = now === null ? new Map() : draftOf(now);
+    for (const button of list.querySelectorAll<HTMLElement>("button[data-key]")) {
+      button.setAttribute("aria-pressed", String(button.dataset["key"] === `state ${path ?? ""}`));
+    }
+    fill(result);
+    showForm();
+    showFindings(all?.findings ?? []);
+    update();
+  }
+
+  function showForm(): void {
+    const now = state();
+    fields.clear();
+    if (now === null) {
+      fill(form, h("p", { class: "faint" }, "No state is chosen."));
+      return;
+    }
+    const title = h("h2", {}, now.path, h("span", { class: "faint" }, ` ${now.form}, line ${now.line}`));
+    if (now.fixed !== "") {
+      const rows = now.in_force.map((row) => h("li", {}, `${row.key}: ${row.text} `, h("span", { class: "faint" }, `(${row.from})`)));
+      fill(form, title, h("p", { class: "warn" }, now.fixed), h("ul", { class: "plain" }, ...rows));
+      return;
+    }
+    const words = now.keys.map((one) => h("datalist", { id: `words-${one.key}` }, ...wordsFor(one.key, all ?? { kinds: [], predicates: [], entities: [] }).map((value) => h("option", { value }))));
+    fill(form, title, h("div", { id: "of-state" }), ...now.keys.map((one) => field(one, now)), ...words, h("div", { class: "row" }, save, undo, again));
+  }
+
+  function field(one: AnnotationKey, now: AnnotatedState): HTMLElement {
+    const said = draft.get(one.key) ?? { said: false, items: [] };
+    const items = h("div", {});
+    const findings = h("div", { id: `findings-${one.key}`, "aria-live": "polite" });
+    const force = h("div", {});
+    fields.set(one.key, { findings, force });
+    fill(force, inForce(now.in_force, one.key));
+    const own = h("input", { type: "checkbox", checked: said.said, "data-key": `said ${one.key}` });
+    const input = (item: string, index: number) => {
+      const box = h("input", {
+        type: "text",
+        value: item,
+        list: `words-${one.key}`,
+        autocomplete: "off",
+        spellcheck: "false",
+        "aria-label": one.listed ? `${one.key}, ${index + 1}` : one.key,
+        "aria-describedby": `findings-${one.key}`,
+        "data-key": `${one.key} ${index}`,
+        disabled: !said.said,
+        oninput: () => {
+          said.items[index] = box.value;
+          edited();
+        },
+      });
+      const away = h(
+        "button",
+        {
+          "aria-label": `Remove ${one.key}, ${index + 1}`,
+          disabled: !said.said,
+          onclick: () => {
+            said.items.splice(index, 1);
+            showItems();
+            edited();
+            add.focus();
+          },
+        },
+        "−",
+      );
+      return h("div", { class: "row item" }, box, one.listed ? away : null);
+    };
+    const add = h(
+      "button",
+      {
+        "data-key": `add ${one.key}`,
+        "aria-label": `Add to ${one.key}`,
+        onclick: () => {
+          said.items.push("");
+          showItems();
+          items.querySelector<HTMLElement>(`[data-key="${one.key} ${said.items.length - 1}"]`)?.focus();
+        },
+      },
+      "+",
+    );
+    function showItems(): void {
+      if (!one.listed && said.items.length === 0) said.items.push("");
+      fill(items, ...said.items.map(input));
+      add.hidden = !one.listed;
+      add.disabled = !said.said;
+    }
+    own.addEventListener("change", () => {
+      said.said = own.checked;
+      if (said.said && said.items.length === 0) said.items.push(one.key === "computes" ? "true" : "");
+      showItems();
+      edited();
+    });
+    draft.set(one.key, said);
+    showItems();
+    return h("fieldset", {}, h("legend", {}, h("label", {}, own, ` ${one.key}`)), h("p", { class: "faint" }, ABOUT[one.key] ?? ""), items, add, findings, force);
+  }
+
+  function showFindings(all: Finding[]): void {
+    const now = state();
+    const { byKey, own, others: rest } = sorted(all, chosen ?? "", now?.keys.map((one) => one.key) ?? []);
+    for (const [key, { findings }] of fields) fill(findings, findingsList(byKey.get(key) ?? [], false));
+    const place = form.querySelector("#of-state");
+    if (place !== null) fill(place, findingsList(own, false));
+    fill(others, ...(rest.length === 0 ? [] : [h("h2", {}, "Elsewhere in the file"), findingsList(rest, true)]));
+  }
+
+  function update(): void {
+    const some = changes().length > 0;
+    undo.disabled = !some;
+    save.disabled = !some || checked === null || checked.problem !== "" || checked.refused;
+  }
+
+  /** Something was typed: it is checked a moment later. */
+  function edited(): void {
+    checked = null;
+    question += 1;
+    update();
+    clearTimeout(timer);
+    timer = setTimeout(() => void check(), DEBOUNCE_MS);
+  }
+
+  async function check(): Promise<void> {
+    const [own, asked] = [question, proposal()];
+    if (asked.changes.length === 0) {
+      fill(result);
+      showFindings(all?.findings ?? []);
+      for (const [key, { force }] of fields) fill(force, inForce(state()?.in_force ?? [], key));
+      return;
+    }
+    try {
+      const answer = await api.checkAnnotations(asked);
+      if (own !== question) return;
+      checked = answer;
+      complain("");
+      showFindings(answer.findings);
+      const at = fields.get(answer.key);
+      if (answer.problem !== "" && at !== undefined) append(at.findings, [h("p", { class: "bad" }, answer.problem)]);
+      for (const [key, { force }] of fields) fill(force, inForce(answer.in_force, key));
+      const gain = h("p", {}, "What it gains is simulated …");
+      fill(result, ...outcome(answer), answer.problem === "" && !answer.refused ? gain : null);
+      update();
+      if (answer.problem !== "" || answer.refused) return;
+      const gained = await api.gainOfAnnotations(asked);
+      if (own === question) gain.textContent = gainText(gained);
+    } catch (error) {
+      if (own === question) failed(error);
+    }
+  }
+
+  function outcome(answer: Proposed): Child[] {
+    if (answer.problem !== "") return [h("p", { class: "bad" }, answer.problem)];
+    return [
+      h("h2", {}, answer.refused ? "With this change the file would be refused" : "What would be written"),
+      ...lines(answer),
+    ];
+  }
+
+  function lines(answer: Proposed): Child[] {
+    const text = [...answer.before.map((line) => `− ${line}`), ...answer.after.map((line) => `+ ${line}`)].join("\n");
+    return [h("p", { class: "faint" }, `From line ${answer.line} on:`), h("pre", { tabindex: 0 }, text)];
+  }
+
+  function askToSave(): void {
+    const [asked, answer] = [proposal(), checked];
+    if (answer === null) return;
+    confirm("Save?", "Save", [h("p", {}, `${asked.state} in ${all?.file ?? ""}:`), ...lines(answer)], false, () => {
+      const saving = api.saveAnnotations(asked);
+      saving.then(
+        async (told) => {
+          await load();
+          desk.say(told.said);
+        },
+        (error: unknown) => failed(error),
+      );
+    });
+  }
+
+  const element = h(
+    "main",
+    { id: "page", class: "annotations", tabindex: -1 },
+    h("section", { "aria-label": "States of the task" }, h("h1", { class: "hidden-text" }, "Annotations"), head, list),
+    h("div", {}, notice, form, result, others),
+  );
+  return { element, wide: true, begin: () => void (all === null ? load() : undefined), update: () => undefined };
+}

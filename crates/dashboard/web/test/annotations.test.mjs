@@ -1,0 +1,48 @@
+// What the page "Annotations" works out without a browser.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import { changesOf, draftOf, gainText, sorted, wordsFor } from "../src/annotations.ts";
+
+const key = (name, items = null) => ({ key: name, said: items !== null, items: items ?? [], listed: name !== "duration" });
+const state = { path: "a/b", depth: 1, form: "action: x/y", line: 3, fixed: "", in_force: [], keys: [key("reads", ["at(table)"]), key("effects"), key("duration", ["2"])] };
+
+test("only what is otherwise than the file is a change", () => {
+  const draft = draftOf(state);
+  assert.deepEqual(changesOf(state, draft), []);
+  draft.get("reads").items.push("  ");
+  assert.deepEqual(changesOf(state, draft), [], "an empty line counts for nothing");
+  draft.get("reads").items[1] = " on(cup, table) ";
+  draft.get("effects").said = true;
+  draft.get("duration").items[0] = "";
+  assert.deepEqual(changesOf(state, draft), [
+    { key: "reads", items: ["at(table)", "on(cup, table)"] },
+    { key: "effects", items: [] },
+    { key: "duration", items: null },
+  ]);
+  draft.get("reads").said = false;
+  assert.deepEqual(changesOf(state, draft)[0], { key: "reads", items: null });
+  assert.deepEqual(state.keys[0].items, ["at(table)"], "what was read stays as it was");
+});
+
+test("findings stand under their key, at their state, or elsewhere", () => {
+  const one = (path, name) => ({ severity: "error", rule: "r", path, key: name, line: 1, message: "m", help: "" });
+  const { byKey, own, others } = sorted([one("a/b", "reads"), one("a/b", "reads"), one("a/b", "in"), one("a", "reads"), one("", "")], "a/b", ["reads", "effects"]);
+  assert.deepEqual([byKey.get("reads").length, own.length, others.length], [2, 1, 2]);
+});
+
+test("what is gained is said, and why it is not", () => {
+  assert.match(gainText({ before_s: 56, after_s: 42, obstacle: "" }), /14.0\u00a0s shorter \(25.0\u00a0%\)/);
+  assert.match(gainText({ before_s: 42, after_s: 56, obstacle: "" }), /14.0\u00a0s longer/);
+  assert.match(gainText({ before_s: 42, after_s: 42, obstacle: "" }), /nothing is gained/);
+  assert.match(gainText({ before_s: 42, after_s: null, obstacle: "it takes too long" }), /cannot be said: it takes too long. As it is: 42.0/);
+});
+
+test("words are completed from the catalogue and the ontology", () => {
+  const all = { kinds: ["Arm"], predicates: ["at(?)", "on(?, ?)"], entities: ["cup"] };
+  assert.ok(wordsFor("resources", all).includes("{ block: Arm }"));
+  assert.deepEqual(wordsFor("reads", all), ["scene", "at(?)", "at(cup)", "on(?, ?)"]);
+  assert.ok(wordsFor("effects", all).includes("not at(cup)"));
+  assert.deepEqual(wordsFor("computes", all), ["true", "false"]);
+  assert.deepEqual(wordsFor("duration", all), []);
+});
