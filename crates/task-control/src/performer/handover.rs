@@ -201,7 +201,7 @@ mod tests {
         assert_eq!(handover(&ended(SUCCESS), &[asks(2, planner(), 7)], &queue, 1), Some(InstanceId(12)));
         assert_eq!(handover(&ended(SUCCESS), &[asks(2, planner(), 8)], &queue, 1), Some(InstanceId(2)));
         let withdrawn = Command::Withdraw { instance: InstanceId(12) };
-        assert_eq!(handover(&ended(SUCCESS), &[withdrawn.clone()], &queue, 1), Some(InstanceId(13)));
+        assert_eq!(handover(&ended(SUCCESS), std::slice::from_ref(&withdrawn), &queue, 1), Some(InstanceId(13)));
         let again = [withdrawn, asks(12, planner(), 9)];
         assert_eq!(handover(&ended(SUCCESS), &again, &queue, 1), Some(InstanceId(12)), "what it asks for now");
         assert_eq!(handover(&ended(SUCCESS), &[], &queue, 100), None, "its turn is over");
