@@ -5,7 +5,7 @@
 mod support;
 
 use ratn_model::resource::Quantity;
-use ratn_simulation::sequential::{Assumptions, Obstacle, Sequential, sequential};
+use ratn_simulation::sequential::{Assumptions, Obstacle, Sequential, makespan_s, sequential};
 use std::collections::BTreeMap;
 use support::{NoFiles, catalogue, load};
 
@@ -19,7 +19,13 @@ fn check_with_brains(text: &str, brains: u32) -> Result<Sequential, Obstacle> {
     let units = BTreeMap::from([("Brain".to_owned(), Quantity::whole(brains))]);
     let (durations_s, attributes) = (BTreeMap::new(), BTreeMap::new());
     let assumptions = Assumptions { parameters, elements: 2, durations_s, units, attributes };
-    sequential(&program, &catalogue(), &assumptions)
+    let found = sequential(&program, &catalogue(), &assumptions);
+    if let Ok(found) = &found {
+        let makespan_s = |max_events| makespan_s(&program, &catalogue(), &assumptions, max_events);
+        assert_eq!(makespan_s(usize::MAX), Ok(found.cdtn_s));
+        assert!(makespan_s(0).is_err_and(|obstacle| obstacle.to_string().contains("no end")));
+    }
+    found
 }
 
 fn move_arm(name: &str, input: &str, seconds: u32) -> String {

@@ -293,3 +293,32 @@ fn merged_keys_are_left_alone() {
         assert!(after.contains("<<"), "{after}");
     }
 }
+
+/// The files of the reference are written in every way that there is.
+#[test]
+fn in_every_task_of_the_reference_a_key_is_added_changed_and_taken_away_or_it_is_said_why_not() {
+    let reference = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/task-files.md");
+    let reference = std::fs::read_to_string(reference).unwrap();
+    let blocks = reference.split("```yaml\n").skip(1).filter_map(|block| block.split("```").next());
+    let (mut done, mut refused) = (0, Vec::new());
+    for text in blocks {
+        for state in written(text).unwrap() {
+            for (key, old) in &state.keys {
+                let new = if old.is_some() { None } else { Some(value("[here(it)]")) };
+                match edited(text, &state.path, key, new.as_ref()) {
+                    Ok(after) => {
+                        done += 1;
+                        let now = written(&after).unwrap();
+                        let own = now.iter().find(|one| one.path == state.path).unwrap();
+                        assert!(own.keys.contains(&(*key, new)), "{} {key}", state.path);
+                        edited(&after, &state.path, key, old.as_ref()).unwrap();
+                    }
+                    Err(error) => refused.push(error),
+                }
+            }
+        }
+    }
+    assert!(done > 200, "{done} done, {refused:?}");
+    let is_shared = |error: &EditError| matches!(error, EditError::Shared { .. });
+    assert!(refused.iter().all(is_shared), "{refused:?}");
+}
