@@ -185,6 +185,18 @@ pub enum Event {
         /// What it says.
         message: String,
     },
+    /// A goal has a result that can be used, and goes on for a better one: the first, or a better one than before.
+    Improved {
+        /// Which instance.
+        instance: InstanceId,
+        /// In which attempt.
+        attempt: u32,
+        /// Its output ports.
+        outputs: BTreeMap<String, Value>,
+        /// What it costs whoever uses it, in seconds of the robot's time: how long the planned motion takes. Each is less than the one
+        /// before.
+        cost_s: f64,
+    },
     /// A goal has ended and says how.
     Finished {
         /// Which instance.
@@ -481,6 +493,9 @@ pub struct Goal {
     /// It is cancelled when it takes longer than this, in seconds of the robot's time.
     #[serde(default)]
     pub timeout_s: Option<f64>,
+    /// Where it may go on when it has a result, and improve it until it is told to stop: the outputs that stay as they were at first.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub improves: Option<Box<[String]>>,
 }
 
 /// One line of an event log.

@@ -11,6 +11,7 @@ use super::{Writer, unix_ns};
 use prost::Message;
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_model::id::InstanceId;
+use ratn_model::program::SUCCESS;
 use ratn_otlp::ids::number_of;
 use ratn_report::statistics::mode_name;
 use ratn_report::timeline::{Cause, Changed, Ending, Holding, Stage, Timeline};
@@ -227,6 +228,7 @@ impl<W: Write> Writer for Perfetto<W> {
             LogEntry::Event(Event::Finished { instance, outcome, reason, .. }) => {
                 self.ends_behind(*instance, outcome, reason);
             }
+            LogEntry::Event(Event::Improved { instance, .. }) => self.ends_behind(*instance, SUCCESS, ""),
             LogEntry::Event(Event::Crashed { instance, reason, .. }) => self.ends_behind(*instance, "crashed", reason),
             LogEntry::Command(Command::Acquire { instance, .. } | Command::Project { instance, .. }) => {
                 self.flows(run, *instance, at_s)?;

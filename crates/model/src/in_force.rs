@@ -81,6 +81,9 @@ fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
         ),
         line("duration", said.duration_s.as_ref().map_or_else(unknown, |duration| named(program, duration))),
     ];
+    if said.anytime {
+        all.push(line("anytime", "true".to_owned()));
+    }
     if !said.holds.is_empty() {
         all.push(line("while", listed(program, &said.holds, Expr::flows)));
     }

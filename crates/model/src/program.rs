@@ -229,6 +229,9 @@ pub struct Annotations {
     pub exceptional: Vec<String>,
     /// The same inputs and facts always give the same result, whatever the seed.
     pub deterministic: bool,
+    /// Its action gives a result that can be used, and better ones later; any of them will do.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub anytime: bool,
     /// On a region: facts that other regions may touch too. The programmer answers for their order.
     pub shared: Vec<FactExpr>,
     /// Who says what is in force, by key; keys that nobody says are left out.

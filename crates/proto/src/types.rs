@@ -538,6 +538,17 @@ pub struct Goal {
     pub deadline_ms: u64,
     /// How long it may go on when nobody listens to it, in milliseconds of wall time; 0 not at all.
     pub grace_ms: u64,
+    /// Where it may give a result, go on and give better ones: the outputs that stay as they were in the first.
+    pub improves: Option<Vec<String>>,
+}
+
+/// A result that can be used, of a goal that goes on for a better one.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct GoalImproved {
+    /// The output ports, as of a goal that ends with success.
+    pub outputs: BTreeMap<String, Value>,
+    /// What it costs whoever uses it, in seconds of the robot's time.
+    pub cost_s: f64,
 }
 
 /// How a goal has ended.

@@ -2,7 +2,7 @@
 
 use super::critical::{self, Link};
 use super::statistics::{Statistics, mode_name};
-use super::timeline::{Speculation, Timeline};
+use super::timeline::{Improvement, Speculation, Timeline};
 use super::waiting::{self, Waiting};
 use ratn_executive::protocol::Mode;
 use ratn_model::program::SUCCESS;
@@ -21,6 +21,8 @@ pub struct Report {
     pub waiting: Vec<Waiting>,
     /// What work ahead of time was good for.
     pub speculation: Speculation,
+    /// What results gained that got better after they were given.
+    pub improvement: Improvement,
 }
 
 impl Report {
@@ -31,6 +33,7 @@ impl Report {
             critical_path: critical::path(run),
             waiting: waiting::by_cause(run),
             speculation: run.speculation(),
+            improvement: run.improvement(),
         }
     }
 }
@@ -43,6 +46,13 @@ impl fmt::Display for Report {
             writeln!(
                 f,
                 "\nwork ahead of time, in jobs: {useful} of use ({useful_s:.1} s), {wasted} discarded ({wasted_s:.1} s), {open} open"
+            )?;
+        }
+        let Improvement { results, better, first_cost_s, gained_s } = self.improvement;
+        if results > 0 {
+            writeln!(
+                f,
+                "\nimproved while others went on: {better} of {results} results, by {gained_s:.1} of {first_cost_s:.1} s of motion; none of it was waited for"
             )?;
         }
         f.write_str(&critical::table(&self.critical_path))?;

@@ -35,6 +35,18 @@ pub trait Oracle {
     /// How a goal goes. `world` is its projection, or the actual world where it has none.
     fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, world: &World) -> Performance;
 
+    /// What comes after a first result, of a goal that may improve it; nothing unless said: then the first is the last.
+    fn better(
+        &mut self,
+        path: &str,
+        attempt: u32,
+        goal: &Goal,
+        first: &BTreeMap<String, Value>,
+    ) -> Option<Better> {
+        let _ = (path, attempt, goal, first);
+        None
+    }
+
     /// What comes of a state that waits, and so many virtual seconds later; nothing unless said.
     fn awaited(&mut self, path: &str, instance: InstanceId) -> Option<(f64, Event)> {
         let _ = (path, instance);
@@ -49,6 +61,15 @@ pub struct Performance {
     pub duration_s: f64,
     /// What it answers.
     pub answer: Answer,
+}
+
+/// What comes after the first result of a goal.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Better {
+    /// Each so many virtual seconds after the first, with its output ports and what it costs.
+    pub results: Vec<(f64, BTreeMap<String, Value>, f64)>,
+    /// How the goal ends, so many virtual seconds after the first result; nothing where it goes on until it is told to stop.
+    pub end: Option<(f64, Answer)>,
 }
 
 /// The answer to a goal.
@@ -582,6 +603,27 @@ impl Simulation<'_> {
         self.bring_from_outside(|trigger| (*trigger == Trigger::Starts(path.clone())).then_some(Duration::ZERO));
         let world = goal.projection.and_then(|p| self.projections.get(&p)).unwrap_or(&self.root);
         let Performance { duration_s, answer } = self.oracle.perform(&path, attempt, goal, world);
+        let first = match &answer {
+            Answer::Finished { outcome, outputs, .. } if outcome == "success" && goal.improves.is_some() => Some(outputs),
+            _ => None,
+        };
+        let better = first.and_then(|first| Some((first.clone(), self.oracle.better(&path, attempt, goal, first)?)));
+        let Some((first, Better { results, end })) = better else {
+            return self.ends(instance, attempt, goal, duration_s, answer);
+        };
+        let first_cost = results.first().map_or(0.0, |(_, _, cost)| cost + 1.0);
+        for (number, (after_s, outputs, cost_s)) in [(0.0, first, first_cost)].into_iter().chain(results).enumerate() {
+            let event = Event::Improved { instance, attempt, outputs, cost_s };
+            let delay = Duration::from_secs_f64((duration_s + after_s).max(0.0));
+            self.send(delay, &format!("improved {number}"), instance, attempt, event);
+        }
+        if let Some((after_s, answer)) = end {
+            self.ends(instance, attempt, goal, duration_s + after_s, answer);
+        }
+    }
+
+    /// A goal ends so, after so many seconds.
+    fn ends(&mut self, instance: InstanceId, attempt: u32, goal: &Goal, after_s: f64, answer: Answer) {
         let event = match answer {
             Answer::Finished { outcome, outputs, measured } => {
                 let reason = if outcome == "success" { String::new() } else { format!("the oracle says {outcome}") };
@@ -593,7 +635,7 @@ impl Simulation<'_> {
                 let lease = goal.lease.as_ref().map(|lease| lease.id);
                 match lease.filter(|lease| self.leases.get(lease) == Some(&instance)) {
                     Some(lease) => {
-                        let at = self.now + Duration::from_secs_f64(duration_s.max(0.0));
+                        let at = self.now + Duration::from_secs_f64(after_s.max(0.0));
                         self.next_entry += 1;
                         self.agenda.insert((at, self.next_entry), Entry::Loss { lease, instance, attempt });
                         return;
@@ -603,7 +645,7 @@ impl Simulation<'_> {
                 }
             }
         };
-        self.send(Duration::from_secs_f64(duration_s.max(0.0)), "answer", instance, attempt, event);
+        self.send(Duration::from_secs_f64(after_s.max(0.0)), "answer", instance, attempt, event);
     }
 
     fn task_resources(&self) -> BTreeMap<String, Quantity> {
@@ -715,6 +757,7 @@ pub(crate) fn shown(world: World, reads: &Footprint) -> World {
 fn is_answer(entry: &Entry, to: InstanceId, of: u32) -> bool {
     matches!(entry,
         Entry::Event(Event::Finished { instance, attempt, .. }
+        | Event::Improved { instance, attempt, .. }
         | Event::Crashed { instance, attempt, .. }
         | Event::Projected { instance, attempt, .. })
         | Entry::Loss { instance, attempt, .. } if *instance == to && *attempt == of)

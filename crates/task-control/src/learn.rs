@@ -83,7 +83,8 @@ struct Fold {
 impl Fold {
     fn event(&mut self, statistics: &mut LearnedStatistics, at: Timestamp, event: &Event) {
         match event {
-            Event::Finished { instance, attempt, .. } => {
+            // With its first result it is done for whoever waits.
+            Event::Finished { instance, attempt, .. } | Event::Improved { instance, attempt, .. } => {
                 let Some((_, began)) = self.started.remove(instance).filter(|started| started.0 == *attempt) else {
                     return;
                 };

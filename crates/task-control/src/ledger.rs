@@ -305,6 +305,7 @@ mod tests {
     fn a_goal_is_open_until_it_has_ended_or_is_cancelled_in_its_attempt() {
         let instance = InstanceId(1);
         let goal = Goal {
+            improves: None,
             provider: "arm".into(),
             action: "follow".into(),
             inputs: BTreeMap::new(),

@@ -72,7 +72,7 @@ impl Progress {
         event: &Event,
         commands: impl Iterator<Item = &'a Command> + Clone,
     ) {
-        if let Event::Finished { instance, .. } = event {
+        if let Event::Finished { instance, .. } | Event::Improved { instance, .. } = event {
             self.ends(*instance);
         }
         self.hear(event);
@@ -187,6 +187,16 @@ impl Progress {
         let waited: Vec<InstanceId> = self.awaiting.keys().copied().collect();
         self.await_things(commands.iter());
         match event {
+            // Of a result that gets better the first is told.
+            Event::Improved { instance, .. } => {
+                let path = self.path(*instance);
+                if let Some(began) = self.ends(*instance) {
+                    let took_s = at.since(began).as_secs_f64();
+                    say(&mut lines, at, &format!("done   {path}  {took_s:.1} s, and goes on for a better one"));
+                }
+            }
+            // Its result was there already.
+            Event::Finished { instance, .. } if !self.started.contains_key(instance) => {}
             Event::Finished { instance, outcome, reason, .. } => {
                 let path = self.path(*instance);
                 let took = self.ends(*instance).map_or(0.0, |s| at.since(s).as_secs_f64());

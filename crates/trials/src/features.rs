@@ -56,6 +56,8 @@ pub struct Features {
     pub watched: bool,
     /// Queries are said with what they find.
     pub finds: bool,
+    /// Actions whose results get better after they were given.
+    pub anytime: bool,
 }
 
 impl Features {
@@ -87,6 +89,7 @@ impl Features {
         waits: false,
         watched: false,
         finds: false,
+        anytime: false,
     };
 
     /// Sequences, hierarchies, loops over lists, conditions, routines and actions alone.
@@ -117,6 +120,7 @@ impl Features {
         waits: false,
         watched: false,
         finds: false,
+        anytime: false,
     };
 
     /// [`Features::ALL`], without those assumptions.
@@ -148,6 +152,9 @@ impl Features {
 
     /// [`Features::WAITS`], with states that are watched, and with what queries find.
     pub const WATCHED: Features = Features { watched: true, finds: true, ..Features::WAITS };
+
+    /// [`Features::WATCHED`], with results that get better after they were given.
+    pub const ANYTIME: Features = Features { anytime: true, ..Features::WATCHED };
 
     /// Imprecise motions that fail, in programs that never look at the world: where a failure leads is then the same in both
     /// modes, whatever younger motions have done meanwhile.

@@ -20,7 +20,7 @@
 //! loader makes of one is made directly).
 
 use super::{
-    AGAIN, ARGUMENTS, Dice, EMPTY, FOUND, Features, PART, PREDICATES, TOOL, around, finds, is_in_routine,
+    AGAIN, ARGUMENTS, Dice, EMPTY, FOUND, Features, PART, PREDICATES, TOOL, anytime, around, finds, is_in_routine,
     is_preemptive, lists,
 };
 use annotations::{block, resource, task_resource};
@@ -133,6 +133,9 @@ pub fn program(seed: u64, features: &Features) -> Program {
     }
     if features.finds {
         finds::say_with_find(&mut program, &mut Dice(seed ^ 0x0000_f19d_5a1d));
+    }
+    if features.anytime {
+        anytime::improve(&mut program, &mut Dice(seed ^ 0x0000_be77_e200));
     }
     if features.lists {
         lists::say_with_comprehensions(&mut program, &mut maker.dice);

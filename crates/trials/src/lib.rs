@@ -21,12 +21,13 @@
 //! | | |
 //! |---|---|
 //! | programs | `generator`, `features`, `listing` |
-//! | their world | `oracle`, `awaited`, `dice` |
+//! | their world | `oracle`, `awaited`, `anytime`, `dice` |
 //! | both modes beside each other | `trial`, `outside`, `interrupt`, `story`, `weak`, `blind` |
 //! | both modes beside a plain evaluation of the program | `reference` |
 //! | every run once more from its log | `replay` |
 //! | smaller programs that fail alike | `shrink`, `rewrite` |
 
+mod anytime;
 mod awaited;
 mod blind;
 mod features;

@@ -115,6 +115,7 @@ fn said(program: &Program, state: &State) -> String {
     said.extend(a.exceptions.map(|exceptions| format!("{exceptions:?}").to_lowercase()));
     said.extend(a.routine.then(|| "routine".to_owned()));
     said.extend(a.deterministic.then(|| "deterministic".to_owned()));
+    said.extend(a.anytime.then(|| "anytime".to_owned()));
     said.iter().map(|part| format!(" | {part}")).collect()
 }
 

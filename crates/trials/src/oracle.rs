@@ -7,6 +7,7 @@
 //! of seconds) never changes which ends first, so that the outcome is one function of the program in both modes.
 
 use super::generator::tolerance::{OFF, TOLERANT};
+use super::anytime;
 use super::{AGAIN, ARGUMENTS, FOUND, PREDICATES, is_preemptive, plain, state_of};
 use super::{Dice, Hash};
 use ratn_executive::protocol::{Event, Goal};
@@ -15,7 +16,7 @@ use ratn_model::fact::{FactKey, FactPattern, Footprint, Term};
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Nature, PREEMPTED, Program, STOPPED, SUCCESS, State, StateKind};
 use ratn_model::value::Value;
-use ratn_simulation::run::{Answer, Oracle, Performance};
+use ratn_simulation::run::{Answer, Better, Oracle, Performance};
 use ratn_world::world::World;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -63,7 +64,7 @@ impl Oracle for HashOracle<'_> {
             hash.add(path);
             hash.add_number(goal.seed);
         }
-        for (port, value) in &goal.inputs {
+        for (port, value) in goal.inputs.iter().filter(|(port, _)| anytime::depends_on(state, port)) {
             hash.add(port);
             hash.add(&value.to_string());
         }
@@ -83,9 +84,20 @@ impl Oracle for HashOracle<'_> {
         let outcome = self.outcome(&mut dice, path, state);
         let x = dice.below(3) as i64;
         let list = (0..dice.below(4)).map(|_| Value::Int(dice.below(ARGUMENTS) as i64)).collect();
-        let outputs = BTreeMap::from([("x".to_owned(), Value::Int(x)), ("list".to_owned(), Value::List(list))]);
+        let mut outputs = BTreeMap::from([("x".to_owned(), Value::Int(x)), ("list".to_owned(), Value::List(list))]);
+        anytime::with_cost(state, &mut outputs);
         let measured = self.measured(&mut dice, state, goal, (&outcome, x));
         Performance { duration_s, answer: Answer::Finished { outcome, outputs, measured } }
+    }
+
+    fn better(
+        &mut self,
+        path: &str,
+        attempt: u32,
+        goal: &Goal,
+        first: &BTreeMap<String, Value>,
+    ) -> Option<Better> {
+        anytime::later(self.seed, path, attempt, goal, first)
     }
 
     fn awaited(&mut self, path: &str, instance: InstanceId) -> Option<(f64, Event)> {

@@ -1,6 +1,7 @@
 //! What became of a run, in the terms of the safety theorem: which PIAs started and ended when, which instances retired with what,
 //! which changes became real.
 
+use super::anytime::without_cost;
 use super::{around, is_in_routine, is_preemptive, plain, state_of};
 use ratn_executive::protocol::{Command, Event, Goal, LogEntry, Note};
 use ratn_model::fact::Change;
@@ -43,6 +44,7 @@ pub(super) enum Data {
 
 impl Real {
     pub(super) fn new(outcome: String, data: Option<Ports>) -> Real {
+        let data = data.map(|(inputs, outputs)| (without_cost(&inputs), without_cost(&outputs)));
         Real { outcome, data: data.map_or(Data::Untold, Data::Of) }
     }
 
@@ -60,7 +62,7 @@ impl Real {
 
 /// The try and the inputs of a goal.
 pub(super) fn goal_text(goal: &Goal) -> String {
-    format!("{:x} {:?}", goal.seed, goal.inputs)
+    format!("{:x} {:?}", goal.seed, without_cost(&goal.inputs))
 }
 
 /// A run.
@@ -151,7 +153,7 @@ pub(super) fn story(program: &Program, run: &Run) -> Story {
                 let Some(life) = lives.get_mut(instance) else { continue };
                 life.attempt = *attempt;
                 life.outcome.clear();
-                life.inputs = Some(goal.inputs.clone());
+                life.inputs = Some(without_cost(&goal.inputs));
                 life.outputs.clear();
                 life.reused = false;
                 if life.irreversible {
@@ -177,12 +179,14 @@ pub(super) fn story(program: &Program, run: &Run) -> Story {
                     story.changes.entry(predicate.clone()).or_default().push(change.clone());
                 }
             }
-            LogEntry::Event(Event::Finished { instance, attempt, outputs, .. }) => {
+            LogEntry::Event(
+                Event::Finished { instance, attempt, outputs, .. } | Event::Improved { instance, attempt, outputs, .. },
+            ) => {
                 let is_answer = |life: &&mut Life| life.attempt == *attempt && life.outcome.is_empty();
                 if let Some(life) = lives.get_mut(instance).filter(is_answer) {
-                    life.outputs.clone_from(outputs);
+                    life.outputs = without_cost(outputs);
                     if !life.irreversible {
-                        let ports = (life.inputs.clone().unwrap_or_default(), outputs.clone());
+                        let ports = (life.inputs.clone().unwrap_or_default(), life.outputs.clone());
                         answers.entry(life.path.clone()).or_default().push(ports);
                     }
                     running.retain(|act| Some(*act) != life.started);

@@ -8,7 +8,7 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "a test may panic and print its seed")]
 
-use ratn_executive::protocol::Mode;
+use ratn_executive::protocol::{Command, LogEntry, Mode};
 use ratn_model::expression::{Expr, Function};
 use ratn_model::program::Program;
 use ratn_model::value::Value;
@@ -131,10 +131,11 @@ fn random_programs_leave_the_same_world_in_both_modes() {
         Ok("guards") => Features::GUARDS,
         Ok("waits") => Features::WAITS,
         Ok("watched") => Features::WATCHED,
+        Ok("anytime") => Features::ANYTIME,
         Ok("all") | Err(_) => Features::ALL,
         Ok(other) => {
             panic!(
-                "RATN_FEATURES: basic, all, everything, lists, guards, waits, watched, weak or imprecise, not {other}"
+                "RATN_FEATURES: basic, all, everything, lists, guards, waits, watched, anytime, weak or imprecise, not {other}"
             )
         }
     };
@@ -346,4 +347,32 @@ fn programs_that_once_failed_without_the_assumptions_are_decided_and_final() {
         62_092_164,
     ];
     once_failed(trial, &Features::WEAK, &SEEDS);
+}
+
+/// What seed the programs with results that get better begin with.
+const ANYTIME: u64 = 7 << 41;
+
+#[test]
+fn random_programs_whose_results_get_better_leave_the_same_world_in_both_modes() {
+    none_fails(trial, ANYTIME, 400, &Features::ANYTIME);
+    none_fails(trial_interrupted, ANYTIME, 100, &Features::ANYTIME);
+    none_fails(trial_from_outside, ANYTIME, 100, &Features::ANYTIME);
+}
+
+#[test]
+fn motions_are_given_better_results_than_the_first() {
+    let (mut motions, mut better) = (0, 0);
+    for seed in ANYTIME..ANYTIME + 200 {
+        let (made, conditions) =
+            (Arc::new(program(seed, &Features::ANYTIME)), Conditions::of(seed, &Features::ANYTIME));
+        let Ok(run) = execute(&made, &conditions, Mode::Cdtn, 100_000) else { continue };
+        for line in run.log {
+            let LogEntry::Command(Command::Start { goal, .. }) = line.entry else { continue };
+            let costs = goal.inputs.iter().filter(|(port, _)| port.starts_with("cost"));
+            let costs: Vec<_> = costs.map(|(_, cost)| cost.clone()).collect();
+            motions += costs.len();
+            better += costs.iter().filter(|cost| **cost != Value::Int(100)).count();
+        }
+    }
+    assert!(better * 10 > motions, "{better} of {motions} results were better than the first");
 }

@@ -42,6 +42,7 @@ pub async fn performed<const N: usize>(action: impl Action, inputs: [(&str, Valu
         world_pool: String::new(),
         deadline_ms: 0,
         grace_ms: 0,
+        improves: None,
     };
     let client = ActionClient::new(Channels::new(&ClientTls::none()));
     let outcome = client.execute(&endpoint, goal, |_, _| {}).await.map_err(|error| chain(&error));

@@ -220,6 +220,8 @@ impl Interpreter {
             projection: current.projection,
             expected_s: self.with_scope(context, thread, None, |scope| binding::expected_s(state, scope)),
             timeout_s: state.annotations.timeout_s,
+            // Nothing waits meanwhile, so it would be for nothing.
+            improves: None,
         };
         let timeout = state.annotations.timeout_s.map(|seconds| context.now + duration(seconds));
         if self.routine_of(thread).is_none() && self.is_pia(context, thread) {

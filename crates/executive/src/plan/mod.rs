@@ -9,12 +9,14 @@
 //! | [`written`] | under which keys it writes |
 //! | [`waits`] | what a wait may find otherwise than it was before |
 //! | [`flows`] | the outputs and variables that its expressions use |
+//! | [`improves`] | whether its result may be improved after it was given, and what of it stays |
 //!
 //! Hierarchies and routines are resolved here: a routine is one node, so its plan speaks of what it contains, too. Predicates and kinds of
 //! task resources are numbered ([`Predicate`]), so that tables of writers are indexed by small numbers.
 
 mod flows;
 mod footprint;
+mod improves;
 mod nature;
 mod outcomes;
 mod resources;
@@ -128,6 +130,8 @@ pub(crate) struct StatePlan {
     pub(crate) is_read: bool,
     /// The states inside of it whose outputs are read: they are forgotten when it is entered.
     pub(crate) read_inside: Vec<StateId>,
+    /// Of an action whose result may be improved after it was given: the outputs that stay as they were at first.
+    pub(crate) improves: Option<Box<[String]>>,
 }
 
 impl Plan {
@@ -141,6 +145,9 @@ impl Plan {
         let states = program.states.iter().map(of).collect();
         let (width, buckets) = (names.numbers.len() + 2, Plan::buckets(program.horizon));
         let mut plan = Plan { states, width, buckets, names };
+        for (id, kept) in improves::of(program, &plan) {
+            plan.states[index(id)].improves = Some(kept);
+        }
         for id in &read {
             for parent in std::iter::successors(program.state(*id).parent, |id| program.state(*id).parent) {
                 plan.states[index(parent)].read_inside.push(*id);
@@ -237,6 +244,7 @@ impl StatePlan {
             assigns: flows::assigns(subject).into_iter().collect(),
             is_read: read.contains(&state.id),
             read_inside: Vec::new(),
+            improves: None,
         }
     }
 

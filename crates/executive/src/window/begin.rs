@@ -137,6 +137,7 @@ impl Window {
         self.dispatch.begin(&self.graph, context.plan, instance);
         self.graph.acquire(id, priority);
         self.wait(id, Wait::Resources);
+        self.make_room(context, id);
         context.commands.push(Command::Acquire { instance: id, requirements, priority });
     }
 
@@ -372,6 +373,9 @@ impl Window {
             return self.begin_waiting(context, id);
         }
         let Some((provider, action)) = context.plan.state(instance.state).action.clone() else { return };
+        let improves = context.plan.state(instance.state).improves.clone();
+        let known = if self.harvest_for(context, id) { None } else { known };
+        let Some(instance) = self.graph.get(id) else { return };
         let looked = self.look(context, id, None, |_, view| {
             let bound = match &known {
                 Some(inputs) => Ok(inputs.clone()),
@@ -397,6 +401,7 @@ impl Window {
             projection: held.projection,
             expected_s,
             timeout_s: state.annotations.timeout_s,
+            improves,
         };
         if let Some(timeout_s) = state.annotations.timeout_s {
             self.set_timer(context, timeout_s, Timer::Timeout(id, attempt));
@@ -422,6 +427,7 @@ impl Window {
         let Some((is_pia, state)) = self.graph.get(id).map(|instance| (instance.is_pia(), instance.state)) else {
             return;
         };
+        self.harvest_for(context, id);
         let looked = self.look(context, id, None, |instance, view| {
             let own = context.plan.state(instance.state);
             let environment = &view.instance.environment;

@@ -25,6 +25,7 @@ impl Window {
         let mut places = Collector::default();
         self.graph.collect(&mut places);
         self.growth.collect(&mut places);
+        self.improving.collect(&mut places);
         let projection = |world: &World| (world.revision(), difference(root, world));
         let projections = self.graph.routines().filter_map(|routine| routine.projection()).map(projection).collect();
         Beside { places: places.finish(), projections }
@@ -43,6 +44,7 @@ impl Window {
         let mut places = places.restored(plan)?;
         self.graph.restore(&mut places)?;
         self.growth.restore(&mut places)?;
+        self.improving.restore(&mut places)?;
         places.finish()?;
         let mut projections = projections.into_iter();
         for routine in self.graph.routines_mut().filter(|routine| routine.projection().is_some()) {

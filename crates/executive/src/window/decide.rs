@@ -258,6 +258,7 @@ impl Window {
                 None => {}
             }
         }
+        self.harvest_all(context);
         self.end = Some(end);
     }
 }

@@ -77,6 +77,7 @@ impl Window {
         for id in all.into_iter().rev() {
             self.discard_one(context, id);
         }
+        self.harvest_all(context);
         self.growth.stop();
         self.end = Some(super::End { outcome: outcome.to_owned(), outputs: Outputs::new(), reason });
     }

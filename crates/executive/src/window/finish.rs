@@ -22,6 +22,9 @@ impl Window {
             return;
         };
         let (id, attempt) = (*id, *attempt);
+        if self.improving.is(id, attempt) {
+            return self.improvement_ended(context, id, event);
+        }
         let node = self.graph.node(id).filter(|node| node.attempt == attempt);
         match (event, node.map(|node| &node.status)) {
             (Event::Finished { outcome, outputs, measured, evidence, reason, .. }, Some(Status::Running(_))) => {
@@ -52,6 +55,7 @@ impl Window {
                         self.waits.enqueue(&mut self.graph, id);
                     }
                 }
+                Timer::Room(id) => self.make_way_for(context, id),
                 Timer::Timeout(id, attempt) => {
                     let Some(instance) = self.graph.get(id) else { continue };
                     let is_running =
@@ -223,6 +227,7 @@ impl Window {
 
     /// Takes back what was asked for a node; it holds nothing afterwards.
     pub(super) fn stop_node(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        self.harvest(context, id);
         let Some(node) = self.graph.node(id) else { return };
         let attempt = node.attempt;
         let is_pause = self.graph.get(id).is_some_and(|instance| context.program.state(instance.state).is_pause());

@@ -11,12 +11,14 @@
 //! | [`waits`] | which instance waits for which other one, the queue, timers |
 //! | [`dispatch`] | running instances, priorities, which speculative holder gives way |
 //! | [`results`] | the result cache |
+//! | [`improving`] | results that are there and still get better |
 //!
 //! | what happens | |
 //! |---|---|
 //! | `ready`, `begin` | a node may begin, asks for its resources, gets its projection, runs |
 //! | `waiting` | a state waits, without a provider |
 //! | `finish` | its goal ends, its worker dies, it is tried again |
+//! | `harvest` | its result is there, and gets better until somebody uses it or wants what it holds |
 //! | `decide` | conditions, lists of loops, deciders, ends of composite states |
 //! | `retire` | what becomes real, in program order per line |
 //! | `revise` | what was made of something that came out otherwise is made again |
@@ -35,6 +37,8 @@ mod dispatch;
 mod finish;
 mod graph;
 mod growth;
+mod harvest;
+mod improving;
 mod memory;
 mod outside;
 mod ready;
@@ -55,6 +59,7 @@ use dispatch::Dispatch;
 use graph::Graph;
 use graph::instance::{Instance, Role, Status};
 use growth::Growth;
+use improving::Improving;
 use memory::{Memory, Sight, View};
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::InstanceId;
@@ -84,6 +89,7 @@ pub(crate) struct Window {
     waits: Waits,
     dispatch: Dispatch,
     results: Results,
+    improving: Improving,
     tolerance: Tolerance,
     hold: Hold,
     end: Option<End>,
@@ -113,6 +119,7 @@ impl Window {
             waits: Waits::default(),
             dispatch: Dispatch::new(capacity, learned.durations_s),
             results: Results::default(),
+            improving: Improving::default(),
             tolerance,
             hold: Hold::default(),
             end: None,
@@ -141,6 +148,7 @@ impl Window {
         match event {
             Event::Granted { .. } | Event::Refused { .. } | Event::Projected { .. } => self.answered(context, event),
             Event::Finished { .. } | Event::Crashed { .. } => self.attempt_ended(context, event),
+            Event::Improved { instance, attempt, outputs, .. } => self.improved(context, instance, attempt, outputs),
             Event::RetirementFailed { reason, .. } => {
                 self.stop(context, ABORTED, format!("what had happened could not be recorded: {reason}"));
             }
@@ -333,6 +341,7 @@ impl Window {
         self.waits.check_invariants(&self.graph)?;
         self.dispatch.check_invariants(&self.graph)?;
         self.results.check_invariants(&self.graph)?;
+        self.improving.check_invariants(&self.graph)?;
         if !self.memory.is_fresh() {
             return Err("something came out otherwise, and its users were not looked at".to_owned());
         }

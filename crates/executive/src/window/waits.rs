@@ -127,6 +127,8 @@ pub(crate) enum Timer {
     Timeout(InstanceId, u32),
     /// It has been held back as long as it may be.
     Hold(InstanceId),
+    /// It has waited long enough for what is held only to improve a result.
+    Room(InstanceId),
     /// The task has had its time.
     Deadline,
 }

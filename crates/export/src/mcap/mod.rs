@@ -121,6 +121,9 @@ fn said(line: &LogLine, run: &Timeline) -> Option<(Level, String)> {
             (Level::Warning, format!("{} ended with {outcome}: {reason}", path(*instance)))
         }
         LogEntry::Event(Event::Finished { instance, .. }) => (Level::Info, format!("{} is done", path(*instance))),
+        LogEntry::Event(Event::Improved { instance, cost_s, .. }) => {
+            (Level::Info, format!("{} has a result of {cost_s:.2} s, and goes on for a better one", path(*instance)))
+        }
         LogEntry::Event(Event::Crashed { instance, reason, .. }) => {
             (Level::Error, format!("{} crashed: {reason}", path(*instance)))
         }

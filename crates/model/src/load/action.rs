@@ -219,6 +219,15 @@ impl<'b> Sources<'b> {
         fields.out.findings.warning("annotation-not-in-force", *at, &path, message, format!("say `{key}` here"));
     }
 
+    /// Whether its action gives better results later: only where it counts as one that computes.
+    pub(crate) fn is_anytime(&mut self, nature: &Nature) -> bool {
+        let is = *nature == Nature::Computes && self.action.as_ref().is_some_and(|(said, ..)| said.anytime);
+        if is {
+            self.origin.insert("anytime".to_owned(), Origin::Action);
+        }
+        is
+    }
+
     /// What the state is, where it does not say so itself.
     pub(crate) fn nature(
         &mut self,

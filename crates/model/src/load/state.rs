@@ -276,6 +276,7 @@ fn annotations(fields: &mut Fields<'_, '_>, step: &Step<'_>, kind: &StateKind) -
     let waits_s = annotations.timeout_s;
     let mut sources = Sources::of(fields, step, kind);
     annotations.nature = sources.nature(fields, |fields| nature(fields, body));
+    annotations.anytime = sources.is_anytime(&annotations.nature);
     let read = sources.read(fields, "reads", |fields, node| {
         fields.note("reads", node.at);
         node.items().into_iter().flat_map(|item| reads(fields, item)).collect()

@@ -1,11 +1,14 @@
 //! Goals and their results.
 
 use super::{Malformed, each, label, name, ports, wire_ports};
-use crate::types::{FactRecord, Goal, GoalOutcome};
+use crate::types::{FactRecord, Goal, GoalImproved, GoalOutcome};
 use crate::v1;
 use ratn_model::id::ProjectionId;
 use ratn_model::resource::Lease;
 use std::collections::BTreeMap;
+
+/// A goal keeps no more of its outputs than an action may have ports.
+const MAX_KEPT: usize = 128;
 
 impl From<Goal> for v1::Goal {
     fn from(goal: Goal) -> v1::Goal {
@@ -19,6 +22,7 @@ impl From<Goal> for v1::Goal {
             world_pool_endpoint: goal.world_pool,
             deadline_ms: goal.deadline_ms,
             grace_ms: goal.grace_ms,
+            improve: goal.improves.map(|keep| v1::Improve { keep }),
         }
     }
 }
@@ -43,7 +47,33 @@ impl TryFrom<v1::Goal> for Goal {
             world_pool: goal.world_pool_endpoint,
             deadline_ms: goal.deadline_ms,
             grace_ms: goal.grace_ms,
+            improves: goal.improve.map(|improve| kept(improve.keep)).transpose()?,
         })
+    }
+}
+
+fn kept(ports: Vec<String>) -> Result<Vec<String>, Malformed> {
+    if ports.len() > MAX_KEPT {
+        return Err(Malformed::new("improve.keep", format!("names {} outputs: at most {MAX_KEPT}", ports.len())));
+    }
+    ports.iter().try_for_each(|port| name(port, "improve.keep"))?;
+    Ok(ports)
+}
+
+impl From<GoalImproved> for v1::GoalImproved {
+    fn from(better: GoalImproved) -> v1::GoalImproved {
+        v1::GoalImproved { outputs: wire_ports(better.outputs), cost_s: better.cost_s }
+    }
+}
+
+impl TryFrom<v1::GoalImproved> for GoalImproved {
+    type Error = Malformed;
+
+    fn try_from(better: v1::GoalImproved) -> Result<GoalImproved, Malformed> {
+        if !better.cost_s.is_finite() {
+            return Err(Malformed::new("improved.cost_s", "is no finite number"));
+        }
+        Ok(GoalImproved { outputs: ports(better.outputs, "improved.outputs")?, cost_s: better.cost_s })
     }
 }
 

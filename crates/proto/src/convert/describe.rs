@@ -46,6 +46,7 @@ impl From<Annotations> for v1::ActionAnnotations {
             effects: said.effects.unwrap_or_default(),
             resources: said.resources,
             duration: said.duration.unwrap_or_default(),
+            anytime: said.anytime,
         }
     }
 }
@@ -61,6 +62,7 @@ impl From<v1::ActionAnnotations> for Annotations {
             effects: list(said.effects, said.changes_nothing),
             resources: said.resources,
             duration: Some(said.duration).filter(|duration| !duration.is_empty()),
+            anytime: said.anytime,
         }
     }
 }

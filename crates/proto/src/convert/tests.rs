@@ -240,6 +240,7 @@ fn goal() -> impl Strategy<Value = Goal> {
             world_pool: "unix:/world.sock".to_owned(),
             deadline_ms: seed / 2,
             grace_ms: seed / 3,
+            improves: seed.is_multiple_of(2).then(|| vec!["end".to_owned(); (seed % 3) as usize]),
         },
     )
 }

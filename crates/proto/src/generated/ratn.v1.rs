@@ -5733,6 +5733,17 @@ pub struct Goal {
     /// at all. At most a minute. Its lease may end before.
     #[prost(uint64, tag = "9")]
     pub grace_ms: u64,
+    /// Its results may come one after the other, each better than the one before, until it ends or is cancelled; unset where only its end
+    /// counts. A provider need not do so.
+    #[prost(message, optional, tag = "10")]
+    pub improve: ::core::option::Option<Improve>,
+}
+/// How a goal may go on when it has a result.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Improve {
+    /// The outputs that stay as they were in the first result: others have used them.
+    #[prost(string, repeated, tag = "1")]
+    pub keep: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
 /// Gives a goal.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -5749,7 +5760,7 @@ pub struct ExecuteRequest {
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ExecuteResponse {
     /// Exactly one is set.
-    #[prost(oneof = "execute_response::Kind", tags = "1, 2, 3")]
+    #[prost(oneof = "execute_response::Kind", tags = "1, 2, 3, 4")]
     pub kind: ::core::option::Option<execute_response::Kind>,
 }
 /// Nested message and enum types in `ExecuteResponse`.
@@ -5766,6 +5777,9 @@ pub mod execute_response {
         /// It has ended. The last message.
         #[prost(message, tag = "3")]
         Result(super::GoalResult),
+        /// It has a result that can be used, and goes on for a better one. Only of goals that may.
+        #[prost(message, tag = "4")]
+        Improved(super::GoalImproved),
     }
 }
 /// A goal is under way.
@@ -5787,6 +5801,19 @@ pub struct GoalProgress {
         ::prost::alloc::string::String,
         Value,
     >,
+}
+/// A result that can be used, of a goal that goes on. A listener that falls behind misses some, but not the last.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct GoalImproved {
+    /// The output ports, as of a goal that ends with success.
+    #[prost(btree_map = "string, message", tag = "1")]
+    pub outputs: ::prost::alloc::collections::BTreeMap<
+        ::prost::alloc::string::String,
+        Value,
+    >,
+    /// What it costs whoever uses it, in seconds of the robot's time: how long the planned motion takes. Less than that of the one before.
+    #[prost(double, tag = "2")]
+    pub cost_s: f64,
 }
 /// How a goal has ended.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -5846,7 +5873,7 @@ pub struct PerformResponse {
     #[prost(uint64, tag = "1")]
     pub id: u64,
     /// Exactly one is set.
-    #[prost(oneof = "perform_response::Kind", tags = "2, 3, 4")]
+    #[prost(oneof = "perform_response::Kind", tags = "2, 3, 4, 5")]
     pub kind: ::core::option::Option<perform_response::Kind>,
 }
 /// Nested message and enum types in `PerformResponse`.
@@ -5863,6 +5890,9 @@ pub mod perform_response {
         /// The execute failed, as its status would have said. The last message of this id; the stream goes on.
         #[prost(message, tag = "4")]
         Failure(super::CallFailure),
+        /// It has a result that can be used, and goes on for a better one.
+        #[prost(message, tag = "5")]
+        Improved(super::GoalImproved),
     }
 }
 /// Tells a goal to stop.
@@ -5977,6 +6007,9 @@ pub struct ActionAnnotations {
     /// How long it usually takes, in seconds; empty where the action does not say.
     #[prost(string, tag = "9")]
     pub duration: ::prost::alloc::string::String,
+    /// It gives a result that can be used, and better ones later, until it is stopped; any of them will do. Only what computes can be so.
+    #[prost(bool, tag = "10")]
+    pub anytime: bool,
 }
 /// Generated client implementations.
 pub mod action_service_client {

@@ -5,6 +5,7 @@ use super::{Changed, Commit, Span, Timeline};
 use ratn_event_log::without_visits;
 use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Note, Origin};
 use ratn_model::id::InstanceId;
+use ratn_model::program::SUCCESS;
 use ratn_model::resource::LeasedResource;
 use ratn_model::value::Value;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -134,7 +135,8 @@ impl Timeline {
     fn event(&mut self, at: f64, event: &Event, changed: &mut Changed) {
         let of = instance_of(event);
         changed.instance = of;
-        if let Some(id) = of {
+        // Of one that has left, its goal may still give better results: that is no news of it.
+        if let Some(id) = of.filter(|id| !self.is_only_improved(*id, event)) {
             // It may be the first that is said of it.
             self.known(id, at);
         }
@@ -144,6 +146,7 @@ impl Timeline {
         self.cause = match event {
             Event::Started { .. } => Cause::Start,
             Event::Finished { instance, .. }
+            | Event::Improved { instance, .. }
             | Event::Crashed { instance, .. }
             | Event::RetirementFailed { instance, .. } => Cause::Result(*instance, path(self, *instance)),
             Event::Granted { instance, .. } | Event::Refused { instance, .. } => {
@@ -188,8 +191,16 @@ impl Timeline {
                 self.resources.withdraws(*instance);
                 self.enter(*instance, Stage::Waiting, at);
             }
+            Event::Finished { instance, attempt, .. } | Event::Crashed { instance, attempt, .. }
+                if self.improvements.is_over(*instance, *attempt) => {}
             Event::Finished { instance, attempt, outcome, outputs, reason, .. } => {
                 self.end(*instance, *attempt, at, Ending::Outcome(outcome.clone(), reason.clone()), outputs);
+            }
+            Event::Improved { instance, attempt, outputs, cost_s } => {
+                if !self.improvements.has(*instance, *attempt) {
+                    self.end(*instance, *attempt, at, Ending::Outcome(SUCCESS.to_owned(), String::new()), outputs);
+                }
+                self.improvements.given(*instance, *attempt, *cost_s);
             }
             Event::Crashed { instance, attempt, reason } => {
                 self.end(*instance, *attempt, at, Ending::Crashed(reason.clone()), &BTreeMap::new());
@@ -238,6 +249,7 @@ impl Timeline {
                 changed.instance = Some(*instance);
                 self.starts(*instance, at, *attempt, goal);
             }
+            Command::Cancel { instance, attempt } if self.improvements.is_over(*instance, *attempt) => {}
             Command::Cancel { instance, attempt } => {
                 changed.instance = Some(*instance);
                 self.end(*instance, *attempt, at, Ending::Cancelled, &BTreeMap::new());
@@ -302,11 +314,13 @@ impl Timeline {
                 self.open.remove(&id);
             }
             Note::Retired { .. } => {
+                self.improvements.is_real(id);
                 self.count.retired += usize::from(!self.known(id, at).has_left());
                 self.known(id, at).retired = true;
                 self.leaves(id, Stage::Retired, at);
             }
             Note::Squashed { .. } => {
+                self.improvements.is_gone(id);
                 self.count.squashed += usize::from(!self.known(id, at).has_left());
                 self.known(id, at).squashed = true;
                 self.resources.withdraws(id);
@@ -314,6 +328,7 @@ impl Timeline {
             }
             Note::Reused { .. } => self.reuses(id, at),
             Note::Invalidated { reason, .. } => {
+                self.improvements.is_gone(id);
                 let instance = self.known(id, at);
                 instance.invalidations.push(reason.clone());
                 (instance.finished, instance.outcome) = (false, None);
@@ -408,6 +423,16 @@ impl Timeline {
         self.known(id, at).enter(stage, at, &cause);
     }
 
+    /// Whether an event says no more of an instance than how its goal goes on that has given its result.
+    fn is_only_improved(&self, id: InstanceId, event: &Event) -> bool {
+        match event {
+            Event::Improved { attempt, .. } | Event::Finished { attempt, .. } | Event::Crashed { attempt, .. } => {
+                self.improvements.has(id, *attempt)
+            }
+            _ => false,
+        }
+    }
+
     /// An instance, which may be new.
     fn known(&mut self, id: InstanceId, at_s: f64) -> &mut Instance {
         self.instances.entry(id).or_insert_with(|| {
@@ -425,6 +450,7 @@ fn instance_of(event: &Event) -> Option<InstanceId> {
         | Event::Projected { instance, .. }
         | Event::Progressed { instance, .. }
         | Event::Finished { instance, .. }
+        | Event::Improved { instance, .. }
         | Event::Crashed { instance, .. }
         | Event::Answered { instance, .. }
         | Event::RetirementFailed { instance, .. } => Some(*instance),

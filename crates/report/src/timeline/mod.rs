@@ -9,9 +9,11 @@
 
 pub(crate) mod explain;
 mod fold;
+mod improvement;
 mod instance;
 mod resources;
 
+pub use improvement::Improvement;
 pub use instance::{Activity, Behind, Cause, Ending, Instance, Job, Phase, Stage, Wait, Yield};
 pub use resources::{Asked, Holding, Resources};
 
@@ -77,6 +79,7 @@ pub struct Timeline {
     results: BTreeMap<Arc<str>, (InstanceId, usize)>,
     /// Of the instances that were given away.
     speculation: Speculation,
+    improvements: improvement::Improvements,
 }
 
 /// A time.
@@ -190,6 +193,7 @@ impl Timeline {
             at_work: BTreeSet::new(),
             results: BTreeMap::new(),
             speculation: Speculation::default(),
+            improvements: improvement::Improvements::default(),
         }
     }
 
@@ -257,6 +261,11 @@ impl Timeline {
         let mut all = self.speculation;
         self.instances().for_each(|instance| all.add(instance));
         all
+    }
+
+    /// What results gained that got better after they were given.
+    pub fn improvement(&self) -> Improvement {
+        self.improvements.total()
     }
 }
 

@@ -8,9 +8,9 @@ use ratn_model::id::{InstanceId, LeaseId};
 use ratn_model::measurement::Measurement;
 use ratn_model::program::{ABORTED, PREEMPTED};
 use ratn_model::value::Value;
-use ratn_proto::types::{Goal, GoalOutcome, HOST_KIND};
+use ratn_proto::types::{Goal, GoalImproved, GoalOutcome, HOST_KIND};
 use ratn_worker::client::retry_unanswered;
-use ratn_worker::client::{ActionClient, CallError, Channels, ProcessClient, ResourceClient};
+use ratn_worker::client::{ActionClient, CallError, Channels, ProcessClient, ResourceClient, Said};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::DEFAULT_TTL;
 use std::collections::BTreeMap;
@@ -104,7 +104,7 @@ impl Performing {
         if given == Given::Now {
             return self.given(endpoint).await;
         }
-        match self.actions.attach(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
+        match self.actions.attach_hearing(endpoint, self.goal.clone(), |said| self.said(said)).await {
             Ok(fate) if fate.orphaned => {
                 self.crashed(format!("it was stopped while task control was gone: {}", fate.outcome.reason))
             }
@@ -121,7 +121,7 @@ impl Performing {
     }
 
     async fn given(&self, endpoint: &Endpoint) -> Event {
-        match self.actions.execute(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
+        match self.actions.execute_hearing(endpoint, self.goal.clone(), |said| self.said(said)).await {
             Ok(outcome) => self.finished(outcome),
             // What was wrong with the goal is wrong with it the next time, too.
             Err(error) if error.code() == Some(tonic::Code::InvalidArgument) => self.aborted(said(&error)),
@@ -161,7 +161,7 @@ impl Performing {
     }
 
     async fn attached(&self, endpoint: &Endpoint, broken: &CallError) -> Event {
-        match self.actions.attach(endpoint, self.goal.clone(), |message, _| self.progressed(message)).await {
+        match self.actions.attach_hearing(endpoint, self.goal.clone(), |said| self.said(said)).await {
             Ok(fate) if !fate.orphaned => self.finished(fate.outcome),
             _ => self.lost(endpoint, broken).await,
         }
@@ -228,10 +228,16 @@ impl Performing {
         }
     }
 
-    fn progressed(&self, message: String) {
+    fn said(&self, said: Said) {
         let (instance, attempt) = (self.instance, self.attempt);
-        // Progress is for people: when events pile up, it is what can be missed.
-        let _ = self.events.try_send(Event::Progressed { instance, attempt, message }.into());
+        let event = match said {
+            Said::Progress { message, .. } => Event::Progressed { instance, attempt, message },
+            // What it comes to when it was told to stop nobody waits for.
+            Said::Improved(_) if self.stop.is_cancelled() => return,
+            Said::Improved(GoalImproved { outputs, cost_s }) => Event::Improved { instance, attempt, outputs, cost_s },
+        };
+        // Progress is for people, and a result comes again, at the latest at the goal's end: when events pile up, they are what can be missed.
+        let _ = self.events.try_send(event.into());
     }
 
     fn finished(&self, done: GoalOutcome) -> Event {

@@ -534,6 +534,7 @@ impl Performer {
                 world_pool: self.world.endpoint().to_string(),
                 deadline_ms: goal::deadline_ms(goal.timeout_s, self.speed),
                 grace_ms: goal::GRACE_MS,
+                improves: goal.improves.map(Vec::from),
             },
         };
         let ended = tokio::spawn(trace::within(self.of(instance), performing.perform(given)));

@@ -159,6 +159,7 @@ impl Reference<'_> {
         let expected_s = estimate_s(state, &place);
         let seed = seed(self.seed, path, if state.annotations.deterministic { 1 } else { tries });
         let goal = Goal {
+            improves: None,
             provider: provider.as_str().into(),
             action: action.as_str().into(),
             inputs,

@@ -1,7 +1,7 @@
 //! What an action is given: its goal with the inputs, and access to the world model, the lease and other providers.
 
 use super::ActionFailure;
-use super::goal::GoalEntry;
+use super::goal::{GoalEntry, Said};
 use crate::client::{ActionClient, CallError, Channels, WorldClient, retry_unanswered};
 use crate::endpoint::{Endpoint, EndpointError};
 use crate::safety::{Safety, SafetyState};
@@ -10,7 +10,8 @@ use ratn_model::id::ProjectionId;
 use ratn_model::program::{PREEMPTED, STOPPED};
 use ratn_model::resource::Lease;
 use ratn_model::value::Value;
-use ratn_proto::convert::wire_ports;
+use ratn_proto::MAX_PORTS_BYTES;
+use ratn_proto::convert::{ports_bytes, wire_ports};
 use ratn_proto::types::{FactRecord, Goal, GoalOutcome};
 use ratn_proto::v1;
 use ratn_world::scene::delta::DeltaError;
@@ -41,6 +42,7 @@ pub struct GoalContext {
     pub cancelled: CancellationToken,
     /// Who holds the lease, as the goal says.
     session: String,
+    improves: Option<Vec<String>>,
     world_pool: String,
     channels: Channels,
     pub(super) safety: Safety,
@@ -144,6 +146,7 @@ impl GoalContext {
             lease: goal.lease,
             projection: goal.projection,
             session: goal.session,
+            improves: goal.improves,
             cancelled: entry.cancelled.clone(),
             world_pool: goal.world_pool,
             channels,
@@ -162,7 +165,37 @@ impl GoalContext {
     pub fn progress_with(&self, message: impl Into<String>, values: BTreeMap<String, Value>) {
         let progress = v1::GoalProgress { message: message.into(), values: wire_ports(values) };
         // Nobody may be listening.
-        let _ = self.entry.progress.send(progress);
+        let _ = self.entry.said.send(Said::Progress(progress));
+    }
+
+    /// Whether the goal may give a result, go on and give better ones ([`GoalContext::improved`]), and if so which outputs stay as they
+    /// were in the first: others have used them. `None`: only its end counts.
+    pub fn improves(&self) -> Option<&[String]> {
+        self.improves.as_deref()
+    }
+
+    /// Gives a result that can be used, and goes on: the first one, or one that costs less than all before. `cost_s` is what it costs whoever
+    /// uses it, in seconds of the robot's time: how long the planned motion takes. The goal is cancelled when somebody uses the result or wants
+    /// the worker; then the last one that was given counts, and how the goal ends does not matter. Never blocks.
+    ///
+    /// # Errors
+    /// [`ActionFailure::Aborted`] where the goal may not ([`GoalContext::improves`]), or where that is no result of the action: too large to
+    /// be sent, a cost that is no finite number.
+    pub fn improved(&self, outputs: BTreeMap<String, Value>, cost_s: f64) -> Result<(), ActionFailure> {
+        let refused = |why: String| Err(ActionFailure::Aborted(format!("a result of {}: {why}", self.action)));
+        if self.improves.is_none() {
+            return refused("only the end of this goal counts; see `improves`".to_owned());
+        }
+        if !cost_s.is_finite() {
+            return refused(format!("it costs {cost_s} s, which is no finite number"));
+        }
+        let outputs = wire_ports(outputs);
+        let bytes = ports_bytes(&outputs);
+        if bytes > MAX_PORTS_BYTES {
+            return refused(format!("the outputs have {bytes} bytes: at most {MAX_PORTS_BYTES} are sent"));
+        }
+        let _ = self.entry.said.send(Said::Improved(v1::GoalImproved { outputs, cost_s }));
+        Ok(())
     }
 
     /// An error where the goal has to stop: call it with `?` between two steps of the work.
@@ -277,6 +310,7 @@ impl GoalContext {
             deadline_ms: 0,
             // Whoever asks here is a goal itself, and has its own.
             grace_ms: 0,
+            improves: None,
         };
         let client = ActionClient::new(self.channels.clone());
         let performed = client.execute(&endpoint, goal, |_, _| {});

@@ -13,8 +13,8 @@ use std::time::Duration;
 use tokio::sync::{broadcast, watch};
 use tokio_util::sync::CancellationToken;
 
-/// A listener that falls further behind misses the oldest progress messages.
-const PROGRESS_KEPT: usize = 256;
+/// A listener that falls further behind misses the oldest of what a goal says before its end.
+const SAID_KEPT: usize = 64;
 
 /// However long a client may want to come back.
 const MAX_GRACE: Duration = Duration::from_secs(60);
@@ -38,6 +38,15 @@ pub(crate) enum StopCause {
     ShuttingDown,
     /// An emergency stop, and why.
     EmergencyStop(String),
+}
+
+/// What a goal says before its end.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Said {
+    /// How far it is.
+    Progress(v1::GoalProgress),
+    /// It has a result that can be used.
+    Improved(v1::GoalImproved),
 }
 
 /// How a goal ended.
@@ -111,7 +120,7 @@ pub(crate) struct GoalEntry {
     /// Whose lease that is, as the goal says; may be empty.
     pub(crate) session: String,
     pub(crate) cancelled: CancellationToken,
-    pub(crate) progress: broadcast::Sender<v1::GoalProgress>,
+    pub(crate) said: broadcast::Sender<Said>,
     pub(crate) result: watch::Sender<Option<Ending>>,
     /// Fires when its action has returned; an action that does not stop in time does so after its result was told.
     pub(crate) returned: CancellationToken,
@@ -147,7 +156,7 @@ impl GoalEntry {
             lease: goal.lease.as_ref().map(|lease| (lease.id, lease.token)),
             session: goal.session.clone(),
             cancelled: CancellationToken::new(),
-            progress: broadcast::channel(PROGRESS_KEPT).0,
+            said: broadcast::channel(SAID_KEPT).0,
             result: watch::channel(None).0,
             returned: CancellationToken::new(),
             suspended: watch::Sender::new(false),

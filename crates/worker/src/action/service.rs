@@ -1,7 +1,7 @@
 //! The gRPC adapter of [`ActionServer`].
 
 use super::ActionServer;
-use super::goal::{Ending, Fingerprint, GoalEntry, Listener};
+use super::goal::{Ending, Fingerprint, GoalEntry, Listener, Said};
 use super::stream::CallerGoals;
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
@@ -109,7 +109,7 @@ pub(super) fn described(
 pub(super) struct Messages {
     accepted: Option<bool>,
     over: bool,
-    progress: broadcast::Receiver<v1::GoalProgress>,
+    said: broadcast::Receiver<Said>,
     result: watch::Receiver<Option<Ending>>,
     _listener: Listener,
 }
@@ -119,7 +119,7 @@ impl Messages {
         Messages {
             accepted: Some(joined),
             over: false,
-            progress: entry.progress.subscribe(),
+            said: entry.said.subscribe(),
             result: entry.result.subscribe(),
             _listener: entry.listen(),
         }
@@ -143,8 +143,8 @@ impl Messages {
         loop {
             let ending = tokio::select! {
                 biased;
-                progress = self.progress.recv() => match progress {
-                    Ok(progress) => return Some(Ok(Kind::Progress(progress))),
+                said = self.said.recv() => match said {
+                    Ok(said) => return Some(Ok(kind(said))),
                     Err(RecvError::Lagged(_)) => continue,
                     Err(RecvError::Closed) => return None,
                 },
@@ -154,8 +154,8 @@ impl Messages {
                 },
             };
             // A last word may have come between the two looks.
-            if let Ok(progress) = self.progress.try_recv() {
-                return Some(Ok(Kind::Progress(progress)));
+            if let Ok(said) = self.said.try_recv() {
+                return Some(Ok(kind(said)));
             }
             self.over = true;
             return Some(match ending {
@@ -164,5 +164,12 @@ impl Messages {
                 Ending::Lost(reason) => Err(Status::aborted(reason)),
             });
         }
+    }
+}
+
+fn kind(said: Said) -> Kind {
+    match said {
+        Said::Progress(progress) => Kind::Progress(progress),
+        Said::Improved(better) => Kind::Improved(better),
     }
 }

@@ -62,6 +62,7 @@ fn told(messages: Messages) -> impl futures::Stream<Item = Result<Kind, Status>>
                 // That it goes on is no news.
                 Ok(Heard::Accepted(_)) => continue,
                 Ok(Heard::Progress(progress)) => Ok(Kind::Progress(progress)),
+                Ok(Heard::Improved(better)) => Ok(Kind::Improved(better)),
                 Ok(Heard::Result(result)) => Ok(Kind::Result(result)),
                 Err(status) => Err(status),
             };

@@ -8,7 +8,7 @@ use ratn_model::catalogue::WorkerDescription;
 use ratn_model::value::Value;
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::convert::{MAX_DESCRIPTION_BYTES, Malformed, ports};
-use ratn_proto::types::{Goal, GoalOutcome};
+use ratn_proto::types::{Goal, GoalImproved, GoalOutcome};
 use ratn_proto::v1;
 use ratn_proto::v1::action_service_client::ActionServiceClient;
 use ratn_proto::v1::execute_response::Kind;
@@ -31,6 +31,20 @@ pub struct ProviderInfo {
     pub resource: String,
     /// In the order of names.
     pub actions: Vec<ActionInfo>,
+}
+
+/// What a goal says before its end.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Said {
+    /// How far it is.
+    Progress {
+        /// For people and for the event log.
+        message: String,
+        /// Figures to it.
+        values: BTreeMap<String, Value>,
+    },
+    /// It has a result that can be used, and goes on for a better one.
+    Improved(GoalImproved),
 }
 
 /// How a goal ended that was given before.
@@ -85,17 +99,30 @@ impl ActionClient {
         &self,
         endpoint: &Endpoint,
         goal: Goal,
-        mut on_progress: impl FnMut(String, BTreeMap<String, Value>),
+        on_progress: impl FnMut(String, BTreeMap<String, Value>),
+    ) -> Result<GoalOutcome, CallError> {
+        self.execute_hearing(endpoint, goal, only_progress(on_progress)).await
+    }
+
+    /// As [`ActionClient::execute`], hearing also the results that a goal gives before its end.
+    ///
+    /// # Errors
+    /// As [`ActionClient::execute`].
+    pub async fn execute_hearing(
+        &self,
+        endpoint: &Endpoint,
+        goal: Goal,
+        mut on_said: impl FnMut(Said),
     ) -> Result<GoalOutcome, CallError> {
         let question = v1::ExecuteRequest { goal: Some(goal.into()), known_only: false };
         for _ in 1..TRIES {
-            match self.listen(endpoint, question.clone(), &mut on_progress).await {
+            match self.listen(endpoint, question.clone(), &mut on_said).await {
                 // It has begun nothing.
                 Err(error) if error.is_unconfirmed() => tokio::time::sleep(PAUSE).await,
                 ended => return ended.map(|fate| fate.outcome),
             }
         }
-        self.listen(endpoint, question, on_progress).await.map(|fate| fate.outcome)
+        self.listen(endpoint, question, on_said).await.map(|fate| fate.outcome)
     }
 
     /// Waits for the end of a goal that was given before, by this client or by an earlier one. Never begins the goal.
@@ -109,21 +136,41 @@ impl ActionClient {
         goal: Goal,
         on_progress: impl FnMut(String, BTreeMap<String, Value>),
     ) -> Result<Fate, CallError> {
-        self.listen(endpoint, v1::ExecuteRequest { goal: Some(goal.into()), known_only: true }, on_progress).await
+        self.attach_hearing(endpoint, goal, only_progress(on_progress)).await
+    }
+
+    /// As [`ActionClient::attach`], hearing also the results that a goal gives from now on before its end.
+    ///
+    /// # Errors
+    /// As [`ActionClient::attach`].
+    pub async fn attach_hearing(
+        &self,
+        endpoint: &Endpoint,
+        goal: Goal,
+        on_said: impl FnMut(Said),
+    ) -> Result<Fate, CallError> {
+        self.listen(endpoint, v1::ExecuteRequest { goal: Some(goal.into()), known_only: true }, on_said).await
     }
 
     async fn listen(
         &self,
         endpoint: &Endpoint,
         question: v1::ExecuteRequest,
-        mut on_progress: impl FnMut(String, BTreeMap<String, Value>),
+        mut on_said: impl FnMut(Said),
     ) -> Result<Fate, CallError> {
         let malformed = |m: Malformed| CallError::malformed(endpoint, m);
         let mut nonsense = None;
         let mut heard = |answer| {
-            let Heard::Progress(progress) = answer else { return };
-            match ports(progress.values, "progress.values") {
-                Ok(values) => on_progress(progress.message, values),
+            let said = match answer {
+                Heard::Progress(progress) => {
+                    let values = ports(progress.values, "progress.values");
+                    values.map(|values| Said::Progress { message: progress.message, values })
+                }
+                Heard::Improved(better) => GoalImproved::try_from(better).map(Said::Improved),
+                Heard::Result(_) | Heard::Failure(_) => return,
+            };
+            match said {
+                Ok(said) => on_said(said),
                 Err(error) => nonsense = Some(error),
             }
         };
@@ -159,6 +206,7 @@ impl ActionClient {
         while let Some(answer) = answers.message().await? {
             match answer.kind {
                 Some(Kind::Progress(progress)) => heard(Heard::Progress(progress)),
+                Some(Kind::Improved(better)) => heard(Heard::Improved(better)),
                 Some(Kind::Result(result)) => return Ok(Heard::Result(result)),
                 Some(Kind::Accepted(_)) | None => {}
             }
@@ -212,5 +260,14 @@ impl ActionClient {
         Ok(ActionServiceClient::new(self.channels.to_provider(endpoint)?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES))
+    }
+}
+
+/// Hears how far a goal is, and nothing else.
+fn only_progress(mut on_progress: impl FnMut(String, BTreeMap<String, Value>)) -> impl FnMut(Said) {
+    move |said| {
+        if let Said::Progress { message, values } = said {
+            on_progress(message, values);
+        }
     }
 }

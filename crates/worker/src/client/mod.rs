@@ -11,7 +11,7 @@ mod snapshot;
 mod unheard;
 mod world;
 
-pub use action::{ActionClient, ActionInfo, DescribeError, Fate, ProviderInfo};
+pub use action::{ActionClient, ActionInfo, DescribeError, Fate, ProviderInfo, Said};
 pub use error::CallError;
 pub use health::{Health, NOT_SERVING, wait_until_serving};
 pub use pattern::{fact, pattern};

@@ -136,7 +136,7 @@ impl Protocol for GoalCalls {
     }
 
     fn is_last(answer: &perform_response::Kind) -> bool {
-        !matches!(answer, perform_response::Kind::Progress(_))
+        !matches!(answer, perform_response::Kind::Progress(_) | perform_response::Kind::Improved(_))
     }
 
     fn ends_call(id: u64, call: &perform_request::Kind) -> Option<u64> {

@@ -10,9 +10,10 @@ mod outlook;
 
 use super::graph::Graph;
 use super::graph::instance::{Instance, Status};
+use super::improving::Improving;
 use crate::plan::Plan;
 use crate::protocol::CERTAIN;
-use ratn_model::id::InstanceId;
+use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::WORLD_MODEL;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use serde::{Deserialize, Serialize};
@@ -182,7 +183,7 @@ impl Dispatch {
         let mut wanted: BTreeMap<&str, InstanceId> = BTreeMap::new();
         for id in asked {
             let Some(instance) = graph.get(id) else { continue };
-            for (kind, _) in blocks(plan, instance) {
+            for (kind, _) in blocks(plan, instance.state) {
                 wanted.entry(kind).or_insert(id);
             }
         }
@@ -195,7 +196,7 @@ impl Dispatch {
             if !is_certain && !holds {
                 continue;
             }
-            for (kind, count) in blocks(plan, instance).filter(|(kind, _)| wanted.contains_key(kind)) {
+            for (kind, count) in blocks(plan, instance.state).filter(|(kind, _)| wanted.contains_key(kind)) {
                 *taken.entry(kind).or_default() += count;
                 if !is_certain {
                     holders.entry(kind).or_default().push((self.priority(graph, instance), instance.id, count));
@@ -222,6 +223,39 @@ impl Dispatch {
         order
     }
 
+    /// Who holds only to improve a result what an instance that asks cannot have beside it, as far as is known how much there is; whoever has
+    /// improved for longest first.
+    pub(crate) fn too_much(
+        &self,
+        graph: &Graph,
+        plan: &Plan,
+        improving: &Improving,
+        asks: InstanceId,
+    ) -> BTreeSet<InstanceId> {
+        let mut in_the_way = BTreeSet::new();
+        let Some(instance) = graph.get(asks) else { return in_the_way };
+        for (kind, _) in blocks(plan, instance.state) {
+            let Some(capacity) = self.capacity.get(kind).copied() else { continue };
+            let of = |state: StateId| {
+                blocks(plan, state).filter(|(other, _)| *other == kind).map(|(_, count)| count).sum::<Quantity>()
+            };
+            let active = self.active.iter().filter_map(|id| graph.get(*id));
+            let mut taken: Quantity = active.map(|instance| of(instance.state)).sum();
+            let holders = improving.iter().map(|(id, improvement)| (id, of(improvement.state)));
+            let holders: Vec<_> = holders.filter(|(_, count)| *count > Quantity::default()).collect();
+            taken += holders.iter().filter(|(id, _)| !in_the_way.contains(id)).map(|(_, count)| *count).sum();
+            for (id, count) in holders {
+                if taken <= capacity {
+                    break;
+                }
+                if in_the_way.insert(id) {
+                    taken = taken.saturating_sub(count);
+                }
+            }
+        }
+        in_the_way
+    }
+
     /// What is wrong, if anything: who is under way is active, and nobody else.
     pub(crate) fn check_invariants(&self, graph: &Graph) -> Result<(), String> {
         for instance in graph.iter() {
@@ -246,8 +280,8 @@ impl Dispatch {
     }
 }
 
-/// The kinds that a node blocks, and how much.
-fn blocks<'p>(plan: &'p Plan, instance: &Instance) -> impl Iterator<Item = (&'p str, Quantity)> {
-    let requirements = plan.state(instance.state).requirements.iter();
+/// The kinds that the node of a state blocks, and how much.
+fn blocks(plan: &Plan, state: StateId) -> impl Iterator<Item = (&str, Quantity)> {
+    let requirements = plan.state(state).requirements.iter();
     requirements.filter(|r| r.operation == ResourceOperation::Block).map(|r| (r.kind.as_str(), r.count))
 }

@@ -52,7 +52,7 @@ impl Dispatch {
                 is_speculative: graph.is_speculative(instance.segment),
                 urgency_s: f64::from(instance.dispatch.remaining_s.unwrap_or(duration_s)),
                 probability: graph.probability(instance.segment),
-                demands: blocks(sight.plan, instance).map(|(kind, count)| (kind.to_owned(), count)).collect(),
+                demands: blocks(sight.plan, instance.state).map(|(kind, count)| (kind.to_owned(), count)).collect(),
                 after,
             });
         }

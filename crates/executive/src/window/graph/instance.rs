@@ -111,7 +111,7 @@ pub(crate) enum Status {
 }
 
 /// What a node has got.
-#[derive(Default, Serialize, Deserialize)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Held {
     #[serde(with = "leases")]
     pub(crate) lease: Option<Box<Lease>>,

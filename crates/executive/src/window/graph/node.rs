@@ -1,6 +1,7 @@
 //! The life of a node: the changes of its status, each with what the status owns.
 
 use super::Graph;
+use crate::binding::Outputs;
 use super::instance::{Body, Held, Instance, Node, Status};
 use crate::interpreter::Interpreter;
 use ratn_model::id::{InstanceId, ProjectionId};
@@ -93,6 +94,13 @@ impl Graph {
     /// What it held, which it does not hold any more.
     pub(crate) fn take_held(&mut self, id: InstanceId) -> Held {
         self.node_mut(id).map(|node| node.status.take_held()).unwrap_or_default()
+    }
+
+    /// Its result is a better one, of which nobody has used what is otherwise.
+    pub(crate) fn improve(&mut self, id: InstanceId, outputs: Outputs) {
+        if let Some(Node { status: Status::Finished(ended), .. }) = self.node_mut(id) {
+            ended.outputs = outputs;
+        }
     }
 
     /// It begins again, as another attempt; what it was made of stays known.

@@ -18,7 +18,7 @@ use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use smallvec::SmallVec;
 use std::borrow::Cow;
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
 /// What is appended: a node, or a marker that leaves its state by an outcome.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -81,7 +81,7 @@ impl Growth {
             visit,
             iteration,
             environment,
-            producer: writes_outputs.then(|| Arc::new(Producer { instance: id, real: OnceLock::new() })),
+            producer: writes_outputs.then(|| Arc::new(Producer::new(id))),
             line,
             segment,
             position,

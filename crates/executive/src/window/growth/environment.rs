@@ -46,6 +46,21 @@ pub(crate) struct Producer {
     pub(crate) instance: InstanceId,
     #[serde(skip)]
     pub(crate) real: OnceLock<Outputs>,
+    /// The better ones that came after that, once somebody begins who uses them.
+    #[serde(skip)]
+    pub(crate) better: OnceLock<Outputs>,
+}
+
+impl Producer {
+    /// An instance that has not retired.
+    pub(crate) fn new(instance: InstanceId) -> Producer {
+        Producer { instance, real: OnceLock::new(), better: OnceLock::new() }
+    }
+
+    /// The outputs, once the instance has retired.
+    pub(crate) fn outputs(&self) -> Option<&Outputs> {
+        self.better.get().or_else(|| self.real.get())
+    }
 }
 
 /// One activation of a list of states.

@@ -54,12 +54,12 @@ impl<'a> Sight<'a> {
     /// What a producer that has ended assigns to variables: a routine does also where it ends badly.
     pub(crate) fn assigned_by(self, producer: &'a Producer) -> Option<&'a Outputs> {
         let alive = || self.graph.get(producer.instance)?.ended().map(|ended| &ended.outputs);
-        producer.real.get().or_else(alive)
+        producer.outputs().or_else(alive)
     }
 
     /// The outputs of a producer that has ended well.
     pub(crate) fn outputs_of(self, producer: &'a Producer) -> Option<&'a Outputs> {
-        producer.real.get().or_else(|| self.graph.get(producer.instance)?.outputs())
+        producer.outputs().or_else(|| self.graph.get(producer.instance)?.outputs())
     }
 
     /// The producers, in the window, of the outputs and variables that an instance reads.

@@ -140,8 +140,7 @@ impl<'a> Known<'a> {
         if let Some(place) = self.producers.find(producer) {
             return place;
         }
-        let Producer { instance, real } = &**producer;
-        let form = ProducerForm { instance: *instance, real: real.get().map(Cow::Borrowed) };
+        let form = ProducerForm { instance: producer.instance, real: producer.outputs().map(Cow::Borrowed) };
         self.producers.add(producer, form)
     }
 
@@ -207,7 +206,7 @@ impl Places<'_> {
         let Shared { producers, lists, frames, variables, writer_nodes, producer_nodes } = self.shared;
         let producer = |ProducerForm { instance, real }| {
             let real = real.map_or_else(OnceLock::new, |real| OnceLock::from(real.into_owned()));
-            Arc::new(Producer { instance, real })
+            Arc::new(Producer { real, ..Producer::new(instance) })
         };
         let producers: Vec<Arc<Producer>> = producers.into_iter().map(producer).collect();
         let producer = |place: u32| at(&producers, place, "a producer that is not there");

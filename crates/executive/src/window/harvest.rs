@@ -1,0 +1,163 @@
+//! Results that get better until they are needed.
+//!
+//! ```text
+//! goal ── first result ── better ── better ──┬─ a motion begins that uses it        ┐
+//!           │ finished: whoever             ├─ somebody wants what it holds         ├─ harvested: the best counts, what it
+//!           ▼ computes with it goes on      ├─ it is discarded, or made again       │  held is given back
+//!                                           └─ its provider has no better one       ┘
+//! ```
+//! What anybody may have used before a motion begins stays as it was at first ([`crate::plan`], `improves`): nothing is made again because
+//! of an improvement, and what becomes of the world does not depend on when it is harvested.
+
+use super::Window;
+use super::graph::instance::{Ended, Node, Status};
+use super::improving::Improvement;
+use super::waits::Timer;
+use crate::binding::{self, Outputs};
+use crate::context::Context;
+use crate::protocol::{Command, Event};
+use ratn_model::id::InstanceId;
+use ratn_model::program::{SUCCESS, StateKind};
+
+/// So long somebody waits for what is held only to improve a result, where it was not known that there is too little for both, in seconds.
+const PATIENCE_S: f64 = 0.1;
+
+impl Window {
+    /// A goal has a result and goes on: the first finishes its instance, others are kept until they are used.
+    pub(super) fn improved(&mut self, context: &mut Context<'_>, id: InstanceId, attempt: u32, outputs: Outputs) {
+        if self.improving.is(id, attempt) {
+            return self.keep_best(context, id, outputs);
+        }
+        let Some(instance) = self.graph.get(id) else { return };
+        let is_running =
+            instance.node().is_some_and(|node| node.attempt == attempt && matches!(node.status, Status::Running(_)));
+        let StateKind::Action { outputs: declared, .. } = &context.program.state(instance.state).kind else { return };
+        let may = context.plan.state(instance.state).improves.is_some();
+        // What is not whole is no result: the goal goes on, and says in the end what comes of it.
+        if !is_running || !may || binding::missing_output(declared, &outputs).is_some() {
+            return;
+        }
+        let Some(producer) = instance.producer.clone() else { return };
+        let state = instance.state;
+        let held = self.graph.take_held(id);
+        self.improving.begin(id, Improvement { state, attempt, held, producer, best: None });
+        self.finish(context, id, Ended::with(SUCCESS, outputs));
+        if self.graph.get(id).is_some_and(|instance| instance.outputs().is_none()) {
+            // What it assigns could not be worked out.
+            return self.harvest(context, id);
+        }
+        // Some may have waited for what it holds since before it had a result.
+        let asks = |id: &InstanceId| matches!(self.graph.node(*id), Some(Node { status: Status::Acquiring { .. }, .. }));
+        let asking: Vec<InstanceId> = self.dispatch.active().filter(asks).collect();
+        asking.into_iter().for_each(|id| self.make_room(context, id));
+    }
+
+    /// A goal whose result is there has ended: with its best, or without another word.
+    pub(super) fn improvement_ended(&mut self, context: &mut Context<'_>, id: InstanceId, event: Event) {
+        if let Event::Finished { outcome, outputs, .. } = event
+            && outcome == SUCCESS
+        {
+            self.keep_best(context, id, outputs);
+        }
+        if let Some(improvement) = self.settle_best(id) {
+            release(context, id, &improvement);
+        }
+    }
+
+    /// Better outputs, if they are what may be: whole, and as at first in what somebody may have used.
+    fn keep_best(&mut self, context: &Context<'_>, id: InstanceId, outputs: Outputs) {
+        let Some(improvement) = self.improving.get_mut(id) else { return };
+        let StateKind::Action { outputs: declared, .. } = &context.program.state(improvement.state).kind else { return };
+        let Some(kept) = &context.plan.state(improvement.state).improves else { return };
+        let first = improvement.producer.outputs().or_else(|| self.graph.get(id)?.outputs());
+        let is_kept = first.is_some_and(|first| kept.iter().all(|port| first.get(port) == outputs.get(port)));
+        if is_kept && binding::missing_output(declared, &outputs).is_none() {
+            improvement.best = Some(outputs);
+        }
+    }
+
+    /// A result is to be used, or what it holds is wanted, or nobody wants it any more: the goal is told to stop, and its best counts.
+    /// Nothing where it does not get better.
+    pub(super) fn harvest(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        if let Some(improvement) = self.settle_best(id) {
+            context.commands.push(Command::Cancel { instance: id, attempt: improvement.attempt });
+            release(context, id, &improvement);
+        }
+    }
+
+    /// The best outputs are the outputs from now on.
+    fn settle_best(&mut self, id: InstanceId) -> Option<Improvement> {
+        let mut improvement = self.improving.end(id)?;
+        let Some(best) = improvement.best.take() else { return Some(improvement) };
+        let with_best = |first: &Outputs| {
+            let mut all = first.clone();
+            all.extend(best);
+            all
+        };
+        if let Some(first) = improvement.producer.real.get() {
+            let _ = improvement.producer.better.set(with_best(first));
+        } else if let Some(better) = self.graph.get(id).and_then(|instance| instance.outputs()).map(with_best) {
+            self.graph.improve(id, better);
+        }
+        Some(improvement)
+    }
+
+    /// A motion begins: what it uses is final. Whether any of it was not.
+    pub(super) fn harvest_for(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
+        let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return false };
+        if self.improving.is_empty() {
+            return false;
+        }
+        let flows = context.plan.state(instance.state).flows.iter();
+        let used: Vec<InstanceId> =
+            flows.filter_map(|state| instance.environment.producer(*state)).map(|producer| producer.instance).collect();
+        let before = context.commands.len();
+        used.into_iter().for_each(|producer| self.harvest(context, producer));
+        context.commands.len() > before
+    }
+
+    /// The run is over.
+    pub(super) fn harvest_all(&mut self, context: &mut Context<'_>) {
+        let all: Vec<InstanceId> = self.improving.iter().map(|(id, _)| id).collect();
+        all.into_iter().for_each(|id| self.harvest(context, id));
+    }
+
+    /// An instance is about to ask for resources. Where there is not enough for it and for what only gets better, the latter gives way; where
+    /// that is not known, it does so after a while.
+    pub(super) fn make_room(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        if self.improving.is_empty() {
+            return;
+        }
+        let in_the_way = self.dispatch.too_much(&self.graph, context.plan, &self.improving, id);
+        in_the_way.into_iter().for_each(|other| self.harvest(context, other));
+        if self.holders_of_what(context, id).next().is_some() {
+            self.set_timer(context, PATIENCE_S, Timer::Room(id));
+        }
+    }
+
+    /// An instance has waited for resources for a while: whoever holds such only to improve a result gives way.
+    pub(super) fn make_way_for(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let asks = self.graph.node(id).is_some_and(|node| matches!(node.status, Status::Acquiring { .. }));
+        if asks {
+            let holders: Vec<InstanceId> = self.holders_of_what(context, id).collect();
+            holders.into_iter().for_each(|other| self.harvest(context, other));
+        }
+    }
+
+    /// Who holds, only to improve a result, a kind that an instance wants.
+    fn holders_of_what<'a>(&'a self, context: &'a Context<'_>, id: InstanceId) -> impl Iterator<Item = InstanceId> + 'a {
+        let wanted = self.graph.get(id).map(|instance| &context.plan.state(instance.state).requirements);
+        let is_wanted = move |kind: &str| wanted.is_some_and(|wanted| wanted.iter().any(|wanted| wanted.kind == kind));
+        let holds = move |improvement: &Improvement| {
+            context.plan.state(improvement.state).requirements.iter().any(|held| is_wanted(&held.kind))
+        };
+        self.improving.iter().filter(move |(_, improvement)| holds(improvement)).map(|(id, _)| id)
+    }
+}
+
+fn release(context: &mut Context<'_>, id: InstanceId, improvement: &Improvement) {
+    let (lease, projection) = (improvement.held.lease.as_ref().map(|lease| lease.id), improvement.held.projection);
+    if lease.is_some() || projection.is_some() {
+        context.commands.push(Command::Release { instance: id, lease, projection });
+    }
+}
