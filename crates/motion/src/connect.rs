@@ -261,7 +261,7 @@ pub fn connect_to_targets(
 /// What the caller's answer means for the search.
 fn go_on(control: &mut dyn FnMut(usize) -> Control, iterations: usize) -> Result<(), ConnectError> {
     match control(iterations) {
-        Control::Continue => Ok(()),
+        Control::Continue | Control::Settle => Ok(()),
         Control::TimeUp => Err(ConnectError::TimeUp { iterations }),
         Control::Cancelled => Err(ConnectError::Cancelled),
     }

@@ -230,7 +230,7 @@ pub(crate) fn walk(
     let (mut here, mut steps) = (*from, Vec::new());
     loop {
         let answer = control(steps.len());
-        if answer != Control::Continue {
+        if !answer.goes_on() {
             return Err(answer);
         }
         let far = distance(&here, to);
@@ -264,7 +264,7 @@ pub fn shorten(
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     for attempt in 0..attempts {
         let answer = control(attempt);
-        if answer != Control::Continue {
+        if !answer.goes_on() {
             return Err(answer);
         }
         if path.len() < 3 {

@@ -1,8 +1,10 @@
 //! How the caller controls the planner: a callback is called often, reports progress, and answers whether to go on.
 
+use crate::plan::Plan;
+
 /// What the planner reports when it asks whether to go on.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Progress {
+pub enum Progress<'p> {
     /// Nothing new.
     Working,
     /// The first path was found; reported once.
@@ -10,22 +12,37 @@ pub enum Progress {
         /// Its length in joint space.
         length_rad: f64,
     },
-    /// The path became quicker.
+    /// The path became quicker; of the first one, when its improvement begins.
     Quicker {
         /// About how long what follows the departure takes now, in seconds.
         about_s: f64,
     },
+    /// A whole motion that can be used, after [`Control::Settle`]: the best so far, then those that are at least [`BETTER`] quicker. They all
+    /// end in the same posture.
+    Usable(&'p Plan),
 }
+
+/// A motion that is usable already is reported again when this share of its duration is saved.
+pub const BETTER: f64 = 0.01;
 
 /// The caller's answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Control {
     /// Go on.
     Continue,
+    /// The best so far will do: report it as [`Progress::Usable`] and go on, with the same end. Once said, it stays so.
+    Settle,
     /// Finish with the best path so far.
     TimeUp,
     /// Give up.
     Cancelled,
+}
+
+impl Control {
+    /// Whether the planner goes on.
+    pub(crate) fn goes_on(self) -> bool {
+        matches!(self, Control::Continue | Control::Settle)
+    }
 }
 
 /// Why the planner stopped before it was done.
@@ -39,25 +56,27 @@ impl From<Control> for Stop {
     fn from(control: Control) -> Stop {
         match control {
             Control::Cancelled => Stop::Cancelled,
-            Control::Continue | Control::TimeUp => Stop::TimeUp,
+            Control::Continue | Control::Settle | Control::TimeUp => Stop::TimeUp,
         }
     }
 }
 
 pub(crate) struct Pace<'c> {
-    control: &'c mut dyn FnMut(Progress) -> Control,
+    control: &'c mut dyn FnMut(Progress<'_>) -> Control,
     /// Iterations of search and improvement so far.
     pub(crate) iterations: usize,
+    /// What is there will do.
+    is_settled: bool,
 }
 
 impl<'c> Pace<'c> {
-    pub(crate) fn new(control: &'c mut dyn FnMut(Progress) -> Control) -> Pace<'c> {
-        Pace { control, iterations: 0 }
+    pub(crate) fn new(control: &'c mut dyn FnMut(Progress<'_>) -> Control) -> Pace<'c> {
+        Pace { control, iterations: 0, is_settled: false }
     }
 
-    pub(crate) fn report(&mut self, progress: Progress) -> Result<(), Stop> {
-        match (self.control)(progress) {
-            Control::Continue => Ok(()),
+    pub(crate) fn report(&mut self, progress: Progress<'_>) -> Result<(), Stop> {
+        match self.asked(progress) {
+            Control::Continue | Control::Settle => Ok(()),
             Control::TimeUp => Err(Stop::TimeUp),
             Control::Cancelled => Err(Stop::Cancelled),
         }
@@ -65,7 +84,21 @@ impl<'c> Pace<'c> {
 
     /// Calls the callback directly, for searches that count their own iterations.
     pub(crate) fn answer(&mut self) -> Control {
-        (self.control)(Progress::Working)
+        match self.asked(Progress::Working) {
+            Control::Settle => Control::Continue,
+            answer => answer,
+        }
+    }
+
+    fn asked(&mut self, progress: Progress<'_>) -> Control {
+        let answer = (self.control)(progress);
+        self.is_settled |= answer == Control::Settle;
+        answer
+    }
+
+    /// Whether the caller has said that what is there will do.
+    pub(crate) fn is_settled(&self) -> bool {
+        self.is_settled
     }
 
     pub(crate) fn poll(&mut self) -> Result<(), Stop> {

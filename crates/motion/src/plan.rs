@@ -32,7 +32,7 @@ use candidates::Candidates;
 pub(crate) use contact::straight_collision;
 use departure::departure;
 pub use error::PlanError;
-use improvement::{Improved, Improvement, Motion, Way};
+use improvement::{Before, Improvement, Way};
 use ratn_model::pose::Pose;
 use ratn_model::value::Trajectory;
 use ratn_world::scene::Scene;
@@ -70,7 +70,7 @@ pub fn plan(
     robot: &Robot,
     scene: &Scene,
     request: &Request,
-    control: &mut dyn FnMut(Progress) -> Control,
+    control: &mut dyn FnMut(Progress<'_>) -> Control,
 ) -> Result<Plan, PlanError> {
     request.check(robot, scene)?;
     let mut pace = Pace::new(control);
@@ -88,24 +88,9 @@ pub fn plan(
     arm.pad_at_least_tightly();
     let mut candidates = Candidates::find(&mut arm, &start, &mut pace)?;
     let first = first_way(&mut arm, &start, &door, &candidates, &mut pace)?;
-    let length_rad = |way: &Way, candidates: &Candidates<'_>| {
-        before_rad + f64::from(path_length(&way.path)) + candidates[way.candidate].length_rad
-    };
-    let first_length_rad = length_rad(&first, &candidates);
-    let improvement = Improvement::new(&mut arm, &mut candidates, &depart);
-    let Improved { first_duration_s, motion, time_up } = improvement.run(first, first_length_rad, &mut pace)?;
-    let Motion { way, curve } = motion;
-    let end = candidates[way.candidate].goal();
-    Ok(Plan {
-        trajectory: curve.named(robot.arm_joints()),
-        end,
-        end_pose: arm.tool_pose(&end),
-        first_length_rad,
-        length_rad: length_rad(&way, &candidates),
-        first_duration_s,
-        iterations: pace.iterations,
-        time_up,
-    })
+    let first_length_rad = before_rad + f64::from(path_length(&first.path)) + candidates[first.candidate].length_rad;
+    let before = Before { depart: &depart, length_rad: before_rad, first_length_rad };
+    Improvement::new(&mut arm, &mut candidates, before).run(first, &mut pace)
 }
 
 /// From the door at the start to that of a candidate.

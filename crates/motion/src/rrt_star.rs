@@ -127,7 +127,7 @@ impl RrtStar {
         let start = self.nodes[0].state;
         for sample in 0..samples {
             let answer = control(sample);
-            if answer != Control::Continue {
+            if !answer.goes_on() {
                 return Err(answer);
             }
             let bound = self.best(ends).map_or(limit, |(_, length)| limit.min(length));

@@ -330,6 +330,34 @@ fn when_time_is_up_the_best_path_so_far_is_the_answer() {
 }
 
 #[test]
+fn what_will_do_is_reported_and_gets_quicker_with_the_same_end() {
+    for seed in 0..3 {
+        let mut cell = Cell::with_boxes(4, seed);
+        cell.improvement_iterations = 4_000;
+        let request = cell.approach("box_1");
+        let (mut usable, mut steps): (Vec<Plan>, _) = (Vec::new(), 0);
+        let last = plan(&cell.robot, &cell.scene, &request, &mut |progress| {
+            match progress {
+                Progress::Usable(plan) => usable.push(plan.clone()),
+                Progress::FirstPath { .. } | Progress::Quicker { .. } | Progress::Working => {}
+            }
+            steps += 1;
+            if steps == 100 { Control::Settle } else { Control::Continue }
+        });
+        usable.push(last.unwrap());
+        assert!(usable.len() > 1, "nothing was reported");
+        for (n, plan) in usable.iter().enumerate() {
+            assert_valid(&cell, plan, request.speed);
+            assert_eq!((plan.end, plan.end_pose), (usable[0].end, usable[0].end_pose));
+            let is_last = n + 1 == usable.len();
+            let before_s = if n > 0 { lasts_s(&usable[n - 1]) } else { f64::INFINITY };
+            let wanted_s = if is_last { before_s } else { 0.99 * before_s };
+            assert!(lasts_s(plan) <= wanted_s, "result {n} of seed {seed}: {} s after {before_s}", lasts_s(plan));
+        }
+    }
+}
+
+#[test]
 fn a_cancelled_planning_ends_at_once() {
     let cell = Cell::with_boxes(3, 3);
     let mut asked = 0;

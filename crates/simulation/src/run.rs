@@ -36,13 +36,7 @@ pub trait Oracle {
     fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, world: &World) -> Performance;
 
     /// What comes after a first result, of a goal that may improve it; nothing unless said: then the first is the last.
-    fn better(
-        &mut self,
-        path: &str,
-        attempt: u32,
-        goal: &Goal,
-        first: &BTreeMap<String, Value>,
-    ) -> Option<Better> {
+    fn better(&mut self, path: &str, attempt: u32, goal: &Goal, first: &BTreeMap<String, Value>) -> Option<Better> {
         let _ = (path, attempt, goal, first);
         None
     }
@@ -604,7 +598,9 @@ impl Simulation<'_> {
         let world = goal.projection.and_then(|p| self.projections.get(&p)).unwrap_or(&self.root);
         let Performance { duration_s, answer } = self.oracle.perform(&path, attempt, goal, world);
         let first = match &answer {
-            Answer::Finished { outcome, outputs, .. } if outcome == "success" && goal.improves.is_some() => Some(outputs),
+            Answer::Finished { outcome, outputs, .. } if outcome == "success" && goal.improves.is_some() => {
+                Some(outputs)
+            }
             _ => None,
         };
         let better = first.and_then(|first| Some((first.clone(), self.oracle.better(&path, attempt, goal, first)?)));

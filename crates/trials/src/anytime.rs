@@ -60,7 +60,11 @@ pub(super) fn depends_on(state: &State, port: &str) -> bool {
 
 /// Ports without those that may be better in one mode than in the other.
 pub(super) fn without_cost(ports: &BTreeMap<String, Value>) -> BTreeMap<String, Value> {
-    ports.iter().filter(|(port, _)| !port.starts_with(COST)).map(|(port, value)| (port.clone(), value.clone())).collect()
+    ports
+        .iter()
+        .filter(|(port, _)| !port.starts_with(COST))
+        .map(|(port, value)| (port.clone(), value.clone()))
+        .collect()
 }
 
 /// The outputs, with what the result costs where the action says so.
@@ -71,7 +75,13 @@ pub(super) fn with_cost(state: &State, outputs: &mut BTreeMap<String, Value>) {
 }
 
 /// What comes after the first result, and how the goal ends then.
-pub(super) fn later(seed: u64, path: &str, attempt: u32, goal: &Goal, first: &BTreeMap<String, Value>) -> Option<Better> {
+pub(super) fn later(
+    seed: u64,
+    path: &str,
+    attempt: u32,
+    goal: &Goal,
+    first: &BTreeMap<String, Value>,
+) -> Option<Better> {
     let kept = goal.improves.as_deref()?;
     let mut hash = Hash(seed);
     hash.add("better");
@@ -97,7 +107,8 @@ pub(super) fn later(seed: u64, path: &str, attempt: u32, goal: &Goal, first: &BT
     };
     let results: Vec<_> = (1..=1 + (hash.dice().below(4) as i64)).map(&mut better).collect();
     let last = results.last().map(|(_, outputs, _)| outputs.clone()).unwrap_or_default();
-    let finished = |outcome: &str, outputs| Answer::Finished { outcome: outcome.to_owned(), outputs, measured: Vec::new() };
+    let finished =
+        |outcome: &str, outputs| Answer::Finished { outcome: outcome.to_owned(), outputs, measured: Vec::new() };
     let end = match dice.below(6) {
         0 | 1 => Some(finished("success", last)),
         2 => Some(finished(ABORTED, BTreeMap::new())),

@@ -6,8 +6,8 @@
 //! three actions per region, whatever else may shift the end of an action (messages that are late, workers that die: some tens
 //! of seconds) never changes which ends first, so that the outcome is one function of the program in both modes.
 
-use super::generator::tolerance::{OFF, TOLERANT};
 use super::anytime;
+use super::generator::tolerance::{OFF, TOLERANT};
 use super::{AGAIN, ARGUMENTS, FOUND, PREDICATES, is_preemptive, plain, state_of};
 use super::{Dice, Hash};
 use ratn_executive::protocol::{Event, Goal};
@@ -90,13 +90,7 @@ impl Oracle for HashOracle<'_> {
         Performance { duration_s, answer: Answer::Finished { outcome, outputs, measured } }
     }
 
-    fn better(
-        &mut self,
-        path: &str,
-        attempt: u32,
-        goal: &Goal,
-        first: &BTreeMap<String, Value>,
-    ) -> Option<Better> {
+    fn better(&mut self, path: &str, attempt: u32, goal: &Goal, first: &BTreeMap<String, Value>) -> Option<Better> {
         anytime::later(self.seed, path, attempt, goal, first)
     }
 

@@ -2,7 +2,8 @@
 //!
 //! For each goal it fetches the scene of the goal's projection (as the difference to a scene that it has), plans on a thread of its own, and
 //! answers with a timed trajectory. All durations in goals and answers are in the robot's seconds; `clock` converts them to wall time. With
-//! `budget_s`, planning takes exactly that long and finds a quicker motion. Without it, the first path is improved for 50 ms of wall time.
+//! `budget_s`, planning takes exactly that long and finds a quicker motion. Without it, the first path is improved as long as that saves more
+//! of the motion than it takes, for 50 ms of wall time at least. Where the goal may improve its result, that is its first one, and it goes on.
 
 mod arms;
 mod bounds;
@@ -20,6 +21,7 @@ use ratn_worker::worker::{Worker, WorkerOptions};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
+use tokio::sync::oneshot;
 
 /// The action `path_planner/plan`: plans a motion of an arm.
 #[derive(Debug)]
@@ -76,12 +78,17 @@ impl Action for PlanAction {
 
         let goal = Arc::new(goal);
         let mut clock = Clock::new(begin, self.speed, budget_s, Arc::clone(&goal));
-        let planning = tokio::task::spawn_blocking(move || {
+        let (tell, planned) = oneshot::channel();
+        let planning = move || {
             let outcome = plan(&robot, &scene, &request, &mut |progress| clock.control(progress));
-            (outcome, clock.figures())
-        });
-        match planning.await? {
-            (Ok(plan), figures) => Ok(outcome(plan, &figures)),
+            let _ = tell.send((outcome, clock.figures()));
+        };
+        // A thread of its own, which can be nice without another goal being so after it.
+        std::thread::Builder::new().name("planner".to_owned()).spawn(planning)?;
+        let planned =
+            planned.await.map_err(|_| ActionFailure::aborted("the planner panicked: see the worker's log"))?;
+        match planned {
+            (Ok(plan), figures) => Ok(GoalOutcome { outputs: outputs(&plan, &figures), ..GoalOutcome::success() }),
             (Err(PlanError::Cancelled), _) => Err(goal.stopped()),
             (Err(PlanError::TimeUp), figures) => {
                 let reason = format!("{} ({:.1} s)", PlanError::TimeUp, figures.planning_s);
@@ -92,9 +99,9 @@ impl Action for PlanAction {
     }
 }
 
-fn outcome(plan: Plan, figures: &Figures) -> GoalOutcome {
-    let outputs: BTreeMap<String, Value> = [
-        ("trajectory", Value::Trajectory(plan.trajectory)),
+fn outputs(plan: &Plan, figures: &Figures) -> BTreeMap<String, Value> {
+    [
+        ("trajectory", Value::Trajectory(plan.trajectory.clone())),
         ("end", Value::Joints(plan.end.to_vec())),
         ("end_pose", Value::Pose(plan.end_pose)),
         ("first_path_s", Value::Float(figures.first_path_s)),
@@ -104,6 +111,5 @@ fn outcome(plan: Plan, figures: &Figures) -> GoalOutcome {
         ("iterations", Value::Int(i64::try_from(plan.iterations).unwrap_or(i64::MAX))),
     ]
     .map(|(port, value)| (port.to_owned(), value))
-    .into();
-    GoalOutcome { outputs, ..GoalOutcome::success() }
+    .into()
 }

@@ -14,7 +14,7 @@ use ratn_motion::collision::Contact;
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_motion::validate::validate_trajectory;
 use ratn_proto::types::Goal;
-use ratn_worker::client::{ActionClient, Channels, WorldClient};
+use ratn_worker::client::{ActionClient, Channels, Said, WorldClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::{RuntimeDirectory, wait_for_file};
 use ratn_worker::tls::ClientTls;
@@ -146,6 +146,41 @@ async fn without_a_budget_the_first_path_is_improved_for_fifty_milliseconds_and_
         lasts.push(trajectory.duration_s());
     }
     assert!(lasts[1] <= lasts[0], "{lasts:?}");
+}
+
+#[tokio::test]
+async fn a_goal_that_may_improve_its_result_gives_one_as_soon_as_it_will_do_and_then_quicker_ones_with_the_same_end() {
+    let system = system().await;
+    let goal = Goal { improves: Some(vec!["end".to_owned()]), ..system.grasp("a", &[]) };
+    let (mut given, begun) = (Vec::new(), Instant::now());
+    let mut first_after = None;
+    let last = system.client.execute_hearing(&system.planner, goal, |said| {
+        let Said::Improved(better) = said else { return };
+        first_after.get_or_insert(begun.elapsed());
+        given.push(better);
+    });
+    let last = last.await.unwrap();
+    assert!(last.is_success(), "{}", last.reason);
+    assert!(!given.is_empty(), "nothing was given before the end");
+    // It goes on for a second at the least.
+    assert!(begun.elapsed() - first_after.unwrap() > Duration::from_millis(900));
+    for (n, better) in given.iter().enumerate() {
+        assert_eq!(better.outputs["end"], last.outputs["end"]);
+        let Value::Trajectory(trajectory) = &better.outputs["trajectory"] else { panic!() };
+        assert_eq!(better.cost_s, trajectory.duration_s());
+        assert!(n == 0 || better.cost_s < given[n - 1].cost_s);
+    }
+}
+
+#[tokio::test]
+async fn a_goal_with_a_budget_gives_its_result_when_that_is_over_and_ends() {
+    let system = system().await;
+    let goal = system.grasp("a", &[("budget_s", Value::Float(3.0))]);
+    let goal = Goal { improves: Some(Vec::new()), ..goal };
+    let mut given = 0;
+    let heard = |said| given += usize::from(matches!(said, Said::Improved(_)));
+    assert!(system.client.execute_hearing(&system.planner, goal, heard).await.unwrap().is_success());
+    assert_eq!(given, 0);
 }
 
 #[tokio::test]

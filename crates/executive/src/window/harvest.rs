@@ -47,7 +47,8 @@ impl Window {
             return self.harvest(context, id);
         }
         // Some may have waited for what it holds since before it had a result.
-        let asks = |id: &InstanceId| matches!(self.graph.node(*id), Some(Node { status: Status::Acquiring { .. }, .. }));
+        let asks =
+            |id: &InstanceId| matches!(self.graph.node(*id), Some(Node { status: Status::Acquiring { .. }, .. }));
         let asking: Vec<InstanceId> = self.dispatch.active().filter(asks).collect();
         asking.into_iter().for_each(|id| self.make_room(context, id));
     }
@@ -67,7 +68,9 @@ impl Window {
     /// Better outputs, if they are what may be: whole, and as at first in what somebody may have used.
     fn keep_best(&mut self, context: &Context<'_>, id: InstanceId, outputs: Outputs) {
         let Some(improvement) = self.improving.get_mut(id) else { return };
-        let StateKind::Action { outputs: declared, .. } = &context.program.state(improvement.state).kind else { return };
+        let StateKind::Action { outputs: declared, .. } = &context.program.state(improvement.state).kind else {
+            return;
+        };
         let Some(kept) = &context.plan.state(improvement.state).improves else { return };
         let first = improvement.producer.outputs().or_else(|| self.graph.get(id)?.outputs());
         let is_kept = first.is_some_and(|first| kept.iter().all(|port| first.get(port) == outputs.get(port)));
@@ -145,7 +148,11 @@ impl Window {
     }
 
     /// Who holds, only to improve a result, a kind that an instance wants.
-    fn holders_of_what<'a>(&'a self, context: &'a Context<'_>, id: InstanceId) -> impl Iterator<Item = InstanceId> + 'a {
+    fn holders_of_what<'a>(
+        &'a self,
+        context: &'a Context<'_>,
+        id: InstanceId,
+    ) -> impl Iterator<Item = InstanceId> + 'a {
         let wanted = self.graph.get(id).map(|instance| &context.plan.state(instance.state).requirements);
         let is_wanted = move |kind: &str| wanted.is_some_and(|wanted| wanted.iter().any(|wanted| wanted.kind == kind));
         let holds = move |improvement: &Improvement| {

@@ -1,11 +1,12 @@
 //! Makes the motion quicker while the caller gives time: other free paths and other candidates, compared by how long they roughly take, and
 //! taken where the whole motion, timed exactly, is quicker.
 
+use super::Plan;
 use super::arm_in_scene::ArmInScene;
 use super::candidates::{Candidate, Candidates};
 use super::error::PlanError;
 use crate::joint_vector::JointVector;
-use crate::pace::{Control, Pace, Progress, Stop};
+use crate::pace::{BETTER, Control, Pace, Progress, Stop};
 use crate::refine::{End, Refinement};
 use crate::request::Goal;
 use crate::simplify::path_length;
@@ -13,6 +14,7 @@ use crate::space::{State, state};
 use crate::timing::Section;
 use crate::trajectory::Curve;
 use rand::RngExt;
+use std::ops::Range;
 
 /// Of a hundred steps of improvement, those that look for a new candidate.
 const NEW_CANDIDATES: i32 = 8;
@@ -43,36 +45,39 @@ pub(super) struct Motion {
     pub(super) curve: Curve,
 }
 
-/// What came of improvement.
-pub(super) struct Improved {
-    pub(super) first_duration_s: f64,
-    /// The quickest that was timed.
-    pub(super) motion: Motion,
-    /// The caller's time was up before all steps were done.
-    pub(super) time_up: bool,
+/// What is fixed before improvement begins.
+pub(super) struct Before<'p> {
+    /// The straight part at the start.
+    pub(super) depart: &'p [JointVector],
+    /// How long that is, with the way to the door behind it.
+    pub(super) length_rad: f64,
+    /// How long the first path is, straight parts included.
+    pub(super) first_length_rad: f64,
 }
 
 /// Improvement under way.
 pub(super) struct Improvement<'p, 'a> {
     arm: &'p mut ArmInScene<'a>,
     candidates: &'p mut Candidates<'a>,
-    /// The straight part at the start.
-    depart: &'p [JointVector],
+    before: Before<'p>,
+    first_duration_s: f64,
+    /// How long the motion took that was reported last as usable.
+    usable_s: Option<f64>,
 }
 
 impl<'p, 'a> Improvement<'p, 'a> {
     pub(super) fn new(
         arm: &'p mut ArmInScene<'a>,
         candidates: &'p mut Candidates<'a>,
-        depart: &'p [JointVector],
+        before: Before<'p>,
     ) -> Improvement<'p, 'a> {
-        Improvement { arm, candidates, depart }
+        Improvement { arm, candidates, before, first_duration_s: 0.0, usable_s: None }
     }
 
     /// The quickest motion found, if only that along the first path: to be timed is part of every plan, also when time is up.
-    pub(super) fn run(mut self, first: Way, first_length_rad: f64, pace: &mut Pace<'_>) -> Result<Improved, PlanError> {
+    pub(super) fn run(mut self, first: Way, pace: &mut Pace<'_>) -> Result<Plan, PlanError> {
         let mut shorter = first.clone();
-        let reported = pace.report(Progress::FirstPath { length_rad: first_length_rad });
+        let reported = pace.report(Progress::FirstPath { length_rad: self.before.first_length_rad });
         let shortened = reported.and_then(|()| self.arm.shorten(&mut shorter.path, pace));
         if shortened == Err(Stop::Cancelled) {
             return Err(PlanError::Cancelled);
@@ -82,30 +87,68 @@ impl<'p, 'a> Improvement<'p, 'a> {
         let Ok(mut motion) = timed else {
             // A shorter path that cannot be timed so that the tool keeps what it is to keep is no start for improvement.
             let motion = self.motion(first, &mut not_cancelled(pace))?;
-            return finished(motion.curve.duration_s(), motion, stopped, pace);
+            self.first_duration_s = motion.curve.duration_s();
+            return self.finished(&motion, stopped, pace);
         };
-        let first_duration_s = motion.curve.duration_s();
+        self.first_duration_s = motion.curve.duration_s();
         if stopped.is_none() {
             stopped = self.refine(&mut motion, pace).err();
         }
-        finished(first_duration_s, motion, stopped, pace)
+        self.finished(&motion, stopped, pace)
+    }
+
+    fn finished(&self, motion: &Motion, stopped: Option<Stop>, pace: &mut Pace<'_>) -> Result<Plan, PlanError> {
+        if stopped == Some(Stop::Cancelled) || pace.answer() == Control::Cancelled {
+            return Err(PlanError::Cancelled);
+        }
+        Ok(Plan { time_up: stopped.is_some(), ..self.plan(motion, pace.iterations) })
+    }
+
+    fn plan(&self, Motion { way, curve }: &Motion, iterations: usize) -> Plan {
+        let candidate = &self.candidates[way.candidate];
+        let end = candidate.goal();
+        Plan {
+            trajectory: curve.named(self.arm.robot().arm_joints()),
+            end,
+            end_pose: self.arm.tool_pose(&end),
+            first_length_rad: self.before.first_length_rad,
+            length_rad: self.before.length_rad + f64::from(path_length(&way.path)) + candidate.length_rad,
+            first_duration_s: self.first_duration_s,
+            iterations,
+            time_up: true,
+        }
     }
 
     /// As many steps of improvement as were asked for; from time to time what they have led to is timed.
     fn refine(&mut self, best: &mut Motion, pace: &mut Pace<'_>) -> Result<(), Stop> {
         let Way { path, candidate } = best.way.clone();
         let mut refinement = self.arm.refinement(path, candidate, self.candidates.ends());
-        let stopped = self.steps(&mut refinement, best, pace);
+        let mut steps = 0..self.arm.request().improvement_iterations;
+        let mut stopped = self.steps(&mut steps, &mut refinement, best, pace);
         if stopped != Err(Stop::Cancelled) {
             self.time_if_new(&refinement, best, &mut not_cancelled(pace));
+        }
+        if stopped.is_ok() && pace.is_settled() {
+            stopped = self.refine_usable(&mut steps, best, pace);
         }
         stopped
     }
 
-    fn steps(&mut self, refinement: &mut Refinement, best: &mut Motion, pace: &mut Pace<'_>) -> Result<(), Stop> {
+    /// Until the steps are done, or the caller is content with what is there.
+    fn steps(
+        &mut self,
+        steps: &mut Range<usize>,
+        refinement: &mut Refinement,
+        best: &mut Motion,
+        pace: &mut Pace<'_>,
+    ) -> Result<(), Stop> {
         let (mut reported, mut timed_at) = (refinement.cost(), FIRST_TIMED);
-        for iteration in 1..=self.arm.request().improvement_iterations {
+        pace.report(Progress::Quicker { about_s: f64::from(reported) })?;
+        for step in steps {
             pace.iteration()?;
+            if pace.is_settled() {
+                return Ok(());
+            }
             if self.arm.random().random_range(0..100) < NEW_CANDIDATES {
                 self.find_another(refinement);
             } else {
@@ -116,7 +159,7 @@ impl<'p, 'a> Improvement<'p, 'a> {
                 reported = about_s;
                 pace.report(Progress::Quicker { about_s: f64::from(about_s) })?;
             }
-            if iteration == timed_at {
+            if step + 1 == timed_at {
                 timed_at = timed_at.saturating_mul(TIMED_AGAIN);
                 self.time_if_new(refinement, best, &mut || pace.answer() == Control::Continue);
             }
@@ -124,9 +167,47 @@ impl<'p, 'a> Improvement<'p, 'a> {
         Ok(())
     }
 
+    /// The best so far is used already, as far as where it ends: the rest of the steps make the way there quicker.
+    fn refine_usable(&mut self, steps: &mut Range<usize>, best: &mut Motion, pace: &mut Pace<'_>) -> Result<(), Stop> {
+        self.report_usable(best, pace)?;
+        // Of all ends only its own, so it is the first.
+        let Way { path, candidate } = best.way.clone();
+        let mut refinement = self.arm.refinement(path, 0, vec![self.candidates[candidate].end()]);
+        let mut timed_s = refinement.cost();
+        for _ in steps {
+            pace.iteration()?;
+            self.arm.step(&mut refinement, pace)?;
+            // It is timed only where that may be worth a report: that takes longer than many steps.
+            if refinement.cost() < timed_s * (1.0 - BETTER as f32) {
+                timed_s = refinement.cost();
+                let way = Way { path: refinement.path().to_vec(), candidate };
+                self.take_if_quicker(way, best, &mut || pace.answer() == Control::Continue);
+                self.report_usable(best, pace)?;
+            }
+        }
+        let way = Way { path: refinement.path().to_vec(), candidate };
+        self.take_if_quicker(way, best, &mut not_cancelled(pace));
+        Ok(())
+    }
+
+    /// Reports a motion that is the first to be usable, or noticeably quicker than the one before.
+    fn report_usable(&mut self, best: &Motion, pace: &mut Pace<'_>) -> Result<(), Stop> {
+        let lasts_s = best.curve.duration_s();
+        if self.usable_s.is_some_and(|usable_s| lasts_s > usable_s * (1.0 - BETTER)) {
+            return Ok(());
+        }
+        self.usable_s = Some(lasts_s);
+        let plan = self.plan(best, pace.iterations);
+        pace.report(Progress::Usable(&plan))
+    }
+
     /// Times the path of a refinement, and takes it where the motion is quicker: never one that is slower, whatever the estimate says.
     fn time_if_new(&mut self, refinement: &Refinement, best: &mut Motion, goes_on: &mut dyn FnMut() -> bool) {
         let way = Way { path: refinement.path().to_vec(), candidate: refinement.end() };
+        self.take_if_quicker(way, best, goes_on);
+    }
+
+    fn take_if_quicker(&mut self, way: Way, best: &mut Motion, goes_on: &mut dyn FnMut() -> bool) {
         if way == best.way {
             return;
         }
@@ -140,7 +221,7 @@ impl<'p, 'a> Improvement<'p, 'a> {
     fn motion(&mut self, way: Way, goes_on: &mut dyn FnMut() -> bool) -> Result<Motion, PlanError> {
         let chosen = &self.candidates[way.candidate];
         let sections = [
-            Section::Loose(self.depart.to_vec(), [0.0, BLENDED_SHARE]),
+            Section::Loose(self.before.depart.to_vec(), [0.0, BLENDED_SHARE]),
             Section::Blended(self.whole(&way.path, chosen)),
             Section::Loose(chosen.approach.clone(), [BLENDED_SHARE, 0.0]),
         ];
@@ -150,7 +231,7 @@ impl<'p, 'a> Improvement<'p, 'a> {
 
     /// The free path with its ways out and in, from the end of the departure to the beginning of the approach.
     fn whole(&self, path: &[State], candidate: &Candidate) -> Vec<JointVector> {
-        let start = self.depart[self.depart.len() - 1];
+        let start = self.before.depart[self.before.depart.len() - 1];
         let mut whole: Vec<JointVector> = path.iter().map(|s| self.arm.joints(s)).collect();
         if path[0] == state(&start) {
             whole[0] = start;
@@ -190,16 +271,4 @@ impl<'p, 'a> Improvement<'p, 'a> {
 
 fn not_cancelled<'p>(pace: &'p mut Pace<'_>) -> impl FnMut() -> bool + 'p {
     move || pace.answer() != Control::Cancelled
-}
-
-fn finished(
-    first_duration_s: f64,
-    motion: Motion,
-    stopped: Option<Stop>,
-    pace: &mut Pace<'_>,
-) -> Result<Improved, PlanError> {
-    if stopped == Some(Stop::Cancelled) || pace.answer() == Control::Cancelled {
-        return Err(PlanError::Cancelled);
-    }
-    Ok(Improved { first_duration_s, motion, time_up: stopped.is_some() })
 }

@@ -1,8 +1,8 @@
 //! The life of a node: the changes of its status, each with what the status owns.
 
 use super::Graph;
-use crate::binding::Outputs;
 use super::instance::{Body, Held, Instance, Node, Status};
+use crate::binding::Outputs;
 use crate::interpreter::Interpreter;
 use ratn_model::id::{InstanceId, ProjectionId};
 use ratn_model::resource::Lease;
