@@ -144,6 +144,7 @@ states:
         plan effects: nothing (None)
         plan resources: block PathPlanner; block WorldModel (Some(Action))
         plan duration: 2 (Some(State))
+        plan anytime: true (Some(Action))
         grasp pia: true (Some(State))
         grasp reads: at(base); at(box_1) (Some(Action))
         grasp requires: hand_empty(gripper) (Some(Action))

@@ -102,6 +102,21 @@ impl Goal {
         Ok(())
     }
 
+    /// The outputs that stay as they were in the first result, where the goal may give one and go on for better ones (`goal.improved`); `None`
+    /// where only what the action returns counts.
+    #[getter]
+    fn improves(&self) -> Option<Vec<String>> {
+        self.context.improves().map(<[String]>::to_vec)
+    }
+
+    /// Gives a result that can be used, and goes on: the first one, or one that costs less than those before. `cost_s` is what it costs
+    /// whoever uses it, in seconds of the robot's time. The goal is told to stop (`ratn.Cancelled`) when somebody uses the result, or wants the worker:
+    /// then the last one that was given counts.
+    #[pyo3(signature = (outputs, *, cost_s))]
+    fn improved(&self, outputs: &Bound<'_, PyDict>, cost_s: f64) -> PyResult<()> {
+        self.context.improved(fields_from_python(outputs)?, cost_s).map_err(of_failure)
+    }
+
     /// A fact as measured, `goal.measured("at(box_1)", pose, covariance=…)`: it is told with the outcome. `covariance` is a square matrix,
     /// row by row or as an array (of a pose x, y, z in metres, and the rotation about them in radians); `confidence` is a probability.
     #[pyo3(signature = (fact_text, value, *, covariance=None, confidence=None, source=String::new()))]

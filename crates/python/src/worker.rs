@@ -46,6 +46,8 @@ pub(crate) struct Described {
     takes: Option<String>,
     /// It stands still while its goal is suspended.
     suspends: bool,
+    /// It gives a result that can be used, and better ones later.
+    anytime: bool,
     /// Called with the goal and its inputs as a dict; gives an outcome, its outputs as a dict and a reason.
     perform: Py<PyAny>,
 }
@@ -196,6 +198,9 @@ impl PythonAction {
         }
         if let Some(takes) = &described.takes {
             signature = signature.takes(takes);
+        }
+        if described.anytime {
+            signature = signature.anytime();
         }
         let (suspends, perform, threads) = (described.suspends, Arc::new(perform), threads.clone());
         Ok(PythonAction { suspends, name, description, signature, perform, threads })

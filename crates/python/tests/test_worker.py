@@ -155,6 +155,22 @@ def test_async_def_performs_goals_and_tells_how_far_it_is(tester: Place) -> None
     assert performed(tester, "slept", "nap", "{ seconds: 0.05 }", "slept") == 0.05
 
 
+def test_a_result_gets_better_until_it_is_used(tester: Place) -> None:
+    states = (
+        state("move", "tester/nap", "Tester", "{ seconds: 1.0 }", "pia: true, effects: []")
+        + state("price", "tester/price", "Tester", "{ item: cup }", "description: it computes, as its action says")
+        + state("pay", "tester/pay", "Tester", "{ cost: price.cost }", "pia: true, effects: []")
+    )
+    text = task("better", states, "outputs:\n  paid: { type: int, value: pay.paid }\n")
+    paid = {}
+    for mode in ("hsm", "cdtn"):
+        ended = tester.run(tester.write(f"better_{mode}.yaml", text), "--mode", mode)
+        assert ended["outcome"] == "success", ended
+        paid[mode] = ended["outputs"]["paid"]
+    assert paid["hsm"] == 100
+    assert paid["cdtn"] < 90, "it got better while the nap went on"
+
+
 def test_which_interpreter_runs_a_script_is_said_and_what_is_missing_is_explained(place: Place) -> None:
     place.write("w.py", "")
     config = place.write("system.toml", NO_CATALOGUE + template("w", "W", python="w.py", interpreter=PYTHON))

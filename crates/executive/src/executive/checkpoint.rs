@@ -11,6 +11,7 @@
 //! | estimated durations and paths | they are made when the window has grown enough, and stand until then |
 //! | signals that no wait has taken | the next wait of their name takes them |
 //! | results that were discarded | they serve again |
+//! | results that get better, with the best so far and what their goals hold | they are given to motions, and what they hold goes back |
 //! | the queue, timers, cursors, branches, lines, the interpreters with their threads | where everything is |
 //!
 //! | not in it | because |
@@ -41,7 +42,7 @@ use std::fmt::{self, Write};
 use std::sync::Arc;
 
 /// The version of the form. Any change of what is written takes a new number: no version reads another's.
-const FORMAT: u8 = 5;
+const FORMAT: u8 = 6;
 
 type Hash = [u8; blake3::OUT_LEN];
 

@@ -60,6 +60,7 @@ class Action:
     takes: str | None
     perform: Callable[..., tuple[str, dict[str, Any], str]]
     suspends: bool = False
+    anytime: bool = False
     arrays: set[str] = field(default_factory=set)
 
 

@@ -53,6 +53,7 @@ class Worker:
         blocks: Iterable[str] = (),
         takes: float | str | None = None,
         suspends: bool = False,
+        anytime: bool = False,
     ) -> Any:
         """Makes a function (also an ``async def``) an action. Its first parameter is the goal, the others are the input ports.
 
@@ -61,7 +62,8 @@ class Worker:
         ``effects`` (``[]``: none; left out: unknown, so any), what it ``senses`` and ``requires``, which kinds of resources it ``blocks`` beside its own, and
         how many seconds it usually ``takes``. One that
         ``suspends`` stands still while its goal is suspended, because the resource manager is not heard (``goal.while_held()`` between its steps);
-        the others end then.
+        the others end then. An ``anytime`` action computes, and gives results before it returns (``goal.improved``) where its goal may
+        (``goal.improves``): any of them will do.
         """
 
         def known(function: _Function) -> _Function:
@@ -81,6 +83,7 @@ class Worker:
                 blocks=list(blocks),
                 takes=None if takes is None else str(takes),
                 suspends=suspends,
+                anytime=anytime,
                 perform=lambda *_: ("aborted", {}, "not ready"),
                 arrays=arrays,
             )

@@ -55,6 +55,23 @@ async def nap(goal: ratn.Goal, seconds: float) -> dict:
     return {"slept": seconds}
 
 
+@w.action(anytime=True, effects=[], reads=[])
+def price(goal: ratn.Goal, item: str) -> TypedDict("Price", {"item": str, "cost": int}):
+    """A price, and lower ones as long as nobody pays."""
+    first = {"item": item, "cost": 100}
+    if goal.improves is None:
+        return first
+    for cost in range(100, 0, -1):
+        goal.improved({"item": item, "cost": cost}, cost_s=cost)
+        goal.sleep(0.02)
+    return first
+
+
+@w.action
+def pay(goal: ratn.Goal, cost: int) -> TypedDict("Paid", {"paid": int}):
+    return {"paid": cost}
+
+
 @w.action
 def wait(goal: ratn.Goal, seconds: float) -> dict:
     try:

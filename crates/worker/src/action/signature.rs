@@ -170,6 +170,14 @@ impl Signature {
         self
     }
 
+    /// The action gives a result that can be used, and better ones later, where its goal may ([`super::GoalContext::improved`]). Any of them
+    /// will do: what uses one comes to the same with a better one. Only for what computes.
+    #[must_use]
+    pub fn anytime(mut self) -> Signature {
+        self.said.annotations.anytime = true;
+        self
+    }
+
     /// Whether every default is of its port's type.
     ///
     /// # Errors

@@ -101,7 +101,7 @@ impl ActionClient {
         goal: Goal,
         on_progress: impl FnMut(String, BTreeMap<String, Value>),
     ) -> Result<GoalOutcome, CallError> {
-        self.execute_hearing(endpoint, goal, only_progress(on_progress)).await
+        Box::pin(self.execute_hearing(endpoint, goal, only_progress(on_progress))).await
     }
 
     /// As [`ActionClient::execute`], hearing also the results that a goal gives before its end.
@@ -136,7 +136,7 @@ impl ActionClient {
         goal: Goal,
         on_progress: impl FnMut(String, BTreeMap<String, Value>),
     ) -> Result<Fate, CallError> {
-        self.attach_hearing(endpoint, goal, only_progress(on_progress)).await
+        Box::pin(self.attach_hearing(endpoint, goal, only_progress(on_progress))).await
     }
 
     /// As [`ActionClient::attach`], hearing also the results that a goal gives from now on before its end.
