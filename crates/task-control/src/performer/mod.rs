@@ -534,7 +534,8 @@ impl Performer {
                 world_pool: self.world.endpoint().to_string(),
                 deadline_ms: goal::deadline_ms(goal.timeout_s, self.speed),
                 grace_ms: goal::GRACE_MS,
-                improves: goal.improves.map(Vec::from),
+                // What others may want is not held only to improve a result.
+                improves: goal.improves.filter(|_| !self.told.has_others()).map(Vec::from),
             },
         };
         let ended = tokio::spawn(trace::within(self.of(instance), performing.perform(given)));
