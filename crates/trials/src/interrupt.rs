@@ -29,7 +29,7 @@ pub fn trial_interrupted(program: &Arc<Program>, conditions: &Conditions) -> Ver
     };
     let mut dice = Dice(conditions.seed ^ 0x1e77_0b7e);
     let has_regions = program.states.iter().any(|state| matches!(state.kind, StateKind::Concurrency { .. }));
-    let ask = || Event::AbortRequested { reason: "that is enough".to_owned() };
+    let ask = || Event::AbortRequested { reason: "that is enough".to_owned(), at_once: false };
     let at = dice.below(1_000) as f64 / 1_000.0 * whole.end_s;
     match dice.below(4) {
         0 => {
