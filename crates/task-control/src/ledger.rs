@@ -150,7 +150,7 @@ impl Ledger {
             Command::Withdraw { instance } => {
                 self.withdrawn.extend(self.waiting.remove(instance).map(|asked| asked.request));
             }
-            Command::Project { instance, attempt, base, changes, writers, reads, lease } => {
+            Command::Project { instance, attempt, base, changes, writers, reads, lease, .. } => {
                 let (attempt, base, changes, writers) = (*attempt, *base, changes.clone(), writers.clone());
                 let asked = Projecting { attempt, base, changes, writers, reads: reads.clone(), lease: *lease };
                 self.projecting.insert(*instance, asked);

@@ -318,11 +318,12 @@ impl WorldPool {
     }
 
     /// The world at a revision with changes applied. A request made before gets its answer again, as long as it lives. An id that was promised
-    /// for it is not promised any more, whatever comes of it: who waits for it need not wait longer.
+    /// for it is used up, whatever comes of it, so that who waits for it need not wait longer; not where only its commit is not there yet.
     pub(super) fn project(&mut self, request: ProjectRequest) -> Result<ProjectionId, ProjectError> {
         let (id, by) = (request.id, request.by.name.clone());
         let made = self.make(request);
-        if let Some(id) = id.filter(|id| self.promised.whose(*id) == Some(&by)) {
+        let is_over = !matches!(made, Err(ProjectError::NoSuchCommit { .. }));
+        if let Some(id) = id.filter(|id| is_over && self.promised.whose(*id) == Some(&by)) {
             self.promised.end(id);
         }
         made

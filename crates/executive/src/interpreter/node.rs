@@ -185,8 +185,9 @@ impl Interpreter {
             Target::Actual => (context.root.revision(), Vec::new(), Vec::new()),
             Target::Projection { base, changes, writers, .. } => (*base, changes.clone(), writers.clone()),
         };
+        let acts = self.is_pia(context, thread);
         self.set_phase(thread, Phase::Projecting);
-        context.commands.push(Command::Project { instance, attempt, base, changes, writers, reads, lease });
+        context.commands.push(Command::Project { instance, attempt, base, changes, writers, reads, lease, acts });
     }
 
     pub(super) fn run(&mut self, context: &mut Context<'_>, thread: u64) {

@@ -359,10 +359,11 @@ impl Window {
         let Some(node) = self.graph.node(id) else { return };
         let Status::Granted(held) = &node.status else { return };
         let (attempt, lease) = (node.attempt, held.lease.as_ref().map(|lease| (lease.id, lease.token)));
+        let acts = self.graph.get(id).is_some_and(Instance::is_pia);
         let base = context.root.revision();
         let (writers, changes) = self.named(context, by_writer);
         self.graph.project(id);
-        context.commands.push(Command::Project { instance: id, attempt, base, changes, writers, reads, lease });
+        context.commands.push(Command::Project { instance: id, attempt, base, changes, writers, reads, lease, acts });
     }
 
     fn start_goal(&mut self, context: &mut Context<'_>, id: InstanceId, known: Option<Outputs>) {

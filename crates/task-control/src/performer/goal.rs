@@ -461,7 +461,9 @@ mod tests {
         assert!(costs.windows(2).all(|pair| pair[1] < pair[0]), "{costs:?}");
         assert!(costs.len() > 2 && costs.len() <= MOST_RESULTS as usize, "{}", costs.len());
         // A goal that may not give any ends as it says: that it tried to is an error of the action.
-        bench.performing("better", None, 0).perform(Given::Now).await;
+        let mut performing = bench.performing("better", None, 0);
+        performing.goal.id.push_str("/again");
+        performing.perform(Given::Now).await;
         let event = bench.event().await;
         assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == ABORTED), "{event:?}");
         Ok(())

@@ -13,9 +13,10 @@ mod watch;
 
 pub(super) use resume::{check_world, remembers};
 
-use super::ledger::{Confirmed, acquire_request};
+use super::ledger::{Confirmed, Projecting, acquire_request};
 use super::outside::Outside;
-use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Record, Recorded, Recorder, said};
+use super::promises::{Making, Promises};
+use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Named, Record, Recorded, Recorder, Root, said};
 use super::shell::{Place, Urgency};
 use crate::background_runtime::BackgroundRuntime;
 use crate::messages::Messages;
@@ -147,6 +148,9 @@ pub(super) struct Performer {
     following: Option<AbortOnDropHandle<()>>,
     cancelled: Cancelled,
     recorded: Recorded,
+    /// Ids for projections that goals are given before they are there.
+    promises: Promises,
+    making: Making,
     asking: Waiting,
     /// Since when instances have waited that have not got what they need, however often they ask.
     waiting_since: BTreeMap<InstanceId, Instant>,
@@ -209,6 +213,7 @@ impl Performer {
         let world = WorldClient::new(&channels, &place.endpoints.world_pool)?;
         let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
         let (cancelled, recorded) = (Cancelled::default(), Recorded::default());
+        let promises = Promises::default();
         let recorder = Recorder {
             run: run.clone(),
             world: world.clone(),
@@ -218,7 +223,8 @@ impl Performer {
             events: events.clone(),
             trust: session.trust(),
             trace,
-            root: Revision::default(),
+            root: Root::default(),
+            promises: promises.clone(),
         };
         tracing::debug!(run, trace = %trace.trace_id(), "calls of this run are of one trace");
         tokio::spawn(trace::within(trace, recorder.work(work)));
@@ -243,6 +249,8 @@ impl Performer {
             following: None,
             cancelled,
             recorded,
+            promises,
+            making: Making::default(),
             asking: Waiting::default(),
             waiting_since: BTreeMap::new(),
             leases: Leases::default(),
@@ -332,8 +340,9 @@ impl Performer {
                     asking.withdrawn.cancel();
                 }
             }
-            Command::Project { instance, attempt, base, changes, writers, reads, lease } => {
-                self.record(Record::Project { instance, attempt, base, changes, writers, reads, lease })?;
+            Command::Project { instance, attempt, base, changes, writers, reads, lease, acts } => {
+                let asked = Projecting { attempt, base, changes, writers, reads, lease };
+                self.project(instance, asked, acts)?;
             }
             Command::Start { instance, attempt, goal } => self.start(instance, attempt, *goal, Given::Now),
             Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
@@ -388,6 +397,19 @@ impl Performer {
         if self.records.try_send(record).is_err() {
             bail!("the world pool is more than {MAX_PENDING_RECORDS} requests behind, or gone");
         }
+        Ok(())
+    }
+
+    /// What works in it and does not act goes on at once, if a projection was promised.
+    fn project(&mut self, instance: InstanceId, asked: Projecting, acts: bool) -> anyhow::Result<()> {
+        let behind = self.records.max_capacity() - self.records.capacity();
+        let told = if acts { None } else { self.events.clone().try_reserve_owned().ok() };
+        let Some((told, id)) = told.and_then(|told| Some((told, self.promises.take(behind)?))) else {
+            return self.record(Record::Project { instance, asked, named: None });
+        };
+        let (attempt, made) = (asked.attempt, self.making.begin(id));
+        self.record(Record::Project { instance, asked, named: Some(Named { id, made }) })?;
+        told.send(Event::Projected { instance, attempt, projection: id }.into());
         Ok(())
     }
 
@@ -484,6 +506,12 @@ impl Performer {
                     if let (Event::Granted { lease, .. }, Some(asked)) = (&event, asked) {
                         self.leases.granted(lease, asked.requirements, Instant::now());
                     }
+                }
+                // Also where it is the projection that could not be made, while its goal went on.
+                if let Event::Crashed { instance, attempt, .. } = &event
+                    && let Some(job) = self.jobs.get(instance).filter(|job| job.attempt == *attempt)
+                {
+                    job.stop.cancel();
                 }
                 Some(event)
             }
@@ -585,12 +613,14 @@ impl Performer {
         }
         let (resources, world) = (self.resources.clone(), self.world.clone());
         let note = self.told.left(&self.run, self.decided).to_string();
+        let projection = projection.map(|id| (id, self.making.end(id)));
         let returning = async move {
             // Whoever gets the resources next finds them idle.
             for job in jobs {
                 let _ = job.ended.await;
             }
-            if let Some(projection) = projection
+            if let Some((projection, is_there)) = projection
+                && is_there.await
                 && let Err(error) = retry_unanswered(|| world.release(projection)).await
             {
                 tracing::warn!(%instance, "a projection was not given back: {}", said(&error));

@@ -96,10 +96,7 @@ impl Performer {
             let _ = retry_unanswered(|| self.resources.withdraw(request)).await;
         }
         for (instance, asked) in ledger.projecting {
-            let attempt = asked.attempt;
-            let (base, changes, writers) = (asked.base, asked.changes, asked.writers);
-            let (reads, lease) = (asked.reads, asked.lease);
-            self.record(Record::Project { instance, attempt, base, changes, writers, reads, lease })?;
+            self.record(Record::Project { instance, asked, named: None })?;
         }
         for (instance, (attempt, goal)) in ledger.goals {
             self.start(instance, attempt, goal, Given::Before);

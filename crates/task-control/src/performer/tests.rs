@@ -401,6 +401,7 @@ async fn a_projection_that_crosses_its_cancel_goes_back() -> anyhow::Result<()> 
         writers: Vec::new(),
         reads: reads.clone(),
         lease: None,
+        acts: true,
     };
     bench.performer.perform(project(1))?;
     let made = bench.answers.recv().await;
@@ -409,6 +410,75 @@ async fn a_projection_that_crosses_its_cancel_goes_back() -> anyhow::Result<()> 
     assert!(bench.performer.cancelled.lock().is_ok_and(|cancelled| cancelled.is_empty()));
     bench.performer.perform(project(2))?;
     assert!(matches!(bench.event().await, Some(Event::Projected { attempt: 2, .. })));
+    bench.performer.close().await
+}
+
+/// A projection of everything, at no lease.
+fn projection(instance: InstanceId, attempt: u32, acts: bool) -> Command {
+    Command::Project {
+        instance,
+        attempt,
+        base: Revision(0),
+        changes: Vec::new(),
+        writers: Vec::new(),
+        reads: Footprint::Everything,
+        lease: None,
+        acts,
+    }
+}
+
+#[tokio::test]
+async fn a_projection_is_named_before_it_is_there_and_shows_the_commit_on_its_way() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let instance = InstanceId(1);
+    // The first is waited for; with its answer others are promised.
+    bench.performer.perform(projection(instance, 1, false))?;
+    let Some(Event::Projected { projection: first, .. }) = bench.event().await else { bail!("no projection") };
+    bench.performer.perform(Command::Commit {
+        instance,
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(1),
+    })?;
+    bench.performer.perform(projection(instance, 2, false))?;
+    // Nobody else has run since: the world pool was not heard.
+    let Ok(answer) = bench.answers.try_recv() else { bail!("it waits for the world pool") };
+    let named = bench.performer.accept(answer, &World::default())?;
+    let Some(Event::Projected { attempt: 2, projection: named, .. }) = named else { bail!("{named:?}") };
+    assert_ne!(first, named);
+    let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
+    assert_eq!(world.query(Some(named), &[]).await?.len(), 1, "it shows the commit, and is waited for");
+    bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
+    // What acts begins when its projection is there.
+    bench.performer.perform(projection(instance, 3, true))?;
+    assert!(bench.answers.try_recv().is_err());
+    assert!(matches!(bench.event().await, Some(Event::Projected { attempt: 3, .. })));
+    bench.performer.close().await?;
+    let gone = world.query(Some(named), &[]).await;
+    assert_eq!(gone.map_err(|error| error.reason().to_owned()).err().as_deref(), Some("PROJECTION_UNKNOWN"));
+    Ok(())
+}
+
+#[tokio::test]
+async fn of_a_named_projection_that_cannot_be_made_is_heard_afterwards() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let instance = InstanceId(1);
+    bench.performer.perform(projection(instance, 1, false))?;
+    assert!(matches!(bench.event().await, Some(Event::Projected { .. })));
+    let mut ahead = projection(instance, 2, false);
+    if let Command::Project { base, .. } = &mut ahead {
+        *base = Revision(9);
+    }
+    bench.performer.perform(ahead)?;
+    let Some(Event::Projected { projection: named, .. }) = bench.event().await else { bail!("no projection") };
+    let Some(Event::Crashed { attempt: 2, reason, .. }) = bench.event().await else { bail!("not heard of") };
+    assert!(reason.contains("no projection"), "{reason}");
+    let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
+    let refused = world.query(Some(named), &[]).await;
+    assert_eq!(refused.map_err(|error| error.reason().to_owned()).err().as_deref(), Some("PROJECTION_UNKNOWN"));
+    // What is given back is not waited for in vain.
+    bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
     bench.performer.close().await
 }
 

@@ -456,8 +456,10 @@ fn a_promised_id_is_used_once_by_whom_it_was_promised_to() {
 fn a_promise_ends_with_the_first_try_or_when_it_is_taken_back() {
     let mut pool = pool();
     let ids = pool.promise(&"adam".into(), 3);
-    let refused = pool.project(promised("one", Some(ids[0]), Some("no such commit")));
-    assert!(matches!(refused, Err(ProjectError::NoSuchCommit { .. })));
+    let early = pool.project(promised("one", Some(ids[0]), Some("not yet")));
+    assert!(matches!(early, Err(ProjectError::NoSuchCommit { .. })) && pool.is_promised(ids[0]));
+    let refused = ProjectRequest { base: Revision(7), ..promised("one", Some(ids[0]), None) };
+    assert!(matches!(pool.project(refused), Err(ProjectError::Revision(_))));
     assert_eq!(query(&pool, Some(ids[0]), &[]), Err(QueryError::Unknown { id: ids[0] }));
     assert!(pool.release_for(&task("eve"), ids[1]).is_err());
     assert_eq!(pool.release_for(&task("adam"), ids[1]), Ok(true));
