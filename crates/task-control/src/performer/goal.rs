@@ -1,6 +1,7 @@
 //! One goal, from giving it to a provider (or finding it there again) to the event of its end.
 
 use super::Answer;
+use super::told::Told;
 use crate::record::said;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
@@ -17,6 +18,7 @@ use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
+use tokio::sync::mpsc::error::TrySendError;
 use tokio_util::sync::CancellationToken;
 
 /// A provider that was told to stop and does not is left alone after this long.
@@ -38,6 +40,9 @@ const DEADLINE_SLACK: Duration = Duration::from_millis(500);
 
 /// So many results of one goal are taken; each is a line of the event log.
 const MOST_RESULTS: u32 = 256;
+
+/// Beside other runs, so often it is looked whether a goal has given its first result.
+const LOOK_AGAIN: Duration = Duration::from_millis(20);
 
 /// The results that a goal has given before its end.
 #[derive(Debug)]
@@ -89,6 +94,7 @@ pub(super) struct Performing {
     pub(super) stop: CancellationToken,
     pub(super) goal: Goal,
     pub(super) results: Mutex<Results>,
+    pub(super) told: Told,
 }
 
 /// The deadline that the provider is told, in wall time; 0 for none.
@@ -115,7 +121,16 @@ impl Performing {
     /// `None` when it was told to stop.
     async fn execute(&self, endpoint: &Endpoint, given: Given) -> Option<Event> {
         let begun = Instant::now();
-        let mut ending = std::pin::pin!(self.ending(endpoint, given));
+        let ending = async {
+            let mut ending = std::pin::pin!(self.ending(endpoint, given));
+            tokio::select! {
+                event = &mut ending => return event,
+                () = self.is_in_the_way() => {}
+            }
+            let _ = self.actions.cancel(endpoint, &self.goal.id).await;
+            ending.await
+        };
+        let mut ending = std::pin::pin!(ending);
         let event = tokio::select! {
             event = &mut ending => event,
             () = self.stop.cancelled() => {
@@ -128,6 +143,17 @@ impl Performing {
             }
         };
         Some(self.in_time(event, begun))
+    }
+
+    /// Resolves when the goal only improves a result that it has given, beside other runs: what others may want is not held for that.
+    async fn is_in_the_way(&self) {
+        if self.goal.improves.is_none() {
+            return std::future::pending().await;
+        }
+        self.told.others_after(Duration::ZERO).await;
+        while !self.results.lock().is_ok_and(|results| results.taken > 0) {
+            tokio::time::sleep(LOOK_AGAIN).await;
+        }
     }
 
     async fn ending(&self, endpoint: &Endpoint, given: Given) -> Event {
@@ -271,8 +297,14 @@ impl Performing {
                 Event::Improved { instance, attempt, outputs, cost_s }
             }
         };
-        // Progress is for people, and a result comes again, at the latest at the goal's end: when events pile up, they are what can be missed.
-        let _ = self.events.try_send(event.into());
+        let sent = self.events.try_send(event.into());
+        // When events pile up, progress can be missed: it is for people. A result cannot, its goal may give no other.
+        if let Err(TrySendError::Full(Answer::Event { event, withdrawn })) = sent
+            && matches!(*event, Event::Improved { .. })
+        {
+            let events = self.events.clone();
+            tokio::spawn(async move { events.send(Answer::Event { event, withdrawn }).await });
+        }
     }
 
     fn finished(&self, done: GoalOutcome) -> Event {
@@ -327,6 +359,11 @@ mod tests {
                 goal.cancelled.cancelled().await;
                 return Err(goal.stopped());
             }
+            if self.0 == "endless" {
+                goal.improved(BTreeMap::new(), 5.0)?;
+                goal.cancelled.cancelled().await;
+                return Err(goal.stopped());
+            }
             if self.0 == "better" {
                 for cost_s in [5.0, 7.0, 4.0, 4.0].into_iter().chain((0..400).map(|n| 3.0 - f64::from(n) * 0.001)) {
                     goal.improved(BTreeMap::new(), cost_s)?;
@@ -350,8 +387,12 @@ mod tests {
     impl Bench {
         async fn new() -> anyhow::Result<Bench> {
             let place = tempfile::tempdir()?;
-            let server =
-                ActionServer::builder("").action(Named("work")).action(Named("hang")).action(Named("better")).build();
+            let server = ActionServer::builder("")
+                .action(Named("work"))
+                .action(Named("hang"))
+                .action(Named("better"))
+                .action(Named("endless"))
+                .build();
             let bound = bind(&Endpoint::Unix(place.path().join("provider.sock"))).await?;
             let (endpoint, shutdown) = (bound.endpoint().clone(), CancellationToken::new());
             tokio::spawn(bound.serve(Services::new().with(server.clone().into_service()), shutdown.clone()));
@@ -374,6 +415,7 @@ mod tests {
                 events: self.events.clone(),
                 stop: CancellationToken::new(),
                 results: Mutex::default(),
+                told: Told::new(),
                 goal: Goal {
                     id: format!("run/1/{action}"),
                     action: action.to_owned(),
@@ -436,6 +478,22 @@ mod tests {
             matches!(&event, Some(Event::Crashed { reason, .. }) if reason.contains("nobody listened")),
             "{event:?}"
         );
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn a_goal_that_only_improves_its_result_ends_when_there_are_other_runs() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        let mut performing = bench.performing("endless", None, 0);
+        performing.goal.improves = Some(Vec::new());
+        let told = performing.told.clone();
+        let ended = tokio::spawn(performing.perform(Given::Now));
+        assert!(matches!(bench.event().await, Some(Event::Improved { .. })));
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        assert!(!ended.is_finished(), "alone it goes on");
+        told.beside_others();
+        let event = bench.event().await;
+        assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == PREEMPTED), "{event:?}");
         Ok(())
     }
 

@@ -1,7 +1,8 @@
 //! Leases that go from one node to the next without the resource manager: where a goal ends well and the next node wants exactly what
 //! it had, giving it back and asking for it again would cost two calls and come to the same.
 //!
-//! The resource manager sees one lease that lives longer, so others get their turn: after [`TURN`] it goes back all the same. Within the run the
+//! The resource manager sees one lease that lives longer, so others get their turn: after [`TURN`] it goes back all the same, and nothing is handed
+//! over beside other runs, whose nodes may come first. Within the run the
 //! order is the resource manager's: who comes first of those that want any of it takes it over, also one that waits there already, whose
 //! request is then withdrawn ([`super::acquiring`]); where that one wants something else, too, nothing is handed over. What depends on the state of a resource (attributes,
 //! conditions, what is there or is used up) is asked anew every time.

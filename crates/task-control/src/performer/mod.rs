@@ -138,6 +138,8 @@ pub(super) struct Performer {
     session: Session,
     /// Where the session is kept alive, whatever this thread does.
     _background: BackgroundRuntime,
+    /// Looks for other runs.
+    _others: AbortOnDropHandle<()>,
     events: mpsc::Sender<Answer>,
     records: mpsc::Sender<Record>,
     outside: Outside,
@@ -197,6 +199,11 @@ impl Performer {
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, manager, session.id())?;
         let told = Told::new();
+        let (heard, another) = (told.clone(), claim::another(resources.clone(), run.clone()));
+        let others = AbortOnDropHandle::new(tokio::spawn(async move {
+            another.await;
+            heard.beside_others();
+        }));
         match claim(&resources, &run, task, place.alone).await {
             Ok(true) => told.beside_others(),
             Ok(false) => {}
@@ -241,6 +248,7 @@ impl Performer {
             world,
             session,
             _background: background,
+            _others: others,
             events,
             records,
             outside: Outside::default(),
@@ -310,7 +318,10 @@ impl Performer {
                 _ => {}
             }
         }
-        self.handover = self.leases.handover(event, commands, &self.asking, Instant::now());
+        // Beside other runs it is the resource manager's to say who comes next.
+        let alone = !self.told.has_others();
+        let handover = alone.then(|| self.leases.handover(event, commands, &self.asking, Instant::now()));
+        self.handover = handover.flatten();
         // To one whose answer is on its way nothing is handed over: the lease goes back.
         self.handover.take_if(|one| one.waits && self.asking.hand(one.to, &one.lease) != Some(Ok(())));
     }
@@ -465,7 +476,13 @@ impl Performer {
         let messages = self.messages.clone();
         tokio::spawn(async move {
             // One that has its answer by now does not wait any more.
-            let Ok(waiting) = resources.explain(&request).await else { return };
+            let waiting = match resources.explain(&request).await {
+                Ok(waiting) => waiting,
+                Err(_) => match resources.explain(&acquiring::late_request(&request)).await {
+                    Ok(waiting) => waiting,
+                    Err(_) => return,
+                },
+            };
             let obstacles: Vec<String> = waiting.into_iter().flat_map(|one| one.obstacles).collect();
             let why = if obstacles.is_empty() { "its turn".to_owned() } else { obstacles.join("; ") };
             let at = at.seconds();
@@ -552,6 +569,7 @@ impl Performer {
             events: self.events.clone(),
             stop: stop.clone(),
             results: Mutex::default(),
+            told: self.told.clone(),
             goal: types::Goal {
                 id: format!("{}/{instance}/{attempt}", self.run),
                 action: goal.action.to_string(),
@@ -563,8 +581,7 @@ impl Performer {
                 world_pool: self.world.endpoint().to_string(),
                 deadline_ms: goal::deadline_ms(goal.timeout_s, self.speed),
                 grace_ms: goal::GRACE_MS,
-                // What others may want is not held only to improve a result.
-                improves: goal.improves.filter(|_| !self.told.has_others()).map(Vec::from),
+                improves: goal.improves.map(Vec::from),
             },
         };
         let ended = tokio::spawn(trace::within(self.of(instance), performing.perform(given)));

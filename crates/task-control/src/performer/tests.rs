@@ -246,6 +246,49 @@ async fn one_that_asks_again_in_the_step_that_gives_it_a_lease_has_it_once() -> 
     bench.performer.close().await
 }
 
+/// A resource manager that a token ends, at the same place as the one before it.
+fn manager_at(directory: &RuntimeDirectory) -> (CancellationToken, impl Future<Output = ()> + use<>) {
+    let shutdown = CancellationToken::new();
+    let running = resource_manager::run(ResourceManagerConfig::default(), directory.clone(), shutdown.clone());
+    let running = tokio::spawn(running);
+    (shutdown, async move { drop(running.await) })
+}
+
+#[tokio::test]
+async fn who_waits_beside_others_while_the_manager_is_started_again_is_served_and_not_refused() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let place = tempfile::tempdir()?;
+    let directory = RuntimeDirectory::create(place.path())?;
+    let (shutdown, ended) = manager_at(&directory);
+    let resource_manager = directory.wait_for(resource_manager::ROLE, SESSION_DEADLINE).await?;
+    bench.endpoints.resource_manager = resource_manager;
+    let (channels, manager) = (Channels::new(&ClientTls::none()), &bench.endpoints.resource_manager);
+    let robot = Session::open(&channels, manager, "robot", DEFAULT_TTL);
+    robot.alive(SESSION_DEADLINE).await?;
+    let offering = ResourceClient::new(&channels, manager, robot.id())?;
+    offering.create(Resource::new("arm", ResourceClass::Module, "Arm")).await?;
+    let lease = offering.acquire(arm(), AcquireOptions::default()).await?;
+
+    let (events, _first) = mpsc::channel(8);
+    let first = connect(&bench.endpoints, "first", events).await?;
+    let (events, mut answers) = mpsc::channel(8);
+    let mut second = connect(&bench.endpoints, "second", events).await?;
+    assert!(second.told.has_others());
+    second.perform(Command::Acquire { instance: InstanceId(1), requirements: arm(), priority: CERTAIN })?;
+    // It is away when the node has waited long enough to come next.
+    tokio::time::sleep(LONG_BESIDE_OTHERS / 2).await;
+    shutdown.cancel();
+    ended.await;
+    tokio::time::sleep(LONG_BESIDE_OTHERS).await;
+    let (_again, _ended) = manager_at(&directory);
+    offering.release(lease.id).await?;
+    let answer = answers.recv().await.context("no answer")?;
+    let Answer::Event { event, .. } = answer else { bail!("{answer:?}") };
+    assert!(matches!(*event, Event::Granted { .. }), "{event:?}");
+    first.close().await?;
+    second.close().await
+}
+
 #[tokio::test]
 async fn a_run_goes_beside_others_and_one_that_goes_alone_does_not() -> anyhow::Result<()> {
     let bench = Bench::new().await?;
