@@ -177,6 +177,11 @@ pub enum Event {
         /// What holds now of what is otherwise than the run knew; a fact without a value does not.
         facts: Vec<(FactKey, Option<Value>)>,
     },
+    /// Another run waits for what one of these holds, and needs it for certain. Told again where it waits longer.
+    WantedByOthers {
+        /// Which instances.
+        holders: Vec<InstanceId>,
+    },
     /// A goal says how far it is. Logged; changes nothing.
     Progressed {
         /// Which instance.
@@ -426,8 +431,9 @@ pub enum Note {
     Preempted {
         /// Its id.
         instance: InstanceId,
-        /// Who needs it.
-        by: InstanceId,
+        /// Who needs it; `None`: another run.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        by: Option<InstanceId>,
     },
     /// The same was computed before, from the same inputs and facts and with the same seed: that result is its result.
     Reused {

@@ -63,6 +63,19 @@ pub enum Obstacle {
     },
 }
 
+impl Explanation {
+    /// The leases that hold what it lacks.
+    pub fn held_by(&self) -> impl Iterator<Item = LeaseId> {
+        self.obstacles
+            .iter()
+            .flat_map(|obstacle| match obstacle {
+                Obstacle::Held { holders, .. } => holders.as_slice(),
+                _ => &[],
+            })
+            .map(|(lease, ..)| *lease)
+    }
+}
+
 impl Pool {
     /// What a waiter waits for; `None` if it is not in the queue.
     pub fn explain(&self, id: WaiterId) -> Option<Explanation> {

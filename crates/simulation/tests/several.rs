@@ -267,3 +267,54 @@ fn two_runs_leave_a_world_that_some_interleaving_of_their_sequential_programs_le
     let (worlds, open) = try_pairs(first..first + count);
     assert!(open as u64 > count / 2, "the pairs hardly meet: {open} of them have several ends, {worlds} worlds in all");
 }
+
+/// Turns its head for 6 s and computes for both of what may come of it meanwhile, which takes 4 s.
+const AHEAD: &str = "task: ahead
+states:
+  - look: { action: head/turn, pia: true, effects: [], resources: [{ block: Head }], duration: 6 }
+  - found:
+      condition: look.x = 1
+      then:
+        - plan_carry: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 4 }
+        - carry: { action: arm/move, in: { a: plan_carry.x }, pia: true, effects: [], resources: [{ block: Arm }] }
+      else:
+        - plan_search: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 4 }
+        - search: { action: head/turn, in: { a: plan_search.x }, pia: true, effects: [], resources: [{ block: Head }] }
+";
+
+/// Computes what it needs in any case.
+const CERTAINLY: &str = "task: certainly
+states:
+  - plan: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 1 }
+";
+
+#[test]
+fn what_one_run_computes_in_case_gives_way_to_what_another_needs() {
+    let loaded = |text: &str| load(text, "task.yaml", &NoFiles);
+    let mut resources = setup(loaded(AHEAD), Mode::Hsm).resources;
+    let brain = resources.iter_mut().find(|(kind, _)| kind == "Brain").unwrap();
+    brain.1.count = ratn_model::resource::Quantity::ONE;
+    for latency in [Duration::ZERO, Duration::from_millis(300)] {
+        let shared = Shared { resources: resources.clone(), world: Vec::new(), latency, seed: 1 };
+        let together = |task: &str, begins_s| {
+            let program = Arc::new(loaded(task));
+            Together { program, mode: Mode::Cdtn, begins_s, told: Vec::new() }
+        };
+        let runs = [together(AHEAD, 0.0), together(CERTAINLY, 1.0)];
+        let mut given = Vec::new();
+        let mut providers =
+            Providers(|path: &str, attempt: u32, _: &ratn_executive::protocol::Goal, _: &ratn_world::world::World| {
+                given.push((path.to_owned(), attempt));
+                ("success", Value::Int(1))
+            });
+        let ended = run(&shared, &runs, &mut providers).unwrap();
+        assert!(ended.outcomes.iter().all(|(outcome, _)| outcome == "success"), "{:?}", ended.outcomes);
+        let thought: Vec<(&str, u32)> = given
+            .iter()
+            .filter(|(path, _)| path.contains("plan"))
+            .map(|(path, attempt)| (path.as_str(), *attempt))
+            .collect();
+        let carry = "0:found/plan_carry";
+        assert!(thought.starts_with(&[(carry, 1), ("1:plan", 1), (carry, 2)]), "{thought:?}");
+    }
+}

@@ -1076,6 +1076,9 @@ pub struct WaitingAcquire {
     /// What is in the way of each requirement that cannot be met now, for people: "`block Arm`: held by lease-1 of session a".
     #[prost(string, repeated, tag = "6")]
     pub obstacles: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// The leases that hold what it lacks, at most 8 for each requirement.
+    #[prost(uint64, repeated, tag = "7")]
+    pub held_by_leases: ::prost::alloc::vec::Vec<u64>,
 }
 /// Asks who is there.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]

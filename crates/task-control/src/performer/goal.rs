@@ -429,7 +429,7 @@ mod tests {
         async fn event(&mut self) -> Option<Event> {
             match self.answers.recv().await? {
                 Answer::Event { event, .. } => Some(*event),
-                Answer::World(_) => None,
+                Answer::World(_) | Answer::Wanted(_) => None,
             }
         }
     }

@@ -27,6 +27,8 @@ struct Held {
     lease: Lease,
     requirements: Vec<Requirement>,
     granted: Instant,
+    /// Who has it now.
+    holder: InstanceId,
 }
 
 /// A lease that is handed over.
@@ -40,8 +42,14 @@ pub(super) struct Handover {
 
 impl Leases {
     /// A lease is there; one that was handed over counts from its grant.
-    pub(super) fn granted(&mut self, lease: &Lease, requirements: Vec<Requirement>, now: Instant) {
-        self.0.entry(lease.id).or_insert_with(|| Held { lease: lease.clone(), requirements, granted: now });
+    pub(super) fn granted(&mut self, to: InstanceId, lease: &Lease, requirements: Vec<Requirement>, now: Instant) {
+        let new = || Held { lease: lease.clone(), requirements, granted: now, holder: to };
+        self.0.entry(lease.id).or_insert_with(new).holder = to;
+    }
+
+    /// Who has a lease now.
+    pub(super) fn holder(&self, lease: LeaseId) -> Option<InstanceId> {
+        self.0.get(&lease).map(|held| held.holder)
     }
 
     /// A lease goes back.
@@ -156,7 +164,7 @@ mod tests {
         };
         let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: vec![resource] };
         let (mut leases, now) = (Leases::default(), Instant::now());
-        leases.granted(&lease, planner(), now);
+        leases.granted(FIRST, &lease, planner(), now);
         let mut commands = asks.to_vec();
         commands.push(Command::Release { instance: FIRST, lease: Some(lease.id), projection: None });
         let handover = leases.handover(event, &commands, &waiting(waits), now + Duration::from_millis(after_ms))?;
@@ -233,7 +241,8 @@ mod tests {
             let mut requirements = planner();
             requirements.iter_mut().for_each(change);
             let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: Vec::new() };
-            Held { lease, requirements: requirements.clone(), granted: Instant::now() }.serves(&requirements)
+            Held { lease, requirements: requirements.clone(), granted: Instant::now(), holder: FIRST }
+                .serves(&requirements)
         };
         assert!(held(&|_| {}));
         assert!(!held(&|one| drop(one.attributes.insert("gpu".to_owned(), Value::Bool(true)))));

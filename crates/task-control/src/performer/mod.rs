@@ -9,6 +9,7 @@ mod resume;
 #[cfg(test)]
 mod tests;
 mod told;
+mod wanted;
 mod watch;
 
 pub(super) use resume::{check_world, remembers};
@@ -114,6 +115,8 @@ pub(super) enum Answer {
     },
     /// A revision of the root: the run's own, or another's.
     World(WorldChange),
+    /// Another run waits for what these leases hold, and needs it for certain.
+    Wanted(Vec<LeaseId>),
 }
 
 impl From<Event> for Answer {
@@ -138,8 +141,8 @@ pub(super) struct Performer {
     session: Session,
     /// Where the session is kept alive, whatever this thread does.
     _background: BackgroundRuntime,
-    /// Looks for other runs.
-    _others: AbortOnDropHandle<()>,
+    /// Look for other runs, and for what they need.
+    _others: [AbortOnDropHandle<()>; 2],
     events: mpsc::Sender<Answer>,
     records: mpsc::Sender<Record>,
     outside: Outside,
@@ -218,6 +221,8 @@ impl Performer {
             }
         }
         let world = WorldClient::new(&channels, &place.endpoints.world_pool)?;
+        let listening = wanted::listen(resources.clone(), run.clone(), told.clone(), events.clone());
+        let listening = AbortOnDropHandle::new(tokio::spawn(listening));
         let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
         let (cancelled, recorded) = (Cancelled::default(), Recorded::default());
         let promises = Promises::default();
@@ -248,7 +253,7 @@ impl Performer {
             world,
             session,
             _background: background,
-            _others: others,
+            _others: [others, listening],
             events,
             records,
             outside: Outside::default(),
@@ -504,6 +509,11 @@ impl Performer {
                 }
                 return Ok(self.outside.told(change, mirror));
             }
+            Answer::Wanted(leases) => {
+                let holders: Vec<InstanceId> =
+                    leases.into_iter().filter_map(|lease| self.leases.holder(lease)).collect();
+                return Ok((!holders.is_empty()).then_some(Event::WantedByOthers { holders }));
+            }
         };
         Ok(match event {
             Event::Granted { instance, lease } if withdrawn => {
@@ -521,7 +531,7 @@ impl Performer {
                     let asked = self.asking.remove(*instance);
                     self.waiting_since.remove(instance);
                     if let (Event::Granted { lease, .. }, Some(asked)) = (&event, asked) {
-                        self.leases.granted(lease, asked.requirements, Instant::now());
+                        self.leases.granted(*instance, lease, asked.requirements, Instant::now());
                     }
                 }
                 // Also where it is the projection that could not be made, while its goal went on.

@@ -246,6 +246,25 @@ async fn one_that_asks_again_in_the_step_that_gives_it_a_lease_has_it_once() -> 
     bench.performer.close().await
 }
 
+#[tokio::test]
+async fn a_run_hears_of_who_waits_beside_it_for_what_it_holds_and_needs_that_for_certain() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (holder, waiter) = (InstanceId(1), InstanceId(2));
+    bench.ask(holder)?;
+    bench.granted(holder).await?;
+    let (events, _answers) = mpsc::channel(8);
+    let mut other = connect(&bench.endpoints, "other", events).await?;
+    // What may be in vain has time.
+    other.perform(Command::Acquire { instance: waiter, requirements: arm(), priority: 7 })?;
+    let quiet = tokio::time::timeout(Duration::from_secs(2), bench.event()).await;
+    assert!(quiet.is_err(), "{quiet:?}");
+    other.perform(Command::Withdraw { instance: waiter })?;
+    other.perform(Command::Acquire { instance: waiter, requirements: arm(), priority: CERTAIN })?;
+    assert_eq!(bench.event().await, Some(Event::WantedByOthers { holders: vec![holder] }));
+    other.close().await?;
+    bench.performer.close().await
+}
+
 /// A resource manager that a token ends, at the same place as the one before it.
 fn manager_at(directory: &RuntimeDirectory) -> (CancellationToken, impl Future<Output = ()> + use<>) {
     let shutdown = CancellationToken::new();
