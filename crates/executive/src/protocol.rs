@@ -160,7 +160,7 @@ pub enum Event {
         /// Why, and what to do.
         reason: String,
     },
-    /// The world pool made the projection of a [`Command::Project`], or has promised it under this id where nothing acts in it. If nothing comes
+    /// The world pool made the projection of a [`Command::Project`], or has promised it under this id where it need not be there first. If nothing comes
     /// of a promise, `Crashed` follows.
     Projected {
         /// For which instance.
@@ -293,9 +293,9 @@ pub enum Command {
         reads: Footprint,
         /// What holds the room for it: the instance's lease, or that of the routine it is in.
         lease: Option<(LeaseId, FencingToken)>,
-        /// Whether what works in it changes the environment: that begins only when the projection is there.
+        /// Whether it has to be there before the goal begins: what that does changes the environment, or its time is limited.
         #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-        acts: bool,
+        first: bool,
     },
     /// Give a provider a goal; answered by `Finished` or `Crashed`.
     Start {

@@ -64,6 +64,12 @@ pub enum Obstacle {
 }
 
 impl Explanation {
+    /// Whether it would get what it wants if others gave it back: all of that is there.
+    pub fn is_hopeful(&self) -> bool {
+        let is_there = |one: &Obstacle| !matches!(one, Obstacle::MissingKind { .. } | Obstacle::TooFew { .. });
+        self.obstacles.iter().all(is_there)
+    }
+
     /// The leases that hold what it lacks.
     pub fn held_by(&self) -> impl Iterator<Item = LeaseId> {
         self.obstacles

@@ -7,38 +7,51 @@
 use ratn_model::id::ProjectionId;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
+use tokio::sync::oneshot::error::TryRecvError;
 
 /// So many ids are kept.
 const KEPT: usize = 32;
+
+/// So long an id is used; the world pool keeps its promises three times as long.
+const FRESH: Duration = Duration::from_secs(10);
 
 /// Where more than so many records wait for the world pool, goals wait for their projections: the workers would.
 const FEW_BEHIND: usize = 4;
 
 /// The ids that are promised to a run; clones share them.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Promises(Arc<Mutex<VecDeque<ProjectionId>>>);
+pub(super) struct Promises(Arc<Mutex<VecDeque<Promise>>>);
+
+#[derive(Debug, Clone, Copy)]
+struct Promise {
+    id: ProjectionId,
+    since: Instant,
+}
 
 impl Promises {
-    fn ids(&self) -> MutexGuard<'_, VecDeque<ProjectionId>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    fn fresh(&self, now: Instant) -> MutexGuard<'_, VecDeque<Promise>> {
+        let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        while all.pop_front_if(|oldest| now.duration_since(oldest.since) >= FRESH).is_some() {}
+        all
     }
 
     /// An id for a projection that is to be named at once; `behind` records wait for the world pool.
-    pub(super) fn take(&self, behind: usize) -> Option<ProjectionId> {
-        if behind > FEW_BEHIND { None } else { self.ids().pop_front() }
+    pub(super) fn take(&self, behind: usize, now: Instant) -> Option<ProjectionId> {
+        if behind > FEW_BEHIND { None } else { self.fresh(now).pop_front().map(|promise| promise.id) }
     }
 
     /// So many the next answer is to promise.
-    pub(super) fn wanted(&self) -> u32 {
-        let left = self.ids().len();
+    pub(super) fn wanted(&self, now: Instant) -> u32 {
+        let left = self.fresh(now).len();
         if left > KEPT / 2 { 0 } else { u32::try_from(KEPT - left).unwrap_or_default() }
     }
 
     /// What an answer has promised.
-    pub(super) fn add(&self, promised: Vec<ProjectionId>) {
-        let mut ids = self.ids();
-        ids.extend(promised);
+    pub(super) fn add(&self, promised: Vec<ProjectionId>, now: Instant) {
+        let mut ids = self.fresh(now);
+        ids.extend(promised.into_iter().map(|id| Promise { id, since: now }));
         // Answers that crossed have promised more than was wanted: the pool forgets the oldest first, and so does the run.
         let too_many = ids.len().saturating_sub(2 * KEPT);
         ids.drain(..too_many);
@@ -46,7 +59,7 @@ impl Promises {
 
     /// The world pool knows of no promise: it was started again.
     pub(super) fn forget(&self) {
-        self.ids().clear();
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clear();
     }
 }
 
@@ -66,48 +79,47 @@ impl Making {
         made
     }
 
-    /// It is to be given back, as soon as it is there: resolves to whether there is something to give back.
-    pub(super) fn end(&mut self, projection: ProjectionId) -> impl Future<Output = bool> + Send + use<> {
-        let making = self.0.remove(&projection);
-        async move {
-            match making {
-                Some(is_made) => is_made.await.is_ok(),
-                None => true,
-            }
-        }
+    /// It is to be given back: at once, or when this says that it is there. An error of that: it never will be.
+    pub(super) fn end(&mut self, projection: ProjectionId) -> Option<oneshot::Receiver<Made>> {
+        let mut making = self.0.remove(&projection)?;
+        matches!(making.try_recv(), Err(TryRecvError::Empty)).then_some(making)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use futures::FutureExt;
 
     #[test]
     fn ids_are_asked_for_when_few_are_left_and_used_while_the_pool_keeps_up() {
-        let promises = Promises::default();
-        assert_eq!((promises.take(0), promises.wanted()), (None, 32));
-        promises.add((1..=32).map(ProjectionId).collect());
-        assert_eq!((promises.wanted(), promises.take(FEW_BEHIND + 1)), (0, None));
-        let taken: Vec<_> = (1..=16).filter_map(|_| promises.take(0)).collect();
+        let (promises, now) = (Promises::default(), Instant::now());
+        assert_eq!((promises.take(0, now), promises.wanted(now)), (None, 32));
+        promises.add((1..=32).map(ProjectionId).collect(), now);
+        assert_eq!((promises.wanted(now), promises.take(FEW_BEHIND + 1, now)), (0, None));
+        let taken: Vec<_> = (1..=16).filter_map(|_| promises.take(0, now)).collect();
         assert_eq!(taken[15], ProjectionId(16));
-        assert_eq!(promises.wanted(), 16);
-        promises.add((33..=200).map(ProjectionId).collect());
-        assert_eq!(promises.take(0), Some(ProjectionId(137)), "not more than twice as many");
+        assert_eq!(promises.wanted(now), 16);
+        promises.add((33..=200).map(ProjectionId).collect(), now);
+        assert_eq!(promises.take(0, now), Some(ProjectionId(137)), "not more than twice as many");
+        assert_eq!((promises.wanted(now + FRESH), promises.take(0, now + FRESH)), (32, None), "they are too old");
+        promises.add(vec![ProjectionId(300)], now);
         promises.forget();
-        assert_eq!(promises.take(0), None);
+        assert_eq!(promises.take(0, now), None);
     }
 
     #[test]
     fn what_is_not_there_yet_is_given_back_when_it_is() {
         let mut making = Making::default();
         let [made, never] = [ProjectionId(1), ProjectionId(2)].map(|id| making.begin(id));
-        let mut first = making.end(ProjectionId(1)).boxed();
-        assert_eq!(first.as_mut().now_or_never(), None);
+        let mut first = making.end(ProjectionId(1)).expect("it is not there yet");
         assert!(made.send(Made).is_ok());
-        assert_eq!(first.now_or_never(), Some(true));
+        assert!(first.try_recv().is_ok());
+        let mut second = making.end(ProjectionId(2)).expect("it is not there yet");
         drop(never);
-        assert_eq!(making.end(ProjectionId(2)).now_or_never(), Some(false));
-        assert_eq!(making.end(ProjectionId(3)).now_or_never(), Some(true), "one that was there before it was named");
+        assert!(second.try_recv().is_err());
+        assert!(making.end(ProjectionId(3)).is_none(), "one that was there before it was named");
+        let made = making.begin(ProjectionId(4));
+        assert!(made.send(Made).is_ok());
+        assert!(making.end(ProjectionId(4)).is_none(), "it is there by now");
     }
 }

@@ -21,6 +21,7 @@ use std::collections::BTreeSet;
 use std::pin::pin;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
@@ -32,7 +33,8 @@ const MAX_OVERTAKEN: u32 = 100;
 
 /// As the world pool names its refusals.
 const NO_SUCH_COMMIT: &str = "NO_SUCH_COMMIT";
-const NOT_PROMISED: &str = "NOT_PROMISED";
+const ENDED: &str = "PROJECTION_ENDED";
+const REUSED: &str = "REQUEST_ID_REUSED";
 
 /// One thing to do, in order.
 #[derive(Debug)]
@@ -62,6 +64,8 @@ pub(super) struct Named {
     pub(super) id: ProjectionId,
     /// Told when it is there.
     pub(super) made: oneshot::Sender<Made>,
+    /// Whether it may have been asked for before task control was gone.
+    pub(super) again: bool,
 }
 
 /// What an instance has changed, to become real.
@@ -212,7 +216,7 @@ impl Recorder {
 
     /// Begins to have a projection made.
     fn project(&self, instance: InstanceId, asked: Projecting, named: Option<Named>, after: Option<UnderWay>) {
-        let Projecting { attempt, base, changes, writers, reads, lease } = asked;
+        let Projecting { attempt, base, changes, writers, reads, lease, .. } = asked;
         let request = format!("{}/{instance}/{attempt}", self.run);
         let making = MakingProjection {
             instance,
@@ -298,7 +302,11 @@ impl MakingProjection {
                 None
             }
             (Ok(projection), None) => Some(Event::Projected { instance, attempt, projection }),
+            // It was there, whatever has become of it: its goal knows.
+            (Err(error), Some(Named { again: true, .. })) if matches!(error.reason(), ENDED | REUSED) => None,
             (Err(error), named) => {
+                // If the world pool was started again, it has promised nothing.
+                self.promises.forget();
                 self.named = named;
                 self.take_back().await;
                 Some(Event::Crashed { instance, attempt, reason: format!("no projection: {}", said(&error)) })
@@ -309,7 +317,7 @@ impl MakingProjection {
     /// It will not be made: a worker that waits for it need not wait longer.
     async fn take_back(&mut self) {
         if let Some(named) = self.named.take() {
-            let _ = self.world.release(named.id).await;
+            let _ = retry_unanswered(|| self.world.release(named.id)).await;
         }
     }
 
@@ -321,18 +329,14 @@ impl MakingProjection {
             let wanted = Projection { base, ..self.wanted.clone() };
             let after = self.after.as_ref().map(|commit| commit.id.clone());
             let id = self.named.as_ref().map(|named| named.id);
-            let early = Early { id, after, promise: self.promises.wanted() };
+            let early = Early { id, after, promise: self.promises.wanted(Instant::now()) };
             match retry_unanswered(|| self.world.project_early(wanted.clone(), early.clone())).await {
                 Ok((projection, promised)) => {
-                    self.promises.add(promised);
+                    self.promises.add(promised, Instant::now());
                     return Ok(projection);
                 }
                 Err(error) => match (error.reason(), self.after.take()) {
                     (NO_SUCH_COMMIT, Some(commit)) => commit.over.cancelled().await,
-                    (NOT_PROMISED, _) => {
-                        self.promises.forget();
-                        return Err(error);
-                    }
                     _ => return Err(error),
                 },
             }

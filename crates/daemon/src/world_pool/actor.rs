@@ -202,8 +202,12 @@ impl Core for WorldCore {
 
     fn receive(&mut self, message: Message, context: &mut WorldTurn) {
         if !is_early(&self.pool, &message) {
+            let lets_go_on =
+                matches!(message, Message::Commit { .. } | Message::Project { .. } | Message::Release { .. });
             self.perform(message, context);
-            self.take_up(context);
+            if lets_go_on {
+                self.take_up(context);
+            }
         } else if let Err(message) = self.parked.park(context.now(), message) {
             message.refused(status::too_many_wait());
         }
@@ -265,8 +269,10 @@ impl Core for WorldCore {
 /// Whether it is about something that is on its way.
 fn is_early(pool: &WorldPool, message: &Message) -> bool {
     match message {
-        Message::Project { projection, .. } => {
-            projection.after.as_ref().is_some_and(|id| !pool.has_commit(&projection.by, id))
+        Message::Project { projection: NewProjection { by, id, after, .. }, .. } => {
+            // With an id of its own it is refused at once where that is not promised any more, as who asks for the projection is.
+            let may_be = id.is_none_or(|id| pool.is_promised_to(by, id));
+            may_be && after.as_ref().is_some_and(|commit| !pool.has_commit(by, commit))
         }
         Message::Query { projection, .. } | Message::Scene { projection, .. } => {
             projection.is_some_and(|id| pool.is_promised(id))
@@ -320,7 +326,7 @@ impl WorldCore {
             Message::Project { projection, promise, answer } => {
                 let by = projection.by.name.clone();
                 let projected = self.project(projection, context.now());
-                let projected = projected.map(|id| (id, self.pool.promise(&by, promise)));
+                let projected = projected.map(|id| (id, self.pool.promise(context.now(), &by, promise)));
                 context.reply(answer, projected);
             }
             Message::Query { projection, at, patterns, answer } => {

@@ -288,13 +288,13 @@ impl WorldPool {
     }
 
     /// Promises a caller as many ids as there is room for.
-    pub(super) fn promise(&mut self, caller: &Arc<str>, wanted: u32) -> Vec<ProjectionId> {
+    pub(super) fn promise(&mut self, now: Timestamp, caller: &Arc<str>, wanted: u32) -> Vec<ProjectionId> {
         let ids = (0..self.promised.room(wanted)).map(|_| {
             self.last_projection += 1;
             ProjectionId(self.last_projection)
         });
         let ids: Vec<ProjectionId> = ids.collect();
-        ids.iter().for_each(|id| self.promised.promise(caller, *id));
+        ids.iter().for_each(|id| self.promised.promise(now, caller, *id));
         ids
     }
 
@@ -317,6 +317,11 @@ impl WorldPool {
         self.promised.has(id)
     }
 
+    /// Whether a caller may make a projection with this id.
+    pub(super) fn is_promised_to(&self, caller: &Caller, id: ProjectionId) -> bool {
+        self.promised.whose(id) == Some(&caller.name)
+    }
+
     /// The world at a revision with changes applied. A request made before gets its answer again, as long as it lives. An id that was promised
     /// for it is used up, whatever comes of it, so that who waits for it need not wait longer; not where only its commit is not there yet.
     pub(super) fn project(&mut self, request: ProjectRequest) -> Result<ProjectionId, ProjectError> {
@@ -330,7 +335,7 @@ impl WorldPool {
     }
 
     fn make(&mut self, mut request: ProjectRequest) -> Result<ProjectionId, ProjectError> {
-        let fingerprint = Fingerprint::of_projection(request.base, &request.changes, &request.reads, &request.writers);
+        let fingerprint = Fingerprint::of_projection(&request.changes, &request.reads, &request.writers);
         if let Some(id) = self.projected.recall(&request.by.name, &request.request_id, fingerprint)? {
             let ended = || ProjectError::Ended { request_id: request.request_id.clone() };
             return self.projections.contains_key(&id).then_some(id).ok_or_else(ended);
@@ -472,6 +477,7 @@ impl WorldPool {
 
     /// Ends what is held by nothing but time that has passed.
     pub(super) fn expire(&mut self, now: Timestamp) {
+        self.promised.expire(now);
         let over = |projection: &Projection| matches!(projection.held_by, HeldBy::Until(end) if end <= now);
         let ids: Vec<ProjectionId> = self.projections.iter().filter(|(_, p)| over(p)).map(|(id, _)| *id).collect();
         for id in ids {

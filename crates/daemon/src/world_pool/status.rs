@@ -72,7 +72,8 @@ pub(super) fn of_too_much(error: &TooMuch) -> Status {
 pub(super) fn too_many_wait() -> Status {
     let message =
         format!("{} calls wait for projections and commits that are on their way: ask again later", parked::MOST);
-    retry_later(Code::ResourceExhausted, "TOO_MANY_WAIT", message, parked::PATIENCE)
+    // As a daemon that is not there for a moment: what it is about may be there by then.
+    retry_later(Code::Unavailable, "TOO_MANY_WAIT", message, parked::PATIENCE)
 }
 
 pub(super) fn lease_ended(lease: LeaseId) -> Status {

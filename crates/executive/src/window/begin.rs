@@ -359,11 +359,13 @@ impl Window {
         let Some(node) = self.graph.node(id) else { return };
         let Status::Granted(held) = &node.status else { return };
         let (attempt, lease) = (node.attempt, held.lease.as_ref().map(|lease| (lease.id, lease.token)));
-        let acts = self.graph.get(id).is_some_and(Instance::is_pia);
+        let first = self.graph.get(id).is_some_and(|instance| {
+            instance.is_pia() || context.program.state(instance.state).annotations.timeout_s.is_some()
+        });
         let base = context.root.revision();
         let (writers, changes) = self.named(context, by_writer);
         self.graph.project(id);
-        context.commands.push(Command::Project { instance: id, attempt, base, changes, writers, reads, lease, acts });
+        context.commands.push(Command::Project { instance: id, attempt, base, changes, writers, reads, lease, first });
     }
 
     fn start_goal(&mut self, context: &mut Context<'_>, id: InstanceId, known: Option<Outputs>) {

@@ -1076,7 +1076,7 @@ pub struct WaitingAcquire {
     /// What is in the way of each requirement that cannot be met now, for people: "`block Arm`: held by lease-1 of session a".
     #[prost(string, repeated, tag = "6")]
     pub obstacles: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// The leases that hold what it lacks, at most 8 for each requirement.
+    /// The leases that hold what it lacks, at most 8 for each requirement; none where some of that is not there at all.
     #[prost(uint64, repeated, tag = "7")]
     pub held_by_leases: ::prost::alloc::vec::Vec<u64>,
 }
@@ -3278,7 +3278,7 @@ pub struct ProjectRequest {
     pub projection_id: u64,
     /// So many ids the answer promises, at most 64: for projections of the caller's that are named to others before they are asked for. Whoever asks
     /// for a promised projection (Query, GetScene, WatchProjection) waits until it is there, 1 s at most: UNAVAILABLE (NOT_YET) then, ask again.
-    /// Of those promised to one caller that were never used the pool forgets the oldest where there are more than 1,024.
+    /// A promise is kept for 30 s; of those to one caller the pool forgets the oldest where there are more than 16,384.
     #[prost(uint32, tag = "9")]
     pub promise: u32,
     /// A commit of the caller's that may still be on its way: the revision below is that which it makes, or base_revision where that is later. It is

@@ -94,6 +94,8 @@ pub(super) struct Performing {
     pub(super) stop: CancellationToken,
     pub(super) goal: Goal,
     pub(super) results: Mutex<Results>,
+    /// What a result has to have.
+    pub(super) outputs: Vec<String>,
     pub(super) told: Told,
 }
 
@@ -290,6 +292,12 @@ impl Performing {
             Said::Progress { message, .. } => Event::Progressed { instance, attempt, message },
             // What it comes to when it was told to stop nobody waits for.
             Said::Improved(_) if self.stop.is_cancelled() => return,
+            // What is not whole is no result.
+            Said::Improved(GoalImproved { outputs, .. })
+                if !self.outputs.iter().all(|port| outputs.contains_key(port)) =>
+            {
+                return;
+            }
             Said::Improved(GoalImproved { outputs, cost_s }) => {
                 if !self.results.lock().unwrap_or_else(PoisonError::into_inner).takes(cost_s) {
                     return;
@@ -415,6 +423,7 @@ mod tests {
                 events: self.events.clone(),
                 stop: CancellationToken::new(),
                 results: Mutex::default(),
+                outputs: Vec::new(),
                 told: Told::new(),
                 goal: Goal {
                     id: format!("run/1/{action}"),

@@ -50,6 +50,7 @@ use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 use told::Told;
+use wanted::HoldsSpeculatively;
 
 /// A resource manager that does not open a session within this time is not there.
 const SESSION_DEADLINE: Duration = Duration::from_secs(5);
@@ -76,6 +77,12 @@ fn holder(task: &str, path: &str) -> String {
     match path.chars().count() {
         length if length <= room => format!("{task}: {path}"),
         length => format!("{task}: …{}", path.chars().skip(length - room).collect::<String>()),
+    }
+}
+
+async fn end_projection(world: &WorldClient, instance: InstanceId, projection: ProjectionId) {
+    if let Err(error) = retry_unanswered(|| world.release(projection)).await {
+        tracing::warn!(%instance, "a projection was not given back: {}", said(&error));
     }
 }
 
@@ -160,6 +167,7 @@ pub(super) struct Performer {
     /// Since when instances have waited that have not got what they need, however often they ask.
     waiting_since: BTreeMap<InstanceId, Instant>,
     leases: Leases,
+    holds: HoldsSpeculatively,
     /// What the instances of the window are called, for whoever asks who holds something.
     paths: BTreeMap<InstanceId, String>,
     /// Of the commands that are performed now.
@@ -221,7 +229,8 @@ impl Performer {
             }
         }
         let world = WorldClient::new(&channels, &place.endpoints.world_pool)?;
-        let listening = wanted::listen(resources.clone(), run.clone(), told.clone(), events.clone());
+        let holds = HoldsSpeculatively::default();
+        let listening = wanted::listen(resources.clone(), run.clone(), told.clone(), holds.clone(), events.clone());
         let listening = AbortOnDropHandle::new(tokio::spawn(listening));
         let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
         let (cancelled, recorded) = (Cancelled::default(), Recorded::default());
@@ -267,6 +276,7 @@ impl Performer {
             asking: Waiting::default(),
             waiting_since: BTreeMap::new(),
             leases: Leases::default(),
+            holds,
             paths: BTreeMap::new(),
             handover: None,
             jobs: BTreeMap::new(),
@@ -356,9 +366,9 @@ impl Performer {
                     asking.withdrawn.cancel();
                 }
             }
-            Command::Project { instance, attempt, base, changes, writers, reads, lease, acts } => {
-                let asked = Projecting { attempt, base, changes, writers, reads, lease };
-                self.project(instance, asked, acts)?;
+            Command::Project { instance, attempt, base, changes, writers, reads, lease, first } => {
+                let asked = Projecting { attempt, base, changes, writers, reads, lease, first, named: None };
+                self.project(instance, asked)?;
             }
             Command::Start { instance, attempt, goal } => self.start(instance, attempt, *goal, Given::Now),
             Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
@@ -416,15 +426,15 @@ impl Performer {
         Ok(())
     }
 
-    /// What works in it and does not act goes on at once, if a projection was promised.
-    fn project(&mut self, instance: InstanceId, asked: Projecting, acts: bool) -> anyhow::Result<()> {
+    /// Where it need not be there first its goal leaves at once, if an id was promised.
+    fn project(&mut self, instance: InstanceId, asked: Projecting) -> anyhow::Result<()> {
         let behind = self.records.max_capacity() - self.records.capacity();
-        let told = if acts { None } else { self.events.clone().try_reserve_owned().ok() };
-        let Some((told, id)) = told.and_then(|told| Some((told, self.promises.take(behind)?))) else {
+        let told = if asked.first { None } else { self.events.clone().try_reserve_owned().ok() };
+        let Some((told, id)) = told.and_then(|told| Some((told, self.promises.take(behind, Instant::now())?))) else {
             return self.record(Record::Project { instance, asked, named: None });
         };
         let (attempt, made) = (asked.attempt, self.making.begin(id));
-        self.record(Record::Project { instance, asked, named: Some(Named { id, made }) })?;
+        self.record(Record::Project { instance, asked, named: Some(Named { id, made, again: false }) })?;
         told.send(Event::Projected { instance, attempt, projection: id }.into());
         Ok(())
     }
@@ -511,7 +521,7 @@ impl Performer {
             }
             Answer::Wanted(leases) => {
                 let holders: Vec<InstanceId> =
-                    leases.into_iter().filter_map(|lease| self.leases.holder(lease)).collect();
+                    leases.into_iter().filter_map(|lease| self.leases.speculative_holder(lease)).collect();
                 return Ok((!holders.is_empty()).then_some(Event::WantedByOthers { holders }));
             }
         };
@@ -531,14 +541,17 @@ impl Performer {
                     let asked = self.asking.remove(*instance);
                     self.waiting_since.remove(instance);
                     if let (Event::Granted { lease, .. }, Some(asked)) = (&event, asked) {
-                        self.leases.granted(*instance, lease, asked.requirements, Instant::now());
+                        self.leases.granted(*instance, lease, (asked.requirements, asked.priority), Instant::now());
+                        self.holds.set(self.leases.has_speculative());
                     }
                 }
                 // Also where it is the projection that could not be made, while its goal went on.
-                if let Event::Crashed { instance, attempt, .. } = &event
-                    && let Some(job) = self.jobs.get(instance).filter(|job| job.attempt == *attempt)
-                {
-                    job.stop.cancel();
+                if let Event::Crashed { instance, attempt, .. } = &event {
+                    // If the world pool was started again, it has promised nothing.
+                    self.promises.forget();
+                    if let Some(job) = self.jobs.get(instance).filter(|job| job.attempt == *attempt) {
+                        job.stop.cancel();
+                    }
                 }
                 Some(event)
             }
@@ -579,6 +592,7 @@ impl Performer {
             events: self.events.clone(),
             stop: stop.clone(),
             results: Mutex::default(),
+            outputs: self.outputs_of(&goal),
             told: self.told.clone(),
             goal: types::Goal {
                 id: format!("{}/{instance}/{attempt}", self.run),
@@ -596,6 +610,13 @@ impl Performer {
         };
         let ended = tokio::spawn(trace::within(self.of(instance), performing.perform(given)));
         self.jobs.insert(instance, Job { attempt, lease, stop, ended });
+    }
+
+    /// The outputs that a result of the goal's action has to have.
+    fn outputs_of(&self, goal: &Goal) -> Vec<String> {
+        let provider = self.catalogue.providers.get(&*goal.provider);
+        let action = provider.and_then(|provider| provider.actions.get(&*goal.action));
+        action.map(|action| action.outputs.keys().cloned().collect()).unwrap_or_default()
     }
 
     /// What performs goals says where it is: a resource of that kind that does not is nobody's to give a goal to, whoever made it.
@@ -637,25 +658,33 @@ impl Performer {
     ) {
         if let Some(lease) = lease {
             self.leases.given_back(lease);
+            self.holds.set(self.leases.has_speculative());
         }
         let (resources, world) = (self.resources.clone(), self.world.clone());
         let note = self.told.left(&self.run, self.decided).to_string();
-        let projection = projection.map(|id| (id, self.making.end(id)));
+        let (there, coming) = match projection.map(|id| (id, self.making.end(id))) {
+            Some((id, None)) => (Some(id), None),
+            Some((id, Some(coming))) => (None, Some((id, coming))),
+            None => (None, None),
+        };
         let returning = async move {
             // Whoever gets the resources next finds them idle.
             for job in jobs {
                 let _ = job.ended.await;
             }
-            if let Some((projection, is_there)) = projection
-                && is_there.await
-                && let Err(error) = retry_unanswered(|| world.release(projection)).await
-            {
-                tracing::warn!(%instance, "a projection was not given back: {}", said(&error));
+            if let Some(projection) = there {
+                end_projection(&world, instance, projection).await;
             }
             if let Some(lease) = lease
                 && let Err(error) = retry_unanswered(|| resources.release_with_note(lease, note.clone())).await
             {
                 tracing::warn!(%instance, "a lease was not given back: {}", said(&error));
+            }
+            // The lease is not kept until it is there.
+            if let Some((projection, coming)) = coming
+                && coming.await.is_ok()
+            {
+                end_projection(&world, instance, projection).await;
             }
         };
         self.giving_back.spawn(trace::within(self.of(instance), returning));

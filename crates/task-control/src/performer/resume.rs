@@ -8,7 +8,7 @@ use super::Performer;
 use super::goal::Given;
 use crate::ledger::{Confirmed, Ledger};
 use crate::outside;
-use crate::record::{Decided, Record, commit_next, operate_once, said};
+use crate::record::{Decided, Named, Record, commit_next, operate_once, said};
 use crate::shell::Place;
 use anyhow::bail;
 use ratn_executive::protocol::Event;
@@ -96,7 +96,8 @@ impl Performer {
             let _ = retry_unanswered(|| self.resources.withdraw(request)).await;
         }
         for (instance, asked) in ledger.projecting {
-            self.record(Record::Project { instance, asked, named: None })?;
+            let named = asked.named.map(|id| Named { id, made: self.making.begin(id), again: true });
+            self.record(Record::Project { instance, asked, named })?;
         }
         for (instance, (attempt, goal)) in ledger.goals {
             self.start(instance, attempt, goal, Given::Before);

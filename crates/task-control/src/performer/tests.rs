@@ -463,7 +463,7 @@ async fn a_projection_that_crosses_its_cancel_goes_back() -> anyhow::Result<()> 
         writers: Vec::new(),
         reads: reads.clone(),
         lease: None,
-        acts: true,
+        first: true,
     };
     bench.performer.perform(project(1))?;
     let made = bench.answers.recv().await;
@@ -476,7 +476,7 @@ async fn a_projection_that_crosses_its_cancel_goes_back() -> anyhow::Result<()> 
 }
 
 /// A projection of everything, at no lease.
-fn projection(instance: InstanceId, attempt: u32, acts: bool) -> Command {
+fn projection(instance: InstanceId, attempt: u32, first: bool) -> Command {
     Command::Project {
         instance,
         attempt,
@@ -485,7 +485,7 @@ fn projection(instance: InstanceId, attempt: u32, acts: bool) -> Command {
         writers: Vec::new(),
         reads: Footprint::Everything,
         lease: None,
-        acts,
+        first,
     }
 }
 

@@ -435,7 +435,7 @@ fn large_pool() -> WorldPool {
 #[test]
 fn a_promised_id_is_used_once_by_whom_it_was_promised_to() {
     let mut pool = large_pool();
-    let ids = pool.promise(&"adam".into(), 2);
+    let ids = pool.promise(Timestamp(0), &"adam".into(), 2);
     let id = ids[0];
     assert_eq!(query(&pool, Some(id), &[]), Err(QueryError::NotYet { id }));
     let of_eve = ProjectRequest { by: task("eve"), ..promised("of eve", Some(id), None) };
@@ -455,7 +455,7 @@ fn a_promised_id_is_used_once_by_whom_it_was_promised_to() {
 #[test]
 fn a_promise_ends_with_the_first_try_or_when_it_is_taken_back() {
     let mut pool = pool();
-    let ids = pool.promise(&"adam".into(), 3);
+    let ids = pool.promise(Timestamp(0), &"adam".into(), 3);
     let early = pool.project(promised("one", Some(ids[0]), Some("not yet")));
     assert!(matches!(early, Err(ProjectError::NoSuchCommit { .. })) && pool.is_promised(ids[0]));
     let refused = ProjectRequest { base: Revision(7), ..promised("one", Some(ids[0]), None) };
