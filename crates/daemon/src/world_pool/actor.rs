@@ -484,5 +484,12 @@ mod tests {
         let (seen, made) = tokio::join!(look(ids[1]), project("two", None, Some("b")));
         assert_eq!((seen, made.unwrap_err().code()), (Err(Code::Unavailable), Code::FailedPrecondition));
         assert!(began.elapsed() >= super::super::parked::PATIENCE);
+        // Of another pool before this one: neither waits in vain.
+        let (seen, made) = tokio::time::timeout(Duration::from_millis(900), async {
+            tokio::join!(look(ProjectionId(77)), project("three", Some(ProjectionId(77)), Some("b")))
+        })
+        .await
+        .unwrap();
+        assert_eq!((seen, made.unwrap_err().code()), (Err(Code::NotFound), Code::FailedPrecondition));
     }
 }

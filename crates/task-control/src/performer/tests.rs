@@ -523,6 +523,28 @@ async fn a_projection_is_named_before_it_is_there_and_shows_the_commit_on_its_wa
 }
 
 #[tokio::test]
+async fn a_projection_that_was_named_and_not_asked_for_before_the_kill_is_asked_for_by_who_comes_back()
+-> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let instance = InstanceId(1);
+    bench.performer.perform(projection(instance, 1, false))?;
+    assert!(matches!(bench.event().await, Some(Event::Projected { .. })));
+    // It has an id for the next one, and is killed when it has written that down.
+    let named = bench.performer.promises.take(0, Instant::now()).context("nothing is promised")?;
+    let mut ledger = ledger(&bench.performer.run, &[projection(instance, 2, false)]);
+    ledger.event(Timestamp(0), &Event::Projected { instance, attempt: 2, projection: named });
+    let mut bench = bench.comes_back(true).await?;
+    bench.performer.take_up(ledger, &World::default()).await?;
+    let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
+    assert!(world.query(Some(named), &[]).await?.is_empty());
+    bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
+    bench.performer.close().await?;
+    let gone = world.query(Some(named), &[]).await;
+    assert_eq!(gone.map_err(|error| error.reason().to_owned()).err().as_deref(), Some("PROJECTION_UNKNOWN"));
+    Ok(())
+}
+
+#[tokio::test]
 async fn of_a_named_projection_that_cannot_be_made_is_heard_afterwards() -> anyhow::Result<()> {
     let mut bench = Bench::new().await?;
     let instance = InstanceId(1);
