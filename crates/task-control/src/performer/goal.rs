@@ -507,6 +507,25 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn who_comes_back_to_a_goal_hears_of_the_result_that_it_has_given() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        let endless = |bench: &Bench| {
+            let mut performing = bench.performing("endless", None, 5_000);
+            performing.goal.improves = Some(Vec::new());
+            performing
+        };
+        let left = tokio::spawn(endless(&bench).perform(Given::Now));
+        assert!(matches!(bench.event().await, Some(Event::Improved { .. })));
+        left.abort();
+        let again = endless(&bench);
+        let stop = again.stop.clone();
+        let again = tokio::spawn(again.perform(Given::Before));
+        assert!(matches!(bench.event().await, Some(Event::Improved { .. })));
+        stop.cancel();
+        Ok(again.await?)
+    }
+
+    #[tokio::test]
     async fn of_the_results_before_the_end_those_are_taken_that_are_better_and_so_many_at_the_most()
     -> anyhow::Result<()> {
         let mut results = Results::default();
