@@ -500,7 +500,7 @@ mod tests {
         assert!(matches!(bench.event().await, Some(Event::Improved { .. })));
         tokio::time::sleep(Duration::from_millis(100)).await;
         assert!(!ended.is_finished(), "alone it goes on");
-        told.beside_others();
+        told.beside_others(true);
         let event = bench.event().await;
         assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == PREEMPTED), "{event:?}");
         Ok(())

@@ -210,14 +210,10 @@ impl Performer {
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, manager, session.id())?;
         let told = Told::new();
-        let (heard, another) = (told.clone(), claim::another(resources.clone(), run.clone()));
-        let others = AbortOnDropHandle::new(tokio::spawn(async move {
-            another.await;
-            heard.beside_others();
-        }));
+        let others = claim::look_for_others(resources.clone(), run.clone(), told.clone());
+        let others = AbortOnDropHandle::new(tokio::spawn(others));
         match claim(&resources, &run, task, place.alone).await {
-            Ok(true) => told.beside_others(),
-            Ok(false) => {}
+            Ok(has_others) => told.beside_others(has_others),
             // What a run that comes back holds is still its own.
             Err(refused) if session.state().borrow().found => {
                 session.abandon().await;
@@ -515,7 +511,7 @@ impl Performer {
             Answer::World(change) => {
                 self.record(Record::Known(change.revision))?;
                 if told::maker(&change.commit).is_some_and(|(run, _)| run != self.run) {
-                    self.told.beside_others();
+                    self.told.beside_others(true);
                 }
                 return Ok(self.outside.told(change, mirror));
             }
