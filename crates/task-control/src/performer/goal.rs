@@ -3,6 +3,7 @@
 use super::Answer;
 use super::told::Told;
 use crate::record::said;
+use crate::safe_on_disk::Mark;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId};
@@ -96,6 +97,8 @@ pub(super) struct Performing {
     pub(super) results: Mutex<Results>,
     /// What a result has to have.
     pub(super) outputs: Vec<String>,
+    /// What has to be safe before it begins.
+    pub(super) safe: Option<Mark>,
     pub(super) told: Told,
 }
 
@@ -108,7 +111,14 @@ pub(super) fn deadline_ms(timeout_s: Option<f64>, speed: f64) -> u64 {
 
 impl Performing {
     /// Until its end; the event goes to the shell, unless the goal was told to stop.
-    pub(super) async fn perform(self, given: Given) {
+    pub(super) async fn perform(mut self, given: Given) {
+        if let Some(safe) = self.safe.take() {
+            tokio::select! {
+                // Where it never will be the run ends.
+                is_safe = safe.is_safe() => if !is_safe { return },
+                () = self.stop.cancelled() => return,
+            }
+        }
         let event = match &self.endpoint {
             Ok(endpoint) => self.execute(endpoint, given).await,
             Err(reason) => Some(self.aborted(reason.clone())),
@@ -424,6 +434,7 @@ mod tests {
                 stop: CancellationToken::new(),
                 results: Mutex::default(),
                 outputs: Vec::new(),
+                safe: None,
                 told: Told::new(),
                 goal: Goal {
                     id: format!("run/1/{action}"),

@@ -60,6 +60,13 @@ fn finished(instance: InstanceId) -> Event {
     }
 }
 
+impl Performer {
+    /// As where everything before it is safe.
+    fn perform(&mut self, command: Command) -> anyhow::Result<()> {
+        self.perform_when(None, command)
+    }
+}
+
 /// A performer with a resource manager, a world pool and one arm.
 struct Bench {
     performer: Performer,

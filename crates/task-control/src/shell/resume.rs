@@ -1,7 +1,7 @@
 //! Going on with a run from its event log: the executive is brought to where it was, what was open is taken up, and the loop goes
 //! on as ever.
 
-use super::{Ended, LOOK, Place, Shell, advisor_of, unix_ms};
+use super::{Ended, LOOK, Place, Shell, advisor_of, syncer_of, unix_ms};
 use crate::checkpoint::{Checkpointer, ReplayedState};
 use crate::control::Control;
 use crate::history::{History, HistoryError};
@@ -105,6 +105,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         progress,
         messages: place.messages.clone(),
         program,
+        syncer: syncer_of(&log)?,
         log,
         checkpointer,
         clock: RobotClock::going_on(replay::now(&ledger, unix_ms(), place.speed), place.speed),
@@ -129,7 +130,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         let changed = shell.performer.take_up(ledger, &mirror).await?;
         // Commits are there by now.
         let missing = missing.into_iter().filter(|command| !matches!(command, Command::Commit { .. }));
-        let ended = shell.perform(now, missing.chain(commands))?;
+        let ended = shell.perform(now, missing.chain(commands), None)?;
         match changed {
             Some(changed) if ended.is_none() => shell.step(changed),
             _ => Ok(ended),
