@@ -132,10 +132,11 @@ fn random_programs_leave_the_same_world_in_both_modes() {
         Ok("waits") => Features::WAITS,
         Ok("watched") => Features::WATCHED,
         Ok("anytime") => Features::ANYTIME,
+        Ok("ways_out") => Features::WAYS_OUT,
         Ok("all") | Err(_) => Features::ALL,
         Ok(other) => {
             panic!(
-                "RATN_FEATURES: basic, all, everything, lists, guards, waits, watched, anytime, weak or imprecise, not {other}"
+                "RATN_FEATURES: basic, all, everything, lists, guards, waits, watched, anytime, ways_out, weak or imprecise, not {other}"
             )
         }
     };
@@ -191,6 +192,17 @@ fn random_programs_that_are_watched_leave_the_same_world_in_both_modes() {
     none_fails(trial, FURTHER, 80, &Features::WATCHED);
     none_fails(trial_from_outside, FURTHER, 80, &Features::WATCHED);
     none_fails(trial_interrupted, FURTHER, 40, &Features::WATCHED);
+}
+
+/// What seed the programs with more ways out begin with.
+const WAYS_OUT: u64 = 9 << 41;
+
+/// Told to end at any moment, or over its deadline, a run does what is to be done on its way out, as the reference does it at some place.
+#[test]
+fn random_programs_do_what_is_to_be_done_on_every_way_out_in_both_modes() {
+    none_fails(trial, WAYS_OUT, 150, &Features::WAYS_OUT);
+    none_fails(trial_interrupted, WAYS_OUT, 250, &Features::WAYS_OUT);
+    none_fails(trial_from_outside, WAYS_OUT, 60, &Features::WAYS_OUT);
 }
 
 /// A pause asked for what a state around it blocks.

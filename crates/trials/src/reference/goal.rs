@@ -92,8 +92,15 @@ impl Reference<'_> {
             if self.is_violated(state, variables)? {
                 return Ok(violated(false));
             }
+            self.may_be_cut()?;
             let (goal, performance) = self.perform(state, path, variables, tries, attempt)?;
             *inputs = goal.inputs;
+            if let Err(cut) = self.may_be_cut() {
+                if is_irreversible(state) {
+                    self.say_cut_short(state, variables);
+                }
+                return Err(cut);
+            }
             if self.is_violated(state, variables)? {
                 return Ok(violated(true));
             }
@@ -122,6 +129,14 @@ impl Reference<'_> {
             }
             return ended.ok_or_else(|| Fail::Wrong("it took too long".to_owned()));
         }
+    }
+
+    /// What a state says of being cut short is true, where it has a value.
+    pub(super) fn say_cut_short(&mut self, state: &State, variables: &[(String, Value)]) {
+        let Some(declared) = state.annotations.effects.get(PREEMPTED) else { return };
+        let changes = effects::bound(declared, &self.place(variables, Some(&Outputs::new())));
+        // What has none, or is not allowed, is not said.
+        let _ = changes.and_then(|changes| self.change(changes));
     }
 
     /// Whether something does not hold that has to while it goes on.

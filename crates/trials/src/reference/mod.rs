@@ -37,7 +37,7 @@ mod walk;
 #[cfg(test)]
 mod tests;
 
-pub(super) use compare::{disagreement, end, outcomes};
+pub(super) use compare::{disagreement, end, is_cut, outcomes};
 pub(super) use preconditions::unmet;
 
 use super::story::Real;
@@ -66,6 +66,8 @@ pub(super) enum Fail {
     Wrong(String),
     /// The reference does not evaluate this: there is no verdict on the program.
     NotMine(&'static str),
+    /// The run was told to end here.
+    Cut,
 }
 
 /// What should become of a program.
@@ -115,7 +117,28 @@ struct Reference<'a> {
     /// How regions ended.
     regions: BTreeMap<StateId, String>,
     steps: usize,
+    /// The run is told to end after so many places where an action waits or is under way.
+    cut_after: Option<usize>,
+    /// What was told to end had not been entered.
+    is_outside: bool,
     result: ReferenceResult,
+}
+
+/// Evaluates a program up to a place where the run is told to end, and what is done on the way out. `None` where it ends before.
+///
+/// # Errors
+/// [`Fail::NotMine`].
+pub(super) fn evaluate_cut(given: Given<'_>, after: usize, outcome: &str) -> Result<Option<ReferenceResult>, Fail> {
+    let (mut reference, mut variables) = Reference::of(given);
+    reference.cut_after = Some(after);
+    match reference.task(&mut variables) {
+        Err(Fail::Cut) => {
+            reference.result.outcome = outcome.to_owned();
+            Ok(Some(reference.result))
+        }
+        Err(problem) => Err(problem),
+        Ok(_) => Ok(None),
+    }
 }
 
 /// Evaluates a program from its start to its end.
@@ -123,25 +146,49 @@ struct Reference<'a> {
 /// # Errors
 /// [`Fail::NotMine`].
 pub(super) fn evaluate(given: Given<'_>) -> Result<ReferenceResult, Fail> {
-    let Given { program, seed, parameters, facts, units, refused, outside, signals, oracle } = given;
-    let mut reference = Reference {
-        program,
-        seed,
-        oracle,
-        refused,
-        outside,
-        signals,
-        outputs: BTreeMap::new(),
-        regions: BTreeMap::new(),
-        steps: 0,
-        result: ReferenceResult { facts, units, ..ReferenceResult::default() },
-    };
-    let mut variables: Vec<(String, Value)> = parameters.into_iter().collect();
+    let (mut reference, mut variables) = Reference::of(given);
     reference.result.outcome = reference.task(&mut variables)?;
     Ok(reference.result)
 }
 
+impl<'a> Reference<'a> {
+    /// At the start of a program, with the variables in sight.
+    fn of(given: Given<'a>) -> (Reference<'a>, Vec<(String, Value)>) {
+        let Given { program, seed, parameters, facts, units, refused, outside, signals, oracle } = given;
+        let reference = Reference {
+            program,
+            seed,
+            oracle,
+            refused,
+            outside,
+            signals,
+            outputs: BTreeMap::new(),
+            regions: BTreeMap::new(),
+            steps: 0,
+            cut_after: None,
+            is_outside: false,
+            result: ReferenceResult { facts, units, ..ReferenceResult::default() },
+        };
+        (reference, parameters.into_iter().collect())
+    }
+}
+
 impl Reference<'_> {
+    /// A place where the run may be told to end.
+    fn may_be_cut(&mut self) -> Result<(), Fail> {
+        match &mut self.cut_after {
+            Some(0) => {
+                self.cut_after = None;
+                Err(Fail::Cut)
+            }
+            Some(after) => {
+                *after -= 1;
+                Ok(())
+            }
+            None => Ok(()),
+        }
+    }
+
     fn task(&mut self, variables: &mut Vec<(String, Value)>) -> Result<String, Fail> {
         let program = self.program;
         if program.deadline_s.is_some() {
@@ -199,6 +246,7 @@ impl Reference<'_> {
 fn fails<T>(result: Result<T, Fail>) -> Result<Result<T, Fail>, Fail> {
     match result {
         Err(Fail::NotMine(what)) => Err(Fail::NotMine(what)),
+        Err(Fail::Cut) => Err(Fail::Cut),
         other => Ok(other),
     }
 }

@@ -1,6 +1,7 @@
 //! States that contain others: which state comes next, and what happens when one is left.
 
 use super::evaluate::Read;
+use crate::around;
 use super::{Fail, MAX_STEPS, Outputs, Reference, effects, fails};
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Again, Finally, PREEMPTED, Program, SUCCESS, State, StateKind, Target, VIOLATED};
@@ -11,8 +12,29 @@ use std::collections::BTreeMap;
 type Variables = Vec<(String, Value)>;
 
 impl Reference<'_> {
-    /// Visits a state at a path; its outcome.
+    /// Visits a state at a path; its outcome. Where the run is told to end inside of it, it says what that means, and what is around it goes on.
     pub(super) fn visit(
+        &mut self,
+        id: StateId,
+        path: &str,
+        variables: &mut Variables,
+        in_routine: bool,
+    ) -> Result<String, Fail> {
+        let outside = variables.len();
+        let ended = self.visited(id, path, variables, in_routine);
+        let state = self.program.state(id);
+        let is_composite = !matches!(state.kind, StateKind::Action { .. });
+        if ended == Err(Fail::Cut) && is_composite && !std::mem::take(&mut self.is_outside) {
+            let has_finally = |state: &State| state.annotations.finally.is_some();
+            if !has_finally(state) && around(self.program, state).skip(1).any(has_finally) {
+                self.say_cut_short(state, variables);
+            }
+            variables.truncate(outside);
+        }
+        ended
+    }
+
+    fn visited(
         &mut self,
         id: StateId,
         path: &str,
@@ -35,6 +57,10 @@ impl Reference<'_> {
             return Ok(ABORTED.to_owned());
         }
         let begins_routine = state.is_routine() && !in_routine;
+        if begins_routine && let Err(cut) = self.may_be_cut() {
+            self.is_outside = true;
+            return Err(cut);
+        }
         if begins_routine && fails(self.asks(state, variables))?.is_err() {
             return Ok(ABORTED.to_owned());
         }
@@ -207,13 +233,35 @@ impl Reference<'_> {
         variables: &mut Variables,
         in_routine: bool,
     ) -> Result<String, Fail> {
-        let outcome = self.visit(finally.body, &below(path, "body"), variables, in_routine)?;
+        let outcome = match self.visit(finally.body, &below(path, "body"), variables, in_routine) {
+            Err(Fail::Cut) => return self.cut_lastly(finally, path, variables, "finally_preempted"),
+            ended => ended?,
+        };
         let Some(last) = finally.lastly.get(&outcome) else {
             return Err(Fail::Wrong(format!("nothing is done on the way out by {outcome}")));
         };
         let name = if outcome == SUCCESS { "finally".to_owned() } else { format!("finally_{outcome}") };
-        let last = self.visit(*last, &below(path, &name), variables, in_routine)?;
+        let last = match self.visit(*last, &below(path, &name), variables, in_routine) {
+            Err(Fail::Cut) if outcome == PREEMPTED => {
+                return self.cut_lastly(finally, path, variables, "finally_preempted#2");
+            }
+            Err(Fail::Cut) => return self.cut_lastly(finally, path, variables, "finally_preempted"),
+            ended => ended?,
+        };
         Ok(if last == SUCCESS { outcome } else { last })
+    }
+
+    /// It is done, whatever comes of it, in no routine any more; then what is around is left.
+    fn cut_lastly(
+        &mut self,
+        finally: &Finally,
+        path: &str,
+        variables: &mut Variables,
+        name: &str,
+    ) -> Result<String, Fail> {
+        let Some(last) = finally.lastly.get(PREEMPTED) else { return Err(Fail::Cut) };
+        if std::env::var_os("RATN_MUTANT").is_none() { fails(self.visit(*last, &below(path, name), variables, false))?.ok(); }
+        Err(Fail::Cut)
     }
 
     #[expect(clippy::too_many_arguments, reason = "all of it is one loop")]
