@@ -291,7 +291,7 @@ impl Executive {
                     self.state = State::Leaving(Box::new(leaving));
                     None
                 }
-                Err(end) => Some(end),
+                Err(end) => Some(*end),
             },
             end => end,
         };

@@ -110,13 +110,13 @@ pub(crate) struct Leaving {
 
 impl Leaving {
     /// Begins; the end, if nothing is to be waited for.
-    pub(crate) fn begin(context: &mut Context<'_>, mut end: End) -> Result<Leaving, End> {
+    pub(crate) fn begin(context: &mut Context<'_>, mut end: End) -> Result<Leaving, Box<End>> {
         let WayOut { scopes, mut steps, hold } = std::mem::take(&mut end.way_out);
         steps.sort_by_key(|step| (step.depth, std::cmp::Reverse(step.state)));
         let until = context.now + Duration::from_secs(LIMIT_S);
         let mut leaving = Leaving { end, steps, scopes, hold, current: None, until };
         match leaving.go_on(context) {
-            Some(end) => Err(end),
+            Some(end) => Err(Box::new(end)),
             None => {
                 context.commands.push(Command::Wake { at: until });
                 Ok(leaving)

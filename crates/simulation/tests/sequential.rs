@@ -180,3 +180,28 @@ fn what_a_task_waits_for_comes_and_a_wait_is_not_said_to_lack_annotations() {
     let refused = check("task: t\nstates:\n  - cup: { wait: { for: exists at(cup) } }\n").unwrap_err();
     assert!(refused.to_string().contains("what makes `exists at(cup)` hold of cup is not known"), "{refused}");
 }
+
+#[test]
+fn a_task_that_does_nothing_for_ever_between_two_events_is_given_up_before_memory_is() {
+    let text = "task: t
+states:
+  - for: x in range(1, 9000)
+    do:
+      - go: { action: arm/move, in: { a: 1 }, pia: true, reads: [], effects: [], resources: [{ block: Arm }] }
+      - for: y in range(1, 9900)
+        do:
+          - condition: $y > 0
+            then: []
+            else: []
+";
+    let program = load(text, "task.yaml", &NoFiles);
+    let assumptions = Assumptions {
+        parameters: program.bind_parameters(&[]).unwrap(),
+        elements: 2,
+        durations_s: BTreeMap::new(),
+        units: BTreeMap::new(),
+        attributes: BTreeMap::new(),
+    };
+    let said = makespan_s(&program, &catalogue(), &assumptions, 2_000).unwrap_err().to_string();
+    assert!(said.contains("no end after 40000 lines of its event log"), "{said}");
+}

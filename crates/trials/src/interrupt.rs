@@ -27,7 +27,7 @@ use std::sync::Arc;
 pub fn trial_interrupted(program: &Arc<Program>, conditions: &Conditions) -> Verdict {
     let whole = match execute_under(program, conditions, Mode::Hsm, max_hsm_events(program), Vec::new()) {
         Ok(run) => run,
-        Err(RunError::Endless(_)) => return Verdict::LeftOut,
+        Err(RunError::Endless(_) | RunError::TooLong(_)) => return Verdict::LeftOut,
         Err(problem) => return Verdict::Differs(format!("HSM mode: {problem}")),
     };
     let mut dice = Dice(conditions.seed ^ 0x1e77_0b7e);

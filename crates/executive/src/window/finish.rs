@@ -23,7 +23,7 @@ impl Window {
         };
         let (id, attempt) = (*id, *attempt);
         if self.improving.is(id, attempt) {
-            return self.improvement_ended(context, id, event);
+            return self.improvement_ended(context, id);
         }
         let node = self.graph.node(id).filter(|node| node.attempt == attempt);
         match (event, node.map(|node| &node.status)) {

@@ -15,7 +15,7 @@ use super::improving::Improvement;
 use super::waits::Timer;
 use crate::binding::{self, Outputs};
 use crate::context::Context;
-use crate::protocol::{Command, Event};
+use crate::protocol::Command;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{SUCCESS, StateKind};
 
@@ -53,13 +53,8 @@ impl Window {
         asking.into_iter().for_each(|id| self.make_room(context, id));
     }
 
-    /// A goal whose result is there has ended: with its best, or without another word.
-    pub(super) fn improvement_ended(&mut self, context: &mut Context<'_>, id: InstanceId, event: Event) {
-        if let Event::Finished { outcome, outputs, .. } = event
-            && outcome == SUCCESS
-        {
-            self.keep_best(context, id, outputs);
-        }
+    /// A goal whose result is there has ended, however: what it gave last counts.
+    pub(super) fn improvement_ended(&mut self, context: &mut Context<'_>, id: InstanceId) {
         if let Some(improvement) = self.settle_best(id) {
             release(context, id, &improvement);
         }

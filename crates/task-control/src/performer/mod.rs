@@ -41,7 +41,7 @@ use ratn_worker::session::{DEFAULT_TTL, Session};
 use ratn_worker::trace::{self, TraceContext};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
-use std::sync::{Arc, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::{JoinHandle, JoinSet};
@@ -523,6 +523,7 @@ impl Performer {
             channels: self.channels.clone(),
             events: self.events.clone(),
             stop: stop.clone(),
+            results: Mutex::default(),
             goal: types::Goal {
                 id: format!("{}/{instance}/{attempt}", self.run),
                 action: goal.action.to_string(),
@@ -534,7 +535,8 @@ impl Performer {
                 world_pool: self.world.endpoint().to_string(),
                 deadline_ms: goal::deadline_ms(goal.timeout_s, self.speed),
                 grace_ms: goal::GRACE_MS,
-                improves: goal.improves.map(Vec::from),
+                // What others may want is not held only to improve a result.
+                improves: goal.improves.filter(|_| !self.told.has_others()).map(Vec::from),
             },
         };
         let ended = tokio::spawn(trace::within(self.of(instance), performing.perform(given)));

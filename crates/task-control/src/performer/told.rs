@@ -106,6 +106,11 @@ impl Told {
         self.0.send_modify(|heard| heard.has_others = true);
     }
 
+    /// Whether another run is, or was, under way beside this one.
+    pub(super) fn has_others(&self) -> bool {
+        self.0.borrow().has_others
+    }
+
     /// Waits for so long, and until another run is known of.
     pub(super) async fn others_after(&self, time: Duration) {
         tokio::time::sleep(time).await;
