@@ -6,7 +6,7 @@
 //! |---|---|
 //! | the user ends the run when a PIA starts, no regions | both modes end alike: PIAs, changes, world, outcome |
 //! | the same with regions; at any moment; a deadline | of each mode: its PIAs are a closed part of those of HSM mode undisturbed, with the same goals and in its order; its changes are, predicate by predicate, the first of HSM mode's; without regions, they are its first changes in one order; the outcome is `preempted`, or `aborted` at the deadline, or the run had ended before, as ever |
-//! | the same of a program with something to do on every way out | of each mode, without regions: there is a place of the program at which the reference, told to end there, does the same PIAs with the same goals, the same changes, and leaves the same world; with regions, the outcome |
+//! | the same of a program with something to do on every way out | of each mode: there is a place of the program, or one in each region, at which the reference, told to end there, does the same PIAs with the same goals, the same changes, and leaves the same world; with races of regions, the outcome |
 //! | the world changes at any moment | see [`super::outside`] |
 //!
 //! That nothing is left over in any of them the simulation checks by itself.
@@ -104,13 +104,12 @@ fn leaves_otherwise(
     part: &Run,
     outcome: &str,
 ) -> Option<String> {
-    let has_regions = program.states.iter().any(|state| matches!(state.kind, StateKind::Concurrency { .. }));
     let is_cut = part.outcome == outcome && part.outputs.is_empty();
     if !is_cut {
         let races = program.states.iter().any(is_preemptive);
         return (!races).then(|| same_end(whole, part)).flatten();
     }
-    if has_regions || is_long(program) || part.reason.contains("its way out took longer") {
+    if is_long(program) || part.reason.contains("its way out took longer") {
         return None;
     }
     let told = story(program, part);
@@ -119,7 +118,10 @@ fn leaves_otherwise(
     let is_otherwise = known == Some(false) && same_end(whole, part).is_some();
     is_otherwise.then(|| {
         let acts: Vec<&str> = told.acts.iter().map(|act| act.path.as_str()).collect();
-        format!("there is no place at which a run that is told to end does this: {acts:?} {:?} {:?}", told.changes, part.reason)
+        format!(
+            "there is no place at which a run that is told to end does this: {acts:?} {:?} {:?}",
+            told.changes, part.reason
+        )
     })
 }
 

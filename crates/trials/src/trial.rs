@@ -203,15 +203,17 @@ pub(super) fn is_cut_somewhere(
     story: &Story,
     outcome: &str,
 ) -> Option<bool> {
-    const MOST_PLACES: usize = 400;
-    for after in 0..MOST_PLACES {
+    const MOST_PLACES: usize = 2_000;
+    let mut choices = reference::Choices::default();
+    for _ in 0..MOST_PLACES {
         let mut oracle = oracle(program, conditions);
-        match reference::evaluate_cut(given(program, conditions, &[], &mut oracle), after, outcome) {
-            Ok(Some(wanted)) if reference::is_cut(program, &wanted, run, story) => return Some(true),
-            Ok(Some(_)) => {}
-            Ok(None) => return Some(false),
-            Err(_) => return None,
+        let given = given(program, conditions, &[], &mut oracle);
+        let (wanted, made) = reference::evaluate_cut(given, choices, outcome).ok()?;
+        if wanted.is_some_and(|wanted| reference::is_cut(program, &wanted, run, story)) {
+            return Some(true);
         }
+        let Some(next) = made.next() else { return Some(false) };
+        choices = next;
     }
     None
 }

@@ -95,8 +95,9 @@ impl Reference<'_> {
             self.may_be_cut()?;
             let (goal, performance) = self.perform(state, path, variables, tries, attempt)?;
             *inputs = goal.inputs;
-            if let Err(cut) = self.may_be_cut() {
-                if is_irreversible(state) {
+            let seconds = performance.duration_s.min(annotations.timeout_s.unwrap_or(f64::INFINITY));
+            if let Err(cut) = self.may_be_cut().and_then(|()| self.takes(seconds)) {
+                if cut == Fail::Cut && (is_irreversible(state) || self.has_lost()) {
                     self.say_cut_short(state, variables);
                 }
                 return Err(cut);
@@ -131,12 +132,11 @@ impl Reference<'_> {
         }
     }
 
-    /// What a state says of being cut short is true, where it has a value.
+    /// What a state says of being cut short is true, where it has a value and is allowed.
     pub(super) fn say_cut_short(&mut self, state: &State, variables: &[(String, Value)]) {
         let Some(declared) = state.annotations.effects.get(PREEMPTED) else { return };
         let changes = effects::bound(declared, &self.place(variables, Some(&Outputs::new())));
-        // What has none, or is not allowed, is not said.
-        let _ = changes.and_then(|changes| self.change(changes));
+        self.races.has_failed |= changes.and_then(|changes| self.change(changes)).is_err();
     }
 
     /// Whether something does not hold that has to while it goes on.

@@ -57,6 +57,7 @@ impl Reference<'_> {
                         None => drop(self.result.facts.remove(&key)),
                     }
                 }
+                self.is_watched()?;
                 if condition.is_true(&self.place(variables, None))? {
                     return Ok((SUCCESS.to_owned(), Outputs::new()));
                 }
