@@ -58,7 +58,8 @@ pub struct Features {
     pub finds: bool,
     /// Actions whose results get better after they were given.
     pub anytime: bool,
-    /// Something is done on every way out of states inside of races and regions, too, and being cut short changes the world.
+    /// Limits of composites, and races whose regions touch nothing of each other; something is done on every way out of states inside of
+    /// these and of regions, and being cut short changes the world.
     pub ways_out: bool,
 }
 

@@ -11,7 +11,7 @@
 //! | what is said of a state | `annotations`, `variables`, `supplies`, `estimates` |
 //! | facts | `facts`, `effects`, `tolerance` |
 //!
-//! What it does not make: limits of composites; waits in races and beside imprecise motions, conditions of waits with keys that are not constants (scenarios of the
+//! What it does not make: limits of what is beside others or holds a race; waits in races and beside imprecise motions, conditions of waits with keys that are not constants (scenarios of the
 //! simulation have them); hierarchies and concurrencies with tolerated facts or port keys in their effects; numbers within a
 //! tolerance that add up, or that are looked up by anything that compares exactly; individuals of classes (ontologies declare
 //! numbers and things); values that are poses, joint positions or trajectories; selectors of task resources; task resources and

@@ -6,7 +6,7 @@
 //! |---|---|
 //! | the user ends the run when a PIA starts, no regions | both modes end alike: PIAs, changes, world, outcome |
 //! | the same with regions; at any moment; a deadline | of each mode: its PIAs are a closed part of those of HSM mode undisturbed, with the same goals and in its order; its changes are, predicate by predicate, the first of HSM mode's; without regions, they are its first changes in one order; the outcome is `preempted`, or `aborted` at the deadline, or the run had ended before, as ever |
-//! | the same of a program with something to do on every way out | of each mode: there is a place of the program, or one in each region, at which the reference, told to end there, does the same PIAs with the same goals, the same changes, and leaves the same world; with races of regions, the outcome |
+//! | the same of a program with something to do on every way out, or that says what being cut short means | of each mode: there is a place of the program, or one in each region, at which the reference, told to end there, does the same PIAs with the same goals, the same changes, and leaves the same world; with races of regions, the outcome |
 //! | the world changes at any moment | see [`super::outside`] |
 //!
 //! That nothing is left over in any of them the simulation checks by itself.
@@ -19,7 +19,7 @@ use super::trial::{
 use super::{Dice, is_long, is_preemptive};
 use ratn_executive::protocol::{Command, Event, LogEntry, Mode};
 use ratn_model::fact::Change;
-use ratn_model::program::{ABORTED, PREEMPTED, Program, StateKind};
+use ratn_model::program::{ABORTED, PREEMPTED, Program, State, StateKind};
 use ratn_simulation::run::{Run, RunError, Trigger};
 use std::sync::Arc;
 
@@ -80,7 +80,10 @@ fn parts_of(
             Ok(run) => run,
             Err(problem) => return Verdict::Differs(format!("{mode:?} mode, interrupted: {problem}")),
         };
-        let problem = match program.states.iter().any(|state| state.annotations.finally.is_some()) {
+        let changes =
+            |state: &State| state.annotations.effects.get(PREEMPTED).is_some_and(|effects| !effects.is_empty());
+        let is_otherwise = |state: &State| state.annotations.finally.is_some() || changes(state);
+        let problem = match program.states.iter().any(is_otherwise) {
             true => leaves_otherwise(unlimited, conditions, whole, &part, outcome),
             false => is_no_part(program, whole, &part, outcome),
         };

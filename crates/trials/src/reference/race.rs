@@ -74,9 +74,13 @@ impl Beside {
     }
 
     /// All of them have ended.
-    pub(super) fn end(mut self, reference: &mut Reference<'_>) -> Result<(), Fail> {
+    pub(super) fn end(mut self, reference: &mut Reference<'_>, regions: usize) -> Result<(), Fail> {
         self.begin(reference);
         reference.races.now_s = self.end_s;
+        if self.cut.is_none() && regions > 1 && reference.is_broken() {
+            // What made a condition false may have been done while another region went on.
+            return Err(Fail::NotMine("regions that are watched"));
+        }
         let Some(cut) = self.cut else { return Ok(()) };
         reference.races.has_failed |= self.has_failed;
         Err(reference.cut(cut))
@@ -113,6 +117,11 @@ impl Reference<'_> {
             }
         }
         Ok(())
+    }
+
+    /// Whether a condition of what is around does not hold any more.
+    fn is_broken(&self) -> bool {
+        !self.is_leaving && self.races.watches.iter().flatten().any(|watch| self.broken(watch) != Ok(None))
     }
 
     /// Something goes on for so long.
@@ -354,12 +363,12 @@ impl Reference<'_> {
             self.races.has_failed |= regions.iter().any(|region| region.cut.is_some() && region.has_failed);
             return Ok(());
         }
-        if is_leaving || !regions.iter().any(is_inner) {
+        if regions.len() == 1 && !regions.iter().any(is_inner) {
             return Ok(());
         }
         // What is around may be decided, or broken, while this is on its way out.
-        let is_late = self.races.until.is_some_and(|(until_s, _)| end_s + CLOSE_S > until_s);
-        if is_late || self.races.watches.clone().iter().flatten().any(|watch| self.broken(watch) != Ok(None)) {
+        let is_late = !is_leaving && self.races.until.is_some_and(|(until_s, _)| end_s + CLOSE_S > until_s);
+        if is_late || self.is_broken() {
             return Err(Fail::NotMine("a race that is cut short on its way out"));
         }
         Ok(())
