@@ -86,13 +86,14 @@ impl Reference<'_> {
         let annotations = &state.annotations;
         loop {
             self.meets(state, &variables.to_vec())?;
+            // It waits for what it asks for, be it refused, and for what it sees.
+            self.may_be_cut()?;
             if !in_routine {
                 self.asks(state, variables)?;
             }
             if self.is_violated(state, variables)? {
                 return Ok(violated(false));
             }
-            self.may_be_cut()?;
             let (goal, performance) = self.perform(state, path, variables, tries, attempt)?;
             *inputs = goal.inputs;
             let seconds = performance.duration_s.min(annotations.timeout_s.unwrap_or(f64::INFINITY));
