@@ -20,8 +20,6 @@ use std::path::{Path, PathBuf};
 
 /// How many elements a list has that an action answers, as `ratn check` assumes.
 const ASSUMED_ELEMENTS: usize = 3;
-/// What a change gains is simulated up to so many events: about two seconds.
-const MAX_EVENTS: usize = 20_000;
 
 /// Serves the pages until the user has seen enough.
 pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(), Failure> {
@@ -79,10 +77,10 @@ fn editing(file: &Path, directory: &Path) -> Result<Editing, Failure> {
     let kinds = config.catalogue.resources.keys().cloned().collect();
     let (catalogue, name) = (config.catalogue.clone(), file.display().to_string());
     let check = move |text: &str| load_with(text, &name, &catalogue, &input::Libraries);
-    let makespan = move |program: &Program| {
+    let makespan = move |program: &Program, goes_on: &dyn Fn() -> bool| {
         let parameters = program.bind_parameters(&[]).map_err(|error| error.to_string())?;
         let assumptions = Assumptions { parameters, ..assumptions.clone() };
-        makespan_s(program, &config.catalogue, &assumptions, MAX_EVENTS).map_err(|obstacle| obstacle.to_string())
+        makespan_s(program, &config.catalogue, &assumptions, goes_on).map_err(|obstacle| obstacle.to_string())
     };
     Ok(Editing::of(file.to_owned(), kinds, check, makespan))
 }

@@ -27,13 +27,26 @@ export type Draft = Map<string, { said: boolean; items: string[] }>;
 const DEBOUNCE_MS = 350;
 const ABOUT: Record<string, string> = {
   computes: "it only computes, and may run early, twice, or for nothing",
+  pia: "it may change the environment: as every action that says neither this nor one of the two above",
   reads: "the facts that it depends on; scene for those that geometry comes from",
   senses: "the facts that must be as at its place when it looks",
   requires: "conditions that must hold before it begins",
   effects: "what it changes: at(cup) = pose, not hand_empty(gripper)",
   resources: "what it asks of the resource manager: { block: Arm }",
   duration: "an estimate, in the robot's seconds",
+  attempts: "how often it is tried when its worker dies, if it computes or senses",
+  deterministic: "the same inputs and facts always give the same result",
+  routine: "it and what it contains are one node, under one lease",
+  exceptional: "outcomes that are not followed ahead, although they are connected: aborted",
+  exceptions: "imprecise: younger PIAs may run beside it",
+  shared: "of a region: facts that the regions beside it may touch, too",
 };
+/** Of those that few states say, shown only when they are wanted. */
+const RARE = ["attempts", "deterministic", "routine", "exceptional", "exceptions", "shared"];
+/** What a key is as soon as it is said. */
+const FIRST: Record<string, string> = { computes: "true", pia: "true", attempts: "3", deterministic: "true", routine: "true", exceptional: "aborted", exceptions: "imprecise" };
+/** More words are no help. */
+const MOST_WORDS = 500;
 
 export function draftOf(state: AnnotatedState): Draft {
   return new Map(state.keys.map((one) => [one.key, { said: one.said, items: [...one.items] }]));
@@ -78,27 +91,57 @@ export function gainText(gained: Gained): string {
   return `What it gains cannot be said: ${obstacle}.${known}`;
 }
 
+type Words = Pick<Annotations, "kinds" | "predicates" | "entities">;
+
 /** Words for completion under a key. */
-export function wordsFor(key: string, all: Pick<Annotations, "kinds" | "predicates" | "entities">): string[] {
+export function wordsFor(key: string, all: Words): string[] {
   const { kinds, predicates, entities } = all;
-  switch (key) {
-    case "computes":
-      return ["true", "false"];
-    case "resources":
-      return ["world_model", ...["block", "consume", "exists"].flatMap((verb) => kinds.map((kind) => `{ ${verb}: ${kind} }`))];
-    case "reads":
-    case "senses": {
-      const facts = predicates.flatMap((one) => [one, ...(/^[^(]+\(\?\)$/.test(one) ? entities.map((entity) => one.replace("?", entity)) : [])]);
-      return key === "reads" ? ["scene", ...facts] : facts;
+  // Of predicates with several places each is completed as it is typed.
+  const facts = predicates.flatMap((one) => (/^[^(]+\(\?\)$/.test(one) ? entities.map((entity) => one.replace("?", entity)) : []));
+  const words = (): string[] => {
+    switch (key) {
+      case "computes":
+      case "pia":
+      case "deterministic":
+      case "routine":
+        return ["true", "false"];
+      case "exceptions":
+        return ["imprecise", "precise"];
+      case "exceptional":
+        return ["aborted", "violated"];
+      case "resources":
+        return ["world_model", ...["block", "consume", "exists"].flatMap((verb) => kinds.map((kind) => `{ ${verb}: ${kind} }`))];
+      case "reads":
+        return ["scene", ...predicates, ...facts];
+      case "senses":
+      case "shared":
+        return [...predicates, ...facts];
+      case "effects":
+        return [...predicates, ...facts, ...[...predicates, ...facts].map((fact) => `not ${fact}`)];
+      case "requires":
+        return [...predicates, ...facts, ...[...predicates, ...facts].map((fact) => `exists ${fact}`)];
+      default:
+        return [];
     }
-    case "effects":
-    case "requires": {
-      const facts = predicates.flatMap((one) => (/^[^(]+\(\?\)$/.test(one) ? entities.map((entity) => one.replace("?", entity)) : [one]));
-      return key === "requires" ? [...facts, ...facts.map((fact) => `exists ${fact}`)] : [...facts, ...facts.map((fact) => `not ${fact}`)];
-    }
-    default:
-      return [];
-  }
+  };
+  return words().slice(0, MOST_WORDS);
+}
+
+/** What may follow what was typed under a key: within the brackets of a predicate, the individuals of the place that is typed. */
+export function completions(key: string, typed: string, all: Words): string[] {
+  const open = /(?:^|[^\w])(\w+)\(([^()]*)$/.exec(typed);
+  const predicate = all.predicates.find((one) => open !== null && one.startsWith(`${open[1]}(`));
+  if (open === null || predicate === undefined) return wordsFor(key, all);
+  const places = predicate.split(",").length;
+  const given = (open[2] ?? "").split(",");
+  if (given.length > places) return [];
+  const last = (given[given.length - 1] ?? "").trimStart();
+  const begun = typed.slice(0, typed.length - last.length);
+  const space = begun.endsWith(",") && last === "" ? " " : "";
+  const end = given.length < places ? ", " : ")";
+  // Whatever is looked at may be meant: of effects only what `not` takes away.
+  const any = key === "requires" || (key === "effects" && !/\b(not|delete)\b/.test(typed)) ? [] : ["?"];
+  return [...all.entities, ...any].slice(0, MOST_WORDS).map((one) => `${begun}${space}${one}${end}`);
 }
 
 function findingsList(findings: Finding[], where: boolean): HTMLElement | null {
@@ -237,8 +280,9 @@ export function annotationsPage(desk: Desk): Page {
       fill(form, title, h("p", { class: "warn" }, now.fixed), h("ul", { class: "plain" }, ...rows));
       return;
     }
-    const words = now.keys.map((one) => h("datalist", { id: `words-${one.key}` }, ...wordsFor(one.key, all ?? { kinds: [], predicates: [], entities: [] }).map((value) => h("option", { value }))));
-    fill(form, title, h("div", { id: "of-state" }), ...now.keys.map((one) => field(one, now)), ...words, h("div", { class: "row" }, save, undo, again));
+    const [rare, common] = [now.keys.filter((one) => RARE.includes(one.key)), now.keys.filter((one) => !RARE.includes(one.key))];
+    const more = h("details", { open: rare.some((one) => one.said) }, h("summary", {}, "More annotations"), ...rare.map((one) => field(one, now)));
+    fill(form, title, h("div", { id: "of-state" }), ...common.map((one) => field(one, now)), rare.length === 0 ? null : more, h("div", { class: "row" }, save, undo, again));
   }
 
   function field(one: AnnotationKey, now: AnnotatedState): HTMLElement {
@@ -248,6 +292,9 @@ export function annotationsPage(desk: Desk): Page {
     const force = h("div", {});
     fields.set(one.key, { findings, force });
     fill(force, inForce(now.in_force, one.key));
+    const words = h("datalist", { id: `words-${one.key}` });
+    const offer = (typed: string) => fill(words, ...completions(one.key, typed, all ?? { kinds: [], predicates: [], entities: [] }).map((value) => h("option", { value })));
+    offer("");
     const own = h("input", { type: "checkbox", checked: said.said, "data-key": `said ${one.key}` });
     const input = (item: string, index: number) => {
       const box = h("input", {
@@ -260,8 +307,10 @@ export function annotationsPage(desk: Desk): Page {
         "aria-describedby": `findings-${one.key}`,
         "data-key": `${one.key} ${index}`,
         disabled: !said.said,
+        onfocus: () => offer(box.value),
         oninput: () => {
           said.items[index] = box.value;
+          offer(box.value);
           edited();
         },
       });
@@ -302,13 +351,13 @@ export function annotationsPage(desk: Desk): Page {
     }
     own.addEventListener("change", () => {
       said.said = own.checked;
-      if (said.said && said.items.length === 0) said.items.push(one.key === "computes" ? "true" : "");
+      if (said.said && said.items.length === 0) said.items.push(FIRST[one.key] ?? "");
       showItems();
       edited();
     });
     draft.set(one.key, said);
     showItems();
-    return h("fieldset", {}, h("legend", {}, h("label", {}, own, ` ${one.key}`)), h("p", { class: "faint" }, ABOUT[one.key] ?? ""), items, add, findings, force);
+    return h("fieldset", {}, h("legend", {}, h("label", {}, own, ` ${one.key}`)), h("p", { class: "faint" }, ABOUT[one.key] ?? ""), items, add, words, findings, force);
   }
 
   function showFindings(all: Finding[]): void {

@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { changesOf, draftOf, gainText, sorted, wordsFor } from "../src/annotations.ts";
+import { changesOf, completions, draftOf, gainText, sorted, wordsFor } from "../src/annotations.ts";
 
 const key = (name, items = null) => ({ key: name, said: items !== null, items: items ?? [], listed: name !== "duration" });
 const state = { path: "a/b", depth: 1, form: "action: x/y", line: 3, fixed: "", in_force: [], keys: [key("reads", ["at(table)"]), key("effects"), key("duration", ["2"])] };
@@ -41,8 +41,23 @@ test("what is gained is said, and why it is not", () => {
 test("words are completed from the catalogue and the ontology", () => {
   const all = { kinds: ["Arm"], predicates: ["at(?)", "on(?, ?)"], entities: ["cup"] };
   assert.ok(wordsFor("resources", all).includes("{ block: Arm }"));
-  assert.deepEqual(wordsFor("reads", all), ["scene", "at(?)", "at(cup)", "on(?, ?)"]);
+  assert.deepEqual(wordsFor("reads", all), ["scene", "at(?)", "on(?, ?)", "at(cup)"]);
   assert.ok(wordsFor("effects", all).includes("not at(cup)"));
   assert.deepEqual(wordsFor("computes", all), ["true", "false"]);
   assert.deepEqual(wordsFor("duration", all), []);
+});
+
+test("within a predicate's brackets the individuals of each place are offered", () => {
+  const all = { kinds: [], predicates: ["at(?)", "on(?, ?)"], entities: ["cup", "table"] };
+  assert.deepEqual(completions("reads", "", all), wordsFor("reads", all));
+  assert.deepEqual(completions("reads", "at(", all), ["at(cup)", "at(table)", "at(?)"]);
+  assert.deepEqual(completions("reads", "on(c", all), ["on(cup, ", "on(table, ", "on(?, "]);
+  assert.deepEqual(completions("reads", "on(cup, ", all), ["on(cup, cup)", "on(cup, table)", "on(cup, ?)"]);
+  assert.deepEqual(completions("reads", "on(cup,", all), ["on(cup, cup)", "on(cup, table)", "on(cup, ?)"]);
+  assert.deepEqual(completions("reads", "on(cup,ta", all), ["on(cup,cup)", "on(cup,table)", "on(cup,?)"], "what was typed stays");
+  assert.deepEqual(completions("requires", "exists on(cup, table) and at(", all), ["exists on(cup, table) and at(cup)", "exists on(cup, table) and at(table)"]);
+  assert.deepEqual(completions("effects", "at(", all), ["at(cup)", "at(table)"]);
+  assert.deepEqual(completions("effects", "not on(cup, ", all), ["not on(cup, cup)", "not on(cup, table)", "not on(cup, ?)"]);
+  assert.deepEqual(completions("reads", "on(cup, table, ", all), [], "it has two places");
+  assert.deepEqual(completions("reads", "compose(", all), wordsFor("reads", all), "no predicate");
 });

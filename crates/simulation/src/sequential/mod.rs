@@ -10,7 +10,7 @@ mod providers;
 
 pub use chain::Link;
 
-use crate::run::{Circumstances, Run, RunError, Setup, run_under};
+use crate::run::{Circumstances, Run, RunError, Setup, run_while};
 use annotate::{annotated, missing};
 use providers::AssumedProviders;
 use ratn_executive::protocol::{Command, LogEntry};
@@ -152,8 +152,8 @@ pub fn sequential(program: &Program, catalogue: &Catalogue, assumptions: &Assump
     })
 }
 
-/// How long a checked program takes as a dataflow network, in seconds, with what is assumed. It is given up after so many events, which bounds
-/// how long that takes.
+/// How long a checked program takes as a dataflow network, in seconds, with what is assumed. It is simulated as long as `goes_on` says so, which is
+/// asked before every event.
 ///
 /// # Errors
 /// [`Obstacle`] where the task does not come to a successful end with what is assumed.
@@ -161,9 +161,9 @@ pub fn makespan_s(
     program: &Program,
     catalogue: &Catalogue,
     assumptions: &Assumptions,
-    max_events: usize,
+    goes_on: &dyn Fn() -> bool,
 ) -> Result<f64, Obstacle> {
-    simulate_up_to(program, catalogue, assumptions, Mode::Cdtn, &mut BTreeSet::new(), max_events).map(|run| run.end_s)
+    simulate_while(program, catalogue, assumptions, Mode::Cdtn, &mut BTreeSet::new(), goes_on).map(|run| run.end_s)
 }
 
 /// The states whose failure is handled and could be exceptional, with what that gains.
@@ -237,17 +237,16 @@ fn simulate(
     mode: Mode,
     unknown: &mut BTreeSet<String>,
 ) -> Result<Run, Obstacle> {
-    let max_events = Circumstances::default().max_events;
-    simulate_up_to(program, catalogue, assumptions, mode, unknown, max_events)
+    simulate_while(program, catalogue, assumptions, mode, unknown, &|| true)
 }
 
-fn simulate_up_to(
+fn simulate_while(
     program: &Program,
     catalogue: &Catalogue,
     assumptions: &Assumptions,
     mode: Mode,
     unknown: &mut BTreeSet<String>,
-    max_events: usize,
+    goes_on: &dyn Fn() -> bool,
 ) -> Result<Run, Obstacle> {
     let name = match mode {
         Mode::Hsm => "HSM",
@@ -273,9 +272,9 @@ fn simulate_up_to(
         latency: Duration::ZERO,
     };
     let mut providers = AssumedProviders::new(&program, assumptions);
-    let circumstances =
-        Circumstances { attributes: assumptions.attributes.clone(), max_events, ..Circumstances::default() };
-    let run = run_under(setup, &mut providers, circumstances).map_err(|source| Obstacle::Run { mode: name, source })?;
+    let circumstances = Circumstances { attributes: assumptions.attributes.clone(), ..Circumstances::default() };
+    let run = run_while(setup, &mut providers, circumstances, goes_on);
+    let run = run.map_err(|source| Obstacle::Run { mode: name, source })?;
     unknown.extend(providers.unknown_durations());
     if run.outcome == SUCCESS {
         Ok(run)

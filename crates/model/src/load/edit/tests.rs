@@ -57,7 +57,10 @@ fn frame(old: &str, new: &str) -> (usize, usize) {
 /// Values that a key may have, short and long ones, in other words than any example.
 fn values(key: &str) -> Vec<Option<Document>> {
     let texts: &[&str] = match key {
-        "computes" => &["true", "false"],
+        "computes" | "pia" | "deterministic" | "routine" => &["true", "false"],
+        "attempts" => &["5", "1"],
+        "exceptional" => &["[aborted]", "[violated, aborted]"],
+        "exceptions" => &["imprecise", "precise"],
         "duration" => &["3.25", "\"max($i, 2)\""],
         "resources" => {
             &["[{ block: Other }]", "[world_model, { create: Made, class: task, with: { what: \"a: b\" } }]"]
