@@ -154,6 +154,11 @@ impl Logs {
         self.at(id, &Asked::default(), |fold, _, _| (PathBuf::from(&fold.run.file), fold.digest.clone()))
     }
 
+    /// What a log says of its robot; nothing in one of an earlier version.
+    pub(crate) fn robot(&self, id: u64) -> Result<String, NotTold> {
+        self.at(id, &Asked::default(), |fold, _, _| fold.run.robot.clone())
+    }
+
     /// The world of a log at a moment.
     pub(crate) fn world(&self, id: u64, asked: &Asked, filter: &str) -> Result<wire::World, NotTold> {
         self.at(id, asked, |fold, _, _| {

@@ -20,25 +20,25 @@ const MOST_CHARACTERS: usize = 200;
 /// The posture in which a cell begins.
 const HOME: &str = "home";
 
-/// How the robot of the logs is known: the robot, and whence, or why it is not known. It may read files.
+/// How the robot of a log is known: the robot, and whence, or why it is not known. It may read files.
 #[derive(Clone)]
 pub struct Robots(Arc<Load>);
 
-type Load = dyn Fn() -> Result<(Robot, String), String> + Send + Sync;
+type Load = dyn Fn(&str) -> Result<(Robot, String), String> + Send + Sync;
 
 impl Robots {
-    /// Loads it so. Beside the robot stands whence it is known, in a few words.
-    pub fn by(load: impl Fn() -> Result<(Robot, String), String> + Send + Sync + 'static) -> Robots {
+    /// Loads it so, given what the log says of it: a name or a path, or nothing. Beside the robot stands whence it is known, in a few words.
+    pub fn by(load: impl Fn(&str) -> Result<(Robot, String), String> + Send + Sync + 'static) -> Robots {
         Robots(Arc::new(load))
     }
 
     /// None is known.
     pub fn none() -> Robots {
-        Robots::by(|| Err("no robot was named".to_owned()))
+        Robots::by(|_| Err("no robot was named".to_owned()))
     }
 
-    pub(crate) fn load(&self) -> Result<Shown, String> {
-        (self.0)().and_then(|(robot, whence)| Shown::of(&robot, whence))
+    pub(crate) fn load(&self, of_log: &str) -> Result<Shown, String> {
+        (self.0)(of_log).and_then(|(robot, whence)| Shown::of(&robot, whence))
     }
 }
 

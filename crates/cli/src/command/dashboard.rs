@@ -95,19 +95,34 @@ fn catalogue(directory: &Path) -> Result<Catalogue, Failure> {
     Ok(config(directory)?.catalogue)
 }
 
-/// The robot that the user names, else that of the system that runs, or ran, in a directory, else the one that is built in. A log does not say
-/// which one it is of; what it moves is held against the robot.
+/// The robot that the user names, else the one that the log names. Of a log that names none, that of the system that runs, or ran, in a directory,
+/// else the one that is built in. What the log moves is held against the robot.
 fn robots(directory: PathBuf, named: Option<String>) -> Robots {
-    Robots::by(move || {
-        let own = SystemConfig::read(&directory.join(CONFIG_FILE)).ok().map(|config| config.robot);
-        let (robot, whence) = match (&named, own) {
-            (Some(named), _) => (named.clone(), "as --robot says".to_owned()),
-            (None, Some(own)) => (own, format!("the robot of the system in {}", directory.display())),
-            (None, None) => (SystemConfig::default().robot, "the built-in robot: --robot names another one".to_owned()),
+    Robots::by(move |of_log| {
+        let own = || SystemConfig::read(&directory.join(CONFIG_FILE)).ok().map(|config| config.robot);
+        if let Some(named) = &named {
+            return Ok((robot(named)?, "as --robot says".to_owned()));
+        }
+        if !of_log.is_empty() {
+            let needs = |why| format!("the log is of the robot {of_log}: {why}; --robot names another description of it");
+            return Ok((robot(of_log).map_err(needs)?, "as the log says".to_owned()));
+        }
+        let (robot_of, whence) = match own() {
+            Some(own) => (own, format!("the robot of the system in {}", directory.display())),
+            None => (SystemConfig::default().robot, "the built-in robot".to_owned()),
         };
-        let read = Robot::named_or_file(&robot);
-        read.map(|read| (read, whence)).map_err(|error| format!("the robot {robot} is not known: {error}"))
+        Ok((robot(&robot_of)?, format!("{whence}: the log does not say which one, --robot names another one")))
     })
+}
+
+/// A built-in robot, or one that a file describes.
+fn robot(named: &str) -> Result<Robot, String> {
+    // A log may name anything: opening a pipe would wait for whoever writes it.
+    let is_other = |file: &Path| std::fs::metadata(file).is_ok_and(|is| !is.is_file());
+    if Robot::built_in(named).is_none() && is_other(Path::new(named)) {
+        return Err(format!("the robot {named} is not known: it is no regular file"));
+    }
+    Robot::named_or_file(named).map_err(|error| format!("the robot {named} is not known: {error}"))
 }
 
 /// Task files are read again whenever somebody asks: they are small, and may have been put back.

@@ -282,7 +282,7 @@ export function annotationsPage(desk: Desk): Page {
     }
     const [rare, common] = [now.keys.filter((one) => RARE.includes(one.key)), now.keys.filter((one) => !RARE.includes(one.key))];
     const more = h("details", { open: rare.some((one) => one.said) }, h("summary", {}, "More annotations"), ...rare.map((one) => field(one, now)));
-    fill(form, title, h("div", { id: "of-state" }), ...common.map((one) => field(one, now)), rare.length === 0 ? null : more, h("div", { class: "row" }, save, undo, again));
+    fill(form, title, h("div", { id: "of-state" }), ...common.map((one) => field(one, now)), rare.length === 0 ? null : more, h("div", { class: "row saving" }, save, undo, again));
   }
 
   function field(one: AnnotationKey, now: AnnotatedState): HTMLElement {
@@ -443,8 +443,8 @@ export function annotationsPage(desk: Desk): Page {
   const element = h(
     "main",
     { id: "page", class: "annotations", tabindex: -1 },
-    h("section", { "aria-label": "States of the task" }, h("h1", { class: "hidden-text" }, "Annotations"), head, list),
-    h("div", {}, notice, form, result, others),
+    h("section", { "aria-label": "States of the task" }, h("h1", { class: "hidden-text" }, "Annotations"), head, list, result, others),
+    h("div", {}, notice, form),
   );
   return { element, wide: true, begin: () => void (all === null ? load() : undefined), update: () => undefined };
 }

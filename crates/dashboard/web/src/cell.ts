@@ -93,9 +93,11 @@ export class CellView {
       this.log = log;
       this.film.clear();
       this.paths.clear();
-      [this.cell, this.objects] = [null, []];
+      [this.cell, this.objects, this.robot] = [null, [], null];
     }
-    this.robot ??= await api.robot();
+    const robot = this.robot ?? (await api.robot(log));
+    if (log !== this.log) return;
+    this.robot = robot;
     // One that is not known may be known when the page is opened again.
     const frame = this.site.store.frame;
     const epoch = frame?.epoch ?? 0;
