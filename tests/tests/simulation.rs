@@ -63,7 +63,8 @@ fn check_says_what_an_annotation_is_worth() -> anyhow::Result<()> {
     let known = std::fs::read_to_string(repository("deploy/catalogue.toml"))?;
     ensure!(known.contains(said));
     let unsaid = place.path().join("catalogue.toml");
-    std::fs::write(&unsaid, known.replace(said, ""))?;
+    // What does not say that it computes cannot say that it does so at any time.
+    std::fs::write(&unsaid, known.replace(said, "").replace("anytime = true\n", ""))?;
     let (task, unsaid) = (task.to_str().context("a path")?, unsaid.to_str().context("a path")?);
     let whole = json(&place, &["check", task, "--json"])?;
     let half = json(&place, &["check", task, "--json", "--catalogue", unsaid])?;

@@ -1,4 +1,4 @@
-//! What an arm keeps from another arm and from the head of the same robot: two gantries whose hands slide along x, y and z, and a head with a
+//! What an arm keeps from another arm and from the head of the same robot, also while its fingers open: two gantries whose hands slide along x, y and z, and a head with a
 //! stick, so that every distance is known.
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
@@ -404,4 +404,130 @@ fn an_arm_whose_joints_carry_the_head_moves_before_or_after_it() {
     assert_eq!(bench.start_with(LEFT, look(SHORT)).1, []);
     let reason = refused(&mut bench, LEFT, to([0.0, 0.4, 0.0], 0.5));
     assert!(reason.contains("is moved by the arm `left` and by the head, which is under way"), "{reason}");
+}
+
+/// The left arm with fingers that have closed around nothing and opened a little again.
+fn ajar(bench: &mut Bench) {
+    assert!(matches!(bench.perform_with(LEFT, close()), Ending::Aborted(_)), "they close around nothing");
+    assert!(matches!(bench.perform_with(LEFT, Request::OpenTo { width: 0.01 }), Ending::Done(_)));
+}
+
+#[test]
+fn fingers_open_further_while_their_arm_moves_whichever_begins_first() {
+    for arm_first in [false, true] {
+        let (mut bench, _folder) = gantry();
+        ajar(&mut bench);
+        let both = [Request::Release, to(ASIDE, 0.2)];
+        let both = if arm_first { both.into_iter().rev().collect::<Vec<_>>() } else { both.to_vec() };
+        for request in both {
+            assert_eq!(bench.start_with(LEFT, request).1, []);
+        }
+        let ended = bench.pass(0.79);
+        assert!(matches!(&ended[..], [Command::Ended { ending: Ending::Done(_), .. }]), "the fingers: {ended:?}");
+        let at = bench.cell.measured_of(LEFT);
+        assert!(at.finger == 0.04 && at.arm[1] > HOMES[LEFT][1] && at.arm[1] < ASIDE[1], "{at:?}");
+        bench.pass(60.0);
+        assert_eq!(bench.cell.measured_of(LEFT).arm[1], ASIDE[1]);
+        assert_eq!(bench.cell.unintended_contacts(), []);
+    }
+}
+
+#[test]
+fn no_arm_leaves_before_its_fingers_have_parted_nor_while_they_close() {
+    let (mut bench, _folder) = gantry();
+    assert_eq!(bench.start_with(LEFT, close()).1, []);
+    bench.pass(0.1);
+    let reason = refused(&mut bench, LEFT, to(ASIDE, 0.2));
+    assert!(reason.contains("an arm does not move while its fingers close"), "{reason}");
+    bench.pass(60.0);
+    assert_eq!(bench.start_with(LEFT, Request::Release).1, []);
+    // Of 40 mm in 0.8 s each has gone 2 and 4 mm.
+    bench.pass(0.04);
+    let reason = refused(&mut bench, LEFT, to(ASIDE, 0.2));
+    assert!(reason.contains("nor before they have parted from what they let go"), "{reason}");
+    bench.pass(0.04);
+    assert_eq!(bench.start_with(LEFT, to(ASIDE, 0.2)).1, []);
+    // Nor does anything close on the way, nor begin to part.
+    bench.pass(0.8);
+    let reason = refused(&mut bench, LEFT, close());
+    assert!(reason.contains("an arm does not move while its fingers close"), "{reason}");
+    bench.pass(60.0);
+    assert!(matches!(bench.perform_with(LEFT, close()), Ending::Aborted(_)));
+    assert_eq!(bench.start_with(LEFT, to([0.0, 0.4, 0.0], 0.2)).1, []);
+    let reason = refused(&mut bench, LEFT, Request::Release);
+    assert!(reason.contains("nor before they have parted from what they let go"), "{reason}");
+}
+
+#[test]
+fn opening_in_two_parts_takes_as_long_as_at_once() {
+    let (mut bench, _folder) = gantry();
+    assert!(matches!(bench.perform_with(LEFT, close()), Ending::Aborted(_)));
+    let began = bench.now;
+    for request in [Request::OpenTo { width: 0.01 }, Request::OpenTo { width: 0.05 }, Request::Release] {
+        assert!(matches!(bench.perform_with(LEFT, request), Ending::Done(_)));
+    }
+    let lasted_s = bench.now.since(began).as_secs_f64();
+    assert!((lasted_s - 0.8).abs() < 1e-6, "{lasted_s}");
+    for (width, wrong) in [(0.08, "80 mm apart"), (0.05, "80 mm apart"), (0.2, "at most 80 mm"), (f64::NAN, "NaN")] {
+        let reason = refused(&mut bench, LEFT, Request::OpenTo { width });
+        assert!(reason.contains("input `width_m` is") && reason.contains(wrong), "{reason}");
+    }
+}
+
+#[test]
+fn fingers_do_not_open_on_the_way_of_their_arm_where_another_arm_stands_beside_it() {
+    // The tip of the right arm's rod is beside the way of the left arm's fingers: 18 mm off where they are closed, in them where they are open.
+    let beside = |bench: &mut Bench| {
+        ajar(bench);
+        let [x, y, z] = between_the_fingers(0.0);
+        let before = between_the_fingers(0.1);
+        goes(bench, RIGHT, before);
+        with_right_at(bench, [x, y + 0.035, z]);
+    };
+    let away = [HOMES[LEFT][0], HOMES[LEFT][1], 0.2];
+    let (mut bench, _folder) = gantry();
+    beside(&mut bench);
+    // The arm alone may go, and the fingers may not open, neither before nor beside that.
+    let reason = refused(&mut bench, LEFT, Request::Release);
+    assert!(reason.starts_with("the fingers stay where they are: left_finger"), "{reason}");
+    assert_eq!(bench.start_with(LEFT, to(away, 0.1)).1, []);
+    let reason = refused(&mut bench, LEFT, Request::Release);
+    assert!(reason.starts_with("the fingers stay where they are: left_finger"), "{reason}");
+    bench.pass(60.0);
+    assert!(matches!(bench.perform_with(LEFT, Request::Release), Ending::Done(_)), "up there is room");
+    assert_eq!(bench.cell.unintended_contacts(), []);
+}
+
+/// The gantries with a post of their own robot that hangs where the left hand's fingers pass by on the way to y = 0.6 if they are closed, and
+/// do not if they are open.
+fn with_post() -> (Bench, TempDir) {
+    let post = "<link name='post'><collision><geometry><box size='0.01 0.01 0.06'/></geometry></collision></link>\
+                <joint name='post' type='fixed'><parent link='world'/><child link='post'/><origin xyz='0 0.66 1.42'/></joint></robot>";
+    let folder = tempfile::tempdir().unwrap();
+    let config = config(folder.path(), &description());
+    std::fs::write(folder.path().join("gantry.urdf"), urdf().replace("</robot>", post)).unwrap();
+    (Bench::of(config), folder)
+}
+
+#[test]
+fn fingers_do_not_open_on_the_way_of_their_arm_where_its_own_robot_is() {
+    for arm_first in [false, true] {
+        let (mut bench, _folder) = with_post();
+        ajar(&mut bench);
+        let far = [0.0, 0.63, 0.0];
+        if arm_first {
+            assert_eq!(bench.start_with(LEFT, to(far, 0.2)).1, []);
+            let reason = refused(&mut bench, LEFT, Request::Release);
+            assert!(reason.starts_with("the fingers stay where they are: while its fingers open, "), "{reason}");
+        } else {
+            assert_eq!(bench.start_with(LEFT, Request::Release).1, []);
+            let reason = refused(&mut bench, LEFT, to(far, 0.2));
+            assert!(reason.starts_with("the trajectory is refused: while its fingers open, "), "{reason}");
+            assert!(reason.contains("post") && reason.contains("finger"), "{reason}");
+        }
+        // Where the post is far, both go.
+        bench.pass(60.0);
+        goes(&mut bench, LEFT, [0.0, 0.3, 0.0]);
+        assert_eq!(bench.cell.unintended_contacts(), []);
+    }
 }

@@ -329,6 +329,10 @@ fn value(key: &str, items: &[String]) -> Result<Document, Problem> {
 /// What somebody has typed: in brackets or quotes, a number or a boolean as YAML has it, else a text as it stands there.
 fn item(text: &str) -> Result<Document, String> {
     let text = text.trim();
+    // A few bytes of them are millions of values.
+    if edit::has_anchor(text) {
+        return Err("an anchor or an alias (`&`, `*`) stands in it: write out what it stands for".to_owned());
+    }
     let as_yaml = || Document::read(text, "").map_err(|finding| finding.message.clone());
     if text.starts_with(['{', '[', '"', '\'']) {
         return as_yaml();

@@ -11,6 +11,7 @@ use crate::lookahead::Problem;
 use crate::plan::Plan;
 use crate::protocol::{Command, Event, Mode};
 use crate::signals::Signals;
+use crate::way_out::{Leaving, WayOut};
 use crate::window::{End, Window};
 use ratn_model::expression::EffectExpr;
 use ratn_model::fact::FactKey;
@@ -50,6 +51,7 @@ enum State {
     Fresh,
     Hsm(Box<Interpreter>),
     Cdtn(Box<Window>),
+    Leaving(Box<Leaving>),
     Ended,
 }
 
@@ -110,6 +112,7 @@ impl Executive {
         match &self.state {
             State::Cdtn(window) => window.breakpoints(),
             State::Hsm(interpreter) => interpreter.breakpoints(),
+            State::Leaving(leaving) => leaving.breakpoints(),
             State::Fresh | State::Ended => &[],
         }
     }
@@ -132,7 +135,7 @@ impl Executive {
     pub fn check_invariants(&self) -> Result<(), String> {
         match &self.state {
             State::Cdtn(window) => window.check_invariants(),
-            State::Fresh | State::Hsm(_) | State::Ended => Ok(()),
+            State::Fresh | State::Hsm(_) | State::Leaving(_) | State::Ended => Ok(()),
         }
     }
 
@@ -161,7 +164,7 @@ impl Executive {
         };
         match &mut self.state {
             State::Cdtn(window) => window.check_quiescence(&mut context),
-            State::Fresh | State::Hsm(_) | State::Ended => Ok(()),
+            State::Fresh | State::Hsm(_) | State::Leaving(_) | State::Ended => Ok(()),
         }
     }
 
@@ -258,21 +261,23 @@ impl Executive {
         let end = match &mut self.state {
             State::Fresh | State::Ended => None,
             State::Cdtn(window) => window.handle(&mut context, event),
+            State::Leaving(leaving) => leaving.handle(&mut context, event),
             State::Hsm(interpreter) if self.deadline.is_some_and(|deadline| deadline <= now) => {
-                interpreter.abort(&mut context);
                 let limit = program.deadline_s.unwrap_or_default();
                 let reason = format!("the task took longer than its deadline of {limit} s");
-                Some(End { outcome: ABORTED.to_owned(), outputs: BTreeMap::new(), reason })
+                Some(cut_short(&mut context, interpreter, ABORTED, reason))
             }
             State::Hsm(interpreter) => match event {
-                Event::AbortRequested { reason } => {
+                Event::AbortRequested { reason, at_once: false } => {
+                    Some(cut_short(&mut context, interpreter, PREEMPTED, reason))
+                }
+                Event::AbortRequested { reason, at_once: true } => {
                     interpreter.abort(&mut context);
-                    Some(End { outcome: PREEMPTED.to_owned(), outputs: BTreeMap::new(), reason })
+                    Some(End::new(PREEMPTED, reason))
                 }
                 Event::RetirementFailed { reason, .. } => {
                     interpreter.abort(&mut context);
-                    let reason = format!("what had happened could not be recorded: {reason}");
-                    Some(End { outcome: ABORTED.to_owned(), outputs: BTreeMap::new(), reason })
+                    Some(End::new(ABORTED, format!("what had happened could not be recorded: {reason}")))
                 }
                 event => {
                     let progress = interpreter.handle(&mut context, event);
@@ -280,15 +285,33 @@ impl Executive {
                 }
             },
         };
+        let end = match end {
+            Some(end) if !end.way_out.is_empty() => match Leaving::begin(&mut context, end) {
+                Ok(leaving) => {
+                    self.state = State::Leaving(Box::new(leaving));
+                    None
+                }
+                Err(end) => Some(*end),
+            },
+            end => end,
+        };
         self.end(end, commands);
     }
 
     fn end(&mut self, end: Option<End>, commands: &mut Vec<Command>) {
-        if let Some(End { outcome, outputs, reason }) = end {
+        if let Some(End { outcome, outputs, reason, .. }) = end {
             self.state = State::Ended;
             commands.push(Command::End { outcome, outputs, reason });
         }
     }
+}
+
+/// Everything under way ends, and then what is to be done on the way out.
+fn cut_short(context: &mut Context<'_>, interpreter: &mut Interpreter, outcome: &str, reason: String) -> End {
+    let mut way_out = WayOut::default();
+    interpreter.way_out(context.program, &mut way_out);
+    interpreter.abort(context);
+    End { way_out, ..End::new(outcome, reason) }
 }
 
 /// Acquires of one event in the order of their priority, and what is given back after them: so that what is free, and what
@@ -343,10 +366,10 @@ fn end_of(context: &mut Context<'_>, interpreter: &Interpreter, progress: Progre
                 }
                 Err(error) => {
                     let reason = format!("output `{}`: {error}", output.name);
-                    return Some(End { outcome: ABORTED.to_owned(), outputs: BTreeMap::new(), reason });
+                    return Some(End::new(ABORTED, reason));
                 }
             }
         }
     }
-    Some(End { outcome, outputs, reason })
+    Some(End { outputs, ..End::new(&outcome, reason) })
 }

@@ -36,6 +36,7 @@ pub mod lookahead;
 mod plan;
 pub mod protocol;
 mod signals;
+mod way_out;
 mod window;
 
 pub use signals::MOST_SIGNALS_KEPT;

@@ -234,10 +234,13 @@ pub enum Event {
         /// Why.
         reason: String,
     },
-    /// The user wants the run to end now.
+    /// The user wants the run to end now. Asked for a second time it ends at once.
     AbortRequested {
         /// Why.
         reason: String,
+        /// Nothing is done any more, not even what states say under `finally`: what it needs cannot be had.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        at_once: bool,
     },
 }
 

@@ -92,7 +92,11 @@ impl Findings {
     }
 
     fn add(&mut self, severity: Severity, rule: &str, location: Location, path: &str, message: String, help: String) {
-        if self.list.len() < MAX_DIAGNOSTICS {
+        // What stands once in the file may be several states of the program: it is told once.
+        let is_known = |d: &Diagnostic| {
+            (d.location, d.severity, d.rule.as_str(), d.message.as_str()) == (location, severity, rule, &message)
+        };
+        if self.list.len() < MAX_DIAGNOSTICS && !self.list.iter().any(is_known) {
             let (rule, path, file) = (rule.to_owned(), path.to_owned(), String::new());
             self.list.push(Diagnostic { rule, severity, file, location, path, message, help });
         }

@@ -22,8 +22,7 @@
 //! The state that was written is `try` or `body`; with both, `body` is what holds `try`. From outside, the state of its name is seen, with
 //! the same ports. Names of variables that are made here cannot be written in a task file.
 //!
-//! Task files have `retry`, `while` and `timeout`. `finally` is for programs that are made in code (random programs are): a task file refuses it, because a
-//! deadline and a lost race do not run it yet.
+//! Where a state is cut short from outside (a lost race, a limit around it, the end of the run), the executive goes on with `finally_preempted`.
 
 use crate::expression::{BinaryOperator, Expr};
 use crate::id::StateId;
@@ -71,7 +70,8 @@ pub struct Retried {
     pub before: Vec<StateId>,
 }
 
-/// Where the states of a program are after [`unfold`]: of each the ids, the outermost first. The last is the state as it was written.
+/// Where the states of a program are after [`unfold`]: of each the ids, the outermost first. The last is the state as it was written. What is
+/// done on every way out is there once for each way.
 pub type Places = BTreeMap<StateId, Vec<StateId>>;
 
 /// There would be more than 20,000 states.
@@ -82,7 +82,7 @@ pub struct TooManyStates;
 ///
 /// # Errors
 /// There would be too many states: what is done on every way out is there once for each outcome.
-pub fn unfold(program: &mut Program, guards: &BTreeMap<StateId, Guard>) -> Result<Places, TooManyStates> {
+pub fn unfold(program: &mut Program, guards: &BTreeMap<StateId, Guard>) -> Result<Vec<Places>, TooManyStates> {
     let outcomes = program.all_outcomes();
     let scopes = vec![Scope { around: None, places: Places::new() }];
     let (new, of_scope, links, outputs, again, lastly) = Default::default();
@@ -94,12 +94,7 @@ pub fn unfold(program: &mut Program, guards: &BTreeMap<StateId, Guard>) -> Resul
     for output in &mut program.outputs {
         output.value.rewrite(&mut |part| unfolding.port(StateId(0), part));
     }
-    let mut places = Places::new();
-    for scope in scopes {
-        for (old, new) in &scope.places {
-            places.entry(*old).or_insert_with(|| new.clone());
-        }
-    }
+    let places = scopes.iter().map(|scope| scope.places.clone()).collect();
     program.states = resolved;
     Ok(places)
 }

@@ -272,13 +272,14 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
         match guard::unfold(&mut program, &out.guards) {
             Ok(places) => out.places.move_to(&places),
             Err(guard::TooManyStates) => {
-                let message = "with what retries are made of there are more than 20,000 states";
+                let message =
+                    "with what `retry`, `while`, `timeout` and `finally` are made of there are more than 20,000 states";
                 out.findings.error(
                     "invalid-state",
                     root.at,
                     "",
                     message,
-                    "retry fewer states, or the state around them",
+                    "say it of fewer states, or of the state around them",
                 );
             }
         }

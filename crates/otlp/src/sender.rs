@@ -6,7 +6,8 @@ use super::config::{Fault, OtlpConfig, Target};
 use super::post::{PostError, post};
 use super::span::Span;
 use super::wire;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::fmt;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot};
@@ -32,6 +33,33 @@ static SENDER: OnceLock<Sender> = OnceLock::new();
 pub struct Sender {
     queue: mpsc::Sender<Message>,
     counts: Counts,
+    trouble: Arc<Trouble>,
+}
+
+/// Tells once that spans are dropped.
+struct Trouble {
+    collector: String,
+    is_said: AtomicBool,
+    say: Box<dyn Fn(&str) + Send + Sync>,
+}
+
+impl Trouble {
+    /// Why the collector does not get them.
+    fn say(&self, why: &dyn fmt::Display) {
+        if !self.is_said.swap(true, Ordering::Relaxed) {
+            (self.say)(&format!(
+                "the OTLP collector at {} does not take spans: {why}; what it does not take is dropped and counted, \
+                 and not said again: start a collector there, or leave [service.otlp] out",
+                self.collector
+            ));
+        }
+    }
+}
+
+impl fmt::Debug for Trouble {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Trouble").field("collector", &self.collector).field("is_said", &self.is_said).finish()
+    }
 }
 
 /// How many spans were sent, and how many dropped. Clones count together.
@@ -74,7 +102,7 @@ pub fn sender() -> Option<&'static Sender> {
 pub fn start(
     config: &OtlpConfig,
     resource: Vec<(&'static str, String)>,
-    say: impl Fn(&str) + Send + 'static,
+    say: impl Fn(&str) + Send + Sync + 'static,
 ) -> Result<Option<&'static Sender>, Fault> {
     let Some(target) = config.target()? else { return Ok(sender()) };
     if let Some(sender) = sender() {
@@ -89,15 +117,17 @@ impl Sender {
         target: Target,
         timeout_ms: u64,
         resource: Vec<(&'static str, String)>,
-        say: impl Fn(&str) + Send + 'static,
+        say: impl Fn(&str) + Send + Sync + 'static,
     ) -> Sender {
         let (queue, spans) = mpsc::channel(QUEUE);
-        let sender = Sender { queue, counts: Counts::default() };
-        let counts = sender.counts.clone();
-        let work = Work { target, timeout_ms, resource, counts, said: false, say };
+        let trouble =
+            Trouble { collector: target.uri.to_string(), is_said: AtomicBool::new(false), say: Box::new(say) };
+        let sender = Sender { queue, counts: Counts::default(), trouble: Arc::new(trouble) };
+        let (counts, trouble) = (sender.counts.clone(), Arc::clone(&sender.trouble));
+        let work = Work { target, timeout_ms, resource, counts, trouble };
         let sending = move || match tokio::runtime::Builder::new_current_thread().enable_all().build() {
             Ok(runtime) => runtime.block_on(work.send_all(spans)),
-            Err(error) => (work.say)(&format!("OTLP: no spans are sent: {error}")),
+            Err(error) => work.trouble.say(&format_args!("this process cannot send any: {error}")),
         };
         // Without the thread the queue is closed, and everything is dropped.
         let _ = std::thread::Builder::new().name("otlp".to_owned()).spawn(sending);
@@ -108,6 +138,7 @@ impl Sender {
     pub fn record(&self, span: Span) {
         if self.queue.try_send(Message::Span(Box::new(span))).is_err() {
             self.counts.add(0, 1);
+            self.trouble.say(&format_args!("{QUEUE} wait to be sent, and more come than it takes"));
         }
     }
 
@@ -124,21 +155,23 @@ impl Sender {
                 let _ = is_done.await;
             }
         };
-        let _ = tokio::time::timeout(patience, flushing).await;
+        if tokio::time::timeout(patience, flushing).await.is_err() {
+            let patience_s = patience.as_secs_f64();
+            self.trouble.say(&format_args!("the last ones were not taken within {patience_s} s of the end"));
+        }
     }
 }
 
-struct Work<S> {
+struct Work {
     target: Target,
     timeout_ms: u64,
     resource: Vec<(&'static str, String)>,
     counts: Counts,
-    said: bool,
-    say: S,
+    trouble: Arc<Trouble>,
 }
 
-impl<S: Fn(&str)> Work<S> {
-    async fn send_all(mut self, mut queue: mpsc::Receiver<Message>) {
+impl Work {
+    async fn send_all(self, mut queue: mpsc::Receiver<Message>) {
         let mut batch = Vec::with_capacity(BATCH);
         while let Some(first) = queue.recv().await {
             let mut flushed = match first {
@@ -166,7 +199,7 @@ impl<S: Fn(&str)> Work<S> {
         }
     }
 
-    async fn send(&mut self, batch: &[Span]) {
+    async fn send(&self, batch: &[Span]) {
         let body = wire::request(&self.resource, SCOPE, batch);
         let patience = Duration::from_millis(self.timeout_ms);
         let sent = tokio::time::timeout(patience, post(&self.target, body)).await;
@@ -174,14 +207,7 @@ impl<S: Fn(&str)> Work<S> {
             Ok(()) => self.counts.add(batch.len(), 0),
             Err(why) => {
                 self.counts.add(0, batch.len());
-                if !self.said {
-                    self.said = true;
-                    let collector = &self.target.uri;
-                    (self.say)(&format!(
-                        "the OTLP collector at {collector} does not take spans: {why}; what it does not take is dropped and counted, \
-                         and not said again: start a collector there, or leave [service.otlp] out"
-                    ));
-                }
+                self.trouble.say(&why);
             }
         }
     }
@@ -307,7 +333,17 @@ mod tests {
         sender.flush(patience).await;
         assert!((patience..patience * 10).contains(&began.elapsed()), "{:?}", began.elapsed());
         assert_eq!(sender.counts().sent(), 0);
-        // It is not yet known that the collector hangs.
-        assert!(heard.lock().unwrap().is_empty());
+        let heard = heard.lock().unwrap();
+        assert!(heard.len() == 1 && heard[0].contains("4096 wait to be sent"), "{heard:?}");
+    }
+
+    #[tokio::test]
+    async fn what_is_not_taken_by_the_end_is_said() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let (sender, heard) = to(listener.local_addr().unwrap().port(), 60_000);
+        sender.record(span(1));
+        sender.flush(Duration::from_millis(50)).await;
+        let heard = heard.lock().unwrap();
+        assert!(heard.len() == 1 && heard[0].contains("within 0.05 s of the end"), "{heard:?}");
     }
 }

@@ -133,8 +133,12 @@ def test_every_form_of_a_state_is_traced() -> None:
         with ratn.when((fn.len(look.boxes) > 0) & ~ratn.exists(ratn.fact("in_gripper", "cup")) | (count < 2), outcomes=["empty"], transitions={"empty": "none"}):
             with ratn.sequence("held", routine=True, resources=["Arm"], timeout=20):
                 gripper.release(holds=[ratn.fact("closed", "door")])
+            with ratn.lastly():
+                gripper.release()
         with ratn.otherwise():
             ratn.leave("empty")
+        with ratn.lastly():
+            pan_tilt.look_at(target=TABLE)
         with ratn.while_(tries < 3) as loop:
             pan_tilt.look_at(target=fn.pose(0.8, loop.index * 0.1, 0.7), assign={"tries": tries + 1})
         with ratn.until() as seen:
@@ -155,6 +159,7 @@ def test_every_form_of_a_state_is_traced() -> None:
         "until: \"len(again.boxes) > 1\"",
         "while: [\"closed(door)\"]",
         "timeout: 20",
+        "finally:",
         "for: \"box in sort_by($b in look.boxes, $b.size[0])\"",
         "requires: [\"$i < 9\", \"cup in [cup, mug]\"]",
         "description: \"All of them.\"",

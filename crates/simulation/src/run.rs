@@ -30,6 +30,13 @@ const COMPARED_FACTS: usize = 256;
 /// When something took another time than was planned with, this part of the orders is looked at.
 const GLANCE_PART: usize = 10;
 
+/// The log of a run has so many lines per event that it may have at the most: one event may expand thousands of states that do nothing, again
+/// and again …
+const LINES_PER_EVENT: usize = 20;
+
+/// … and never more than this, a gigabyte at the most.
+const MAX_LINES: usize = 3_000_000;
+
 /// What the providers do.
 pub trait Oracle {
     /// How a goal goes. `world` is its projection, or the actual world where it has none.
@@ -143,6 +150,9 @@ pub enum RunError {
         /// When, in the run.
         at_s: f64,
     },
+    /// More lines of its log than any run should have.
+    #[error("no end after {0} lines of its event log")]
+    TooLong(usize),
     /// An invariant does not hold.
     #[error("at {at_s:.3} s: {problem}")]
     Broken {
@@ -230,6 +240,7 @@ pub fn run_while(
     goes_on: &dyn Fn() -> bool,
 ) -> Result<Run, RunError> {
     let (orders, max_events) = (circumstances.orders, circumstances.max_events);
+    let max_lines = max_events.saturating_mul(LINES_PER_EVENT).min(MAX_LINES);
     let (mut resume_after, learned) = (circumstances.resume_after, circumstances.learned.clone());
     let mut root = World::default();
     let initial: Vec<Change> =
@@ -307,6 +318,9 @@ pub fn run_while(
             for command in commands {
                 simulation.log.push(LogLine { at: now, entry: LogEntry::Command(command.clone()) });
                 simulation.perform(command)?;
+            }
+            if simulation.log.len() > max_lines {
+                return Err(RunError::TooLong(max_lines));
             }
             if orders > 0 && (lookout.is_due() || lookout.is_surprised()) && simulation.end.is_none() {
                 let outlook = executive.outlook(now);

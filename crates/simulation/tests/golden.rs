@@ -131,7 +131,7 @@ fn transcript(run: &Run, script: &Script) -> String {
                     };
                     Some(("world", facts.iter().map(fact).collect::<Vec<_>>().join(", ")))
                 }
-                Event::AbortRequested { reason } => Some(("abort", reason.clone())),
+                Event::AbortRequested { reason, .. } => Some(("abort", reason.clone())),
                 _ => None,
             },
             LogEntry::Command(_) => None,

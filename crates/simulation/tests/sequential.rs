@@ -21,9 +21,10 @@ fn check_with_brains(text: &str, brains: u32) -> Result<Sequential, Obstacle> {
     let assumptions = Assumptions { parameters, elements: 2, durations_s, units, attributes };
     let found = sequential(&program, &catalogue(), &assumptions);
     if let Ok(found) = &found {
-        let makespan_s = |goes_on| makespan_s(&program, &catalogue(), &assumptions, &|| goes_on);
-        assert_eq!(makespan_s(true), Ok(found.cdtn_s));
-        assert!(makespan_s(false).is_err_and(|obstacle| obstacle.to_string().contains("ended")));
+        let makespan_s = |max_events, goes_on| makespan_s(&program, &catalogue(), &assumptions, max_events, &|| goes_on);
+        assert_eq!(makespan_s(usize::MAX, true), Ok(found.cdtn_s));
+        assert!(makespan_s(0, true).is_err_and(|obstacle| obstacle.to_string().contains("no end")));
+        assert!(makespan_s(usize::MAX, false).is_err_and(|obstacle| obstacle.to_string().contains("was ended at 0.000 s")));
     }
     found
 }
@@ -179,4 +180,29 @@ fn what_a_task_waits_for_comes_and_a_wait_is_not_said_to_lack_annotations() {
     assert_eq!(found.unknown_durations, ["lid", "which"]);
     let refused = check("task: t\nstates:\n  - cup: { wait: { for: exists at(cup) } }\n").unwrap_err();
     assert!(refused.to_string().contains("what makes `exists at(cup)` hold of cup is not known"), "{refused}");
+}
+
+#[test]
+fn a_task_that_does_nothing_for_ever_between_two_events_is_given_up_before_memory_is() {
+    let text = "task: t
+states:
+  - for: x in range(1, 9000)
+    do:
+      - go: { action: arm/move, in: { a: 1 }, pia: true, reads: [], effects: [], resources: [{ block: Arm }] }
+      - for: y in range(1, 9900)
+        do:
+          - condition: $y > 0
+            then: []
+            else: []
+";
+    let program = load(text, "task.yaml", &NoFiles);
+    let assumptions = Assumptions {
+        parameters: program.bind_parameters(&[]).unwrap(),
+        elements: 2,
+        durations_s: BTreeMap::new(),
+        units: BTreeMap::new(),
+        attributes: BTreeMap::new(),
+    };
+    let said = makespan_s(&program, &catalogue(), &assumptions, 2_000, &|| true).unwrap_err().to_string();
+    assert!(said.contains("no end after 40000 lines of its event log"), "{said}");
 }

@@ -223,7 +223,7 @@ fn try_pairs(seeds: std::ops::Range<u64>) -> (usize, usize) {
         let resume_s = pause_s + seconds(6);
         let pauses = vec![(pause_s, Event::PauseRequested), (resume_s, Event::ResumeRequested)];
         let (pauses, is_cut) = (if dice.below(2) == 0 { pauses } else { Vec::new() }, dice.below(4) == 0);
-        let abort = (abort_s, Event::AbortRequested { reason: "it is enough".to_owned() });
+        let abort = (abort_s, Event::AbortRequested { reason: "it is enough".to_owned(), at_once: false });
         let runs = [
             Together { program: Arc::new(loaded(&tasks[0])), mode: modes[0], begins_s: 0.0, told: pauses },
             Together {

@@ -196,7 +196,7 @@ impl Word {
             Word::Pause => Event::PauseRequested,
             Word::Resume => Event::ResumeRequested,
             Word::Step => Event::StepRequested,
-            Word::Abort => Event::AbortRequested { reason: "the user asked for it".into() },
+            Word::Abort => Event::AbortRequested { reason: "the user asked for it".into(), at_once: false },
         }
     }
 }

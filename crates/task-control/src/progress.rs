@@ -216,7 +216,7 @@ impl Progress {
             Event::RetirementFailed { instance, reason } => {
                 say(&mut lines, at, &format!("failed to make {} real: {reason}", self.path(*instance)));
             }
-            Event::AbortRequested { reason } => say(&mut lines, at, &format!("abort: {reason}")),
+            Event::AbortRequested { reason, .. } => say(&mut lines, at, &format!("abort: {reason}")),
             Event::WorldChanged { facts, .. } => {
                 for (fact, value) in facts.iter().take(MOST_FACTS) {
                     match value {

@@ -18,7 +18,7 @@ use super::progress::Progress;
 use super::replay::{self, VERSION};
 use super::spans::{Spans, trace_of};
 use crate::interrupt::Interrupt;
-use anyhow::{Context, bail};
+use anyhow::Context;
 use ratn_event_log::{LogWriter, without_visits};
 use ratn_executive::MOST_SIGNALS_KEPT;
 use ratn_executive::executive::Executive;
@@ -272,13 +272,13 @@ impl Shell {
         interrupt: &Interrupt,
     ) -> anyhow::Result<Ended> {
         let mut ended = begin(self).await?;
-        let mut asked_to_abort = false;
+        let mut asked = Asks::default();
         loop {
             if let Some(ended) = ended {
                 self.checkpointer.take().into_iter().for_each(Checkpointer::end);
                 return Ok(ended);
             }
-            let event = self.next(interrupt, &mut asked_to_abort).await?;
+            let event = self.next(interrupt, &mut asked).await?;
             ended = self.step(event)?;
         }
     }
@@ -478,7 +478,7 @@ impl Shell {
     }
 
     /// The next event that the executive has to know of.
-    async fn next(&mut self, interrupt: &Interrupt, asked_to_abort: &mut bool) -> anyhow::Result<Event> {
+    async fn next(&mut self, interrupt: &Interrupt, asked: &mut Asks) -> anyhow::Result<Event> {
         loop {
             let timer = self.timers.first().copied();
             let due = async {
@@ -552,22 +552,30 @@ impl Shell {
                     }
                     continue;
                 }
-                () = interrupt.asked_times(1), if !*asked_to_abort => {
-                    *asked_to_abort = true;
-                    return Ok(Event::AbortRequested { reason: "the user asked for it".into() });
+                // Asked once it does what is to be done on the way out, asked twice it ends at once.
+                () = interrupt.asked_times(asked.by_the_user + 1), if asked.by_the_user < 2 => {
+                    asked.by_the_user += 1;
+                    return Ok(Event::AbortRequested { reason: "the user asked for it".into(), at_once: false });
                 }
-                () = self.performer.lost(), if !*asked_to_abort => {
-                    *asked_to_abort = true;
+                () = self.performer.lost(), if !asked.for_lost_leases => {
+                    asked.for_lost_leases = true;
                     let reason = "the session with the resource manager, and every lease, is lost".into();
-                    return Ok(Event::AbortRequested { reason });
+                    return Ok(Event::AbortRequested { reason, at_once: true });
                 }
-                () = interrupt.asked_times(2) => bail!("interrupted twice: the run was left where it was"),
             };
             if let Some(event) = self.performer.accept(answer, self.executive.root())? {
                 return Ok(event);
             }
         }
     }
+}
+
+/// What has asked the run to end.
+#[derive(Debug, Default)]
+struct Asks {
+    /// So often.
+    by_the_user: u32,
+    for_lost_leases: bool,
 }
 
 fn ended(command: Command, now: Timestamp) -> Option<Ended> {

@@ -24,12 +24,12 @@ use std::sync::Arc;
 pub fn trial_interrupted(program: &Arc<Program>, conditions: &Conditions) -> Verdict {
     let whole = match execute_under(program, conditions, Mode::Hsm, max_hsm_events(program), Vec::new()) {
         Ok(run) => run,
-        Err(RunError::Endless(_)) => return Verdict::LeftOut,
+        Err(RunError::Endless(_) | RunError::TooLong(_)) => return Verdict::LeftOut,
         Err(problem) => return Verdict::Differs(format!("HSM mode: {problem}")),
     };
     let mut dice = Dice(conditions.seed ^ 0x1e77_0b7e);
     let has_regions = program.states.iter().any(|state| matches!(state.kind, StateKind::Concurrency { .. }));
-    let ask = || Event::AbortRequested { reason: "that is enough".to_owned() };
+    let ask = || Event::AbortRequested { reason: "that is enough".to_owned(), at_once: false };
     let at = dice.below(1_000) as f64 / 1_000.0 * whole.end_s;
     match dice.below(4) {
         0 => {

@@ -27,7 +27,7 @@ use std::sync::Arc;
 pub fn trial_from_outside(program: &Arc<Program>, conditions: &Conditions) -> Verdict {
     let undisturbed = match execute_under(program, conditions, Mode::Hsm, max_hsm_events(program), Vec::new()) {
         Ok(run) => run,
-        Err(RunError::Endless(_)) => return Verdict::LeftOut,
+        Err(RunError::Endless(_) | RunError::TooLong(_)) => return Verdict::LeftOut,
         Err(problem) => return Verdict::Differs(format!("HSM mode: {problem}")),
     };
     let mut dice = Dice(conditions.seed ^ 0x0000_0075_1de5);
@@ -78,7 +78,7 @@ pub(super) fn trial_at_any_moment(program: &Arc<Program>, conditions: &Condition
     let outside = vec![(Trigger::Starts(path), event)];
     let hsm = match execute_under(program, conditions, Mode::Hsm, max_hsm_events(program), outside) {
         Ok(run) => run,
-        Err(RunError::Endless(_)) => return Verdict::LeftOut,
+        Err(RunError::Endless(_) | RunError::TooLong(_)) => return Verdict::LeftOut,
         Err(problem) => return Verdict::Differs(format!("HSM mode: {problem}")),
     };
     match problem(program, &hsm, &cdtn, &(story(program, &hsm), told)) {

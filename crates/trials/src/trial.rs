@@ -129,7 +129,7 @@ pub fn trial(program: &Arc<Program>, conditions: &Conditions) -> Verdict {
 pub(super) fn compare(program: &Arc<Program>, conditions: &Conditions, outside: &[(Trigger, Event)]) -> Verdict {
     let hsm = match execute_under(program, conditions, Mode::Hsm, max_hsm_events(program), outside.to_vec()) {
         Ok(run) => run,
-        Err(RunError::Endless(_)) => return Verdict::LeftOut,
+        Err(RunError::Endless(_) | RunError::TooLong(_)) => return Verdict::LeftOut,
         Err(problem) => return Verdict::Differs(format!("HSM mode: {problem}")),
     };
     let events = MAX_CDTN_EVENTS * hsm.log.len() + 10_000;

@@ -7,12 +7,17 @@
 use super::activity::{Kind, Module, Ticket};
 use super::braking::Way;
 use super::cell::Cell;
-use super::clearance::{Ahead, Crossing, Other, Part, keep_apart};
+use super::clearance::{Ahead, Crossing, MAX_POSTURES, Other, Part, keep_apart};
+use ratn_model::pose::Pose;
+use ratn_motion::collision::{Checker, Contact};
 use ratn_motion::joint_vector::JointVector;
-use ratn_motion::robot::ArmPosition;
+use ratn_motion::robot::{ArmPosition, Configuration};
+use ratn_world::scene::Scene;
 
 /// How far a finger may be from one position to the next that are compared, in metres.
 const FINGER_STEP_M: f64 = 0.002;
+/// The same where the arm moves meanwhile, and every position of the fingers comes with every one of its joints. No finger is as thin as that.
+const OPENING_STEP_M: f64 = 0.008;
 /// The same of the head's joints, in radians.
 const HEAD_STEP_RAD: f64 = 0.01;
 
@@ -23,10 +28,13 @@ impl Cell {
     /// # Errors
     /// Which links come too close, of what, and what that one is doing.
     pub(super) fn arm_keeps_apart(&self, arm: usize, way: &Way) -> Result<(), String> {
-        let finger = self.arms.seen_from(arm, &self.measured()).finger;
-        let course = way.ahead(&self.robot, 0.0).into_iter().map(|joints| ArmPosition { joints, finger });
-        let ours = Ahead { part: Part::Arm(arm), links: self.robot.links_of(arm), courses: vec![course.collect()] };
-        self.keeps_apart(&ours, ["the trajectory is refused: on the way ", "the trajectory is refused: its way"])
+        let from = self.arms.seen_from(arm, &self.measured()).finger;
+        let joints = way.ahead(&self.robot, 0.0);
+        let refused = ["the trajectory is refused: on the way ", "the trajectory is refused: its way"];
+        // Its fingers may open meanwhile.
+        let to = self.opens_fingers_to(arm).unwrap_or(from);
+        self.keeps_apart(&self.both_move(arm, &joints, from, to), refused)?;
+        self.meets_not_itself(arm, &joints, from, to, "the trajectory is refused")
     }
 
     /// Whether the fingers of an arm may go so: from and to these distances from the middle, in metres.
@@ -37,10 +45,67 @@ impl Cell {
         if from == to {
             return Ok(());
         }
+        let refused = ["the fingers stay where they are: ", "the fingers stay where they are: their way"];
+        let links = self.robot.finger_links_of(arm);
+        // The arm may move meanwhile.
+        if let (ahead, Some(_)) = self.joints_ahead(arm) {
+            self.keeps_apart(&Ahead { links, ..self.both_move(arm, &ahead, from, to) }, refused)?;
+            return self.meets_not_itself(arm, &ahead, from, to, "the fingers stay where they are");
+        }
         let joints = self.arms.seen_from(arm, &self.measured()).arm;
-        let course = passed(from, to).map(|finger| ArmPosition { joints, finger }).collect();
-        let ours = Ahead { part: Part::Arm(arm), links: self.robot.finger_links_of(arm), courses: vec![course] };
-        self.keeps_apart(&ours, ["the fingers stay where they are: ", "the fingers stay where they are: their way"])
+        let course = passed(from, to, FINGER_STEP_M).map(|finger| ArmPosition { joints, finger }).collect();
+        let ours = Ahead { part: Part::Arm(arm), links, courses: vec![course], between_m: 0.0 };
+        self.keeps_apart(&ours, refused)
+    }
+
+    /// What an arm does whose joints and fingers move at once: both take their own time, so any of the one comes with any of the other.
+    fn both_move(&self, arm: usize, joints: &[JointVector], from: f64, to: f64) -> Ahead {
+        let course = |finger: f64| joints.iter().map(|at| ArmPosition { joints: *at, finger }).collect();
+        let courses: Vec<Vec<ArmPosition>> = passed(from, to, OPENING_STEP_M).map(course).collect();
+        let between_m = if from == to { 0.0 } else { OPENING_STEP_M / 2.0 };
+        Ahead { part: Part::Arm(arm), links: self.robot.links_of(arm), courses, between_m }
+    }
+
+    /// Whether the fingers of an arm meet nothing of their own robot while they go so and its joints go so. A trajectory is checked with the fingers
+    /// where they are; how near the robot's links may come to each other is the same here.
+    fn meets_not_itself(
+        &self,
+        arm: usize,
+        joints: &[JointVector],
+        from: f64,
+        to: f64,
+        near: &str,
+    ) -> Result<(), String> {
+        if from == to {
+            return Ok(());
+        }
+        let robot = self.arms.view(arm);
+        let nothing = Scene { base: Pose::IDENTITY, objects: Vec::new() };
+        let at = self.arms.seen_from(arm, &self.measured());
+        let steps = ((to - from).abs() / OPENING_STEP_M).ceil() as usize + 1;
+        if steps * joints.len() > MAX_POSTURES {
+            return Err(format!(
+                "{near}: arm and fingers move for too long at once to be checked: move one after the other"
+            ));
+        }
+        // From one finger position to the next they move by less than they are thick: nothing is passed over.
+        for finger in passed(from, to, OPENING_STEP_M) {
+            let mut checker = Checker::new(robot, &nothing, &Configuration { finger, ..at }, 0.0);
+            let mut before: Option<&JointVector> = None;
+            for (i, posture) in joints.iter().enumerate() {
+                // The last one is always looked at, and no step of a link is longer than the checker's own.
+                let is_next_far =
+                    joints.get(i + 1).is_none_or(|next| before.is_none_or(|b| checker.steps(b, next) > 1));
+                if !is_next_far {
+                    continue;
+                }
+                before = Some(posture);
+                if let Some(collision) = checker.collision(posture, Contact::None) {
+                    return Err(format!("{near}: while its fingers open, {collision}"));
+                }
+            }
+        }
+        Ok(())
     }
 
     /// Whether the head may turn so: from and to these positions of pan and tilt, in radians.
@@ -48,7 +113,8 @@ impl Cell {
     /// # Errors
     /// Which links come too close, of what, and what that one is doing.
     pub(super) fn head_keeps_apart(&self, from: [f64; 2], to: [f64; 2]) -> Result<(), String> {
-        let ours = Ahead { part: Part::Head, links: self.robot.head_links(), courses: vec![turned(from, to)] };
+        let (links, courses) = (self.robot.head_links(), vec![turned(from, to)]);
+        let ours = Ahead { part: Part::Head, links, courses, between_m: 0.0 };
         self.keeps_apart(&ours, ["the head stays where it is: ", "the head stays where it is: its way"])
     }
 
@@ -122,12 +188,38 @@ impl Cell {
             _ => ([here.pan, here.tilt], None),
         };
         let courses = vec![turned([here.pan, here.tilt], to)];
-        (Ahead { part: Part::Head, links: self.robot.head_links(), courses }, ticket)
+        (Ahead { part: Part::Head, links: self.robot.head_links(), courses, between_m: 0.0 }, ticket)
     }
 
     /// The fingers of an arm that stands may move.
     fn ahead_of_arm(&self, arm: usize) -> (Ahead, Option<Ticket>) {
         let at = self.arms.seen_from(arm, &self.measured());
+        let (joints, ticket) = self.joints_ahead(arm);
+        if let (Some(to), Some(_)) = (self.opens_fingers_to(arm), ticket) {
+            return (self.both_move(arm, &joints, at.finger, to), ticket);
+        }
+        let mut fingers = vec![vec![at.finger]];
+        if self.arms.view(arm).finger().is_some() {
+            let open = self.arms.open_finger_m(arm);
+            match self.activities.get(&Module::Gripper(arm)).map(|activity| &activity.kind) {
+                // What slips out of fingers lets them close fully.
+                Some(Kind::Close { .. }) => fingers = vec![passed(at.finger, 0.0, FINGER_STEP_M).collect(), vec![open]],
+                Some(Kind::Open { to, .. }) => fingers = vec![passed(at.finger, *to, FINGER_STEP_M).collect()],
+                _ if open != at.finger => fingers.push(vec![open]),
+                _ => {}
+            }
+        }
+        // Either the joints move or the fingers do; what does both is above.
+        let course = |fingers: Vec<f64>| -> Vec<ArmPosition> {
+            let positions = fingers.into_iter().flat_map(|finger| joints.iter().map(move |at| (*at, finger)));
+            positions.map(|(joints, finger)| ArmPosition { joints, finger }).collect()
+        };
+        let courses = fingers.into_iter().map(course).collect();
+        (Ahead { part: Part::Arm(arm), links: self.robot.links_of(arm), courses, between_m: 0.0 }, ticket)
+    }
+
+    /// Where the joints of an arm are from now on, and with which goal where it is on its way; else it stands.
+    fn joints_ahead(&self, arm: usize) -> (Vec<JointVector>, Option<Ticket>) {
         let activity = self.activities.get(&Module::Arm(arm));
         let followed = activity.and_then(|activity| match &activity.kind {
             Kind::Follow(way) => Some((activity.ticket, way.ahead(&self.robot, activity.elapsed_s(self.motion_time)))),
@@ -135,31 +227,14 @@ impl Cell {
         });
         let braking = self.braking.get(&Module::Arm(arm));
         let braked = braking.map(|braking| (braking.ticket, braking.ahead(self.now)));
-        let (ticket, joints) = followed.or(braked).map_or((None, vec![at.arm]), |(ticket, way)| (Some(ticket), way));
-        let mut fingers = vec![vec![at.finger]];
-        if self.arms.view(arm).finger().is_some() {
-            let open = self.arms.open_finger_m(arm);
-            match self.activities.get(&Module::Gripper(arm)).map(|activity| &activity.kind) {
-                // What slips out of fingers lets them close fully.
-                Some(Kind::Close { .. }) => fingers = vec![passed(at.finger, 0.0).collect(), vec![open]],
-                Some(Kind::Open { to, .. }) => fingers = vec![passed(at.finger, *to).collect()],
-                _ if open != at.finger => fingers.push(vec![open]),
-                _ => {}
-            }
-        }
-        // Either the joints move or the fingers do.
-        let course = |fingers: Vec<f64>| -> Vec<ArmPosition> {
-            let positions = fingers.into_iter().flat_map(|finger| joints.iter().map(move |at| (*at, finger)));
-            positions.map(|(joints, finger)| ArmPosition { joints, finger }).collect()
-        };
-        let courses = fingers.into_iter().map(course).collect();
-        (Ahead { part: Part::Arm(arm), links: self.robot.links_of(arm), courses }, ticket)
+        let at = || vec![self.arms.seen_from(arm, &self.measured()).arm];
+        followed.or(braked).map_or_else(|| (at(), None), |(ticket, way)| (way, Some(ticket)))
     }
 }
 
 /// Positions of fingers on their way.
-fn passed(from: f64, to: f64) -> impl Iterator<Item = f64> {
-    let steps = ((to - from).abs() / FINGER_STEP_M).ceil().max(1.0) as u32;
+fn passed(from: f64, to: f64, step_m: f64) -> impl Iterator<Item = f64> {
+    let steps = ((to - from).abs() / step_m).ceil().max(1.0) as u32;
     (0..=steps).map(move |i| from + (to - from) * f64::from(i) / f64::from(steps))
 }
 

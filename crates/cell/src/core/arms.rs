@@ -30,6 +30,8 @@ struct Arm {
     pads: Option<Pads>,
     /// How far each finger is from the middle when the gripper is open, in metres.
     open_finger_m: f64,
+    /// The same where they last were when they had closed, around something or not.
+    closed_finger_m: f64,
     held: Option<Held>,
 }
 
@@ -77,7 +79,7 @@ impl Arms {
                 FIRST => opening_m / 2.0,
                 _ => most.min(opening_m / 2.0),
             });
-            arms.push(Arm { name: name.to_owned(), view, pads, open_finger_m, held: None });
+            arms.push(Arm { name: name.to_owned(), view, pads, open_finger_m, closed_finger_m: 0.0, held: None });
         }
         Ok(Arms(arms))
     }
@@ -110,6 +112,16 @@ impl Arms {
     /// How far each finger of an arm is from the middle when its gripper is open, in metres.
     pub(super) fn open_finger_m(&self, arm: usize) -> f64 {
         self.0[arm].open_finger_m
+    }
+
+    /// How far each finger of an arm was from the middle when it last had closed, in metres.
+    pub(super) fn closed_finger_m(&self, arm: usize) -> f64 {
+        self.0[arm].closed_finger_m
+    }
+
+    /// The fingers of an arm have closed so far.
+    pub(super) fn closed(&mut self, arm: usize, finger_m: f64) {
+        self.0[arm].closed_finger_m = finger_m;
     }
 
     /// What an arm holds.

@@ -48,6 +48,8 @@ pub(super) struct Ahead {
     pub(super) links: Vec<usize>,
     /// Courses that it may take: of each the positions, near each other, in the order of time.
     pub(super) courses: Vec<Vec<ArmPosition>>,
+    /// How far anything may be beside the nearest course, in metres: courses stand for what is between them.
+    pub(super) between_m: f64,
 }
 
 /// What the other part does meanwhile, which says how far apart both have to be.
@@ -173,6 +175,7 @@ fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahea
         for (i, at) in course.iter().enumerate() {
             let beside = [i.checked_sub(1), Some(i + 1)].map(|next| next.and_then(|next| course.get(next)));
             let leg = beside.into_iter().flatten().map(|next| levers.moved(at, next)).fold(0.0, f32::max) / 2.0;
+            let leg = leg + ours.between_m as f32;
             if looked_at.is_some_and(|(before, room)| levers.moved(before, at) + leg <= room) {
                 continue;
             }
@@ -223,6 +226,7 @@ fn swept(robot: &Robot, here: &Configuration, ahead: &Ahead, resolution: f32) ->
         }
     }
     let grown = |(mut body, _): (Swept, Kept)| {
+        body.dropped += ahead.between_m as f32;
         if !body.places.is_empty() {
             body.grow(0, body.places.len());
         }
@@ -450,7 +454,12 @@ mod tests {
             joints[0] += by * passed.min(2.0 - passed);
             ArmPosition { joints, finger: 0.0 }
         };
-        Ahead { part: Part::Arm(0), links: robot.links_of(0), courses: vec![(0..2 * steps * times).map(at).collect()] }
+        Ahead {
+            part: Part::Arm(0),
+            links: robot.links_of(0),
+            courses: vec![(0..2 * steps * times).map(at).collect()],
+            between_m: 0.0,
+        }
     }
 
     #[test]

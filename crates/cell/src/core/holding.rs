@@ -134,6 +134,7 @@ impl Cell {
             Ok(grip) => grip,
             Err((stopped, reason)) => {
                 self.resting.set_finger(arm, 0.0);
+                self.arms.closed(arm, 0.0);
                 let felt = stopped.map_or("nothing stopped the fingers".to_owned(), |width| {
                     format!("something {:.0} mm wide slipped out of the fingers", width * 1e3)
                 });
@@ -142,6 +143,7 @@ impl Cell {
             }
         };
         self.resting.set_finger(arm, grip.width / 2.0);
+        self.arms.closed(arm, grip.width / 2.0);
         let friction = self.environment.model(grip.index).kind.friction();
         let in_tool = grip.in_tool.compose(&parts[grip.index].0.inverse());
         self.arms.hold(arm, Some(Held::new(grip.index, in_tool, friction)));
@@ -199,6 +201,7 @@ impl Cell {
         self.contacts.let_go(arm, held.object, false);
         // Nothing is left to stop the fingers.
         self.resting.set_finger(arm, 0.0);
+        self.arms.closed(arm, 0.0);
         Some(held.object)
     }
 

@@ -72,12 +72,12 @@ impl Scenery {
     }
 }
 
-/// The average of all frames, each from where the camera truly was. Takes milliseconds per exposure.
+/// The average of all frames, each from where the camera truly was; what passed before the rest is left out where the rest was seen. Takes milliseconds per exposure.
 pub fn develop(robot: &Robot, camera: &Camera, noise: &Noise, seed: u64, exposures: &[Exposure]) -> DepthImage {
     let pictures = exposures.iter().map(|exposure| {
         let eye = Camera { pose: exposure.scenery.eye, ..*camera };
         let clean = render(&eye, &exposure.scenery.bodies(robot));
         (observe(&clean, &camera.intrinsics, noise, seed, exposure.first_frame, exposure.frames), exposure.frames)
     });
-    average(camera.intrinsics.width, camera.intrinsics.height, pictures)
+    average(camera.intrinsics.width, camera.intrinsics.height, noise, pictures)
 }

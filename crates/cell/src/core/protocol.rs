@@ -94,6 +94,11 @@ pub enum Request {
     },
     /// Opens the fingers.
     Release,
+    /// Opens the fingers so far and no further.
+    OpenTo {
+        /// How far they are apart then, in metres.
+        width: f64,
+    },
     /// Turns the camera.
     LookAt {
         /// Towards this point of the world.
@@ -226,7 +231,9 @@ impl Request {
         match self {
             Request::Drive { .. } | Request::SenseBase => Module::Base,
             Request::Follow { .. } | Request::MoveTo { .. } | Request::SenseArm => Module::Arm(arm),
-            Request::Grasp { .. } | Request::Release | Request::SenseGripper => Module::Gripper(arm),
+            Request::Grasp { .. } | Request::Release | Request::OpenTo { .. } | Request::SenseGripper => {
+                Module::Gripper(arm)
+            }
             Request::LookAt { .. } => Module::PanTilt,
             Request::Capture { .. } => Module::Camera,
         }

@@ -57,6 +57,9 @@ struct Posture {
     pan: f64,
     tilt: f64,
     finger: f64,
+    /// Where the fingers last had closed.
+    #[serde(default)]
+    closed_finger: f64,
     /// The arms from number 1 on.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     other_arms: Vec<ArmPosture>,
@@ -67,6 +70,8 @@ struct Posture {
 struct ArmPosture {
     joints: JointVector,
     finger: f64,
+    #[serde(default)]
+    closed_finger: f64,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     held: Option<SavedHold>,
 }
@@ -189,9 +194,12 @@ impl Cell {
         };
         let other_arms = self.arms.others(&measured).into_iter().enumerate();
         let other_arms = other_arms
-            .map(|(i, ArmPosition { joints, finger })| ArmPosture { joints, finger, held: held(i + 1) })
+            .map(|(i, ArmPosition { joints, finger })| {
+                let closed_finger = self.arms.closed_finger_m(i + 1);
+                ArmPosture { joints, finger, closed_finger, held: held(i + 1) }
+            })
             .collect();
-        let first_held = held(FIRST);
+        let (first_held, closed_finger) = (held(FIRST), self.arms.closed_finger_m(FIRST));
         let (faults, drawn) = self.faults.save();
         self.battery = Battery::at(self.config.battery, self.battery.level());
         Snapshot {
@@ -201,7 +209,7 @@ impl Cell {
             ids: self.ids.clone(),
             tilts: self.tilts.clone(),
             environment: self.environment.save(&self.robot, &self.configuration()),
-            posture: Posture { base, arm, pan, tilt, finger, other_arms },
+            posture: Posture { base, arm, pan, tilt, finger, closed_finger, other_arms },
             held: first_held,
             battery: self.battery.level(),
             frames_taken: self.frames_taken,
@@ -220,9 +228,11 @@ impl Cell {
             return;
         }
         self.freeze("the cell was put back to a snapshot", out);
-        let Posture { base, arm, pan, tilt, finger, other_arms } = snapshot.posture.clone();
+        let Posture { base, arm, pan, tilt, finger, closed_finger, other_arms } = snapshot.posture.clone();
         self.resting = Configuration { base, arm, pan, tilt, finger, ..self.arms.first_posture() };
+        self.arms.closed(FIRST, closed_finger);
         for (i, other) in other_arms.into_iter().enumerate() {
+            self.arms.closed(i + 1, other.closed_finger);
             self.resting.set_joints(i + 1, other.joints);
             self.resting.set_finger(i + 1, other.finger);
         }

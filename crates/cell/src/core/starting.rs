@@ -23,12 +23,15 @@ const NO_BASE: &str = "the robot has no base that drives: its description has no
 const NO_CAMERA: &str = "the robot has no camera: its description has no `[camera]`";
 /// Why nothing is grasped.
 const NO_GRIPPER: &str = "the arm has no gripper: its description has none";
+/// How far each finger goes away from what it lets go before the arm may leave, in metres.
+const PARTED_M: f64 = 0.003;
 /// How far the camera may look past its target, in radians.
 const MAX_LOOK_ERROR_RAD: f64 = 0.02;
 
 /// Why two modules do not move at once, and what a task does about it.
 const BASE: &str = "nothing else happens while the base drives, so let both states block `Base`";
-const HAND: &str = "arm and gripper do not move at once, so let one of both states block `Arm` and `Gripper`";
+const HAND: &str = "an arm does not move while its fingers close, nor before they have parted from what they let go, so let one of both \
+                    states block `Arm` and `Gripper`";
 const PICTURE: &str =
     "no picture is taken while the head moves, so let one of both states block `PanTilt` and `Camera`";
 
@@ -76,7 +79,7 @@ impl Cell {
                 let trajectory = self.checked(arm, &here, &line)?;
                 self.following(arm, trajectory)?
             }
-            Request::Grasp { .. } | Request::Release if self.arms.pads(arm).is_none() => {
+            Request::Grasp { .. } | Request::Release | Request::OpenTo { .. } if self.arms.pads(arm).is_none() => {
                 return Err(NO_GRIPPER.to_owned());
             }
             Request::Grasp { object, expected } => {
@@ -92,14 +95,8 @@ impl Cell {
                 self.contacts.closing(arm);
                 (Kind::Close { from, to, object, expected }, self.config.gripper.close_s)
             }
-            Request::Release => {
-                self.no_motion_of(Module::Base, BASE)?;
-                self.no_motion_of(Module::Arm(arm), HAND)?;
-                let (from, to) = (self.arms.seen_from(arm, &here).finger, self.arms.open_finger_m(arm));
-                self.fingers_keep_apart(arm, from, to)?;
-                self.let_go(arm);
-                (Kind::Open { from, to }, self.config.gripper.open_s)
-            }
+            Request::Release => self.opening(arm, self.arms.open_finger_m(arm))?,
+            Request::OpenTo { width } => self.opening(arm, self.opens_to(arm, width)?)?,
             Request::SenseBase => (Kind::SenseBase, 0.0),
             Request::SenseArm => (Kind::SenseArm, 0.0),
             Request::SenseGripper => (Kind::SenseGripper, 0.0),
@@ -136,10 +133,53 @@ impl Cell {
         Ok(())
     }
 
-    /// What does not move while an arm does.
+    /// What does not move while an arm does: of its own fingers those that close, and those that have not parted yet from what they let go.
     fn may_move_arm(&self, arm: usize) -> Result<(), String> {
         self.no_motion_of(Module::Base, BASE)?;
+        let finger = self.arms.seen_from(arm, &self.measured()).finger;
+        let parted = finger >= self.arms.closed_finger_m(arm) + PARTED_M;
+        if parted && self.opens_fingers_to(arm).is_some() {
+            return Ok(());
+        }
         self.no_motion_of(Module::Gripper(arm), HAND)
+    }
+
+    /// How far each finger will be from the middle, where the fingers of an arm open.
+    pub(super) fn opens_fingers_to(&self, arm: usize) -> Option<f64> {
+        match self.activities.get(&Module::Gripper(arm))?.kind {
+            Kind::Open { to, .. } => Some(to),
+            _ => None,
+        }
+    }
+
+    /// How far each finger is from the middle where they are so far apart.
+    ///
+    /// # Errors
+    /// When they do not open by going there.
+    fn opens_to(&self, arm: usize, width: f64) -> Result<f64, String> {
+        let (finger, open) = (self.arms.seen_from(arm, &self.measured()).finger, self.arms.open_finger_m(arm));
+        if width / 2.0 > finger && width / 2.0 <= open {
+            return Ok(width / 2.0);
+        }
+        let [from, at_most] = [finger, open].map(|finger| 2e3 * finger);
+        Err(format!(
+            "input `width_m` is {width}: the fingers are {from:.0} mm apart, so they open to more than that and at most {at_most:.0} mm"
+        ))
+    }
+
+    /// What opening fingers do, and for how long: as fast as if they opened all the way from where they had closed. What they hold they let go, which
+    /// an arm that stands does; else the arm may move meanwhile.
+    fn opening(&mut self, arm: usize, to: f64) -> Result<(Kind, f64), String> {
+        self.no_motion_of(Module::Base, BASE)?;
+        let from = self.arms.seen_from(arm, &self.measured()).finger;
+        let (closed, whole_s) = (self.arms.closed_finger_m(arm), self.config.gripper.open_s);
+        if self.arms.held(arm).is_some() || from < closed + PARTED_M {
+            self.no_motion_of(Module::Arm(arm), HAND)?;
+        }
+        self.fingers_keep_apart(arm, from, to)?;
+        self.let_go(arm);
+        let part = (to - from) / (self.arms.open_finger_m(arm) - closed);
+        Ok((Kind::Open { from, to }, if part > 0.0 && part < 1.0 { whole_s * part } else { whole_s }))
     }
 
     /// A trajectory of an arm, checked beside the other arms with their fingers as they are and with those open: neither takes all the room of

@@ -96,7 +96,9 @@ const ACTIONS: [(Module, &str, &str, Read); 10] = [
         let expected = goal.port("expected").optional().map(|port| port.pose()).transpose()?;
         Ok(Request::Grasp { object: goal.input_string("object")?.to_owned(), expected })
     }),
-    (Module::Gripper(FIRST), "release", "opens the fingers", |_| Ok(Request::Release)),
+    (Module::Gripper(FIRST), "release", "opens the fingers", |goal| {
+        Ok(goal.optional_float("width_m")?.map_or(Request::Release, |width| Request::OpenTo { width }))
+    }),
     (Module::Arm(FIRST), "where", "says where the arm's joints are", |_| Ok(Request::SenseArm)),
     (Module::Gripper(FIRST), "feel", "says whether the fingers hold something", |_| Ok(Request::SenseGripper)),
     (Module::PanTilt, "look_at", "turns the camera to a point of the world", |goal| {

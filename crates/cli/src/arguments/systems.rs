@@ -96,6 +96,8 @@ pub(crate) enum Budget {
     Task,
     /// What they need for a path, no more
     None,
+    /// Nothing but the last row, of the task whose motions and looks overlap
+    Overlapped,
     /// One row for each
     Both,
 }

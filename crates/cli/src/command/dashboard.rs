@@ -20,6 +20,8 @@ use std::path::{Path, PathBuf};
 
 /// How many elements a list has that an action answers, as `ratn check` assumes.
 const ASSUMED_ELEMENTS: usize = 3;
+/// What a change gains is simulated up to so many events, which bounds the memory that it takes; how long it may take, the dashboard says.
+const MAX_EVENTS: usize = 50_000;
 
 /// Serves the pages until the user has seen enough.
 pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(), Failure> {
@@ -80,7 +82,7 @@ fn editing(file: &Path, directory: &Path) -> Result<Editing, Failure> {
     let makespan = move |program: &Program, goes_on: &dyn Fn() -> bool| {
         let parameters = program.bind_parameters(&[]).map_err(|error| error.to_string())?;
         let assumptions = Assumptions { parameters, ..assumptions.clone() };
-        makespan_s(program, &config.catalogue, &assumptions, goes_on).map_err(|obstacle| obstacle.to_string())
+        makespan_s(program, &config.catalogue, &assumptions, MAX_EVENTS, goes_on).map_err(|obstacle| obstacle.to_string())
     };
     Ok(Editing::of(file.to_owned(), kinds, check, makespan))
 }

@@ -81,6 +81,10 @@ pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Fail
     let load = |text: &str, file: &str| check::load_from(&BuiltIn, text, file, &config.catalogue).map(Arc::new);
     let program = load(&text, file)?;
     let overlapped = overlapped(arguments, &config).map(|(file, text)| load(text, file)).transpose()?;
+    if arguments.budget == Budget::Overlapped && overlapped.is_none() {
+        let why = format!("made for {AIMM}, a cell in which nothing goes wrong, and no plates");
+        return Err(Failure::Refused(format!("ratn: --budget overlapped: the task that overlaps is {why}")));
+    }
     let plans = plans(arguments, overlapped.is_some());
     let directory = out_directory(arguments)?;
     let programs = (program, overlapped);
@@ -176,12 +180,12 @@ fn what_is_wrong(outcome: &Outcome, goods: &result::Goods) -> Option<String> {
 fn plans(arguments: &DemoArguments, overlapped: bool) -> Vec<Plan> {
     let plan = |mode, planners, work| Plan { mode, planners, work };
     let mut plans = Vec::new();
-    if arguments.budget != Budget::None {
+    if matches!(arguments.budget, Budget::Task | Budget::Both) {
         plans.push(plan(Mode::Hsm, arguments.planners, Work::Budget));
         plans.push(plan(Mode::Cdtn, 1, Work::Budget));
         plans.push(plan(Mode::Cdtn, arguments.planners, Work::Budget));
     }
-    if arguments.budget != Budget::Task {
+    if matches!(arguments.budget, Budget::None | Budget::Both) {
         plans.push(plan(Mode::Hsm, arguments.planners, Work::NoBudget));
         if arguments.budget == Budget::None {
             plans.push(plan(Mode::Cdtn, 1, Work::NoBudget));

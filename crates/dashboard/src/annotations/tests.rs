@@ -144,6 +144,9 @@ fn what_is_typed_is_read_as_it_was_shown() {
         assert_eq!(typed(&read), text);
     }
     assert!(item(" ").is_err() && item("{ a").is_err());
+    for bomb in ["[&a [1, 1], *a, *a]", "{ a: &b 1 }", "&a 3", "*a"] {
+        assert!(item(bomb).unwrap_err().contains("anchor or an alias"), "{bomb}");
+    }
 }
 
 #[tokio::test]

@@ -13,6 +13,7 @@
 //! | results that were discarded | they serve again |
 //! | results that get better, with the best so far and what their goals hold | they are given to motions, and what they hold goes back |
 //! | the queue, timers, cursors, branches, lines, the interpreters with their threads | where everything is |
+//! | what is still to be done of a run that was told to end | it ends after that |
 //!
 //! | not in it | because |
 //! |---|---|
@@ -42,7 +43,7 @@ use std::fmt::{self, Write};
 use std::sync::Arc;
 
 /// The version of the form. Any change of what is written takes a new number: no version reads another's.
-const FORMAT: u8 = 6;
+const FORMAT: u8 = 7;
 
 type Hash = [u8; blake3::OUT_LEN];
 
@@ -129,7 +130,7 @@ impl Executive {
     fn body(&self, facts: Vec<(&FactKey, &Value, Revision)>) -> Vec<u8> {
         let beside = match &self.state {
             State::Cdtn(window) => Some(window.beside(&self.root)),
-            State::Fresh | State::Hsm(_) | State::Ended => None,
+            State::Fresh | State::Hsm(_) | State::Leaving(_) | State::Ended => None,
         };
         let Executive { last_instance, seed, signals, deadline, state, .. } = self;
         let (program, revision) = (self.fingerprint(), self.root.revision());

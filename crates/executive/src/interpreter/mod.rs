@@ -110,10 +110,30 @@ enum Todo {
     Iterate,
     /// An action is under way.
     Busy,
-    /// Its regions are under way.
-    Join { state: StateId, path: String, regions: Vec<u64> },
+    /// Its regions are under way; once it is decided, those that are cut short.
+    Join { state: StateId, path: String, regions: Vec<u64>, decided: Option<Decided> },
     /// It has come to its end.
     Done { outcome: String, reason: String },
+}
+
+/// How a concurrency will end, once what it cuts short has ended.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+struct Decided {
+    /// The first region that had ended.
+    first: Option<usize>,
+    /// Of so many successes: whether they are there, or can no longer be.
+    enough: Option<bool>,
+    /// The last region had begun.
+    is_entered: bool,
+}
+
+/// A thread that is cut short: what it had under way is cancelled, and it leaves one state after the other.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+struct CutShort {
+    /// So many frames there are while a `finally` is done; none before the first.
+    frames: usize,
+    /// What could not be done on the way out.
+    problem: String,
 }
 
 /// A thread of control: the state's, or a region's.
@@ -129,6 +149,8 @@ struct Thread {
     routine: Option<u64>,
     /// Its visits since it last started something; see [`crate::context::MAX_IDLE_VISITS`].
     idle_visits: u32,
+    /// Another region was first.
+    cut_short: Option<CutShort>,
 }
 
 /// How far an action is.
@@ -217,6 +239,7 @@ impl Interpreter {
             current: None,
             routine: routine.as_ref().map(|_| MAIN),
             idle_visits: 0,
+            cut_short: None,
         };
         Interpreter {
             threads: BTreeMap::from([(MAIN, main)]),
@@ -389,7 +412,7 @@ impl Interpreter {
             Target::Projection { world, .. } => world,
         };
         let (frames, variables, todo) = (Vec::new(), Vec::new(), Todo::Busy);
-        let none = Thread { frames, variables, todo, current: None, routine: None, idle_visits: 0 };
+        let none = Thread { frames, variables, todo, current: None, routine: None, idle_visits: 0, cut_short: None };
         let thread = self.threads.get(&thread).unwrap_or(&none);
         let names = Scoped { interpreter: self, thread, program: context.program };
         use_scope(&Bindings { names: &names, outputs, world, unknown: &Footprint::NOTHING })

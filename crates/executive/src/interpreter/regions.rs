@@ -1,6 +1,6 @@
 //! Concurrency: a thread per region, and the decider when they have ended.
 
-use super::{Interpreter, Thread, Todo};
+use super::{Decided, Interpreter, Thread, Todo};
 use crate::context::Context;
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS, StateKind, VIOLATED};
@@ -26,14 +26,24 @@ impl Interpreter {
                 variables: variables.len(),
             };
             let (frames, variables) = (vec![frame], variables.clone());
-            let region = Thread { frames, variables, todo, current: None, routine, idle_visits: 0 };
+            let region = Thread { frames, variables, todo, current: None, routine, idle_visits: 0, cut_short: None };
             self.threads.insert(self.last_thread, region);
         }
-        self.set(thread, Todo::Join { state, path, regions: threads });
+        self.set(thread, Todo::Join { state, path, regions: threads, decided: None });
     }
 
     /// Whether enough regions have ended.
-    pub(super) fn may_join(&self, program: &Program, state: StateId, regions: &[u64]) -> bool {
+    pub(super) fn may_join(
+        &self,
+        program: &Program,
+        thread: u64,
+        state: StateId,
+        regions: &[u64],
+        is_decided: bool,
+    ) -> bool {
+        if is_decided || self.is_leaving(thread) {
+            return self.have_ended(regions);
+        }
         let mut ended = regions.iter().map(|region| self.region_end(*region).is_some());
         match program.state(state).kind {
             StateKind::Concurrency { successes: Some(wanted), .. } => {
@@ -46,39 +56,57 @@ impl Interpreter {
         }
     }
 
+    /// Whether all of them have.
+    pub(super) fn have_ended(&self, regions: &[u64]) -> bool {
+        regions.iter().all(|region| self.region_end(*region).is_some())
+    }
+
     /// How many regions have ended with success.
     fn succeeded(&self, regions: &[u64]) -> usize {
         regions.iter().filter(|region| self.region_end(**region).is_some_and(|(outcome, _)| outcome == SUCCESS)).count()
     }
 
     /// How a region has ended, and why.
-    fn region_end(&self, region: u64) -> Option<(&str, &str)> {
+    pub(super) fn region_end(&self, region: u64) -> Option<(&str, &str)> {
         match &self.threads.get(&region)?.todo {
             Todo::Done { outcome, reason } => Some((outcome, reason)),
             _ => None,
         }
     }
 
-    /// The regions have ended: their outcomes decide.
-    pub(super) fn join(&mut self, context: &mut Context<'_>, thread: u64, id: StateId, path: String, regions: &[u64]) {
+    /// Enough regions have ended: the others are cut short, and when these have ended, too, the outcomes decide.
+    pub(super) fn join(
+        &mut self,
+        context: &mut Context<'_>,
+        thread: u64,
+        id: StateId,
+        path: String,
+        regions: Vec<u64>,
+        decided: Option<Decided>,
+    ) {
+        if self.is_leaving(thread) {
+            return self.leave_regions(context, thread, id, &path, &regions);
+        }
+        let Decided { first, enough, is_entered } =
+            decided.unwrap_or_else(|| self.decision(context.program, id, &regions));
+        for region in &regions {
+            self.cut_short(context, *region);
+        }
+        if !self.have_ended(&regions) {
+            let decided = Some(Decided { first, enough, is_entered });
+            return self.set(thread, Todo::Join { state: id, path, regions, decided });
+        }
+        let regions = regions.as_slice();
         let program = context.program;
-        let StateKind::Concurrency { regions: states, decide, preemptive, successes, .. } = &program.state(id).kind
-        else {
+        let StateKind::Concurrency { regions: states, decide, preemptive, .. } = &program.state(id).kind else {
             return;
         };
-        let enough = successes.map(|wanted| self.succeeded(regions) >= wanted as usize);
-        let first = regions.iter().position(|region| self.region_end(*region).is_some());
-        let last = regions.last().and_then(|last| self.threads.get(last));
-        let is_entered = last.is_none_or(|last| !matches!(last.todo, Todo::Enter(..)) || last.frames.len() > 1);
         let watches = states.first().is_some_and(|first| matches!(program.state(*first).wait(), Some(Wait::Watch(_))));
         let mut outcomes = Vec::new();
         let mut reasons = Vec::new();
         for (region, state) in regions.iter().zip(states) {
             let end = self.region_end(*region).map(|(outcome, reason)| (outcome.to_owned(), reason.to_owned()));
-            let (outcome, reason) = end.unwrap_or_else(|| match self.preempt(context, *region) {
-                Ok(()) => (PREEMPTED.to_owned(), String::new()),
-                Err(problem) => (ABORTED.to_owned(), problem),
-            });
+            let (outcome, reason) = end.unwrap_or_else(|| (PREEMPTED.to_owned(), String::new()));
             self.regions.insert(*state, outcome.clone());
             if !reason.is_empty() {
                 reasons.push(reason);
@@ -125,6 +153,19 @@ impl Interpreter {
             return self.ended(thread, id, outcome, reason);
         }
         self.exit(context, thread, id, &path, base, outcome, reason);
+    }
+
+    /// How a concurrency will end.
+    fn decision(&self, program: &Program, id: StateId, regions: &[u64]) -> Decided {
+        let StateKind::Concurrency { successes, .. } = &program.state(id).kind else {
+            return Decided { first: None, enough: None, is_entered: true };
+        };
+        let last = regions.last().and_then(|last| self.threads.get(last));
+        Decided {
+            first: regions.iter().position(|region| self.region_end(*region).is_some()),
+            enough: successes.map(|wanted| self.succeeded(regions) >= wanted as usize),
+            is_entered: last.is_none_or(|last| !matches!(last.todo, Todo::Enter(..)) || last.frames.len() > 1),
+        }
     }
 
     /// What regions assigned to variables outside is seen from here on; where several did, the last region's.

@@ -1,11 +1,18 @@
 //! Ending what is under way: all of it when the run ends, a region when another one was first.
+//!
+//! A region that is cut short leaves the states in which it is, the innermost first. A state with something to do on every way out is left
+//! when that is done: the region goes on with it, and ends when it has left the last of them. Only then the concurrency around it has ended.
 
-use super::{Interpreter, Phase, Todo};
+use super::{CutShort, Frame, Interpreter, MAIN, Phase, Target, Thread, Todo};
 use crate::binding::Outputs;
 use crate::context::Context;
+use crate::hold::Hold;
 use crate::protocol::{Command, Note};
+use crate::way_out::WayOut;
 use ratn_model::id::StateId;
-use ratn_model::program::PREEMPTED;
+use ratn_model::program::{ABORTED, Finally, PREEMPTED, Program, StateKind};
+use ratn_model::value::Value;
+use std::collections::BTreeMap;
 
 impl Interpreter {
     /// Ends everything under way. What a motion says of being cut short is true; what composite states do at their ends is left undone.
@@ -19,35 +26,128 @@ impl Interpreter {
         self.give_up_routines(context);
     }
 
+    fn is_cut_short(&self, thread: u64) -> bool {
+        self.threads.get(&thread).is_some_and(|thread| thread.cut_short.is_some())
+    }
+
+    /// Whether a thread is cut short and leaves states, and does nothing on the way out of one.
+    pub(super) fn is_leaving(&self, thread: u64) -> bool {
+        let is_leaving = |thread: &Thread| {
+            thread.cut_short.as_ref().is_some_and(|cut| cut.frames == 0 || thread.frames.len() < cut.frames)
+        };
+        self.threads.get(&thread).is_some_and(is_leaving)
+    }
+
     /// Another region was first: what this one has under way is cancelled and ends `preempted`, then the composite states in which it is, the
-    /// innermost first.
-    ///
-    /// # Errors
-    /// Why an effect that they declare for that could not be made.
-    pub(super) fn preempt(&mut self, context: &mut Context<'_>, id: u64) -> Result<(), String> {
-        let mut result = self.cancel(context, id);
-        let Some(thread) = self.threads.get_mut(&id) else { return result };
-        let todo = std::mem::replace(&mut thread.todo, Todo::Busy);
-        if let Todo::Join { state, path, regions } = todo {
-            for region in &regions {
-                result = result.and(self.preempt(context, *region));
-            }
-            self.merge_variables(id, &regions);
-            for region in &regions {
-                self.threads.remove(region);
-            }
-            result = result.and(self.leave_preempted(context, id, state, &path));
+    /// innermost first. Nothing happens where it has ended, or is on its way out.
+    pub(super) fn cut_short(&mut self, context: &mut Context<'_>, id: u64) {
+        if self.is_cut_short(id) || self.region_end(id).is_some() {
+            return;
         }
-        // The outermost frame is that of the concurrency itself.
-        while let Some(thread) = self.threads.get_mut(&id).filter(|thread| thread.frames.len() > 1)
+        let cancelled = self.cancel(context, id);
+        let Some(thread) = self.threads.get_mut(&id) else { return };
+        thread.cut_short = Some(CutShort::default());
+        let todo = std::mem::replace(&mut thread.todo, Todo::Busy);
+        // What was to be done on the way out has been done.
+        if let Todo::Ended { state, .. } = &todo
+            && let Some(frame) = thread.frames.last()
+            && finally(context.program, frame).is_some_and(|finally| finally.lastly.values().any(|last| last == state))
             && let Some(frame) = thread.frames.pop()
         {
-            result = result.and(self.leave_preempted(context, id, frame.owner, &frame.path));
+            thread.variables.truncate(frame.variables);
+        }
+        self.has_problem(id, cancelled);
+        match todo {
+            Todo::Join { state, path, regions, .. } => {
+                for region in &regions {
+                    self.cut_short(context, *region);
+                }
+                if self.have_ended(&regions) {
+                    self.leave_regions(context, id, state, &path, &regions);
+                } else {
+                    self.set(id, Todo::Join { state, path, regions, decided: None });
+                }
+            }
+            _ => self.leave_all(context, id),
+        }
+    }
+
+    /// The regions of a concurrency that is cut short have ended.
+    pub(super) fn leave_regions(
+        &mut self,
+        context: &mut Context<'_>,
+        id: u64,
+        state: StateId,
+        path: &str,
+        regions: &[u64],
+    ) {
+        self.merge_variables(id, regions);
+        for region in regions {
+            let thread = self.threads.remove(region);
+            if let Some(cut) = thread.and_then(|thread| thread.cut_short).filter(|cut| !cut.problem.is_empty()) {
+                self.has_problem(id, Err(cut.problem));
+            }
+        }
+        let left = self.leave_preempted(context, id, state, path);
+        self.has_problem(id, left);
+        self.leave_all(context, id);
+    }
+
+    /// A region that is cut short leaves the states in which it is, as far as the next one with something to do on the way out.
+    fn leave_all(&mut self, context: &mut Context<'_>, id: u64) {
+        // The outermost frame is that of the concurrency itself.
+        while let Some(thread) = self.threads.get_mut(&id).filter(|thread| thread.frames.len() > 1)
+            && let Some(frame) = thread.frames.last()
+        {
+            if let Some(last) = finally(context.program, frame).and_then(|finally| finally.lastly.get(PREEMPTED)) {
+                let frames = thread.frames.len();
+                thread.cut_short.get_or_insert_default().frames = frames;
+                return self.set(id, Todo::Enter(*last, None));
+            }
+            let Some(frame) = thread.frames.pop() else { break };
+            let left = self.leave_preempted(context, id, frame.owner, &frame.path);
+            self.has_problem(id, left);
             if let Some(thread) = self.threads.get_mut(&id) {
                 thread.variables.truncate(frame.variables);
             }
         }
-        result
+        let problem = self.threads.get(&id).and_then(|thread| thread.cut_short.as_ref());
+        let reason = problem.map(|cut| cut.problem.clone()).unwrap_or_default();
+        let outcome = if reason.is_empty() { PREEMPTED } else { ABORTED };
+        self.set(id, Todo::Done { outcome: outcome.to_owned(), reason });
+    }
+
+    /// A state has ended in a thread that is cut short: where what had to be done on the way out of it is done, the thread leaves the states
+    /// around it; whether it does.
+    pub(super) fn goes_on_out(
+        &mut self,
+        context: &mut Context<'_>,
+        id: u64,
+        state: StateId,
+        outcome: &str,
+        reason: &str,
+    ) -> bool {
+        let is_left = |thread: &Thread| thread.cut_short.as_ref().is_some_and(|cut| thread.frames.len() < cut.frames);
+        if !self.threads.get(&id).is_some_and(is_left) {
+            return false;
+        }
+        if outcome != PREEMPTED {
+            let path = &context.program.state(state).path;
+            let reason = if reason.is_empty() { format!("{path}: it ended `{outcome}`") } else { reason.to_owned() };
+            self.has_problem(id, Err(reason));
+        }
+        self.leave_all(context, id);
+        true
+    }
+
+    /// The first problem on the way out is told.
+    fn has_problem(&mut self, id: u64, result: Result<(), String>) {
+        if let Err(problem) = result
+            && let Some(cut) = self.threads.get_mut(&id).and_then(|thread| thread.cut_short.as_mut())
+            && cut.problem.is_empty()
+        {
+            cut.problem = problem;
+        }
     }
 
     fn leave_preempted(
@@ -60,6 +160,52 @@ impl Interpreter {
         let state = context.program.state(state);
         let changed = self.change(context, thread, state, path, PREEMPTED, &Outputs::new());
         changed.map_err(|problem| format!("{path}: {problem}"))
+    }
+
+    /// What composite states say of being cut short is true, of one that a run is in which has been told to end.
+    pub(crate) fn leave(&mut self, context: &mut Context<'_>, state: StateId, path: &str) -> Result<(), String> {
+        self.leave_preempted(context, MAIN, state, path)
+    }
+
+    /// What is still to be done where everything that is under way in the actual world is cut short.
+    pub(crate) fn way_out(&self, program: &Program, way: &mut WayOut) {
+        if !matches!(self.target, Target::Actual) {
+            return;
+        }
+        for thread in self.threads.values() {
+            let is_region = |frame: &&Frame| matches!(program.state(frame.owner).kind, StateKind::Concurrency { .. });
+            // The outermost frame of a region is that of the concurrency, which the thread around is in.
+            let own = usize::from(thread.frames.first().is_some_and(|frame| is_region(&frame)));
+            let joins = match &thread.todo {
+                Todo::Join { state, path, .. } => Some((*state, path.clone(), 0)),
+                _ => None,
+            };
+            let entered = |frame: &Frame| {
+                let last = finally(program, frame).and_then(|finally| finally.lastly.get(PREEMPTED));
+                let visits = last.and_then(|last| frame.visits.get(last)).copied().unwrap_or(0);
+                (frame.owner, frame.path.clone(), visits)
+            };
+            let places = joins.into_iter().chain(thread.frames[own..].iter().rev().map(entered));
+            let variables = || thread.variables.iter().map(|(name, value)| (name.clone(), (**value).clone())).collect();
+            way.add(program, places, variables, || self.outputs.clone());
+        }
+        way.hold = self.hold.clone();
+    }
+
+    /// Does what is to be done on the way out of a run that has been told to end, in the scope of where it was.
+    pub(crate) fn on_the_way_out(
+        variables: Vec<(String, Value)>,
+        outputs: BTreeMap<StateId, Outputs>,
+        hold: Hold,
+    ) -> Interpreter {
+        Interpreter { hold, ..Interpreter::new(variables, outputs, None, Target::Actual) }
+    }
+
+    /// The variables and outputs in the scope of the outermost state, and what the operator lets begin.
+    pub(crate) fn into_scope(mut self) -> (Vec<(String, Value)>, BTreeMap<StateId, Outputs>, Hold) {
+        let main = self.threads.remove(&MAIN).map(|main| main.variables).unwrap_or_default();
+        let variables = main.into_iter().map(|(name, value)| (name, (*value).clone())).collect();
+        (variables, self.outputs, self.hold)
     }
 
     /// Ends the action that a thread has under way. What that did to the world is said as for any end.
@@ -82,4 +228,9 @@ impl Interpreter {
         context.note(Note::Squashed { instance: current.instance });
         result
     }
+}
+
+/// What is to be done on every way out of the state that a list belongs to.
+pub(super) fn finally<'p>(program: &'p Program, frame: &Frame) -> Option<&'p Finally> {
+    program.state(frame.owner).annotations.finally.as_ref()
 }

@@ -17,7 +17,9 @@ impl Interpreter {
             let follows = |thread: u64, todo: &Todo| match todo {
                 Todo::Ended { .. } | Todo::Iterate => true,
                 Todo::Enter(..) | Todo::Busy => false,
-                Todo::Join { state, regions, .. } => self.may_join(context.program, *state, regions),
+                Todo::Join { state, regions, decided, .. } => {
+                    self.may_join(context.program, thread, *state, regions, decided.is_some())
+                }
                 Todo::Done { .. } => thread == MAIN,
             };
             let id = match (self.first(follows), self.first(|_, todo| matches!(todo, Todo::Enter(..)))) {
@@ -35,7 +37,9 @@ impl Interpreter {
                 Todo::Ended { state, outcome, reason } => self.follow(context, id, state, outcome, reason),
                 Todo::Iterate => self.iterate(context, id),
                 Todo::Busy => {}
-                Todo::Join { state, path, regions } => self.join(context, id, state, path, &regions),
+                Todo::Join { state, path, regions, decided } => {
+                    self.join(context, id, state, path, regions, decided);
+                }
                 Todo::Done { outcome, reason } => return Progress::Ended { outcome, reason },
             }
             if let Some(reason) = self.in_circles.clone() {
@@ -301,6 +305,9 @@ impl Interpreter {
     /// Follows the outcome of a state that has ended.
     fn follow(&mut self, context: &mut Context<'_>, id: u64, state: StateId, outcome: String, reason: String) {
         self.end_routine(context, id, state, &outcome);
+        if self.goes_on_out(context, id, state, &outcome, &reason) {
+            return;
+        }
         let Some(frame) = self.threads.get(&id).and_then(|thread| thread.frames.last()) else {
             return self.set(id, Todo::Done { outcome, reason });
         };

@@ -241,7 +241,7 @@ impl Window {
         let Some(marker) = instance.marker() else { return };
         let outcome = context.plan.state(instance.state).outcomes[marker.leaves_by].to_string();
         let reason = marker.because.as_ref().map_or(String::new(), ToString::to_string);
-        let mut end = End { outcome, outputs: Outputs::new(), reason };
+        let mut end = End::new(&outcome, reason);
         if end.outcome == SUCCESS {
             end.reason = String::new();
             let outputs = self.look(context, id, None, |_, view| {
@@ -254,7 +254,7 @@ impl Window {
             });
             match outputs {
                 Some(Ok(outputs)) => end.outputs = outputs,
-                Some(Err(reason)) => end = End { outcome: ABORTED.to_owned(), outputs: Outputs::new(), reason },
+                Some(Err(reason)) => end = End::new(ABORTED, reason),
                 None => {}
             }
         }

@@ -2,11 +2,15 @@
 
 use super::Window;
 use super::graph::Pruned;
-use super::graph::instance::Status;
-use crate::binding::Outputs;
+use super::graph::instance::{Role, Status};
+use super::growth::environment::{Binding, Environment, assigned};
+use super::memory::Sight;
 use crate::context::Context;
 use crate::protocol::Note;
-use ratn_model::id::InstanceId;
+use crate::way_out::WayOut;
+use ratn_model::id::{InstanceId, StateId};
+use ratn_model::program::PREEMPTED;
+use std::collections::BTreeSet;
 
 impl Window {
     /// A decision is made: the other arms are discarded.
@@ -79,6 +83,82 @@ impl Window {
         }
         self.harvest_all(context);
         self.growth.stop();
-        self.end = Some(super::End { outcome: outcome.to_owned(), outputs: Outputs::new(), reason });
+        self.end = Some(super::End::new(outcome, reason));
+    }
+
+    /// The same, and what is to be done on the way out of the states in which it is.
+    pub(super) fn cut_short(&mut self, context: &mut Context<'_>, outcome: &str, reason: String) {
+        let way_out = self.way_out(context);
+        self.stop(context, outcome, reason);
+        if let Some(end) = &mut self.end {
+            end.way_out = way_out;
+        }
+    }
+
+    /// The states with something to do on the way out that are entered and not left, per line: where its oldest instance stands the sequential
+    /// program would be, too.
+    fn way_out(&self, context: &Context<'_>) -> WayOut {
+        let mut way = WayOut::default();
+        let mut forks = BTreeSet::new();
+        let sight = self.sight(context);
+        for head in self.graph.active_heads() {
+            if let Some(interpreter) = self.status_of_routine(head.id) {
+                interpreter.way_out(context.program, &mut way);
+            }
+            // A join and an exit stand behind what the state contains, and the state is not left yet.
+            let is_in = matches!(head.role(), Some(Role::Join | Role::Exit));
+            let path = |environment: &Environment| {
+                environment.path(&context.program.state(head.state).name, head.visit, head.iteration)
+            };
+            let own = is_in.then(|| (head.state, path(&head.environment)));
+            let mut next = self.add_way_out(context, sight, &head.environment, own, &mut way);
+            while let Some((fork, own)) = next {
+                let Some(around) = self.growth.around(fork).filter(|_| forks.insert(fork)) else { break };
+                next = self.add_way_out(context, sight, around, Some(own), &mut way);
+            }
+        }
+        way.hold = self.hold.clone();
+        way
+    }
+
+    /// Of one line, as far as the fork at which it begins: that, with the concurrency and its path.
+    fn add_way_out(
+        &self,
+        context: &Context<'_>,
+        sight: Sight<'_>,
+        environment: &Environment,
+        own: Option<(StateId, String)>,
+        way: &mut WayOut,
+    ) -> Option<(InstanceId, (StateId, String))> {
+        let program = context.program;
+        let frames = || std::iter::successors(environment.frames.as_deref(), |frame| frame.below.as_deref());
+        let fork = frames().find_map(|frame| Some((frame.fork?, (frame.owner, frame.path.to_string()))));
+        let of_line = frames().take_while(|frame| frame.fork.is_none());
+        let frames = of_line.map(|frame| (frame.owner, frame.path.to_string()));
+        // Whether the last thing to be done is under way already.
+        let mut inside = None;
+        let places = own.into_iter().chain(frames).map(|(owner, path)| {
+            let last = program.state(owner).annotations.finally.as_ref().and_then(|f| f.lastly.get(PREEMPTED));
+            let visits = u32::from(last.is_some() && last.copied() == inside);
+            inside = Some(owner);
+            (owner, path, visits)
+        });
+        let variables = || {
+            let scoped = environment.variables.iter().filter_map(|(name, binding)| {
+                let value = match binding {
+                    Binding::Known(value) => value.clone(),
+                    Binding::Assigned(producer) => sight.assigned_by(producer)?.get(&assigned(name))?.clone(),
+                };
+                Some((name.to_string(), value))
+            });
+            let looping = environment.loop_variables(program);
+            scoped.chain(looping.map(|(name, value)| (name.to_owned(), value.into_owned()))).collect()
+        };
+        let outputs = || {
+            let ids = program.states.iter().map(|state| state.id);
+            ids.filter_map(|id| Some((id, sight.outputs_of(environment.producer(id)?)?.clone()))).collect()
+        };
+        way.add(program, places, variables, outputs);
+        fork
     }
 }

@@ -73,7 +73,7 @@ impl Window {
                 }
                 Timer::Deadline => {
                     let limit = context.program.deadline_s.unwrap_or_default();
-                    self.stop(context, ABORTED, format!("the task took longer than its deadline of {limit} s"));
+                    self.cut_short(context, ABORTED, format!("the task took longer than its deadline of {limit} s"));
                 }
             }
         }
@@ -277,7 +277,7 @@ impl Window {
         }
     }
 
-    fn status_of_routine(&self, id: InstanceId) -> Option<&crate::interpreter::Interpreter> {
+    pub(super) fn status_of_routine(&self, id: InstanceId) -> Option<&crate::interpreter::Interpreter> {
         match &self.graph.node(id)?.status {
             Status::RunningRoutine(interpreter, _) => Some(interpreter),
             _ => None,

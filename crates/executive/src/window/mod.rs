@@ -54,6 +54,7 @@ use crate::hold::Hold;
 use crate::lookahead;
 use crate::plan::Plan;
 use crate::protocol::{Command, Event, Learned};
+use crate::way_out::WayOut;
 pub(crate) use checkpoint::Beside;
 use dispatch::Dispatch;
 use graph::Graph;
@@ -78,6 +79,15 @@ pub(crate) struct End {
     pub(crate) outcome: String,
     pub(crate) outputs: Outputs,
     pub(crate) reason: String,
+    /// What is still to be done before.
+    pub(crate) way_out: WayOut,
+}
+
+impl End {
+    /// Without outputs.
+    pub(crate) fn new(outcome: &str, reason: String) -> End {
+        End { outcome: outcome.to_owned(), outputs: Outputs::new(), reason, way_out: WayOut::default() }
+    }
 }
 
 /// CDTN mode.
@@ -152,7 +162,8 @@ impl Window {
             Event::RetirementFailed { reason, .. } => {
                 self.stop(context, ABORTED, format!("what had happened could not be recorded: {reason}"));
             }
-            Event::AbortRequested { reason } => self.stop(context, PREEMPTED, reason),
+            Event::AbortRequested { reason, at_once: true } => self.stop(context, PREEMPTED, reason),
+            Event::AbortRequested { reason, at_once: false } => self.cut_short(context, PREEMPTED, reason),
             Event::PauseRequested => self.hold.pause(),
             Event::ResumeRequested => {
                 self.hold.resume();

@@ -139,7 +139,7 @@ fn said(line: &LogLine, run: &Timeline) -> Option<(Level, String)> {
         LogEntry::Command(Command::Note(Note::Awaiting { instance, awaited, .. })) => {
             (Level::Info, format!("{} waits for {awaited}", path(*instance)))
         }
-        LogEntry::Event(Event::AbortRequested { reason }) => (Level::Warning, format!("is aborted: {reason}")),
+        LogEntry::Event(Event::AbortRequested { reason, .. }) => (Level::Warning, format!("is aborted: {reason}")),
         LogEntry::Command(Command::Start { instance, goal, .. }) => {
             (Level::Info, format!("{} begins: {}/{}", path(*instance), goal.provider, goal.action))
         }

@@ -14,7 +14,8 @@ use super::yaml::{self, Content, Entry, Node};
 use super::{state, written_out};
 use crate::diagnostic::Findings;
 use crate::program::Location;
-use scan::{Lines, comments, flow_end, has_anchor};
+pub use scan::has_anchor;
+use scan::{Lines, comments, flow_end, has_hidden_comment};
 use std::collections::BTreeMap;
 
 /// The annotations that can be changed.
@@ -425,6 +426,9 @@ impl Change<'_> {
         let (key, end) = (keys[place], end(place));
         if has_anchor(&text[key..end]) {
             return Err(ANCHORED);
+        }
+        if has_hidden_comment(&text[key..end]) {
+            return Err("what looks like a comment stands behind a text over several lines (`|`, `>`)");
         }
         // What was said in it stays: behind the key what stands on its line, else in lines of their own.
         let first_line_end = end.min(self.lines.end(self.lines.line_of(key)));

@@ -23,15 +23,15 @@ impl Places {
         self.places.insert((state, part.into()), at);
     }
 
-    /// The states have become others: transitions belong to the outermost of those that one became, all else to the innermost.
-    pub(crate) fn move_to(&mut self, places: &BTreeMap<StateId, Vec<StateId>>) {
-        let moved = std::mem::take(&mut self.places).into_iter().map(|((id, part), at)| {
+    /// The states have become others, some of them several: transitions belong to the outermost of those that one became, all else to the innermost.
+    pub(crate) fn move_to(&mut self, copies: &[BTreeMap<StateId, Vec<StateId>>]) {
+        for ((id, part), at) in std::mem::take(&mut self.places) {
             let is_outside = part.starts_with("transitions") || part == "exceptional" || part.starts_with("shared");
-            let layers = places.get(&id).map_or(&[][..], Vec::as_slice);
-            let now = if is_outside { layers.first() } else { layers.last() };
-            ((now.copied().unwrap_or(id), part), at)
-        });
-        self.places = moved.collect();
+            for layers in copies.iter().filter_map(|places| places.get(&id)) {
+                let now = if is_outside { layers.first() } else { layers.last() };
+                self.places.insert((now.copied().unwrap_or(id), part.clone()), at);
+            }
+        }
     }
 
     /// The place of a part; of the state where the part's is not known.

@@ -217,6 +217,7 @@ pub(crate) fn decide(fields: &mut Fields<'_, '_>, body: &Node) -> Vec<(String, E
 pub(crate) fn annotate(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotations) {
     retry(fields, body, annotations);
     limits(fields, body, annotations);
+    finally(fields, body);
     annotations.exceptions = body.get("exceptions").and_then(|node| exceptions(fields, node));
     annotations.deterministic = body.get("deterministic").is_some_and(|node| fields.flag(node));
     for node in body.get("exceptional").into_iter().flat_map(Node::items) {
@@ -288,6 +289,19 @@ fn limits(fields: &mut Fields<'_, '_>, body: &Node, annotations: &mut Annotation
     }
     if !holds.is_empty() || timeout_s.is_some() {
         fields.out.guards.entry(id).or_default().limits = Some(Limits { holds, timeout_s });
+    }
+}
+
+/// `finally: […]`
+fn finally(fields: &mut Fields<'_, '_>, body: &Node) {
+    let Some(id) = fields.view.state else { return };
+    let states = fields.task.outline.step(id).finally.clone();
+    if let Some(node) = body.get("finally").filter(|node| node.items().is_empty()) {
+        let help = "list the states that are run on every way out, or leave it out";
+        fields.error("invalid-state", node.at, "nothing is done on the way out", help);
+    }
+    if !states.is_empty() {
+        fields.out.guards.entry(id).or_default().finally = states;
     }
 }
 

@@ -75,6 +75,8 @@ pub(crate) struct Step<'a> {
     pub(crate) form: Form<'a>,
     /// What is done before it is tried again.
     pub(crate) before: Vec<StateId>,
+    /// What is done on every way out of it.
+    pub(crate) finally: Vec<StateId>,
     /// Its mapping.
     pub(crate) body: &'a Node,
     pub(crate) at: Location,
@@ -89,6 +91,8 @@ pub(crate) enum Branch {
     Otherwise,
     /// `retry: {before: …}`: in none of its lists, and not inside of it.
     Before,
+    /// `finally: […]`: the same.
+    Finally,
 }
 
 /// What a step is.
@@ -165,6 +169,7 @@ impl Outline<'_> {
         match (parent.map(|parent| &parent.form), step.branch) {
             (Some(Form::Condition { otherwise, .. }), Branch::Otherwise) => otherwise,
             (Some(_), Branch::Before) => parent.map_or(&[], |parent| &parent.before),
+            (Some(_), Branch::Finally) => parent.map_or(&[], |parent| &parent.finally),
             (Some(form), _) => form.first_branch(),
             (None, _) => &[],
         }
@@ -183,7 +188,8 @@ impl Outline<'_> {
 }
 
 impl Outline<'_> {
-    /// The states that a step is inside of, innermost first. What is done before another try of a state is not inside of that state.
+    /// The states that a step is inside of, innermost first. What is done before another try of a state, or on every way out of it, is not
+    /// inside of that state.
     pub(crate) fn containers(&self, id: StateId) -> impl Iterator<Item = StateId> + '_ {
         std::iter::successors(self.container(id), |id| self.container(*id))
     }
@@ -192,7 +198,7 @@ impl Outline<'_> {
         let step = self.step(id);
         match step.branch {
             Branch::First | Branch::Otherwise => step.parent,
-            Branch::Before => step.parent.and_then(|parent| self.container(parent)),
+            Branch::Before | Branch::Finally => step.parent.and_then(|parent| self.container(parent)),
         }
     }
 }
@@ -247,6 +253,7 @@ pub(crate) fn outline<'a>(name: &str, root: &'a Node, findings: &mut Findings) -
         branch: Branch::First,
         form: Form::Sequence { children: Vec::new() },
         before: Vec::new(),
+        finally: Vec::new(),
         body: root,
         at: root.at,
     });
@@ -409,8 +416,9 @@ impl<'a> Builder<'a, '_> {
         };
         let id = StateId(self.steps.len() as u64);
         let placeholder = Form::Sequence { children: Vec::new() };
-        let (path_of_step, before) = (path.clone(), Vec::new());
-        let step = Step { name, path: path_of_step, parent: Some(parent), branch, form: placeholder, before, body, at };
+        let (before, finally) = (Vec::new(), Vec::new());
+        let parent = Some(parent);
+        let step = Step { name, path: path.clone(), parent, branch, form: placeholder, before, finally, body, at };
         self.steps.push(step);
         let form = match form.key.as_str() {
             "action" => Form::Action { action: &form.value },
@@ -448,6 +456,9 @@ impl<'a> Builder<'a, '_> {
         self.steps[id.0 as usize].form = form;
         if let Some(list) = body.get("retry").and_then(|retry| retry.get("before")) {
             self.steps[id.0 as usize].before = self.list(list, id, Branch::Before, depth + 1);
+        }
+        if let Some(list) = body.get("finally") {
+            self.steps[id.0 as usize].finally = self.list(list, id, Branch::Finally, depth + 1);
         }
         Some(id)
     }

@@ -23,8 +23,9 @@ const LIBRARY_KEYS: [&str; 2] = ["library", "with"];
 const WAIT_KEYS: [&str; 2] = ["wait", "ask"];
 /// A state that waits reads what it says, holds nothing and changes nothing.
 const WAITING_KEYS: [&str; 7] = ["retry", "duration", "description", "transitions", "exceptional", "assign", "shared"];
-const NODE_KEYS: [&str; 13] = [
+const NODE_KEYS: [&str; 14] = [
     "retry",
+    "finally",
     "timeout",
     "while",
     "reads",

@@ -31,7 +31,7 @@ const MAX_CASES: usize = 24;
 const MAX_REGIONS: usize = 64;
 
 /// Keys of a state below which there are lists of states.
-const LISTS: [&str; 8] = ["states", "do", "then", "else", "regions", "default", "fallback", "before"];
+const LISTS: [&str; 9] = ["states", "do", "then", "else", "regions", "default", "fallback", "before", "finally"];
 
 /// Writes out what stands in a list of states, and in all lists within.
 pub(crate) fn write_out(list: &mut Node, findings: &mut Findings) {

@@ -202,6 +202,27 @@ def otherwise() -> _Otherwise:
     return _Otherwise()
 
 
+class _Lastly:
+    def __init__(self) -> None:
+        trace = Trace.now("`ratn.lastly`")
+        siblings, _ = trace.open[-1]
+        if not siblings or "finally" in siblings[-1].branches:
+            refuse("`ratn.lastly` without a state", "write it right behind the state or block that it is about")
+        self._trace, self._node = trace, siblings[-1]
+
+    def __enter__(self) -> None:
+        self._trace.enter(self._node, "finally")
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            self._trace.leave(self._node)
+
+
+def lastly() -> _Lastly:
+    """What is done on every way out of the state or block before it: ``finally`` in a task file."""
+    return _Lastly()
+
+
 class Each(Iterator[Any]):
     """A loop over a list; its body is traced once."""
 

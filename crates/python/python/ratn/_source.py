@@ -102,6 +102,14 @@ class _Source:
             if isinstance(value, dict) and not _is_form(key, value):
                 name, body = key, value
         body = _written_out(body)
+        lastly = body.get("finally")
+        if lastly:
+            body = {key: value for key, value in body.items() if key != "finally"}
+        self.form(name, body)
+        if lastly:
+            self.block("lastly", [], lastly)
+
+    def form(self, name: str | None, body: dict[str, Any]) -> None:
         called = [] if name is None else [f"name={name!r}"]
         retry = body.get("retry")
         # A loop or a condition has what is done before another try in the words of task files.

@@ -110,11 +110,11 @@ class Trace:
         owner = node.owner
         if owner is None:
             refuse(f"`{node.named()}` is a state of another task", "states see those of their own task only")
-        if node.siblings is owner.before or not owner.shows_outputs:
+        if node.siblings in (owner.before, owner.branches.get("finally")) or not owner.shows_outputs:
             where = f"{owner.line[0]}:{owner.line[1]}"
             refuse(
                 f"`{node.named()}` is not seen outside of the block that begins at {where}",
-                "a loop, a condition or a `before` has no outputs: let an effect say it as a fact, and read that",
+                "a loop, a condition, a `before` or a `lastly` has no outputs: let an effect say it as a fact, and read that",
             )
         if port == "outcome":
             refuse(f"how `{node.named()}` ended is seen only beside it", "let an effect say it as a fact, or give the block around an outcome")

@@ -152,8 +152,8 @@ pub fn sequential(program: &Program, catalogue: &Catalogue, assumptions: &Assump
     })
 }
 
-/// How long a checked program takes as a dataflow network, in seconds, with what is assumed. It is simulated as long as `goes_on` says so, which is
-/// asked before every event.
+/// How long a checked program takes as a dataflow network, in seconds, with what is assumed. It is given up after so many events, which bounds how
+/// much memory that takes, and when `goes_on`, which is asked before every event, no longer holds.
 ///
 /// # Errors
 /// [`Obstacle`] where the task does not come to a successful end with what is assumed.
@@ -161,9 +161,11 @@ pub fn makespan_s(
     program: &Program,
     catalogue: &Catalogue,
     assumptions: &Assumptions,
+    max_events: usize,
     goes_on: &dyn Fn() -> bool,
 ) -> Result<f64, Obstacle> {
-    simulate_while(program, catalogue, assumptions, Mode::Cdtn, &mut BTreeSet::new(), goes_on).map(|run| run.end_s)
+    let bound = Bound { max_events, goes_on };
+    simulate_within(bound, program, catalogue, assumptions, Mode::Cdtn, &mut BTreeSet::new()).map(|run| run.end_s)
 }
 
 /// The states whose failure is handled and could be exceptional, with what that gains.
@@ -237,16 +239,23 @@ fn simulate(
     mode: Mode,
     unknown: &mut BTreeSet<String>,
 ) -> Result<Run, Obstacle> {
-    simulate_while(program, catalogue, assumptions, mode, unknown, &|| true)
+    let bound = Bound { max_events: Circumstances::default().max_events, goes_on: &|| true };
+    simulate_within(bound, program, catalogue, assumptions, mode, unknown)
 }
 
-fn simulate_while(
+/// When a simulation is given up.
+struct Bound<'b> {
+    max_events: usize,
+    goes_on: &'b dyn Fn() -> bool,
+}
+
+fn simulate_within(
+    bound: Bound<'_>,
     program: &Program,
     catalogue: &Catalogue,
     assumptions: &Assumptions,
     mode: Mode,
     unknown: &mut BTreeSet<String>,
-    goes_on: &dyn Fn() -> bool,
 ) -> Result<Run, Obstacle> {
     let name = match mode {
         Mode::Hsm => "HSM",
@@ -272,8 +281,9 @@ fn simulate_while(
         latency: Duration::ZERO,
     };
     let mut providers = AssumedProviders::new(&program, assumptions);
-    let circumstances = Circumstances { attributes: assumptions.attributes.clone(), ..Circumstances::default() };
-    let run = run_while(setup, &mut providers, circumstances, goes_on);
+    let (attributes, max_events) = (assumptions.attributes.clone(), bound.max_events);
+    let circumstances = Circumstances { attributes, max_events, ..Circumstances::default() };
+    let run = run_while(setup, &mut providers, circumstances, bound.goes_on);
     let run = run.map_err(|source| Obstacle::Run { mode: name, source })?;
     unknown.extend(providers.unknown_durations());
     if run.outcome == SUCCESS {

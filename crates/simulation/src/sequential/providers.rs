@@ -109,7 +109,8 @@ impl Oracle for AssumedProviders {
             Wait::Condition(condition) => match made_true(state) {
                 Some(facts) => Event::WorldChanged { revision: Revision(0), facts },
                 None => {
-                    Event::AbortRequested { reason: format!("what makes `{condition}` hold of {path} is not known") }
+                    let reason = format!("what makes `{condition}` hold of {path} is not known");
+                    Event::AbortRequested { reason, at_once: true }
                 }
             },
         };

@@ -188,7 +188,7 @@ impl Outside {
             "resume" => Event::ResumeRequested,
             "step" => Event::StepRequested,
             "break" => Event::BreakpointsSet { states: self.states.clone() },
-            "abort" => Event::AbortRequested { reason: "the user wants it so".to_owned() },
+            "abort" => Event::AbortRequested { reason: "the user wants it so".to_owned(), at_once: false },
             "world" => {
                 let set = self.facts.iter().map(|(key, v)| (fact(key), Some(value(v))));
                 let facts = set.chain(self.gone.iter().map(|key| (fact(key), None))).collect();

@@ -14,6 +14,7 @@ use ratn_worker::client::{ActionClient, CallError, Channels, ProcessClient, Reso
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::session::DEFAULT_TTL;
 use std::collections::BTreeMap;
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -34,6 +35,34 @@ const END_DEADLINE: Duration = Duration::from_secs(1);
 const SESSION_SLACK: Duration = Duration::from_millis(500);
 /// The executive ends a goal that takes too long. The provider does so this much later, where nobody tells it to.
 const DEADLINE_SLACK: Duration = Duration::from_millis(500);
+
+/// So many results of one goal are taken; each is a line of the event log.
+const MOST_RESULTS: u32 = 256;
+
+/// The results that a goal has given before its end.
+#[derive(Debug)]
+pub(super) struct Results {
+    taken: u32,
+    /// What the last one costs.
+    cost_s: f64,
+}
+
+impl Default for Results {
+    fn default() -> Results {
+        Results { taken: 0, cost_s: f64::INFINITY }
+    }
+}
+
+impl Results {
+    /// Whether a result that costs so much is taken: the first, or a better one.
+    fn takes(&mut self, cost_s: f64) -> bool {
+        let takes = cost_s < self.cost_s && self.taken < MOST_RESULTS;
+        if takes {
+            *self = Results { taken: self.taken + 1, cost_s };
+        }
+        takes
+    }
+}
 
 /// Whether a goal is new to its provider.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,6 +88,7 @@ pub(super) struct Performing {
     pub(super) events: mpsc::Sender<Answer>,
     pub(super) stop: CancellationToken,
     pub(super) goal: Goal,
+    pub(super) results: Mutex<Results>,
 }
 
 /// The deadline that the provider is told, in wall time; 0 for none.
@@ -234,7 +264,12 @@ impl Performing {
             Said::Progress { message, .. } => Event::Progressed { instance, attempt, message },
             // What it comes to when it was told to stop nobody waits for.
             Said::Improved(_) if self.stop.is_cancelled() => return,
-            Said::Improved(GoalImproved { outputs, cost_s }) => Event::Improved { instance, attempt, outputs, cost_s },
+            Said::Improved(GoalImproved { outputs, cost_s }) => {
+                if !self.results.lock().unwrap_or_else(PoisonError::into_inner).takes(cost_s) {
+                    return;
+                }
+                Event::Improved { instance, attempt, outputs, cost_s }
+            }
         };
         // Progress is for people, and a result comes again, at the latest at the goal's end: when events pile up, they are what can be missed.
         let _ = self.events.try_send(event.into());
@@ -278,7 +313,7 @@ mod tests {
     use ratn_worker::tls::ClientTls;
     use tokio_util::sync::DropGuard;
 
-    /// `work`: is done at once. `hang`: never, unless it is told to stop.
+    /// `work`: is done at once. `hang`: never, unless it is told to stop. `better`: with results before that, not each of which is better.
     struct Named(&'static str);
 
     #[tonic::async_trait]
@@ -291,6 +326,12 @@ mod tests {
             if self.0 == "hang" {
                 goal.cancelled.cancelled().await;
                 return Err(goal.stopped());
+            }
+            if self.0 == "better" {
+                for cost_s in [5.0, 7.0, 4.0, 4.0].into_iter().chain((0..400).map(|n| 3.0 - f64::from(n) * 0.001)) {
+                    goal.improved(BTreeMap::new(), cost_s)?;
+                    tokio::task::yield_now().await;
+                }
             }
             Ok(GoalOutcome::success())
         }
@@ -309,7 +350,8 @@ mod tests {
     impl Bench {
         async fn new() -> anyhow::Result<Bench> {
             let place = tempfile::tempdir()?;
-            let server = ActionServer::builder("").action(Named("work")).action(Named("hang")).build();
+            let server =
+                ActionServer::builder("").action(Named("work")).action(Named("hang")).action(Named("better")).build();
             let bound = bind(&Endpoint::Unix(place.path().join("provider.sock"))).await?;
             let (endpoint, shutdown) = (bound.endpoint().clone(), CancellationToken::new());
             tokio::spawn(bound.serve(Services::new().with(server.clone().into_service()), shutdown.clone()));
@@ -331,6 +373,7 @@ mod tests {
                 resources: self.resources.clone(),
                 events: self.events.clone(),
                 stop: CancellationToken::new(),
+                results: Mutex::default(),
                 goal: Goal {
                     id: format!("run/1/{action}"),
                     action: action.to_owned(),
@@ -393,6 +436,34 @@ mod tests {
             matches!(&event, Some(Event::Crashed { reason, .. }) if reason.contains("nobody listened")),
             "{event:?}"
         );
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn of_the_results_before_the_end_those_are_taken_that_are_better_and_so_many_at_the_most()
+    -> anyhow::Result<()> {
+        let mut results = Results::default();
+        assert!(results.takes(5.0) && !results.takes(7.0) && results.takes(4.0) && !results.takes(4.0));
+        let mut bench = Bench::new().await?;
+        let mut performing = bench.performing("better", None, 0);
+        performing.goal.improves = Some(Vec::new());
+        let (events, mut answers) = mpsc::channel(1_024);
+        performing.events = events;
+        performing.perform(Given::Now).await;
+        let mut costs = Vec::new();
+        while let Some(Answer::Event { event, .. }) = answers.recv().await {
+            match *event {
+                Event::Improved { cost_s, .. } => costs.push(cost_s),
+                Event::Finished { .. } => break,
+                _ => {}
+            }
+        }
+        assert!(costs.windows(2).all(|pair| pair[1] < pair[0]), "{costs:?}");
+        assert!(costs.len() > 2 && costs.len() <= MOST_RESULTS as usize, "{}", costs.len());
+        // A goal that may not give any ends as it says: that it tried to is an error of the action.
+        bench.performing("better", None, 0).perform(Given::Now).await;
+        let event = bench.event().await;
+        assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == ABORTED), "{event:?}");
         Ok(())
     }
 }

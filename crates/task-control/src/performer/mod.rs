@@ -41,7 +41,7 @@ use ratn_worker::session::{DEFAULT_TTL, Session};
 use ratn_worker::trace::{self, TraceContext};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
-use std::sync::{Arc, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::{JoinHandle, JoinSet};
@@ -523,6 +523,7 @@ impl Performer {
             channels: self.channels.clone(),
             events: self.events.clone(),
             stop: stop.clone(),
+            results: Mutex::default(),
             goal: types::Goal {
                 id: format!("{}/{instance}/{attempt}", self.run),
                 action: goal.action.to_string(),

@@ -221,9 +221,12 @@ impl Demonstration {
                 document[name] = self.row_json(work);
             }
         }
-        if document.get("overlapped").is_some() {
-            let sweep = self.sweep().into_iter().map(|(plan_s, hsm_s)| json!({ "plan_s": plan_s, "hsm_s": hsm_s }));
-            document["overlapped"]["sweep"] = sweep.collect();
+        let sweep = self.sweep().into_iter().map(|(plan_s, hsm_s)| json!({ "plan_s": plan_s, "hsm_s": hsm_s }));
+        let sweep: Value = sweep.collect();
+        if OVERLAPPED.is_like(main) {
+            document["sweep"] = sweep;
+        } else if document.get("overlapped").is_some() {
+            document["overlapped"]["sweep"] = sweep;
         }
         document
     }

@@ -271,7 +271,13 @@ impl Graph {
         self.lines.head(line)
     }
 
-    /// The oldest instances of all lines.
+    /// The oldest instances of the lines that go on and wait for no region.
+    pub(crate) fn active_heads(&self) -> impl Iterator<Item = &Instance> {
+        let lines = std::iter::successors(self.next_active_line(None), |line| self.next_active_line(Some(*line)));
+        lines.filter_map(|line| self.get(self.head_of(line)?))
+    }
+
+    /// The oldest instances of all lines, also of those that have not begun.
     pub(crate) fn heads(&self) -> impl Iterator<Item = &Instance> {
         self.lines.heads().filter_map(|id| self.instances.get(id))
     }

@@ -173,6 +173,11 @@ impl Growth {
         self.cursors[index].todo = Todo::Await(join);
     }
 
+    /// Where the concurrency of a fork stands.
+    pub(crate) fn around(&self, fork: InstanceId) -> Option<&Environment> {
+        self.regions.get(&fork).map(|regions| &regions.waiting.environment)
+    }
+
     /// A join has decided: the concurrency is left by an outcome.
     pub(crate) fn leave_join(&mut self, graph: &Graph, join: InstanceId, outcome: usize, because: Option<Arc<str>>) {
         let Some(instance) = graph.get(join) else { return };

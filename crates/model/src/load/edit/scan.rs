@@ -173,10 +173,22 @@ pub(super) fn comments(text: &str) -> Vec<&str> {
 }
 
 /// Whether an anchor, an alias or a merge begins somewhere in it.
-pub(super) fn has_anchor(text: &str) -> bool {
+pub fn has_anchor(text: &str) -> bool {
+    begins_with(text, ['&', '*'])
+}
+
+/// Whether a text over several lines, with `|` or `>` before it, begins somewhere in it, and a quote in it may hide a comment: what is in such a
+/// text are no quotes, which this file does not know.
+pub(super) fn has_hidden_comment(text: &str) -> bool {
+    let begins = text.lines().filter(|line| line.starts_with('#') || line.contains(" #") || line.contains("\t#"));
+    begins_with(text, ['|', '>']) && begins.count() > comments(text).len()
+}
+
+/// Whether a value begins with one of these somewhere in a text.
+fn begins_with(text: &str, letters: [char; 2]) -> bool {
     let mut found = false;
     walk(text, |_, letter, token| {
-        found |= token == Token::Plain(true) && matches!(letter, '&' | '*');
+        found |= token == Token::Plain(true) && letters.contains(&letter);
         !found
     });
     found

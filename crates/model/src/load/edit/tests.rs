@@ -325,3 +325,19 @@ fn in_every_task_of_the_reference_a_key_is_added_changed_and_taken_away_or_it_is
     let is_shared = |error: &EditError| matches!(error, EditError::Shared { .. });
     assert!(refused.iter().all(is_shared), "{refused:?}");
 }
+
+#[test]
+fn a_comment_that_a_quote_in_a_text_over_several_lines_may_hide_is_left_to_an_editor() {
+    let text = "task: t
+states:
+  - look:
+      action: detector/segment
+      reads:
+        - |-
+          'at(x)
+        # a comment that matters
+        - scene
+";
+    let refused = edited(text, "look", "reads", Some(&value("[scene]"))).unwrap_err().to_string();
+    assert!(refused.contains("behind a text over several lines"), "{refused}");
+}

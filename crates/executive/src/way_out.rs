@@ -1,0 +1,197 @@
+//! What is still to be done when a run is cut short: told to end, or over its deadline.
+//!
+//! The states with something to do on every way out (`finally`) that are entered and not left are left one after the other, the innermost
+//! first: what they contain says what being cut short did to the world (`effects: {preempted: […]}`), then their `finally` is executed, by the
+//! sequential interpreter on the actual world, in both modes. One that was under way already is begun anew. Then the run ends.
+//!
+//! ```text
+//! told to end ─► what is under way is cancelled ─► each `finally`, the innermost first ─► the end
+//!                                                     └─ told again, or after 60 s: cancelled ─┘
+//! ```
+//!
+//! Outcome and reason are those of the first time; a `finally` that fails is told in the reason, and keeps no other one from being done.
+
+use crate::binding::{Outputs, child_path};
+use crate::context::Context;
+use crate::hold::Hold;
+use crate::interpreter::{Interpreter, Progress};
+use crate::protocol::{Command, Event};
+use crate::window::End;
+use ratn_model::id::StateId;
+use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS};
+use ratn_model::time::Timestamp;
+use ratn_model::value::Value;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+/// A run that was told to end has ended after so many of the robot's seconds, whatever it does on its way out.
+const LIMIT_S: u64 = 60;
+
+/// The states to be left.
+#[derive(Debug, Default, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct WayOut {
+    scopes: Vec<Scope>,
+    steps: Vec<Step>,
+    /// What the operator lets begin.
+    pub(crate) hold: Hold,
+}
+
+/// What is seen from where a thread of control was.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Scope {
+    variables: Vec<(String, Value)>,
+    outputs: BTreeMap<StateId, Outputs>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Step {
+    scope: usize,
+    /// What is left, or what is done when the state around it is left.
+    state: StateId,
+    path: String,
+    is_finally: bool,
+    /// How deep in the program.
+    depth: usize,
+}
+
+impl WayOut {
+    /// The states in which a thread of control is, the innermost first: each with its path, and how often what it does when it is cut short was
+    /// begun.
+    pub(crate) fn add(
+        &mut self,
+        program: &Program,
+        entered: impl Iterator<Item = (StateId, String, u32)>,
+        variables: impl FnOnce() -> Vec<(String, Value)>,
+        outputs: impl FnOnce() -> BTreeMap<StateId, Outputs>,
+    ) {
+        let around = |id: StateId| std::iter::successors(program.state(id).parent, |id| program.state(*id).parent);
+        let finally = |id: StateId| program.state(id).annotations.finally.as_ref()?.lastly.get(PREEMPTED).copied();
+        let scope = self.scopes.len();
+        let before = self.steps.len();
+        for (owner, path, visits) in entered {
+            let depth = around(owner).count();
+            match finally(owner) {
+                Some(state) => {
+                    let name = &program.state(state).name;
+                    let name = if visits == 0 { name.clone() } else { format!("{name}#{}", visits + 1) };
+                    let path = child_path(&path, &name);
+                    self.steps.push(Step { scope, state, path, is_finally: true, depth });
+                }
+                None if around(owner).any(|id| finally(id).is_some()) => {
+                    self.steps.push(Step { scope, state: owner, path, is_finally: false, depth });
+                }
+                None => {}
+            }
+        }
+        if self.steps.len() > before {
+            self.scopes.push(Scope { variables: variables(), outputs: outputs() });
+        }
+    }
+
+    /// Whether nothing is to be done.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.steps.is_empty()
+    }
+}
+
+/// A run on its way out.
+#[derive(Serialize, Deserialize)]
+pub(crate) struct Leaving {
+    end: End,
+    /// The last is next.
+    steps: Vec<Step>,
+    scopes: Vec<Scope>,
+    hold: Hold,
+    /// What is being done, and in which scope.
+    current: Option<(usize, Box<Interpreter>)>,
+    until: Timestamp,
+}
+
+impl Leaving {
+    /// Begins; the end, if nothing is to be waited for.
+    pub(crate) fn begin(context: &mut Context<'_>, mut end: End) -> Result<Leaving, Box<End>> {
+        let WayOut { scopes, mut steps, hold } = std::mem::take(&mut end.way_out);
+        steps.sort_by_key(|step| (step.depth, std::cmp::Reverse(step.state)));
+        let until = context.now + Duration::from_secs(LIMIT_S);
+        let mut leaving = Leaving { end, steps, scopes, hold, current: None, until };
+        match leaving.go_on(context) {
+            Some(end) => Err(Box::new(end)),
+            None => {
+                context.commands.push(Command::Wake { at: until });
+                Ok(leaving)
+            }
+        }
+    }
+
+    /// Takes an event; the end of the run, when this was it.
+    pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Option<End> {
+        match event {
+            Event::AbortRequested { reason, .. } => return self.cut_short(context, &reason),
+            Event::RetirementFailed { reason, .. } => {
+                ABORTED.clone_into(&mut self.end.outcome);
+                return self.cut_short(context, &format!("what had happened could not be recorded: {reason}"));
+            }
+            _ if self.until <= context.now => {
+                return self.cut_short(context, &format!("its way out took longer than {LIMIT_S} s"));
+            }
+            event => {
+                let (_, interpreter) = self.current.as_mut()?;
+                let progress = interpreter.handle(context, event);
+                self.ended(progress);
+            }
+        }
+        self.go_on(context)
+    }
+
+    /// As [`crate::executive::Executive::breakpoints`].
+    pub(crate) fn breakpoints(&self) -> &[String] {
+        self.current.as_ref().map_or(self.hold.breakpoints(), |(_, interpreter)| interpreter.breakpoints())
+    }
+
+    /// Does what is next until something is to be waited for.
+    fn go_on(&mut self, context: &mut Context<'_>) -> Option<End> {
+        while self.current.is_none() {
+            let Some(Step { scope, state, path, is_finally, .. }) = self.steps.pop() else {
+                return Some(self.end.clone());
+            };
+            let Some(Scope { variables, outputs }) = self.scopes.get(scope).cloned() else { continue };
+            let mut interpreter = Box::new(Interpreter::on_the_way_out(variables, outputs, self.hold.clone()));
+            if is_finally {
+                let progress = interpreter.start(context, state, &path);
+                self.current = Some((scope, interpreter));
+                self.ended(progress);
+            } else if let Err(problem) = interpreter.leave(context, state, &path) {
+                self.tell(&problem);
+            }
+        }
+        None
+    }
+
+    /// What was being done has ended, if it has; what it assigned is seen by what is done next.
+    fn ended(&mut self, progress: Progress) {
+        let Progress::Ended { outcome, reason } = progress else { return };
+        let Some((scope, interpreter)) = self.current.take() else { return };
+        let (variables, outputs, hold) = interpreter.into_scope();
+        if let Some(scope) = self.scopes.get_mut(scope) {
+            *scope = Scope { variables, outputs };
+        }
+        self.hold = hold;
+        if outcome != SUCCESS {
+            self.tell(if reason.is_empty() { &outcome } else { &reason });
+        }
+    }
+
+    /// It ends at once.
+    fn cut_short(&mut self, context: &mut Context<'_>, why: &str) -> Option<End> {
+        if let Some((_, mut interpreter)) = self.current.take() {
+            interpreter.abort(context);
+        }
+        self.tell(why);
+        Some(self.end.clone())
+    }
+
+    fn tell(&mut self, problem: &str) {
+        self.end.reason = format!("{}; on the way out: {problem}", self.end.reason);
+    }
+}
