@@ -91,7 +91,7 @@ fn overlapped(goods: &[&str], delivered: u64) -> anyhow::Result<()> {
     ensure!(code == Some(0), "{code:?}\n{said}");
     let document: Value = serde_json::from_str(&document).with_context(|| document.clone())?;
     // The state machine for each time that a plan may get better, then the network.
-    ensure!(document["delivered_per_run"] == serde_json::json!([delivered; 4]), "{document}");
+    ensure!(document["delivered_per_run"] == serde_json::json!(vec![delivered; 4]), "{document}");
     ensure!(document["unintended_contacts"] == 0, "{document}\n{said}");
     ensure!(
         document["sweep"].as_array().is_some_and(|sweep| sweep.iter().all(|run| run["hsm_s"].is_f64())),
