@@ -17,12 +17,16 @@ use ratn_worker::trace::TraceContext;
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use tokio::sync::oneshot::{self, error::TryRecvError};
+use tokio::time::Instant;
 
 /// While the log is read so many events are kept. Of a run in which more happen meanwhile no more spans are sent.
 const MOST_KEPT: usize = 16_384;
 /// What a process that was killed has recorded in its last moments may not have left its queue: it is sent again. A collector that has
 /// taken it sees the same ids twice.
 const SENT_AGAIN: Duration = Duration::from_secs(3);
+
+/// The thread that reads it has ended without a word.
+const UNREAD: &str = "its log is not read";
 
 /// A run's place in its trace, of which the export of its log is, too.
 pub(super) fn trace_of(run: &str, task: &str, seed: u64, began_unix_ms: u64) -> TraceContext {
@@ -39,7 +43,11 @@ pub(super) struct Spans {
 #[derive(Debug)]
 enum Stage {
     Following(Box<Live>),
-    CatchingUp { read: oneshot::Receiver<Result<CaughtUp, LogError>>, kept: Vec<Step>, messages: Messages },
+    CatchingUp {
+        read: oneshot::Receiver<Result<CaughtUp, LogError>>,
+        kept: Vec<Step>,
+        messages: Messages,
+    },
     /// It cannot be known what was before.
     GivenUp,
 }
@@ -100,7 +108,7 @@ impl Spans {
                     return kept.push((at, event.clone(), commands.to_vec()));
                 }
                 Err(TryRecvError::Empty) => self.give_up(&"too much happened while its log was read"),
-                Err(TryRecvError::Closed) => self.give_up(&"its log is not read"),
+                Err(TryRecvError::Closed) => self.give_up(&UNREAD),
                 Ok(read) => self.catch_up(read),
             }
         }
@@ -112,20 +120,18 @@ impl Spans {
     /// Sends what is left, and the run's own span; waits for that no longer than [`END_OF_RUN`].
     pub(super) async fn end(spans: Option<Spans>) {
         let Some(mut spans) = spans else { return };
-        let sender = spans.sender;
-        let ending = async {
-            if let Stage::CatchingUp { read, .. } = &mut spans.stage {
-                match read.await {
-                    Ok(read) => spans.catch_up(read),
-                    Err(_) => spans.give_up(&"its log is not read"),
-                }
+        let (sender, until) = (spans.sender, Instant::now() + END_OF_RUN);
+        if let Stage::CatchingUp { read, .. } = &mut spans.stage {
+            match tokio::time::timeout_at(until, read).await {
+                Ok(Ok(read)) => spans.catch_up(read),
+                Ok(Err(_)) => spans.give_up(&UNREAD),
+                Err(_) => spans.give_up(&"its log was not read to where it went on before it ended"),
             }
-            if let Stage::Following(live) = &mut spans.stage {
-                live.end().into_iter().for_each(|span| sender.record(span));
-            }
-            sender.flush(END_OF_RUN).await;
-        };
-        let _ = tokio::time::timeout(END_OF_RUN, ending).await;
+        }
+        if let Stage::Following(live) = &mut spans.stage {
+            live.end().into_iter().for_each(|span| sender.record(span));
+        }
+        sender.flush(until.saturating_duration_since(Instant::now())).await;
     }
 
     fn catch_up(&mut self, read: Result<CaughtUp, LogError>) {
