@@ -736,7 +736,54 @@ async function annotations() {
   await page.waitForFunction(() => document.querySelector('[data-key="state open"]')?.parentElement.textContent.includes("says pia, exceptional"));
   step("it is said that an action may change the environment, and which of its outcomes is exceptional");
 
+  // What is typed while a change is saved stays, and is a change of the file as it is then.
+  const late = async (route) => {
+    await new Promise((resolve) => setTimeout(resolve, 800));
+    await route.continue();
+  };
+  await page.route("**/api/annotations/save*", late);
+  await page.locator('[data-key="said duration"]').press("Space");
+  await page.locator('[data-key="duration 0"]').fill("6");
+  await page.waitForFunction(() => document.querySelector('[data-key="save"]')?.disabled === false);
+  await page.locator('[data-key="save"]').press("Enter");
+  await page.locator("dialog button[value=yes]").press("Enter");
+  await page.locator('[data-key="duration 0"]').fill("7");
+  await until("what was saved is written", () => readFileSync(file, "utf8").includes("exceptional: [aborted], duration: 6 }"));
+  await page.waitForFunction(() => document.querySelector("pre")?.textContent.includes("duration: 7"));
+  assert.equal(await page.locator('[data-key="duration 0"]').inputValue(), "7");
+  await page.unroute("**/api/annotations/save*", late);
+  await page.waitForFunction(() => document.querySelector('[data-key="save"]')?.disabled === false);
+  await page.locator('[data-key="save"]').press("Enter");
+  await page.locator("dialog button[value=yes]").press("Enter");
+  await until("it is written, too", () => readFileSync(file, "utf8").includes("exceptional: [aborted], duration: 7 }"));
+  step("what is typed while a change is saved is not lost");
+
+  // A file that is refused already can be mended from here, step by step, and a text over several lines keeps its lines.
+  const refused = text.replace("duration: 2 # s", "duration: no.where\n      requires:\n        - |-\n          exists on(cup,\n          table)\n        - no.where.either");
+  writeFileSync(file, refused);
+  await page.locator('[data-key="again"]').press("Enter");
+  await page.locator('[data-key="state plan"]').press("Enter");
+  await page.waitForSelector("#findings-duration .bad");
+  const long = page.locator('textarea[data-key="requires 0"]');
+  assert.equal(await long.inputValue(), "exists on(cup,\ntable)");
+  await page.locator('[data-key="duration 0"]').fill("2");
+  await page.waitForFunction(() => document.querySelector("main")?.textContent.includes("still is with this change"));
+  await page.waitForFunction(() => document.querySelector('[data-key="save"]')?.disabled === false);
+  await axe(page, "Annotations of a file that is refused");
+  await shot(page, "annotations-refused");
+  await page.locator('[data-key="save"]').press("Enter");
+  await page.locator("dialog button[value=yes]").press("Enter");
+  await until("half of it is mended", () => readFileSync(file, "utf8") === refused.replace("duration: no.where", "duration: 2"));
+  await page.waitForFunction(() => document.querySelector("#findings-duration .bad") === null);
+  await long.press("Control+End");
+  await page.keyboard.type(" # 2");
+  await page.waitForFunction(() => document.querySelector("pre")?.textContent.includes("exists on(cup,\\ntable) # 2"));
+  step("a file that was refused already is mended step by step; a text over several lines keeps them");
+
   // Somebody else writes it.
+  writeFileSync(file, text);
+  await page.locator('[data-key="undo"]').press("Enter");
+  await page.locator('[data-key="again"]').press("Enter");
   await page.locator('[data-key="state plan"]').press("Enter");
   writeFileSync(file, text);
   await page.locator('[data-key="duration 0"]').fill("5");

@@ -243,7 +243,8 @@ fn a_run_that_goes_on_after_its_task_control_was_killed_goes_on_in_its_trace() -
     ensure!(look.time_unix_ns.1 <= end.time_unix_ns.0 + 100_000_000, "{look:?} {end:?}");
     ensure!(of_run.iter().all(|span| span.time_unix_ns.0 >= root.time_unix_ns.0), "{root:?}");
     let served = |node: &Decoded| {
-        let of_node = |span: &&Decoded| span.name.ends_with("/Execute") && span.trace == root.trace && span.parent == node.id;
+        let of_node =
+            |span: &&Decoded| span.name.ends_with("/Execute") && span.trace == root.trace && span.parent == node.id;
         spans.iter().find(of_node).cloned()
     };
     for node in [look, end] {

@@ -111,7 +111,8 @@ fn a_reload_takes_over_bounds_roles_and_the_log_filter_and_names_what_it_does_no
          [resource-manager.limits]\nresources = 2\n",
     )?;
     let named = "need_a_restart=\"service.otlp.endpoint, service.otlp.headers.x-api-key\"";
-    let said = wait_for("the keys of the collector", || Ok(Some(manager.process.said()).filter(|said| said.contains(named))))?;
+    let said =
+        wait_for("the keys of the collector", || Ok(Some(manager.process.said()).filter(|said| said.contains(named))))?;
     ensure!(!said.contains("hidden"), "{said}");
 
     // A bad one changes nothing, and says where it is bad.

@@ -3,6 +3,7 @@
 //! It owns the file only while it writes: what a page has seen is known by a digest, and a text of another digest is not changed. What changes
 //! in the text, `ratn_model::load::edit` decides; how a text is checked and simulated, whoever starts the dashboard says.
 
+mod attributes;
 mod file;
 
 use crate::wire;
@@ -230,7 +231,8 @@ pub(crate) fn proposed(editing: &Editing, proposal: &Proposal) -> Result<wire::P
     })
 }
 
-/// What changes would gain: two simulations, each of which is ended after [`SIMULATION`], or when somebody asks for another one.
+/// What changes would gain: two simulations, each of which is ended after [`SIMULATION`], when somebody asks for another one, and when this is
+/// dropped.
 pub(crate) async fn gained(editing: &Editing, proposal: Proposal) -> Result<wire::Gained, Problem> {
     let without = |obstacle: &str| Ok(wire::Gained { obstacle: obstacle.to_owned(), ..wire::Gained::default() });
     let own = editing.0.asked.fetch_add(1, Ordering::Relaxed) + 1;
@@ -238,20 +240,22 @@ pub(crate) async fn gained(editing: &Editing, proposal: Proposal) -> Result<wire
         return without("the dashboard ends");
     };
     let editing = editing.clone();
+    let asker = Arc::new(());
+    let waits = Arc::downgrade(&asker);
     let simulated = tokio::task::spawn_blocking(move || {
         // As long as it goes on no other one begins.
         let _place = place;
         let text = as_seen(&editing, &proposal)?;
         let new = changed(&text, &proposal)?;
         let inner = &editing.0;
-        let is_newest = || inner.asked.load(Ordering::Relaxed) == own;
+        let is_wanted = || inner.asked.load(Ordering::Relaxed) == own && waits.strong_count() > 0;
         let makespan_s = |text: &str, which: &str| {
             let program = (inner.check)(text).map_err(|_| format!("`ratn check` refuses the file {which}"))?.program;
             let began = Instant::now();
             let is_in_time = || began.elapsed() < SIMULATION;
-            let makespan_s = (inner.makespan)(&program, &|| is_newest() && is_in_time());
+            let makespan_s = (inner.makespan)(&program, &|| is_wanted() && is_in_time());
             match makespan_s {
-                Err(_) if !is_newest() => Err("something else was asked meanwhile".to_owned()),
+                Err(_) if !is_wanted() => Err("something else was asked meanwhile".to_owned()),
                 Err(_) if !is_in_time() => {
                     Err(format!("the simulation of the file {which} takes longer than {} s", SIMULATION.as_secs()))
                 }
@@ -263,7 +267,9 @@ pub(crate) async fn gained(editing: &Editing, proposal: Proposal) -> Result<wire
         let obstacle = after.as_ref().err().or(before.as_ref().err()).cloned().unwrap_or_default();
         Ok(wire::Gained { before_s: before.ok(), after_s: after.ok(), obstacle })
     });
-    simulated.await.unwrap_or_else(|_| without("the simulation ended with a panic"))
+    let gained = simulated.await.unwrap_or_else(|_| without("the simulation ended with a panic"));
+    drop(asker);
+    gained
 }
 
 /// Writes the changes into the file. May read and write files.

@@ -181,7 +181,7 @@ impl Logs {
             let path =
                 |id: InstanceId| fold.run.instance(id).map_or_else(|| id.to_string(), |one| one.path.to_string());
             let cell = robot::cell(&fold.film, version, shown, path);
-            wire::Cell { epoch: fold.epoch, more: !there, at_s: fold.run.end_s, ..cell }
+            wire::Cell { epoch: fold.epoch, more: !there, at_s: fold.run.end_s, from_s: fold.from_s, ..cell }
         })
     }
 

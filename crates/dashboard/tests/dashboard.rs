@@ -288,11 +288,15 @@ async fn the_robot_is_told_once_and_where_its_joints_go_as_far_as_a_moment() {
 #[tokio::test]
 async fn each_log_is_shown_with_the_robot_that_it_names() {
     let place = tempfile::tempdir().unwrap();
-    let of = |robot: &str| log_of(&[started("seen").replace(r#","seed""#, &format!(r#","origin":{{"robot":"{robot}"}},"seed""#))]);
+    let of = |robot: &str| {
+        log_of(&[started("seen").replace(r#","seed""#, &format!(r#","origin":{{"robot":"{robot}"}},"seed""#))])
+    };
     let files = [of("ur5"), of("panda"), of("nobody"), log_of(&[started("earlier")])];
     let robots = Robots::by(|of_log| match of_log {
         "" => Ok((Robot::aimm(), "the built-in robot".to_owned())),
-        _ => Robot::built_in(of_log).map(|robot| (robot, "as the log says".to_owned())).ok_or(format!("there is no {of_log}")),
+        _ => Robot::built_in(of_log)
+            .map(|robot| (robot, "as the log says".to_owned()))
+            .ok_or(format!("there is no {of_log}")),
     });
     let paths: Vec<&Path> = files.iter().map(tempfile::NamedTempFile::path).collect();
     let dashboard = Dashboard::bind(Options { robots, ..options(&paths, place.path()) }).await.unwrap();
@@ -374,6 +378,11 @@ async fn of_a_long_log_what_is_shown_is_read() {
     let run = &frames.last().unwrap()["run"];
     assert_eq!(run["at_s"].as_f64(), Some(200.25));
     assert!(began.elapsed() < Duration::from_secs(20), "{:?}", began.elapsed());
+    // Who sees the cell or the world is told that what was before is not in it.
+    for page in ["cell", "world"] {
+        let told = served.get(&format!("/api/{page}?log={log}&at=200.25&epoch={}", frames[0]["epoch"])).await.json();
+        assert_eq!(told["from_s"], run["from_s"], "{page}");
+    }
     // A short moment after the start is read from the start.
     let early = served.frames(&format!("log={log}&at=3.25")).await.pop().unwrap();
     assert_eq!((early["run"]["from_s"].as_f64(), early["run"]["expanded"].as_u64()), (Some(0.0), Some(3)));

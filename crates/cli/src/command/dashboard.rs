@@ -82,7 +82,8 @@ fn editing(file: &Path, directory: &Path) -> Result<Editing, Failure> {
     let makespan = move |program: &Program, goes_on: &dyn Fn() -> bool| {
         let parameters = program.bind_parameters(&[]).map_err(|error| error.to_string())?;
         let assumptions = Assumptions { parameters, ..assumptions.clone() };
-        makespan_s(program, &config.catalogue, &assumptions, MAX_EVENTS, goes_on).map_err(|obstacle| obstacle.to_string())
+        makespan_s(program, &config.catalogue, &assumptions, MAX_EVENTS, goes_on)
+            .map_err(|obstacle| obstacle.to_string())
     };
     Ok(Editing::of(file.to_owned(), kinds, check, makespan))
 }
@@ -106,7 +107,8 @@ fn robots(directory: PathBuf, named: Option<String>) -> Robots {
             return Ok((robot(named)?, "as --robot says".to_owned()));
         }
         if !of_log.is_empty() {
-            let needs = |why| format!("the log is of the robot {of_log}: {why}; --robot names another description of it");
+            let needs =
+                |why| format!("the log is of the robot {of_log}: {why}; --robot names another description of it");
             return Ok((robot(of_log).map_err(needs)?, "as the log says".to_owned()));
         }
         let (robot_of, whence) = match own() {

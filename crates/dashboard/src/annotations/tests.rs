@@ -51,8 +51,8 @@ fn states_are_told_with_what_they_say_and_what_is_in_force() {
     // Also of a state that is tried again.
     assert!(force(1, "resources").0.contains("Gripper"));
     assert!(told.predicates.iter().any(|one| one == "on(?, ?)"), "{:?}", told.predicates);
-    // Without an ontology, those that the file names.
-    assert_eq!(told.entities, ["gripper"]);
+    // Without an ontology, those that the file and what the catalogue says of its actions name.
+    assert_eq!(told.entities, ["base", "gripper"]);
 }
 
 #[test]
@@ -84,6 +84,38 @@ fn a_change_is_written_and_all_else_and_the_mode_stay() {
 }
 
 #[test]
+fn extended_attributes_stay() {
+    use rustix::fs::{XattrFlags, getxattr, setxattr};
+    let folder = tempfile::tempdir().unwrap();
+    let editing = editing(&folder);
+    let file = &editing.0.file;
+    if let Err(error) = setxattr(file, "user.note", b"kept", XattrFlags::empty()) {
+        eprintln!("skipped: the file system of {} keeps no extended attributes: {error}", folder.path().display());
+        return;
+    }
+    // The user 12345 may read it: version 2, then tag, permissions and id of each entry.
+    let entries: [(u16, u16, u32); 5] =
+        [(1, 6, u32::MAX), (2, 4, 12_345), (4, 4, u32::MAX), (0x10, 4, u32::MAX), (0x20, 0, u32::MAX)];
+    let bytes = entries
+        .iter()
+        .flat_map(|(tag, may, id)| [&tag.to_le_bytes()[..], &may.to_le_bytes()[..], &id.to_le_bytes()[..]].concat());
+    let list: Vec<u8> = 2_u32.to_le_bytes().into_iter().chain(bytes).collect();
+    let with_list = setxattr(file, "system.posix_acl_access", &list, XattrFlags::empty()).is_ok();
+    saved(&editing, &proposal(&editing, "plan", "duration", Some(&["3.5"]))).unwrap();
+    assert!(on_disk(&editing).contains("duration: 3.5"));
+    let value = |name: &str| {
+        let mut value = vec![0; 1024];
+        let length = getxattr(file, name, &mut value[..]).unwrap();
+        value[..length].to_vec()
+    };
+    assert_eq!(value("user.note"), b"kept");
+    if with_list {
+        assert_eq!(value("system.posix_acl_access"), list);
+        assert_eq!(std::fs::metadata(file).unwrap().permissions().mode() & 0o7777, 0o640);
+    }
+}
+
+#[test]
 fn what_else_a_state_may_say_of_itself_is_written_as_it_is_typed() {
     let folder = tempfile::tempdir().unwrap();
     let editing = editing(&folder);
@@ -101,7 +133,10 @@ fn what_else_a_state_may_say_of_itself_is_written_as_it_is_typed() {
     // Two of the three that are one key, and no boolean.
     for (key, items) in [("pia", &["true"][..]), ("deterministic", &["maybe"])] {
         let twice = proposal(&editing, "plan", "computes", Some(&["true"]));
-        let both = Proposal { changes: [twice.changes, proposal(&editing, "plan", key, Some(items)).changes].concat(), ..twice };
+        let both = Proposal {
+            changes: [twice.changes, proposal(&editing, "plan", key, Some(items)).changes].concat(),
+            ..twice
+        };
         let told = proposed(&editing, &both).unwrap();
         assert!(told.refused && told.findings.iter().any(|one| one.path == "plan"), "{told:?}");
     }
@@ -207,4 +242,24 @@ async fn an_older_simulation_makes_room_for_the_newest() {
     assert!(began.elapsed() < SIMULATION);
     assert!(newer.await.unwrap().obstacle.contains("takes longer"));
     assert_eq!(going_on.load(Ordering::SeqCst), 0);
+}
+
+#[tokio::test]
+async fn a_simulation_for_which_nobody_waits_any_more_ends_its_thread() {
+    let folder = tempfile::tempdir().unwrap();
+    let (editing, going_on) = endless(&folder);
+    let asked = tokio::spawn({
+        let (editing, proposal) = (editing.clone(), proposal(&editing, "plan", "duration", Some(&["3"])));
+        async move { gained(&editing, proposal).await.unwrap() }
+    });
+    while going_on.load(Ordering::SeqCst) == 0 {
+        tokio::task::yield_now().await;
+    }
+    let began = Instant::now();
+    asked.abort();
+    // The thread gives its place back when it has ended.
+    let place = editing.0.simulating.acquire().await.unwrap();
+    assert!(began.elapsed() < SIMULATION / 2, "{:?}", began.elapsed());
+    assert_eq!(going_on.load(Ordering::SeqCst), 0);
+    drop(place);
 }

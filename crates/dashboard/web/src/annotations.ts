@@ -45,6 +45,7 @@ const ABOUT: Record<string, string> = {
 const RARE = ["attempts", "deterministic", "routine", "exceptional", "exceptions", "shared"];
 /** What a key is as soon as it is said. */
 const FIRST: Record<string, string> = { computes: "true", pia: "true", attempts: "3", deterministic: "true", routine: "true", exceptional: "aborted", exceptions: "imprecise" };
+const REFUSED = "The file is refused as it is, and still is with this change.";
 /** More words are no help. */
 const MOST_WORDS = 500;
 
@@ -75,6 +76,22 @@ export function sorted(findings: Finding[], state: string, keys: string[]): { by
     else byKey.set(one.key, [...(byKey.get(one.key) ?? []), one]);
   }
   return { byKey, own, others };
+}
+
+/** Whether a change that was checked may be saved: a file that is refused already may be, so that it can be mended step by step. */
+export function maySave(changes: Change[], checked: Proposed | null, findings: Finding[]): boolean {
+  if (changes.length === 0 || checked === null || checked.problem !== "") return false;
+  return !checked.refused || isRefused(findings);
+}
+
+/** Whether the file as it is is refused. */
+export function isRefused(findings: Finding[]): boolean {
+  return findings.some((one) => one.severity === "error");
+}
+
+/** Whether somebody has typed on since this was sent. */
+export function isOther(sent: Proposal, now: Proposal): boolean {
+  return sent.state === now.state && JSON.stringify(sent.changes) !== JSON.stringify(now.changes);
 }
 
 /** What a change gains, in a sentence. */
@@ -205,16 +222,20 @@ export function annotationsPage(desk: Desk): Page {
     complain(error instanceof Refused && error.status === 409 ? text : `${text} `);
   }
 
-  async function load(): Promise<void> {
+  /** Reads the file. `sent` was written into it: what was typed since then, or for another state, stays. */
+  async function load(sent?: Proposal): Promise<void> {
     if (loading) return;
     loading = true;
     try {
-      all = await api.annotations();
+      const read = await api.annotations();
+      const stays = sent !== undefined && (sent.state !== chosen || isOther(sent, proposal()));
+      all = read;
       complain(all.problem);
       fill(head, h("b", {}, all.file), ` ${all.states.length} states. What is typed is checked as by `, h("code", {}, "ratn check"), "; nothing is written before you save.");
       showList();
       const kept = all.states.some((one) => one.path === chosen) ? chosen : (all.states[0]?.path ?? null);
-      choose(kept);
+      if (stays && kept === chosen) goOn();
+      else choose(kept);
     } catch (error) {
       failed(error);
     } finally {
@@ -267,6 +288,13 @@ export function annotationsPage(desk: Desk): Page {
     update();
   }
 
+  /** What is typed stays, and is a change of the file as it is now. */
+  function goOn(): void {
+    showForm();
+    showFindings(all?.findings ?? []);
+    edited();
+  }
+
   function showForm(): void {
     const now = state();
     fields.clear();
@@ -297,10 +325,8 @@ export function annotationsPage(desk: Desk): Page {
     offer("");
     const own = h("input", { type: "checkbox", checked: said.said, "data-key": `said ${one.key}` });
     const input = (item: string, index: number) => {
-      const box = h("input", {
-        type: "text",
-        value: item,
-        list: `words-${one.key}`,
+      const rows = item.split("\n").length;
+      const more = {
         autocomplete: "off",
         spellcheck: "false",
         "aria-label": one.listed ? `${one.key}, ${index + 1}` : one.key,
@@ -313,7 +339,10 @@ export function annotationsPage(desk: Desk): Page {
           offer(box.value);
           edited();
         },
-      });
+      };
+      // A text over several lines would lose its ends of lines in an input.
+      const box: HTMLInputElement | HTMLTextAreaElement =
+        rows > 1 ? h("textarea", { ...more, rows }, item) : h("input", { ...more, type: "text", value: item, list: `words-${one.key}` });
       const away = h(
         "button",
         {
@@ -372,7 +401,7 @@ export function annotationsPage(desk: Desk): Page {
   function update(): void {
     const some = changes().length > 0;
     undo.disabled = !some;
-    save.disabled = !some || checked === null || checked.problem !== "" || checked.refused;
+    save.disabled = !maySave(changes(), checked, all?.findings ?? []);
   }
 
   /** Something was typed: it is checked a moment later. */
@@ -415,7 +444,8 @@ export function annotationsPage(desk: Desk): Page {
   function outcome(answer: Proposed): Child[] {
     if (answer.problem !== "") return [h("p", { class: "bad" }, answer.problem)];
     return [
-      h("h2", {}, answer.refused ? "With this change the file would be refused" : "What would be written"),
+      h("h2", {}, answer.refused && !isRefused(all?.findings ?? []) ? "With this change the file would be refused" : "What would be written"),
+      answer.refused && isRefused(all?.findings ?? []) ? h("p", { class: "warn" }, REFUSED) : null,
       ...lines(answer),
     ];
   }
@@ -428,14 +458,22 @@ export function annotationsPage(desk: Desk): Page {
   function askToSave(): void {
     const [asked, answer] = [proposal(), checked];
     if (answer === null) return;
-    confirm("Save?", "Save", [h("p", {}, `${asked.state} in ${all?.file ?? ""}:`), ...lines(answer)], false, () => {
+    const warning = answer.refused ? h("p", { class: "warn" }, REFUSED) : null;
+    confirm("Save?", "Save", [h("p", {}, `${asked.state} in ${all?.file ?? ""}:`), warning, ...lines(answer)], false, () => {
+      // Of the text that is written now nothing was checked.
+      checked = null;
+      update();
       const saving = api.saveAnnotations(asked);
       saving.then(
         async (told) => {
-          await load();
+          await load(asked);
           desk.say(told.said);
         },
-        (error: unknown) => failed(error),
+        (error: unknown) => {
+          failed(error);
+          checked ??= answer;
+          update();
+        },
       );
     });
   }

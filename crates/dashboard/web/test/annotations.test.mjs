@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { changesOf, completions, draftOf, gainText, sorted, wordsFor } from "../src/annotations.ts";
+import { changesOf, completions, draftOf, gainText, isOther, maySave, sorted, wordsFor } from "../src/annotations.ts";
 
 const key = (name, items = null) => ({ key: name, said: items !== null, items: items ?? [], listed: name !== "duration" });
 const state = { path: "a/b", depth: 1, form: "action: x/y", line: 3, fixed: "", in_force: [], keys: [key("reads", ["at(table)"]), key("effects"), key("duration", ["2"])] };
@@ -36,6 +36,24 @@ test("what is gained is said, and why it is not", () => {
   assert.match(gainText({ before_s: 42, after_s: 56, obstacle: "" }), /14.0\u00a0s longer/);
   assert.match(gainText({ before_s: 42, after_s: 42, obstacle: "" }), /nothing is gained/);
   assert.match(gainText({ before_s: 42, after_s: null, obstacle: "it takes too long" }), /cannot be said: it takes too long. As it is: 42.0/);
+});
+
+test("what is refused cannot be saved, unless the file was refused before", () => {
+  const [some, error, warning] = [[{ key: "reads", items: [] }], { severity: "error" }, { severity: "warning" }];
+  assert.equal(maySave(some, { problem: "", refused: false }, []), true);
+  assert.equal(maySave(some, { problem: "", refused: true }, [warning]), false);
+  assert.equal(maySave(some, { problem: "", refused: true }, [warning, error]), true);
+  assert.equal(maySave(some, { problem: "no value", refused: false }, [error]), false);
+  assert.equal(maySave(some, null, [error]), false);
+  assert.equal(maySave([], { problem: "", refused: false }, []), false);
+});
+
+test("what is typed while a change is saved is told from what was sent", () => {
+  const sent = { digest: "1", state: "a", changes: [{ key: "reads", items: ["x"] }] };
+  assert.equal(isOther(sent, { ...sent, digest: "2" }), false);
+  assert.equal(isOther(sent, { ...sent, changes: [{ key: "reads", items: ["x", "y"] }] }), true);
+  assert.equal(isOther(sent, { ...sent, changes: [] }), true);
+  assert.equal(isOther(sent, { ...sent, state: "b", changes: [] }), false);
 });
 
 test("words are completed from the catalogue and the ontology", () => {
