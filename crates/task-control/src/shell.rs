@@ -89,6 +89,8 @@ pub struct Place {
     pub directory: PathBuf,
     /// What there is on it.
     pub catalogue: Arc<Catalogue>,
+    /// Its robot: the name of a built-in one, or the absolute path of its description.
+    pub robot: String,
     /// The robot's seconds per second of wall time.
     pub speed: f64,
     /// Where what people read of the run goes.
@@ -181,6 +183,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
                 version: VERSION.to_owned(),
                 file: run.file,
                 from: run.from,
+                robot: place.robot.clone(),
                 began_unix_ms,
                 imprecise: imprecise(&run.program),
                 natures: natures(&run.program, &place.catalogue),
