@@ -37,6 +37,7 @@ fn place_of(endpoints: &Endpoints) -> Place {
         tls: ClientTls::none(),
         directory: std::path::PathBuf::new(),
         catalogue: Arc::default(),
+        robot: String::new(),
         speed: 1.0,
         messages: Messages::nowhere(),
         alone: false,
