@@ -217,11 +217,11 @@ fn a_run_that_goes_on_after_its_task_control_was_killed_goes_on_in_its_trace() -
     let before: Vec<Decoded> = collector.spans().into_iter().filter(|span| span.service == "ratn").collect();
     ensure!(!before.is_empty() && before.iter().all(|span| span.id != ROOT), "{before:?}");
 
-    let again = place.start_as("again", &["run", "--resume", log_name])?;
+    let mut again = place.start_as("again", &["run", "--resume", log_name])?;
     wait_for("the run to go on", || {
         Ok(std::fs::read_to_string(&log)?.contains("\"event\":\"resumed\"").then_some(()))
     })?;
-    let signal = place.start_as("signal", &["signal", "killed", "go"])?;
+    let mut signal = place.start_as("signal", &["signal", "killed", "go"])?;
     let (code, _, said) = signal.finish()?;
     ensure!(code == Some(0), "{said}");
     let (code, _, said) = again.finish()?;

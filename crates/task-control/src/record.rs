@@ -371,7 +371,7 @@ impl MakingProjection {
 /// The failure, where what has to be safe before never will be.
 async fn unsafe_on_disk(instance: InstanceId, safe: Option<Mark>) -> Option<Event> {
     let is_safe = match safe {
-        Some(safe) => safe.is_safe().await,
+        Some(safe) => safe.safe().await,
         None => true,
     };
     let reason = || "the event log, which says what has happened, cannot be made safe on its disk".to_owned();

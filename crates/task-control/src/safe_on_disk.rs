@@ -72,7 +72,7 @@ impl Syncer {
 
 impl Mark {
     /// Waits until everything before it is safe; false where it never will be.
-    pub(super) async fn is_safe(mut self) -> bool {
+    pub(super) async fn safe(mut self) -> bool {
         let number = self.number;
         // Where the thread is gone it has said the last that is to be said.
         let _ = self.safe.wait_for(|safe| safe.through >= number || safe.failed.is_some()).await;
@@ -119,9 +119,9 @@ mod tests {
         let first = syncer.mark();
         tokio::time::sleep(Duration::from_millis(10)).await;
         let others: Vec<Mark> = (0..10).map(|_| syncer.mark()).collect();
-        assert!(first.is_safe().await);
+        assert!(first.safe().await);
         for mark in others {
-            assert!(mark.is_safe().await);
+            assert!(mark.safe().await);
         }
         assert!(count.load(Ordering::SeqCst) < 8, "eleven marks cost fewer looks");
     }
@@ -134,16 +134,16 @@ mod tests {
             _ => Err(io::Error::other("the disk is gone")),
         });
         let first = syncer.mark();
-        assert!(first.clone().is_safe().await);
-        assert!(!syncer.mark().is_safe().await);
+        assert!(first.clone().safe().await);
+        assert!(!syncer.mark().safe().await);
         assert_eq!(&*syncer.failed().await, "the disk is gone");
-        assert!(first.is_safe().await, "what was safe stays so");
-        assert!(!syncer.mark().is_safe().await);
+        assert!(first.safe().await, "what was safe stays so");
+        assert!(!syncer.mark().safe().await);
     }
 
     #[tokio::test]
     async fn without_a_disk_nobody_waits() {
         let mut syncer = Syncer::start(None).expect("no thread is needed");
-        assert!(syncer.mark().is_safe().await);
+        assert!(syncer.mark().safe().await);
     }
 }

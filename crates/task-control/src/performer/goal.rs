@@ -115,7 +115,7 @@ impl Performing {
         if let Some(safe) = self.safe.take() {
             tokio::select! {
                 // Where it never will be the run ends.
-                is_safe = safe.is_safe() => if !is_safe { return },
+                is_safe = safe.safe() => if !is_safe { return },
                 () = self.stop.cancelled() => return,
             }
         }

@@ -689,7 +689,7 @@ impl Performer {
             }
             // What others do then stands on what is known here.
             if let Some(safe) = safe {
-                safe.is_safe().await;
+                safe.safe().await;
             }
             if let Some(projection) = there {
                 end_projection(&world, instance, projection).await;

@@ -406,9 +406,9 @@ impl Reference<'_> {
                 (_, None) => touched.reads_any |= !state.is_pause(),
             }
             // What it measures is said nowhere.
-            let outcomes = state.outcomes.iter().map(String::as_str).chain([SUCCESS]);
+            let mut outcomes = state.outcomes.iter().map(String::as_str).chain([SUCCESS]);
             let is_said = |outcome: &str| annotations.effects.contains_key(outcome);
-            touched.writes_any |= annotations.nature != Nature::Computes && !outcomes.map(is_said).all(|said| said);
+            touched.writes_any |= annotations.nature != Nature::Computes && !outcomes.all(is_said);
         }
         touched
     }
