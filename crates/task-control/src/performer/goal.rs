@@ -17,7 +17,7 @@ use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
-use tokio_util::sync::CancellationToken;
+use tokio_util::sync::{CancellationToken, DropGuard};
 
 /// A provider that was told to stop and does not is left alone after this long.
 const CANCEL_DEADLINE: Duration = Duration::from_secs(2);
@@ -77,6 +77,10 @@ pub(super) enum Given {
 pub(super) struct Performing {
     pub(super) instance: InstanceId,
     pub(super) attempt: u32,
+    /// It is given when these goals have ended, which were told to stop: each is cancelled then.
+    pub(super) before: Vec<CancellationToken>,
+    /// Says that it has ended.
+    pub(super) over: DropGuard,
     pub(super) endpoint: Result<Endpoint, String>,
     /// The provider's id: what measures, where it names nothing itself.
     pub(super) source: String,
@@ -101,6 +105,12 @@ pub(super) fn deadline_ms(timeout_s: Option<f64>, speed: f64) -> u64 {
 impl Performing {
     /// Until its end; the event goes to the shell, unless the goal was told to stop.
     pub(super) async fn perform(self, given: Given) {
+        for before in &self.before {
+            tokio::select! {
+                () = before.cancelled() => {}
+                () = self.stop.cancelled() => return,
+            }
+        }
         let event = match &self.endpoint {
             Ok(endpoint) => self.execute(endpoint, given).await,
             Err(reason) => Some(self.aborted(reason.clone())),
@@ -311,7 +321,6 @@ mod tests {
     use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
     use ratn_worker::server::{Services, bind};
     use ratn_worker::tls::ClientTls;
-    use tokio_util::sync::DropGuard;
 
     /// `work`: is done at once. `hang`: never, unless it is told to stop. `better`: with results before that, not each of which is better.
     struct Named(&'static str);
@@ -364,6 +373,8 @@ mod tests {
             Performing {
                 instance: InstanceId(1),
                 attempt: 1,
+                before: Vec::new(),
+                over: CancellationToken::new().drop_guard(),
                 endpoint: Ok(self.endpoint.clone()),
                 source: "worker-1".to_owned(),
                 timeout_s,

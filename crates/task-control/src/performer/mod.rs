@@ -6,6 +6,7 @@ mod claim;
 mod goal;
 mod handover;
 mod resume;
+mod stopping;
 #[cfg(test)]
 mod tests;
 mod told;
@@ -43,6 +44,7 @@ use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
+use stopping::Stopping;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
@@ -156,6 +158,7 @@ pub(super) struct Performer {
     /// Of the commands that are performed now.
     handover: Option<Handover>,
     jobs: BTreeMap<InstanceId, Job>,
+    stopping: Stopping,
     giving_back: JoinSet<()>,
     acquires: u64,
     operations: u64,
@@ -169,8 +172,12 @@ struct Job {
     attempt: u32,
     /// What it works under; a routine's serves several jobs.
     lease: Option<LeaseId>,
+    /// The resource that performs it; empty without one.
+    resource: String,
     stop: CancellationToken,
     ended: JoinHandle<()>,
+    /// Is cancelled when it has ended.
+    over: CancellationToken,
 }
 
 impl Performer {
@@ -249,6 +256,7 @@ impl Performer {
             paths: BTreeMap::new(),
             handover: None,
             jobs: BTreeMap::new(),
+            stopping: Stopping::default(),
             giving_back: JoinSet::new(),
             acquires: 0,
             operations: 0,
@@ -337,7 +345,7 @@ impl Performer {
             }
             Command::Start { instance, attempt, goal } => self.start(instance, attempt, *goal, Given::Now),
             Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
-                Some(job) if job.attempt == attempt => job.stop.cancel(),
+                Some(job) if job.attempt == attempt => self.stopping.stop(job),
                 _ => {
                     self.cancelled.lock().unwrap_or_else(PoisonError::into_inner).insert((instance, attempt));
                 }
@@ -511,9 +519,12 @@ impl Performer {
             ),
             Err(reason) => (String::new(), Err(reason)),
         };
+        let (resource, before, over) = (source.clone(), self.stopping.before(&source), CancellationToken::new());
         let performing = Performing {
             instance,
             attempt,
+            before,
+            over: over.clone().drop_guard(),
             endpoint,
             source,
             timeout_s: goal.timeout_s,
@@ -540,7 +551,7 @@ impl Performer {
             },
         };
         let ended = tokio::spawn(trace::within(self.of(instance), performing.perform(given)));
-        self.jobs.insert(instance, Job { attempt, lease, stop, ended });
+        self.jobs.insert(instance, Job { attempt, lease, resource, stop, ended, over });
     }
 
     /// What performs goals says where it is: a resource of that kind that does not is nobody's to give a goal to, whoever made it.
