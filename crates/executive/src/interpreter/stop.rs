@@ -214,7 +214,7 @@ impl Interpreter {
         let has_begun = current.phase == Phase::Running && !context.program.state(current.state).is_pause();
         let mut result = Ok(());
         match current.phase {
-            Phase::Held | Phase::Stalled | Phase::Backoff(_) => {}
+            Phase::Held | Phase::Stalled | Phase::Backoff(_) | Phase::Queued(_) => {}
             Phase::Running if !has_begun => {}
             Phase::Acquiring => context.commands.push(Command::Withdraw { instance: current.instance }),
             Phase::Projecting | Phase::Running => {

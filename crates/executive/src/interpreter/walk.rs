@@ -24,6 +24,7 @@ impl Interpreter {
             };
             let id = match (self.first(follows), self.first(|_, todo| matches!(todo, Todo::Enter(..)))) {
                 (Some(id), _) => id,
+                (None, None) if self.take_turns(context) => continue,
                 (None, None) => return Progress::Busy,
                 (None, Some(_)) if std::mem::take(&mut self.has_changed) && self.look_at_waits(context) => {
                     self.has_changed = true;

@@ -89,6 +89,8 @@ pub(crate) struct StatePlan {
     /// What it acquires when it starts: blocks (its own and those of the hierarchies around it and of what it contains, merged by
     /// maximum), consumes and exists.
     pub(crate) requirements: Vec<ResourceExpr>,
+    /// The kinds of what an action works with: of each, one goal has a unit at a time.
+    pub(crate) works_with: Vec<String>,
     /// What it does to resources when it ends with success.
     pub(crate) operations: Vec<ResourceExpr>,
     /// Whether something is used up when it gets what it acquires: that is not given back.
@@ -237,6 +239,7 @@ impl StatePlan {
             awaited,
             writes: writes.into_iter().collect(),
             requirements: resources.requirements,
+            works_with: resources.works_with,
             operations: resources.operations,
             start_flows: flows::start_flows(subject),
             flows: flows::flows(subject),
