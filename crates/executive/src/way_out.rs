@@ -106,6 +106,8 @@ pub(crate) struct Leaving {
     /// What is being done, and in which scope.
     current: Option<(usize, Box<Interpreter>)>,
     until: Timestamp,
+    /// The user has asked for the end: when he does so again, it comes at once.
+    is_asked: bool,
 }
 
 impl Leaving {
@@ -114,7 +116,8 @@ impl Leaving {
         let WayOut { scopes, mut steps, hold } = std::mem::take(&mut end.way_out);
         steps.sort_by_key(|step| (step.depth, std::cmp::Reverse(step.state)));
         let until = context.now + Duration::from_secs(LIMIT_S);
-        let mut leaving = Leaving { end, steps, scopes, hold, current: None, until };
+        let is_asked = end.outcome == PREEMPTED;
+        let mut leaving = Leaving { end, steps, scopes, hold, current: None, until, is_asked };
         match leaving.go_on(context) {
             Some(end) => Err(Box::new(end)),
             None => {
@@ -127,6 +130,8 @@ impl Leaving {
     /// Takes an event; the end of the run, when this was it.
     pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Option<End> {
         match event {
+            // The run is over its deadline, and the user asks for the first time.
+            Event::AbortRequested { at_once: false, .. } if !self.is_asked => self.is_asked = true,
             Event::AbortRequested { reason, .. } => return self.cut_short(context, &reason),
             Event::RetirementFailed { reason, .. } => {
                 ABORTED.clone_into(&mut self.end.outcome);
