@@ -37,6 +37,17 @@ pub(crate) struct WayOut {
     pub(crate) hold: Hold,
 }
 
+/// A state that is entered and not left: its path, and how often what it does when it is cut short was begun.
+pub(crate) type Place = (StateId, String, u32);
+
+/// What the thread of control of a routine is in, the innermost first, and what is seen there.
+#[derive(Default)]
+pub(crate) struct Within {
+    pub(crate) places: Vec<Place>,
+    pub(crate) variables: Vec<(String, Value)>,
+    pub(crate) outputs: BTreeMap<StateId, Outputs>,
+}
+
 /// What is seen from where a thread of control was.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Scope {
@@ -56,12 +67,11 @@ struct Step {
 }
 
 impl WayOut {
-    /// The states in which a thread of control is, the innermost first: each with its path, and how often what it does when it is cut short was
-    /// begun.
+    /// The states in which a thread of control is, the innermost first.
     pub(crate) fn add(
         &mut self,
         program: &Program,
-        entered: impl Iterator<Item = (StateId, String, u32)>,
+        entered: impl Iterator<Item = Place>,
         variables: impl FnOnce() -> Vec<(String, Value)>,
         outputs: impl FnOnce() -> BTreeMap<StateId, Outputs>,
     ) {
