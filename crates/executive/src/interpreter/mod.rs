@@ -265,6 +265,11 @@ impl Interpreter {
         self.routines.get(&MAIN)?.lease.as_ref()
     }
 
+    /// Whether the window's routine asks for all that it needs anew.
+    pub(crate) fn asks(&self) -> bool {
+        self.threads.values().flat_map(|thread| &thread.current).any(|current| current.phase == Phase::Acquiring)
+    }
+
     /// Begins with `state`, visited at `path`.
     pub(crate) fn start(&mut self, context: &mut Context<'_>, state: StateId, path: &str) -> Progress {
         if let Some(main) = self.threads.get_mut(&MAIN) {
