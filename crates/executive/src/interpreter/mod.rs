@@ -98,6 +98,8 @@ struct Frame {
     iteration: Option<(usize, Option<Vec<Value>>)>,
     /// How many variables there were before the owner was entered.
     variables: usize,
+    /// Why the last state of it that failed did so.
+    because: String,
 }
 
 /// What a thread does next.
