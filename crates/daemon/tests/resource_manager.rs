@@ -55,7 +55,7 @@ async fn an_acquire_that_waits_in_vain_says_what_it_waited_for() {
     let system = TestSystem::new();
     let manager = system.resource_manager().await;
     let a = system.client(&manager, "a").await;
-    let options = AcquireOptions { deadline: Duration::from_millis(30), ..AcquireOptions::default() };
+    let options = AcquireOptions { deadline: Duration::from_millis(500), ..AcquireOptions::default() };
     let error = a.resources.acquire(vec![block("Arm")], options.clone()).await.unwrap_err();
     assert_eq!(error.code(), Some(Code::DeadlineExceeded));
     let words = "not granted: deadline passed while waiting for `block Arm`: no resource of kind Arm exists";

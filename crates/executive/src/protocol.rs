@@ -160,7 +160,8 @@ pub enum Event {
         /// Why, and what to do.
         reason: String,
     },
-    /// The world pool made the projection of a [`Command::Project`].
+    /// The world pool made the projection of a [`Command::Project`], or has promised it under this id where it need not be there first. If nothing comes
+    /// of a promise, `Crashed` follows.
     Projected {
         /// For which instance.
         instance: InstanceId,
@@ -175,6 +176,11 @@ pub enum Event {
         revision: Revision,
         /// What holds now of what is otherwise than the run knew; a fact without a value does not.
         facts: Vec<(FactKey, Option<Value>)>,
+    },
+    /// Another run waits for what one of these holds, and needs it for certain. Told again where it waits longer.
+    WantedByOthers {
+        /// Which instances.
+        holders: Vec<InstanceId>,
     },
     /// A goal says how far it is. Logged; changes nothing.
     Progressed {
@@ -287,6 +293,9 @@ pub enum Command {
         reads: Footprint,
         /// What holds the room for it: the instance's lease, or that of the routine it is in.
         lease: Option<(LeaseId, FencingToken)>,
+        /// Whether it has to be there before the goal begins: what that does changes the environment, or its time is limited.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        first: bool,
     },
     /// Give a provider a goal; answered by `Finished` or `Crashed`.
     Start {
@@ -422,8 +431,9 @@ pub enum Note {
     Preempted {
         /// Its id.
         instance: InstanceId,
-        /// Who needs it.
-        by: InstanceId,
+        /// Who needs it; `None`: another run.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        by: Option<InstanceId>,
     },
     /// The same was computed before, from the same inputs and facts and with the same seed: that result is its result.
     Reused {

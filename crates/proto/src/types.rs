@@ -198,6 +198,8 @@ pub struct WaitingAcquire {
     pub ahead: u32,
     /// What is in the way, for people.
     pub obstacles: Vec<String>,
+    /// The leases that hold what it lacks.
+    pub held_by: Vec<LeaseId>,
 }
 
 /// A session as the resource manager lists it.

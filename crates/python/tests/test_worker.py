@@ -80,6 +80,11 @@ def test_a_worker_describes_itself(tester: Place) -> None:
         assert part in shown, shown
 
 
+def test_what_a_goal_sets_in_its_context_is_its_own(tester: Place) -> None:
+    for given in (1, 2, 3, 4):
+        assert performed(tester, f"context_{given}", "of_its_own", f"{{given: {given}}}", "before", "int") == 0
+
+
 def test_arrays_of_numpy_come_and_go(tester: Place) -> None:
     assert performed(tester, "total", "add", "{ numbers: '[1, 2.5]' }", "total", "float") == 7.0
     assert performed(tester, "joints", "add", "{ numbers: '[1, 2.5]', factor: 1 }", "joints", "joints") == [1.0, 2.5]

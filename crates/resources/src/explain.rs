@@ -63,6 +63,25 @@ pub enum Obstacle {
     },
 }
 
+impl Explanation {
+    /// Whether it would get what it wants if others gave it back: all of that is there.
+    pub fn is_hopeful(&self) -> bool {
+        let is_there = |one: &Obstacle| !matches!(one, Obstacle::MissingKind { .. } | Obstacle::TooFew { .. });
+        self.obstacles.iter().all(is_there)
+    }
+
+    /// The leases that hold what it lacks.
+    pub fn held_by(&self) -> impl Iterator<Item = LeaseId> {
+        self.obstacles
+            .iter()
+            .flat_map(|obstacle| match obstacle {
+                Obstacle::Held { holders, .. } => holders.as_slice(),
+                _ => &[],
+            })
+            .map(|(lease, ..)| *lease)
+    }
+}
+
 impl Pool {
     /// What a waiter waits for; `None` if it is not in the queue.
     pub fn explain(&self, id: WaiterId) -> Option<Explanation> {

@@ -511,7 +511,7 @@ impl Simulation<'_> {
                 }
                 self.answers();
             }
-            Command::Project { instance, attempt, base, changes, writers, lease, reads } => {
+            Command::Project { instance, attempt, base, changes, writers, lease, reads, first: _ } => {
                 if writers.len() != changes.len() || writers.iter().any(|writer| writer.is_empty()) {
                     return Err(self.broken(format!("of a change that {instance} builds on nobody is named")));
                 }

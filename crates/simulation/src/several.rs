@@ -6,7 +6,7 @@
 use crate::dice::Dice;
 use crate::run::{Answer, MAX_EVENTS, Oracle, Performance, RunError, offer, shown};
 use ratn_executive::executive::Executive;
-use ratn_executive::protocol::{Command, Event, Learned, Mode, Note};
+use ratn_executive::protocol::{CERTAIN, Command, Event, Learned, Mode, Note};
 use ratn_model::catalogue::ResourceOffer;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId};
@@ -233,6 +233,9 @@ impl System<'_> {
                 let waiter = self.pool.acquire(self.now, request).map_err(|error| self.broken(error))?;
                 self.runs[run].waiters.insert(instance, waiter);
                 self.answers();
+                if priority >= CERTAIN {
+                    self.tell_holders(run, waiter);
+                }
             }
             Command::Withdraw { instance } => {
                 if let Some(waiter) = self.runs[run].waiters.remove(&instance) {
@@ -289,6 +292,20 @@ impl System<'_> {
             Command::End { outcome, reason, .. } => self.runs[run].end = Some((outcome, reason)),
         }
         Ok(())
+    }
+
+    /// Who holds what a node of a run needs for certain hears of it, if the node waits.
+    fn tell_holders(&mut self, run: usize, waiter: WaiterId) {
+        let Some(why) = self.pool.explain(waiter) else { return };
+        let leases: Vec<LeaseId> = why.held_by().collect();
+        for other in (0..self.runs.len()).filter(|other| *other != run) {
+            let holders =
+                leases.iter().filter_map(|lease| self.runs[other].leases.get(lease).copied()).collect::<Vec<_>>();
+            if !holders.is_empty() {
+                let late = self.late();
+                self.at(other, late, Due::Event(Box::new(Event::WantedByOthers { holders })));
+            }
+        }
     }
 
     fn give_back(&mut self, run: usize, lease: LeaseId) -> Result<(), RunError> {

@@ -93,7 +93,10 @@ fn transcript(run: &Run, script: &Script) -> String {
                 Note::Invalidated { instance, reason } => {
                     Some(("invalidate", format!("{} ({reason})", path(instance))))
                 }
-                Note::Preempted { instance, by } => Some(("preempt", format!("{} for {}", path(instance), path(by)))),
+                Note::Preempted { instance, by } => {
+                    let by = by.as_ref().map_or("another run".to_owned(), &path);
+                    Some(("preempt", format!("{} for {by}", path(instance))))
+                }
                 Note::Awaiting { instance, awaited, until } => {
                     let until = until.map_or_else(String::new, |until| format!(", until {}", until.seconds()));
                     Some(("wait", format!("{} for {awaited}{until}", path(instance))))

@@ -1,16 +1,18 @@
 //! Two runs on one system leave a world that some interleaving of their sequential programs leaves.
 //!
 //! The programs are random and small; every interleaving of the beginnings and ends of their steps is made by an evaluator that shares nothing
-//! with the executive but the values of facts. Two motions are under way at once where they are of different resources.
+//! with the executive but the values of facts. Workers crash. Two motions are under way at once where they are of different resources.
 //!
 //! `RATN_PROGRAMS=20000 RATN_FIRST=1000 cargo test -p ratn-simulation --test several` tries other pairs.
 
 mod support;
 
-use ratn_executive::protocol::{Event, Mode};
+use ratn_executive::protocol::{Event, Goal, Mode};
 use ratn_model::value::Value;
 use ratn_simulation::dice::Dice;
+use ratn_simulation::run::{Answer, Oracle, Performance};
 use ratn_simulation::several::{Shared, Together, run};
+use ratn_world::world::World;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
@@ -39,10 +41,11 @@ struct Motion {
 /// One step of a program.
 #[derive(Debug, Clone, PartialEq)]
 enum Step {
-    /// Requires that a fact is greater than a number, where it says so; else it aborts, and the program goes on.
-    Move(Option<(u64, i64)>, Motion),
-    /// Computes the fact plus ten.
-    Think(u64),
+    /// Requires that a fact is greater than a number, where it says so; else it aborts, and the program goes on. So it does where who moves
+    /// crashes, if that is said.
+    Move(Option<(u64, i64)>, Motion, bool),
+    /// Computes the fact plus ten. The first who computes it crashes, where that is said.
+    Think(u64, bool),
     /// One motion or another one, by whether a fact is greater than a number.
     Choose((u64, i64), Motion, Motion),
 }
@@ -62,16 +65,17 @@ fn motion(dice: &mut Dice, has_computed: bool) -> Motion {
 fn program(dice: &mut Dice) -> Vec<Step> {
     let mut has_computed = false;
     let condition = |dice: &mut Dice| (dice.below(FACTS), i64::try_from(dice.below(6)).unwrap_or_default());
+    let crashes = |dice: &mut Dice| dice.below(4) == 0;
     let count = 2 + dice.below(3);
     (0..count)
         .map(|_| match dice.below(4) {
             0 => {
                 has_computed = true;
-                Step::Think(dice.below(FACTS))
+                Step::Think(dice.below(FACTS), crashes(dice))
             }
             1 => Step::Choose(condition(dice), motion(dice, has_computed), motion(dice, has_computed)),
-            2 => Step::Move(Some(condition(dice)), motion(dice, has_computed)),
-            _ => Step::Move(None, motion(dice, has_computed)),
+            2 => Step::Move(Some(condition(dice)), motion(dice, has_computed), crashes(dice)),
+            _ => Step::Move(None, motion(dice, has_computed), crashes(dice)),
         })
         .collect()
 }
@@ -97,11 +101,11 @@ fn task(name: &str, steps: &[Step]) -> String {
         let next = if number + 1 < steps.len() { format!("s{}", number + 1) } else { "success".to_owned() };
         let ends = format!(", transitions: {{ success: {next}, aborted: {next} }}");
         match step {
-            Step::Move(requires, motion) => {
+            Step::Move(requires, motion, _) => {
                 let requires = requires.map_or(String::new(), |(p, n)| format!("requires: ['p{p}() > {n}'], "));
                 text += &format!("  {}", moves(&format!("s{number}"), &requires, motion, &computed, &ends));
             }
-            Step::Think(p) => {
+            Step::Think(p, _) => {
                 text += &format!(
                     "  - s{number}: {{ action: brain/think, computes: true, reads: ['p{p}()'], in: {{ a: p{p}() }}, resources: [{{ block: Brain }}], duration: 1, transitions: {{ success: {next} }} }}\n"
                 );
@@ -143,8 +147,8 @@ fn apply(facts: &mut Facts, effect: &Effect, computed: i64) {
 /// What may come next of a program while the other one moves this: nothing at its end, or where that is in the way.
 fn next(steps: &[Step], place: &Place, facts: &Facts, other: Option<&'static str>) -> Option<(Place, Facts)> {
     let (mut place, mut facts) = (place.clone(), facts.clone());
-    let (requires, motion) = match steps.get(place.step)? {
-        Step::Think(p) => {
+    let (requires, motion, crashes) = match steps.get(place.step)? {
+        Step::Think(p, _) => {
             place.computed = facts[p] + 10;
             place.step += 1;
             return Some((place, facts));
@@ -153,8 +157,8 @@ fn next(steps: &[Step], place: &Place, facts: &Facts, other: Option<&'static str
             place.chosen = Some(facts[p] > *n);
             return Some((place, facts));
         }
-        Step::Move(requires, motion) => (*requires, motion),
-        Step::Choose(_, then, otherwise) => (None, if place.chosen == Some(true) { then } else { otherwise }),
+        Step::Move(requires, motion, crashes) => (*requires, motion, *crashes),
+        Step::Choose(_, then, otherwise) => (None, if place.chosen == Some(true) { then } else { otherwise }, false),
     };
     let is_met = requires.is_none_or(|(p, n)| facts[&p] > n);
     match place.moving {
@@ -164,6 +168,7 @@ fn next(steps: &[Step], place: &Place, facts: &Facts, other: Option<&'static str
             return Some((place, facts));
         }
         None => {}
+        Some(_) if crashes => {}
         Some(_) => apply(&mut facts, &motion.effect, place.computed),
     }
     (place.moving, place.chosen) = (None, None);
@@ -202,6 +207,34 @@ fn interleaved(programs: &[Vec<Step>; 2], facts: Facts, is_cut: bool) -> BTreeSe
     ends
 }
 
+/// They do what the steps say.
+struct Workers<'a>(&'a [Vec<Step>; 2]);
+
+impl Oracle for Workers<'_> {
+    fn perform(&mut self, path: &str, attempt: u32, goal: &Goal, _: &World) -> Performance {
+        let (run, state) = path.split_once(":s").expect("a path: the run, and its state");
+        let number: usize = state.split('/').next().and_then(|number| number.parse().ok()).expect("a number");
+        let crashes = match &self.0[run.parse::<usize>().expect("a run")][number] {
+            Step::Move(_, _, crashes) => *crashes,
+            Step::Think(_, crashes) => *crashes && attempt == 1,
+            Step::Choose(..) => false,
+        };
+        let x = match goal.inputs.get("a") {
+            Some(Value::Int(a)) => Value::Int(a + 10),
+            other => other.cloned().unwrap_or(Value::Null),
+        };
+        let answer = match crashes {
+            true => Answer::Crashed,
+            false => Answer::Finished {
+                outcome: "success".to_owned(),
+                outputs: BTreeMap::from([("x".to_owned(), x)]),
+                measured: Vec::new(),
+            },
+        };
+        Performance { duration_s: goal.expected_s.unwrap_or(1.0), answer }
+    }
+}
+
 /// How many different worlds the pairs of these seeds could have left, and how many pairs could have left more than one.
 fn try_pairs(seeds: std::ops::Range<u64>) -> (usize, usize) {
     let (mut worlds, mut open) = (0, 0);
@@ -233,16 +266,9 @@ fn try_pairs(seeds: std::ops::Range<u64>) -> (usize, usize) {
                 told: Vec::from_iter(is_cut.then_some(abort)),
             },
         ];
-        let mut providers =
-            Providers(|_: &str, _: u32, goal: &ratn_executive::protocol::Goal, _: &ratn_world::world::World| {
-                let x = match goal.inputs.get("a") {
-                    Some(Value::Int(a)) => Value::Int(a + 10),
-                    other => other.cloned().unwrap_or(Value::Null),
-                };
-                ("success", x)
-            });
+        let mut workers = Workers(&programs);
         let about = || format!("seed {seed}, {modes:?}\n{}\n{}", tasks[0], tasks[1]);
-        let ended = run(&shared, &runs, &mut providers).unwrap_or_else(|error| panic!("{error}\n{}", about()));
+        let ended = run(&shared, &runs, &mut workers).unwrap_or_else(|error| panic!("{error}\n{}", about()));
         let is_well = |(number, (outcome, _)): (usize, &(String, String))| {
             outcome == "success" || number == 1 && is_cut && outcome == "preempted"
         };
@@ -266,4 +292,54 @@ fn two_runs_leave_a_world_that_some_interleaving_of_their_sequential_programs_le
     let (first, count) = (given("RATN_FIRST", 0), given("RATN_PROGRAMS", 600));
     let (worlds, open) = try_pairs(first..first + count);
     assert!(open as u64 > count / 2, "the pairs hardly meet: {open} of them have several ends, {worlds} worlds in all");
+}
+
+/// Turns its head for 6 s and computes for both of what may come of it meanwhile, which takes 4 s.
+const AHEAD: &str = "task: ahead
+states:
+  - look: { action: head/turn, pia: true, effects: [], resources: [{ block: Head }], duration: 6 }
+  - found:
+      condition: look.x = 1
+      then:
+        - plan_carry: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 4 }
+        - carry: { action: arm/move, in: { a: plan_carry.x }, pia: true, effects: [], resources: [{ block: Arm }] }
+      else:
+        - plan_search: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 4 }
+        - search: { action: head/turn, in: { a: plan_search.x }, pia: true, effects: [], resources: [{ block: Head }] }
+";
+
+/// Computes what it needs in any case.
+const CERTAINLY: &str = "task: certainly
+states:
+  - plan: { action: brain/think, computes: true, reads: [], resources: [{ block: Brain }], duration: 1 }
+";
+
+#[test]
+fn what_one_run_computes_in_case_gives_way_to_what_another_needs() {
+    let loaded = |text: &str| load(text, "task.yaml", &NoFiles);
+    let mut resources = setup(loaded(AHEAD), Mode::Hsm).resources;
+    let brain = resources.iter_mut().find(|(kind, _)| kind == "Brain").unwrap();
+    brain.1.count = ratn_model::resource::Quantity::ONE;
+    for latency in [Duration::ZERO, Duration::from_millis(300)] {
+        let shared = Shared { resources: resources.clone(), world: Vec::new(), latency, seed: 1 };
+        let together = |task: &str, begins_s| {
+            let program = Arc::new(loaded(task));
+            Together { program, mode: Mode::Cdtn, begins_s, told: Vec::new() }
+        };
+        let runs = [together(AHEAD, 0.0), together(CERTAINLY, 1.0)];
+        let mut given = Vec::new();
+        let mut providers = Providers(|path: &str, attempt: u32, _: &Goal, _: &World| {
+            given.push((path.to_owned(), attempt));
+            ("success", Value::Int(1))
+        });
+        let ended = run(&shared, &runs, &mut providers).unwrap();
+        assert!(ended.outcomes.iter().all(|(outcome, _)| outcome == "success"), "{:?}", ended.outcomes);
+        let thought: Vec<(&str, u32)> = given
+            .iter()
+            .filter(|(path, _)| path.contains("plan"))
+            .map(|(path, attempt)| (path.as_str(), *attempt))
+            .collect();
+        let carry = "0:found/plan_carry";
+        assert!(thought.starts_with(&[(carry, 1), ("1:plan", 1), (carry, 2)]), "{thought:?}");
+    }
 }

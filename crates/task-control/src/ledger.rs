@@ -4,7 +4,7 @@
 use super::record::Decided;
 use ratn_executive::protocol::{Command, Event, Goal, Origin};
 use ratn_model::fact::{Change, Footprint};
-use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
+use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -85,6 +85,10 @@ pub(super) struct Projecting {
     pub(super) writers: Vec<Arc<str>>,
     pub(super) reads: Footprint,
     pub(super) lease: Option<(LeaseId, FencingToken)>,
+    /// Whether its goal begins only when it is there.
+    pub(super) first: bool,
+    /// The id under which its goal was given, where it was perhaps not there yet.
+    pub(super) named: Option<ProjectionId>,
 }
 
 /// The request id of an acquire. Asked for again after task control was gone, it is another request: whatever the first one
@@ -126,8 +130,12 @@ impl Ledger {
             Event::Refused { instance, .. } => {
                 self.waiting.remove(instance);
             }
-            Event::Projected { instance, attempt, .. } => {
-                self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt);
+            Event::Projected { instance, attempt, projection } => {
+                // What need not be there first is perhaps only promised.
+                self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt || !asked.first);
+                if let Some(asked) = self.projecting.get_mut(instance).filter(|asked| asked.attempt == *attempt) {
+                    asked.named = Some(*projection);
+                }
             }
             Event::Finished { instance, attempt, .. } | Event::Crashed { instance, attempt, .. } => {
                 self.goals.retain(|id, goal| id != instance || goal.0 != *attempt);
@@ -150,9 +158,10 @@ impl Ledger {
             Command::Withdraw { instance } => {
                 self.withdrawn.extend(self.waiting.remove(instance).map(|asked| asked.request));
             }
-            Command::Project { instance, attempt, base, changes, writers, reads, lease } => {
+            Command::Project { instance, attempt, base, changes, writers, reads, lease, first } => {
                 let (attempt, base, changes, writers) = (*attempt, *base, changes.clone(), writers.clone());
-                let asked = Projecting { attempt, base, changes, writers, reads: reads.clone(), lease: *lease };
+                let (reads, lease, first) = (reads.clone(), *lease, *first);
+                let asked = Projecting { attempt, base, changes, writers, reads, lease, first, named: None };
                 self.projecting.insert(*instance, asked);
             }
             Command::Start { instance, attempt, goal } => {
@@ -162,7 +171,9 @@ impl Ledger {
                 self.goals.retain(|id, goal| id != instance || goal.0 != *attempt);
                 self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt);
             }
-            Command::Release { lease, .. } => {
+            Command::Release { instance, lease, projection } => {
+                self.projecting
+                    .retain(|id, asked| id != instance || asked.named.is_none() || asked.named != *projection);
                 if let Some(lease) = lease {
                     self.held.remove(lease);
                 }

@@ -21,6 +21,7 @@ mod messages;
 mod outside;
 mod performer;
 pub mod progress;
+mod promises;
 mod record;
 mod replay;
 pub mod shell;

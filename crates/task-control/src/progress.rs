@@ -244,6 +244,7 @@ impl Progress {
             | Event::Projected { .. }
             | Event::Progressed { .. }
             | Event::Woken
+            | Event::WantedByOthers { .. }
             | Event::Advised { .. } => {}
         }
         for command in commands {

@@ -1,23 +1,29 @@
 //! What must reach the world pool and the resource manager in the order in which it was decided: projections, commits,
-//! creation and deletion of task resources. One task, one request at a time.
+//! creation and deletion of task resources. One task; what changes something is one request at a time, and projections of what a commit makes are
+//! asked for while that is on its way.
 
-use super::ledger::{Confirmed, operation_request};
+use super::ledger::{Confirmed, Projecting, operation_request};
 use super::performer::Answer;
+use super::promises::{Made, Promises};
 use ratn_executive::protocol::Event;
-use ratn_model::fact::{Change, Footprint};
-use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
+use ratn_model::fact::Change;
+use ratn_model::id::{InstanceId, ProjectionId, Revision};
 use ratn_model::measurement::Evidence;
 use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
 use ratn_otlp::ids;
 use ratn_proto::types::Resource;
 use ratn_worker::client::retry_unanswered;
-use ratn_worker::client::{CallError, Commit, Projection, ResourceClient, WorldClient};
+use ratn_worker::client::{CallError, Commit, Early, Projection, ResourceClient, WorldClient};
 use ratn_worker::session::Trust;
 use ratn_worker::trace::{self, TraceContext};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
+use std::pin::pin;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
 
 /// How far the world pool may be behind before the run is given up.
 pub(super) const MAX_PENDING_RECORDS: usize = 65_536;
@@ -25,18 +31,19 @@ pub(super) const MAX_PENDING_RECORDS: usize = 65_536;
 /// Others who write without a pause do not hold up a commit more often than this.
 const MAX_OVERTAKEN: u32 = 100;
 
+/// As the world pool names its refusals.
+const NO_SUCH_COMMIT: &str = "NO_SUCH_COMMIT";
+const ENDED: &str = "PROJECTION_ENDED";
+const REUSED: &str = "REQUEST_ID_REUSED";
+
 /// One thing to do, in order.
 #[derive(Debug)]
 pub(super) enum Record {
     Project {
         instance: InstanceId,
-        attempt: u32,
-        base: Revision,
-        changes: Vec<Change>,
-        /// Who makes the change at the same place, by path.
-        writers: Vec<Arc<str>>,
-        reads: Footprint,
-        lease: Option<(LeaseId, FencingToken)>,
+        asked: Projecting,
+        /// Where its goal has it already.
+        named: Option<Named>,
     },
     Commit(Decided),
     /// The pool's root is at this revision, or has been.
@@ -49,6 +56,16 @@ pub(super) enum Record {
     },
     /// Answers once everything before it is done: with the first failure of the run, if there was one.
     Flush(oneshot::Sender<Result<(), String>>),
+}
+
+/// A projection that was named before it is there.
+#[derive(Debug)]
+pub(super) struct Named {
+    pub(super) id: ProjectionId,
+    /// Told when it is there.
+    pub(super) made: oneshot::Sender<Made>,
+    /// Whether it may have been asked for before task control was gone.
+    pub(super) again: bool,
 }
 
 /// What an instance has changed, to become real.
@@ -95,31 +112,72 @@ pub(super) struct Recorder {
     pub(super) trust: Trust,
     /// The run's place in its trace.
     pub(super) trace: TraceContext,
-    /// The pool's root as far as it is known: what the run's own revisions come to there, and what it was told of others'.
-    pub(super) root: Revision,
+    pub(super) root: Root,
+    /// What the pool promises goes there.
+    pub(super) promises: Promises,
+}
+
+/// The pool's root as far as it is known: what the run's own revisions come to there, and what it was told of others'. Clones share it.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Root(Arc<AtomicU64>);
+
+impl Root {
+    fn get(&self) -> Revision {
+        Revision(self.0.load(Ordering::SeqCst))
+    }
+
+    fn reached(&self, revision: Revision) {
+        self.0.fetch_max(revision.0, Ordering::SeqCst);
+    }
+}
+
+/// A commit that is on its way.
+#[derive(Debug, Clone)]
+struct UnderWay {
+    id: String,
+    /// When it has its answer.
+    over: CancellationToken,
 }
 
 impl Recorder {
     /// Until nobody can ask any more.
-    pub(super) async fn work(mut self, mut records: mpsc::Receiver<Record>) {
-        let mut recorded = Ok(());
-        while let Some(record) = records.recv().await {
+    pub(super) async fn work(self, mut records: mpsc::Receiver<Record>) {
+        let (mut recorded, mut next) = (Ok(()), None);
+        loop {
+            let record = match next.take() {
+                Some(record) => record,
+                None => match records.recv().await {
+                    Some(record) => record,
+                    None => return,
+                },
+            };
             let confirms = confirms(&record);
             let event = match record {
-                Record::Project { instance, attempt, base, changes, writers, reads, lease } => {
-                    let request = format!("{}/{instance}/{attempt}", self.run);
-                    // What the run knows is real there by now, whatever number it has.
-                    let base = base.max(self.root);
-                    let wanted = Projection { request, base, changes, writers, reads, lease };
-                    trace::within(self.of(instance), self.project(instance, attempt, wanted)).await
+                Record::Project { instance, asked, named } => {
+                    self.project(instance, asked, named, None);
+                    None
                 }
                 Record::Commit(decided) => {
-                    let (instance, own) = (decided.instance, self.of(decided.instance));
-                    let commit = decided.commit(&self.run);
-                    trace::within(own, self.commit(instance, commit)).await
+                    let over = CancellationToken::new();
+                    let (instance, under_way) = (decided.instance, UnderWay { id: decided.id(&self.run), over });
+                    let committing = self.commit(instance, decided.commit(&self.run));
+                    let mut committing = pin!(trace::within(self.of(instance), committing));
+                    let _answered = under_way.over.clone().drop_guard();
+                    loop {
+                        tokio::select! {
+                            biased;
+                            event = &mut committing => break event,
+                            Some(record) = records.recv(), if next.is_none() => match record {
+                                Record::Project { instance, asked, named } => {
+                                    self.project(instance, asked, named, Some(under_way.clone()));
+                                }
+                                record => next = Some(record),
+                            },
+                        }
+                    }
                 }
                 Record::Known(revision) => {
-                    self.root = self.root.max(revision);
+                    self.root.reached(revision);
                     None
                 }
                 Record::Operate { instance, number, operations } => {
@@ -156,34 +214,40 @@ impl Recorder {
         done.operation = done.operation.max(confirmed.operation);
     }
 
-    async fn project(&self, instance: InstanceId, attempt: u32, wanted: Projection) -> Option<Event> {
-        let cancelled = || self.cancelled.lock().unwrap_or_else(PoisonError::into_inner).remove(&(instance, attempt));
-        if cancelled() {
-            return None;
-        }
-        let made = retry_unanswered(|| self.world.project(wanted.clone())).await;
-        match made {
-            Ok(projection) if cancelled() => {
-                let _ = self.world.release(projection).await;
-                None
+    /// Begins to have a projection made.
+    fn project(&self, instance: InstanceId, asked: Projecting, named: Option<Named>, after: Option<UnderWay>) {
+        let Projecting { attempt, base, changes, writers, reads, lease, .. } = asked;
+        let request = format!("{}/{instance}/{attempt}", self.run);
+        let making = MakingProjection {
+            instance,
+            attempt,
+            wanted: Projection { request, base, changes, writers, reads, lease },
+            named,
+            after,
+            world: self.world.clone(),
+            cancelled: self.cancelled.clone(),
+            root: self.root.clone(),
+            promises: self.promises.clone(),
+        };
+        let (own, events) = (self.of(instance), self.events.clone());
+        tokio::spawn(trace::within(own, async move {
+            if let Some(event) = making.make().await {
+                let _ = events.send(event.into()).await;
             }
-            Ok(projection) => Some(Event::Projected { instance, attempt, projection }),
-            Err(error) => {
-                Some(Event::Crashed { instance, attempt, reason: format!("no projection: {}", said(&error)) })
-            }
-        }
+        }));
     }
 
-    async fn commit(&mut self, instance: InstanceId, commit: Commit) -> Option<Event> {
-        if !self.trust.is_kept().await {
+    async fn commit(&self, instance: InstanceId, commit: Commit) -> Option<Event> {
+        let mut trust = self.trust.clone();
+        if !trust.is_kept().await {
             let reason = "its effects are not recorded: the run's session was lost before, and whoever had its resources since may have \
                 changed the same"
                 .to_owned();
             return Some(Event::RetirementFailed { instance, reason });
         }
-        match commit_next(&self.world, self.root, commit).await {
+        match commit_next(&self.world, self.root.get(), commit).await {
             Ok(revision) => {
-                self.root = self.root.max(revision);
+                self.root.reached(revision);
                 None
             }
             Err(error) => Some(Event::RetirementFailed {
@@ -202,6 +266,86 @@ impl Recorder {
             }
         }
         None
+    }
+}
+
+/// A projection that is being made.
+struct MakingProjection {
+    instance: InstanceId,
+    attempt: u32,
+    wanted: Projection,
+    named: Option<Named>,
+    after: Option<UnderWay>,
+    world: WorldClient,
+    cancelled: Cancelled,
+    root: Root,
+    promises: Promises,
+}
+
+impl MakingProjection {
+    /// The event that it leads to, if any.
+    async fn make(mut self) -> Option<Event> {
+        let (instance, attempt) = (self.instance, self.attempt);
+        if self.is_cancelled() {
+            self.take_back().await;
+            return None;
+        }
+        let made = self.ask().await;
+        match (made, self.named.take()) {
+            (Ok(_), Some(named)) => {
+                // Nobody waits for that where its goal is under way.
+                let _ = named.made.send(Made);
+                None
+            }
+            (Ok(projection), None) if self.is_cancelled() => {
+                let _ = self.world.release(projection).await;
+                None
+            }
+            (Ok(projection), None) => Some(Event::Projected { instance, attempt, projection }),
+            // It was there, whatever has become of it: its goal knows.
+            (Err(error), Some(Named { again: true, .. })) if matches!(error.reason(), ENDED | REUSED) => None,
+            (Err(error), named) => {
+                // If the world pool was started again, it has promised nothing.
+                self.promises.forget();
+                self.named = named;
+                self.take_back().await;
+                Some(Event::Crashed { instance, attempt, reason: format!("no projection: {}", said(&error)) })
+            }
+        }
+    }
+
+    /// It will not be made: a worker that waits for it need not wait longer.
+    async fn take_back(&mut self) {
+        if let Some(named) = self.named.take() {
+            let _ = retry_unanswered(|| self.world.release(named.id)).await;
+        }
+    }
+
+    /// Asks the world pool, again where the commit below it takes long.
+    async fn ask(&mut self) -> Result<ProjectionId, CallError> {
+        loop {
+            // What the run knows is real there by now, whatever number it has.
+            let base = self.wanted.base.max(self.root.get());
+            let wanted = Projection { base, ..self.wanted.clone() };
+            let after = self.after.as_ref().map(|commit| commit.id.clone());
+            let id = self.named.as_ref().map(|named| named.id);
+            let early = Early { id, after, promise: self.promises.wanted(Instant::now()) };
+            match retry_unanswered(|| self.world.project_early(wanted.clone(), early.clone())).await {
+                Ok((projection, promised)) => {
+                    self.promises.add(promised, Instant::now());
+                    return Ok(projection);
+                }
+                Err(error) => match (error.reason(), self.after.take()) {
+                    (NO_SUCH_COMMIT, Some(commit)) => commit.over.cancelled().await,
+                    _ => return Err(error),
+                },
+            }
+        }
+    }
+
+    fn is_cancelled(&self) -> bool {
+        let mut cancelled = self.cancelled.lock().unwrap_or_else(PoisonError::into_inner);
+        cancelled.remove(&(self.instance, self.attempt))
     }
 }
 

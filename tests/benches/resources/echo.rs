@@ -85,7 +85,9 @@ impl UnaryService<ProjectRequest> for Projected {
     type Future = Boxed<Result<Response<ProjectResponse>, Status>>;
 
     fn call(&mut self, request: Request<ProjectRequest>) -> Self::Future {
-        Box::pin(async move { Ok(Response::new(ProjectResponse { projection_id: request.get_ref().base_revision })) })
+        Box::pin(async move {
+            Ok(Response::new(ProjectResponse { projection_id: request.get_ref().base_revision, promised: Vec::new() }))
+        })
     }
 }
 

@@ -21,6 +21,7 @@ use ratn_panic_point::panic_point;
 use ratn_proto::types::{Demand, HostPools, PoolStatus, Scale, TrackingMode, WorkerStatus};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
+use ratn_worker::unix_socket::SocketAccess;
 use ratn_worker::vitals::Vitals;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant, SystemTime};
@@ -74,6 +75,8 @@ pub(super) struct Parts {
     pub(super) roster: Roster,
     /// Knows which processes belong to which worker.
     pub(super) tracker: Tracker,
+    /// Who may connect to this manager's socket.
+    pub(super) sockets: SocketAccess,
     /// The ids of the workers that the last process manager left.
     pub(super) before: Vec<String>,
     /// The workers among them that were taken over.
@@ -127,7 +130,7 @@ pub(super) fn start(
     let (config, adopted) = (parts.config, parts.adopted);
     let (drained, tracking) = (Drained::of(&parts.directory), parts.tracker.mode());
     let (processes, events) =
-        Processes::start(&config, parts.directory, parts.tls, parts.told, parts.roster, parts.tracker)?;
+        Processes::start(&config, parts.directory, parts.tls, parts.told, parts.roster, parts.tracker, &parts.sockets)?;
     let mut pools = Pools::new(&config.host, config.templates).with_labels(config.labels.clone());
     pools.go_on_after(&parts.before);
     pools.moved_before(Timestamp(0), &parts.motions);

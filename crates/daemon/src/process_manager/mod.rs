@@ -168,6 +168,7 @@ pub async fn run_as(
         told,
         roster,
         tracker,
+        sockets: serving.exposure.socket.clone(),
         before,
         adopted,
         motions,

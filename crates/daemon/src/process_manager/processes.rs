@@ -25,6 +25,7 @@ use ratn_worker::panic::{exit_on_panic, exit_on_panic_blocking};
 use ratn_worker::pooled::{LISTEN_VARIABLE, PROVIDER_SESSION_VARIABLE, STANDSTILL_VARIABLE};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
+use ratn_worker::unix_socket::SocketAccess;
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::io;
@@ -143,6 +144,7 @@ impl Processes {
         told: ManagerContact,
         roster: Roster,
         tracker: Tracker,
+        sockets: &SocketAccess,
     ) -> io::Result<(Processes, ProcessEvents)> {
         let (outcome, outcomes) = mpsc::channel(OUTCOMES);
         let (serving, served) = mpsc::channel(OUTCOMES);
@@ -151,7 +153,8 @@ impl Processes {
             host: config.host.clone(),
             tls,
             told,
-            is_local: config.listen.is_local(),
+            // A worker's socket is for its own user and group alone.
+            is_local: config.listen.is_local() && sockets == &SocketAccess::default(),
             worker_environment: config.worker_environment.clone(),
             catalogue: config.catalogue.clone(),
             max_log_bytes: config.max_log_bytes,
@@ -303,7 +306,8 @@ impl Processes {
     }
 
     /// The socket that a worker listens on unless its template says otherwise: where both managers are reached by their sockets in the runtime
-    /// directory alone, so is it. On loopback a call costs more, and other users could make one.
+    /// directory alone, so is it, unless others than this user and group may connect there. On loopback a call costs more, and other users could
+    /// make one.
     fn socket_for(&self, id: &str, directory: &RuntimeDirectory) -> Option<Endpoint> {
         let manager = directory.find(resource_manager::ROLE).ok()?;
         let is_meant = self.is_local

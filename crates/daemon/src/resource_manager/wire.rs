@@ -130,5 +130,6 @@ pub(super) fn waiting(request_id: &str, request: &AcquireRequest, why: &Explanat
         priority: request.priority,
         ahead: u32::try_from(why.ahead).unwrap_or(u32::MAX),
         obstacles: why.obstacles.iter().map(ToString::to_string).collect(),
+        held_by: if why.is_hopeful() { why.held_by().collect() } else { Vec::new() },
     }
 }

@@ -6,6 +6,7 @@
 use super::core::{HeldBy, ProjectError, ProjectRequest, WorldPool};
 use super::history::{Between, Commit, History, Kept, Version};
 use super::leases::{Known, LiveLeases};
+use super::parked::Parked;
 use super::query::View;
 use super::{WorldPoolConfig, status};
 use crate::access::Caller;
@@ -43,7 +44,9 @@ pub(super) enum Message {
     },
     Project {
         projection: NewProjection,
-        answer: Answer<ProjectionId>,
+        /// So many ids are to be promised with it.
+        promise: u32,
+        answer: Answer<(ProjectionId, Vec<ProjectionId>)>,
     },
     Query {
         projection: Option<ProjectionId>,
@@ -98,6 +101,8 @@ pub(super) enum Update {
 pub(super) struct NewProjection {
     pub(super) by: Caller,
     pub(super) request_id: String,
+    pub(super) id: Option<ProjectionId>,
+    pub(super) after: Option<String>,
     pub(super) base: Revision,
     pub(super) changes: Vec<Change>,
     pub(super) writers: Vec<Arc<str>>,
@@ -119,6 +124,8 @@ pub(super) struct WorldCore {
     /// Projections that somebody watches.
     watched: BTreeMap<ProjectionId, watch::Sender<Option<Contradiction>>>,
     leases: watch::Receiver<LiveLeases>,
+    /// What came before what it is about.
+    parked: Parked<Message>,
     /// When projections without a lease are looked at next.
     next_look: Timestamp,
 }
@@ -148,6 +155,7 @@ pub(super) fn start(
         contradicted: Vec::new(),
         watched: BTreeMap::new(),
         leases: leases.clone(),
+        parked: Parked::default(),
         next_look: Timestamp(0),
     };
     durable_actor::start(core, journal, leases, vitals, CancellationToken::new(), over)
@@ -173,7 +181,7 @@ impl Core for WorldCore {
 
     fn next_deadline(&self, context: &WorldTurn) -> Option<Timestamp> {
         let stale = self.pool.next_expiry().filter(|_| context.stopped().is_none());
-        stale.into_iter().chain([self.next_look]).min()
+        stale.into_iter().chain([self.next_look]).chain(self.parked.next_deadline()).min()
     }
 
     fn advance(&mut self, context: &mut WorldTurn) {
@@ -185,67 +193,23 @@ impl Core for WorldCore {
         if context.stopped().is_none() {
             self.pool.expire_facts(now);
         }
+        self.take_up(context);
     }
 
     fn receive_urgent(&mut self, urgent: Infallible, _: &mut WorldTurn) {
         match urgent {}
     }
 
-    // An answer that nobody waits for any more is of no consequence: commits and projections are idempotent by id.
     fn receive(&mut self, message: Message, context: &mut WorldTurn) {
-        match message {
-            Message::Commit { commit, answer } => {
-                let committed = match context.stopped() {
-                    Some(stopped) => Err(stopped.status.clone()),
-                    None => self.pool.commit(context.now(), &commit).map_err(|error| status::of_commit(&error)),
-                };
-                let contradictions = self.pool.take_contradictions();
-                self.contradicted.extend(contradictions.iter().cloned());
-                self.collect(context);
-                let committed = committed.map(|revision| (revision, contradictions));
-                tracing::debug!(id = commit.id, changes = commit.changes.len(), ?committed, "commit");
-                context.reply(answer, committed);
+        if !is_early(&self.pool, &message) {
+            let lets_go_on =
+                matches!(message, Message::Commit { .. } | Message::Project { .. } | Message::Release { .. });
+            self.perform(message, context);
+            if lets_go_on {
+                self.take_up(context);
             }
-            Message::Project { projection, answer } => {
-                let projected = self.project(projection, context.now());
-                context.reply(answer, projected);
-            }
-            Message::Query { projection, at, patterns, answer } => {
-                let view = self.pool.view(projection, at, &patterns).map_err(|error| status::of_query(&error));
-                context.reply(answer, view);
-            }
-            Message::Watch { after, answer } => {
-                let watch = self.watch(after, context);
-                context.reply(answer, watch);
-            }
-            Message::WatchProjection { projection, answer } => {
-                let watch = match self.pool.contradiction(projection) {
-                    Ok(contradiction) => {
-                        let known = contradiction.cloned();
-                        let new = || watch::Sender::new(known);
-                        Ok(self.watched.entry(projection).or_insert_with(new).subscribe())
-                    }
-                    Err(error) => Err(status::of_query(&error)),
-                };
-                context.reply(answer, watch);
-            }
-            Message::Diff { from, to, answer } => {
-                let to = to.unwrap_or(self.pool.root().revision());
-                let between = self.pool.history.between(from, to).map_err(status::of_revision);
-                context.reply(answer, between.map(|between| (between, to)));
-            }
-            Message::Versions { key, limit, answer } => {
-                let versions = self.pool.history.versions(&key, limit);
-                context.reply(answer, Ok(versions));
-            }
-            Message::Scene { projection, bases, answer } => {
-                let scene = self.pool.scene(projection, &bases).map_err(|error| status::of_query(&error));
-                context.reply(answer, scene);
-            }
-            Message::Release { by, projection, answer } => {
-                let released = self.pool.release_for(&by, projection).map_err(|error| status::of_release(&error));
-                context.reply(answer, released);
-            }
+        } else if let Err(message) = self.parked.park(context.now(), message) {
+            message.refused(status::too_many_wait());
         }
     }
 
@@ -302,7 +266,108 @@ impl Core for WorldCore {
     }
 }
 
+/// Whether it is about something that is on its way.
+fn is_early(pool: &WorldPool, message: &Message) -> bool {
+    match message {
+        Message::Project { projection: NewProjection { by, id, after, .. }, .. } => {
+            // With an id of its own it is refused at once where that is not promised any more, as who asks for the projection is.
+            let may_be = id.is_none_or(|id| pool.is_promised_to(by, id));
+            may_be && after.as_ref().is_some_and(|commit| !pool.has_commit(by, commit))
+        }
+        Message::Query { projection, .. } | Message::Scene { projection, .. } => {
+            projection.is_some_and(|id| pool.is_promised(id))
+        }
+        Message::WatchProjection { projection, .. } => pool.is_promised(*projection),
+        _ => false,
+    }
+}
+
+impl Message {
+    /// To who asked for something that is waited for.
+    fn refused(self, status: Status) {
+        match self {
+            Message::Project { answer, .. } => drop(answer.send(Err(status))),
+            Message::Query { answer, .. } => drop(answer.send(Err(status))),
+            Message::Scene { answer, .. } => drop(answer.send(Err(status))),
+            Message::WatchProjection { answer, .. } => drop(answer.send(Err(status))),
+            _ => {}
+        }
+    }
+}
+
 impl WorldCore {
+    /// Performs what need not wait any more, and what that lets go on.
+    fn take_up(&mut self, context: &mut WorldTurn) {
+        loop {
+            let pool = &self.pool;
+            let ready = self.parked.take(context.now(), |message| is_early(pool, message));
+            if ready.is_empty() {
+                return;
+            }
+            ready.into_iter().for_each(|message| self.perform(message, context));
+        }
+    }
+
+    // An answer that nobody waits for any more is of no consequence: commits and projections are idempotent by id.
+    fn perform(&mut self, message: Message, context: &mut WorldTurn) {
+        match message {
+            Message::Commit { commit, answer } => {
+                let committed = match context.stopped() {
+                    Some(stopped) => Err(stopped.status.clone()),
+                    None => self.pool.commit(context.now(), &commit).map_err(|error| status::of_commit(&error)),
+                };
+                let contradictions = self.pool.take_contradictions();
+                self.contradicted.extend(contradictions.iter().cloned());
+                self.collect(context);
+                let committed = committed.map(|revision| (revision, contradictions));
+                tracing::debug!(id = commit.id, changes = commit.changes.len(), ?committed, "commit");
+                context.reply(answer, committed);
+            }
+            Message::Project { projection, promise, answer } => {
+                let by = projection.by.name.clone();
+                let projected = self.project(projection, context.now());
+                let projected = projected.map(|id| (id, self.pool.promise(context.now(), &by, promise)));
+                context.reply(answer, projected);
+            }
+            Message::Query { projection, at, patterns, answer } => {
+                let view = self.pool.view(projection, at, &patterns).map_err(|error| status::of_query(&error));
+                context.reply(answer, view);
+            }
+            Message::Watch { after, answer } => {
+                let watch = self.watch(after, context);
+                context.reply(answer, watch);
+            }
+            Message::WatchProjection { projection, answer } => {
+                let watch = match self.pool.contradiction(projection) {
+                    Ok(contradiction) => {
+                        let known = contradiction.cloned();
+                        let new = || watch::Sender::new(known);
+                        Ok(self.watched.entry(projection).or_insert_with(new).subscribe())
+                    }
+                    Err(error) => Err(status::of_query(&error)),
+                };
+                context.reply(answer, watch);
+            }
+            Message::Diff { from, to, answer } => {
+                let to = to.unwrap_or(self.pool.root().revision());
+                let between = self.pool.history.between(from, to).map_err(status::of_revision);
+                context.reply(answer, between.map(|between| (between, to)));
+            }
+            Message::Versions { key, limit, answer } => {
+                let versions = self.pool.history.versions(&key, limit);
+                context.reply(answer, Ok(versions));
+            }
+            Message::Scene { projection, bases, answer } => {
+                let scene = self.pool.scene(projection, &bases).map_err(|error| status::of_query(&error));
+                context.reply(answer, scene);
+            }
+            Message::Release { by, projection, answer } => {
+                let released = self.pool.release_for(&by, projection).map_err(|error| status::of_release(&error));
+                context.reply(answer, released);
+            }
+        }
+    }
+
     fn watch(&self, after: Option<Revision>, context: &mut WorldTurn) -> Result<mpsc::Receiver<Update>, Status> {
         context.watchers.admit(self.config.max_watchers)?;
         let first = match after {
@@ -330,8 +395,8 @@ impl WorldCore {
                 Known::NotYet => unbound,
             },
         };
-        let NewProjection { by, request_id, base, changes, writers, reads, .. } = new;
-        let request = ProjectRequest { by, request_id, base, changes, writers, reads, held_by };
+        let NewProjection { by, request_id, id, after, base, changes, writers, reads, .. } = new;
+        let request = ProjectRequest { by, request_id, id, after, base, changes, writers, reads, held_by };
         self.pool.project(request).map_err(|error: ProjectError| status::of_project(&error))
     }
 }
@@ -356,13 +421,15 @@ mod tests {
             let projection = NewProjection {
                 by: Caller { name: name.into(), roles: [role].into() },
                 request_id: String::new(),
+                id: None,
+                after: None,
                 base: Revision(0),
                 changes: Vec::new(),
                 writers: Vec::new(),
                 reads: Footprint::Everything,
                 lease: Some(LeaseId(lease)),
             };
-            let made = actor.request(|answer| Message::Project { projection, answer }).await;
+            let made = actor.request(|answer| Message::Project { projection, promise: 0, answer }).await;
             made.map(drop).map_err(|refused| (refused.code(), refused.message().to_owned()))
         };
         for (name, role) in [("adam", Role::Task), ("world", Role::Agent), ("root", Role::Operator)] {
@@ -372,5 +439,57 @@ mod tests {
         assert!(code == Code::PermissionDenied && message.contains("of a session of `adam`"), "{message}");
         let ended = project("adam", Role::Task, 2).await.unwrap_err();
         assert_eq!(ended.0, Code::FailedPrecondition, "{}", ended.1);
+    }
+
+    #[tokio::test]
+    async fn what_comes_before_its_projection_or_its_commit_waits_for_that() {
+        let (config, directory) = (WorldPoolConfig::default(), tempfile::tempdir().unwrap());
+        let log = Journal::log(&config.storage, directory.path());
+        let kept = super::super::open(&config, Arc::new(log)).unwrap();
+        let live = watch::Sender::new(LiveLeases::default());
+        let over = CancellationToken::new();
+        let (actor, _ended) = start(config, None, kept, live.subscribe(), Vitals::default(), over).unwrap();
+        let adam = Caller { name: "adam".into(), roles: [Role::Task].into() };
+        let project = async |request: &str, id: Option<ProjectionId>, after: Option<&str>| {
+            let projection = NewProjection {
+                by: adam.clone(),
+                request_id: request.to_owned(),
+                id,
+                after: after.map(str::to_owned),
+                base: Revision(0),
+                changes: Vec::new(),
+                writers: Vec::new(),
+                reads: Footprint::Everything,
+                lease: None,
+            };
+            actor.request(|answer| Message::Project { projection, promise: 2, answer }).await
+        };
+        let look = async |id| {
+            let (projection, patterns) = (Some(id), Vec::new());
+            let view = actor.request(|answer| Message::Query { projection, at: None, patterns, answer }).await;
+            view.map(|view| view.revision).map_err(|status| status.code())
+        };
+        let (_, ids) = project("first", None, None).await.unwrap();
+        let commit = async {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+            let fact = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
+            let changes = vec![Change::Set { fact, value: ratn_model::value::Value::Int(1) }];
+            let commit = Commit { by: adam.clone(), id: "a".to_owned(), changes, ..Commit::default() };
+            actor.request(|answer| Message::Commit { commit, answer }).await
+        };
+        let (seen, made, committed) = tokio::join!(look(ids[0]), project("one", Some(ids[0]), Some("a")), commit);
+        assert_eq!((seen, made.unwrap().0, committed.unwrap().0), (Ok(Revision(1)), ids[0], Revision(1)));
+        // In vain.
+        let began = std::time::Instant::now();
+        let (seen, made) = tokio::join!(look(ids[1]), project("two", None, Some("b")));
+        assert_eq!((seen, made.unwrap_err().code()), (Err(Code::Unavailable), Code::FailedPrecondition));
+        assert!(began.elapsed() >= super::super::parked::PATIENCE);
+        // Of another pool before this one: neither waits in vain.
+        let (seen, made) = tokio::time::timeout(Duration::from_millis(900), async {
+            tokio::join!(look(ProjectionId(77)), project("three", Some(ProjectionId(77)), Some("b")))
+        })
+        .await
+        .unwrap();
+        assert_eq!((seen, made.unwrap_err().code()), (Err(Code::NotFound), Code::FailedPrecondition));
     }
 }

@@ -9,6 +9,7 @@ use super::expiry::Expiry;
 use super::fingerprint::Fingerprint;
 use super::history::{Commit, CommitError, History, RevisionError};
 use super::memory::{Memory, Reused};
+use super::promised::Promised;
 use super::query::View;
 use super::scenes::{Scenes, moves};
 use crate::access::Caller;
@@ -45,6 +46,7 @@ pub(super) struct WorldPool {
     /// How many each caller made that are there.
     made: BTreeMap<Arc<str>, usize>,
     last_projection: u64,
+    promised: Promised,
 }
 
 #[derive(Debug)]
@@ -75,6 +77,10 @@ pub(super) enum HeldBy {
 pub(super) struct ProjectRequest {
     pub(super) by: Caller,
     pub(super) request_id: String,
+    /// One that was promised to the caller; the pool picks one otherwise.
+    pub(super) id: Option<ProjectionId>,
+    /// A commit of the caller's: the base is the revision that it made, or a later one.
+    pub(super) after: Option<String>,
     pub(super) base: Revision,
     pub(super) changes: Vec<Change>,
     /// Who will make the change at the same place; empty or missing: nobody.
@@ -114,11 +120,15 @@ pub(super) enum ProjectError {
     Quota { whose: Arc<str>, limit: usize },
     #[error("the projection of request `{request_id}` has ended; ask with another request id")]
     Ended { request_id: String },
+    #[error("{id} is not promised to {caller}, or not any more: ask without an id (projection_id: 0)")]
+    NotPromised { id: ProjectionId, caller: Arc<str> },
+    #[error("no commit `{id}` of {caller} is known: it has not come yet, was refused, or was long ago")]
+    NoSuchCommit { id: String, caller: Arc<str> },
 }
 
 /// A projection that somebody else made.
 #[derive(Debug, PartialEq, thiserror::Error)]
-#[error("{id} was made by {made_by}: only they and operators release it, not {caller}")]
+#[error("{id} is of {made_by}: only they and operators release it, not {caller}")]
 pub(super) struct MadeByAnother {
     id: ProjectionId,
     made_by: Arc<str>,
@@ -130,6 +140,8 @@ pub(super) struct MadeByAnother {
 pub(super) enum QueryError {
     #[error("{id} is unknown or has ended (its lease ended, or it was released)")]
     Unknown { id: ProjectionId },
+    #[error("{id} is promised and not there yet: ask again")]
+    NotYet { id: ProjectionId },
     #[error("{id} does not show {pattern}: it is not among the reads declared for it; declare it (reads: […])")]
     Hidden { id: ProjectionId, pattern: FactPattern },
     #[error(transparent)]
@@ -159,6 +171,7 @@ impl WorldPool {
             by_lease: BTreeMap::new(),
             made: BTreeMap::new(),
             last_projection: floor,
+            promised: Promised::default(),
             config,
         };
         pool.all_begin(Timestamp(0));
@@ -197,8 +210,7 @@ impl WorldPool {
 
     /// The first contradiction of a projection, if there was one.
     pub(super) fn contradiction(&self, id: ProjectionId) -> Result<Option<&Contradiction>, QueryError> {
-        let projection = self.projections.get(&id).ok_or(QueryError::Unknown { id })?;
-        Ok(projection.contradiction.as_ref())
+        Ok(self.projection(id)?.contradiction.as_ref())
     }
 
     /// Whether a projection is there.
@@ -275,17 +287,74 @@ impl WorldPool {
         }
     }
 
-    /// The world at a revision with changes applied. A request made before gets its answer again, as long as it lives.
+    /// Promises a caller as many ids as there is room for.
+    pub(super) fn promise(&mut self, now: Timestamp, caller: &Arc<str>, wanted: u32) -> Vec<ProjectionId> {
+        let ids = (0..self.promised.room(wanted)).map(|_| {
+            self.last_projection += 1;
+            ProjectionId(self.last_projection)
+        });
+        let ids: Vec<ProjectionId> = ids.collect();
+        ids.iter().for_each(|id| self.promised.promise(now, caller, *id));
+        ids
+    }
+
+    fn projection(&self, id: ProjectionId) -> Result<&Projection, QueryError> {
+        self.projections.get(&id).ok_or_else(|| self.missing(id))
+    }
+
+    /// What is said of a projection that is not there.
+    pub(super) fn missing(&self, id: ProjectionId) -> QueryError {
+        if self.promised.has(id) { QueryError::NotYet { id } } else { QueryError::Unknown { id } }
+    }
+
+    /// Whether a commit of the caller's is known.
+    pub(super) fn has_commit(&self, caller: &Caller, id: &str) -> bool {
+        self.history.commit_of(&caller.name, id).is_some()
+    }
+
+    /// Whether the projection is promised and not there yet.
+    pub(super) fn is_promised(&self, id: ProjectionId) -> bool {
+        self.promised.has(id)
+    }
+
+    /// Whether a caller may make a projection with this id.
+    pub(super) fn is_promised_to(&self, caller: &Caller, id: ProjectionId) -> bool {
+        self.promised.whose(id) == Some(&caller.name)
+    }
+
+    /// The world at a revision with changes applied. A request made before gets its answer again, as long as it lives. An id that was promised
+    /// for it is used up, whatever comes of it, so that who waits for it need not wait longer; not where only its commit is not there yet.
     pub(super) fn project(&mut self, request: ProjectRequest) -> Result<ProjectionId, ProjectError> {
-        let fingerprint = Fingerprint::of_projection(request.base, &request.changes, &request.reads, &request.writers);
+        let (id, by) = (request.id, request.by.name.clone());
+        let made = self.make(request);
+        let is_over = !matches!(made, Err(ProjectError::NoSuchCommit { .. }));
+        if let Some(id) = id.filter(|id| is_over && self.promised.whose(*id) == Some(&by)) {
+            self.promised.end(id);
+        }
+        made
+    }
+
+    fn make(&mut self, mut request: ProjectRequest) -> Result<ProjectionId, ProjectError> {
+        let fingerprint = Fingerprint::of_projection(&request.changes, &request.reads, &request.writers);
         if let Some(id) = self.projected.recall(&request.by.name, &request.request_id, fingerprint)? {
             let ended = || ProjectError::Ended { request_id: request.request_id.clone() };
             return self.projections.contains_key(&id).then_some(id).ok_or_else(ended);
         }
+        let of_another = |id: &ProjectionId| self.promised.whose(*id) != Some(&request.by.name);
+        if let Some(id) = request.id.filter(of_another) {
+            return Err(ProjectError::NotPromised { id, caller: request.by.name });
+        }
         self.check_room(&request.by)?;
+        if let Some(id) = &request.after {
+            let made = self.history.commit_of(&request.by.name, id);
+            let missing = || ProjectError::NoSuchCommit { id: id.clone(), caller: request.by.name.clone() };
+            request.base = made.ok_or_else(missing)?.max(request.base);
+        }
         let world = self.history.at(request.base)?.project_as(&request.writers, &request.changes)?;
-        self.last_projection += 1;
-        let id = ProjectionId(self.last_projection);
+        let id = request.id.unwrap_or_else(|| {
+            self.last_projection += 1;
+            ProjectionId(self.last_projection)
+        });
         let (contradiction, effects) = self.catch_up(id, &world, &request);
         self.live.insert(id, request.base, world.clone(), effects, request.reads.clone());
         if let HeldBy::Lease(lease) = request.held_by {
@@ -338,7 +407,7 @@ impl WorldPool {
             (None, None) => Ok(of_root(self.root(), self.root().revision())),
             (None, Some(at)) => Ok(of_root(self.history.at(at)?, at)),
             (Some(id), _) => {
-                let projection = self.projections.get(&id).ok_or(QueryError::Unknown { id })?;
+                let projection = self.projection(id)?;
                 let hidden = |pattern: &&FactPattern| match &projection.reads {
                     Footprint::Everything => false,
                     Footprint::Patterns(reads) => !reads.iter().any(|read| read.covers(pattern)),
@@ -358,7 +427,17 @@ impl WorldPool {
             Some(projection) if projection.made_by != caller.name && !caller.is_operator() => {
                 Err(MadeByAnother { id, made_by: projection.made_by.clone(), caller: caller.name.clone() })
             }
-            _ => Ok(self.release(id)),
+            Some(_) => Ok(self.release(id)),
+            None => match self.promised.whose(id) {
+                Some(whose) if *whose != caller.name && !caller.is_operator() => {
+                    Err(MadeByAnother { id, made_by: whose.clone(), caller: caller.name.clone() })
+                }
+                promised => {
+                    let is_promised = promised.is_some();
+                    self.promised.end(id);
+                    Ok(is_promised)
+                }
+            },
         }
     }
 
@@ -398,6 +477,7 @@ impl WorldPool {
 
     /// Ends what is held by nothing but time that has passed.
     pub(super) fn expire(&mut self, now: Timestamp) {
+        self.promised.expire(now);
         let over = |projection: &Projection| matches!(projection.held_by, HeldBy::Until(end) if end <= now);
         let ids: Vec<ProjectionId> = self.projections.iter().filter(|(_, p)| over(p)).map(|(id, _)| *id).collect();
         for id in ids {

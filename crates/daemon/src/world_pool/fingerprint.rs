@@ -6,7 +6,6 @@
 
 use prost::Message;
 use ratn_model::fact::{Change, Footprint};
-use ratn_model::id::Revision;
 use ratn_proto::convert::all;
 use ratn_proto::v1;
 use serde::{Deserialize, Serialize};
@@ -27,21 +26,16 @@ impl Fingerprint {
         Fingerprint::of("commit 1", &v1::CommitRequest { changes, ..v1::CommitRequest::default() })
     }
 
-    /// Of a projection; the lease that it hangs on may be another when it is asked for again.
-    pub(super) fn of_projection(
-        base: Revision,
-        changes: &[Change],
-        reads: &Footprint,
-        writers: &[Arc<str>],
-    ) -> Fingerprint {
+    /// Of a projection; the lease that it hangs on, and the revision from which its caller knows that all is in it, may be others when it is
+    /// asked for again.
+    pub(super) fn of_projection(changes: &[Change], reads: &Footprint, writers: &[Arc<str>]) -> Fingerprint {
         let message = v1::ProjectRequest {
-            base_revision: base.0,
             changes: all(changes.iter().cloned()),
             reads: Some(reads.clone().into()),
             writers: writers.iter().map(ToString::to_string).collect(),
             ..v1::ProjectRequest::default()
         };
-        Fingerprint::of("projection 1", &message)
+        Fingerprint::of("projection 2", &message)
     }
 
     /// Of a message; `form` names what is hashed, with a number that grows when something else is.

@@ -261,6 +261,11 @@ impl History {
         Ok(revision)
     }
 
+    /// The revision that a commit of this caller has made, as long as that is remembered.
+    pub(super) fn commit_of(&self, caller: &Arc<str>, id: &str) -> Option<Revision> {
+        self.commits.of(caller, id)
+    }
+
     /// The root as it was at a revision.
     pub(super) fn at(&self, revision: Revision) -> Result<&World, RevisionError> {
         let (root, oldest, wanted) = (self.root().revision().0, self.revisions[0].world.revision().0, revision.0);

@@ -64,6 +64,11 @@ impl<T: Copy> Memory<T> {
         Ok(unknown.filter(|answer| answer.fingerprint.may_be(fingerprint)).map(|answer| answer.value))
     }
 
+    /// The answer to a request of this caller, whatever it asked for.
+    pub(super) fn of(&self, caller: &Arc<str>, id: &str) -> Option<T> {
+        self.answers.get(&Key { id: Arc::from(id), caller: caller.clone() }).map(|answer| answer.value)
+    }
+
     /// As [`Memory::recall`]. An operator may go on with what another caller began: the same request of anybody is the operator's.
     pub(super) fn recall_for(&self, caller: &Caller, id: &str, fingerprint: Fingerprint) -> Result<Option<T>, Reused> {
         let own = self.recall(&caller.name, id, fingerprint)?;

@@ -16,6 +16,8 @@ mod fingerprint;
 mod history;
 mod leases;
 mod memory;
+mod parked;
+mod promised;
 mod query;
 mod record;
 mod scenes;

@@ -36,7 +36,8 @@ impl WorldPool {
                 self.scenes.follow(&self.history, root)?
             }
             Some(id) => {
-                let projection = self.projections.get(&id).ok_or(QueryError::Unknown { id })?;
+                let unknown = self.missing(id);
+                let projection = self.projections.get(&id).ok_or(unknown)?;
                 if shows_all(&projection.reads) {
                     let mut scene = self.scenes.follow(&self.history, projection.base)?;
                     scene.update(self.history.at(projection.base)?, &projection.world, &projection.moves)?;
@@ -166,6 +167,8 @@ mod tests {
         let request = ProjectRequest {
             by: crate::access::Caller::default(),
             request_id: format!("{base} {changes:?} {reads:?}"),
+            id: None,
+            after: None,
             base: Revision(base),
             changes,
             writers: Vec::new(),

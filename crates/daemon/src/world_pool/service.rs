@@ -162,12 +162,15 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
     async fn project(&self, request: Request<v1::ProjectRequest>) -> Result<Response<v1::ProjectResponse>, Status> {
         let (caller, request) = (Caller::of(&request), request.into_inner());
         label(&request.request_id, "request_id")?;
+        label(&request.after_commit_id, "after_commit_id")?;
         self.sizes.check("changes", &request.changes)?;
         request.writers.iter().try_for_each(|writer| label(writer, "writers"))?;
         let lease = (request.lease_id != 0).then_some(LeaseId(request.lease_id));
         let projection = NewProjection {
             by: caller.clone(),
             request_id: request.request_id,
+            id: (request.projection_id != 0).then_some(ProjectionId(request.projection_id)),
+            after: Some(request.after_commit_id).filter(|id| !id.is_empty()),
             base: Revision(request.base_revision),
             changes: each(request.changes, "changes")?,
             writers: request.writers.into_iter().map(Arc::from).collect(),
@@ -185,10 +188,12 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             // In vain for a lease that holds nothing: the actor knows what to do with that.
             let _ = tokio::time::timeout(LEASE_PATIENCE, told).await;
         }
-        let made = self.actor.request(|answer| Message::Project { projection, answer }).await;
+        let promise = request.promise;
+        let made = self.actor.request(|answer| Message::Project { projection, promise, answer }).await;
         pending.ended(&made);
-        let id = made?;
-        Ok(Response::new(v1::ProjectResponse { projection_id: id.0 }))
+        let (id, promised) = made?;
+        let promised = promised.into_iter().map(|id| id.0).collect();
+        Ok(Response::new(v1::ProjectResponse { projection_id: id.0, promised }))
     }
 
     async fn query(&self, request: Request<v1::QueryRequest>) -> Result<Response<v1::QueryResponse>, Status> {

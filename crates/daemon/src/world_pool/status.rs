@@ -2,6 +2,7 @@
 
 use super::core::{MadeByAnother, ProjectError, QueryError};
 use super::history::{CommitError, RevisionError};
+use super::parked;
 use super::query::TooMuch;
 use crate::access::Caller;
 use crate::details::{retry_later, status, status_about};
@@ -41,6 +42,8 @@ pub(super) fn of_project(error: &ProjectError) -> Status {
         ProjectError::Reused(_) => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
         ProjectError::Change(_) => (Code::FailedPrecondition, "CHANGE_DOES_NOT_APPLY"),
         ProjectError::Ended { .. } => (Code::FailedPrecondition, "PROJECTION_ENDED"),
+        ProjectError::NotPromised { .. } => (Code::FailedPrecondition, "NOT_PROMISED"),
+        ProjectError::NoSuchCommit { .. } => (Code::FailedPrecondition, "NO_SUCH_COMMIT"),
         ProjectError::Quota { .. } => {
             return retry_later(Code::ResourceExhausted, "QUOTA", error.to_string(), RETRY_DELAY);
         }
@@ -55,6 +58,7 @@ pub(super) fn of_query(error: &QueryError) -> Status {
     match error {
         QueryError::Scene(_) => status(Code::FailedPrecondition, "NO_SCENE", error.to_string()),
         QueryError::Unknown { .. } => status(Code::NotFound, "PROJECTION_UNKNOWN", error.to_string()),
+        QueryError::NotYet { .. } => retry_later(Code::Unavailable, "NOT_YET", error.to_string(), Duration::ZERO),
         QueryError::Revision(error) => of_revision(*error),
         QueryError::Hidden { .. } => status(Code::PermissionDenied, "NOT_AMONG_READS", error.to_string()),
     }
@@ -62,6 +66,14 @@ pub(super) fn of_query(error: &QueryError) -> Status {
 
 pub(super) fn of_too_much(error: &TooMuch) -> Status {
     status(Code::ResourceExhausted, "QUERY_TOO_LARGE", error.to_string())
+}
+
+/// It would wait for what it is about, and too much waits.
+pub(super) fn too_many_wait() -> Status {
+    let message =
+        format!("{} calls wait for projections and commits that are on their way: ask again later", parked::MOST);
+    // As a daemon that is not there for a moment: what it is about may be there by then.
+    retry_later(Code::Unavailable, "TOO_MANY_WAIT", message, parked::PATIENCE)
 }
 
 pub(super) fn lease_ended(lease: LeaseId) -> Status {

@@ -179,7 +179,7 @@ impl Interpreter {
         }
         let lease = self.routine_of(thread).map_or(&current.lease, |routine| &routine.lease);
         let lease = lease.as_ref().map(|l| (l.id, l.token));
-        let (instance, attempt) = (current.instance, current.attempt);
+        let (instance, attempt, state) = (current.instance, current.attempt, current.state);
         let reads = match &analysis.reads {
             None => Footprint::Everything,
             Some(reads) => self.with_scope(context, thread, None, |s| FactExpr::footprint(reads, s)),
@@ -188,8 +188,10 @@ impl Interpreter {
             Target::Actual => (context.root.revision(), Vec::new(), Vec::new()),
             Target::Projection { base, changes, writers, .. } => (*base, changes.clone(), writers.clone()),
         };
+        let is_limited = context.program.state(state).annotations.timeout_s.is_some();
+        let first = is_limited || self.is_pia(context, thread);
         self.set_phase(thread, Phase::Projecting);
-        context.commands.push(Command::Project { instance, attempt, base, changes, writers, reads, lease });
+        context.commands.push(Command::Project { instance, attempt, base, changes, writers, reads, lease, first });
     }
 
     pub(super) fn run(&mut self, context: &mut Context<'_>, thread: u64) {

@@ -359,10 +359,13 @@ impl Window {
         let Some(node) = self.graph.node(id) else { return };
         let Status::Granted(held) = &node.status else { return };
         let (attempt, lease) = (node.attempt, held.lease.as_ref().map(|lease| (lease.id, lease.token)));
+        let first = self.graph.get(id).is_some_and(|instance| {
+            instance.is_pia() || context.program.state(instance.state).annotations.timeout_s.is_some()
+        });
         let base = context.root.revision();
         let (writers, changes) = self.named(context, by_writer);
         self.graph.project(id);
-        context.commands.push(Command::Project { instance: id, attempt, base, changes, writers, reads, lease });
+        context.commands.push(Command::Project { instance: id, attempt, base, changes, writers, reads, lease, first });
     }
 
     fn start_goal(&mut self, context: &mut Context<'_>, id: InstanceId, known: Option<Outputs>) {
@@ -524,14 +527,37 @@ impl Window {
         first.extend(self.dispatch.take_released(&self.graph));
         let changed = !in_the_way.is_empty() || !first.is_empty();
         for (holder, by) in in_the_way {
-            context.note(Note::Preempted { instance: holder, by });
-            self.step_back(context, holder, Wait::Nothing);
-            self.waits.enqueue(&mut self.graph, holder);
+            self.preempt(context, holder, Some(by));
         }
         for id in first {
             self.waits.enqueue(&mut self.graph, id);
         }
         changed
+    }
+}
+
+impl Window {
+    /// Another run needs for certain what one of these holds: whoever only improves a result gives way, else the least urgent of those that
+    /// are speculative, if any is.
+    pub(super) fn give_way_to_others(&mut self, context: &mut Context<'_>, holders: &[InstanceId]) {
+        if let Some(improving) = holders.iter().find(|id| self.improving.has(**id)) {
+            return self.harvest(context, *improving);
+        }
+        let speculative = holders.iter().filter_map(|id| self.graph.get(*id)).filter(|instance| {
+            let holds = instance.node().is_some_and(|node| node.status.since().is_some());
+            holds && self.dispatch.is_speculative(instance.id)
+        });
+        let least = speculative.min_by_key(|instance| (self.dispatch.priority(&self.graph, instance), instance.id));
+        if let Some(holder) = least.map(|instance| instance.id) {
+            self.preempt(context, holder, None);
+        }
+    }
+
+    /// A speculative holder gives back what it has and asks again.
+    fn preempt(&mut self, context: &mut Context<'_>, holder: InstanceId, by: Option<InstanceId>) {
+        context.note(Note::Preempted { instance: holder, by });
+        self.step_back(context, holder, Wait::Nothing);
+        self.waits.enqueue(&mut self.graph, holder);
     }
 }
 

@@ -38,6 +38,10 @@ impl Improving {
         self.0.get(&id).is_some_and(|improvement| improvement.attempt == attempt)
     }
 
+    pub(crate) fn has(&self, id: InstanceId) -> bool {
+        self.0.contains_key(&id)
+    }
+
     pub(crate) fn get_mut(&mut self, id: InstanceId) -> Option<&mut Improvement> {
         self.0.get_mut(&id)
     }

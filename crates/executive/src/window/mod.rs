@@ -186,6 +186,7 @@ impl Window {
                 self.may_end_waits = true;
                 self.world_changed(context, facts.iter().map(|(fact, _)| fact));
             }
+            Event::WantedByOthers { holders } => self.give_way_to_others(context, &holders),
             Event::Signalled { .. } => self.may_end_waits = true,
             Event::Woken => self.wake_routines(context),
             Event::Answered { .. } | Event::Started { .. } | Event::Progressed { .. } | Event::Resumed => {}

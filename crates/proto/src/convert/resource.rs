@@ -436,6 +436,7 @@ impl From<WaitingAcquire> for v1::WaitingAcquire {
             priority: waiting.priority,
             ahead: waiting.ahead,
             obstacles: waiting.obstacles,
+            held_by_leases: waiting.held_by.into_iter().map(|lease| lease.0).collect(),
         }
     }
 }
@@ -451,6 +452,7 @@ impl TryFrom<v1::WaitingAcquire> for WaitingAcquire {
             priority: waiting.priority,
             ahead: waiting.ahead,
             obstacles: waiting.obstacles,
+            held_by: waiting.held_by_leases.into_iter().map(LeaseId).collect(),
         })
     }
 }

@@ -1076,6 +1076,9 @@ pub struct WaitingAcquire {
     /// What is in the way of each requirement that cannot be met now, for people: "`block Arm`: held by lease-1 of session a".
     #[prost(string, repeated, tag = "6")]
     pub obstacles: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// The leases that hold what it lacks, at most 8 for each requirement; none where some of that is not there at all.
+    #[prost(uint64, repeated, tag = "7")]
+    pub held_by_leases: ::prost::alloc::vec::Vec<u64>,
 }
 /// Asks who is there.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -3270,13 +3273,28 @@ pub struct ProjectRequest {
     /// of it; empty or missing: nobody, and the change stands over whatever is committed.
     #[prost(string, repeated, tag = "7")]
     pub writers: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// Its id, one that was promised to the caller; 0: the pool picks one. FAILED_PRECONDITION (NOT_PROMISED) for any other.
+    #[prost(uint64, tag = "8")]
+    pub projection_id: u64,
+    /// So many ids the answer promises, at most 64: for projections of the caller's that are named to others before they are asked for. Whoever asks
+    /// for a promised projection (Query, GetScene, WatchProjection) waits until it is there, 1 s at most: UNAVAILABLE (NOT_YET) then, ask again.
+    /// A promise is kept for 30 s; of those to one caller the pool forgets the oldest where there are more than 16,384.
+    #[prost(uint32, tag = "9")]
+    pub promise: u32,
+    /// A commit of the caller's that may still be on its way: the revision below is that which it makes, or base_revision where that is later. It is
+    /// waited for 1 s at most: FAILED_PRECONDITION (NO_SUCH_COMMIT) then. Empty: none.
+    #[prost(string, tag = "10")]
+    pub after_commit_id: ::prost::alloc::string::String,
 }
 /// The projection is there.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ProjectResponse {
     /// Its id.
     #[prost(uint64, tag = "1")]
     pub projection_id: u64,
+    /// As many as were asked for, or fewer.
+    #[prost(uint64, repeated, tag = "2")]
+    pub promised: ::prost::alloc::vec::Vec<u64>,
 }
 /// Asks whether a projection holds.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -3881,7 +3899,7 @@ pub mod world_pool_service_client {
                 .insert(GrpcMethod::new("ratn.v1.WorldPoolService", "GetScene"));
             self.inner.unary(req, path, codec).await
         }
-        /// Ends a projection. PERMISSION_DENIED for one that another made, except to operators.
+        /// Ends a projection, or takes back the promise of one. PERMISSION_DENIED for one that another made or was promised, except to operators.
         pub async fn release(
             &mut self,
             request: impl tonic::IntoRequest<super::WorldPoolServiceReleaseRequest>,
@@ -3997,7 +4015,7 @@ pub mod world_pool_service_server {
             tonic::Response<super::GetSceneResponse>,
             tonic::Status,
         >;
-        /// Ends a projection. PERMISSION_DENIED for one that another made, except to operators.
+        /// Ends a projection, or takes back the promise of one. PERMISSION_DENIED for one that another made or was promised, except to operators.
         async fn release(
             &self,
             request: tonic::Request<super::WorldPoolServiceReleaseRequest>,

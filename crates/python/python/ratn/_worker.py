@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import inspect
 import logging
 import pathlib
@@ -188,7 +189,8 @@ def _performed(
         import numpy
 
         given[port] = numpy.asarray(given[port], dtype=float)
-    ended = function(goal, **given)
+    # What a goal sets there is its own: its thread performs others after it.
+    ended = contextvars.copy_context().run(function, goal, **given)
     if inspect.isawaitable(ended):
         ended = asyncio.run(_until_cancelled(goal, ended))
     if isinstance(ended, Outcome):

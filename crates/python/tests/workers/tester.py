@@ -1,6 +1,7 @@
 """Actions that do what tests need."""
 
 import asyncio
+import contextvars
 import logging
 import os
 import time
@@ -17,6 +18,17 @@ class Sums(TypedDict):
     total: float
     joints: ratn.Joints
     count: int
+
+
+places: contextvars.ContextVar[int] = contextvars.ContextVar("places", default=0)
+
+
+@w.action(computes=True)
+def of_its_own(goal: ratn.Goal, given: int) -> dict:
+    """What the goal before it has left in the context of its thread; leaves something there itself."""
+    before = places.get()
+    places.set(given)
+    return {"before": before}
 
 
 @w.action

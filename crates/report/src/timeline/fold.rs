@@ -156,6 +156,7 @@ impl Timeline {
             Event::WorldChanged { .. } => Cause::World,
             Event::Woken => Cause::Time,
             Event::Advised { .. } => Cause::Advice,
+            Event::WantedByOthers { .. } => Cause::AnotherRun,
             Event::Resumed => Cause::Resumed,
             Event::PauseRequested
             | Event::ResumeRequested
@@ -221,6 +222,7 @@ impl Timeline {
             | Event::Answered { .. }
             | Event::Resumed
             | Event::Woken
+            | Event::WantedByOthers { .. }
             | Event::Advised { .. } => {}
         }
     }
@@ -462,6 +464,7 @@ fn instance_of(event: &Event) -> Option<InstanceId> {
         | Event::StepRequested
         | Event::BreakpointsSet { .. }
         | Event::Advised { .. }
+        | Event::WantedByOthers { .. }
         | Event::WorldChanged { .. }
         | Event::Signalled { .. }
         | Event::AbortRequested { .. } => None,

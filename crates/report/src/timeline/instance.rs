@@ -70,6 +70,8 @@ pub enum Cause {
     Signal(Arc<str>),
     /// A look ahead found a better order.
     Advice,
+    /// Another run needed what an instance held.
+    AnotherRun,
     /// Task control came back.
     Resumed,
 }
@@ -85,6 +87,7 @@ impl Cause {
             | Cause::Operator
             | Cause::Signal(_)
             | Cause::Advice
+            | Cause::AnotherRun
             | Cause::Resumed => None,
         }
     }
@@ -101,6 +104,7 @@ impl Cause {
             Cause::Operator => "the operator".to_owned(),
             Cause::Signal(signal) => format!("the signal `{signal}`"),
             Cause::Advice => "a better order".to_owned(),
+            Cause::AnotherRun => "what another run needs".to_owned(),
             Cause::Resumed => "task control".to_owned(),
         }
     }

@@ -91,6 +91,11 @@ impl Waiting {
     }
 }
 
+/// The id of the request that is made when that one has waited too long beside other runs.
+pub(super) fn late_request(request: &str) -> String {
+    format!("{request}/late")
+}
+
 /// One acquire's way.
 pub(super) struct Acquiring {
     pub(super) instance: InstanceId,
@@ -174,7 +179,15 @@ impl Acquiring {
                 // Others are not let pass any more.
                 () = self.told.others_after(late), if may_be_late => {}
             }
-            self.withdraw().await;
+            tokio::select! {
+                biased;
+                Ok(lease) = &mut self.handed, if !self.handed.is_terminated() => return Got::Handed(lease),
+                () = self.withdrawn.cancelled() => return Got::Nothing,
+                // What is asked for twice would be had twice.
+                withdrawn = retry_until_answered(|| self.resources.withdraw(&self.options.request)) => drop(withdrawn),
+            }
+            // Another request: a manager that was started again has not heard of the first, and refuses what was withdrawn before it came.
+            self.options.request = late_request(&self.options.request);
             self.options.priority = OVERDUE;
         }
     }

@@ -7,9 +7,12 @@ use ratn_model::resource::ResourceClass;
 use ratn_model::value::Value;
 use ratn_proto::types::Resource;
 use ratn_worker::client::{ResourceClient, retry_unanswered};
+use std::time::Duration;
 
 /// So many runs are under way on a system at the most.
 const MOST_RUNS: usize = 64;
+/// So often a run that is alone looks whether it still is.
+const LOOK_AGAIN: Duration = Duration::from_secs(1);
 /// The attributes of the resource that says that a run is under way: its task,
 const TASK: &str = "task";
 /// and whether no other run may be.
@@ -37,6 +40,17 @@ pub async fn claim(resources: &ResourceClient, run: &str, task: &str, alone: boo
     }
     // Of two that begin at the same moment each sees the other one.
     others(resources, run, alone).await
+}
+
+/// Resolves when another run is under way on the system.
+pub(super) async fn another(resources: ResourceClient, run: String) {
+    loop {
+        tokio::time::sleep(LOOK_AGAIN).await;
+        let runs = resources.list(&[RUN_KIND]).await;
+        if runs.is_ok_and(|runs| runs.iter().any(|other| other.id != run)) {
+            return;
+        }
+    }
 }
 
 /// Whether other runs are under way, beside which this one may be.

@@ -1,6 +1,7 @@
 //! One goal, from giving it to a provider (or finding it there again) to the event of its end.
 
 use super::Answer;
+use super::told::Told;
 use crate::record::said;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
@@ -17,6 +18,7 @@ use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
+use tokio::sync::mpsc::error::TrySendError;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 /// A provider that was told to stop and does not is left alone after this long.
@@ -38,6 +40,9 @@ const DEADLINE_SLACK: Duration = Duration::from_millis(500);
 
 /// So many results of one goal are taken; each is a line of the event log.
 const MOST_RESULTS: u32 = 256;
+
+/// Beside other runs, so often it is looked whether a goal has given its first result.
+const LOOK_AGAIN: Duration = Duration::from_millis(20);
 
 /// The results that a goal has given before its end.
 #[derive(Debug)]
@@ -93,6 +98,9 @@ pub(super) struct Performing {
     pub(super) stop: CancellationToken,
     pub(super) goal: Goal,
     pub(super) results: Mutex<Results>,
+    /// What a result has to have.
+    pub(super) outputs: Vec<String>,
+    pub(super) told: Told,
 }
 
 /// The deadline that the provider is told, in wall time; 0 for none.
@@ -125,7 +133,16 @@ impl Performing {
     /// `None` when it was told to stop.
     async fn execute(&self, endpoint: &Endpoint, given: Given) -> Option<Event> {
         let begun = Instant::now();
-        let mut ending = std::pin::pin!(self.ending(endpoint, given));
+        let ending = async {
+            let mut ending = std::pin::pin!(self.ending(endpoint, given));
+            tokio::select! {
+                event = &mut ending => return event,
+                () = self.is_in_the_way() => {}
+            }
+            let _ = self.actions.cancel(endpoint, &self.goal.id).await;
+            ending.await
+        };
+        let mut ending = std::pin::pin!(ending);
         let event = tokio::select! {
             event = &mut ending => event,
             () = self.stop.cancelled() => {
@@ -138,6 +155,17 @@ impl Performing {
             }
         };
         Some(self.in_time(event, begun))
+    }
+
+    /// Resolves when the goal only improves a result that it has given, beside other runs: what others may want is not held for that.
+    async fn is_in_the_way(&self) {
+        if self.goal.improves.is_none() {
+            return std::future::pending().await;
+        }
+        self.told.others_after(Duration::ZERO).await;
+        while !self.results.lock().is_ok_and(|results| results.taken > 0) {
+            tokio::time::sleep(LOOK_AGAIN).await;
+        }
     }
 
     async fn ending(&self, endpoint: &Endpoint, given: Given) -> Event {
@@ -274,6 +302,12 @@ impl Performing {
             Said::Progress { message, .. } => Event::Progressed { instance, attempt, message },
             // What it comes to when it was told to stop nobody waits for.
             Said::Improved(_) if self.stop.is_cancelled() => return,
+            // What is not whole is no result.
+            Said::Improved(GoalImproved { outputs, .. })
+                if !self.outputs.iter().all(|port| outputs.contains_key(port)) =>
+            {
+                return;
+            }
             Said::Improved(GoalImproved { outputs, cost_s }) => {
                 if !self.results.lock().unwrap_or_else(PoisonError::into_inner).takes(cost_s) {
                     return;
@@ -281,8 +315,14 @@ impl Performing {
                 Event::Improved { instance, attempt, outputs, cost_s }
             }
         };
-        // Progress is for people, and a result comes again, at the latest at the goal's end: when events pile up, they are what can be missed.
-        let _ = self.events.try_send(event.into());
+        let sent = self.events.try_send(event.into());
+        // When events pile up, progress can be missed: it is for people. A result cannot, its goal may give no other.
+        if let Err(TrySendError::Full(Answer::Event { event, withdrawn })) = sent
+            && matches!(*event, Event::Improved { .. })
+        {
+            let events = self.events.clone();
+            tokio::spawn(async move { events.send(Answer::Event { event, withdrawn }).await });
+        }
     }
 
     fn finished(&self, done: GoalOutcome) -> Event {
@@ -336,6 +376,11 @@ mod tests {
                 goal.cancelled.cancelled().await;
                 return Err(goal.stopped());
             }
+            if self.0 == "endless" {
+                goal.improved(BTreeMap::new(), 5.0)?;
+                goal.cancelled.cancelled().await;
+                return Err(goal.stopped());
+            }
             if self.0 == "better" {
                 for cost_s in [5.0, 7.0, 4.0, 4.0].into_iter().chain((0..400).map(|n| 3.0 - f64::from(n) * 0.001)) {
                     goal.improved(BTreeMap::new(), cost_s)?;
@@ -359,8 +404,12 @@ mod tests {
     impl Bench {
         async fn new() -> anyhow::Result<Bench> {
             let place = tempfile::tempdir()?;
-            let server =
-                ActionServer::builder("").action(Named("work")).action(Named("hang")).action(Named("better")).build();
+            let server = ActionServer::builder("")
+                .action(Named("work"))
+                .action(Named("hang"))
+                .action(Named("better"))
+                .action(Named("endless"))
+                .build();
             let bound = bind(&Endpoint::Unix(place.path().join("provider.sock"))).await?;
             let (endpoint, shutdown) = (bound.endpoint().clone(), CancellationToken::new());
             tokio::spawn(bound.serve(Services::new().with(server.clone().into_service()), shutdown.clone()));
@@ -385,6 +434,8 @@ mod tests {
                 events: self.events.clone(),
                 stop: CancellationToken::new(),
                 results: Mutex::default(),
+                outputs: Vec::new(),
+                told: Told::new(),
                 goal: Goal {
                     id: format!("run/1/{action}"),
                     action: action.to_owned(),
@@ -398,7 +449,7 @@ mod tests {
         async fn event(&mut self) -> Option<Event> {
             match self.answers.recv().await? {
                 Answer::Event { event, .. } => Some(*event),
-                Answer::World(_) => None,
+                Answer::World(_) | Answer::Wanted(_) => None,
             }
         }
     }
@@ -451,6 +502,41 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn a_goal_that_only_improves_its_result_ends_when_there_are_other_runs() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        let mut performing = bench.performing("endless", None, 0);
+        performing.goal.improves = Some(Vec::new());
+        let told = performing.told.clone();
+        let ended = tokio::spawn(performing.perform(Given::Now));
+        assert!(matches!(bench.event().await, Some(Event::Improved { .. })));
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        assert!(!ended.is_finished(), "alone it goes on");
+        told.beside_others();
+        let event = bench.event().await;
+        assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == PREEMPTED), "{event:?}");
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn who_comes_back_to_a_goal_hears_of_the_result_that_it_has_given() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        let endless = |bench: &Bench| {
+            let mut performing = bench.performing("endless", None, 5_000);
+            performing.goal.improves = Some(Vec::new());
+            performing
+        };
+        let left = tokio::spawn(endless(&bench).perform(Given::Now));
+        assert!(matches!(bench.event().await, Some(Event::Improved { .. })));
+        left.abort();
+        let again = endless(&bench);
+        let stop = again.stop.clone();
+        let again = tokio::spawn(again.perform(Given::Before));
+        assert!(matches!(bench.event().await, Some(Event::Improved { .. })));
+        stop.cancel();
+        Ok(again.await?)
+    }
+
+    #[tokio::test]
     async fn of_the_results_before_the_end_those_are_taken_that_are_better_and_so_many_at_the_most()
     -> anyhow::Result<()> {
         let mut results = Results::default();
@@ -472,7 +558,9 @@ mod tests {
         assert!(costs.windows(2).all(|pair| pair[1] < pair[0]), "{costs:?}");
         assert!(costs.len() > 2 && costs.len() <= MOST_RESULTS as usize, "{}", costs.len());
         // A goal that may not give any ends as it says: that it tried to is an error of the action.
-        bench.performing("better", None, 0).perform(Given::Now).await;
+        let mut performing = bench.performing("better", None, 0);
+        performing.goal.id.push_str("/again");
+        performing.perform(Given::Now).await;
         let event = bench.event().await;
         assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == ABORTED), "{event:?}");
         Ok(())

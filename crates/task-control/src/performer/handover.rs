@@ -1,13 +1,14 @@
 //! Leases that go from one node to the next without the resource manager: where a goal ends well and the next node wants exactly what
 //! it had, giving it back and asking for it again would cost two calls and come to the same.
 //!
-//! The resource manager sees one lease that lives longer, so others get their turn: after [`TURN`] it goes back all the same. Within the run the
+//! The resource manager sees one lease that lives longer, so others get their turn: after [`TURN`] it goes back all the same, and nothing is handed
+//! over beside other runs, whose nodes may come first. Within the run the
 //! order is the resource manager's: who comes first of those that want any of it takes it over, also one that waits there already, whose
 //! request is then withdrawn ([`super::acquiring`]); where that one wants something else, too, nothing is handed over. What depends on the state of a resource (attributes,
 //! conditions, what is there or is used up) is asked anew every time.
 
 use super::acquiring::Waiting;
-use ratn_executive::protocol::{Command, Event};
+use ratn_executive::protocol::{CERTAIN, Command, Event};
 use ratn_model::id::{InstanceId, LeaseId};
 use ratn_model::program::SUCCESS;
 use ratn_model::resource::{Lease, Requirement, ResourceOperation};
@@ -26,6 +27,10 @@ struct Held {
     lease: Lease,
     requirements: Vec<Requirement>,
     granted: Instant,
+    /// Who has it now,
+    holder: InstanceId,
+    /// and whether that asked for it in case it is needed.
+    is_speculative: bool,
 }
 
 /// A lease that is handed over.
@@ -39,8 +44,21 @@ pub(super) struct Handover {
 
 impl Leases {
     /// A lease is there; one that was handed over counts from its grant.
-    pub(super) fn granted(&mut self, lease: &Lease, requirements: Vec<Requirement>, now: Instant) {
-        self.0.entry(lease.id).or_insert_with(|| Held { lease: lease.clone(), requirements, granted: now });
+    pub(super) fn granted(&mut self, to: InstanceId, lease: &Lease, asked: (Vec<Requirement>, i64), now: Instant) {
+        let (requirements, is_speculative) = (asked.0, asked.1 < CERTAIN);
+        let new = || Held { lease: lease.clone(), requirements, granted: now, holder: to, is_speculative };
+        let held = self.0.entry(lease.id).or_insert_with(new);
+        (held.holder, held.is_speculative) = (to, is_speculative);
+    }
+
+    /// Whether any lease was asked for in case it is needed.
+    pub(super) fn has_speculative(&self) -> bool {
+        self.0.values().any(|held| held.is_speculative)
+    }
+
+    /// Who has a lease that was asked for in case it is needed.
+    pub(super) fn speculative_holder(&self, lease: LeaseId) -> Option<InstanceId> {
+        self.0.get(&lease).filter(|held| held.is_speculative).map(|held| held.holder)
     }
 
     /// A lease goes back.
@@ -155,7 +173,7 @@ mod tests {
         };
         let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: vec![resource] };
         let (mut leases, now) = (Leases::default(), Instant::now());
-        leases.granted(&lease, planner(), now);
+        leases.granted(FIRST, &lease, (planner(), 0), now);
         let mut commands = asks.to_vec();
         commands.push(Command::Release { instance: FIRST, lease: Some(lease.id), projection: None });
         let handover = leases.handover(event, &commands, &waiting(waits), now + Duration::from_millis(after_ms))?;
@@ -232,7 +250,14 @@ mod tests {
             let mut requirements = planner();
             requirements.iter_mut().for_each(change);
             let lease = Lease { id: LeaseId(7), token: FencingToken(7), resources: Vec::new() };
-            Held { lease, requirements: requirements.clone(), granted: Instant::now() }.serves(&requirements)
+            Held {
+                lease,
+                requirements: requirements.clone(),
+                granted: Instant::now(),
+                holder: FIRST,
+                is_speculative: false,
+            }
+            .serves(&requirements)
         };
         assert!(held(&|_| {}));
         assert!(!held(&|one| drop(one.attributes.insert("gpu".to_owned(), Value::Bool(true)))));

@@ -10,13 +10,15 @@ mod stopping;
 #[cfg(test)]
 mod tests;
 mod told;
+mod wanted;
 mod watch;
 
 pub(super) use resume::{check_world, remembers};
 
-use super::ledger::{Confirmed, acquire_request};
+use super::ledger::{Confirmed, Projecting, acquire_request};
 use super::outside::Outside;
-use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Record, Recorded, Recorder, said};
+use super::promises::{Making, Promises};
+use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Named, Record, Recorded, Recorder, Root, said};
 use super::shell::{Place, Urgency};
 use crate::background_runtime::BackgroundRuntime;
 use crate::messages::Messages;
@@ -50,6 +52,7 @@ use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
 use told::Told;
+use wanted::HoldsSpeculatively;
 
 /// A resource manager that does not open a session within this time is not there.
 const SESSION_DEADLINE: Duration = Duration::from_secs(5);
@@ -76,6 +79,12 @@ fn holder(task: &str, path: &str) -> String {
     match path.chars().count() {
         length if length <= room => format!("{task}: {path}"),
         length => format!("{task}: …{}", path.chars().skip(length - room).collect::<String>()),
+    }
+}
+
+async fn end_projection(world: &WorldClient, instance: InstanceId, projection: ProjectionId) {
+    if let Err(error) = retry_unanswered(|| world.release(projection)).await {
+        tracing::warn!(%instance, "a projection was not given back: {}", said(&error));
     }
 }
 
@@ -115,6 +124,8 @@ pub(super) enum Answer {
     },
     /// A revision of the root: the run's own, or another's.
     World(WorldChange),
+    /// Another run waits for what these leases hold, and needs it for certain.
+    Wanted(Vec<LeaseId>),
 }
 
 impl From<Event> for Answer {
@@ -139,6 +150,8 @@ pub(super) struct Performer {
     session: Session,
     /// Where the session is kept alive, whatever this thread does.
     _background: BackgroundRuntime,
+    /// Look for other runs, and for what they need.
+    _others: [AbortOnDropHandle<()>; 2],
     events: mpsc::Sender<Answer>,
     records: mpsc::Sender<Record>,
     outside: Outside,
@@ -149,10 +162,14 @@ pub(super) struct Performer {
     following: Option<AbortOnDropHandle<()>>,
     cancelled: Cancelled,
     recorded: Recorded,
+    /// Ids for projections that goals are given before they are there.
+    promises: Promises,
+    making: Making,
     asking: Waiting,
     /// Since when instances have waited that have not got what they need, however often they ask.
     waiting_since: BTreeMap<InstanceId, Instant>,
     leases: Leases,
+    holds: HoldsSpeculatively,
     /// What the instances of the window are called, for whoever asks who holds something.
     paths: BTreeMap<InstanceId, String>,
     /// Of the commands that are performed now.
@@ -200,6 +217,11 @@ impl Performer {
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, manager, session.id())?;
         let told = Told::new();
+        let (heard, another) = (told.clone(), claim::another(resources.clone(), run.clone()));
+        let others = AbortOnDropHandle::new(tokio::spawn(async move {
+            another.await;
+            heard.beside_others();
+        }));
         match claim(&resources, &run, task, place.alone).await {
             Ok(true) => told.beside_others(),
             Ok(false) => {}
@@ -214,8 +236,12 @@ impl Performer {
             }
         }
         let world = WorldClient::new(&channels, &place.endpoints.world_pool)?;
+        let holds = HoldsSpeculatively::default();
+        let listening = wanted::listen(resources.clone(), run.clone(), told.clone(), holds.clone(), events.clone());
+        let listening = AbortOnDropHandle::new(tokio::spawn(listening));
         let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
         let (cancelled, recorded) = (Cancelled::default(), Recorded::default());
+        let promises = Promises::default();
         let recorder = Recorder {
             run: run.clone(),
             world: world.clone(),
@@ -225,7 +251,8 @@ impl Performer {
             events: events.clone(),
             trust: session.trust(),
             trace,
-            root: Revision::default(),
+            root: Root::default(),
+            promises: promises.clone(),
         };
         tracing::debug!(run, trace = %trace.trace_id(), "calls of this run are of one trace");
         tokio::spawn(trace::within(trace, recorder.work(work)));
@@ -242,6 +269,7 @@ impl Performer {
             world,
             session,
             _background: background,
+            _others: [others, listening],
             events,
             records,
             outside: Outside::default(),
@@ -250,9 +278,12 @@ impl Performer {
             following: None,
             cancelled,
             recorded,
+            promises,
+            making: Making::default(),
             asking: Waiting::default(),
             waiting_since: BTreeMap::new(),
             leases: Leases::default(),
+            holds,
             paths: BTreeMap::new(),
             handover: None,
             jobs: BTreeMap::new(),
@@ -310,7 +341,10 @@ impl Performer {
                 _ => {}
             }
         }
-        self.handover = self.leases.handover(event, commands, &self.asking, Instant::now());
+        // Beside other runs it is the resource manager's to say who comes next.
+        let alone = !self.told.has_others();
+        let handover = alone.then(|| self.leases.handover(event, commands, &self.asking, Instant::now()));
+        self.handover = handover.flatten();
         // To one whose answer is on its way nothing is handed over: the lease goes back.
         self.handover.take_if(|one| one.waits && self.asking.hand(one.to, &one.lease) != Some(Ok(())));
     }
@@ -340,8 +374,9 @@ impl Performer {
                     asking.withdrawn.cancel();
                 }
             }
-            Command::Project { instance, attempt, base, changes, writers, reads, lease } => {
-                self.record(Record::Project { instance, attempt, base, changes, writers, reads, lease })?;
+            Command::Project { instance, attempt, base, changes, writers, reads, lease, first } => {
+                let asked = Projecting { attempt, base, changes, writers, reads, lease, first, named: None };
+                self.project(instance, asked)?;
             }
             Command::Start { instance, attempt, goal } => self.start(instance, attempt, *goal, Given::Now),
             Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
@@ -399,6 +434,19 @@ impl Performer {
         Ok(())
     }
 
+    /// Where it need not be there first its goal leaves at once, if an id was promised.
+    fn project(&mut self, instance: InstanceId, asked: Projecting) -> anyhow::Result<()> {
+        let behind = self.records.max_capacity() - self.records.capacity();
+        let told = if asked.first { None } else { self.events.clone().try_reserve_owned().ok() };
+        let Some((told, id)) = told.and_then(|told| Some((told, self.promises.take(behind, Instant::now())?))) else {
+            return self.record(Record::Project { instance, asked, named: None });
+        };
+        let (attempt, made) = (asked.attempt, self.making.begin(id));
+        self.record(Record::Project { instance, asked, named: Some(Named { id, made, again: false }) })?;
+        told.send(Event::Projected { instance, attempt, projection: id }.into());
+        Ok(())
+    }
+
     fn acquire(&mut self, instance: InstanceId, number: u64, requirements: Vec<Requirement>, priority: i64) {
         let withdrawn = CancellationToken::new();
         let (hand, handed) = oneshot::channel();
@@ -451,7 +499,13 @@ impl Performer {
         let messages = self.messages.clone();
         tokio::spawn(async move {
             // One that has its answer by now does not wait any more.
-            let Ok(waiting) = resources.explain(&request).await else { return };
+            let waiting = match resources.explain(&request).await {
+                Ok(waiting) => waiting,
+                Err(_) => match resources.explain(&acquiring::late_request(&request)).await {
+                    Ok(waiting) => waiting,
+                    Err(_) => return,
+                },
+            };
             let obstacles: Vec<String> = waiting.into_iter().flat_map(|one| one.obstacles).collect();
             let why = if obstacles.is_empty() { "its turn".to_owned() } else { obstacles.join("; ") };
             let at = at.seconds();
@@ -473,6 +527,11 @@ impl Performer {
                 }
                 return Ok(self.outside.told(change, mirror));
             }
+            Answer::Wanted(leases) => {
+                let holders: Vec<InstanceId> =
+                    leases.into_iter().filter_map(|lease| self.leases.speculative_holder(lease)).collect();
+                return Ok((!holders.is_empty()).then_some(Event::WantedByOthers { holders }));
+            }
         };
         Ok(match event {
             Event::Granted { instance, lease } if withdrawn => {
@@ -490,7 +549,16 @@ impl Performer {
                     let asked = self.asking.remove(*instance);
                     self.waiting_since.remove(instance);
                     if let (Event::Granted { lease, .. }, Some(asked)) = (&event, asked) {
-                        self.leases.granted(lease, asked.requirements, Instant::now());
+                        self.leases.granted(*instance, lease, (asked.requirements, asked.priority), Instant::now());
+                        self.holds.set(self.leases.has_speculative());
+                    }
+                }
+                // Also where it is the projection that could not be made, while its goal went on.
+                if let Event::Crashed { instance, attempt, .. } = &event {
+                    // If the world pool was started again, it has promised nothing.
+                    self.promises.forget();
+                    if let Some(job) = self.jobs.get(instance).filter(|job| job.attempt == *attempt) {
+                        self.stopping.stop(job);
                     }
                 }
                 Some(event)
@@ -535,6 +603,8 @@ impl Performer {
             events: self.events.clone(),
             stop: stop.clone(),
             results: Mutex::default(),
+            outputs: self.outputs_of(&goal),
+            told: self.told.clone(),
             goal: types::Goal {
                 id: format!("{}/{instance}/{attempt}", self.run),
                 action: goal.action.to_string(),
@@ -546,12 +616,18 @@ impl Performer {
                 world_pool: self.world.endpoint().to_string(),
                 deadline_ms: goal::deadline_ms(goal.timeout_s, self.speed),
                 grace_ms: goal::GRACE_MS,
-                // What others may want is not held only to improve a result.
-                improves: goal.improves.filter(|_| !self.told.has_others()).map(Vec::from),
+                improves: goal.improves.map(Vec::from),
             },
         };
         let ended = tokio::spawn(trace::within(self.of(instance), performing.perform(given)));
         self.jobs.insert(instance, Job { attempt, lease, resource, stop, ended, over });
+    }
+
+    /// The outputs that a result of the goal's action has to have.
+    fn outputs_of(&self, goal: &Goal) -> Vec<String> {
+        let provider = self.catalogue.providers.get(&*goal.provider);
+        let action = provider.and_then(|provider| provider.actions.get(&*goal.action));
+        action.map(|action| action.outputs.keys().cloned().collect()).unwrap_or_default()
     }
 
     /// What performs goals says where it is: a resource of that kind that does not is nobody's to give a goal to, whoever made it.
@@ -593,23 +669,33 @@ impl Performer {
     ) {
         if let Some(lease) = lease {
             self.leases.given_back(lease);
+            self.holds.set(self.leases.has_speculative());
         }
         let (resources, world) = (self.resources.clone(), self.world.clone());
         let note = self.told.left(&self.run, self.decided).to_string();
+        let (there, coming) = match projection.map(|id| (id, self.making.end(id))) {
+            Some((id, None)) => (Some(id), None),
+            Some((id, Some(coming))) => (None, Some((id, coming))),
+            None => (None, None),
+        };
         let returning = async move {
             // Whoever gets the resources next finds them idle.
             for job in jobs {
                 let _ = job.ended.await;
             }
-            if let Some(projection) = projection
-                && let Err(error) = retry_unanswered(|| world.release(projection)).await
-            {
-                tracing::warn!(%instance, "a projection was not given back: {}", said(&error));
+            if let Some(projection) = there {
+                end_projection(&world, instance, projection).await;
             }
             if let Some(lease) = lease
                 && let Err(error) = retry_unanswered(|| resources.release_with_note(lease, note.clone())).await
             {
                 tracing::warn!(%instance, "a lease was not given back: {}", said(&error));
+            }
+            // The lease is not kept until it is there.
+            if let Some((projection, coming)) = coming
+                && coming.await.is_ok()
+            {
+                end_projection(&world, instance, projection).await;
             }
         };
         self.giving_back.spawn(trace::within(self.of(instance), returning));

@@ -8,7 +8,7 @@ use super::Performer;
 use super::goal::Given;
 use crate::ledger::{Confirmed, Ledger};
 use crate::outside;
-use crate::record::{Decided, Record, commit_next, operate_once, said};
+use crate::record::{Decided, Named, Record, commit_next, operate_once, said};
 use crate::shell::Place;
 use anyhow::bail;
 use ratn_executive::protocol::Event;
@@ -96,10 +96,8 @@ impl Performer {
             let _ = retry_unanswered(|| self.resources.withdraw(request)).await;
         }
         for (instance, asked) in ledger.projecting {
-            let attempt = asked.attempt;
-            let (base, changes, writers) = (asked.base, asked.changes, asked.writers);
-            let (reads, lease) = (asked.reads, asked.lease);
-            self.record(Record::Project { instance, attempt, base, changes, writers, reads, lease })?;
+            let named = asked.named.map(|id| Named { id, made: self.making.begin(id), again: true });
+            self.record(Record::Project { instance, asked, named })?;
         }
         for (instance, (attempt, goal)) in ledger.goals {
             self.start(instance, attempt, goal, Given::Before);

@@ -252,6 +252,68 @@ async fn one_that_asks_again_in_the_step_that_gives_it_a_lease_has_it_once() -> 
 }
 
 #[tokio::test]
+async fn a_run_hears_of_who_waits_beside_it_for_what_it_holds_and_needs_that_for_certain() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (holder, waiter) = (InstanceId(1), InstanceId(2));
+    bench.ask(holder)?;
+    bench.granted(holder).await?;
+    let (events, _answers) = mpsc::channel(8);
+    let mut other = connect(&bench.endpoints, "other", events).await?;
+    // What may be in vain has time.
+    other.perform(Command::Acquire { instance: waiter, requirements: arm(), priority: 7 })?;
+    let quiet = tokio::time::timeout(Duration::from_secs(2), bench.event()).await;
+    assert!(quiet.is_err(), "{quiet:?}");
+    other.perform(Command::Withdraw { instance: waiter })?;
+    other.perform(Command::Acquire { instance: waiter, requirements: arm(), priority: CERTAIN })?;
+    assert_eq!(bench.event().await, Some(Event::WantedByOthers { holders: vec![holder] }));
+    other.close().await?;
+    bench.performer.close().await
+}
+
+/// A resource manager that a token ends, at the same place as the one before it.
+fn manager_at(directory: &RuntimeDirectory) -> (CancellationToken, impl Future<Output = ()> + use<>) {
+    let shutdown = CancellationToken::new();
+    let running = resource_manager::run(ResourceManagerConfig::default(), directory.clone(), shutdown.clone());
+    let running = tokio::spawn(running);
+    (shutdown, async move { drop(running.await) })
+}
+
+#[tokio::test]
+async fn who_waits_beside_others_while_the_manager_is_started_again_is_served_and_not_refused() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let place = tempfile::tempdir()?;
+    let directory = RuntimeDirectory::create(place.path())?;
+    let (shutdown, ended) = manager_at(&directory);
+    let resource_manager = directory.wait_for(resource_manager::ROLE, SESSION_DEADLINE).await?;
+    bench.endpoints.resource_manager = resource_manager;
+    let (channels, manager) = (Channels::new(&ClientTls::none()), &bench.endpoints.resource_manager);
+    let robot = Session::open(&channels, manager, "robot", DEFAULT_TTL);
+    robot.alive(SESSION_DEADLINE).await?;
+    let offering = ResourceClient::new(&channels, manager, robot.id())?;
+    offering.create(Resource::new("arm", ResourceClass::Module, "Arm")).await?;
+    let lease = offering.acquire(arm(), AcquireOptions::default()).await?;
+
+    let (events, _first) = mpsc::channel(8);
+    let first = connect(&bench.endpoints, "first", events).await?;
+    let (events, mut answers) = mpsc::channel(8);
+    let mut second = connect(&bench.endpoints, "second", events).await?;
+    assert!(second.told.has_others());
+    second.perform(Command::Acquire { instance: InstanceId(1), requirements: arm(), priority: CERTAIN })?;
+    // It is away when the node has waited long enough to come next.
+    tokio::time::sleep(LONG_BESIDE_OTHERS / 2).await;
+    shutdown.cancel();
+    ended.await;
+    tokio::time::sleep(LONG_BESIDE_OTHERS).await;
+    let (_again, _ended) = manager_at(&directory);
+    offering.release(lease.id).await?;
+    let answer = answers.recv().await.context("no answer")?;
+    let Answer::Event { event, .. } = answer else { bail!("{answer:?}") };
+    assert!(matches!(*event, Event::Granted { .. }), "{event:?}");
+    first.close().await?;
+    second.close().await
+}
+
+#[tokio::test]
 async fn a_run_goes_beside_others_and_one_that_goes_alone_does_not() -> anyhow::Result<()> {
     let bench = Bench::new().await?;
     let events = || mpsc::channel(1).0;
@@ -406,6 +468,7 @@ async fn a_projection_that_crosses_its_cancel_goes_back() -> anyhow::Result<()> 
         writers: Vec::new(),
         reads: reads.clone(),
         lease: None,
+        first: true,
     };
     bench.performer.perform(project(1))?;
     let made = bench.answers.recv().await;
@@ -414,6 +477,97 @@ async fn a_projection_that_crosses_its_cancel_goes_back() -> anyhow::Result<()> 
     assert!(bench.performer.cancelled.lock().is_ok_and(|cancelled| cancelled.is_empty()));
     bench.performer.perform(project(2))?;
     assert!(matches!(bench.event().await, Some(Event::Projected { attempt: 2, .. })));
+    bench.performer.close().await
+}
+
+/// A projection of everything, at no lease.
+fn projection(instance: InstanceId, attempt: u32, first: bool) -> Command {
+    Command::Project {
+        instance,
+        attempt,
+        base: Revision(0),
+        changes: Vec::new(),
+        writers: Vec::new(),
+        reads: Footprint::Everything,
+        lease: None,
+        first,
+    }
+}
+
+#[tokio::test]
+async fn a_projection_is_named_before_it_is_there_and_shows_the_commit_on_its_way() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let instance = InstanceId(1);
+    // The first is waited for; with its answer others are promised.
+    bench.performer.perform(projection(instance, 1, false))?;
+    let Some(Event::Projected { projection: first, .. }) = bench.event().await else { bail!("no projection") };
+    bench.performer.perform(Command::Commit {
+        instance,
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(1),
+    })?;
+    bench.performer.perform(projection(instance, 2, false))?;
+    // Nobody else has run since: the world pool was not heard.
+    let Ok(answer) = bench.answers.try_recv() else { bail!("it waits for the world pool") };
+    let named = bench.performer.accept(answer, &World::default())?;
+    let Some(Event::Projected { attempt: 2, projection: named, .. }) = named else { bail!("{named:?}") };
+    assert_ne!(first, named);
+    let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
+    assert_eq!(world.query(Some(named), &[]).await?.len(), 1, "it shows the commit, and is waited for");
+    bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
+    // What acts begins when its projection is there.
+    bench.performer.perform(projection(instance, 3, true))?;
+    assert!(bench.answers.try_recv().is_err());
+    assert!(matches!(bench.event().await, Some(Event::Projected { attempt: 3, .. })));
+    bench.performer.close().await?;
+    let gone = world.query(Some(named), &[]).await;
+    assert_eq!(gone.map_err(|error| error.reason().to_owned()).err().as_deref(), Some("PROJECTION_UNKNOWN"));
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_projection_that_was_named_and_not_asked_for_before_the_kill_is_asked_for_by_who_comes_back()
+-> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let instance = InstanceId(1);
+    bench.performer.perform(projection(instance, 1, false))?;
+    assert!(matches!(bench.event().await, Some(Event::Projected { .. })));
+    // It has an id for the next one, and is killed when it has written that down.
+    let named = bench.performer.promises.take(0, Instant::now()).context("nothing is promised")?;
+    let mut ledger = ledger(&bench.performer.run, &[projection(instance, 2, false)]);
+    ledger.event(Timestamp(0), &Event::Projected { instance, attempt: 2, projection: named });
+    let mut bench = bench.comes_back(true).await?;
+    bench.performer.take_up(ledger, &World::default()).await?;
+    let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
+    assert!(world.query(Some(named), &[]).await?.is_empty());
+    bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
+    bench.performer.close().await?;
+    let gone = world.query(Some(named), &[]).await;
+    assert_eq!(gone.map_err(|error| error.reason().to_owned()).err().as_deref(), Some("PROJECTION_UNKNOWN"));
+    Ok(())
+}
+
+#[tokio::test]
+async fn of_a_named_projection_that_cannot_be_made_is_heard_afterwards() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let instance = InstanceId(1);
+    bench.performer.perform(projection(instance, 1, false))?;
+    assert!(matches!(bench.event().await, Some(Event::Projected { .. })));
+    let mut ahead = projection(instance, 2, false);
+    if let Command::Project { base, .. } = &mut ahead {
+        *base = Revision(9);
+    }
+    bench.performer.perform(ahead)?;
+    let Some(Event::Projected { projection: named, .. }) = bench.event().await else { bail!("no projection") };
+    let Some(Event::Crashed { attempt: 2, reason, .. }) = bench.event().await else { bail!("not heard of") };
+    assert!(reason.contains("no projection"), "{reason}");
+    let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
+    let refused = world.query(Some(named), &[]).await;
+    assert_eq!(refused.map_err(|error| error.reason().to_owned()).err().as_deref(), Some("PROJECTION_UNKNOWN"));
+    // What is given back is not waited for in vain.
+    bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
     bench.performer.close().await
 }
 

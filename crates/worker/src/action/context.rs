@@ -1,7 +1,7 @@
 //! What an action is given: its goal with the inputs, and access to the world model, the lease and other providers.
 
 use super::ActionFailure;
-use super::goal::{GoalEntry, Said};
+use super::goal::GoalEntry;
 use crate::client::{ActionClient, CallError, Channels, WorldClient, retry_unanswered};
 use crate::endpoint::{Endpoint, EndpointError};
 use crate::safety::{Safety, SafetyState};
@@ -165,7 +165,7 @@ impl GoalContext {
     pub fn progress_with(&self, message: impl Into<String>, values: BTreeMap<String, Value>) {
         let progress = v1::GoalProgress { message: message.into(), values: wire_ports(values) };
         // Nobody may be listening.
-        let _ = self.entry.said.send(Said::Progress(progress));
+        let _ = self.entry.progress.send(progress);
     }
 
     /// Whether the goal may give a result, go on and give better ones ([`GoalContext::improved`]), and if so which outputs stay as they
@@ -194,7 +194,7 @@ impl GoalContext {
         if bytes > MAX_PORTS_BYTES {
             return refused(format!("the outputs have {bytes} bytes: at most {MAX_PORTS_BYTES} are sent"));
         }
-        let _ = self.entry.said.send(Said::Improved(v1::GoalImproved { outputs, cost_s }));
+        self.entry.improved.send_replace(Some(v1::GoalImproved { outputs, cost_s }));
         Ok(())
     }
 

@@ -14,7 +14,7 @@ use tokio::sync::{broadcast, watch};
 use tokio_util::sync::CancellationToken;
 
 /// A listener that falls further behind misses the oldest of what a goal says before its end.
-const SAID_KEPT: usize = 64;
+const PROGRESS_KEPT: usize = 64;
 
 /// However long a client may want to come back.
 const MAX_GRACE: Duration = Duration::from_secs(60);
@@ -38,15 +38,6 @@ pub(crate) enum StopCause {
     ShuttingDown,
     /// An emergency stop, and why.
     EmergencyStop(String),
-}
-
-/// What a goal says before its end.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Said {
-    /// How far it is.
-    Progress(v1::GoalProgress),
-    /// It has a result that can be used.
-    Improved(v1::GoalImproved),
 }
 
 /// How a goal ended.
@@ -120,7 +111,10 @@ pub(crate) struct GoalEntry {
     /// Whose lease that is, as the goal says; may be empty.
     pub(crate) session: String,
     pub(crate) cancelled: CancellationToken,
-    pub(crate) said: broadcast::Sender<Said>,
+    /// How far it is.
+    pub(crate) progress: broadcast::Sender<v1::GoalProgress>,
+    /// The last result that can be used; whoever listens hears of it, also who comes later.
+    pub(crate) improved: watch::Sender<Option<v1::GoalImproved>>,
     pub(crate) result: watch::Sender<Option<Ending>>,
     /// Fires when its action has returned; an action that does not stop in time does so after its result was told.
     pub(crate) returned: CancellationToken,
@@ -156,7 +150,8 @@ impl GoalEntry {
             lease: goal.lease.as_ref().map(|lease| (lease.id, lease.token)),
             session: goal.session.clone(),
             cancelled: CancellationToken::new(),
-            said: broadcast::channel(SAID_KEPT).0,
+            progress: broadcast::channel(PROGRESS_KEPT).0,
+            improved: watch::Sender::new(None),
             result: watch::channel(None).0,
             returned: CancellationToken::new(),
             suspended: watch::Sender::new(false),

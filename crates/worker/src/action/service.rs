@@ -1,7 +1,7 @@
 //! The gRPC adapter of [`ActionServer`].
 
 use super::ActionServer;
-use super::goal::{Ending, Fingerprint, GoalEntry, Listener, Said};
+use super::goal::{Ending, Fingerprint, GoalEntry, Listener};
 use super::stream::CallerGoals;
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
@@ -109,17 +109,23 @@ pub(super) fn described(
 pub(super) struct Messages {
     accepted: Option<bool>,
     over: bool,
-    said: broadcast::Receiver<Said>,
+    progress: broadcast::Receiver<v1::GoalProgress>,
+    improved: watch::Receiver<Option<v1::GoalImproved>>,
     result: watch::Receiver<Option<Ending>>,
     _listener: Listener,
 }
 
 impl Messages {
     pub(super) fn of(entry: &Arc<GoalEntry>, joined: bool) -> Messages {
+        let mut improved = entry.improved.subscribe();
+        if improved.borrow().is_some() {
+            improved.mark_changed();
+        }
         Messages {
             accepted: Some(joined),
             over: false,
-            said: entry.said.subscribe(),
+            progress: entry.progress.subscribe(),
+            improved,
             result: entry.result.subscribe(),
             _listener: entry.listen(),
         }
@@ -143,19 +149,28 @@ impl Messages {
         loop {
             let ending = tokio::select! {
                 biased;
-                said = self.said.recv() => match said {
-                    Ok(said) => return Some(Ok(kind(said))),
+                progress = self.progress.recv() => match progress {
+                    Ok(progress) => return Some(Ok(Kind::Progress(progress))),
                     Err(RecvError::Lagged(_)) => continue,
                     Err(RecvError::Closed) => return None,
                 },
+                Ok(()) = self.improved.changed() => {
+                    let Some(improved) = self.improved.borrow_and_update().clone() else { continue };
+                    return Some(Ok(Kind::Improved(improved)));
+                }
                 ending = self.result.wait_for(Option::is_some) => match ending {
                     Ok(ending) => ending.clone()?,
                     Err(_) => return None,
                 },
             };
             // A last word may have come between the two looks.
-            if let Ok(said) = self.said.try_recv() {
-                return Some(Ok(kind(said)));
+            if let Ok(progress) = self.progress.try_recv() {
+                return Some(Ok(Kind::Progress(progress)));
+            }
+            if self.improved.has_changed().unwrap_or_default()
+                && let Some(improved) = self.improved.borrow_and_update().clone()
+            {
+                return Some(Ok(Kind::Improved(improved)));
             }
             self.over = true;
             return Some(match ending {
@@ -164,12 +179,5 @@ impl Messages {
                 Ending::Lost(reason) => Err(Status::aborted(reason)),
             });
         }
-    }
-}
-
-fn kind(said: Said) -> Kind {
-    match said {
-        Said::Progress(progress) => Kind::Progress(progress),
-        Said::Improved(better) => Kind::Improved(better),
     }
 }

@@ -18,7 +18,7 @@ pub use pattern::{fact, pattern};
 pub use process::{LogPieces, ProcessClient, WorkerWatch};
 pub use resource::{AcquireOptions, DemandWatch, ResourceClient, ResourceWatch};
 pub use retry::{PAUSE, retry_unanswered, retry_until_answered};
-pub use world::{Commit, Projection, ProjectionWatch, WorldClient, WorldWatch};
+pub use world::{Commit, Early, Projection, ProjectionWatch, WorldClient, WorldWatch};
 
 use crate::endpoint::{Endpoint, Watched, connect_lazily_as};
 use crate::multiplex::GoalCalls;

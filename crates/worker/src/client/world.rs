@@ -41,6 +41,17 @@ pub struct Projection {
     pub lease: Option<(LeaseId, FencingToken)>,
 }
 
+/// What of a projection is known before it is there.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Early {
+    /// Its id, one that an answer has promised; `None`: the pool picks one.
+    pub id: Option<ProjectionId>,
+    /// A commit that is on its way: the projection stands on what that makes, or on a later revision.
+    pub after: Option<String>,
+    /// So many ids the answer is to promise, at most 64.
+    pub promise: u32,
+}
+
 /// Changes that are to become real.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Commit {
@@ -157,6 +168,18 @@ impl WorldClient {
     /// # Errors
     /// [`CallError`].
     pub async fn project(&self, projection: Projection) -> Result<ProjectionId, CallError> {
+        self.project_early(projection, Early::default()).await.map(|(id, _)| id)
+    }
+
+    /// As [`WorldClient::project`], of one that others were told of already; with the ids that are promised for the next ones.
+    ///
+    /// # Errors
+    /// [`CallError`]; FAILED_PRECONDITION where the id was not promised, or the commit does not come within a second.
+    pub async fn project_early(
+        &self,
+        projection: Projection,
+        early: Early,
+    ) -> Result<(ProjectionId, Vec<ProjectionId>), CallError> {
         let (lease, token) = projection.lease.unwrap_or_default();
         let question = v1::ProjectRequest {
             request_id: projection.request,
@@ -166,9 +189,12 @@ impl WorldClient {
             lease_id: lease.0,
             token: token.0,
             writers: projection.writers.iter().map(ToString::to_string).collect(),
+            projection_id: early.id.unwrap_or_default().0,
+            promise: early.promise,
+            after_commit_id: early.after.unwrap_or_default(),
         };
-        let answer = self.client.clone().project(question).await.map_err(|status| self.failed(&status))?;
-        Ok(ProjectionId(answer.into_inner().projection_id))
+        let answer = self.client.clone().project(question).await.map_err(|status| self.failed(&status))?.into_inner();
+        Ok((ProjectionId(answer.projection_id), answer.promised.into_iter().map(ProjectionId).collect()))
     }
 
     /// The facts of a projection, or of the root, that match any of the patterns.

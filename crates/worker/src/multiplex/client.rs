@@ -159,7 +159,13 @@ impl<P: Protocol> Calls<P> {
         match answer {
             Ok(answer) if !P::is_last(&answer) => {
                 if let Some(progress) = self.waiting.get(&id).and_then(|waiting| waiting.progress.as_ref()) {
-                    let _ = progress.try_send(answer);
+                    let sent = progress.try_send(answer);
+                    if let Err(mpsc::error::TrySendError::Full(answer)) = sent
+                        && !P::may_be_missed(&answer)
+                    {
+                        let progress = progress.clone();
+                        tokio::spawn(async move { progress.send(answer).await });
+                    }
                 }
             }
             last => self.ended(id, last),

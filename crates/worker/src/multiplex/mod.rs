@@ -47,6 +47,11 @@ pub trait Protocol: 'static {
         true
     }
 
+    /// Whether a caller that falls behind may miss an answer before the last one.
+    fn may_be_missed(_: &Self::Answer) -> bool {
+        true
+    }
+
     /// The call that this one ends; `id` is its own.
     fn ends_call(id: u64, call: &Self::Call) -> Option<u64>;
 
@@ -137,6 +142,10 @@ impl Protocol for GoalCalls {
 
     fn is_last(answer: &perform_response::Kind) -> bool {
         !matches!(answer, perform_response::Kind::Progress(_) | perform_response::Kind::Improved(_))
+    }
+
+    fn may_be_missed(answer: &perform_response::Kind) -> bool {
+        matches!(answer, perform_response::Kind::Progress(_))
     }
 
     fn ends_call(id: u64, call: &perform_request::Kind) -> Option<u64> {

@@ -92,7 +92,7 @@ pub(super) fn waiting(waiting: &[WaitingAcquire]) -> String {
 }
 
 pub(super) fn waiting_json(waiting: &WaitingAcquire) -> serde_json::Value {
-    let WaitingAcquire { request, session, holder, priority, ahead, obstacles } = waiting;
+    let WaitingAcquire { request, session, holder, priority, ahead, obstacles, .. } = waiting;
     json!({
         "request": request, "session": session, "holder": holder, "priority": priority, "ahead": ahead,
         "obstacles": obstacles,
@@ -286,6 +286,7 @@ mod tests {
             priority: 5,
             ahead: 0,
             obstacles: vec!["`block Arm`: held by lease 7 of session t".to_owned()],
+            held_by: Vec::new(),
         };
         let other = WaitingAcquire { ahead: 1, request: "run/8/1".to_owned(), obstacles: Vec::new(), ..one.clone() };
         assert_snapshot!(waiting(&[one, other]), @r"

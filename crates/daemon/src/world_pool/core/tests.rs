@@ -44,6 +44,8 @@ fn project(pool: &mut WorldPool, request: &str, base: u64, lease: u64) -> Result
     pool.project(ProjectRequest {
         by: operator(),
         request_id: request.to_owned(),
+        id: None,
+        after: None,
         base: Revision(base),
         changes: vec![set("box", 7)],
         writers: Vec::new(),
@@ -91,6 +93,8 @@ fn a_projection_is_of_its_base_whatever_was_committed_since() {
     let request = ProjectRequest {
         by: operator(),
         request_id: "p".to_owned(),
+        id: None,
+        after: None,
         base: Revision(1),
         changes: vec![set("box", 7)],
         writers: Vec::new(),
@@ -220,6 +224,8 @@ fn a_fact_says_who_wrote_it_and_what_measured_it() {
     let request = ProjectRequest {
         by: operator(),
         request_id: "p".to_owned(),
+        id: None,
+        after: None,
         base: Revision(1),
         changes: vec![set("box", 7), set("cup", 8)],
         writers: vec!["place[1]".into(), "".into()],
@@ -243,6 +249,8 @@ fn a_commit_says_which_projections_it_contradicts_in_which_fact() {
         let request = ProjectRequest {
             by: operator(),
             request_id: format!("{base}/{reads}"),
+            id: None,
+            after: None,
             base: Revision(base),
             changes: vec![set("box", 7)],
             writers: vec!["place[1]".into()],
@@ -268,6 +276,8 @@ fn a_commit_says_which_projections_it_contradicts_in_which_fact() {
     let of_all = ProjectRequest {
         by: operator(),
         request_id: "late".to_owned(),
+        id: None,
+        after: None,
         base: Revision(1),
         changes: vec![set("box", 7)],
         writers: vec!["place[1]".into()],
@@ -308,6 +318,8 @@ fn a_projection_made_late_knows_that_a_deletion_predicted_of_its_writer_came_tru
     let late = ProjectRequest {
         by: operator(),
         request_id: "late".to_owned(),
+        id: None,
+        after: None,
         base: Revision(1),
         changes: vec![gone],
         writers: vec!["take[1]".into()],
@@ -327,6 +339,8 @@ fn project_as(pool: &mut WorldPool, by: &Caller, request: &str) -> Result<Projec
     pool.project(ProjectRequest {
         by: by.clone(),
         request_id: request.to_owned(),
+        id: None,
+        after: None,
         base: Revision(0),
         changes: Vec::new(),
         writers: Vec::new(),
@@ -345,7 +359,7 @@ fn a_projection_is_released_by_who_made_it_or_by_an_operator_and_the_same_reques
     let second = project_as(&mut pool, &eve, "run/i1/1").unwrap();
     assert_ne!(first, second);
     let refused = pool.release_for(&eve, first).unwrap_err().to_string();
-    assert_eq!(refused, format!("{first} was made by adam: only they and operators release it, not eve"));
+    assert_eq!(refused, format!("{first} is of adam: only they and operators release it, not eve"));
     assert!(pool.has(first));
     assert_eq!(pool.release_for(&adam, first), Ok(true));
     assert_eq!(pool.release_for(&eve, first), Ok(false), "it had ended before");
@@ -394,4 +408,83 @@ fn the_commit_of_another_is_another_and_an_operator_goes_on_with_what_anybody_be
     assert_eq!(commit_as(task("eve"), 1), Ok(Revision(2)));
     assert_eq!(commit_as(task("eve"), 2), Err(CommitError::Reused(Reused { id: "run/i1".to_owned() })));
     assert_eq!(commit_as(task("adam"), 1), Ok(Revision(1)));
+}
+
+/// Of `adam`'s, of everything.
+fn promised(request: &str, id: Option<ProjectionId>, after: Option<&str>) -> ProjectRequest {
+    ProjectRequest {
+        by: task("adam"),
+        request_id: request.to_owned(),
+        id,
+        after: after.map(str::to_owned),
+        base: Revision(0),
+        changes: Vec::new(),
+        writers: Vec::new(),
+        reads: Footprint::Everything,
+        held_by: HeldBy::Until(Timestamp(9)),
+    }
+}
+
+/// With room for the projections of tasks.
+fn large_pool() -> WorldPool {
+    let config = WorldPoolConfig::default();
+    let history = History::new(&config);
+    WorldPool::new(config, None, history, 0)
+}
+
+#[test]
+fn a_promised_id_is_used_once_by_whom_it_was_promised_to() {
+    let mut pool = large_pool();
+    let ids = pool.promise(Timestamp(0), &"adam".into(), 2);
+    let id = ids[0];
+    assert_eq!(query(&pool, Some(id), &[]), Err(QueryError::NotYet { id }));
+    let of_eve = ProjectRequest { by: task("eve"), ..promised("of eve", Some(id), None) };
+    let caller = Arc::from("eve");
+    assert_eq!(pool.project(of_eve), Err(ProjectError::NotPromised { id, caller }));
+    assert!(pool.is_promised(id), "it is still adam's");
+    assert_eq!(pool.project(promised("one", Some(id), None)), Ok(id));
+    assert!(!pool.is_promised(id) && query(&pool, Some(id), &[]).is_ok());
+    assert_eq!(pool.project(promised("one", Some(id), None)), Ok(id), "asked again, for the answer was lost");
+    let again = pool.project(promised("another", Some(id), None));
+    assert_eq!(again, Err(ProjectError::NotPromised { id, caller: "adam".into() }));
+    // Nobody else gets the one that is not used yet.
+    let other = pool.project(promised("three", None, None)).unwrap();
+    assert!(!ids.contains(&other));
+}
+
+#[test]
+fn a_promise_ends_with_the_first_try_or_when_it_is_taken_back() {
+    let mut pool = pool();
+    let ids = pool.promise(Timestamp(0), &"adam".into(), 3);
+    let early = pool.project(promised("one", Some(ids[0]), Some("not yet")));
+    assert!(matches!(early, Err(ProjectError::NoSuchCommit { .. })) && pool.is_promised(ids[0]));
+    let refused = ProjectRequest { base: Revision(7), ..promised("one", Some(ids[0]), None) };
+    assert!(matches!(pool.project(refused), Err(ProjectError::Revision(_))));
+    assert_eq!(query(&pool, Some(ids[0]), &[]), Err(QueryError::Unknown { id: ids[0] }));
+    assert!(pool.release_for(&task("eve"), ids[1]).is_err());
+    assert_eq!(pool.release_for(&task("adam"), ids[1]), Ok(true));
+    assert_eq!(pool.release_for(&task("adam"), ids[1]), Ok(false));
+    assert_eq!(query(&pool, Some(ids[1]), &[]), Err(QueryError::Unknown { id: ids[1] }));
+    assert_eq!(pool.release_for(&operator(), ids[2]), Ok(true));
+}
+
+#[test]
+fn a_projection_stands_on_the_commit_that_it_names() {
+    let mut pool = large_pool();
+    let of_adam = |id: &str, value| Commit {
+        by: task("adam"),
+        id: id.to_owned(),
+        changes: vec![set("box", value)],
+        ..Commit::default()
+    };
+    pool.commit(Timestamp(0), &of_adam("a", 1)).unwrap();
+    pool.commit(Timestamp(0), &of_adam("b", 2)).unwrap();
+    let first = pool.project(promised("one", None, Some("a"))).unwrap();
+    assert_eq!(value(&pool, Some(first), "box"), Ok(Some(Value::Int(1))));
+    let later = ProjectRequest { base: Revision(2), ..promised("two", None, Some("a")) };
+    let later = pool.project(later).unwrap();
+    assert_eq!(value(&pool, Some(later), "box"), Ok(Some(Value::Int(2))));
+    // A commit of somebody else by that name is another.
+    let of_eve = ProjectRequest { by: task("eve"), ..promised("three", None, Some("a")) };
+    assert!(matches!(pool.project(of_eve), Err(ProjectError::NoSuchCommit { .. })));
 }

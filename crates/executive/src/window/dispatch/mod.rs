@@ -125,6 +125,11 @@ impl Dispatch {
         }
     }
 
+    /// Whether it is under way, or asks, and may be in vain.
+    pub(crate) fn is_speculative(&self, id: InstanceId) -> bool {
+        self.speculative.contains(&id)
+    }
+
     /// Whether a node may take room for a projection: a speculative one leaves the last to those that are not.
     pub(crate) fn leaves_room(&self, graph: &Graph, instance: &Instance, requirements: &[Requirement]) -> bool {
         let needs = || requirements.iter().any(|r| r.kind == WORLD_MODEL);

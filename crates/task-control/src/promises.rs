@@ -1,0 +1,125 @@
+//! Projections that are named before they are there: a goal leaves at once with an id that the world pool has promised, and its worker waits
+//! for the projection where it looks at it at all.
+//!
+//! So what a node that reads the world waits for is one answer, that of its goal; its projection, and the commit before that, are made
+//! meanwhile. Goals that act are not given so: they begin when their projection is there.
+
+use ratn_model::id::ProjectionId;
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+use tokio::sync::oneshot;
+use tokio::sync::oneshot::error::TryRecvError;
+
+/// So many ids are kept.
+const KEPT: usize = 32;
+
+/// So long an id is used; the world pool keeps its promises three times as long.
+const FRESH: Duration = Duration::from_secs(10);
+
+/// Where more than so many records wait for the world pool, goals wait for their projections: the workers would.
+const FEW_BEHIND: usize = 4;
+
+/// The ids that are promised to a run; clones share them.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Promises(Arc<Mutex<VecDeque<Promise>>>);
+
+#[derive(Debug, Clone, Copy)]
+struct Promise {
+    id: ProjectionId,
+    since: Instant,
+}
+
+impl Promises {
+    fn fresh(&self, now: Instant) -> MutexGuard<'_, VecDeque<Promise>> {
+        let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        while all.pop_front_if(|oldest| now.duration_since(oldest.since) >= FRESH).is_some() {}
+        all
+    }
+
+    /// An id for a projection that is to be named at once; `behind` records wait for the world pool.
+    pub(super) fn take(&self, behind: usize, now: Instant) -> Option<ProjectionId> {
+        if behind > FEW_BEHIND { None } else { self.fresh(now).pop_front().map(|promise| promise.id) }
+    }
+
+    /// So many the next answer is to promise.
+    pub(super) fn wanted(&self, now: Instant) -> u32 {
+        let left = self.fresh(now).len();
+        if left > KEPT / 2 { 0 } else { u32::try_from(KEPT - left).unwrap_or_default() }
+    }
+
+    /// What an answer has promised.
+    pub(super) fn add(&self, promised: Vec<ProjectionId>, now: Instant) {
+        let mut ids = self.fresh(now);
+        ids.extend(promised.into_iter().map(|id| Promise { id, since: now }));
+        // Answers that crossed have promised more than was wanted: the pool forgets the oldest first, and so does the run.
+        let too_many = ids.len().saturating_sub(2 * KEPT);
+        ids.drain(..too_many);
+    }
+
+    /// The world pool knows of no promise: it was started again.
+    pub(super) fn forget(&self) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clear();
+    }
+}
+
+/// The projections that goals were given and that may not be there yet.
+#[derive(Debug, Default)]
+pub(super) struct Making(BTreeMap<ProjectionId, oneshot::Receiver<Made>>);
+
+/// That it is there.
+#[derive(Debug)]
+pub(super) struct Made;
+
+impl Making {
+    /// A projection is named; whoever makes it says so when it is there, and drops this where it never will be.
+    pub(super) fn begin(&mut self, projection: ProjectionId) -> oneshot::Sender<Made> {
+        let (made, is_made) = oneshot::channel();
+        self.0.insert(projection, is_made);
+        made
+    }
+
+    /// It is to be given back: at once, or when this says that it is there. An error of that: it never will be.
+    pub(super) fn end(&mut self, projection: ProjectionId) -> Option<oneshot::Receiver<Made>> {
+        let mut making = self.0.remove(&projection)?;
+        matches!(making.try_recv(), Err(TryRecvError::Empty)).then_some(making)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ids_are_asked_for_when_few_are_left_and_used_while_the_pool_keeps_up() {
+        let (promises, now) = (Promises::default(), Instant::now());
+        assert_eq!((promises.take(0, now), promises.wanted(now)), (None, 32));
+        promises.add((1..=32).map(ProjectionId).collect(), now);
+        assert_eq!((promises.wanted(now), promises.take(FEW_BEHIND + 1, now)), (0, None));
+        let taken: Vec<_> = (1..=16).filter_map(|_| promises.take(0, now)).collect();
+        assert_eq!(taken[15], ProjectionId(16));
+        assert_eq!(promises.wanted(now), 16);
+        promises.add((33..=200).map(ProjectionId).collect(), now);
+        assert_eq!(promises.take(0, now), Some(ProjectionId(137)), "not more than twice as many");
+        assert_eq!((promises.wanted(now + FRESH), promises.take(0, now + FRESH)), (32, None), "they are too old");
+        promises.add(vec![ProjectionId(300)], now);
+        promises.forget();
+        assert_eq!(promises.take(0, now), None);
+    }
+
+    #[test]
+    fn what_is_not_there_yet_is_given_back_when_it_is() {
+        let mut making = Making::default();
+        let [made, never] = [ProjectionId(1), ProjectionId(2)].map(|id| making.begin(id));
+        let mut first = making.end(ProjectionId(1)).expect("it is not there yet");
+        assert!(made.send(Made).is_ok());
+        assert!(first.try_recv().is_ok());
+        let mut second = making.end(ProjectionId(2)).expect("it is not there yet");
+        drop(never);
+        assert!(second.try_recv().is_err());
+        assert!(making.end(ProjectionId(3)).is_none(), "one that was there before it was named");
+        let made = making.begin(ProjectionId(4));
+        assert!(made.send(Made).is_ok());
+        assert!(making.end(ProjectionId(4)).is_none(), "it is there by now");
+    }
+}
