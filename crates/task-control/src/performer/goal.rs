@@ -19,7 +19,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 use tokio::sync::mpsc::error::TrySendError;
-use tokio_util::sync::{CancellationToken, DropGuard};
+use tokio_util::sync::CancellationToken;
 
 /// A provider that was told to stop and does not is left alone after this long.
 const CANCEL_DEADLINE: Duration = Duration::from_secs(2);
@@ -84,8 +84,6 @@ pub(super) struct Performing {
     pub(super) attempt: u32,
     /// It is given when these goals have ended, which were told to stop: each is cancelled then.
     pub(super) before: Vec<CancellationToken>,
-    /// Says that it has ended.
-    pub(super) over: DropGuard,
     pub(super) endpoint: Result<Endpoint, String>,
     /// The provider's id: what measures, where it names nothing itself.
     pub(super) source: String,
@@ -361,6 +359,7 @@ mod tests {
     use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
     use ratn_worker::server::{Services, bind};
     use ratn_worker::tls::ClientTls;
+    use tokio_util::sync::DropGuard;
 
     /// `work`: is done at once. `hang`: never, unless it is told to stop. `better`: with results before that, not each of which is better.
     struct Named(&'static str);
@@ -423,7 +422,6 @@ mod tests {
                 instance: InstanceId(1),
                 attempt: 1,
                 before: Vec::new(),
-                over: CancellationToken::new().drop_guard(),
                 endpoint: Ok(self.endpoint.clone()),
                 source: "worker-1".to_owned(),
                 timeout_s,

@@ -592,7 +592,6 @@ impl Performer {
             instance,
             attempt,
             before,
-            over: over.clone().drop_guard(),
             endpoint,
             source,
             timeout_s: goal.timeout_s,
@@ -619,7 +618,12 @@ impl Performer {
                 improves: goal.improves.map(Vec::from),
             },
         };
-        let ended = tokio::spawn(trace::within(self.of(instance), performing.perform(given)));
+        let ends = over.clone().drop_guard();
+        let performing = async move {
+            performing.perform(given).await;
+            drop(ends);
+        };
+        let ended = tokio::spawn(trace::within(self.of(instance), performing));
         self.jobs.insert(instance, Job { attempt, lease, resource, stop, ended, over });
     }
 
