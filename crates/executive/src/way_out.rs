@@ -37,6 +37,17 @@ pub(crate) struct WayOut {
     pub(crate) hold: Hold,
 }
 
+/// A state that is entered and not left: its path, and how often what it does when it is cut short was begun.
+pub(crate) type Place = (StateId, String, u32);
+
+/// What the thread of control of a routine is in, the innermost first, and what is seen there.
+#[derive(Default)]
+pub(crate) struct Within {
+    pub(crate) places: Vec<Place>,
+    pub(crate) variables: Vec<(String, Value)>,
+    pub(crate) outputs: BTreeMap<StateId, Outputs>,
+}
+
 /// What is seen from where a thread of control was.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Scope {
@@ -56,12 +67,11 @@ struct Step {
 }
 
 impl WayOut {
-    /// The states in which a thread of control is, the innermost first: each with its path, and how often what it does when it is cut short was
-    /// begun.
+    /// The states in which a thread of control is, the innermost first.
     pub(crate) fn add(
         &mut self,
         program: &Program,
-        entered: impl Iterator<Item = (StateId, String, u32)>,
+        entered: impl Iterator<Item = Place>,
         variables: impl FnOnce() -> Vec<(String, Value)>,
         outputs: impl FnOnce() -> BTreeMap<StateId, Outputs>,
     ) {
@@ -106,6 +116,8 @@ pub(crate) struct Leaving {
     /// What is being done, and in which scope.
     current: Option<(usize, Box<Interpreter>)>,
     until: Timestamp,
+    /// The user has asked for the end: when he does so again, it comes at once.
+    is_asked: bool,
 }
 
 impl Leaving {
@@ -114,7 +126,8 @@ impl Leaving {
         let WayOut { scopes, mut steps, hold } = std::mem::take(&mut end.way_out);
         steps.sort_by_key(|step| (step.depth, std::cmp::Reverse(step.state)));
         let until = context.now + Duration::from_secs(LIMIT_S);
-        let mut leaving = Leaving { end, steps, scopes, hold, current: None, until };
+        let is_asked = end.outcome == PREEMPTED;
+        let mut leaving = Leaving { end, steps, scopes, hold, current: None, until, is_asked };
         match leaving.go_on(context) {
             Some(end) => Err(Box::new(end)),
             None => {
@@ -127,6 +140,8 @@ impl Leaving {
     /// Takes an event; the end of the run, when this was it.
     pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Option<End> {
         match event {
+            // The run is over its deadline, and the user asks for the first time.
+            Event::AbortRequested { at_once: false, .. } if !self.is_asked => self.is_asked = true,
             Event::AbortRequested { reason, .. } => return self.cut_short(context, &reason),
             Event::RetirementFailed { reason, .. } => {
                 ABORTED.clone_into(&mut self.end.outcome);

@@ -1,12 +1,14 @@
 //! One run of one task in virtual time: the same loop as the real task control's (receive, handle, perform), with the cores
 //! called directly.
 
+mod busy;
 mod circumstances;
 mod resume;
 
 pub use circumstances::{Circumstances, MAX_EVENTS, Mischief, Trigger};
 
 use crate::dice::Dice;
+use busy::Busy;
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::{Lookout, Memory, Problem, Search};
 use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Mode};
@@ -195,6 +197,7 @@ struct Simulation<'a> {
     grants: BTreeMap<InstanceId, u32>,
     circumstances: Circumstances,
     paths: BTreeMap<InstanceId, String>,
+    busy: Busy,
     agenda: BTreeMap<(Timestamp, u64), Entry>,
     next_entry: u64,
     latency: Duration,
@@ -270,6 +273,7 @@ pub fn run_while(
         grants: BTreeMap::new(),
         circumstances,
         paths: BTreeMap::new(),
+        busy: Busy::new(setup.program.clone()),
         agenda: BTreeMap::new(),
         next_entry: 0,
         latency: setup.latency,
@@ -442,6 +446,9 @@ impl Simulation<'_> {
         if let Event::Projected { projection, .. } = &event {
             self.told.insert(*projection);
         }
+        if let Event::Finished { instance, attempt, .. } | Event::Crashed { instance, attempt, .. } = &event {
+            self.busy.end(*instance, *attempt);
+        }
         if let Event::Finished { instance, .. } | Event::Crashed { instance, .. } = &event
             && let Some(path) = self.paths.get(instance).cloned()
         {
@@ -495,7 +502,8 @@ impl Simulation<'_> {
             return Err(self.broken("a command after the end"));
         }
         match command {
-            Command::Note(ratn_executive::protocol::Note::Expanded { instance, path, .. }) => {
+            Command::Note(ratn_executive::protocol::Note::Expanded { instance, state, path, .. }) => {
+                self.busy.expanded(instance, state);
                 self.paths.insert(instance, path);
             }
             Command::Note(ratn_executive::protocol::Note::Awaiting { instance, .. }) => {
@@ -547,8 +555,16 @@ impl Simulation<'_> {
                 let late = self.late();
                 self.send(late, "projected", instance, attempt, Event::Projected { instance, attempt, projection });
             }
-            Command::Start { instance, attempt, goal } => self.start(instance, attempt, &goal),
+            Command::Start { instance, attempt, goal } => {
+                self.busy.begin(&self.pool, instance, attempt, &goal).map_err(|(unit, other)| {
+                    let path = |id: &InstanceId| self.paths.get(id).cloned().unwrap_or_default();
+                    let (given, performs) = (path(&instance), path(&other));
+                    self.broken(format!("{unit} is given {given} and performs {performs}: one goal at a time"))
+                })?;
+                self.start(instance, attempt, &goal);
+            }
             Command::Cancel { instance, attempt } => {
+                self.busy.end(instance, attempt);
                 let path = self.paths.get(&instance).map_or("", String::as_str);
                 let crosses = self.circumstances.mischief.crosses(path, attempt);
                 let cancelled: Vec<_> =

@@ -2,14 +2,19 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
+use ratn_executive::executive::Executive;
 use ratn_executive::protocol::{Command, Event, Goal, LogEntry, Mode, Note};
 use ratn_model::catalogue::Catalogue;
+use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
 use ratn_model::load::{Files, load_with};
+use ratn_model::program::Program;
+use ratn_model::resource::{Lease, LeasedResource};
+use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use ratn_simulation::run::{Answer, Better, Oracle, Performance, Run, Setup, run};
 use ratn_world::world::World;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -77,10 +82,14 @@ impl Oracle for Cell {
     }
 }
 
-fn simulated(states: &str, brains: u32, mode: Mode, motion_s: &[(&'static str, f64)]) -> Run {
+fn loaded(states: &str, brains: u32) -> (Program, Catalogue) {
     let catalogue = Catalogue::from_toml(&CATALOGUE.replace("BRAINS", &brains.to_string())).unwrap();
     let loaded = load_with(&format!("task: t\nstates:\n{states}"), "task.yaml", &catalogue, &NoFiles);
-    let program = loaded.unwrap_or_else(|problems| panic!("{problems:?}")).program;
+    (loaded.unwrap_or_else(|problems| panic!("{problems:?}")).program, catalogue)
+}
+
+fn simulated(states: &str, brains: u32, mode: Mode, motion_s: &[(&'static str, f64)]) -> Run {
+    let (program, catalogue) = loaded(states, brains);
     let setup = Setup {
         parameters: program.bind_parameters(&[]).unwrap(),
         program: Arc::new(program),
@@ -214,4 +223,70 @@ fn what_gets_better_is_stopped_at_the_end_of_the_run() {
     assert_eq!(cancelled_at(&run, "plan"), Some(9.5));
     let improved = run.log.iter().filter(|line| matches!(line.entry, LogEntry::Event(Event::Improved { .. })));
     assert_eq!(improved.count(), 9);
+}
+
+#[test]
+fn a_routine_that_asks_anew_comes_before_who_only_improves() {
+    let states = "
+  - wait: { action: arm/wait, pia: true }
+  - plan: { action: brain/plan }
+  - r: { routine: true, states: [ a: { action: brain/plan } ] }
+  - follow: { action: arm/follow, pia: true, in: { path: plan.path } }
+";
+    let (program, catalogue) = loaded(states, 2);
+    let mut executive = Executive::new(Arc::new(program), Tolerance::EXACT);
+    let started = Event::Started {
+        task: "t".to_owned(),
+        digest: String::new(),
+        mode: Mode::Cdtn,
+        parameters: BTreeMap::new(),
+        seed: 7,
+        world: Vec::new(),
+        revision: Revision(0),
+        capacity: catalogue.resources.iter().map(|(kind, offer)| (kind.clone(), offer.count)).collect(),
+        learned: Default::default(),
+        breakpoints: Box::default(),
+        origin: Box::default(),
+    };
+    let mut paths: BTreeMap<InstanceId, String> = BTreeMap::new();
+    let (mut events, mut leases, mut now) = (VecDeque::from([started]), 0, Timestamp(0));
+    let (mut has_crashed, mut has_waited, mut stopped) = (false, false, Vec::new());
+    while let Some(event) = events.pop_front() {
+        for command in executive.handle(now, event) {
+            match command {
+                Command::Note(Note::Expanded { instance, path, .. }) => drop(paths.insert(instance, path)),
+                // The worker that died is not replaced, and somebody else has the other one.
+                Command::Acquire { .. } if has_crashed => {}
+                Command::Acquire { instance, requirements, .. } => {
+                    leases += 1;
+                    let resource = |kind: String| LeasedResource {
+                        id: format!("{kind}-{leases}"),
+                        kind,
+                        endpoint: String::new(),
+                        superclasses: Vec::new(),
+                    };
+                    let resources = requirements.into_iter().map(|wanted| resource(wanted.kind)).collect();
+                    let lease = Lease { id: LeaseId(leases), token: FencingToken(leases), resources };
+                    events.push_back(Event::Granted { instance, lease });
+                }
+                Command::Start { instance, attempt, goal } if goal.improves.is_some() => {
+                    let outputs = ["path", "end"].map(|port| (port.to_owned(), Value::Int(1))).into();
+                    events.push_front(Event::Improved { instance, attempt, outputs, cost_s: 1.0 });
+                }
+                Command::Start { instance, attempt, .. } if paths[&instance] == "r/a" => {
+                    has_crashed = true;
+                    events.push_back(Event::Crashed { instance, attempt, reason: "its worker died".to_owned() });
+                }
+                Command::Cancel { instance, .. } => stopped.push(paths[&instance].clone()),
+                _ => {}
+            }
+        }
+        if events.is_empty() && !has_waited {
+            assert!(has_crashed && stopped.is_empty(), "{stopped:?}");
+            has_waited = true;
+            now = now + Duration::from_secs(1);
+            events.push_back(Event::Woken);
+        }
+    }
+    assert_eq!(stopped, ["plan"]);
 }

@@ -77,7 +77,7 @@ impl Interpreter {
         let (attempt, id, phase) = (current.attempt, current.state, current.phase);
         match phase {
             Phase::Held | Phase::Projecting | Phase::Running | Phase::Acquiring => {}
-            Phase::Backoff(_) | Phase::Stalled => return,
+            Phase::Backoff(_) | Phase::Stalled | Phase::Queued(_) => return,
         }
         let given = current.take_held();
         current.attempt += 1;

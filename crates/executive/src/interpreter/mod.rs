@@ -8,7 +8,7 @@
 //! A thread of control has a stack of frames (the lists it is in) and does one thing at a time: [`walk`] says what is next,
 //! [`node`] lives the life of one action, [`again`] tries it anew, [`exit`] does what composite states do at their ends,
 //! [`waits`] lives that of one that waits,
-//! [`routine`] holds what a routine needs from its entry to its end, [`regions`] forks and joins, [`stop`] ends what is under way.
+//! [`routine`] holds what a routine needs from its entry to its end, [`turns`] lets its threads share that, [`regions`] forks and joins, [`stop`] ends what is under way.
 
 mod again;
 mod checkpoint;
@@ -17,6 +17,7 @@ mod node;
 mod regions;
 mod routine;
 mod stop;
+mod turns;
 mod waits;
 mod walk;
 
@@ -97,6 +98,8 @@ struct Frame {
     iteration: Option<(usize, Option<Vec<Value>>)>,
     /// How many variables there were before the owner was entered.
     variables: usize,
+    /// Why the last state of it that failed did so.
+    because: String,
 }
 
 /// What a thread does next.
@@ -165,6 +168,8 @@ enum Phase {
     Acquiring,
     Projecting,
     Running,
+    /// Another thread of its routine works with what it needs; lower numbers first.
+    Queued(u64),
 }
 
 /// An action under way, or a routine that waits for what it needs.
@@ -195,6 +200,7 @@ pub(crate) struct Interpreter {
     regions: BTreeMap<StateId, String>,
     routines: BTreeMap<u64, Routine>,
     last_routine: u64,
+    last_turn: u64,
     target: Target,
     hold: Hold,
     /// Whether the world has changed since what it may end was looked at.
@@ -248,6 +254,7 @@ impl Interpreter {
             regions: BTreeMap::new(),
             routines: routine.map(|routine| (MAIN, routine)).into_iter().collect(),
             last_routine: MAIN,
+            last_turn: 0,
             target,
             hold: Hold::default(),
             has_changed: false,
@@ -258,6 +265,11 @@ impl Interpreter {
     /// What the window's routine holds now.
     pub(crate) fn lease(&self) -> Option<&Lease> {
         self.routines.get(&MAIN)?.lease.as_ref()
+    }
+
+    /// Whether the window's routine asks for all that it needs anew.
+    pub(crate) fn asks(&self) -> bool {
+        self.threads.values().flat_map(|thread| &thread.current).any(|current| current.phase == Phase::Acquiring)
     }
 
     /// Begins with `state`, visited at `path`.

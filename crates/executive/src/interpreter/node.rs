@@ -169,6 +169,9 @@ impl Interpreter {
     }
 
     pub(super) fn project_or_run(&mut self, context: &mut Context<'_>, thread: u64) {
+        if self.waits_its_turn(context, thread) {
+            return;
+        }
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let analysis = context.plan.state(current.state);
         if !analysis.requirements.iter().any(|r| r.kind == WORLD_MODEL) {

@@ -24,6 +24,7 @@ impl Interpreter {
                 visits: Default::default(),
                 iteration: None,
                 variables: variables.len(),
+                because: String::new(),
             };
             let (frames, variables) = (vec![frame], variables.clone());
             let region = Thread { frames, variables, todo, current: None, routine, idle_visits: 0, cut_short: None };

@@ -8,7 +8,7 @@ use crate::binding::Outputs;
 use crate::context::Context;
 use crate::hold::Hold;
 use crate::protocol::{Command, Note};
-use crate::way_out::WayOut;
+use crate::way_out::{Place, WayOut, Within};
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Finally, PREEMPTED, Program, StateKind};
 use ratn_model::value::Value;
@@ -169,27 +169,28 @@ impl Interpreter {
 
     /// What is still to be done where everything that is under way in the actual world is cut short.
     pub(crate) fn way_out(&self, program: &Program, way: &mut WayOut) {
-        if !matches!(self.target, Target::Actual) {
-            return;
-        }
-        for thread in self.threads.values() {
-            let is_region = |frame: &&Frame| matches!(program.state(frame.owner).kind, StateKind::Concurrency { .. });
-            // The outermost frame of a region is that of the concurrency, which the thread around is in.
-            let own = usize::from(thread.frames.first().is_some_and(|frame| is_region(&frame)));
-            let joins = match &thread.todo {
-                Todo::Join { state, path, .. } => Some((*state, path.clone(), 0)),
-                _ => None,
-            };
-            let entered = |frame: &Frame| {
-                let last = finally(program, frame).and_then(|finally| finally.lastly.get(PREEMPTED));
-                let visits = last.and_then(|last| frame.visits.get(last)).copied().unwrap_or(0);
-                (frame.owner, frame.path.clone(), visits)
-            };
-            let places = joins.into_iter().chain(thread.frames[own..].iter().rev().map(entered));
-            let variables = || thread.variables.iter().map(|(name, value)| (name.clone(), (**value).clone())).collect();
-            way.add(program, places, variables, || self.outputs.clone());
+        if let Some(Within { places, variables, outputs }) = self.way_out_within(program, way) {
+            way.add(program, places.into_iter(), || variables, || outputs);
         }
         way.hold = self.hold.clone();
+    }
+
+    /// The same, but for the thread of the state itself: what that is in is returned. Of a routine of the window, what is around it is of the same
+    /// thread of control. `None` where nothing is real.
+    pub(crate) fn way_out_within(&self, program: &Program, way: &mut WayOut) -> Option<Within> {
+        if !matches!(self.target, Target::Actual) {
+            return None;
+        }
+        let within = |thread: &Thread| Within {
+            places: places(program, thread),
+            variables: thread.variables.iter().map(|(name, value)| (name.clone(), (**value).clone())).collect(),
+            outputs: self.outputs.clone(),
+        };
+        for (_, region) in self.threads.iter().filter(|(id, _)| **id != MAIN) {
+            let Within { places, variables, outputs } = within(region);
+            way.add(program, places.into_iter(), || variables, || outputs);
+        }
+        self.threads.get(&MAIN).map(within)
     }
 
     /// Does what is to be done on the way out of a run that has been told to end, in the scope of where it was.
@@ -214,7 +215,7 @@ impl Interpreter {
         let has_begun = current.phase == Phase::Running && !context.program.state(current.state).is_pause();
         let mut result = Ok(());
         match current.phase {
-            Phase::Held | Phase::Stalled | Phase::Backoff(_) => {}
+            Phase::Held | Phase::Stalled | Phase::Backoff(_) | Phase::Queued(_) => {}
             Phase::Running if !has_begun => {}
             Phase::Acquiring => context.commands.push(Command::Withdraw { instance: current.instance }),
             Phase::Projecting | Phase::Running => {
@@ -228,6 +229,23 @@ impl Interpreter {
         context.note(Note::Squashed { instance: current.instance });
         result
     }
+}
+
+/// The states that a thread has entered and not left, the innermost first.
+fn places(program: &Program, thread: &Thread) -> Vec<Place> {
+    let is_region = |frame: &Frame| matches!(program.state(frame.owner).kind, StateKind::Concurrency { .. });
+    // The outermost frame of a region is that of the concurrency, which the thread around is in.
+    let own = usize::from(thread.frames.first().is_some_and(is_region));
+    let joins = match &thread.todo {
+        Todo::Join { state, path, .. } => Some((*state, path.clone(), 0)),
+        _ => None,
+    };
+    let entered = |frame: &Frame| {
+        let last = finally(program, frame).and_then(|finally| finally.lastly.get(PREEMPTED));
+        let visits = last.and_then(|last| frame.visits.get(last)).copied().unwrap_or(0);
+        (frame.owner, frame.path.clone(), visits)
+    };
+    joins.into_iter().chain(thread.frames[own..].iter().rev().map(entered)).collect()
 }
 
 /// What is to be done on every way out of the state that a list belongs to.

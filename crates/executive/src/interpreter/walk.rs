@@ -5,7 +5,7 @@ use crate::binding::{self, child_path};
 use crate::context::{Context, MAX_IDLE_VISITS, in_circles};
 use crate::protocol::Note;
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{ABORTED, Program, SUCCESS, StateKind, Target};
+use ratn_model::program::{ABORTED, Program, SUCCESS, StateKind, Target, is_failure};
 use ratn_model::value::Value;
 use std::sync::Arc;
 
@@ -24,6 +24,7 @@ impl Interpreter {
             };
             let id = match (self.first(follows), self.first(|_, todo| matches!(todo, Todo::Enter(..)))) {
                 (Some(id), _) => id,
+                (None, None) if self.take_turns(context) => continue,
                 (None, None) => return Progress::Busy,
                 (None, Some(_)) if std::mem::take(&mut self.has_changed) && self.look_at_waits(context) => {
                     self.has_changed = true;
@@ -209,7 +210,8 @@ impl Interpreter {
         variables: usize,
         iteration: Option<(usize, Option<Vec<Value>>)>,
     ) {
-        let frame = Frame { owner, list, path, visits: Default::default(), iteration, variables };
+        let frame =
+            Frame { owner, list, path, visits: Default::default(), iteration, variables, because: String::new() };
         if let Some(thread) = self.threads.get_mut(&thread) {
             thread.frames.push(frame);
         }
@@ -238,6 +240,7 @@ impl Interpreter {
         let Some(thread) = self.threads.get_mut(&id) else { return };
         let Some(frame) = thread.frames.last_mut() else { return };
         frame.visits.clear();
+        frame.because.clear();
         thread.variables.truncate(frame.variables);
         let (owner, path) = (frame.owner, frame.path.clone());
         let Some((index, elements)) = &mut frame.iteration else { return };
@@ -311,22 +314,41 @@ impl Interpreter {
         let Some(frame) = self.threads.get(&id).and_then(|thread| thread.frames.last()) else {
             return self.set(id, Todo::Done { outcome, reason });
         };
-        if matches!(context.program.state(frame.owner).kind, StateKind::Concurrency { .. }) {
+        let (owner, list) = (context.program.state(frame.owner), frame.list);
+        if matches!(owner.kind, StateKind::Concurrency { .. }) {
             // A region ends as its state does.
             return self.set(id, Todo::Done { outcome, reason });
+        }
+        if is_failure(&outcome)
+            && !reason.is_empty()
+            && let Some(frame) = self.threads.get_mut(&id).and_then(|thread| thread.frames.last_mut())
+        {
+            frame.because.clone_from(&reason);
         }
         match context.program.target(state, &outcome) {
             Target::State(next) => self.set(id, Todo::Enter(next, None)),
             Target::Outcome(by) => {
-                let owner = context.program.state(frame.owner);
                 let is_loop = matches!(owner.kind, StateKind::ForEach { .. } | StateKind::While { .. });
-                debug_assert!(owner.lists().get(frame.list).is_some_and(|list| list.contains(&state)));
+                debug_assert!(owner.lists().get(list).is_some_and(|list| list.contains(&state)));
                 if is_loop && by == SUCCESS {
                     self.set(id, Todo::Iterate);
                 } else {
+                    let reason = self.because(id, &by, reason);
                     self.leave_list(context, id, by, reason);
                 }
             }
+        }
+    }
+
+    /// Why a list ends as it does. What comes behind a failure, and ends well, has no reason of its own to tell.
+    fn because(&self, id: u64, outcome: &str, reason: String) -> String {
+        if outcome == SUCCESS {
+            return String::new();
+        }
+        let frame = self.threads.get(&id).and_then(|thread| thread.frames.last());
+        match frame.filter(|_| is_failure(outcome) && reason.is_empty()) {
+            Some(frame) => frame.because.clone(),
+            None => reason,
         }
     }
 

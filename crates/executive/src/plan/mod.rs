@@ -89,6 +89,8 @@ pub(crate) struct StatePlan {
     /// What it acquires when it starts: blocks (its own and those of the hierarchies around it and of what it contains, merged by
     /// maximum), consumes and exists.
     pub(crate) requirements: Vec<ResourceExpr>,
+    /// The kinds of what an action works with: of each, one goal has a unit at a time.
+    pub(crate) works_with: Vec<String>,
     /// What it does to resources when it ends with success.
     pub(crate) operations: Vec<ResourceExpr>,
     /// Whether something is used up when it gets what it acquires: that is not given back.
@@ -202,15 +204,26 @@ impl StatePlan {
         let resources = resources::of(subject, operated, names);
         writes.extend(&resources.operated);
         writes.extend(waits.then_some(WAITS));
-        let exits = if subject.is_node { 0 } else { outcomes::exits(state, &ends, &resources.operations) };
-        let around = state.parent.map(|parent| &program.state(parent).kind);
+        // What is done on the way out of a state is done when all inside has ended, and the state is left when that is done.
+        let around = state.parent.map(|parent| program.state(parent));
+        let lastly = around.and_then(|around| around.annotations.finally.as_ref());
+        let is_before_finally = lastly.is_some_and(|finally| finally.body == state.id);
+        let exits = match subject.is_node {
+            true => 0,
+            false if is_before_finally || state.annotations.finally.is_some() => outcomes::every(&ends),
+            false => outcomes::exits(state, &ends, &resources.operations),
+        };
+        let around = around.map(|around| &around.kind);
         let exceptions = state.annotations.exceptions.unwrap_or(program.exceptions);
         StatePlan {
             nature,
             is_node: subject.is_node,
             is_routine: subject.is_routine(),
             is_region: matches!(around, Some(StateKind::Concurrency { .. })),
-            imprecise: nature == NodeNature::Irreversible && exceptions == Exceptions::Imprecise && !is_watched,
+            imprecise: nature == NodeNature::Irreversible
+                && exceptions == Exceptions::Imprecise
+                && !is_watched
+                && !is_before_finally,
             waits,
             is_watched,
             action: match &state.kind {
@@ -237,6 +250,7 @@ impl StatePlan {
             awaited,
             writes: writes.into_iter().collect(),
             requirements: resources.requirements,
+            works_with: resources.works_with,
             operations: resources.operations,
             start_flows: flows::start_flows(subject),
             flows: flows::flows(subject),

@@ -177,6 +177,12 @@ fn predicates(effects: &Effects, names: &mut Names) -> BTreeSet<Predicate> {
     }
 }
 
+/// All outcomes of a state.
+pub(super) fn every(ends: &Ends) -> Outcomes {
+    let known = ends.names.iter().take(MAX_OUTCOMES).enumerate();
+    known.fold(0, |all, (number, _)| all | 1 << number)
+}
+
 /// The outcomes with which the exit of a composite state has something to do.
 pub(super) fn exits(state: &State, ends: &Ends, operations: &[ResourceExpr]) -> Outcomes {
     let has_outputs = match &state.kind {

@@ -1,13 +1,14 @@
 //! Resources of a state: what it acquires when it starts, and what it creates, deletes or consumes when it ends.
 
 use super::{Names, Predicate, Subject, is_action};
-use ratn_model::program::{Program, ResourceExpr, State};
+use ratn_model::program::{Program, ResourceExpr, State, WORLD_MODEL};
 use ratn_model::resource::{Quantity, ResourceClass, ResourceOperation};
 use std::collections::BTreeSet;
 
 /// The resources of one state; its fields are those of [`super::StatePlan`].
 pub(super) struct Resources {
     pub(super) requirements: Vec<ResourceExpr>,
+    pub(super) works_with: Vec<String>,
     pub(super) operations: Vec<ResourceExpr>,
     pub(super) kinds: Vec<Predicate>,
     pub(super) operated: Vec<Predicate>,
@@ -28,7 +29,22 @@ pub(super) fn of(subject: &Subject<'_>, operated_anywhere: &BTreeSet<&str>, name
     let used = requirements.iter().filter(of_the_task).map(|r| r.kind.as_str());
     let numbers: Vec<Predicate> = operated.iter().map(|kind| names.of_kind(kind)).collect();
     let kinds: BTreeSet<Predicate> = used.map(|kind| names.of_kind(kind)).chain(numbers.iter().copied()).collect();
-    Resources { kinds: kinds.into_iter().collect(), operated: numbers, requirements, operations }
+    let works_with = works_with(subject);
+    Resources { kinds: kinds.into_iter().collect(), operated: numbers, requirements, works_with, operations }
+}
+
+/// What an action blocks itself, else what the innermost state around it blocks that blocks anything. Many look at a world model at once.
+fn works_with(subject: &Subject<'_>) -> Vec<String> {
+    if !is_action(subject.state) || subject.state.is_pause() {
+        return Vec::new();
+    }
+    let blocks = |state: &State| {
+        let lines = state.annotations.resources.iter();
+        let blocked = lines.filter(|line| line.operation == ResourceOperation::Block && line.kind != WORLD_MODEL);
+        blocked.filter(|line| line.count.is_whole()).map(|line| line.kind.clone()).collect::<Vec<_>>()
+    };
+    let states = std::iter::once(subject.state).chain(subject.around.iter().copied());
+    states.map(blocks).find(|blocked| !blocked.is_empty()).unwrap_or_default()
 }
 
 /// The kinds of resources that a state, without what it contains, changes rather than holds.

@@ -5,11 +5,14 @@ use super::graph::Pruned;
 use super::graph::instance::{Role, Status};
 use super::growth::environment::{Binding, Environment, assigned};
 use super::memory::Sight;
+use crate::binding::Outputs;
 use crate::context::Context;
 use crate::protocol::Note;
-use crate::way_out::WayOut;
+use crate::way_out::{WayOut, Within};
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::PREEMPTED;
+use ratn_model::value::Value;
+use std::borrow::Cow;
 use std::collections::BTreeSet;
 
 impl Window {
@@ -102,32 +105,32 @@ impl Window {
         let mut forks = BTreeSet::new();
         let sight = self.sight(context);
         for head in self.graph.active_heads() {
-            if let Some(interpreter) = self.status_of_routine(head.id) {
-                interpreter.way_out(context.program, &mut way);
-            }
+            let routine = self.status_of_routine(head.id);
+            let within = routine.and_then(|routine| routine.way_out_within(context.program, &mut way));
             // A join and an exit stand behind what the state contains, and the state is not left yet.
             let is_in = matches!(head.role(), Some(Role::Join | Role::Exit));
             let path = |environment: &Environment| {
                 environment.path(&context.program.state(head.state).name, head.visit, head.iteration)
             };
             let own = is_in.then(|| (head.state, path(&head.environment)));
-            let mut next = self.add_way_out(context, sight, &head.environment, own, &mut way);
+            let mut next = self.add_way_out(context, sight, &head.environment, (own, within), &mut way);
             while let Some((fork, own)) = next {
                 let Some(around) = self.growth.around(fork).filter(|_| forks.insert(fork)) else { break };
-                next = self.add_way_out(context, sight, around, Some(own), &mut way);
+                next = self.add_way_out(context, sight, around, (Some(own), None), &mut way);
             }
         }
         way.hold = self.hold.clone();
         way
     }
 
-    /// Of one line, as far as the fork at which it begins: that, with the concurrency and its path.
+    /// Of one line, as far as the fork at which it begins: that, with the concurrency and its path. `own` is the state where the line stands, if
+    /// that is not left yet, `within` what a routine there is in.
     fn add_way_out(
         &self,
         context: &Context<'_>,
         sight: Sight<'_>,
         environment: &Environment,
-        own: Option<(StateId, String)>,
+        (own, within): (Option<(StateId, String)>, Option<Within>),
         way: &mut WayOut,
     ) -> Option<(InstanceId, (StateId, String))> {
         let program = context.program;
@@ -143,22 +146,61 @@ impl Window {
             inside = Some(owner);
             (owner, path, visits)
         });
+        let within = within.unwrap_or_default();
         let variables = || {
-            let scoped = environment.variables.iter().filter_map(|(name, binding)| {
-                let value = match binding {
-                    Binding::Known(value) => value.clone(),
-                    Binding::Assigned(producer) => sight.assigned_by(producer)?.get(&assigned(name))?.clone(),
-                };
-                Some((name.to_string(), value))
+            let names = environment.variables.iter().enumerate();
+            let scoped = names.filter_map(|(place, (name, _))| {
+                Some((name.to_string(), self.variable_now(sight, environment, place)?.into_owned()))
             });
             let looping = environment.loop_variables(program);
-            scoped.chain(looping.map(|(name, value)| (name.to_owned(), value.into_owned()))).collect()
+            let looping = looping.map(|(name, value)| (name.to_owned(), value.into_owned()));
+            // What the routine has assigned meanwhile hides what was assigned before it.
+            scoped.chain(looping).chain(within.variables).collect()
         };
         let outputs = || {
             let ids = program.states.iter().map(|state| state.id);
-            ids.filter_map(|id| Some((id, sight.outputs_of(environment.producer(id)?)?.clone()))).collect()
+            let before = ids.filter_map(|id| Some((id, self.outputs_now(sight, environment, id)?.clone())));
+            before.chain(within.outputs).collect()
         };
-        way.add(program, places, variables, outputs);
+        way.add(program, within.places.into_iter().chain(places), variables, outputs);
         fork
+    }
+
+    /// What a variable is now, by its place among those in sight. What is still under way (an imprecise motion) has assigned nothing yet.
+    fn variable_now<'a>(
+        &'a self,
+        sight: Sight<'a>,
+        environment: &'a Environment,
+        place: usize,
+    ) -> Option<Cow<'a, Value>> {
+        let mut environment = environment;
+        loop {
+            let (name, binding) = environment.variables.iter().nth(place)?;
+            let producer = match binding {
+                Binding::Known(value) => return Some(Cow::Borrowed(value)),
+                Binding::Assigned(producer) => producer,
+            };
+            if let Some(outputs) = sight.assigned_by(producer) {
+                return outputs.get(&assigned(name)).map(Cow::Borrowed);
+            }
+            environment = &self.graph.get(producer.instance)?.environment;
+        }
+    }
+
+    /// The outputs of a state now, likewise.
+    fn outputs_now<'a>(
+        &'a self,
+        sight: Sight<'a>,
+        environment: &'a Environment,
+        state: StateId,
+    ) -> Option<&'a Outputs> {
+        let mut environment = environment;
+        loop {
+            let producer = environment.producer(state)?;
+            if let Some(outputs) = sight.outputs_of(producer) {
+                return Some(outputs);
+            }
+            environment = &self.graph.get(producer.instance)?.environment;
+        }
     }
 }

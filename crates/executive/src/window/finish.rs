@@ -295,8 +295,13 @@ impl Window {
 
     pub(super) fn tell_routine(&mut self, context: &mut Context<'_>, id: InstanceId, event: Event) {
         let Some(interpreter) = self.graph.interpreter(id) else { return };
+        let has_asked = interpreter.asks();
         let progress = interpreter.handle(context, event);
+        let asks = interpreter.asks() && !has_asked;
         self.routine_progressed(context, id, progress);
+        if asks {
+            self.make_room(context, id);
+        }
     }
 
     pub(super) fn routine_progressed(&mut self, context: &mut Context<'_>, id: InstanceId, progress: Progress) {

@@ -10,7 +10,7 @@
 //! of an improvement, and what becomes of the world does not depend on when it is harvested.
 
 use super::Window;
-use super::graph::instance::{Ended, Node, Status};
+use super::graph::instance::{Ended, Status};
 use super::improving::Improvement;
 use super::waits::Timer;
 use crate::binding::{self, Outputs};
@@ -47,9 +47,7 @@ impl Window {
             return self.harvest(context, id);
         }
         // Some may have waited for what it holds since before it had a result.
-        let asks =
-            |id: &InstanceId| matches!(self.graph.node(*id), Some(Node { status: Status::Acquiring { .. }, .. }));
-        let asking: Vec<InstanceId> = self.dispatch.active().filter(asks).collect();
+        let asking: Vec<InstanceId> = self.dispatch.active().filter(|id| self.asks(*id)).collect();
         asking.into_iter().for_each(|id| self.make_room(context, id));
     }
 
@@ -135,10 +133,18 @@ impl Window {
 
     /// An instance has waited for resources for a while: whoever holds such only to improve a result gives way.
     pub(super) fn make_way_for(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        let asks = self.graph.node(id).is_some_and(|node| matches!(node.status, Status::Acquiring { .. }));
-        if asks {
+        if self.asks(id) {
             let holders: Vec<InstanceId> = self.holders_of_what(context, id).collect();
             holders.into_iter().for_each(|other| self.harvest(context, other));
+        }
+    }
+
+    /// Whether an instance waits for resources: also a routine that asks for them anew.
+    fn asks(&self, id: InstanceId) -> bool {
+        match self.graph.node(id).map(|node| &node.status) {
+            Some(Status::Acquiring { .. }) => true,
+            Some(Status::RunningRoutine(interpreter, _)) => interpreter.asks(),
+            _ => false,
         }
     }
 

@@ -83,6 +83,8 @@ pub(super) enum Given {
 pub(super) struct Performing {
     pub(super) instance: InstanceId,
     pub(super) attempt: u32,
+    /// It is given when these goals have ended, which were told to stop: each is cancelled then.
+    pub(super) before: Vec<CancellationToken>,
     pub(super) endpoint: Result<Endpoint, String>,
     /// The provider's id: what measures, where it names nothing itself.
     pub(super) source: String,
@@ -116,6 +118,12 @@ impl Performing {
             tokio::select! {
                 // Where it never will be the run ends.
                 is_safe = safe.safe() => if !is_safe { return },
+                () = self.stop.cancelled() => return,
+            }
+        }
+        for before in &self.before {
+            tokio::select! {
+                () = before.cancelled() => {}
                 () = self.stop.cancelled() => return,
             }
         }
@@ -423,6 +431,7 @@ mod tests {
             Performing {
                 instance: InstanceId(1),
                 attempt: 1,
+                before: Vec::new(),
                 endpoint: Ok(self.endpoint.clone()),
                 source: "worker-1".to_owned(),
                 timeout_s,

@@ -6,6 +6,7 @@ mod claim;
 mod goal;
 mod handover;
 mod resume;
+mod stopping;
 #[cfg(test)]
 mod tests;
 mod told;
@@ -46,6 +47,7 @@ use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
+use stopping::Stopping;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
@@ -174,6 +176,7 @@ pub(super) struct Performer {
     /// Of the commands that are performed now.
     handover: Option<Handover>,
     jobs: BTreeMap<InstanceId, Job>,
+    stopping: Stopping,
     giving_back: JoinSet<()>,
     acquires: u64,
     operations: u64,
@@ -187,8 +190,12 @@ struct Job {
     attempt: u32,
     /// What it works under; a routine's serves several jobs.
     lease: Option<LeaseId>,
+    /// The resource that performs it; empty without one.
+    resource: String,
     stop: CancellationToken,
     ended: JoinHandle<()>,
+    /// Is cancelled when it has ended.
+    over: CancellationToken,
 }
 
 impl Performer {
@@ -277,6 +284,7 @@ impl Performer {
             paths: BTreeMap::new(),
             handover: None,
             jobs: BTreeMap::new(),
+            stopping: Stopping::default(),
             giving_back: JoinSet::new(),
             acquires: 0,
             operations: 0,
@@ -369,7 +377,7 @@ impl Performer {
             }
             Command::Start { instance, attempt, goal } => self.start(instance, attempt, *goal, Given::Now, safe),
             Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
-                Some(job) if job.attempt == attempt => job.stop.cancel(),
+                Some(job) if job.attempt == attempt => self.stopping.stop(job),
                 _ => {
                     self.cancelled.lock().unwrap_or_else(PoisonError::into_inner).insert((instance, attempt));
                 }
@@ -547,7 +555,7 @@ impl Performer {
                     // If the world pool was started again, it has promised nothing.
                     self.promises.forget();
                     if let Some(job) = self.jobs.get(instance).filter(|job| job.attempt == *attempt) {
-                        job.stop.cancel();
+                        self.stopping.stop(job);
                     }
                 }
                 Some(event)
@@ -576,9 +584,11 @@ impl Performer {
             ),
             Err(reason) => (String::new(), Err(reason)),
         };
+        let (resource, before, over) = (source.clone(), self.stopping.before(&source), CancellationToken::new());
         let performing = Performing {
             instance,
             attempt,
+            before,
             endpoint,
             source,
             timeout_s: goal.timeout_s,
@@ -606,8 +616,13 @@ impl Performer {
                 improves: goal.improves.map(Vec::from),
             },
         };
-        let ended = tokio::spawn(trace::within(self.of(instance), performing.perform(given)));
-        self.jobs.insert(instance, Job { attempt, lease, stop, ended });
+        let ends = over.clone().drop_guard();
+        let performing = async move {
+            performing.perform(given).await;
+            drop(ends);
+        };
+        let ended = tokio::spawn(trace::within(self.of(instance), performing));
+        self.jobs.insert(instance, Job { attempt, lease, resource, stop, ended, over });
     }
 
     /// The outputs that a result of the goal's action has to have.

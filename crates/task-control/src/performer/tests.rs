@@ -7,13 +7,18 @@ use anyhow::Context;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
 use ratn_executive::protocol::Origin;
+use ratn_model::catalogue::Provider;
 use ratn_model::fact::{Change, Footprint};
+use ratn_model::id::FencingToken;
 use ratn_model::program::SUCCESS;
-use ratn_model::resource::ResourceClass;
+use ratn_model::resource::{Lease, ResourceClass};
 use ratn_model::time::Timestamp;
-use ratn_proto::types::Resource;
+use ratn_proto::types::{GoalOutcome, Resource};
+use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
 use ratn_worker::client::fresh_id;
+use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::server::{Services, bind};
 use ratn_worker::tls::ClientTls;
 use ratn_world::world::World;
 use tokio_util::sync::DropGuard;
@@ -713,5 +718,74 @@ async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() ->
     assert!(remembers(&place_of(&bench.endpoints), &short).await?);
     assert_eq!(bench.performer.take_up(short, &mirror).await?, None);
     assert_eq!(bench.performer.root().await?.0, Revision(2));
+    bench.performer.close().await
+}
+
+/// `hang` ends when it is told to stop, a while after that; `work` at once.
+struct Arm(&'static str);
+
+#[tonic::async_trait]
+impl Action for Arm {
+    fn name(&self) -> &str {
+        self.0
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        if self.0 == "hang" {
+            goal.cancelled.cancelled().await;
+            return Err(goal.stopped());
+        }
+        Ok(GoalOutcome::success())
+    }
+}
+
+#[tokio::test]
+async fn a_goal_waits_for_one_of_the_same_resource_that_was_told_to_stop() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let arm = ActionServer::builder("").one_at_a_time().action(Arm("hang")).action(Arm("work")).build();
+    let bound = bind(&Endpoint::Unix(bench._place.path().join("arm.sock"))).await?;
+    let endpoint = bound.endpoint().to_string();
+    tokio::spawn(bound.serve(Services::new().with(arm.clone().into_service()), CancellationToken::new()));
+    let provider = Provider { resource: "Arm".to_owned(), joints: None, chain: None, actions: BTreeMap::new() };
+    bench.performer.catalogue =
+        Arc::new(Catalogue { providers: BTreeMap::from([("arm".to_owned(), provider)]), ..Catalogue::default() });
+    let resource = LeasedResource { id: "arm".to_owned(), kind: "Arm".to_owned(), endpoint, superclasses: Vec::new() };
+    let lease = Lease { id: LeaseId(1), token: FencingToken(1), resources: vec![resource] };
+    let start = |instance: InstanceId, attempt: u32, action: &str| Command::Start {
+        instance,
+        attempt,
+        goal: Box::new(Goal {
+            provider: "arm".into(),
+            action: action.into(),
+            inputs: BTreeMap::new(),
+            seed: 0,
+            lease: Some(lease.clone()),
+            projection: None,
+            expected_s: None,
+            timeout_s: None,
+            improves: None,
+        }),
+    };
+    for round in 0..20 {
+        let (first, second, third) = (InstanceId(3 * round + 1), InstanceId(3 * round + 2), InstanceId(3 * round + 3));
+        bench.performer.perform(start(first, 1, "hang"))?;
+        while arm.running() == 0 {
+            tokio::task::yield_now().await;
+        }
+        // What a limit cuts short, and what is done on the way out of it, which is cut short in turn and tried again.
+        bench.performer.perform(Command::Cancel { instance: first, attempt: 1 })?;
+        bench.performer.perform(start(second, 1, "hang"))?;
+        bench.performer.perform(Command::Cancel { instance: second, attempt: 1 })?;
+        bench.performer.perform(start(second, 2, "work"))?;
+        let event = bench.event().await;
+        assert!(
+            matches!(&event, Some(Event::Finished { instance, attempt: 2, outcome, .. })
+                if *instance == second && outcome == SUCCESS),
+            "round {round}: {event:?}"
+        );
+        bench.performer.perform(start(third, 1, "work"))?;
+        let event = bench.event().await;
+        assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == SUCCESS), "{event:?}");
+    }
     bench.performer.close().await
 }

@@ -1,0 +1,58 @@
+//! Which units perform goals. A unit performs one goal at a time: where the executive gives it another one, a real provider refuses that as one
+//! too many, and the simulated run is broken.
+
+use ratn_executive::protocol::Goal;
+use ratn_model::id::{InstanceId, StateId};
+use ratn_model::program::{Program, WORLD_MODEL};
+use ratn_model::resource::{ResourceClass, ResourceOperation};
+use ratn_resources::Pool;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// The units that work, and for whom.
+pub(super) struct Busy {
+    program: Arc<Program>,
+    states: BTreeMap<InstanceId, StateId>,
+    goals: BTreeMap<String, (InstanceId, u32)>,
+}
+
+impl Busy {
+    pub(super) fn new(program: Arc<Program>) -> Busy {
+        Busy { program, states: BTreeMap::new(), goals: BTreeMap::new() }
+    }
+
+    pub(super) fn expanded(&mut self, instance: InstanceId, state: StateId) {
+        self.states.insert(instance, state);
+    }
+
+    /// A goal is given to the units that its state blocks; the other goal, where one of them performs that.
+    pub(super) fn begin(
+        &mut self,
+        pool: &Pool,
+        instance: InstanceId,
+        attempt: u32,
+        goal: &Goal,
+    ) -> Result<(), (String, InstanceId)> {
+        let (Some(state), Some(lease)) = (self.states.get(&instance), &goal.lease) else { return Ok(()) };
+        let blocks = self.program.state(*state).annotations.resources.iter();
+        let blocks = blocks.filter(|line| line.operation == ResourceOperation::Block && line.kind != WORLD_MODEL);
+        for unit in blocks.filter_map(|line| lease.resource(&line.kind)) {
+            // What several may hold at once performs no goals.
+            let is_shared = |id: &str| pool.get(id).is_some_and(|r| r.divisible || r.class == ResourceClass::World);
+            if is_shared(&unit.id) {
+                continue;
+            }
+            if let Some((other, _)) = self.goals.insert(unit.id.clone(), (instance, attempt))
+                && other != instance
+            {
+                return Err((unit.id.clone(), other));
+            }
+        }
+        Ok(())
+    }
+
+    /// A goal has ended, or was told to stop.
+    pub(super) fn end(&mut self, instance: InstanceId, attempt: u32) {
+        self.goals.retain(|_, goal| *goal != (instance, attempt));
+    }
+}
