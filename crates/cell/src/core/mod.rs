@@ -23,6 +23,7 @@ mod clearance;
 mod deviations;
 mod holding;
 mod motion;
+mod parting;
 mod passing;
 mod starting;
 mod trajectory;
