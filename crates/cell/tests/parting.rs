@@ -91,7 +91,8 @@ fn no_arm_leaves_what_its_fingers_let_go_before_they_have_parted_whatever_ended_
     refused_to_leave(&mut bench);
     let state = saved(&mut bench);
     // Nor does the base, nor an arm that was put back to there.
-    let point = |time_s: f64, x: f64| TrajectoryPoint { time_s, positions: vec![x, 0.0, 0.0], velocities: vec![0.0; 3] };
+    let point =
+        |time_s: f64, x: f64| TrajectoryPoint { time_s, positions: vec![x, 0.0, 0.0], velocities: vec![0.0; 3] };
     let joints = bench.cell.robot().base_joints().iter().map(|joint| joint.name.clone()).collect();
     let trajectory = Trajectory { joints, points: vec![point(0.0, 0.0), point(5.0, -0.1)] };
     let reason = refused(&mut bench, Request::Drive { trajectory });

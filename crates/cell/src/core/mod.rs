@@ -22,6 +22,7 @@ mod battery;
 mod clearance;
 mod deviations;
 mod holding;
+mod levers;
 mod motion;
 mod parting;
 mod passing;
