@@ -5,176 +5,32 @@
 
 use ratn_cell::config::CellConfig;
 use ratn_cell::core::cell::Cell;
-use ratn_cell::core::protocol::{Command, Ending, Event, Request};
+use ratn_cell::core::protocol::{Command, Ending, Event, Request, Ticket};
 use ratn_cell::core::snapshot::Snapshot;
 use ratn_model::pose::Pose;
+use ratn_model::value::TrajectoryPoint;
 use ratn_motion::joint_vector::JointVector;
-use std::path::Path;
+use ratn_motion::timing::{Section, parameterise};
+use std::f64::consts::FRAC_PI_2;
 use tempfile::TempDir;
 
 mod bench;
 #[allow(dead_code, reason = "not every test needs all of it")]
 mod duo;
+mod gantry;
 use bench::{Bench, grasp as close};
+use gantry::*;
 
-const LEFT: usize = 0;
-const RIGHT: usize = 1;
-/// Where the hands hang in the posture `home`: x, y and z as seen from the middle of the gantry.
-const HOMES: [[f64; 3]; 2] = [[0.0, 0.4, 0.0], [0.0, -0.4, 0.0]];
-/// How long the rod of a hand is, from the middle of the hand.
-const ROD_M: f64 = 0.30;
-/// How far the fingers are beyond the hand's middle, downwards.
-const FINGERS_BELOW_M: f64 = 0.06;
-
-/// A hand with a rod ahead of it, two fingers below it and a tool that points down.
-fn side(side: &str) -> String {
-    let slides = |name: &str, parent: &str, child: &str, axis: &str, limits: &str, mimic: &str| {
-        format!(
-            "<joint name='{side}_{name}' type='prismatic'><parent link='{parent}'/><child link='{side}_{child}'/><axis xyz='{axis}'/>\
-             <limit {limits} effort='1' velocity='0.5' acceleration='2'/>{mimic}</joint>"
-        )
-    };
-    let boxed = |at: &str, size: &str| {
-        format!("<collision><origin xyz='{at}'/><geometry><box size='{size}'/></geometry></collision>")
-    };
-    let far = "lower='-1' upper='1'";
-    let opens = "lower='0' upper='0.04'";
-    let mimic = format!("<mimic joint='{side}_finger' multiplier='1' offset='0'/>");
-    let middle = ROD_M / 2.0;
-    [
-        format!("<link name='{side}_1'/><link name='{side}_2'/><link name='{side}_tool'/>"),
-        format!("<link name='{side}_hand'>{}", boxed("0 0 0", "0.06 0.12 0.04")),
-        format!("{}</link>", boxed(&format!("{middle} 0 0"), &format!("{ROD_M} 0.01 0.01"))),
-        format!("<link name='{side}_finger_a'>{}</link>", boxed("0 0.005 -0.06", "0.02 0.01 0.08")),
-        format!("<link name='{side}_finger_b'>{}</link>", boxed("0 -0.005 -0.06", "0.02 0.01 0.08")),
-        slides("x", "torso", "1", "1 0 0", far, ""),
-        slides("y", &format!("{side}_1"), "2", "0 1 0", far, ""),
-        slides("z", &format!("{side}_2"), "hand", "0 0 1", far, ""),
-        slides("finger", &format!("{side}_hand"), "finger_a", "0 1 0", opens, ""),
-        slides("mimics", &format!("{side}_hand"), "finger_b", "0 -1 0", opens, &mimic),
-        format!(
-            "<joint name='{side}_mount' type='fixed'><parent link='{side}_hand'/><child link='{side}_tool'/>\
-             <origin xyz='0 0 -0.1' rpy='3.141592653589793 0 0'/></joint>"
-        ),
-    ]
-    .concat()
-}
-
-fn urdf() -> String {
-    format!(
-        "<robot name='gantry'><link name='world'/><link name='torso'/><link name='camera'/>\
-         <joint name='camera_mount' type='fixed'><parent link='world'/><child link='camera'/><origin xyz='0 0 3'/></joint>\
-         <joint name='torso' type='prismatic'><parent link='world'/><child link='torso'/><axis xyz='0 0 1'/>\
-         <limit lower='1.5' upper='1.6' effort='1' velocity='0.5' acceleration='2'/></joint>{}{}</robot>",
-        side("left"),
-        side("right")
-    )
-}
-
-fn srdf() -> String {
-    let pairs = ["left", "right"].map(|side| {
-        [("hand", "finger_a"), ("hand", "finger_b"), ("finger_a", "finger_b")]
-            .map(|(a, b)| format!("<disable_collisions link1='{side}_{a}' link2='{side}_{b}'/>"))
-            .concat()
-    });
-    format!("<robot name='gantry'>{}</robot>", pairs.concat())
-}
-
-fn description() -> String {
-    let arm = |side: &str| {
-        format!("name = \"{side}\"\njoints = [\"{side}_x\", \"{side}_y\", \"{side}_z\"]\ntool = \"{side}_tool\"\n")
-    };
-    let gripper =
-        |side: &str| format!("joint = \"{side}_finger\"\nhand = \"{side}_hand\"\nfinger = \"{side}_finger_a\"\n");
-    let [left, right] = HOMES;
-    format!(
-        "name = \"gantry\"\nurdf = \"gantry.urdf\"\nsrdf = \"gantry.srdf\"\n[arm]\n{}[gripper]\n{}[camera]\nlink = \"camera\"\n[postures]\n\
-         home = {left:?}\n[[other_arm]]\n{}[other_arm.gripper]\n{}[other_arm.postures]\nhome = {right:?}\n[workplace]\n\
-         table = {{ centre = [0, 0, 0.675], size = [0.80, 1.40, 0.05] }}\n\
-         boxes = {{ x = [-0.1, 0.1], y = [-0.1, 0.1], least = [0.05, 0.04, 0.07], greatest = [0.10, 0.05, 0.10] }}\n\
-         places = {{ on = \"table\", yaw = 0, at = [[0.2, 0.2, 0.70]] }}\n",
-        arm("left"),
-        gripper("left"),
-        arm("right"),
-        gripper("right")
-    )
-}
-
-fn config(folder: &Path, description: &str) -> CellConfig {
-    std::fs::write(folder.join("gantry.urdf"), urdf()).unwrap();
-    std::fs::write(folder.join("gantry.srdf"), srdf()).unwrap();
-    let file = folder.join("robot.toml");
-    std::fs::write(&file, description).unwrap();
-    CellConfig { robot: file.display().to_string(), boxes: 0, seed: 2, ..CellConfig::default() }
-}
-
-fn gantry() -> (Bench, TempDir) {
-    let folder = tempfile::tempdir().unwrap();
-    (Bench::of(config(folder.path(), &description())), folder)
-}
-
-/// The same gantries with a head between them in place of the camera above: a stick of 0.5 m at the height of the hands, which pan turns about
-/// x = 0.6, y = 0 from +x over +y. It hangs from the link `parent`.
-fn with_head(parent: &str) -> (Bench, TempDir) {
-    let head = format!(
-        "<link name='pan'/><link name='head'><collision><origin xyz='0.25 0 0'/><geometry><box size='0.5 0.02 0.02'/></geometry></collision></link>\
-         <link name='lens'/>\
-         <joint name='pan' type='revolute'><parent link='{parent}'/><child link='pan'/><origin xyz='0.6 0 {height}'/><axis xyz='0 0 1'/>\
-         <limit lower='0' upper='3' effort='1' velocity='0.5' acceleration='2'/></joint>\
-         <joint name='tilt' type='revolute'><parent link='pan'/><child link='head'/><axis xyz='0 1 0'/>\
-         <limit lower='-0.5' upper='0.5' effort='1' velocity='0.5' acceleration='2'/></joint>\
-         <joint name='lens' type='fixed'><parent link='head'/><child link='lens'/><origin rpy='-1.5707963 0 -1.5707963'/></joint></robot>",
-        height = if parent == "world" { 1.5 } else { 0.0 }
-    );
-    let folder = tempfile::tempdir().unwrap();
-    let description = description()
-        .replace("[camera]\nlink = \"camera\"", "[head]\njoints = [\"pan\", \"tilt\"]\n[camera]\nlink = \"lens\"");
-    let config = config(folder.path(), &description);
-    std::fs::write(folder.path().join("gantry.urdf"), urdf().replace("</robot>", &head)).unwrap();
-    (Bench::of(config), folder)
-}
-
-/// The head turns to where its stick points so far round, in radians.
-fn look(pan: f64) -> Request {
-    Request::LookAt { target: [0.6 + 5.0 * pan.cos(), 5.0 * pan.sin(), 1.5] }
+fn starts(bench: &mut Bench, arm: usize, request: Request) -> Ticket {
+    let (ticket, commands) = bench.start_with(arm, request);
+    assert_eq!(commands, []);
+    ticket
 }
 
 /// Why a cell with this robot is refused.
 fn refused_robot(description: &str) -> String {
     let folder = tempfile::tempdir().unwrap();
     Cell::new(config(folder.path(), description)).err().unwrap().to_string()
-}
-
-fn to(joints: [f64; 3], speed: f64) -> Request {
-    Request::MoveTo { joints: joints.into(), speed }
-}
-
-fn goes(bench: &mut Bench, arm: usize, joints: [f64; 3]) {
-    let ending = bench.perform_with(arm, to(joints, 0.5));
-    assert!(matches!(ending, Ending::Done(_)), "{joints:?}: {ending:?}");
-}
-
-fn refused(bench: &mut Bench, arm: usize, request: Request) -> String {
-    match &bench.start_with(arm, request).1[..] {
-        [Command::Ended { ending: Ending::Aborted(reason), .. }] => reason.clone(),
-        other => panic!("{other:?}"),
-    }
-}
-
-/// The cell with the right arm elsewhere, with no regard to what is on the way there.
-fn with_right_at(bench: &mut Bench, joints: [f64; 3]) {
-    let commands = bench.event(Event::Save);
-    let [Command::Saved { snapshot }] = &commands[..] else { panic!("{commands:?}") };
-    let mut state: serde_json::Value = serde_json::from_str(&snapshot.to_json()).unwrap();
-    state["posture"]["other_arms"][0]["joints"] = serde_json::json!(joints);
-    let snapshot = Snapshot::from_json(&state.to_string()).unwrap();
-    bench.event(Event::PutBack { snapshot: Box::new(snapshot) });
-}
-
-/// The tip of the right arm's rod is between the fingers of the left arm, where that hangs at home, or `beyond` short of there.
-fn between_the_fingers(beyond: f64) -> [f64; 3] {
-    let [x, y, z] = HOMES[LEFT];
-    [x - ROD_M + 0.005 - beyond, y, z - FINGERS_BELOW_M]
 }
 
 #[test]
@@ -250,14 +106,26 @@ fn an_arm_keeps_a_margin_from_one_that_stands_and_may_leave_where_it_is_nearer()
 #[test]
 fn ways_that_are_too_long_to_be_compared_are_refused_by_name() {
     let (mut bench, _folder) = gantry();
-    let far = |arm: usize| {
-        let [_, y, z] = HOMES[arm];
-        [1.0, y, z]
+    ajar(&mut bench);
+    // To and fro, 180 m in all.
+    let home = bench.cell.measured_of(LEFT).arm;
+    let mut far = home;
+    far[0] += 1.0;
+    let leg = |from: JointVector, to: JointVector| {
+        parameterise(bench.cell.robot_of(LEFT), &[Section::AsGiven(vec![from, to])], 1.0, &mut |_, _| false)
     };
-    let (_, commands) = bench.start_with(LEFT, to(far(LEFT), 0.01));
+    let mut trajectory = leg(home, far);
+    for i in 1..180 {
+        let next = if i % 2 == 0 { leg(home, far) } else { leg(far, home) };
+        let began_s = trajectory.duration_s();
+        let later = |point: TrajectoryPoint| TrajectoryPoint { time_s: point.time_s + began_s, ..point };
+        trajectory.points.extend(next.points.into_iter().skip(1).map(later));
+    }
+    let (_, commands) = bench.start_with(LEFT, Request::Follow { trajectory });
     assert_eq!(commands, []);
-    let reason = refused(&mut bench, RIGHT, to(far(RIGHT), 0.5));
-    let said = "its way and that of the arm `left`, which is under way with goal 1, are too long";
+    let [_, y, z] = HOMES[RIGHT];
+    let reason = refused(&mut bench, RIGHT, to([1.0, y, z], 0.5));
+    let said = "its way and that of the arm `left`, which is under way with goal 3, are too long";
     assert!(reason.contains(said) && reason.contains("in shorter motions"), "{reason}");
 }
 
@@ -347,13 +215,6 @@ fn how_long_it_takes_to_compare_two_motions_of_ten_seconds() {
     }
 }
 
-/// The left hand where the stick does not reach it, and where it does.
-const ASIDE: [f64; 3] = [0.0, 0.6, 0.0];
-const IN_THE_WAY: [f64; 3] = [0.0, 0.15, 0.0];
-/// How far the stick turns before it is near to the hands, and how far to pass them, in radians.
-const SHORT: f64 = 1.5;
-const ROUND: f64 = 2.8;
-
 #[test]
 fn a_head_does_not_turn_into_the_way_of_an_arm_nor_into_one_that_stands() {
     let (mut bench, _folder) = with_head("world");
@@ -404,12 +265,6 @@ fn an_arm_whose_joints_carry_the_head_moves_before_or_after_it() {
     assert_eq!(bench.start_with(LEFT, look(SHORT)).1, []);
     let reason = refused(&mut bench, LEFT, to([0.0, 0.4, 0.0], 0.5));
     assert!(reason.contains("is moved by the arm `left` and by the head, which is under way"), "{reason}");
-}
-
-/// The left arm with fingers that have closed around nothing and opened a little again.
-fn ajar(bench: &mut Bench) {
-    assert!(matches!(bench.perform_with(LEFT, close()), Ending::Aborted(_)), "they close around nothing");
-    assert!(matches!(bench.perform_with(LEFT, Request::OpenTo { width: 0.01 }), Ending::Done(_)));
 }
 
 #[test]
@@ -498,17 +353,6 @@ fn fingers_do_not_open_on_the_way_of_their_arm_where_another_arm_stands_beside_i
     assert_eq!(bench.cell.unintended_contacts(), []);
 }
 
-/// The gantries with a post of their own robot that hangs where the left hand's fingers pass by on the way to y = 0.6 if they are closed, and
-/// do not if they are open.
-fn with_post() -> (Bench, TempDir) {
-    let post = "<link name='post'><collision><geometry><box size='0.01 0.01 0.06'/></geometry></collision></link>\
-                <joint name='post' type='fixed'><parent link='world'/><child link='post'/><origin xyz='0 0.66 1.42'/></joint></robot>";
-    let folder = tempfile::tempdir().unwrap();
-    let config = config(folder.path(), &description());
-    std::fs::write(folder.path().join("gantry.urdf"), urdf().replace("</robot>", post)).unwrap();
-    (Bench::of(config), folder)
-}
-
 #[test]
 fn fingers_do_not_open_on_the_way_of_their_arm_where_its_own_robot_is() {
     for arm_first in [false, true] {
@@ -528,6 +372,147 @@ fn fingers_do_not_open_on_the_way_of_their_arm_where_its_own_robot_is() {
         // Where the post is far, both go.
         bench.pass(60.0);
         goes(&mut bench, LEFT, [0.0, 0.3, 0.0]);
+        assert_eq!(bench.cell.unintended_contacts(), []);
+    }
+}
+
+#[test]
+fn fingers_of_an_arm_that_stands_move_neither_into_their_own_robot_nor_into_a_head_that_stands() {
+    let (mut bench, _folder) = with_post();
+    ajar(&mut bench);
+    goes(&mut bench, LEFT, [0.0, 0.63, 0.0]);
+    let reason = refused(&mut bench, LEFT, Request::Release);
+    assert!(reason.starts_with("the fingers stay where they are: ") && reason.contains("link post"), "{reason}");
+    // Open around the post they do not close on it.
+    goes(&mut bench, LEFT, [0.0, 0.63, 0.2]);
+    assert!(matches!(bench.perform_with(LEFT, Request::Release), Ending::Done(_)));
+    goes(&mut bench, LEFT, [0.0, 0.66, 0.2]);
+    goes(&mut bench, LEFT, [0.0, 0.66, 0.0]);
+    let reason = refused(&mut bench, LEFT, close());
+    assert!(reason.starts_with("the fingers stay where they are: ") && reason.contains("link post"), "{reason}");
+
+    let (mut bench, _folder) = with_head("world");
+    bench.done(look(FRAC_PI_2));
+    ajar(&mut bench);
+    // The stick ends 15 mm beside the fingers.
+    for at in [[0.3, 0.53, 0.2], [0.6, 0.53, 0.2], [0.6, 0.53, 0.06]] {
+        goes(&mut bench, LEFT, at);
+    }
+    let reason = refused(&mut bench, LEFT, Request::Release);
+    assert!(reason.starts_with("the fingers stay where they are: ") && reason.contains("link head"), "{reason}");
+    assert!(
+        matches!(bench.perform_with(LEFT, Request::OpenTo { width: 0.02 }), Ending::Done(_)),
+        "so far there is room"
+    );
+    assert_eq!(bench.cell.unintended_contacts(), []);
+}
+
+#[test]
+fn how_slow_a_motion_is_does_not_decide_whether_something_may_go_beside_it() {
+    let far = |arm: usize| [1.0, HOMES[arm][1], HOMES[arm][2]];
+    for arm_first in [false, true] {
+        let (mut bench, _folder) = gantry();
+        ajar(&mut bench);
+        let mut both = [Request::Release, to(far(LEFT), 0.01)];
+        if arm_first {
+            both.reverse();
+        }
+        for request in both {
+            starts(&mut bench, LEFT, request);
+        }
+        // Beside another arm, too, whose fingers may open.
+        starts(&mut bench, RIGHT, to(far(RIGHT), 0.01));
+    }
+}
+
+#[test]
+fn fingers_that_open_a_little_count_as_open_as_those_do_that_stand() {
+    for opens in [false, true] {
+        let (mut bench, _folder) = gantry();
+        assert!(matches!(bench.perform_with(LEFT, close()), Ending::Aborted(_)), "they close around nothing");
+        goes(&mut bench, RIGHT, between_the_fingers(0.1));
+        if opens {
+            starts(&mut bench, LEFT, Request::OpenTo { width: 0.02 });
+        }
+        let [x, y, z] = between_the_fingers(0.0);
+        let reason = refused(&mut bench, RIGHT, to([x, y + 0.045, z], 0.5));
+        assert!(reason.contains("left_finger"), "{opens}: {reason}");
+    }
+}
+
+#[test]
+fn of_two_arms_on_their_ways_neither_goes_where_the_other_ones_fingers_may_open_whichever_begins_first() {
+    // The rod is well below the hand.
+    let [x, y, _] = between_the_fingers(0.0);
+    let z = -0.09;
+    let [left_x, left_y, left_z] = HOMES[LEFT];
+    for left_first in [true, false] {
+        let (mut bench, _folder) = gantry();
+        ajar(&mut bench);
+        goes(&mut bench, RIGHT, [x - 0.1, y + 0.06, z]);
+        let mut both = [(LEFT, to([left_x, left_y, left_z + 0.05], 0.1)), (RIGHT, to([x, y + 0.06, z], 0.1))];
+        if !left_first {
+            both.reverse();
+        }
+        let [(first, goes_first), (second, goes_second)] = both;
+        starts(&mut bench, first, goes_first);
+        let reason = refused(&mut bench, second, goes_second);
+        assert!(reason.contains("20 mm") && reason.contains("left_finger"), "{left_first}: {reason}");
+    }
+}
+
+#[test]
+fn moving_fingers_keep_as_far_from_an_arm_on_its_way_whichever_begins_first() {
+    // The rod passes 10 mm below the tips of the fingers.
+    let below = |x_m: f64| {
+        let [x, y, _] = between_the_fingers(x_m);
+        [x, y, -0.115]
+    };
+    for fingers_first in [true, false] {
+        let (mut bench, _folder) = gantry();
+        goes(&mut bench, RIGHT, below(0.1));
+        let mut both = [(LEFT, close()), (RIGHT, to(below(0.0), 0.1))];
+        if !fingers_first {
+            both.reverse();
+        }
+        let [(first, goes_first), (second, goes_second)] = both;
+        starts(&mut bench, first, goes_first);
+        let reason = refused(&mut bench, second, goes_second);
+        assert!(reason.contains("20 mm") && reason.contains("under way with goal"), "{fingers_first}: {reason}");
+        // One after the other they go.
+        bench.pass(60.0);
+        goes(&mut bench, RIGHT, below(0.01));
+        assert!(
+            matches!(bench.perform_with(LEFT, close()), Ending::Aborted(reason) if reason.contains("nothing stopped"))
+        );
+    }
+}
+
+#[test]
+fn beside_an_arm_that_stands_nearby_fingers_and_their_arm_move_one_after_the_other() {
+    // The tip of the right arm's rod is 3.3 mm beside a finger, which opens along it.
+    let set_out = || {
+        let (mut bench, folder): (Bench, TempDir) = gantry();
+        ajar(&mut bench);
+        let [x, y, z] = between_the_fingers(0.0);
+        goes(&mut bench, RIGHT, [x - 0.1, y, z]);
+        with_right_at(&mut bench, [x - 0.005 - 0.01 - 0.0033, y + 0.01, z]);
+        (bench, folder)
+    };
+    let up = || to([HOMES[LEFT][0], HOMES[LEFT][1], 0.05], 0.1);
+    for arm_first in [false, true] {
+        let (mut bench, _folder) = set_out();
+        let mut both = [Request::Release, up()];
+        if arm_first {
+            both.reverse();
+        }
+        let [first, second] = both;
+        starts(&mut bench, LEFT, first);
+        let reason = refused(&mut bench, LEFT, second.clone());
+        assert!(reason.contains("nearer than 3 mm to right_hand"), "{arm_first}: {reason}");
+        bench.pass(60.0);
+        let ending = bench.perform_with(LEFT, second);
+        assert!(matches!(ending, Ending::Done(_)), "{arm_first}: {ending:?}");
         assert_eq!(bench.cell.unintended_contacts(), []);
     }
 }

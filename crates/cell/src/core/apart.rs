@@ -1,25 +1,68 @@
 //! What the parts of a robot keep from each other: an arm that sets out, fingers that begin to close or to open, and a head that begins to turn
-//! are compared with every other arm, where it stands and on the way that it has before it, and with a head that turns (`clearance`). A head that
-//! stands is no matter of this file: the check of the arm's trajectory knows where it is.
+//! are compared with every other arm, where it stands and on the way that it has before it, and with a head that turns (`clearance`); fingers also
+//! with their own robot and a head that stands. Of an arm that sets out, those are a matter of the check of its trajectory.
 //!
-//! The fingers of another arm count where they are, where they are on their way to, and open: whoever holds that arm may open them.
+//! The fingers of an arm count where they are, where they are on their way to, and open: whoever holds that arm may open them. That is so of both of
+//! two arms on their ways, and fingers on their way keep as far from another part on its way as arms do: so it does not matter which begins first.
 
 use super::activity::{Kind, Module, Ticket};
 use super::braking::Way;
 use super::cell::Cell;
 use super::clearance::{Ahead, Crossing, MAX_POSTURES, Other, Part, keep_apart};
+use super::levers::{Levers, Thinned};
 use ratn_model::pose::Pose;
-use ratn_motion::collision::{Checker, Contact};
+use ratn_motion::collision::{Checker, Collision, Contact};
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{ArmPosition, Configuration};
 use ratn_world::scene::Scene;
 
 /// How far a finger may be from one position to the next that are compared, in metres.
 const FINGER_STEP_M: f64 = 0.002;
-/// The same where the arm moves meanwhile, and every position of the fingers comes with every one of its joints. No finger is as thin as that.
+/// The same where the arm moves meanwhile, beside another part on its way: every position of the fingers comes with every one of the joints. No finger
+/// is as thin as that.
 const OPENING_STEP_M: f64 = 0.008;
-/// The same of the head's joints, in radians.
+/// How many positions of fingers with positions of joints are looked at beside a part that stands, before the fingers' are looked at more coarsely.
+const MAX_POSTURES_BESIDE: usize = 10 * MAX_POSTURES;
+/// How far a joint of the head may be from one position to the next, in radians.
 const HEAD_STEP_RAD: f64 = 0.01;
+
+/// What a part will do, as it is compared with others.
+struct Ours {
+    /// With those that are on their way.
+    beside_moving: Ahead,
+    /// With those that stand.
+    beside_standing: Ahead,
+}
+
+impl Ours {
+    /// The same beside all.
+    fn alike(ahead: Ahead) -> Ours {
+        Ours { beside_moving: ahead.clone(), beside_standing: ahead }
+    }
+
+    fn with(&self, does: Other) -> &Ahead {
+        match does {
+            Other::Moves => &self.beside_moving,
+            Other::Stands => &self.beside_standing,
+        }
+    }
+}
+
+/// What another part does.
+struct Theirs {
+    ahead: Ahead,
+    does: Other,
+    /// The goal with which it is on its way.
+    ticket: Option<Ticket>,
+}
+
+impl Theirs {
+    /// On its way where that is with a goal, else standing.
+    fn of(ahead: Ahead, ticket: Option<Ticket>) -> Theirs {
+        let does = if ticket.is_some() { Other::Moves } else { Other::Stands };
+        Theirs { ahead, does, ticket }
+    }
+}
 
 impl Cell {
     /// Whether an arm that is to go so keeps apart from the rest: on the course that its joints really take, and while it brakes at the end
@@ -33,8 +76,8 @@ impl Cell {
         let refused = ["the trajectory is refused: on the way ", "the trajectory is refused: its way"];
         // Its fingers may open meanwhile.
         let to = self.opens_fingers_to(arm).unwrap_or(from);
-        self.keeps_apart(&self.both_move(arm, &joints, from, to), refused)?;
-        self.meets_not_itself(arm, &joints, from, to, "the trajectory is refused")
+        self.keeps_apart(&self.both_move(arm, &joints, [from, to], self.robot.links_of(arm)), refused)?;
+        if from == to { Ok(()) } else { self.meets_not_itself(arm, &joints, [from, to], "the trajectory is refused") }
     }
 
     /// Whether the fingers of an arm may go so: from and to these distances from the middle, in metres.
@@ -47,62 +90,97 @@ impl Cell {
         }
         let refused = ["the fingers stay where they are: ", "the fingers stay where they are: their way"];
         let links = self.robot.finger_links_of(arm);
-        // The arm may move meanwhile.
-        if let (ahead, Some(_)) = self.joints_ahead(arm) {
-            self.keeps_apart(&Ahead { links, ..self.both_move(arm, &ahead, from, to) }, refused)?;
-            return self.meets_not_itself(arm, &ahead, from, to, "the fingers stay where they are");
-        }
-        let joints = self.arms.seen_from(arm, &self.measured()).arm;
-        let course = passed(from, to, FINGER_STEP_M).map(|finger| ArmPosition { joints, finger }).collect();
-        let ours = Ahead { part: Part::Arm(arm), links, courses: vec![course], between_m: 0.0 };
-        self.keeps_apart(&ours, refused)
+        let (joints, moves) = self.joints_ahead(arm);
+        let ours = if moves.is_some() {
+            self.both_move(arm, &joints, [from, to], links)
+        } else {
+            Ours::alike(fingers_alone(arm, joints[0], links, [from, to], None))
+        };
+        self.keeps_apart(&ours, refused)?;
+        self.meets_not_itself(arm, &joints, [from, to], "the fingers stay where they are")
     }
 
-    /// What an arm does whose joints and fingers move at once: both take their own time, so any of the one comes with any of the other.
-    fn both_move(&self, arm: usize, joints: &[JointVector], from: f64, to: f64) -> Ahead {
-        let course = |finger: f64| joints.iter().map(|at| ArmPosition { joints: *at, finger }).collect();
-        let courses: Vec<Vec<ArmPosition>> = passed(from, to, OPENING_STEP_M).map(course).collect();
+    /// What these links of an arm do whose joints move and whose fingers may go from one place to another meanwhile: both take their own time, so any
+    /// of the one comes with any of the other.
+    fn both_move(&self, arm: usize, joints: &[JointVector], fingers: [f64; 2], links: Vec<usize>) -> Ours {
+        Ours {
+            beside_moving: self.beside_moving(arm, joints, fingers, links.clone()),
+            beside_standing: self.beside_standing(arm, joints, fingers, links),
+        }
+    }
+
+    /// The same as it is compared with parts on their ways: the fingers may open as well.
+    fn beside_moving(&self, arm: usize, joints: &[JointVector], [from, to]: [f64; 2], links: Vec<usize>) -> Ahead {
+        let part = Part::Arm(arm);
+        let fingers: Vec<f64> = passed(from, to, OPENING_STEP_M).chain(self.may_open(arm, to)).collect();
+        // Either of two parts gets half.
+        let most = MAX_POSTURES / 2 / fingers.len();
+        let Thinned { way, beside_m } = Levers::of(&self.robot, part, &links).thinned(joints, most);
         let between_m = if from == to { 0.0 } else { OPENING_STEP_M / 2.0 };
-        Ahead { part: Part::Arm(arm), links: self.robot.links_of(arm), courses, between_m }
+        Ahead { part, links, courses: courses(&way, fingers), beside_m, between_m }
+    }
+
+    /// The same as it is compared with parts that stand.
+    fn beside_standing(&self, arm: usize, joints: &[JointVector], [from, to]: [f64; 2], links: Vec<usize>) -> Ahead {
+        let part = Part::Arm(arm);
+        if from == to {
+            return Ahead { part, links, courses: courses(joints, [from]), beside_m: 0.0, between_m: 0.0 };
+        }
+        let Thinned { way, beside_m } = Levers::of(&self.robot, part, &links).thinned(joints, usize::MAX);
+        let finely: Vec<f64> = passed(from, to, FINGER_STEP_M).collect();
+        let few = finely.len() * way.len() <= MAX_POSTURES_BESIDE;
+        let step_m = if few { FINGER_STEP_M } else { OPENING_STEP_M };
+        let courses = courses(&way, passed(from, to, step_m));
+        Ahead { part, links, courses, beside_m, between_m: step_m / 2.0 }
+    }
+
+    /// Where the fingers of an arm may be besides, that are somewhere or on their way to there: open.
+    fn may_open(&self, arm: usize, finger: f64) -> Option<f64> {
+        let open = self.arms.open_finger_m(arm);
+        (self.arms.view(arm).finger().is_some() && open != finger).then_some(open)
     }
 
     /// Whether the fingers of an arm meet nothing of their own robot while they go so and its joints go so. A trajectory is checked with the fingers
-    /// where they are; how near the robot's links may come to each other is the same here.
+    /// where they are; how near the robot's links may come to each other is the same here. What is met where both begin says nothing of the way.
     fn meets_not_itself(
         &self,
         arm: usize,
         joints: &[JointVector],
-        from: f64,
-        to: f64,
+        [from, to]: [f64; 2],
         near: &str,
     ) -> Result<(), String> {
-        if from == to {
-            return Ok(());
-        }
         let robot = self.arms.view(arm);
         let nothing = Scene { base: Pose::IDENTITY, objects: Vec::new() };
         let at = self.arms.seen_from(arm, &self.measured());
-        let steps = ((to - from).abs() / OPENING_STEP_M).ceil() as usize + 1;
-        if steps * joints.len() > MAX_POSTURES {
+        let checker = |finger: f64| {
+            let mut there: Configuration = at;
+            there.finger = finger;
+            Checker::new(robot, &nothing, &there, 0.0)
+        };
+        let mut first = checker(from);
+        let meets_already = joints.first().and_then(|posture| first.collision(posture, Contact::None));
+        // No step of a link is longer than the checker's own, and the last posture is always looked at.
+        let mut way: Vec<&JointVector> = Vec::new();
+        for (i, posture) in joints.iter().enumerate() {
+            let next = joints.get(i + 1);
+            if next.is_none_or(|next| way.last().is_none_or(|before| first.steps(before, next) > 1)) {
+                way.push(posture);
+            }
+        }
+        let fingers: Vec<f64> = passed(from, to, OPENING_STEP_M).collect();
+        if fingers.len() * way.len() > MAX_POSTURES {
             return Err(format!(
-                "{near}: arm and fingers move for too long at once to be checked: move one after the other"
+                "{near}: arm and fingers move too far at once to be checked: move one after the other"
             ));
         }
         // From one finger position to the next they move by less than they are thick: nothing is passed over.
-        for finger in passed(from, to, OPENING_STEP_M) {
-            let mut checker = Checker::new(robot, &nothing, &Configuration { finger, ..at }, 0.0);
-            let mut before: Option<&JointVector> = None;
-            for (i, posture) in joints.iter().enumerate() {
-                // The last one is always looked at, and no step of a link is longer than the checker's own.
-                let is_next_far =
-                    joints.get(i + 1).is_none_or(|next| before.is_none_or(|b| checker.steps(b, next) > 1));
-                if !is_next_far {
-                    continue;
-                }
-                before = Some(posture);
-                if let Some(collision) = checker.collision(posture, Contact::None) {
-                    return Err(format!("{near}: while its fingers open, {collision}"));
-                }
+        for finger in fingers {
+            let mut checker = checker(finger);
+            let met = way.iter().find_map(|posture| checker.collision(posture, Contact::None));
+            let pair = |met: &Collision| [met.moving.clone(), met.other.clone()];
+            if let Some(met) = met.filter(|met| meets_already.as_ref().map(pair) != Some(pair(met))) {
+                let go = if to > from { "open" } else { "close" };
+                return Err(format!("{near}: while its fingers {go}, {met}"));
             }
         }
         Ok(())
@@ -114,8 +192,8 @@ impl Cell {
     /// Which links come too close, of what, and what that one is doing.
     pub(super) fn head_keeps_apart(&self, from: [f64; 2], to: [f64; 2]) -> Result<(), String> {
         let (links, courses) = (self.robot.head_links(), vec![turned(from, to)]);
-        let ours = Ahead { part: Part::Head, links, courses, between_m: 0.0 };
-        self.keeps_apart(&ours, ["the head stays where it is: ", "the head stays where it is: its way"])
+        let ours = Ahead { part: Part::Head, links, courses, beside_m: 0.0, between_m: 0.0 };
+        self.keeps_apart(&Ours::alike(ours), ["the head stays where it is: ", "the head stays where it is: its way"])
     }
 
     /// What may be on its way beside a part, or in its way.
@@ -126,11 +204,12 @@ impl Cell {
     }
 
     /// `near` begins the sentence that something comes too near, `long` the one that this was not found out.
-    fn keeps_apart(&self, ours: &Ahead, [near, long]: [&str; 2]) -> Result<(), String> {
+    fn keeps_apart(&self, ours: &Ours, [near, long]: [&str; 2]) -> Result<(), String> {
         let here = self.measured();
-        for other in self.beside(ours.part) {
-            let (mut theirs, ticket) = self.ahead_of(other);
-            let does = if ticket.is_some() { Other::Moves } else { Other::Stands };
+        let part = ours.beside_moving.part;
+        for Theirs { ahead: mut theirs, does, ticket } in self.beside(part).flat_map(|other| self.ahead_of(other)) {
+            let ours = ours.with(does);
+            let other = theirs.part;
             let (our_name, name) = (self.named(ours.part), self.named(other));
             let under_way = ticket.map_or_else(String::new, |ticket| format!("is under way with goal {}", ticket.0));
             // A torso that is one of the arm's joints carries the head.
@@ -172,50 +251,45 @@ impl Cell {
         }
     }
 
-    /// What another part does from now on, and with which goal where it is on its way; else it stands.
-    fn ahead_of(&self, part: Part) -> (Ahead, Option<Ticket>) {
+    /// What another part does from now on.
+    fn ahead_of(&self, part: Part) -> Vec<Theirs> {
         match part {
             Part::Arm(arm) => self.ahead_of_arm(arm),
-            Part::Head => self.ahead_of_head(),
+            Part::Head => vec![self.ahead_of_head()],
         }
     }
 
-    fn ahead_of_head(&self) -> (Ahead, Option<Ticket>) {
+    fn ahead_of_head(&self) -> Theirs {
         let here = self.measured();
         let activity = self.activities.get(&Module::PanTilt);
         let (to, ticket) = match activity.map(|activity| (&activity.kind, activity.ticket)) {
             Some((Kind::Look { to, .. }, ticket)) => (*to, Some(ticket)),
             _ => ([here.pan, here.tilt], None),
         };
-        let courses = vec![turned([here.pan, here.tilt], to)];
-        (Ahead { part: Part::Head, links: self.robot.head_links(), courses, between_m: 0.0 }, ticket)
+        let (links, courses) = (self.robot.head_links(), vec![turned([here.pan, here.tilt], to)]);
+        Theirs::of(Ahead { part: Part::Head, links, courses, beside_m: 0.0, between_m: 0.0 }, ticket)
     }
 
-    /// The fingers of an arm that stands may move.
-    fn ahead_of_arm(&self, arm: usize) -> (Ahead, Option<Ticket>) {
-        let at = self.arms.seen_from(arm, &self.measured());
+    /// The fingers of an arm that stands may move: they are on their way then, and the rest of it stands.
+    fn ahead_of_arm(&self, arm: usize) -> Vec<Theirs> {
+        let finger = self.arms.seen_from(arm, &self.measured()).finger;
         let (joints, ticket) = self.joints_ahead(arm);
-        if let (Some(to), Some(_)) = (self.opens_fingers_to(arm), ticket) {
-            return (self.both_move(arm, &joints, at.finger, to), ticket);
-        }
-        let mut fingers = vec![vec![at.finger]];
-        if self.arms.view(arm).finger().is_some() {
-            let open = self.arms.open_finger_m(arm);
-            match self.activities.get(&Module::Gripper(arm)).map(|activity| &activity.kind) {
-                // What slips out of fingers lets them close fully.
-                Some(Kind::Close { .. }) => fingers = vec![passed(at.finger, 0.0, FINGER_STEP_M).collect(), vec![open]],
-                Some(Kind::Open { to, .. }) => fingers = vec![passed(at.finger, *to, FINGER_STEP_M).collect()],
-                _ if open != at.finger => fingers.push(vec![open]),
-                _ => {}
-            }
-        }
-        // Either the joints move or the fingers do; what does both is above.
-        let course = |fingers: Vec<f64>| -> Vec<ArmPosition> {
-            let positions = fingers.into_iter().flat_map(|finger| joints.iter().map(move |at| (*at, finger)));
-            positions.map(|(joints, finger)| ArmPosition { joints, finger }).collect()
+        let gripper = self.activities.get(&Module::Gripper(arm));
+        let (to, fingers_ticket) = match gripper.map(|gripper| (&gripper.kind, gripper.ticket)) {
+            // What slips out of fingers lets them close fully.
+            Some((Kind::Close { .. }, ticket)) => (0.0, Some(ticket)),
+            Some((Kind::Open { to, .. }, ticket)) => (*to, Some(ticket)),
+            _ => (finger, None),
         };
-        let courses = fingers.into_iter().map(course).collect();
-        (Ahead { part: Part::Arm(arm), links: self.robot.links_of(arm), courses, between_m: 0.0 }, ticket)
+        let links = self.robot.links_of(arm);
+        if ticket.is_some() {
+            return vec![Theirs::of(self.beside_moving(arm, &joints, [finger, to], links), ticket)];
+        }
+        let fingers = self.robot.finger_links_of(arm);
+        let stands = fingers_alone(arm, joints[0], links, [finger, to], self.may_open(arm, to));
+        let moves = fingers_ticket.map(|_| fingers_alone(arm, joints[0], fingers, [finger, to], None));
+        let moves = moves.map(|ahead| Theirs::of(ahead, fingers_ticket));
+        std::iter::once(Theirs::of(stands, None)).chain(moves).collect()
     }
 
     /// Where the joints of an arm are from now on, and with which goal where it is on its way; else it stands.
@@ -230,6 +304,20 @@ impl Cell {
         let at = || vec![self.arms.seen_from(arm, &self.measured()).arm];
         followed.or(braked).map_or_else(|| (at(), None), |(ticket, way)| (way, Some(ticket)))
     }
+}
+
+/// All of a way of joints with fingers at each of these places.
+fn courses(way: &[JointVector], fingers: impl IntoIterator<Item = f64>) -> Vec<Vec<ArmPosition>> {
+    let course = |finger: f64| way.iter().map(|joints| ArmPosition { joints: *joints, finger }).collect();
+    fingers.into_iter().map(course).collect()
+}
+
+/// What these links of an arm do that stands while its fingers go from one place to another, and may be open.
+fn fingers_alone(arm: usize, joints: JointVector, links: Vec<usize>, [from, to]: [f64; 2], open: Option<f64>) -> Ahead {
+    let on_their_way: Vec<f64> = passed(from, to, FINGER_STEP_M).collect();
+    let courses = std::iter::once(on_their_way).chain(open.map(|open| vec![open]));
+    let at = |fingers: Vec<f64>| fingers.into_iter().map(|finger| ArmPosition { joints, finger }).collect();
+    Ahead { part: Part::Arm(arm), links, courses: courses.map(at).collect(), beside_m: 0.0, between_m: 0.0 }
 }
 
 /// Positions of fingers on their way.

@@ -5,6 +5,7 @@
 
 use super::grasping::Pads;
 use super::holding::Held;
+use super::parting::{Around, Closed};
 use super::placement::PlacementError;
 use crate::config::CellConfig;
 use ratn_model::pose::Pose;
@@ -30,8 +31,8 @@ struct Arm {
     pads: Option<Pads>,
     /// How far each finger is from the middle when the gripper is open, in metres.
     open_finger_m: f64,
-    /// The same where they last were when they had closed, around something or not.
-    closed_finger_m: f64,
+    /// Where the fingers last were when they had closed, and around what.
+    closed: Closed,
     held: Option<Held>,
 }
 
@@ -79,7 +80,7 @@ impl Arms {
                 FIRST => opening_m / 2.0,
                 _ => most.min(opening_m / 2.0),
             });
-            arms.push(Arm { name: name.to_owned(), view, pads, open_finger_m, closed_finger_m: 0.0, held: None });
+            arms.push(Arm { name: name.to_owned(), view, pads, open_finger_m, closed: Closed::NEVER, held: None });
         }
         Ok(Arms(arms))
     }
@@ -114,14 +115,40 @@ impl Arms {
         self.0[arm].open_finger_m
     }
 
-    /// How far each finger of an arm was from the middle when it last had closed, in metres.
-    pub(super) fn closed_finger_m(&self, arm: usize) -> f64 {
-        self.0[arm].closed_finger_m
+    /// Where the fingers of an arm have closed last, and around what.
+    pub(super) fn closed(&self, arm: usize) -> Closed {
+        self.0[arm].closed
     }
 
-    /// The fingers of an arm have closed so far.
-    pub(super) fn closed(&mut self, arm: usize, finger_m: f64) {
-        self.0[arm].closed_finger_m = finger_m;
+    /// The fingers of an arm have closed so far, around that.
+    pub(super) fn close(&mut self, arm: usize, at_m: f64, around: Around) {
+        self.have_closed(arm, Closed { at_m, around });
+    }
+
+    /// That is where the fingers of an arm have closed last.
+    pub(super) fn have_closed(&mut self, arm: usize, closed: Closed) {
+        self.0[arm].closed = closed;
+    }
+
+    /// An arm sets out: what its fingers are in that slipped out of them they push from now on.
+    pub(super) fn sets_out(&mut self, arm: usize) {
+        let around = &mut self.0[arm].closed.around;
+        if *around == Around::Slipped {
+            *around = Around::Nothing;
+        }
+    }
+
+    /// Whether the fingers of an arm, `finger` metres from the middle, may still be at what they have let go.
+    pub(super) fn is_at_what_it_let_go(&self, arm: usize, finger: f64) -> bool {
+        let Arm { held, closed, open_finger_m, .. } = &self.0[arm];
+        held.is_none() && closed.is_at_what_it_let_go(finger, *open_finger_m)
+    }
+
+    /// Whether the fingers of an arm, `finger` metres from the middle, push what they meet where they do not close.
+    pub(super) fn fingers_push(&self, arm: usize, finger: f64) -> bool {
+        let Arm { held, closed, open_finger_m, .. } = &self.0[arm];
+        // Closed around something, they stand at its faces.
+        held.is_some() || closed.pushes(finger, *open_finger_m)
     }
 
     /// What an arm holds.

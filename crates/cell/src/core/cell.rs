@@ -19,6 +19,7 @@ use super::environment::Environment;
 use super::errors::Errors;
 use super::faults::Faults;
 use super::objects::{Placed, TrueObject};
+use super::parting::{Around, Closed};
 use super::picture::{Exposure, Scenery};
 use super::placement::{self, PlacementError, TABLE};
 use super::protocol::{Command, Ending, Event, Module, Product, Ticket};
@@ -426,6 +427,10 @@ impl Cell {
         for module in stopped {
             let Some(activity) = self.activities.remove(&module) else { continue };
             let ending = ending(&activity);
+            if let (Kind::Close { .. }, Some(arm)) = (&activity.kind, module.arm()) {
+                // What they would have closed around they may be in by now, or not.
+                self.arms.close(arm, self.arms.seen_from(arm, &self.resting).finger, Around::Slipped);
+            }
             if matches!(activity.kind, Kind::Follow(_)) {
                 self.brake(module, activity, ending, times);
             } else {
@@ -505,6 +510,7 @@ impl Cell {
         let objects = placement::objects(&self.robot, self.config.scene, goods, seed).unwrap_or_default();
         for arm in self.arms.numbers() {
             self.arms.hold(arm, None);
+            self.arms.have_closed(arm, Closed::NEVER);
         }
         self.contacts = Contacts::of(&self.robot);
         self.tilts = vec![0.0; objects.len()];

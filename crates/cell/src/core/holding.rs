@@ -5,6 +5,7 @@ use super::environment::{GRAVITY, Grip, Hold, Load, STEP, Slip, Support};
 use super::faults::Kind as Fault;
 use super::grasping::{Grip as GripOf, NotGrasped, felt};
 use super::objects::ON_BASE;
+use super::parting::Around;
 use super::placement::{self, TABLE};
 use super::protocol::{Command, Ending, Product};
 use ratn_model::pose::Pose;
@@ -118,6 +119,7 @@ impl Cell {
             Err(reason) => reason.object().and_then(|id| self.ids.iter().position(|known| known == id)),
         };
         self.contacts.closed(arm, around, &self.environment);
+        let in_vain = if around.is_some() { Around::Slipped } else { Around::Nothing };
         let held = closed.map_err(|reason| (None, reason.to_string())).and_then(|grip| {
             let slips = |reason: String| Err((Some(grip.width), reason));
             let id = &self.ids[grip.index];
@@ -134,7 +136,7 @@ impl Cell {
             Ok(grip) => grip,
             Err((stopped, reason)) => {
                 self.resting.set_finger(arm, 0.0);
-                self.arms.closed(arm, 0.0);
+                self.arms.close(arm, 0.0, in_vain);
                 let felt = stopped.map_or("nothing stopped the fingers".to_owned(), |width| {
                     format!("something {:.0} mm wide slipped out of the fingers", width * 1e3)
                 });
@@ -143,7 +145,7 @@ impl Cell {
             }
         };
         self.resting.set_finger(arm, grip.width / 2.0);
-        self.arms.closed(arm, grip.width / 2.0);
+        self.arms.close(arm, grip.width / 2.0, Around::Something);
         let friction = self.environment.model(grip.index).kind.friction();
         let in_tool = grip.in_tool.compose(&parts[grip.index].0.inverse());
         self.arms.hold(arm, Some(Held::new(grip.index, in_tool, friction)));
@@ -201,7 +203,7 @@ impl Cell {
         self.contacts.let_go(arm, held.object, false);
         // Nothing is left to stop the fingers.
         self.resting.set_finger(arm, 0.0);
-        self.arms.closed(arm, 0.0);
+        self.arms.close(arm, 0.0, Around::Slipped);
         Some(held.object)
     }
 

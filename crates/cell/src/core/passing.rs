@@ -7,9 +7,6 @@ use super::contacts::{ArmDoing, Doing};
 use super::protocol::{Command, Ending, Module};
 use ratn_model::time::Timestamp;
 
-/// How far the fingers may be from fully open and still count as open, in metres.
-const OPEN_M: f64 = 1e-4;
-
 impl Cell {
     /// Lets time go on to `time`, step by step where something moves. Stops at a step at which a held object is lost, because that ends motions,
     /// and something else may be due before `time`; returns whether it did.
@@ -46,11 +43,11 @@ impl Cell {
             self.halt(carries, |_| Ending::Aborted(reason.clone()), 1.0, out);
         }
         let finger = |arm: usize| configuration.of_arm(arm).map_or(0.0, |at| at.finger);
-        let solid = self.arms.numbers().map(|arm| {
-            let open = self.arms.open_finger_m(arm) - finger(arm) < OPEN_M;
-            // Closed around something, they stand at its faces.
-            open || self.arms.held(arm).is_some()
-        });
+        let closes = |arm: usize| {
+            let gripper = self.activities.get(&Module::Gripper(arm));
+            gripper.is_some_and(|gripper| matches!(gripper.kind, Kind::Close { .. }))
+        };
+        let solid = self.arms.numbers().map(|arm| !closes(arm) && self.arms.fingers_push(arm, finger(arm)));
         let solid: Vec<bool> = solid.collect();
         solid.iter().enumerate().for_each(|(arm, solid)| self.environment.set_fingers_solid(arm, *solid));
         self.environment.step(&self.robot, &configuration);

@@ -11,6 +11,7 @@ use super::environment::{Environment, Saved};
 use super::errors::Errors;
 use super::faults::{Fault, Faults};
 use super::holding::Held;
+use super::parting::{Around, Closed};
 use super::placement::furniture;
 use super::protocol::Command;
 use ratn_model::pose::Pose;
@@ -57,9 +58,12 @@ struct Posture {
     pan: f64,
     tilt: f64,
     finger: f64,
-    /// Where the fingers last had closed.
+    /// Where the fingers last had closed; a snapshot of an earlier version does not say.
     #[serde(default)]
     closed_finger: f64,
+    /// They are still at what they have let go.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    at_let_go: bool,
     /// The arms from number 1 on.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     other_arms: Vec<ArmPosture>,
@@ -72,6 +76,8 @@ struct ArmPosture {
     finger: f64,
     #[serde(default)]
     closed_finger: f64,
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    at_let_go: bool,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     held: Option<SavedHold>,
 }
@@ -178,6 +184,26 @@ impl Snapshot {
         let others = self.posture.other_arms.iter().map(|arm| arm.held.as_ref());
         std::iter::once(self.held.as_ref()).chain(others)
     }
+
+    /// Where the fingers of each arm are said to have closed, and whether they are at what they have let go.
+    fn all_closed(&self) -> impl Iterator<Item = (f64, bool)> {
+        let others = self.posture.other_arms.iter().map(|arm| (arm.closed_finger, arm.at_let_go));
+        std::iter::once((self.posture.closed_finger, self.posture.at_let_go)).chain(others)
+    }
+}
+
+/// Where fingers have closed that are `finger` metres from the middle: where they hold something, and never farther than they are.
+fn closed_as((said_m, at_let_go): (f64, bool), finger: f64, holds: bool, open_m: f64) -> Closed {
+    if holds {
+        return Closed { at_m: finger, around: Around::Something };
+    }
+    let closed = Closed { at_m: said_m.clamp(0.0, finger.max(0.0)), around: Around::Something };
+    match (at_let_go, closed.has_parted(finger, open_m)) {
+        (true, _) => closed,
+        (false, true) => Closed { around: Around::Nothing, ..closed },
+        // What they closed around in vain is not in a snapshot.
+        (false, false) => Closed { around: Around::Slipped, ..closed },
+    }
 }
 
 impl Cell {
@@ -192,14 +218,16 @@ impl Cell {
                 SavedHold { object, in_tool, friction }
             })
         };
+        let closed =
+            |arm: usize, finger: f64| (self.arms.closed(arm).at_m, self.arms.is_at_what_it_let_go(arm, finger));
         let other_arms = self.arms.others(&measured).into_iter().enumerate();
         let other_arms = other_arms
             .map(|(i, ArmPosition { joints, finger })| {
-                let closed_finger = self.arms.closed_finger_m(i + 1);
-                ArmPosture { joints, finger, closed_finger, held: held(i + 1) }
+                let (closed_finger, at_let_go) = closed(i + 1, finger);
+                ArmPosture { joints, finger, closed_finger, at_let_go, held: held(i + 1) }
             })
             .collect();
-        let (first_held, closed_finger) = (held(FIRST), self.arms.closed_finger_m(FIRST));
+        let (first_held, (closed_finger, at_let_go)) = (held(FIRST), closed(FIRST, finger));
         let (faults, drawn) = self.faults.save();
         self.battery = Battery::at(self.config.battery, self.battery.level());
         Snapshot {
@@ -209,7 +237,7 @@ impl Cell {
             ids: self.ids.clone(),
             tilts: self.tilts.clone(),
             environment: self.environment.save(&self.robot, &self.configuration()),
-            posture: Posture { base, arm, pan, tilt, finger, closed_finger, other_arms },
+            posture: Posture { base, arm, pan, tilt, finger, closed_finger, at_let_go, other_arms },
             held: first_held,
             battery: self.battery.level(),
             frames_taken: self.frames_taken,
@@ -228,11 +256,9 @@ impl Cell {
             return;
         }
         self.freeze("the cell was put back to a snapshot", out);
-        let Posture { base, arm, pan, tilt, finger, closed_finger, other_arms } = snapshot.posture.clone();
+        let Posture { base, arm, pan, tilt, finger, other_arms, .. } = snapshot.posture.clone();
         self.resting = Configuration { base, arm, pan, tilt, finger, ..self.arms.first_posture() };
-        self.arms.closed(FIRST, closed_finger);
         for (i, other) in other_arms.into_iter().enumerate() {
-            self.arms.closed(i + 1, other.closed_finger);
             self.resting.set_joints(i + 1, other.joints);
             self.resting.set_finger(i + 1, other.finger);
         }
@@ -245,7 +271,9 @@ impl Cell {
             &snapshot.environment,
         );
         self.environment.set_time(self.now);
-        for (arm, held) in snapshot.all_held().enumerate() {
+        for (arm, (held, closed)) in snapshot.all_held().zip(snapshot.all_closed()).enumerate() {
+            let finger = self.arms.seen_from(arm, &self.resting).finger;
+            self.arms.have_closed(arm, closed_as(closed, finger, held.is_some(), self.arms.open_finger_m(arm)));
             self.arms.hold(arm, held.map(|held| Held::new(held.object, held.in_tool, held.friction)));
         }
         self.contacts = Contacts::of(&self.robot);

@@ -23,8 +23,6 @@ const NO_BASE: &str = "the robot has no base that drives: its description has no
 const NO_CAMERA: &str = "the robot has no camera: its description has no `[camera]`";
 /// Why nothing is grasped.
 const NO_GRIPPER: &str = "the arm has no gripper: its description has none";
-/// How far each finger goes away from what it lets go before the arm may leave, in metres.
-const PARTED_M: f64 = 0.003;
 /// How far the camera may look past its target, in radians.
 const MAX_LOOK_ERROR_RAD: f64 = 0.02;
 
@@ -56,6 +54,7 @@ impl Cell {
                 for other in of_arms.chain([Module::PanTilt, Module::Camera]) {
                     self.no_motion_of(other, BASE)?;
                 }
+                self.arms.numbers().try_for_each(|arm| self.has_parted(arm))?;
                 if self.is_lost() {
                     return Err(LOST.to_owned());
                 }
@@ -126,6 +125,7 @@ impl Cell {
         for (arm, held) in held.into_iter().enumerate().filter(|(arm, _)| of_arm.is_none_or(|moves| moves == *arm)) {
             if matches!(kind, Kind::Follow(_)) {
                 self.contacts.sets_out(arm, held);
+                self.arms.sets_out(arm);
             }
         }
         let (started, ends) = (self.motion_time, self.motion_time + seconds(lasts_s));
@@ -137,11 +137,27 @@ impl Cell {
     fn may_move_arm(&self, arm: usize) -> Result<(), String> {
         self.no_motion_of(Module::Base, BASE)?;
         let finger = self.arms.seen_from(arm, &self.measured()).finger;
-        let parted = finger >= self.arms.closed_finger_m(arm) + PARTED_M;
+        let parted = self.arms.closed(arm).has_parted(finger, self.arms.open_finger_m(arm));
         if parted && self.opens_fingers_to(arm).is_some() {
             return Ok(());
         }
-        self.no_motion_of(Module::Gripper(arm), HAND)
+        self.no_motion_of(Module::Gripper(arm), HAND)?;
+        self.has_parted(arm)
+    }
+
+    /// Whether the fingers of an arm have parted from what they let go, if they did. They need not be moving: what opened them a little has
+    /// ended, or was stopped.
+    fn has_parted(&self, arm: usize) -> Result<(), String> {
+        let finger = self.arms.seen_from(arm, &self.measured()).finger;
+        if !self.arms.is_at_what_it_let_go(arm, finger) {
+            return Ok(());
+        }
+        let by_mm = 1e3 * (finger - self.arms.closed(arm).at_m);
+        Err(format!(
+            "the fingers of the {} have not parted from what they let go: each has opened by {by_mm:.1} mm; open them first, or close them \
+             around it again",
+            self.called(Module::Gripper(arm))
+        ))
     }
 
     /// How far each finger will be from the middle, where the fingers of an arm open.
@@ -172,13 +188,13 @@ impl Cell {
     fn opening(&mut self, arm: usize, to: f64) -> Result<(Kind, f64), String> {
         self.no_motion_of(Module::Base, BASE)?;
         let from = self.arms.seen_from(arm, &self.measured()).finger;
-        let (closed, whole_s) = (self.arms.closed_finger_m(arm), self.config.gripper.open_s);
-        if self.arms.held(arm).is_some() || from < closed + PARTED_M {
+        let (closed, open, whole_s) = (self.arms.closed(arm), self.arms.open_finger_m(arm), self.config.gripper.open_s);
+        if self.arms.held(arm).is_some() || !closed.has_parted(from, open) {
             self.no_motion_of(Module::Arm(arm), HAND)?;
         }
         self.fingers_keep_apart(arm, from, to)?;
         self.let_go(arm);
-        let part = (to - from) / (self.arms.open_finger_m(arm) - closed);
+        let part = (to - from) / (open - closed.at_m);
         Ok((Kind::Open { from, to }, if part > 0.0 && part < 1.0 { whole_s * part } else { whole_s }))
     }
 
