@@ -147,7 +147,12 @@ fn only_the_lines_of_the_key_change_in_every_state_of_every_example() {
                     let Some(mut other) = program(&after) else { continue };
                     loaded += 1;
                     for (one, other) in before.states.iter().zip(&mut other.states) {
-                        if one.path == state.path || one.path == format!("{}/try", state.path) {
+                        // What a state says of exceptions counts for those inside, too.
+                        let is_inside = one.path.starts_with(&format!("{}/", state.path));
+                        if one.path == state.path
+                            || one.path == format!("{}/try", state.path)
+                            || (key == "exceptions" && is_inside)
+                        {
                             other.annotations = one.annotations.clone();
                         }
                     }
