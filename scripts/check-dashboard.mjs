@@ -213,6 +213,7 @@ async function control() {
   await go(page, "cell");
   await page.waitForFunction(() => document.querySelector("aside")?.textContent.includes("Objects as they are"));
   await page.waitForFunction(() => Number(document.querySelector("canvas")?.dataset.solids) > 15);
+  await page.waitForFunction(() => document.querySelector("aside")?.textContent.includes("aimm, as the log says"));
   await axe(page, "the cell of a run");
   await shot(page, "cell-live");
   step("the cell is shown in 3D, with the objects as the running cell says that they are");
@@ -563,6 +564,27 @@ async function cell() {
   other.child.kill("SIGTERM");
   await other.ended;
   step("of a log of another robot only the objects and the base are shown, and why");
+
+  const named = (robot, name) => {
+    const file = join(PLACE, name);
+    writeFileSync(file, pickAndPlace().replace('"origin":{', `"origin":{"robot":${JSON.stringify(robot)},`));
+    return file;
+  };
+  const logs = [named("aimm", "named.jsonl"), named("/nowhere/robot.toml", "away.jsonl")];
+  const both = await dashboard([...logs, "--runtime-dir", join(PLACE, "nothing")]);
+  const two = await open(both.url);
+  await go(two, "cell");
+  await two.waitForFunction(() => document.querySelector("aside")?.textContent.includes("aimm, as the log says"));
+  await two.selectOption("header.top select", { label: "away.jsonl" });
+  await two.waitForFunction(() => document.querySelector("main .warn")?.textContent.includes("the log is of the robot /nowhere/robot.toml"));
+  assert.ok((await two.textContent("main .warn")).includes("--robot names another description of it"));
+  await axe(two, "the cell of a robot that is not here");
+  await shot(two, "cell-away");
+  assert.deepEqual(two.problems, []);
+  await two.context().close();
+  both.child.kill("SIGTERM");
+  await both.ended;
+  step("a log is shown with the robot that it names, or says which one it needs");
 }
 
 async function large() {
@@ -659,7 +681,7 @@ async function long() {
 /** A task file is looked at, changed in a form, and written. */
 async function annotations() {
   const file = join(PLACE, "edited.yaml");
-  const text = `task: edited # <b>\nstates:\n  - plan: # it plans\n      action: path_planner/plan\n      in: { start: "joints(0, 0, 0, 0, 0, 0, 0)", goal: "joints(1, 0, 0, 0, 0, 0, 0)" }\n      duration: 2 # s\n  - open: { action: gripper/release }\n`;
+  const text = `task: edited # <b>\nworld: ["on(cup, table)"]\nstates:\n  - plan: # it plans\n      action: path_planner/plan\n      in: { start: "joints(0, 0, 0, 0, 0, 0, 0)", goal: "joints(1, 0, 0, 0, 0, 0, 0)" }\n      duration: 2 # s\n  - open: { action: gripper/release }\n`;
   writeFileSync(file, text);
   const shown = await dashboard(["--edit", file, "--runtime-dir", join(PLACE, "nothing")]);
   const page = await open(shown.url);
@@ -668,24 +690,120 @@ async function annotations() {
   await duration.fill("nothing.here");
   await page.waitForSelector("#findings-duration .bad");
   assert.ok(await page.locator('[data-key="save"]').isDisabled());
+  // What is typed is text wherever it is shown.
+  await duration.fill(INJECTED);
+  await page.waitForFunction((text) => document.querySelector("#findings-duration")?.textContent.includes(text), "window.hit");
+  assert.equal(await page.evaluate(() => window.hit), undefined);
+  assert.equal(await page.locator("main img").count(), 0);
   await duration.fill("4");
   await page.waitForFunction(() => document.querySelector("main")?.textContent.includes("by simulation in CDTN mode"));
+  assert.ok(await page.locator('[data-key="save"]').isVisible());
   await axe(page, "Annotations");
   await shot(page, "annotations");
   assert.equal(readFileSync(file, "utf8"), text);
   await page.locator('[data-key="save"]').press("Enter");
+  await page.waitForSelector("dialog[open]");
+  await axe(page, "the question whether to save");
   await page.locator("dialog button[value=yes]").press("Enter");
   await until("the file is written", () => readFileSync(file, "utf8") === text.replace("duration: 2 #", "duration: 4 #"));
   await page.waitForFunction(() => document.querySelector('[data-key="duration 0"]')?.value === "4");
+  step("a task file's annotations are changed in a form and written");
+
+  // Individuals are offered for each place of a predicate, by keys alone.
+  const offered = (key) => page.locator(`#words-${key} option`).evaluateAll((options) => options.map((option) => option.value));
+  await page.locator('[data-key="said reads"]').press("Space");
+  await page.locator('[data-key="reads 0"]').press("End");
+  await page.keyboard.type("on(");
+  assert.deepEqual(await offered("reads"), ["on(cup, ", "on(table, ", "on(?, "]);
+  await page.keyboard.type("cup, ");
+  assert.deepEqual(await offered("reads"), ["on(cup, cup)", "on(cup, table)", "on(cup, ?)"]);
+  await page.keyboard.type("table)");
+  await page.waitForFunction(() => document.querySelector("main")?.textContent.includes("+       reads: "));
+  step("individuals are offered for each place of a predicate");
+
+  // Of an action that says nothing, and what few states say.
+  await page.locator('[data-key="undo"]').press("Enter");
+  await page.locator('[data-key="state open"]').press("Enter");
+  await page.locator('[data-key="said pia"]').press("Space");
+  await page.locator("summary:has-text('More annotations')").press("Enter");
+  await page.locator('[data-key="said exceptional"]').press("Space");
+  await page.waitForFunction(() => document.querySelector("main")?.textContent.includes("pia: true, exceptional: [aborted] }"));
+  await axe(page, "Annotations, all of them");
+  await shot(page, "annotations-more");
+  await page.locator('[data-key="save"]').press("Enter");
+  await page.locator("dialog button[value=yes]").press("Enter");
+  await until("both are written", () => readFileSync(file, "utf8").endsWith("  - open: { action: gripper/release, pia: true, exceptional: [aborted] }\n"));
+  await page.waitForFunction(() => document.querySelector('[data-key="state open"]')?.parentElement.textContent.includes("says pia, exceptional"));
+  step("it is said that an action may change the environment, and which of its outcomes is exceptional");
+
+  // What is typed while a change is saved stays, and is a change of the file as it is then.
+  const late = async (route) => {
+    await new Promise((resolve) => setTimeout(resolve, 800));
+    await route.continue();
+  };
+  await page.route("**/api/annotations/save*", late);
+  await page.locator('[data-key="said duration"]').press("Space");
+  await page.locator('[data-key="duration 0"]').fill("6");
+  await page.waitForFunction(() => document.querySelector('[data-key="save"]')?.disabled === false);
+  await page.locator('[data-key="save"]').press("Enter");
+  await page.locator("dialog button[value=yes]").press("Enter");
+  await page.locator('[data-key="duration 0"]').fill("7");
+  await until("what was saved is written", () => readFileSync(file, "utf8").includes("exceptional: [aborted], duration: 6 }"));
+  await page.waitForFunction(() => document.querySelector("pre")?.textContent.includes("duration: 7"));
+  assert.equal(await page.locator('[data-key="duration 0"]').inputValue(), "7");
+  await page.unroute("**/api/annotations/save*", late);
+  await page.waitForFunction(() => document.querySelector('[data-key="save"]')?.disabled === false);
+  await page.locator('[data-key="save"]').press("Enter");
+  await page.locator("dialog button[value=yes]").press("Enter");
+  await until("it is written, too", () => readFileSync(file, "utf8").includes("exceptional: [aborted], duration: 7 }"));
+  step("what is typed while a change is saved is not lost");
+
+  // A file that is refused already can be mended from here, step by step, and a text over several lines keeps its lines.
+  const refused = text.replace("duration: 2 # s", "duration: no.where\n      requires:\n        - |-\n          exists on(cup,\n          table)\n        - no.where.either");
+  writeFileSync(file, refused);
+  await page.locator('[data-key="again"]').press("Enter");
+  await page.locator('[data-key="state plan"]').press("Enter");
+  await page.waitForSelector("#findings-duration .bad");
+  const long = page.locator('textarea[data-key="requires 0"]');
+  assert.equal(await long.inputValue(), "exists on(cup,\ntable)");
+  await page.locator('[data-key="duration 0"]').fill("2");
+  await page.waitForFunction(() => document.querySelector("main")?.textContent.includes("still is with this change"));
+  await page.waitForFunction(() => document.querySelector('[data-key="save"]')?.disabled === false);
+  await axe(page, "Annotations of a file that is refused");
+  await shot(page, "annotations-refused");
+  await page.locator('[data-key="save"]').press("Enter");
+  await page.locator("dialog button[value=yes]").press("Enter");
+  await until("half of it is mended", () => readFileSync(file, "utf8") === refused.replace("duration: no.where", "duration: 2"));
+  await page.waitForFunction(() => document.querySelector("#findings-duration .bad") === null);
+  await long.press("Control+End");
+  await page.keyboard.type(" # 2");
+  await page.waitForFunction(() => document.querySelector("pre")?.textContent.includes("exists on(cup,\\ntable) # 2"));
+  step("a file that was refused already is mended step by step; a text over several lines keeps them");
+
   // Somebody else writes it.
+  writeFileSync(file, text);
+  await page.locator('[data-key="undo"]').press("Enter");
+  await page.locator('[data-key="again"]').press("Enter");
+  await page.locator('[data-key="state plan"]').press("Enter");
   writeFileSync(file, text);
   await page.locator('[data-key="duration 0"]').fill("5");
   await page.waitForFunction(() => document.querySelector("main [role=alert]")?.textContent.includes("has changed on the disk"));
+  await axe(page, "Annotations of a file that has changed");
   await page.locator("main [role=alert] button").click();
   await page.waitForFunction(() => document.querySelector('[data-key="duration 0"]')?.value === "2");
   assert.deepEqual(page.problems, []);
-  step("a task file's annotations are changed in a form and written");
   await page.context().close();
+
+  const dark = await open(shown.url, { colorScheme: "dark", locale: "de-DE", viewport: { width: 844, height: 390 } });
+  await go(dark, "annotations");
+  await dark.waitForSelector('[data-key="duration 0"]');
+  await axe(dark, "Annotations, dark, on a phone");
+  await shot(dark, "dark-phone-annotations");
+  const wide = await dark.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+  assert.ok(wide <= 0, `Annotations is ${wide} px wider than the phone`);
+  assert.deepEqual(dark.problems, []);
+  await dark.context().close();
+  step("a file that somebody else has written is read again; dark, on a phone, axe finds nothing");
   shown.child.kill("SIGTERM");
   await shown.ended;
 }

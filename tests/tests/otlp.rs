@@ -13,7 +13,7 @@ use ratn_otlp::{Decoded, decode};
 use std::collections::{BTreeMap, BTreeSet};
 use std::convert::Infallible;
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 use support::{Place, repository, wait_for};
@@ -80,6 +80,36 @@ fn config(place: &Place, endpoint: &str) -> anyhow::Result<PathBuf> {
     Ok(file)
 }
 
+/// Of a trace, and in it.
+type Id = (String, String);
+type Links = BTreeSet<String>;
+
+/// Where a span stands: its parent, and what it is linked to.
+fn in_trace(span: &Decoded) -> (Id, (String, Links)) {
+    let links = span.links.iter().cloned().collect();
+    ((span.trace.clone(), span.id.clone()), (span.parent.clone(), links))
+}
+
+/// The spans that the export of a log has.
+fn exported(place: &Place, log: &Path) -> anyhow::Result<BTreeMap<Id, (String, Links)>> {
+    let exported = place.path().join("log.otlp");
+    let (from, to) = (log.to_str().context("a path")?, exported.to_str().context("a path")?);
+    let (code, _, said) = place.start_as("export", &["export", "otlp", from, "-o", to])?.finish()?;
+    ensure!(code == Some(0), "{said}");
+    let mut of_log = BTreeMap::new();
+    for line in std::fs::read_to_string(&exported)?.lines() {
+        let request: serde_json::Value = serde_json::from_str(line)?;
+        let spans = request["resourceSpans"][0]["scopeSpans"][0]["spans"].as_array().context("spans")?;
+        for span in spans {
+            let text = |name: &str| span[name].as_str().unwrap_or_default().to_owned();
+            let links = span["links"].as_array().into_iter().flatten();
+            let links = links.filter_map(|link| link["spanId"].as_str()).map(str::to_owned).collect();
+            of_log.insert((text("traceId"), text("spanId")), (text("parentSpanId"), links));
+        }
+    }
+    Ok(of_log)
+}
+
 /// Runs a task to its end; what it said, and where its log is.
 fn run(place: &Place, endpoint: Option<&str>) -> anyhow::Result<(String, PathBuf)> {
     let (task, log) = (repository("examples/fetch_boxes.yaml"), place.path().join("log.jsonl"));
@@ -104,30 +134,9 @@ fn a_run_its_acquires_projections_and_goals_are_one_trace() -> anyhow::Result<()
     ensure!(root.service == "ratn" && root.parent.is_empty() && root.error.is_none(), "{root:?}");
 
     // What the run sends is what the export of its log has, and each span once.
-    let exported = place.path().join("log.otlp");
-    let (from, to) = (log.to_str().context("a path")?, exported.to_str().context("a path")?);
-    let (code, _, said) = place.start(&["export", "otlp", from, "-o", to])?.finish()?;
-    ensure!(code == Some(0), "{said}");
-    type Links = BTreeSet<String>;
-    let mut of_log: BTreeMap<(String, String), (String, Links)> = BTreeMap::new();
-    for line in std::fs::read_to_string(&exported)?.lines() {
-        let request: serde_json::Value = serde_json::from_str(line)?;
-        let spans = request["resourceSpans"][0]["scopeSpans"][0]["spans"].as_array().context("spans")?;
-        for span in spans {
-            let text = |name: &str| span[name].as_str().unwrap_or_default().to_owned();
-            let links = span["links"].as_array().into_iter().flatten();
-            let links = links.filter_map(|link| link["spanId"].as_str()).map(str::to_owned).collect();
-            of_log.insert((text("traceId"), text("spanId")), (text("parentSpanId"), links));
-        }
-    }
+    let of_log = exported(&place, &log)?;
     let own: Vec<&Decoded> = spans.iter().filter(|span| span.service == "ratn").collect();
-    let of_run: BTreeMap<(String, String), (String, Links)> = own
-        .iter()
-        .map(|span| {
-            let links = span.links.iter().cloned().collect();
-            ((span.trace.clone(), span.id.clone()), (span.parent.clone(), links))
-        })
-        .collect();
+    let of_run: BTreeMap<Id, (String, Links)> = own.iter().map(|span| in_trace(span)).collect();
     ensure!(of_run.len() == own.len(), "a span was sent twice");
     ensure!(of_run == of_log, "{of_run:?}\n{of_log:?}");
     ensure!(of_run.values().any(|(_, links)| !links.is_empty()), "no node waited for another");
@@ -168,6 +177,81 @@ fn a_run_its_acquires_projections_and_goals_are_one_trace() -> anyhow::Result<()
     let astray =
         spans.iter().find(|span| span.trace == root.trace && !span.parent.is_empty() && !known.contains(&*span.parent));
     ensure!(astray.is_none(), "{astray:?} has no parent");
+    Ok(())
+}
+
+/// First what a run has left behind it for seconds when its task control is killed, then what it is in the middle of.
+const KILLED: &str = "\
+task: killed
+variables:
+  left: 300
+states:
+  - count:
+      loop: { while: $left > 0 }
+      do:
+        - one: { wait: { seconds: 0 }, assign: { left: $left - 1 } }
+  - long_after: { wait: { seconds: 200 } }
+  - look: { action: detector/detect }
+  - go: { wait: { signal: go } }
+  - end: { action: pan_tilt/look_at, in: { target: [1, 0, 0.7] } }
+";
+
+#[test]
+fn a_run_that_goes_on_after_its_task_control_was_killed_goes_on_in_its_trace() -> anyhow::Result<()> {
+    let (place, collector) = (Place::new()?, Collector::start(false)?);
+    let config = config(&place, &format!("http://{}", collector.address))?;
+    let config = config.to_str().context("a path")?;
+    let directory = place.path().join("run");
+    let directory = directory.to_str().context("a path")?;
+    let up = ["up", "--runtime-dir", directory, "--config", config, "--speed", "50"];
+    let up = place.start_as("up", &up)?;
+    wait_for("the system", || Ok(up.said().contains("is ready").then_some(()))).with_context(|| up.said())?;
+    let (task, log) = (place.path().join("killed.yaml"), place.path().join("log.jsonl"));
+    std::fs::write(&task, KILLED)?;
+    let (task, log_name) = (task.to_str().context("a path")?, log.to_str().context("a path")?);
+    let run = place.start_as("run", &["run", task, "--log", log_name, "--checkpoint-every", "20"])?;
+    let waits = || Ok(std::fs::read_to_string(&log)?.contains("\"signal\":\"go\"").then_some(()));
+    wait_for("the wait for the signal", waits).with_context(|| run.said())?;
+    run.process()?.kill()?;
+    drop(run);
+    let before: Vec<Decoded> = collector.spans().into_iter().filter(|span| span.service == "ratn").collect();
+    ensure!(!before.is_empty() && before.iter().all(|span| span.id != ROOT), "{before:?}");
+
+    let mut again = place.start_as("again", &["run", "--resume", log_name])?;
+    wait_for("the run to go on", || {
+        Ok(std::fs::read_to_string(&log)?.contains("\"event\":\"resumed\"").then_some(()))
+    })?;
+    let mut signal = place.start_as("signal", &["signal", "killed", "go"])?;
+    let (code, _, said) = signal.finish()?;
+    ensure!(code == Some(0), "{said}");
+    let (code, _, said) = again.finish()?;
+    ensure!(code == Some(0) && said.contains("a checkpoint after") && !said.contains("OTLP"), "{code:?}: {said}");
+
+    // Together both have sent what the export of the log has, in one trace, and nothing twice that was sent long before.
+    let spans = collector.spans();
+    let of_run: Vec<&Decoded> = spans.iter().filter(|span| span.service == "ratn").collect();
+    let own: BTreeMap<Id, (String, Links)> = of_run.iter().map(|span| in_trace(span)).collect();
+    let of_log = exported(&place, &log)?;
+    ensure!(own == of_log, "{own:?}\n{of_log:?}");
+    ensure!(of_run.len() == own.len(), "{} spans of {} were sent twice", of_run.len() - own.len(), own.len());
+    let roots: Vec<&&Decoded> = of_run.iter().filter(|span| span.id == ROOT).collect();
+    let [root] = roots[..] else { anyhow::bail!("{} spans of the run", roots.len()) };
+    ensure!(own.keys().all(|(trace, _)| *trace == root.trace), "more than one trace");
+    // The last node is laid where it was, after what was done for the one before the kill, and the run is around all of them.
+    let node = |name: &str| of_run.iter().find(|span| span.name == name).with_context(|| format!("no span of {name}"));
+    let (look, end) = (node("look")?, node("end")?);
+    ensure!(look.time_unix_ns.1 <= end.time_unix_ns.0 + 100_000_000, "{look:?} {end:?}");
+    ensure!(of_run.iter().all(|span| span.time_unix_ns.0 >= root.time_unix_ns.0), "{root:?}");
+    let served = |node: &Decoded| {
+        let of_node =
+            |span: &&Decoded| span.name.ends_with("/Execute") && span.trace == root.trace && span.parent == node.id;
+        spans.iter().find(of_node).cloned()
+    };
+    for node in [look, end] {
+        let goal = served(node).with_context(|| format!("no goal of {node:?}"))?;
+        ensure!(goal.time_unix_ns.0 + 100_000_000 >= node.time_unix_ns.0, "{goal:?} began before {node:?}");
+        ensure!(goal.time_unix_ns.1 <= node.time_unix_ns.1 + 100_000_000, "{goal:?} ended after {node:?}");
+    }
     Ok(())
 }
 

@@ -105,6 +105,16 @@ fn a_reload_takes_over_bounds_roles_and_the_log_filter_and_names_what_it_does_no
     let said = manager.process.said();
     ensure!(said.contains("need_a_restart=\"resource-manager.listen, service.drain_ms\""), "{said}");
 
+    // Where spans go is known at the start of a process: each key of it is named, and no key for the collector is told.
+    manager.reload(
+        "[service.otlp]\nendpoint = 'http://127.0.0.1:4318'\nheaders = { x-api-key = 'hidden' }\n[service.log]\nfilter = 'info'\n\
+         [resource-manager.limits]\nresources = 2\n",
+    )?;
+    let named = "need_a_restart=\"service.otlp.endpoint, service.otlp.headers.x-api-key\"";
+    let said =
+        wait_for("the keys of the collector", || Ok(Some(manager.process.said()).filter(|said| said.contains(named))))?;
+    ensure!(!said.contains("hidden"), "{said}");
+
     // A bad one changes nothing, and says where it is bad.
     manager.reload("[resource-manager.limits]\nresources = 3\nresource = 7\n")?;
     wait_for("the complaint", || Ok(manager.process.said().contains("the config stays as it was").then_some(())))?;

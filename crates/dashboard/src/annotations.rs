@@ -3,39 +3,43 @@
 //! It owns the file only while it writes: what a page has seen is known by a digest, and a text of another digest is not changed. What changes
 //! in the text, `ratn_model::load::edit` decides; how a text is checked and simulated, whoever starts the dashboard says.
 
+mod attributes;
 mod file;
 
 use crate::wire;
 use file::FileError;
 use ratn_model::diagnostic::{Diagnostic, Severity};
+use ratn_model::expression::{EffectExpr, Expr, FactExpr};
 use ratn_model::fact::SCENE_PREDICATES;
 use ratn_model::in_force::{InForce, in_force};
 use ratn_model::load::Loaded;
 use ratn_model::load::edit::{self, EditError, Written};
 use ratn_model::load::{Document, MAX_SOURCE};
-use ratn_model::program::{Location, Origin, Program};
+use ratn_model::program::{Location, Nature, Origin, Program};
+use ratn_model::value::Value;
 use serde::Deserialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::sync::Semaphore;
 
 /// What a page sends has at most this many bytes …
 pub(crate) const MAX_BODY: usize = 64 * 1024;
 /// … and this many items of all keys.
 const MAX_ITEMS: usize = 1_000;
-/// A simulation that takes longer is not waited for.
+/// A simulation that takes longer is ended.
 const SIMULATION: Duration = Duration::from_secs(2);
 /// Of longer changes the first lines are shown.
 const MAX_SHOWN_LINES: usize = 60;
 /// So many words of a kind are offered for completion.
 const MAX_WORDS: usize = 500;
 /// Keys of one value; all others have a list.
-const SINGLE: [&str; 2] = ["computes", "duration"];
+const SINGLE: [&str; 7] = ["computes", "pia", "duration", "attempts", "deterministic", "routine", "exceptions"];
 
 type Check = dyn Fn(&str) -> Result<Loaded, Vec<Diagnostic>> + Send + Sync;
-type Makespan = dyn Fn(&Program) -> Result<f64, String> + Send + Sync;
+type Makespan = dyn Fn(&Program, &dyn Fn() -> bool) -> Result<f64, String> + Send + Sync;
 
 /// A task file whose annotations may be changed, and how its text is checked.
 #[derive(Clone)]
@@ -47,7 +51,10 @@ struct Inner {
     check: Box<Check>,
     makespan: Box<Makespan>,
     writing: Mutex<()>,
+    /// One at a time.
     simulating: Arc<Semaphore>,
+    /// How many were asked for: an older one makes room for the newest.
+    asked: AtomicU64,
 }
 
 impl std::fmt::Debug for Editing {
@@ -58,16 +65,16 @@ impl std::fmt::Debug for Editing {
 
 impl Editing {
     /// Of this file. `kinds` of resources are offered; `check` loads and checks a text as the file's; `makespan` says how many seconds a program
-    /// takes as a dataflow network, or why that cannot be said. It should end by itself soon after the two seconds for which it is waited.
+    /// takes as a dataflow network, or why that cannot be said; it asks often whether it shall go on, and ends soon after it shall not.
     pub fn of(
         file: PathBuf,
         kinds: Vec<String>,
         check: impl Fn(&str) -> Result<Loaded, Vec<Diagnostic>> + Send + Sync + 'static,
-        makespan: impl Fn(&Program) -> Result<f64, String> + Send + Sync + 'static,
+        makespan: impl Fn(&Program, &dyn Fn() -> bool) -> Result<f64, String> + Send + Sync + 'static,
     ) -> Editing {
         let simulating = Arc::new(Semaphore::new(1));
         let (check, makespan, writing) = (Box::new(check), Box::new(makespan), Mutex::new(()));
-        Editing(Arc::new(Inner { file, kinds, check, makespan, writing, simulating }))
+        Editing(Arc::new(Inner { file, kinds, check, makespan, writing, simulating, asked: AtomicU64::new(0) }))
     }
 
     /// The file, for people.
@@ -224,32 +231,45 @@ pub(crate) fn proposed(editing: &Editing, proposal: &Proposal) -> Result<wire::P
     })
 }
 
-/// What changes would gain. It is not waited longer than [`SIMULATION`] for each of the two simulations.
+/// What changes would gain: two simulations, each of which is ended after [`SIMULATION`], when somebody asks for another one, and when this is
+/// dropped.
 pub(crate) async fn gained(editing: &Editing, proposal: Proposal) -> Result<wire::Gained, Problem> {
     let without = |obstacle: &str| Ok(wire::Gained { obstacle: obstacle.to_owned(), ..wire::Gained::default() });
-    let Ok(place) = editing.0.simulating.clone().try_acquire_owned() else {
-        return without("another simulation is under way: change something to ask again");
+    let own = editing.0.asked.fetch_add(1, Ordering::Relaxed) + 1;
+    let Ok(place) = editing.0.simulating.clone().acquire_owned().await else {
+        return without("the dashboard ends");
     };
     let editing = editing.clone();
+    let asker = Arc::new(());
+    let waits = Arc::downgrade(&asker);
     let simulated = tokio::task::spawn_blocking(move || {
         // As long as it goes on no other one begins.
         let _place = place;
         let text = as_seen(&editing, &proposal)?;
         let new = changed(&text, &proposal)?;
-        let makespan_s = |text: &str, which: &str| match (editing.0.check)(text) {
-            Ok(loaded) => (editing.0.makespan)(&loaded.program),
-            Err(_) => Err(format!("`ratn check` refuses the file {which}")),
+        let inner = &editing.0;
+        let is_wanted = || inner.asked.load(Ordering::Relaxed) == own && waits.strong_count() > 0;
+        let makespan_s = |text: &str, which: &str| {
+            let program = (inner.check)(text).map_err(|_| format!("`ratn check` refuses the file {which}"))?.program;
+            let began = Instant::now();
+            let is_in_time = || began.elapsed() < SIMULATION;
+            let makespan_s = (inner.makespan)(&program, &|| is_wanted() && is_in_time());
+            match makespan_s {
+                Err(_) if !is_wanted() => Err("something else was asked meanwhile".to_owned()),
+                Err(_) if !is_in_time() => {
+                    Err(format!("the simulation of the file {which} takes longer than {} s", SIMULATION.as_secs()))
+                }
+                said => said,
+            }
         };
         let before = makespan_s(&text, "as it is");
         let after = makespan_s(&new, "with the change");
         let obstacle = after.as_ref().err().or(before.as_ref().err()).cloned().unwrap_or_default();
         Ok(wire::Gained { before_s: before.ok(), after_s: after.ok(), obstacle })
     });
-    match tokio::time::timeout(2 * SIMULATION, simulated).await {
-        Ok(Ok(gained)) => gained,
-        Ok(Err(_)) => without("the simulation ended with a panic"),
-        Err(_) => without("the simulation takes longer than 2 s"),
-    }
+    let gained = simulated.await.unwrap_or_else(|_| without("the simulation ended with a panic"));
+    drop(asker);
+    gained
 }
 
 /// Writes the changes into the file. May read and write files.
@@ -412,7 +432,7 @@ fn of_libraries(program: &Program, written: &[Written], states: &mut Vec<wire::A
     }
 }
 
-/// Predicates and individuals that can be completed to.
+/// Predicates and individuals that can be completed to: of the ontology, and those that the file uses.
 fn words(program: Option<&Program>) -> (Vec<String>, Vec<String>) {
     let Some(program) = program else { return (Vec::new(), Vec::new()) };
     let with = |name: &str, arity: usize| format!("{name}({})", vec!["?"; arity].join(", "));
@@ -425,15 +445,39 @@ fn words(program: Option<&Program>) -> (Vec<String>, Vec<String>) {
         }
         None => predicates.extend(SCENE_PREDICATES.iter().map(|(name, arity)| with(name, *arity))),
     }
+    let mut used = Vec::new();
+    changed_facts(&program.initial, &mut used);
     for state in &program.states {
         let said = &state.annotations;
-        let read = said.reads.iter().flatten();
-        let required = said.requires.iter().flat_map(|one| one.fact_expressions());
-        for fact in read.chain(required) {
-            predicates.insert(with(&fact.predicate, fact.arguments.len()));
+        used.extend(said.reads.iter().flatten());
+        used.extend(said.requires.iter().flat_map(|one| one.fact_expressions()));
+        if let Nature::Senses(sensed) = &said.nature {
+            used.extend(sensed);
         }
+        said.effects.values().for_each(|effects| changed_facts(effects, &mut used));
+    }
+    for fact in used {
+        predicates.insert(with(&fact.predicate, fact.arguments.len()));
+        entities.extend(fact.arguments.iter().flatten().filter_map(individual).map(str::to_owned));
     }
     (predicates.into_iter().take(MAX_WORDS).collect(), entities.into_iter().take(MAX_WORDS).collect())
+}
+
+/// The facts that effects change.
+fn changed_facts<'e>(effects: &'e [EffectExpr], found: &mut Vec<&'e FactExpr>) {
+    for effect in effects {
+        match effect {
+            EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => found.push(fact),
+            EffectExpr::ForEach { effects, .. } => changed_facts(effects, found),
+        }
+    }
+}
+
+/// An argument that is a name, as `cup`.
+fn individual(argument: &Expr) -> Option<&str> {
+    let Expr::Literal(Value::String(name)) = argument else { return None };
+    let is_word = |name: &str| name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
+    Some(&**name).filter(|name| is_word(name) && name.starts_with(|c: char| c.is_ascii_alphabetic()))
 }
 
 fn finding(written: &[Written], one: &Diagnostic) -> wire::Finding {

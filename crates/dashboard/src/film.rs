@@ -11,7 +11,7 @@ use ratn_model::value::{TrajectoryPoint, Value};
 use ratn_report::believed::Believed;
 use ratn_report::motions::{Change, Motions, Way, thinned};
 use ratn_world::scene::{BASE, Scene};
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 
 /// Tracks that are kept.
 const MOST_TRACKS: usize = 96;
@@ -21,7 +21,9 @@ const MOST_POINTS: usize = 600;
 const ARM_KIND: &str = "Arm";
 const BASE_KIND: &str = "Base";
 /// Joints of a track; one with more is not kept.
-const MOST_JOINTS: usize = 64;
+pub(crate) const MOST_JOINTS: usize = 64;
+/// Parts that are remembered; of more the first.
+const MOST_PARTS: usize = 128;
 
 /// What can be seen.
 #[derive(Debug, Default)]
@@ -32,6 +34,10 @@ pub(crate) struct Film {
     version: u64,
     world_changed: u64,
     tracks: VecDeque<Track>,
+    /// What was moved so far, with how many positions: also by tracks that are not kept any more.
+    parts: BTreeSet<(Part, usize)>,
+    /// Tracks of too many joints were left out.
+    leaves_out: bool,
     /// Tracks so far.
     numbers: u64,
     base: Option<Pose>,
@@ -40,7 +46,7 @@ pub(crate) struct Film {
 }
 
 /// Which joints.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Part {
     /// These, by name.
     Named(Vec<String>),
@@ -137,6 +143,16 @@ impl Film {
         self.tracks.iter()
     }
 
+    /// What was moved so far, each with how many positions.
+    pub(crate) fn parts(&self) -> impl Iterator<Item = &(Part, usize)> {
+        self.parts.iter()
+    }
+
+    /// Whether there were tracks of more than [`MOST_JOINTS`] joints, which are not kept.
+    pub(crate) fn leaves_out(&self) -> bool {
+        self.leaves_out
+    }
+
     /// The tracks that are new, or otherwise than at a version.
     pub(crate) fn since(&self, version: u64) -> impl Iterator<Item = &Track> {
         self.tracks.iter().filter(move |track| track.changed > version)
@@ -171,10 +187,15 @@ impl Film {
             Part::Named(names) => names.len(),
             _ => 0,
         };
+        self.version += 1;
         if names > MOST_JOINTS || track.points.iter().any(is_long) {
+            self.leaves_out = true;
             return;
         }
-        self.version += 1;
+        if self.parts.len() < MOST_PARTS {
+            let positions = track.points.first().map_or(0, |point| point.positions.len());
+            self.parts.insert((track.part.clone(), positions));
+        }
         self.numbers += 1;
         if self.tracks.len() >= MOST_TRACKS {
             // What a later one of the same joints has taken over is of interest least.

@@ -154,6 +154,11 @@ impl Logs {
         self.at(id, &Asked::default(), |fold, _, _| (PathBuf::from(&fold.run.file), fold.digest.clone()))
     }
 
+    /// What a log says of its robot; nothing in one of an earlier version.
+    pub(crate) fn robot(&self, id: u64) -> Result<String, NotTold> {
+        self.at(id, &Asked::default(), |fold, _, _| fold.run.robot.clone())
+    }
+
     /// The world of a log at a moment.
     pub(crate) fn world(&self, id: u64, asked: &Asked, filter: &str) -> Result<wire::World, NotTold> {
         self.at(id, asked, |fold, _, _| {
@@ -176,7 +181,7 @@ impl Logs {
             let path =
                 |id: InstanceId| fold.run.instance(id).map_or_else(|| id.to_string(), |one| one.path.to_string());
             let cell = robot::cell(&fold.film, version, shown, path);
-            wire::Cell { epoch: fold.epoch, more: !there, at_s: fold.run.end_s, ..cell }
+            wire::Cell { epoch: fold.epoch, more: !there, at_s: fold.run.end_s, from_s: fold.from_s, ..cell }
         })
     }
 

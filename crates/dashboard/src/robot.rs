@@ -1,6 +1,6 @@
 //! A robot as the pages draw it: its links, its joints, and which of those an arm, a head, fingers or a base are. Pure.
 
-use crate::film::{Film, Part, Track};
+use crate::film::{Film, MOST_JOINTS, Part, Track};
 use crate::wire;
 use ratn_model::id::InstanceId;
 use ratn_model::pose::Pose;
@@ -20,25 +20,25 @@ const MOST_CHARACTERS: usize = 200;
 /// The posture in which a cell begins.
 const HOME: &str = "home";
 
-/// How the robot of the logs is known: the robot, and whence, or why it is not known. It may read files.
+/// How the robot of a log is known: the robot, and whence, or why it is not known. It may read files.
 #[derive(Clone)]
 pub struct Robots(Arc<Load>);
 
-type Load = dyn Fn() -> Result<(Robot, String), String> + Send + Sync;
+type Load = dyn Fn(&str) -> Result<(Robot, String), String> + Send + Sync;
 
 impl Robots {
-    /// Loads it so. Beside the robot stands whence it is known, in a few words.
-    pub fn by(load: impl Fn() -> Result<(Robot, String), String> + Send + Sync + 'static) -> Robots {
+    /// Loads it so, given what the log says of it: a name or a path, or nothing. Beside the robot stands whence it is known, in a few words.
+    pub fn by(load: impl Fn(&str) -> Result<(Robot, String), String> + Send + Sync + 'static) -> Robots {
         Robots(Arc::new(load))
     }
 
     /// None is known.
     pub fn none() -> Robots {
-        Robots::by(|| Err("no robot was named".to_owned()))
+        Robots::by(|_| Err("no robot was named".to_owned()))
     }
 
-    pub(crate) fn load(&self) -> Result<Shown, String> {
-        (self.0)().and_then(|(robot, whence)| Shown::of(&robot, whence))
+    pub(crate) fn load(&self, of_log: &str) -> Result<Shown, String> {
+        (self.0)(of_log).and_then(|(robot, whence)| Shown::of(&robot, whence))
     }
 }
 
@@ -122,8 +122,21 @@ impl Shown {
         match (film.drives(), self.base.is_empty()) {
             (Some(false), false) => Err(format!("{name} has a base that drives, and the system of the run had none")),
             (Some(true), true) => Err(format!("the system of the run had a base that drives, and {name} has none")),
-            _ => film.tracks().try_for_each(|track| self.joints_of(&track.part).map(drop)),
+            _ => film.parts().try_for_each(|(part, positions)| {
+                let joints = self.joints_of(part)?;
+                // Open fingers have no position.
+                if *positions == 0 { Ok(()) } else { self.of_length(*positions, &joints) }
+            }),
         }
+    }
+
+    /// So many positions are those of these joints; what a robot does not have has none.
+    fn of_length(&self, positions: usize, joints: &[usize]) -> Result<(), String> {
+        if joints.is_empty() || joints.len() == positions {
+            return Ok(());
+        }
+        let name = &self.told.name;
+        Err(format!("the log has positions for {positions} joints where {name} has {}", joints.len()))
     }
 
     /// The joints of a part, or why it is not one of this robot.
@@ -164,12 +177,7 @@ impl Shown {
         {
             open.positions.extend(self.arm(arm.as_deref())?.fingers.map(|(_, open_m)| open_m));
         }
-        if !joints.is_empty()
-            && let Some(other) = points.iter().find(|point| point.positions.len() != joints.len())
-        {
-            let (has, name) = (other.positions.len(), &self.told.name);
-            return Err(format!("the log has positions for {has} joints where {name} has {}", joints.len()));
-        }
+        points.iter().try_for_each(|point| self.of_length(point.positions.len(), &joints))?;
         let (id, from_s, until_s, estimated) = (track.id, track.from_s, track.until_s, track.estimated);
         Ok(wire::Track { id, joints, from_s, until_s, estimated, path, points })
     }
@@ -206,6 +214,7 @@ pub(crate) fn cell(
     let untold = scene.as_ref().map_or(0, of).saturating_sub(MOST_OBJECTS);
     let note = match &scene {
         Some(None) if note.is_empty() => "the facts of the log make no scene: objects are not shown".to_owned(),
+        _ if note.is_empty() && film.leaves_out() => format!("motions of more than {MOST_JOINTS} joints are not shown"),
         _ => note,
     };
     wire::Cell {
@@ -284,7 +293,12 @@ fn point(point: &ratn_model::value::TrajectoryPoint) -> wire::Point {
 /// To a micrometre, or a millionth of a radian: shorter to tell, and nobody sees it.
 fn round(value: f64) -> f64 {
     let rounded = (value * 1e6).round() / 1e6;
-    if rounded == 0.0 { 0.0 } else { rounded }
+    match rounded.is_finite() {
+        true if rounded == 0.0 => 0.0,
+        true => rounded,
+        // So large a number has no micrometres.
+        false => value,
+    }
 }
 
 fn cut(text: &str) -> String {
@@ -392,6 +406,35 @@ mod tests {
         assert_eq!(of_panda.note, "aimm has a base that drives, and the system of the run had none");
         let unknown = cell(&film(&[MOVE_TO]), 0, Err("no robot was named"), |_| String::new());
         assert_eq!((unknown.fits, unknown.note.as_str(), unknown.tracks.len()), (false, "no robot was named", 0));
+    }
+
+    #[test]
+    fn a_log_of_another_robot_does_not_become_one_of_this_with_time() {
+        let mut film = film(&[FOREIGN]);
+        // As many motions under way as make the track of before go.
+        let known = FOREIGN.replace("elbow", "arm_joint_1");
+        for id in 10..210 {
+            let line = known.replace(r#""instance":3"#, &format!(r#""instance":{id}"#));
+            film.apply(&serde_json::from_str(&line).unwrap());
+        }
+        assert!(film.tracks().all(|track| track.part == Part::Named(vec!["arm_joint_1".to_owned()])));
+        let told = cell(&film, 0, Ok(&shown("aimm")), |_| String::new());
+        assert_eq!((told.fits, told.note.as_str()), (false, "aimm has no joint `elbow`"));
+    }
+
+    #[test]
+    fn that_motions_of_very_many_joints_are_left_out_is_said() {
+        let names: Vec<String> = (0..65).map(|number| format!("\"j{number}\"")).collect();
+        let wide = FOREIGN.replace(r#"["elbow"]"#, &format!("[{}]", names.join(",")));
+        let told = cell(&film(&[&wide]), 0, Ok(&shown("aimm")), |_| String::new());
+        assert_eq!((told.fits, told.note.as_str()), (true, "motions of more than 64 joints are not shown"));
+    }
+
+    #[test]
+    fn a_number_without_a_millionth_is_told_as_it_is() {
+        for (value, told) in [(1e305, 1e305), (-1.7e308, -1.7e308), (0.123_456_7, 0.123_457), (-1e-9, 0.0)] {
+            assert_eq!(round(value).to_bits(), f64::to_bits(told), "{value}");
+        }
     }
 
     #[test]

@@ -21,7 +21,7 @@ use ratn_proto::types::Scale;
 use ratn_task_control::control::{self, Message, Word};
 use ratn_worker::tls::ClientTls;
 use serde::Serialize;
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
@@ -46,6 +46,8 @@ const PATIENCE: Duration = Duration::from_secs(10);
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
 /// Folds that are read at the same time.
 const MAX_READING: usize = 4;
+/// So many robots are kept; of more all are read again.
+const MOST_ROBOTS: usize = 16;
 /// A robot that could not be read is not tried again for so long.
 const ROBOT_AGAIN: Duration = Duration::from_secs(3);
 const JSON: &str = "application/json";
@@ -184,30 +186,34 @@ struct Shown {
     control: bool,
     edit: Option<Editing>,
     tasks: Tasks,
-    robot: Arc<KnownRobot>,
+    robots: Arc<KnownRobots>,
     reading: Semaphore,
 }
 
-/// The robot, once it was asked for: it is read then, and kept.
+/// The robots of the logs, once they were asked for: each is read then, and kept.
 #[derive(Debug)]
-struct KnownRobot {
+struct KnownRobots {
     robots: Robots,
-    shown: Mutex<Option<(Instant, Loaded)>>,
+    /// By what the logs say of them.
+    shown: Mutex<BTreeMap<String, (Instant, Loaded)>>,
 }
 
 type Loaded = Result<Arc<robot::Shown>, String>;
 
-impl KnownRobot {
-    /// May read files.
-    fn get(&self) -> Loaded {
+impl KnownRobots {
+    /// That of a log which says so. May read files.
+    fn get(&self, of_log: &str) -> Loaded {
         // What a panic left is whole.
         let mut shown = self.shown.lock().unwrap_or_else(PoisonError::into_inner);
-        match &*shown {
+        match shown.get(of_log) {
             Some((at, loaded)) if loaded.is_ok() || at.elapsed() < ROBOT_AGAIN => return loaded.clone(),
             _ => {}
         }
-        let loaded = self.robots.load().map(Arc::new);
-        *shown = Some((Instant::now(), loaded.clone()));
+        let loaded = self.robots.load(of_log).map(Arc::new);
+        if shown.len() >= MOST_ROBOTS {
+            shown.clear();
+        }
+        shown.insert(of_log.to_owned(), (Instant::now(), loaded.clone()));
         loaded
     }
 }
@@ -268,8 +274,8 @@ impl Dashboard {
         let address = listener.local_addr().map_err(refused)?;
         let (logs, system) = (Arc::new(Logs::of(&paths)), System::of(directory, &tls));
         let reading = Semaphore::new(MAX_READING);
-        let robot = Arc::new(KnownRobot { robots, shown: Mutex::default() });
-        let shown = Arc::new(Shown { token, logs, system, control, edit, tasks, robot, reading });
+        let robots = Arc::new(KnownRobots { robots, shown: Mutex::default() });
+        let shown = Arc::new(Shown { token, logs, system, control, edit, tasks, robots, reading });
         Ok(Dashboard { listener, address, shown, patience })
     }
 
@@ -395,7 +401,7 @@ impl Shown {
             (&Method::GET, "/api/run") => self.run(&query).await,
             (&Method::GET, "/api/task") => self.task(&query).await,
             (&Method::GET, "/api/world") => self.world(&query).await,
-            (&Method::GET, "/api/robot") => self.robot().await,
+            (&Method::GET, "/api/robot") => self.robot(&query).await,
             (&Method::GET, "/api/cell") => self.cell(&query).await,
             (&Method::GET, "/api/system") => json(&self.system.told().await),
             (&Method::GET, "/api/tail") => self.tail(&query).await,
@@ -491,10 +497,17 @@ impl Shown {
         self.reading(move |logs| Ok(serde_json::to_string(&logs.world(id, &asked, &filter)?))).await
     }
 
-    async fn robot(&self) -> Answer {
-        let robot = self.robot.clone();
-        self.reading(move |_| Ok(serde_json::to_string(&robot.get().map_or_else(robot::unknown, |shown| shown.told()))))
-            .await
+    async fn robot(&self, query: &Query<'_>) -> Answer {
+        let id = match query.asked() {
+            Ok((id, _)) => id,
+            Err(problem) => return Answer::Refused(StatusCode::BAD_REQUEST, problem),
+        };
+        let robots = self.robots.clone();
+        self.reading(move |logs| {
+            let known = robots.get(&logs.robot(id)?);
+            Ok(serde_json::to_string(&known.map_or_else(robot::unknown, |shown| shown.told())))
+        })
+        .await
     }
 
     async fn cell(&self, query: &Query<'_>) -> Answer {
@@ -507,9 +520,9 @@ impl Shown {
             true => self.system.truth().await,
             false => None,
         };
-        let robot = self.robot.clone();
+        let robots = self.robots.clone();
         self.reading(move |logs| {
-            let known = robot.get();
+            let known = robots.get(&logs.robot(id)?);
             let shown = known.as_deref().map_err(String::as_str);
             let cell = logs.cell(id, &asked, shown)?;
             Ok(serde_json::to_string(&wire::Cell { truth, ..cell }))

@@ -659,6 +659,8 @@ wire! {
         more: bool,
         /// The moment.
         at_s: f64,
+        /// The log was read from this moment on: what was moved between its start and then is not known.
+        from_s: f64,
         /// The log's joints are those of the robot: it is shown.
         fits: bool,
         /// Why the robot is not shown, or what is not known of it; empty where there is nothing to say.

@@ -40,7 +40,7 @@ impl Answer {
 
 fn options(logs: &[&Path], directory: &Path) -> Options {
     let logs = logs.iter().map(|path| path.to_path_buf()).collect();
-    let robots = Robots::by(|| Ok((Robot::aimm(), "the built-in robot".to_owned())));
+    let robots = Robots::by(|_| Ok((Robot::aimm(), "the built-in robot".to_owned())));
     Options { logs, robots, patience: PATIENCE, ..Options::of(directory.to_owned(), ClientTls::none()) }
 }
 
@@ -159,7 +159,7 @@ async fn nothing_is_told_without_the_token_nor_to_pages_of_others() {
     for (method, path) in [
         ("GET", "/api/about"),
         ("GET", "/api/run?log=1"),
-        ("GET", "/api/robot"),
+        ("GET", "/api/robot?log=1"),
         ("GET", "/api/cell?log=1"),
         ("GET", "/api/system"),
         ("POST", "/api/control?log=1&word=abort"),
@@ -264,7 +264,7 @@ async fn the_robot_is_told_once_and_where_its_joints_go_as_far_as_a_moment() {
     let file = log_of(&lines);
     let served = serve(&[file.path()], false).await;
     let log = served.log().await;
-    let robot = served.get("/api/robot").await.json();
+    let robot = served.get(&format!("/api/robot?log={log}")).await.json();
     assert_eq!((&robot["known"], &robot["name"]), (&Value::from(true), &Value::from("aimm")));
     let joint = robot["joints"].as_array().unwrap().iter().position(|one| one["name"] == "arm_joint_1").unwrap();
     let tracks = |cell: &Value| cell["tracks"].as_array().unwrap().len();
@@ -286,18 +286,56 @@ async fn the_robot_is_told_once_and_where_its_joints_go_as_far_as_a_moment() {
 }
 
 #[tokio::test]
+async fn each_log_is_shown_with_the_robot_that_it_names() {
+    let place = tempfile::tempdir().unwrap();
+    let of = |robot: &str| {
+        log_of(&[started("seen").replace(r#","seed""#, &format!(r#","origin":{{"robot":"{robot}"}},"seed""#))])
+    };
+    let files = [of("ur5"), of("panda"), of("nobody"), log_of(&[started("earlier")])];
+    let robots = Robots::by(|of_log| match of_log {
+        "" => Ok((Robot::aimm(), "the built-in robot".to_owned())),
+        _ => Robot::built_in(of_log)
+            .map(|robot| (robot, "as the log says".to_owned()))
+            .ok_or(format!("there is no {of_log}")),
+    });
+    let paths: Vec<&Path> = files.iter().map(tempfile::NamedTempFile::path).collect();
+    let dashboard = Dashboard::bind(Options { robots, ..options(&paths, place.path()) }).await.unwrap();
+    let url = dashboard.url();
+    let (address, token) = url.strip_prefix("http://").unwrap().split_once("/#token=").unwrap();
+    let served = Served { address: address.to_owned(), token: token.to_owned(), _place: place };
+    tokio::spawn(dashboard.serve());
+    let logs = served.get("/api/about").await.json()["logs"].clone();
+    let mut told = Vec::new();
+    for log in logs.as_array().unwrap() {
+        let robot = served.get(&format!("/api/robot?log={}", log["id"])).await.json();
+        let cell = served.get(&format!("/api/cell?log={}", log["id"])).await.json();
+        told.push(format!("{} {} {} {}", robot["known"], robot["name"], robot["note"], cell["fits"]));
+    }
+    assert_eq!(
+        told,
+        [
+            r#"true "ur5" "as the log says" true"#,
+            r#"true "panda" "as the log says" true"#,
+            r#"false "" "there is no nobody" false"#,
+            r#"true "aimm" "the built-in robot" true"#
+        ]
+    );
+}
+
+#[tokio::test]
 async fn without_a_robot_the_objects_are_told_and_why_it_is_not() {
     let place = tempfile::tempdir().unwrap();
     let world = r#"[[{"predicate":"shape","arguments":["box"]},{"map":{"type":{"string":"box"},"size":{"list":[{"float":0.1},{"float":0.2},{"float":0.3}]}}}],[{"predicate":"at","arguments":["box"]},{"pose":{"position":[1.0,0.0,0.5],"quaternion_xyzw":[0.0,0.0,0.0,1.0]}}]]"#;
     let file = log_of(&[started("seen").replace(r#""world":[]"#, &format!(r#""world":{world}"#))]);
-    let robots = Robots::by(|| Err("the robot `mine` is not known".to_owned()));
+    let robots = Robots::by(|_| Err("the robot `mine` is not known".to_owned()));
     let dashboard = Dashboard::bind(Options { robots, ..options(&[file.path()], place.path()) }).await.unwrap();
     let url = dashboard.url();
     let (address, token) = url.strip_prefix("http://").unwrap().split_once("/#token=").unwrap();
     let served = Served { address: address.to_owned(), token: token.to_owned(), _place: place };
     tokio::spawn(dashboard.serve());
-    assert_eq!(served.get("/api/robot").await.json()["known"], false);
+    assert_eq!(served.get("/api/robot").await.status, 400);
     let log = served.log().await;
+    assert_eq!(served.get(&format!("/api/robot?log={log}")).await.json()["known"], false);
     let cell = served.get(&format!("/api/cell?log={log}")).await.json();
     assert_eq!((&cell["fits"], &cell["note"]), (&Value::from(false), &Value::from("the robot `mine` is not known")));
     assert_eq!((&cell["objects"][0]["name"], &cell["truth"]), (&Value::from("box"), &Value::Null));
@@ -340,6 +378,11 @@ async fn of_a_long_log_what_is_shown_is_read() {
     let run = &frames.last().unwrap()["run"];
     assert_eq!(run["at_s"].as_f64(), Some(200.25));
     assert!(began.elapsed() < Duration::from_secs(20), "{:?}", began.elapsed());
+    // Who sees the cell or the world is told that what was before is not in it.
+    for page in ["cell", "world"] {
+        let told = served.get(&format!("/api/{page}?log={log}&at=200.25&epoch={}", frames[0]["epoch"])).await.json();
+        assert_eq!(told["from_s"], run["from_s"], "{page}");
+    }
     // A short moment after the start is read from the start.
     let early = served.frames(&format!("log={log}&at=3.25")).await.pop().unwrap();
     assert_eq!((early["run"]["from_s"].as_f64(), early["run"]["expanded"].as_u64()), (Some(0.0), Some(3)));
@@ -478,7 +521,7 @@ async fn serve_editor() -> (Served, PathBuf) {
     let file = place.path().join("task.yaml");
     std::fs::write(&file, TASK).unwrap();
     let check = |text: &str| load(text, "task.yaml", &Catalogue::standard());
-    let edit = Some(Editing::of(file.clone(), vec!["Arm".to_owned()], check, |_| Ok(7.5)));
+    let edit = Some(Editing::of(file.clone(), vec!["Arm".to_owned()], check, |_, _| Ok(7.5)));
     let dashboard = Dashboard::bind(Options { edit, ..options(&[], place.path()) }).await.unwrap();
     let url = dashboard.url();
     let (address, token) = url.strip_prefix("http://").unwrap().split_once("/#token=").unwrap();

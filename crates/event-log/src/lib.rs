@@ -183,6 +183,15 @@ impl LogWriter {
         self.file.flush().map_err(|source| self.io(source))
     }
 
+    /// The file, to make safe what was written while more is written; `None` where it is on no disk.
+    ///
+    /// # Errors
+    /// Where the system has no room for one more open file.
+    pub fn handle(&self) -> Result<Option<File>, LogError> {
+        let handle = || self.file.get_ref().try_clone().map_err(|source| self.io(source));
+        self.on_disk.then(handle).transpose()
+    }
+
     /// Returns once everything written so far outlives a loss of power.
     pub fn make_durable(&mut self) -> Result<(), LogError> {
         if self.on_disk {

@@ -49,6 +49,9 @@ pub struct Origin {
     /// The state of the task's own list at which it began, where that is not the first.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub from: Option<String>,
+    /// The robot that it is for: the name of a built-in one, or the absolute path of its description. Empty in logs of earlier versions.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub robot: String,
     /// When it began, in milliseconds since 1970.
     #[serde(default)]
     pub began_unix_ms: u64,

@@ -30,9 +30,16 @@ impl Live {
         let entries = std::iter::once(event).chain(commands.iter().cloned().map(LogEntry::Command));
         let mut spans = Vec::new();
         for entry in entries {
-            let changed = self.run.apply(&LogLine { at, entry });
-            self.add(&changed.left, &mut spans);
+            spans.extend(self.line(&LogLine { at, entry }));
         }
+        spans
+    }
+
+    /// What has ended by a line of the run's log.
+    pub fn line(&mut self, line: &LogLine) -> Vec<Span> {
+        let changed = self.run.apply(line);
+        let mut spans = Vec::new();
+        self.add(&changed.left, &mut spans);
         spans
     }
 

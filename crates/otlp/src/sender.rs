@@ -17,6 +17,8 @@ use tokio::time::Instant;
 const QUEUE: usize = 4_096;
 /// As many spans are one request, …
 const BATCH: usize = 512;
+/// … or as many as have so many bytes: collectors take 4 MiB, unless somebody tells them otherwise, …
+const BATCH_BYTES: usize = 1 << 20;
 /// … or what came in this time.
 const PAUSE: Duration = Duration::from_millis(500);
 /// What is queued at the end of a run is sent in this time, …
@@ -136,7 +138,7 @@ impl Sender {
 
     /// Takes a span, or drops it where there is no room; never waits.
     pub fn record(&self, span: Span) {
-        if self.queue.try_send(Message::Span(Box::new(span))).is_err() {
+        if self.queue.try_send(Message::Span(Box::new(span.cut()))).is_err() {
             self.counts.add(0, 1);
             self.trouble.say(&format_args!("{QUEUE} wait to be sent, and more come than it takes"));
         }
@@ -182,9 +184,13 @@ impl Work {
                 }
             };
             let until = Instant::now() + PAUSE;
-            while flushed.is_none() && batch.len() < BATCH {
+            let mut bytes: usize = batch.iter().map(Span::bytes).sum();
+            while flushed.is_none() && batch.len() < BATCH && bytes < BATCH_BYTES {
                 match tokio::time::timeout_at(until, queue.recv()).await {
-                    Ok(Some(Message::Span(span))) => batch.push(*span),
+                    Ok(Some(Message::Span(span))) => {
+                        bytes += span.bytes();
+                        batch.push(*span);
+                    }
                     Ok(Some(Message::Flush(done))) => flushed = Some(done),
                     Ok(None) | Err(_) => break,
                 }
@@ -335,6 +341,34 @@ mod tests {
         assert_eq!(sender.counts().sent(), 0);
         let heard = heard.lock().unwrap();
         assert!(heard.len() == 1 && heard[0].contains("4096 wait to be sent"), "{heard:?}");
+    }
+
+    #[tokio::test]
+    async fn requests_are_bounded_in_bytes_and_long_texts_are_cut() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let (sender, heard) = to(listener.local_addr().unwrap().port(), 60_000);
+        let long = "ä".repeat(10_000);
+        let attributes: Vec<_> = (0..16).map(|_| ("said", long.clone())).collect();
+        let links = (0..100_000).map(|to| crate::Link { to, waited_for: "result" }).collect();
+        sender.record(Span { error: Some("ä".repeat(1 << 20)), name: long, links, ..span(1) });
+        (2..100).for_each(|id| sender.record(Span { attributes: attributes.clone(), ..span(id) }));
+        let flushing = {
+            let sender = sender.clone();
+            tokio::spawn(async move { sender.flush(Duration::from_secs(60)).await })
+        };
+        let (mut spans, mut requests) = (Vec::new(), 0);
+        while spans.len() < 99 {
+            let (_, body) = answer(&listener, "200 OK").await;
+            assert!(body.len() < 2 * BATCH_BYTES, "{}", body.len());
+            spans.extend(decode(&body).unwrap());
+            requests += 1;
+        }
+        flushing.await.unwrap();
+        assert!(requests >= 6, "{requests}");
+        let error = spans[0].error.as_deref().unwrap();
+        assert!(error.len() < 4_200 && error.ends_with("ä…"), "{}", error.len());
+        assert!(spans[0].name.len() < 4_200 && spans[0].links.len() == 128);
+        assert!(heard.lock().unwrap().is_empty());
     }
 
     #[tokio::test]

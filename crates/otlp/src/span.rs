@@ -3,6 +3,12 @@
 use serde_json::{Value, json};
 
 const ERROR: u32 = 2;
+/// Of a longer text the beginning is sent: a reason may be as long as a message of the wire.
+const MAX_TEXT: usize = 4_096;
+/// Of more links the first are sent, as the SDKs of OpenTelemetry do it.
+const MAX_LINKS: usize = 128;
+/// What a span or a link takes on the wire beside its texts, at the most.
+const FRAME: usize = 128;
 
 /// A part of a trace that has ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -90,8 +96,32 @@ impl Span {
         json
     }
 
+    /// With texts and links of bounded length.
+    pub(crate) fn cut(mut self) -> Span {
+        let values = self.attributes.iter_mut().map(|(_, value)| value);
+        values.chain([&mut self.name]).chain(&mut self.error).for_each(cut);
+        self.links.truncate(MAX_LINKS);
+        self
+    }
+
+    /// About how many bytes it takes on the wire.
+    pub(crate) fn bytes(&self) -> usize {
+        let attributes = self.attributes.iter().map(|(key, value)| key.len() + value.len() + FRAME / 4);
+        let texts = self.name.len() + self.error.as_ref().map_or(0, String::len) + attributes.sum::<usize>();
+        texts + FRAME * (1 + self.links.len())
+    }
+
     pub(crate) fn said(&self) -> impl Iterator<Item = (&'static str, &str)> {
         said(&self.attributes)
+    }
+}
+
+fn cut(text: &mut String) {
+    if text.len() > MAX_TEXT {
+        text.truncate(text.floor_char_boundary(MAX_TEXT));
+        text.push('…');
+        // The queue is bounded in spans.
+        text.shrink_to_fit();
     }
 }
 

@@ -146,6 +146,12 @@ pub enum RunError {
     /// More events than any run should have.
     #[error("no end after {0} events")]
     Endless(usize),
+    /// Whoever has it simulated does not want to wait longer.
+    #[error("it was ended at {at_s:.3} s of the task, before its end")]
+    Stopped {
+        /// When, in the run.
+        at_s: f64,
+    },
     /// More lines of its log than any run should have.
     #[error("no end after {0} lines of its event log")]
     TooLong(usize),
@@ -223,6 +229,19 @@ pub fn run_looking_ahead(setup: Setup, oracle: &mut dyn Oracle, orders: usize) -
 /// # Errors
 /// As [`run`].
 pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumstances) -> Result<Run, RunError> {
+    run_while(setup, oracle, circumstances, &|| true)
+}
+
+/// As [`run_under`], as long as it shall go on, which is asked before every event.
+///
+/// # Errors
+/// As [`run`]; [`RunError::Stopped`].
+pub fn run_while(
+    setup: Setup,
+    oracle: &mut dyn Oracle,
+    circumstances: Circumstances,
+    goes_on: &dyn Fn() -> bool,
+) -> Result<Run, RunError> {
     let (orders, max_events) = (circumstances.orders, circumstances.max_events);
     let max_lines = max_events.saturating_mul(LINES_PER_EVENT).min(MAX_LINES);
     let (mut resume_after, learned) = (circumstances.resume_after, circumstances.learned.clone());
@@ -288,6 +307,9 @@ pub fn run_under(setup: Setup, oracle: &mut dyn Oracle, circumstances: Circumsta
         _ => None,
     });
     for event in 1..=max_events {
+        if !goes_on() {
+            return Err(RunError::Stopped { at_s: simulation.now.seconds() });
+        }
         let Some(((now, _), entry)) = simulation.agenda.pop_first() else {
             return Err(RunError::Stuck { at_s: simulation.now.seconds(), waits: executive.explain() });
         };

@@ -21,9 +21,13 @@ fn check_with_brains(text: &str, brains: u32) -> Result<Sequential, Obstacle> {
     let assumptions = Assumptions { parameters, elements: 2, durations_s, units, attributes };
     let found = sequential(&program, &catalogue(), &assumptions);
     if let Ok(found) = &found {
-        let makespan_s = |max_events| makespan_s(&program, &catalogue(), &assumptions, max_events);
-        assert_eq!(makespan_s(usize::MAX), Ok(found.cdtn_s));
-        assert!(makespan_s(0).is_err_and(|obstacle| obstacle.to_string().contains("no end")));
+        let makespan_s =
+            |max_events, goes_on| makespan_s(&program, &catalogue(), &assumptions, max_events, &|| goes_on);
+        assert_eq!(makespan_s(usize::MAX, true), Ok(found.cdtn_s));
+        assert!(makespan_s(0, true).is_err_and(|obstacle| obstacle.to_string().contains("no end")));
+        assert!(
+            makespan_s(usize::MAX, false).is_err_and(|obstacle| obstacle.to_string().contains("was ended at 0.000 s"))
+        );
     }
     found
 }
@@ -202,6 +206,6 @@ states:
         units: BTreeMap::new(),
         attributes: BTreeMap::new(),
     };
-    let said = makespan_s(&program, &catalogue(), &assumptions, 2_000).unwrap_err().to_string();
+    let said = makespan_s(&program, &catalogue(), &assumptions, 2_000, &|| true).unwrap_err().to_string();
     assert!(said.contains("no end after 40000 lines of its event log"), "{said}");
 }

@@ -318,7 +318,7 @@ states:
 fn what_one_run_computes_in_case_gives_way_to_what_another_needs() {
     let loaded = |text: &str| load(text, "task.yaml", &NoFiles);
     let mut resources = setup(loaded(AHEAD), Mode::Hsm).resources;
-    let brain = resources.iter_mut().find(|(kind, _)| kind == "Brain").unwrap();
+    let brain = resources.iter_mut().find(|(kind, _)| kind == "Brain").expect("a brain");
     brain.1.count = ratn_model::resource::Quantity::ONE;
     for latency in [Duration::ZERO, Duration::from_millis(300)] {
         let shared = Shared { resources: resources.clone(), world: Vec::new(), latency, seed: 1 };
@@ -332,7 +332,7 @@ fn what_one_run_computes_in_case_gives_way_to_what_another_needs() {
             given.push((path.to_owned(), attempt));
             ("success", Value::Int(1))
         });
-        let ended = run(&shared, &runs, &mut providers).unwrap();
+        let ended = run(&shared, &runs, &mut providers).expect("both end");
         assert!(ended.outcomes.iter().all(|(outcome, _)| outcome == "success"), "{:?}", ended.outcomes);
         let thought: Vec<(&str, u32)> = given
             .iter()

@@ -24,6 +24,7 @@ pub mod progress;
 mod promises;
 mod record;
 mod replay;
+mod safe_on_disk;
 pub mod shell;
 mod spans;
 #[cfg(test)]

@@ -5,6 +5,7 @@
 use super::ledger::{Confirmed, Projecting, operation_request};
 use super::performer::Answer;
 use super::promises::{Made, Promises};
+use super::safe_on_disk::Mark;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::Change;
 use ratn_model::id::{InstanceId, ProjectionId, Revision};
@@ -45,7 +46,11 @@ pub(super) enum Record {
         /// Where its goal has it already.
         named: Option<Named>,
     },
-    Commit(Decided),
+    Commit {
+        decided: Decided,
+        /// What has to be safe before.
+        safe: Option<Mark>,
+    },
     /// The pool's root is at this revision, or has been.
     Known(Revision),
     Operate {
@@ -53,6 +58,8 @@ pub(super) enum Record {
         /// Its number in the run.
         number: u64,
         operations: Vec<Requirement>,
+        /// What has to be safe before.
+        safe: Option<Mark>,
     },
     /// Answers once everything before it is done: with the first failure of the run, if there was one.
     Flush(oneshot::Sender<Result<(), String>>),
@@ -157,10 +164,10 @@ impl Recorder {
                     self.project(instance, asked, named, None);
                     None
                 }
-                Record::Commit(decided) => {
+                Record::Commit { decided, safe } => {
                     let over = CancellationToken::new();
                     let (instance, under_way) = (decided.instance, UnderWay { id: decided.id(&self.run), over });
-                    let committing = self.commit(instance, decided.commit(&self.run));
+                    let committing = self.commit(instance, decided.commit(&self.run), safe);
                     let mut committing = pin!(trace::within(self.of(instance), committing));
                     let _answered = under_way.over.clone().drop_guard();
                     loop {
@@ -180,8 +187,8 @@ impl Recorder {
                     self.root.reached(revision);
                     None
                 }
-                Record::Operate { instance, number, operations } => {
-                    trace::within(self.of(instance), self.operate(instance, number, operations)).await
+                Record::Operate { instance, number, operations, safe } => {
+                    trace::within(self.of(instance), self.operate(instance, number, operations, safe)).await
                 }
                 Record::Flush(done) => {
                     let _ = done.send(recorded.clone());
@@ -237,7 +244,10 @@ impl Recorder {
         }));
     }
 
-    async fn commit(&self, instance: InstanceId, commit: Commit) -> Option<Event> {
+    async fn commit(&self, instance: InstanceId, commit: Commit, safe: Option<Mark>) -> Option<Event> {
+        if let Some(refused) = unsafe_on_disk(instance, safe).await {
+            return Some(refused);
+        }
         let mut trust = self.trust.clone();
         if !trust.is_kept().await {
             let reason = "its effects are not recorded: the run's session was lost before, and whoever had its resources since may have \
@@ -257,7 +267,16 @@ impl Recorder {
         }
     }
 
-    async fn operate(&self, instance: InstanceId, number: u64, operations: Vec<Requirement>) -> Option<Event> {
+    async fn operate(
+        &self,
+        instance: InstanceId,
+        number: u64,
+        operations: Vec<Requirement>,
+        safe: Option<Mark>,
+    ) -> Option<Event> {
+        if let Some(refused) = unsafe_on_disk(instance, safe).await {
+            return Some(refused);
+        }
         for (index, operation) in operations.into_iter().enumerate() {
             let request = operation_request(&self.run, instance, number, index);
             if let Err(error) = operate_once(&self.resources, &request, &operation).await {
@@ -349,10 +368,20 @@ impl MakingProjection {
     }
 }
 
+/// The failure, where what has to be safe before never will be.
+async fn unsafe_on_disk(instance: InstanceId, safe: Option<Mark>) -> Option<Event> {
+    let is_safe = match safe {
+        Some(safe) => safe.safe().await,
+        None => true,
+    };
+    let reason = || "the event log, which says what has happened, cannot be made safe on its disk".to_owned();
+    (!is_safe).then(|| Event::RetirementFailed { instance, reason: reason() })
+}
+
 /// What is confirmed once a record is done.
 fn confirms(record: &Record) -> Confirmed {
     match record {
-        Record::Commit(decided) => Confirmed { commit: decided.revision, ..Confirmed::default() },
+        Record::Commit { decided, .. } => Confirmed { commit: decided.revision, ..Confirmed::default() },
         Record::Operate { number, .. } => Confirmed { operation: *number, ..Confirmed::default() },
         _ => Confirmed::default(),
     }

@@ -16,9 +16,10 @@ use super::messages::Messages;
 use super::performer::{self, Performer};
 use super::progress::Progress;
 use super::replay::{self, VERSION};
+use super::safe_on_disk::{Mark, Syncer};
 use super::spans::{Spans, trace_of};
 use crate::interrupt::Interrupt;
-use anyhow::Context;
+use anyhow::{Context, bail};
 use ratn_event_log::{LogWriter, without_visits};
 use ratn_executive::MOST_SIGNALS_KEPT;
 use ratn_executive::executive::Executive;
@@ -88,6 +89,8 @@ pub struct Place {
     pub directory: PathBuf,
     /// What there is on it.
     pub catalogue: Arc<Catalogue>,
+    /// Its robot: the name of a built-in one, or the absolute path of its description.
+    pub robot: String,
     /// The robot's seconds per second of wall time.
     pub speed: f64,
     /// Where what people read of the run goes.
@@ -146,6 +149,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
         progress: Progress::new(run.quiet),
         messages: place.messages.clone(),
         program: run.program.clone(),
+        syncer: syncer_of(&log)?,
         log,
         checkpointer,
         clock: RobotClock::start(place.speed),
@@ -179,6 +183,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
                 version: VERSION.to_owned(),
                 file: run.file,
                 from: run.from,
+                robot: place.robot.clone(),
                 began_unix_ms,
                 imprecise: imprecise(&run.program),
                 natures: natures(&run.program, &place.catalogue),
@@ -212,6 +217,10 @@ pub fn breakpoints(program: &Program, states: &[String]) -> Result<Vec<String>, 
     states.iter().map(breakpoint).collect()
 }
 
+fn syncer_of(log: &LogWriter) -> anyhow::Result<Syncer> {
+    Syncer::start(log.handle()?).context("cannot make the event log safe")
+}
+
 /// A run under way.
 struct Shell {
     program: Arc<Program>,
@@ -222,6 +231,7 @@ struct Shell {
     /// When the executive wants to be woken.
     timers: BTreeSet<Timestamp>,
     log: LogWriter,
+    syncer: Syncer,
     /// None where there shall be no checkpoints, or can be none.
     checkpointer: Option<Checkpointer>,
     progress: Progress,
@@ -283,8 +293,9 @@ impl Shell {
     /// Hands an event to the executive, and what it commands to whoever does it.
     fn step(&mut self, event: Event) -> anyhow::Result<Option<Ended>> {
         let (now, commands) = self.decide(&event)?;
+        let safe = replay::must_be_durable(&self.program, &self.states, &commands).then(|| self.syncer.mark());
         self.performer.prepare(&event, &commands);
-        self.perform(now, commands)
+        self.perform(now, commands, safe)
     }
 
     /// What the executive makes of an event, written down.
@@ -296,8 +307,7 @@ impl Shell {
         let commands = self.executive.handle(now, event.clone());
         commands.iter().for_each(|command| replay::follow(&mut self.states, command));
         self.log.append(now, event, &commands)?;
-        let is_sent = !self.confirm.is_empty();
-        if is_sent || replay::must_be_durable(&self.program, &self.states, &commands) {
+        if !self.confirm.is_empty() {
             self.log.make_durable()?;
         }
         for (say, said) in self.confirm.drain(..) {
@@ -320,16 +330,22 @@ impl Shell {
         Ok((now, commands))
     }
 
+    /// What cannot be undone is done when what led to it is safe on the disk, and so is what others may then do; all else at once.
     fn perform(
         &mut self,
         now: Timestamp,
         commands: impl IntoIterator<Item = Command>,
+        safe: Option<Mark>,
     ) -> anyhow::Result<Option<Ended>> {
         for command in commands {
             match command {
                 Command::Wake { at } => drop(self.timers.insert(at)),
                 Command::End { .. } => return Ok(ended(command, now)),
-                command => self.performer.perform(command)?,
+                command => {
+                    let waits = matches!(command, Command::Release { .. })
+                        || replay::must_be_durable(&self.program, &self.states, std::slice::from_ref(&command));
+                    self.performer.perform_when(safe.clone().filter(|_| waits), command)?;
+                }
             }
         }
         Ok(None)
@@ -534,6 +550,9 @@ impl Shell {
                     },
                 },
                 event = advised => return Ok(event),
+                reason = self.syncer.failed() => {
+                    bail!("{} cannot be made safe on its disk: {reason}", self.log.path().display())
+                }
                 () = to_ask => {
                     self.ask_for_advice();
                     continue;

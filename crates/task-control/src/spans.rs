@@ -1,11 +1,32 @@
 //! The spans that a run sends while it goes on, where its process has a sender ([`ratn_otlp::start`]).
+//!
+//! ```text
+//!   begins ─────────────────────────────────────────▶ Following ──▶ end: what is left, and the run's own span
+//!   goes on ──▶ CatchingUp: a thread reads the log; ──▶ Following
+//!               what happens meanwhile is kept
+//! ```
+//! A run that goes on does not wait for its log to be read: a checkpoint has spared it that.
 
+use super::messages::Messages;
+use ratn_event_log::{Lines, LogError};
 use ratn_executive::protocol::{Command, Event};
 use ratn_export::live::Live;
 use ratn_model::time::Timestamp;
-use ratn_otlp::{END_OF_RUN, Sender, ids};
+use ratn_otlp::{END_OF_RUN, Sender, Span, ids};
 use ratn_worker::trace::TraceContext;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::path::PathBuf;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use tokio::sync::oneshot::{self, error::TryRecvError};
+use tokio::time::Instant;
+
+/// While the log is read so many events are kept. Of a run in which more happen meanwhile no more spans are sent.
+const MOST_KEPT: usize = 16_384;
+/// What a process that was killed has recorded in its last moments may not have left its queue: it is sent again. A collector that has
+/// taken it sees the same ids twice.
+const SENT_AGAIN: Duration = Duration::from_secs(3);
+
+/// The thread that reads it has ended without a word.
+const UNREAD: &str = "its log is not read";
 
 /// A run's place in its trace, of which the export of its log is, too.
 pub(super) fn trace_of(run: &str, task: &str, seed: u64, began_unix_ms: u64) -> TraceContext {
@@ -16,31 +37,147 @@ pub(super) fn trace_of(run: &str, task: &str, seed: u64, began_unix_ms: u64) -> 
 #[derive(Debug)]
 pub(super) struct Spans {
     sender: &'static Sender,
+    stage: Stage,
+}
+
+#[derive(Debug)]
+enum Stage {
+    Following(Box<Live>),
+    CatchingUp {
+        read: oneshot::Receiver<Result<CaughtUp, LogError>>,
+        kept: Vec<Step>,
+        messages: Messages,
+    },
+    /// It cannot be known what was before.
+    GivenUp,
+}
+
+/// An event that the executive was given, and what it commanded.
+type Step = (Timestamp, Event, Vec<Command>);
+
+/// What a log comes to.
+#[derive(Debug)]
+struct CaughtUp {
     live: Box<Live>,
+    /// Spans that may not have been sent.
+    again: Vec<Span>,
+}
+
+/// The log of a run that goes on, up to where it does.
+#[derive(Debug)]
+pub(super) struct Before {
+    /// Where it is.
+    pub(super) log: PathBuf,
+    /// So many bytes of it are before.
+    pub(super) bytes: u64,
+    /// When the last event of it was.
+    pub(super) last: Timestamp,
 }
 
 impl Spans {
     /// Of a run whose clock begins now; `None` where nobody wants them.
-    #[allow(
-        clippy::disallowed_methods,
-        reason = "a span is at a moment of the wall clock; how long it took is measured otherwise"
-    )]
     pub(super) fn of_a_run_that_begins(speed: f64) -> Option<Spans> {
         let sender = ratn_otlp::sender()?;
-        let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let now_unix_ns = u64::try_from(since_1970.as_nanos()).unwrap_or(u64::MAX);
-        Some(Spans { sender, live: Box::new(Live::new(now_unix_ns, speed)) })
+        Some(Spans { sender, stage: Stage::Following(Box::new(Live::new(unix_ns(), speed))) })
+    }
+
+    /// Of a run that goes on, whose clock says this now.
+    pub(super) fn of_a_run_that_goes_on(
+        before: Before,
+        now: Timestamp,
+        speed: f64,
+        messages: &Messages,
+    ) -> Option<Spans> {
+        let sender = ratn_otlp::sender()?;
+        let since_ns = (now.seconds() / speed * 1e9).round() as u64;
+        let live = Box::new(Live::new(unix_ns().saturating_sub(since_ns), speed));
+        let (told, read) = oneshot::channel();
+        let reading = move || {
+            // Whoever waits for it may have ended.
+            let _ = told.send(caught_up(live, &before, speed));
+        };
+        // Without the thread nobody tells, and the spans are given up.
+        let _ = std::thread::Builder::new().name("spans".to_owned()).spawn(reading);
+        Some(Spans { sender, stage: Stage::CatchingUp { read, kept: Vec::new(), messages: messages.clone() } })
     }
 
     pub(super) fn follow(&mut self, at: Timestamp, event: &Event, commands: &[Command]) {
-        self.live.follow(at, event, commands).into_iter().for_each(|span| self.sender.record(span));
+        if let Stage::CatchingUp { read, kept, .. } = &mut self.stage {
+            match read.try_recv() {
+                Err(TryRecvError::Empty) if kept.len() < MOST_KEPT => {
+                    return kept.push((at, event.clone(), commands.to_vec()));
+                }
+                Err(TryRecvError::Empty) => self.give_up(&"too much happened while its log was read"),
+                Err(TryRecvError::Closed) => self.give_up(&UNREAD),
+                Ok(read) => self.catch_up(read),
+            }
+        }
+        if let Stage::Following(live) = &mut self.stage {
+            live.follow(at, event, commands).into_iter().for_each(|span| self.sender.record(span));
+        }
     }
 
     /// Sends what is left, and the run's own span; waits for that no longer than [`END_OF_RUN`].
     pub(super) async fn end(spans: Option<Spans>) {
-        if let Some(Spans { sender, mut live }) = spans {
+        let Some(mut spans) = spans else { return };
+        let (sender, until) = (spans.sender, Instant::now() + END_OF_RUN);
+        if let Stage::CatchingUp { read, .. } = &mut spans.stage {
+            match tokio::time::timeout_at(until, read).await {
+                Ok(Ok(read)) => spans.catch_up(read),
+                Ok(Err(_)) => spans.give_up(&UNREAD),
+                Err(_) => spans.give_up(&"its log was not read to where it went on before it ended"),
+            }
+        }
+        if let Stage::Following(live) = &mut spans.stage {
             live.end().into_iter().for_each(|span| sender.record(span));
-            sender.flush(END_OF_RUN).await;
+        }
+        sender.flush(until.saturating_duration_since(Instant::now())).await;
+    }
+
+    fn catch_up(&mut self, read: Result<CaughtUp, LogError>) {
+        let CaughtUp { mut live, again } = match read {
+            Ok(caught_up) => caught_up,
+            Err(error) => return self.give_up(&error),
+        };
+        again.into_iter().for_each(|span| self.sender.record(span));
+        if let Stage::CatchingUp { kept, .. } = &mut self.stage {
+            for (at, event, commands) in kept.drain(..) {
+                live.follow(at, &event, &commands).into_iter().for_each(|span| self.sender.record(span));
+            }
+        }
+        self.stage = Stage::Following(live);
+    }
+
+    fn give_up(&mut self, why: &dyn std::fmt::Display) {
+        if let Stage::CatchingUp { messages, .. } = &self.stage {
+            messages.say(format_args!("no spans of its nodes are sent to the OTLP collector any more: {why}"));
+        }
+        self.stage = Stage::GivenUp;
+    }
+}
+
+/// Reads what was before.
+fn caught_up(mut live: Box<Live>, before: &Before, speed: f64) -> Result<CaughtUp, LogError> {
+    let from_s = before.last.seconds() - SENT_AGAIN.as_secs_f64() * speed;
+    let mut again = Vec::new();
+    let mut lines = Lines::of(&before.log)?;
+    while lines.position().0 < before.bytes
+        && let Some(line) = lines.next()
+    {
+        let line = line?;
+        let spans = live.line(&line);
+        if line.at.seconds() >= from_s {
+            again.extend(spans);
         }
     }
+    Ok(CaughtUp { live, again })
+}
+
+#[allow(
+    clippy::disallowed_methods,
+    reason = "a span is at a moment of the wall clock; how long it took is measured otherwise"
+)]
+fn unix_ns() -> u64 {
+    let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since_1970.as_nanos()).unwrap_or(u64::MAX)
 }

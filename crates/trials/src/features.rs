@@ -58,6 +58,9 @@ pub struct Features {
     pub finds: bool,
     /// Actions whose results get better after they were given.
     pub anytime: bool,
+    /// Limits of composites, and races whose regions touch nothing of each other; something is done on every way out of states inside of
+    /// these and of regions, and being cut short changes the world.
+    pub ways_out: bool,
 }
 
 impl Features {
@@ -90,6 +93,7 @@ impl Features {
         watched: false,
         finds: false,
         anytime: false,
+        ways_out: false,
     };
 
     /// Sequences, hierarchies, loops over lists, conditions, routines and actions alone.
@@ -121,6 +125,7 @@ impl Features {
         watched: false,
         finds: false,
         anytime: false,
+        ways_out: false,
     };
 
     /// [`Features::ALL`], without those assumptions.
@@ -155,6 +160,9 @@ impl Features {
 
     /// [`Features::WATCHED`], with results that get better after they were given.
     pub const ANYTIME: Features = Features { anytime: true, ..Features::WATCHED };
+
+    /// [`Features::WATCHED`], with more ways out.
+    pub const WAYS_OUT: Features = Features { ways_out: true, ..Features::WATCHED };
 
     /// Imprecise motions that fail, in programs that never look at the world: where a failure leads is then the same in both
     /// modes, whatever younger motions have done meanwhile.

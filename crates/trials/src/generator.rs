@@ -7,11 +7,11 @@
 //!
 //! | | |
 //! |---|---|
-//! | the tree | `list`, `composite`, `regions`, `action`, `guards`, `waits`, `watched`, `long`, `patterns` |
+//! | the tree | `list`, `composite`, `regions`, `action`, `guards`, `waits`, `watched`, `ways_out`, `long`, `patterns` |
 //! | what is said of a state | `annotations`, `variables`, `supplies`, `estimates` |
 //! | facts | `facts`, `effects`, `tolerance` |
 //!
-//! What it does not make: limits of composites; waits in races and beside imprecise motions, conditions of waits with keys that are not constants (scenarios of the
+//! What it does not make: limits of what is beside others or holds a race; waits in races and beside imprecise motions, conditions of waits with keys that are not constants (scenarios of the
 //! simulation have them); hierarchies and concurrencies with tolerated facts or port keys in their effects; numbers within a
 //! tolerance that add up, or that are looked up by anything that compares exactly; individuals of classes (ontologies declare
 //! numbers and things); values that are poses, joint positions or trajectories; selectors of task resources; task resources and
@@ -50,6 +50,7 @@ pub(super) mod tolerance;
 mod variables;
 mod waits;
 mod watched;
+mod ways_out;
 
 /// No program has many more states.
 const MAX_STATES: usize = 26;
@@ -112,6 +113,9 @@ pub fn program(seed: u64, features: &Features) -> Program {
     };
     if features.watched {
         watched::watch(&mut program, &mut maker.guards, &mut Dice(seed ^ 0x0000_3a7c_11ed));
+    }
+    if features.ways_out {
+        ways_out::add(&mut program, &mut maker.guards, &mut Dice(seed ^ 0x0000_0f1a_a119));
     }
     if !maker.guards.is_empty() {
         let unfolded = ratn_model::guard::unfold(&mut program, &maker.guards);

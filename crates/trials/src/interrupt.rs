@@ -6,17 +6,20 @@
 //! |---|---|
 //! | the user ends the run when a PIA starts, no regions | both modes end alike: PIAs, changes, world, outcome |
 //! | the same with regions; at any moment; a deadline | of each mode: its PIAs are a closed part of those of HSM mode undisturbed, with the same goals and in its order; its changes are, predicate by predicate, the first of HSM mode's; without regions, they are its first changes in one order; the outcome is `preempted`, or `aborted` at the deadline, or the run had ended before, as ever |
+//! | the same of a program with something to do on every way out, or that says what being cut short means | of each mode: there is a place of the program, or one in each region, at which the reference, told to end there, does the same PIAs with the same goals, the same changes, and leaves the same world; with races of regions, the outcome |
 //! | the world changes at any moment | see [`super::outside`] |
 //!
 //! That nothing is left over in any of them the simulation checks by itself.
 
 use super::outside::trial_at_any_moment;
 use super::story::story;
-use super::trial::{Conditions, Verdict, closure, difference, execute_under, max_hsm_events, same_end};
-use super::{Dice, is_preemptive};
+use super::trial::{
+    Conditions, Verdict, closure, difference, execute_under, is_cut_somewhere, max_hsm_events, same_end,
+};
+use super::{Dice, is_long, is_preemptive};
 use ratn_executive::protocol::{Command, Event, LogEntry, Mode};
 use ratn_model::fact::Change;
-use ratn_model::program::{ABORTED, PREEMPTED, Program, StateKind};
+use ratn_model::program::{ABORTED, PREEMPTED, Program, State, StateKind};
 use ratn_simulation::run::{Run, RunError, Trigger};
 use std::sync::Arc;
 
@@ -44,7 +47,7 @@ pub fn trial_interrupted(program: &Arc<Program>, conditions: &Conditions) -> Ver
         2 => {
             let mut limited = (**program).clone();
             limited.deadline_s = Some(at);
-            parts(&Arc::new(limited), conditions, &whole, (&[], ABORTED), false)
+            parts_of(&Arc::new(limited), program, conditions, &whole, (&[], ABORTED), false)
         }
         _ => trial_at_any_moment(program, conditions, &whole),
     }
@@ -58,6 +61,18 @@ fn parts(
     (outside, outcome): (&[(Trigger, Event)], &str),
     alike: bool,
 ) -> Verdict {
+    parts_of(program, program, conditions, whole, (outside, outcome), alike)
+}
+
+/// The same of a program that is another one but for its deadline.
+fn parts_of(
+    program: &Arc<Program>,
+    unlimited: &Program,
+    conditions: &Conditions,
+    whole: &Run,
+    (outside, outcome): (&[(Trigger, Event)], &str),
+    alike: bool,
+) -> Verdict {
     let mut ends = Vec::new();
     for mode in [Mode::Hsm, Mode::Cdtn] {
         let most = 60 * whole.log.len() + 10_000;
@@ -65,7 +80,14 @@ fn parts(
             Ok(run) => run,
             Err(problem) => return Verdict::Differs(format!("{mode:?} mode, interrupted: {problem}")),
         };
-        if let Some(problem) = is_no_part(program, whole, &part, outcome) {
+        let changes =
+            |state: &State| state.annotations.effects.get(PREEMPTED).is_some_and(|effects| !effects.is_empty());
+        let is_otherwise = |state: &State| state.annotations.finally.is_some() || changes(state);
+        let problem = match program.states.iter().any(is_otherwise) {
+            true => leaves_otherwise(unlimited, conditions, whole, &part, outcome),
+            false => is_no_part(program, whole, &part, outcome),
+        };
+        if let Some(problem) = problem {
             return Verdict::Differs(format!("{mode:?} mode, interrupted: {problem}"));
         }
         ends.push(part);
@@ -75,6 +97,35 @@ fn parts(
         return Verdict::Differs(format!("interrupted at the same place: {problem}"));
     }
     Verdict::Same { hsm_s: ends[0].end_s, cdtn_s: ends[1].end_s, acts: stories.1.acts.len() }
+}
+
+/// What a run did otherwise than one that is told to end at some place and then does what is to be done on its way out.
+fn leaves_otherwise(
+    program: &Program,
+    conditions: &Conditions,
+    whole: &Run,
+    part: &Run,
+    outcome: &str,
+) -> Option<String> {
+    let is_cut = part.outcome == outcome && part.outputs.is_empty();
+    if !is_cut {
+        let races = program.states.iter().any(is_preemptive);
+        return (!races).then(|| same_end(whole, part)).flatten();
+    }
+    if is_long(program) || part.reason.contains("its way out took longer") {
+        return None;
+    }
+    let told = story(program, part);
+    let known = is_cut_somewhere(program, conditions, part, &told, outcome);
+    // It may have been told to end when it had ended, by the same outcome.
+    let is_otherwise = known == Some(false) && same_end(whole, part).is_some();
+    is_otherwise.then(|| {
+        let acts: Vec<&str> = told.acts.iter().map(|act| act.path.as_str()).collect();
+        format!(
+            "there is no place at which a run that is told to end does this: {acts:?} {:?} {:?}",
+            told.changes, part.reason
+        )
+    })
 }
 
 fn is_no_part(program: &Program, whole: &Run, part: &Run, outcome: &str) -> Option<String> {

@@ -24,7 +24,7 @@ use std::collections::BTreeMap;
 /// No goal of a random program takes as long, unless it never answers.
 pub(super) const TIMEOUT_S: f64 = 60.0;
 /// What the actions of a preemptive concurrency take, at least.
-const LONG_S: f64 = 10_000.0;
+pub(super) const LONG_S: f64 = 10_000.0;
 /// And so much more in its second region.
 const SHIFT_S: f64 = 3_000.0;
 /// Attempts from this one on do not crash.

@@ -195,14 +195,46 @@ pub fn no_verdict(program: &Program, conditions: &Conditions) -> Option<&'static
     }
 }
 
+/// Whether the reference knows a place at which a run, told to end there, does what this one did; `None` where it has no verdict.
+pub(super) fn is_cut_somewhere(
+    program: &Program,
+    conditions: &Conditions,
+    run: &Run,
+    story: &Story,
+    outcome: &str,
+) -> Option<bool> {
+    const MOST_PLACES: usize = 2_000;
+    let mut choices = reference::Choices::default();
+    for _ in 0..MOST_PLACES {
+        let mut oracle = oracle(program, conditions);
+        let given = given(program, conditions, &[], &mut oracle);
+        let (wanted, made) = reference::evaluate_cut(given, choices, outcome).ok()?;
+        if wanted.is_some_and(|wanted| reference::is_cut(program, &wanted, run, story)) {
+            return Some(true);
+        }
+        let Some(next) = made.next() else { return Some(false) };
+        choices = next;
+    }
+    None
+}
+
 /// What the reference says of a program.
 fn should_be(
     program: &Program,
     conditions: &Conditions,
     outside: &[(Trigger, Event)],
 ) -> Result<ReferenceResult, Fail> {
+    reference::evaluate(given(program, conditions, outside, &mut oracle(program, conditions)))
+}
+
+fn given<'a>(
+    program: &'a Program,
+    conditions: &Conditions,
+    outside: &[(Trigger, Event)],
+    oracle: &'a mut HashOracle<'_>,
+) -> Given<'a> {
     let task_resources = RESOURCES.iter().filter(|(_, class, _)| *class == ResourceClass::Task);
-    reference::evaluate(Given {
+    Given {
         program,
         seed: conditions.seed,
         parameters: parameters(program),
@@ -211,8 +243,8 @@ fn should_be(
         refused: refused(program, conditions),
         outside: outside.to_vec(),
         signals: early_signals(program, conditions.seed),
-        oracle: &mut oracle(program, conditions),
-    })
+        oracle,
+    }
 }
 
 /// Parameters are what they are by default.

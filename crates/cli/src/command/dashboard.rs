@@ -20,8 +20,8 @@ use std::path::{Path, PathBuf};
 
 /// How many elements a list has that an action answers, as `ratn check` assumes.
 const ASSUMED_ELEMENTS: usize = 3;
-/// What a change gains is simulated up to so many events: about two seconds.
-const MAX_EVENTS: usize = 20_000;
+/// What a change gains is simulated up to so many events, which bounds the memory that it takes; how long it may take, the dashboard says.
+const MAX_EVENTS: usize = 50_000;
 
 /// Serves the pages until the user has seen enough.
 pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(), Failure> {
@@ -79,10 +79,11 @@ fn editing(file: &Path, directory: &Path) -> Result<Editing, Failure> {
     let kinds = config.catalogue.resources.keys().cloned().collect();
     let (catalogue, name) = (config.catalogue.clone(), file.display().to_string());
     let check = move |text: &str| load_with(text, &name, &catalogue, &input::Libraries);
-    let makespan = move |program: &Program| {
+    let makespan = move |program: &Program, goes_on: &dyn Fn() -> bool| {
         let parameters = program.bind_parameters(&[]).map_err(|error| error.to_string())?;
         let assumptions = Assumptions { parameters, ..assumptions.clone() };
-        makespan_s(program, &config.catalogue, &assumptions, MAX_EVENTS).map_err(|obstacle| obstacle.to_string())
+        makespan_s(program, &config.catalogue, &assumptions, MAX_EVENTS, goes_on)
+            .map_err(|obstacle| obstacle.to_string())
     };
     Ok(Editing::of(file.to_owned(), kinds, check, makespan))
 }
@@ -97,19 +98,35 @@ fn catalogue(directory: &Path) -> Result<Catalogue, Failure> {
     Ok(config(directory)?.catalogue)
 }
 
-/// The robot that the user names, else that of the system that runs, or ran, in a directory, else the one that is built in. A log does not say
-/// which one it is of; what it moves is held against the robot.
+/// The robot that the user names, else the one that the log names. Of a log that names none, that of the system that runs, or ran, in a directory,
+/// else the one that is built in. What the log moves is held against the robot.
 fn robots(directory: PathBuf, named: Option<String>) -> Robots {
-    Robots::by(move || {
-        let own = SystemConfig::read(&directory.join(CONFIG_FILE)).ok().map(|config| config.robot);
-        let (robot, whence) = match (&named, own) {
-            (Some(named), _) => (named.clone(), "as --robot says".to_owned()),
-            (None, Some(own)) => (own, format!("the robot of the system in {}", directory.display())),
-            (None, None) => (SystemConfig::default().robot, "the built-in robot: --robot names another one".to_owned()),
+    Robots::by(move |of_log| {
+        let own = || SystemConfig::read(&directory.join(CONFIG_FILE)).ok().map(|config| config.robot);
+        if let Some(named) = &named {
+            return Ok((robot(named)?, "as --robot says".to_owned()));
+        }
+        if !of_log.is_empty() {
+            let needs =
+                |why| format!("the log is of the robot {of_log}: {why}; --robot names another description of it");
+            return Ok((robot(of_log).map_err(needs)?, "as the log says".to_owned()));
+        }
+        let (robot_of, whence) = match own() {
+            Some(own) => (own, format!("the robot of the system in {}", directory.display())),
+            None => (SystemConfig::default().robot, "the built-in robot".to_owned()),
         };
-        let read = Robot::named_or_file(&robot);
-        read.map(|read| (read, whence)).map_err(|error| format!("the robot {robot} is not known: {error}"))
+        Ok((robot(&robot_of)?, format!("{whence}: the log does not say which one, --robot names another one")))
     })
+}
+
+/// A built-in robot, or one that a file describes.
+fn robot(named: &str) -> Result<Robot, String> {
+    // A log may name anything: opening a pipe would wait for whoever writes it.
+    let is_other = |file: &Path| std::fs::metadata(file).is_ok_and(|is| !is.is_file());
+    if Robot::built_in(named).is_none() && is_other(Path::new(named)) {
+        return Err(format!("the robot {named} is not known: it is no regular file"));
+    }
+    Robot::named_or_file(named).map_err(|error| format!("the robot {named} is not known: {error}"))
 }
 
 /// Task files are read again whenever somebody asks: they are small, and may have been put back.

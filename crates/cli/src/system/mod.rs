@@ -159,6 +159,7 @@ impl System {
             tls: self.tls.clone(),
             directory: self.directory.path().to_owned(),
             catalogue: Arc::new(self.config.catalogue.clone()),
+            robot: self.config.robot.clone(),
             speed: self.config.speed,
             messages: output::messages(),
             alone: false,

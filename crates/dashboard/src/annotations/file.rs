@@ -1,5 +1,6 @@
 //! A task file on the disk: read with a bound, known by a digest, and replaced as a whole.
 
+use super::attributes;
 use ring::digest::{SHA256, digest as hashed};
 use std::fs::{File, OpenOptions, Permissions};
 use std::io::{self, ErrorKind, Read, Write};
@@ -51,7 +52,8 @@ pub(super) fn digest(text: &str) -> String {
     hashed(&SHA256, text.as_bytes()).as_ref().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// Puts a new text in the place of the old one, if that is still there: it is written beside it, synced, and renamed. Mode and owner stay.
+/// Puts a new text in the place of the old one, if that is still there: it is written beside it, synced, and renamed. Mode, owner and
+/// extended attributes stay.
 pub(super) fn replace(path: &Path, old: &str, new: &str, most: usize) -> Result<(), FileError> {
     let refused = |why: &str| FileError::Write { path: path.to_owned(), why: why.to_owned() };
     let failed = |error: io::Error| refused(&error.to_string());
@@ -83,6 +85,8 @@ pub(super) fn replace(path: &Path, old: &str, new: &str, most: usize) -> Result<
                 .map_err(|_| refused("it belongs to another user or group, and would not any more"))?;
         }
         file.set_permissions(Permissions::from_mode(there.mode() & 0o7777)).map_err(failed)?;
+        // Behind the mode, of which the list of who may do what is a part.
+        attributes::keep(&File::open(&path).map_err(failed)?, &file).map_err(|why| refused(&why))?;
         file.sync_all().map_err(failed)?;
         // As late as can be: whoever writes it in an editor meanwhile is not overwritten.
         if read(&path, most)? != old {

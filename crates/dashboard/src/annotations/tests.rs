@@ -18,7 +18,7 @@ fn editing(folder: &tempfile::TempDir) -> Editing {
     let file = folder.path().join("t.yaml");
     std::fs::write(&file, TASK).unwrap();
     let check = |text: &str| load(text, "t.yaml", &Catalogue::standard());
-    let makespan = |program: &Program| Ok(program.states.len() as f64);
+    let makespan = |program: &Program, _: &dyn Fn() -> bool| Ok(program.states.len() as f64);
     Editing::of(file, vec!["Arm".to_owned()], check, makespan)
 }
 
@@ -51,6 +51,8 @@ fn states_are_told_with_what_they_say_and_what_is_in_force() {
     // Also of a state that is tried again.
     assert!(force(1, "resources").0.contains("Gripper"));
     assert!(told.predicates.iter().any(|one| one == "on(?, ?)"), "{:?}", told.predicates);
+    // Without an ontology, those that the file and what the catalogue says of its actions name.
+    assert_eq!(told.entities, ["base", "gripper"]);
 }
 
 #[test]
@@ -79,6 +81,65 @@ fn a_change_is_written_and_all_else_and_the_mode_stay() {
     saved(&editing, &proposal(&editing, "open", "effects", None)).unwrap();
     assert!(on_disk(&editing).ends_with("retry: 1 }\n"));
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is left beside it");
+}
+
+#[test]
+fn extended_attributes_stay() {
+    use rustix::fs::{XattrFlags, getxattr, setxattr};
+    let folder = tempfile::tempdir().unwrap();
+    let editing = editing(&folder);
+    let file = &editing.0.file;
+    if let Err(error) = setxattr(file, "user.note", b"kept", XattrFlags::empty()) {
+        eprintln!("skipped: the file system of {} keeps no extended attributes: {error}", folder.path().display());
+        return;
+    }
+    // The user 12345 may read it: version 2, then tag, permissions and id of each entry.
+    let entries: [(u16, u16, u32); 5] =
+        [(1, 6, u32::MAX), (2, 4, 12_345), (4, 4, u32::MAX), (0x10, 4, u32::MAX), (0x20, 0, u32::MAX)];
+    let bytes = entries
+        .iter()
+        .flat_map(|(tag, may, id)| [&tag.to_le_bytes()[..], &may.to_le_bytes()[..], &id.to_le_bytes()[..]].concat());
+    let list: Vec<u8> = 2_u32.to_le_bytes().into_iter().chain(bytes).collect();
+    let with_list = setxattr(file, "system.posix_acl_access", &list, XattrFlags::empty()).is_ok();
+    saved(&editing, &proposal(&editing, "plan", "duration", Some(&["3.5"]))).unwrap();
+    assert!(on_disk(&editing).contains("duration: 3.5"));
+    let value = |name: &str| {
+        let mut value = vec![0; 1024];
+        let length = getxattr(file, name, &mut value[..]).unwrap();
+        value[..length].to_vec()
+    };
+    assert_eq!(value("user.note"), b"kept");
+    if with_list {
+        assert_eq!(value("system.posix_acl_access"), list);
+        assert_eq!(std::fs::metadata(file).unwrap().permissions().mode() & 0o7777, 0o640);
+    }
+}
+
+#[test]
+fn what_else_a_state_may_say_of_itself_is_written_as_it_is_typed() {
+    let folder = tempfile::tempdir().unwrap();
+    let editing = editing(&folder);
+    for (state, key, items, line) in [
+        ("plan", "attempts", &["5"][..], "      attempts: 5\n"),
+        ("plan", "deterministic", &["true"], "      deterministic: true\n"),
+        ("plan", "exceptional", &["aborted"], "      exceptional: [aborted]\n"),
+        ("plan", "exceptions", &["imprecise"], "      exceptions: imprecise\n"),
+    ] {
+        saved(&editing, &proposal(&editing, state, key, Some(items))).unwrap();
+        assert!(on_disk(&editing).contains(line), "{key}: {}", on_disk(&editing));
+    }
+    saved(&editing, &proposal(&editing, "open", "pia", Some(&["true"]))).unwrap();
+    assert!(on_disk(&editing).contains(", pia: true }"), "{}", on_disk(&editing));
+    // Two of the three that are one key, and no boolean.
+    for (key, items) in [("pia", &["true"][..]), ("deterministic", &["maybe"])] {
+        let twice = proposal(&editing, "plan", "computes", Some(&["true"]));
+        let both = Proposal {
+            changes: [twice.changes, proposal(&editing, "plan", key, Some(items)).changes].concat(),
+            ..twice
+        };
+        let told = proposed(&editing, &both).unwrap();
+        assert!(told.refused && told.findings.iter().any(|one| one.path == "plan"), "{told:?}");
+    }
 }
 
 #[test]
@@ -132,6 +193,73 @@ async fn what_it_would_gain_is_said_or_why_it_is_not() {
     assert!(told.before_s.is_some() && told.before_s == told.after_s && told.obstacle.is_empty());
     let bad = gained(&editing, proposal(&editing, "plan", "duration", Some(&["no.where"]))).await.unwrap();
     assert!(bad.before_s.is_some() && bad.after_s.is_none() && bad.obstacle.contains("refuses"), "{bad:?}");
-    let _place = editing.0.simulating.clone().try_acquire_owned().unwrap();
-    assert!(gained(&editing, good).await.unwrap().obstacle.contains("under way"));
+}
+
+/// A simulation that has no end of its own. Beside it stands how many of them go on.
+fn endless(folder: &tempfile::TempDir) -> (Editing, Arc<AtomicU64>) {
+    let (file, going_on) = (folder.path().join("t.yaml"), Arc::new(AtomicU64::new(0)));
+    std::fs::write(&file, TASK).unwrap();
+    let own = Arc::clone(&going_on);
+    let makespan = move |_: &Program, goes_on: &dyn Fn() -> bool| {
+        own.fetch_add(1, Ordering::SeqCst);
+        while goes_on() {
+            std::thread::yield_now();
+        }
+        own.fetch_sub(1, Ordering::SeqCst);
+        Err("ended".to_owned())
+    };
+    let check = |text: &str| load(text, "t.yaml", &Catalogue::standard());
+    (Editing::of(file, Vec::new(), check, makespan), going_on)
+}
+
+#[tokio::test]
+async fn a_simulation_that_takes_too_long_is_really_ended() {
+    let folder = tempfile::tempdir().unwrap();
+    let (editing, going_on) = endless(&folder);
+    let began = Instant::now();
+    let told = gained(&editing, proposal(&editing, "plan", "duration", Some(&["3"]))).await.unwrap();
+    assert_eq!(told.obstacle, "the simulation of the file with the change takes longer than 2 s");
+    assert!(began.elapsed() >= 2 * SIMULATION);
+    assert_eq!((going_on.load(Ordering::SeqCst), editing.0.simulating.available_permits()), (0, 1));
+}
+
+#[tokio::test]
+async fn an_older_simulation_makes_room_for_the_newest() {
+    let folder = tempfile::tempdir().unwrap();
+    let (editing, going_on) = endless(&folder);
+    let asked = |seconds: &str| {
+        let proposal = proposal(&editing, "plan", "duration", Some(&[seconds]));
+        let editing = editing.clone();
+        tokio::spawn(async move { gained(&editing, proposal).await.unwrap() })
+    };
+    let older = asked("3");
+    while going_on.load(Ordering::SeqCst) == 0 {
+        tokio::task::yield_now().await;
+    }
+    let began = Instant::now();
+    let newer = asked("4");
+    assert_eq!(older.await.unwrap().obstacle, "something else was asked meanwhile");
+    assert!(began.elapsed() < SIMULATION);
+    assert!(newer.await.unwrap().obstacle.contains("takes longer"));
+    assert_eq!(going_on.load(Ordering::SeqCst), 0);
+}
+
+#[tokio::test]
+async fn a_simulation_for_which_nobody_waits_any_more_ends_its_thread() {
+    let folder = tempfile::tempdir().unwrap();
+    let (editing, going_on) = endless(&folder);
+    let asked = tokio::spawn({
+        let (editing, proposal) = (editing.clone(), proposal(&editing, "plan", "duration", Some(&["3"])));
+        async move { gained(&editing, proposal).await.unwrap() }
+    });
+    while going_on.load(Ordering::SeqCst) == 0 {
+        tokio::task::yield_now().await;
+    }
+    let began = Instant::now();
+    asked.abort();
+    // The thread gives its place back when it has ended.
+    let place = editing.0.simulating.acquire().await.unwrap();
+    assert!(began.elapsed() < SIMULATION / 2, "{:?}", began.elapsed());
+    assert_eq!(going_on.load(Ordering::SeqCst), 0);
+    drop(place);
 }

@@ -27,13 +27,27 @@ export type Draft = Map<string, { said: boolean; items: string[] }>;
 const DEBOUNCE_MS = 350;
 const ABOUT: Record<string, string> = {
   computes: "it only computes, and may run early, twice, or for nothing",
+  pia: "it may change the environment: as every action that says neither this nor one of the two above",
   reads: "the facts that it depends on; scene for those that geometry comes from",
   senses: "the facts that must be as at its place when it looks",
   requires: "conditions that must hold before it begins",
   effects: "what it changes: at(cup) = pose, not hand_empty(gripper)",
   resources: "what it asks of the resource manager: { block: Arm }",
   duration: "an estimate, in the robot's seconds",
+  attempts: "how often it is tried when its worker dies, if it computes or senses",
+  deterministic: "the same inputs and facts always give the same result",
+  routine: "it and what it contains are one node, under one lease",
+  exceptional: "outcomes that are not followed ahead, although they are connected: aborted",
+  exceptions: "imprecise: younger PIAs may run beside it",
+  shared: "of a region: facts that the regions beside it may touch, too",
 };
+/** Of those that few states say, shown only when they are wanted. */
+const RARE = ["attempts", "deterministic", "routine", "exceptional", "exceptions", "shared"];
+/** What a key is as soon as it is said. */
+const FIRST: Record<string, string> = { computes: "true", pia: "true", attempts: "3", deterministic: "true", routine: "true", exceptional: "aborted", exceptions: "imprecise" };
+const REFUSED = "The file is refused as it is, and still is with this change.";
+/** More words are no help. */
+const MOST_WORDS = 500;
 
 export function draftOf(state: AnnotatedState): Draft {
   return new Map(state.keys.map((one) => [one.key, { said: one.said, items: [...one.items] }]));
@@ -64,6 +78,22 @@ export function sorted(findings: Finding[], state: string, keys: string[]): { by
   return { byKey, own, others };
 }
 
+/** Whether a change that was checked may be saved: a file that is refused already may be, so that it can be mended step by step. */
+export function maySave(changes: Change[], checked: Proposed | null, findings: Finding[]): boolean {
+  if (changes.length === 0 || checked === null || checked.problem !== "") return false;
+  return !checked.refused || isRefused(findings);
+}
+
+/** Whether the file as it is is refused. */
+export function isRefused(findings: Finding[]): boolean {
+  return findings.some((one) => one.severity === "error");
+}
+
+/** Whether somebody has typed on since this was sent. */
+export function isOther(sent: Proposal, now: Proposal): boolean {
+  return sent.state === now.state && JSON.stringify(sent.changes) !== JSON.stringify(now.changes);
+}
+
 /** What a change gains, in a sentence. */
 export function gainText(gained: Gained): string {
   const { before_s: before, after_s: after, obstacle } = gained;
@@ -78,27 +108,57 @@ export function gainText(gained: Gained): string {
   return `What it gains cannot be said: ${obstacle}.${known}`;
 }
 
+type Words = Pick<Annotations, "kinds" | "predicates" | "entities">;
+
 /** Words for completion under a key. */
-export function wordsFor(key: string, all: Pick<Annotations, "kinds" | "predicates" | "entities">): string[] {
+export function wordsFor(key: string, all: Words): string[] {
   const { kinds, predicates, entities } = all;
-  switch (key) {
-    case "computes":
-      return ["true", "false"];
-    case "resources":
-      return ["world_model", ...["block", "consume", "exists"].flatMap((verb) => kinds.map((kind) => `{ ${verb}: ${kind} }`))];
-    case "reads":
-    case "senses": {
-      const facts = predicates.flatMap((one) => [one, ...(/^[^(]+\(\?\)$/.test(one) ? entities.map((entity) => one.replace("?", entity)) : [])]);
-      return key === "reads" ? ["scene", ...facts] : facts;
+  // Of predicates with several places each is completed as it is typed.
+  const facts = predicates.flatMap((one) => (/^[^(]+\(\?\)$/.test(one) ? entities.map((entity) => one.replace("?", entity)) : []));
+  const words = (): string[] => {
+    switch (key) {
+      case "computes":
+      case "pia":
+      case "deterministic":
+      case "routine":
+        return ["true", "false"];
+      case "exceptions":
+        return ["imprecise", "precise"];
+      case "exceptional":
+        return ["aborted", "violated"];
+      case "resources":
+        return ["world_model", ...["block", "consume", "exists"].flatMap((verb) => kinds.map((kind) => `{ ${verb}: ${kind} }`))];
+      case "reads":
+        return ["scene", ...predicates, ...facts];
+      case "senses":
+      case "shared":
+        return [...predicates, ...facts];
+      case "effects":
+        return [...predicates, ...facts, ...[...predicates, ...facts].map((fact) => `not ${fact}`)];
+      case "requires":
+        return [...predicates, ...facts, ...[...predicates, ...facts].map((fact) => `exists ${fact}`)];
+      default:
+        return [];
     }
-    case "effects":
-    case "requires": {
-      const facts = predicates.flatMap((one) => (/^[^(]+\(\?\)$/.test(one) ? entities.map((entity) => one.replace("?", entity)) : [one]));
-      return key === "requires" ? [...facts, ...facts.map((fact) => `exists ${fact}`)] : [...facts, ...facts.map((fact) => `not ${fact}`)];
-    }
-    default:
-      return [];
-  }
+  };
+  return words().slice(0, MOST_WORDS);
+}
+
+/** What may follow what was typed under a key: within the brackets of a predicate, the individuals of the place that is typed. */
+export function completions(key: string, typed: string, all: Words): string[] {
+  const open = /(?:^|[^\w])(\w+)\(([^()]*)$/.exec(typed);
+  const predicate = all.predicates.find((one) => open !== null && one.startsWith(`${open[1]}(`));
+  if (open === null || predicate === undefined) return wordsFor(key, all);
+  const places = predicate.split(",").length;
+  const given = (open[2] ?? "").split(",");
+  if (given.length > places) return [];
+  const last = (given[given.length - 1] ?? "").trimStart();
+  const begun = typed.slice(0, typed.length - last.length);
+  const space = begun.endsWith(",") && last === "" ? " " : "";
+  const end = given.length < places ? ", " : ")";
+  // Whatever is looked at may be meant: of effects only what `not` takes away.
+  const any = key === "requires" || (key === "effects" && !/\b(not|delete)\b/.test(typed)) ? [] : ["?"];
+  return [...all.entities, ...any].slice(0, MOST_WORDS).map((one) => `${begun}${space}${one}${end}`);
 }
 
 function findingsList(findings: Finding[], where: boolean): HTMLElement | null {
@@ -162,16 +222,20 @@ export function annotationsPage(desk: Desk): Page {
     complain(error instanceof Refused && error.status === 409 ? text : `${text} `);
   }
 
-  async function load(): Promise<void> {
+  /** Reads the file. `sent` was written into it: what was typed since then, or for another state, stays. */
+  async function load(sent?: Proposal): Promise<void> {
     if (loading) return;
     loading = true;
     try {
-      all = await api.annotations();
+      const read = await api.annotations();
+      const stays = sent !== undefined && (sent.state !== chosen || isOther(sent, proposal()));
+      all = read;
       complain(all.problem);
       fill(head, h("b", {}, all.file), ` ${all.states.length} states. What is typed is checked as by `, h("code", {}, "ratn check"), "; nothing is written before you save.");
       showList();
       const kept = all.states.some((one) => one.path === chosen) ? chosen : (all.states[0]?.path ?? null);
-      choose(kept);
+      if (stays && kept === chosen) goOn();
+      else choose(kept);
     } catch (error) {
       failed(error);
     } finally {
@@ -224,6 +288,13 @@ export function annotationsPage(desk: Desk): Page {
     update();
   }
 
+  /** What is typed stays, and is a change of the file as it is now. */
+  function goOn(): void {
+    showForm();
+    showFindings(all?.findings ?? []);
+    edited();
+  }
+
   function showForm(): void {
     const now = state();
     fields.clear();
@@ -237,8 +308,9 @@ export function annotationsPage(desk: Desk): Page {
       fill(form, title, h("p", { class: "warn" }, now.fixed), h("ul", { class: "plain" }, ...rows));
       return;
     }
-    const words = now.keys.map((one) => h("datalist", { id: `words-${one.key}` }, ...wordsFor(one.key, all ?? { kinds: [], predicates: [], entities: [] }).map((value) => h("option", { value }))));
-    fill(form, title, h("div", { id: "of-state" }), ...now.keys.map((one) => field(one, now)), ...words, h("div", { class: "row" }, save, undo, again));
+    const [rare, common] = [now.keys.filter((one) => RARE.includes(one.key)), now.keys.filter((one) => !RARE.includes(one.key))];
+    const more = h("details", { open: rare.some((one) => one.said) }, h("summary", {}, "More annotations"), ...rare.map((one) => field(one, now)));
+    fill(form, title, h("div", { id: "of-state" }), ...common.map((one) => field(one, now)), rare.length === 0 ? null : more, h("div", { class: "row saving" }, save, undo, again));
   }
 
   function field(one: AnnotationKey, now: AnnotatedState): HTMLElement {
@@ -248,23 +320,29 @@ export function annotationsPage(desk: Desk): Page {
     const force = h("div", {});
     fields.set(one.key, { findings, force });
     fill(force, inForce(now.in_force, one.key));
+    const words = h("datalist", { id: `words-${one.key}` });
+    const offer = (typed: string) => fill(words, ...completions(one.key, typed, all ?? { kinds: [], predicates: [], entities: [] }).map((value) => h("option", { value })));
+    offer("");
     const own = h("input", { type: "checkbox", checked: said.said, "data-key": `said ${one.key}` });
     const input = (item: string, index: number) => {
-      const box = h("input", {
-        type: "text",
-        value: item,
-        list: `words-${one.key}`,
+      const rows = item.split("\n").length;
+      const more = {
         autocomplete: "off",
         spellcheck: "false",
         "aria-label": one.listed ? `${one.key}, ${index + 1}` : one.key,
         "aria-describedby": `findings-${one.key}`,
         "data-key": `${one.key} ${index}`,
         disabled: !said.said,
+        onfocus: () => offer(box.value),
         oninput: () => {
           said.items[index] = box.value;
+          offer(box.value);
           edited();
         },
-      });
+      };
+      // A text over several lines would lose its ends of lines in an input.
+      const box: HTMLInputElement | HTMLTextAreaElement =
+        rows > 1 ? h("textarea", { ...more, rows }, item) : h("input", { ...more, type: "text", value: item, list: `words-${one.key}` });
       const away = h(
         "button",
         {
@@ -302,13 +380,13 @@ export function annotationsPage(desk: Desk): Page {
     }
     own.addEventListener("change", () => {
       said.said = own.checked;
-      if (said.said && said.items.length === 0) said.items.push(one.key === "computes" ? "true" : "");
+      if (said.said && said.items.length === 0) said.items.push(FIRST[one.key] ?? "");
       showItems();
       edited();
     });
     draft.set(one.key, said);
     showItems();
-    return h("fieldset", {}, h("legend", {}, h("label", {}, own, ` ${one.key}`)), h("p", { class: "faint" }, ABOUT[one.key] ?? ""), items, add, findings, force);
+    return h("fieldset", {}, h("legend", {}, h("label", {}, own, ` ${one.key}`)), h("p", { class: "faint" }, ABOUT[one.key] ?? ""), items, add, words, findings, force);
   }
 
   function showFindings(all: Finding[]): void {
@@ -323,7 +401,7 @@ export function annotationsPage(desk: Desk): Page {
   function update(): void {
     const some = changes().length > 0;
     undo.disabled = !some;
-    save.disabled = !some || checked === null || checked.problem !== "" || checked.refused;
+    save.disabled = !maySave(changes(), checked, all?.findings ?? []);
   }
 
   /** Something was typed: it is checked a moment later. */
@@ -366,7 +444,8 @@ export function annotationsPage(desk: Desk): Page {
   function outcome(answer: Proposed): Child[] {
     if (answer.problem !== "") return [h("p", { class: "bad" }, answer.problem)];
     return [
-      h("h2", {}, answer.refused ? "With this change the file would be refused" : "What would be written"),
+      h("h2", {}, answer.refused && !isRefused(all?.findings ?? []) ? "With this change the file would be refused" : "What would be written"),
+      answer.refused && isRefused(all?.findings ?? []) ? h("p", { class: "warn" }, REFUSED) : null,
       ...lines(answer),
     ];
   }
@@ -379,14 +458,22 @@ export function annotationsPage(desk: Desk): Page {
   function askToSave(): void {
     const [asked, answer] = [proposal(), checked];
     if (answer === null) return;
-    confirm("Save?", "Save", [h("p", {}, `${asked.state} in ${all?.file ?? ""}:`), ...lines(answer)], false, () => {
+    const warning = answer.refused ? h("p", { class: "warn" }, REFUSED) : null;
+    confirm("Save?", "Save", [h("p", {}, `${asked.state} in ${all?.file ?? ""}:`), warning, ...lines(answer)], false, () => {
+      // Of the text that is written now nothing was checked.
+      checked = null;
+      update();
       const saving = api.saveAnnotations(asked);
       saving.then(
         async (told) => {
-          await load();
+          await load(asked);
           desk.say(told.said);
         },
-        (error: unknown) => failed(error),
+        (error: unknown) => {
+          failed(error);
+          checked ??= answer;
+          update();
+        },
       );
     });
   }
@@ -394,8 +481,8 @@ export function annotationsPage(desk: Desk): Page {
   const element = h(
     "main",
     { id: "page", class: "annotations", tabindex: -1 },
-    h("section", { "aria-label": "States of the task" }, h("h1", { class: "hidden-text" }, "Annotations"), head, list),
-    h("div", {}, notice, form, result, others),
+    h("section", { "aria-label": "States of the task" }, h("h1", { class: "hidden-text" }, "Annotations"), head, list, result, others),
+    h("div", {}, notice, form),
   );
   return { element, wide: true, begin: () => void (all === null ? load() : undefined), update: () => undefined };
 }

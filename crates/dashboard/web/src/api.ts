@@ -47,7 +47,7 @@ export const api = {
     ask<Frame>("run", { log, at, epoch, version, about }),
   task: (log: number) => ask<Task>("task", { log }),
   world: (log: number, at: number | null, epoch: number, filter: string) => ask<World>("world", { log, at, epoch, filter }),
-  robot: () => ask<Robot>("robot", {}),
+  robot: (log: number) => ask<Robot>("robot", { log }),
   cell: (log: number, at: number | null, epoch: number, version: number) => ask<Cell>("cell", { log, at, epoch, version }),
   system: () => ask<System>("system", {}),
   tail: (worker: string) => ask<Tail>("tail", { worker }),

@@ -93,9 +93,11 @@ export class CellView {
       this.log = log;
       this.film.clear();
       this.paths.clear();
-      [this.cell, this.objects] = [null, []];
+      [this.cell, this.objects, this.robot] = [null, [], null];
     }
-    this.robot ??= await api.robot();
+    const robot = this.robot ?? (await api.robot(log));
+    if (log !== this.log) return;
+    this.robot = robot;
     // One that is not known may be known when the page is opened again.
     const frame = this.site.store.frame;
     const epoch = frame?.epoch ?? 0;
@@ -249,6 +251,7 @@ export class CellView {
       this.side,
       h("h2", {}, `The cell at ${seconds(moment)}`),
       ...(shown === null ? [h("p", {}, `The robot is not shown. The base is at ${where(cell.base.position)}.`)] : this.robotList(shown, moment)),
+      cell.from_s > 0 && h("p", { class: "warn", id: "read-from" }, `The log was read from ${seconds(cell.from_s)} on: what was moved between the start and then is shown where it was at the start.`),
       held.length > 0 && h("p", {}, `Held: ${held.map((object) => object.name).join(", ")}`),
       table("Objects as believed", ["object", "where", "size"], this.objects.map((object) => thing(object))),
       this.untold > 0 && h("p", { class: "warn" }, `${count(this.untold)} more objects are not shown.`),

@@ -584,6 +584,8 @@ export interface Cell {
   more: boolean;
   /** The moment. */
   at_s: number;
+  /** The log was read from this moment on: what was moved between its start and then is not known. */
+  from_s: number;
   /** The log's joints are those of the robot: it is shown. */
   fits: boolean;
   /** Why the robot is not shown, or what is not known of it; empty where there is nothing to say. */

@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { changesOf, draftOf, gainText, sorted, wordsFor } from "../src/annotations.ts";
+import { changesOf, completions, draftOf, gainText, isOther, maySave, sorted, wordsFor } from "../src/annotations.ts";
 
 const key = (name, items = null) => ({ key: name, said: items !== null, items: items ?? [], listed: name !== "duration" });
 const state = { path: "a/b", depth: 1, form: "action: x/y", line: 3, fixed: "", in_force: [], keys: [key("reads", ["at(table)"]), key("effects"), key("duration", ["2"])] };
@@ -38,11 +38,44 @@ test("what is gained is said, and why it is not", () => {
   assert.match(gainText({ before_s: 42, after_s: null, obstacle: "it takes too long" }), /cannot be said: it takes too long. As it is: 42.0/);
 });
 
+test("what is refused cannot be saved, unless the file was refused before", () => {
+  const [some, error, warning] = [[{ key: "reads", items: [] }], { severity: "error" }, { severity: "warning" }];
+  assert.equal(maySave(some, { problem: "", refused: false }, []), true);
+  assert.equal(maySave(some, { problem: "", refused: true }, [warning]), false);
+  assert.equal(maySave(some, { problem: "", refused: true }, [warning, error]), true);
+  assert.equal(maySave(some, { problem: "no value", refused: false }, [error]), false);
+  assert.equal(maySave(some, null, [error]), false);
+  assert.equal(maySave([], { problem: "", refused: false }, []), false);
+});
+
+test("what is typed while a change is saved is told from what was sent", () => {
+  const sent = { digest: "1", state: "a", changes: [{ key: "reads", items: ["x"] }] };
+  assert.equal(isOther(sent, { ...sent, digest: "2" }), false);
+  assert.equal(isOther(sent, { ...sent, changes: [{ key: "reads", items: ["x", "y"] }] }), true);
+  assert.equal(isOther(sent, { ...sent, changes: [] }), true);
+  assert.equal(isOther(sent, { ...sent, state: "b", changes: [] }), false);
+});
+
 test("words are completed from the catalogue and the ontology", () => {
   const all = { kinds: ["Arm"], predicates: ["at(?)", "on(?, ?)"], entities: ["cup"] };
   assert.ok(wordsFor("resources", all).includes("{ block: Arm }"));
-  assert.deepEqual(wordsFor("reads", all), ["scene", "at(?)", "at(cup)", "on(?, ?)"]);
+  assert.deepEqual(wordsFor("reads", all), ["scene", "at(?)", "on(?, ?)", "at(cup)"]);
   assert.ok(wordsFor("effects", all).includes("not at(cup)"));
   assert.deepEqual(wordsFor("computes", all), ["true", "false"]);
   assert.deepEqual(wordsFor("duration", all), []);
+});
+
+test("within a predicate's brackets the individuals of each place are offered", () => {
+  const all = { kinds: [], predicates: ["at(?)", "on(?, ?)"], entities: ["cup", "table"] };
+  assert.deepEqual(completions("reads", "", all), wordsFor("reads", all));
+  assert.deepEqual(completions("reads", "at(", all), ["at(cup)", "at(table)", "at(?)"]);
+  assert.deepEqual(completions("reads", "on(c", all), ["on(cup, ", "on(table, ", "on(?, "]);
+  assert.deepEqual(completions("reads", "on(cup, ", all), ["on(cup, cup)", "on(cup, table)", "on(cup, ?)"]);
+  assert.deepEqual(completions("reads", "on(cup,", all), ["on(cup, cup)", "on(cup, table)", "on(cup, ?)"]);
+  assert.deepEqual(completions("reads", "on(cup,ta", all), ["on(cup,cup)", "on(cup,table)", "on(cup,?)"], "what was typed stays");
+  assert.deepEqual(completions("requires", "exists on(cup, table) and at(", all), ["exists on(cup, table) and at(cup)", "exists on(cup, table) and at(table)"]);
+  assert.deepEqual(completions("effects", "at(", all), ["at(cup)", "at(table)"]);
+  assert.deepEqual(completions("effects", "not on(cup, ", all), ["not on(cup, cup)", "not on(cup, table)", "not on(cup, ?)"]);
+  assert.deepEqual(completions("reads", "on(cup, table, ", all), [], "it has two places");
+  assert.deepEqual(completions("reads", "compose(", all), wordsFor("reads", all), "no predicate");
 });

@@ -19,7 +19,22 @@ use scan::{Lines, comments, flow_end, has_hidden_comment};
 use std::collections::BTreeMap;
 
 /// The annotations that can be changed.
-pub const KEYS: [&str; 7] = ["computes", "reads", "senses", "requires", "effects", "resources", "duration"];
+pub const KEYS: [&str; 14] = [
+    "computes",
+    "senses",
+    "pia",
+    "reads",
+    "requires",
+    "effects",
+    "resources",
+    "duration",
+    "attempts",
+    "deterministic",
+    "routine",
+    "exceptional",
+    "exceptions",
+    "shared",
+];
 /// Longer lines are written as several.
 const LINE_WIDTH: usize = 120;
 /// Below these stand other states: what is added stands before them.

@@ -174,6 +174,7 @@ impl Timeline {
                 self.task.clone_from(task);
                 self.run.clone_from(&origin.run);
                 self.file.clone_from(&origin.file);
+                self.robot.clone_from(&origin.robot);
                 self.began_unix_ms = origin.began_unix_ms;
                 self.mode = *mode;
                 self.parameters.clone_from(parameters);

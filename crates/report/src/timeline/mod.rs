@@ -33,6 +33,8 @@ pub struct Timeline {
     pub run: String,
     /// The task file.
     pub file: String,
+    /// The robot: the name of a built-in one, or the path of its description; empty where the log does not say.
+    pub robot: String,
     /// When it began, in milliseconds since 1970; 0 where that is not said.
     pub began_unix_ms: u64,
     /// How it was executed.
@@ -168,6 +170,7 @@ impl Timeline {
             task: String::new(),
             run: String::new(),
             file: String::new(),
+            robot: String::new(),
             began_unix_ms: 0,
             mode: Mode::Hsm,
             seed: 0,

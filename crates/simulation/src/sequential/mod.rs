@@ -10,7 +10,7 @@ mod providers;
 
 pub use chain::Link;
 
-use crate::run::{Circumstances, Run, RunError, Setup, run_under};
+use crate::run::{Circumstances, Run, RunError, Setup, run_while};
 use annotate::{annotated, missing};
 use providers::AssumedProviders;
 use ratn_executive::protocol::{Command, LogEntry};
@@ -152,8 +152,8 @@ pub fn sequential(program: &Program, catalogue: &Catalogue, assumptions: &Assump
     })
 }
 
-/// How long a checked program takes as a dataflow network, in seconds, with what is assumed. It is given up after so many events, which bounds
-/// how long that takes.
+/// How long a checked program takes as a dataflow network, in seconds, with what is assumed. It is given up after so many events, which bounds how
+/// much memory that takes, and when `goes_on`, which is asked before every event, no longer holds.
 ///
 /// # Errors
 /// [`Obstacle`] where the task does not come to a successful end with what is assumed.
@@ -162,8 +162,10 @@ pub fn makespan_s(
     catalogue: &Catalogue,
     assumptions: &Assumptions,
     max_events: usize,
+    goes_on: &dyn Fn() -> bool,
 ) -> Result<f64, Obstacle> {
-    simulate_up_to(program, catalogue, assumptions, Mode::Cdtn, &mut BTreeSet::new(), max_events).map(|run| run.end_s)
+    let bound = Bound { max_events, goes_on };
+    simulate_within(bound, program, catalogue, assumptions, Mode::Cdtn, &mut BTreeSet::new()).map(|run| run.end_s)
 }
 
 /// The states whose failure is handled and could be exceptional, with what that gains.
@@ -237,17 +239,23 @@ fn simulate(
     mode: Mode,
     unknown: &mut BTreeSet<String>,
 ) -> Result<Run, Obstacle> {
-    let max_events = Circumstances::default().max_events;
-    simulate_up_to(program, catalogue, assumptions, mode, unknown, max_events)
+    let bound = Bound { max_events: Circumstances::default().max_events, goes_on: &|| true };
+    simulate_within(bound, program, catalogue, assumptions, mode, unknown)
 }
 
-fn simulate_up_to(
+/// When a simulation is given up.
+struct Bound<'b> {
+    max_events: usize,
+    goes_on: &'b dyn Fn() -> bool,
+}
+
+fn simulate_within(
+    bound: Bound<'_>,
     program: &Program,
     catalogue: &Catalogue,
     assumptions: &Assumptions,
     mode: Mode,
     unknown: &mut BTreeSet<String>,
-    max_events: usize,
 ) -> Result<Run, Obstacle> {
     let name = match mode {
         Mode::Hsm => "HSM",
@@ -273,9 +281,10 @@ fn simulate_up_to(
         latency: Duration::ZERO,
     };
     let mut providers = AssumedProviders::new(&program, assumptions);
-    let circumstances =
-        Circumstances { attributes: assumptions.attributes.clone(), max_events, ..Circumstances::default() };
-    let run = run_under(setup, &mut providers, circumstances).map_err(|source| Obstacle::Run { mode: name, source })?;
+    let (attributes, max_events) = (assumptions.attributes.clone(), bound.max_events);
+    let circumstances = Circumstances { attributes, max_events, ..Circumstances::default() };
+    let run = run_while(setup, &mut providers, circumstances, bound.goes_on);
+    let run = run.map_err(|source| Obstacle::Run { mode: name, source })?;
     unknown.extend(providers.unknown_durations());
     if run.outcome == SUCCESS {
         Ok(run)

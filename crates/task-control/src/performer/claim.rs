@@ -1,5 +1,6 @@
 //! Which runs may be under way beside each other: each is a resource of its session, which the others see.
 
+use super::told::Told;
 use crate::NotStarted;
 use crate::record::said;
 use anyhow::bail;
@@ -11,7 +12,7 @@ use std::time::Duration;
 
 /// So many runs are under way on a system at the most.
 const MOST_RUNS: usize = 64;
-/// So often a run that is alone looks whether it still is.
+/// So often a run looks whether others are under way.
 const LOOK_AGAIN: Duration = Duration::from_secs(1);
 /// The attributes of the resource that says that a run is under way: its task,
 const TASK: &str = "task";
@@ -42,13 +43,12 @@ pub async fn claim(resources: &ResourceClient, run: &str, task: &str, alone: boo
     others(resources, run, alone).await
 }
 
-/// Resolves when another run is under way on the system.
-pub(super) async fn another(resources: ResourceClient, run: String) {
+/// Keeps up whether other runs are under way on the system.
+pub(super) async fn look_for_others(resources: ResourceClient, run: String, told: Told) {
     loop {
         tokio::time::sleep(LOOK_AGAIN).await;
-        let runs = resources.list(&[RUN_KIND]).await;
-        if runs.is_ok_and(|runs| runs.iter().any(|other| other.id != run)) {
-            return;
+        if let Ok(runs) = resources.list(&[RUN_KIND]).await {
+            told.beside_others(runs.iter().any(|other| other.id != run));
         }
     }
 }

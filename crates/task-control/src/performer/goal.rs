@@ -3,6 +3,7 @@
 use super::Answer;
 use super::told::Told;
 use crate::record::said;
+use crate::safe_on_disk::Mark;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId};
@@ -98,6 +99,8 @@ pub(super) struct Performing {
     pub(super) results: Mutex<Results>,
     /// What a result has to have.
     pub(super) outputs: Vec<String>,
+    /// What has to be safe before it begins.
+    pub(super) safe: Option<Mark>,
     pub(super) told: Told,
 }
 
@@ -110,7 +113,14 @@ pub(super) fn deadline_ms(timeout_s: Option<f64>, speed: f64) -> u64 {
 
 impl Performing {
     /// Until its end; the event goes to the shell, unless the goal was told to stop.
-    pub(super) async fn perform(self, given: Given) {
+    pub(super) async fn perform(mut self, given: Given) {
+        if let Some(safe) = self.safe.take() {
+            tokio::select! {
+                // Where it never will be the run ends.
+                is_safe = safe.safe() => if !is_safe { return },
+                () = self.stop.cancelled() => return,
+            }
+        }
         for before in &self.before {
             tokio::select! {
                 () = before.cancelled() => {}
@@ -433,6 +443,7 @@ mod tests {
                 stop: CancellationToken::new(),
                 results: Mutex::default(),
                 outputs: Vec::new(),
+                safe: None,
                 told: Told::new(),
                 goal: Goal {
                     id: format!("run/1/{action}"),
@@ -509,7 +520,7 @@ mod tests {
         assert!(matches!(bench.event().await, Some(Event::Improved { .. })));
         tokio::time::sleep(Duration::from_millis(100)).await;
         assert!(!ended.is_finished(), "alone it goes on");
-        told.beside_others();
+        told.beside_others(true);
         let event = bench.event().await;
         assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == PREEMPTED), "{event:?}");
         Ok(())

@@ -22,6 +22,7 @@ use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Named, Record, Reco
 use super::shell::{Place, Urgency};
 use crate::background_runtime::BackgroundRuntime;
 use crate::messages::Messages;
+use crate::safe_on_disk::Mark;
 use acquiring::{Acquiring, Asking, Waiting};
 use anyhow::{Context, bail};
 pub use claim::{RUN_KIND, claim};
@@ -217,14 +218,10 @@ impl Performer {
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, manager, session.id())?;
         let told = Told::new();
-        let (heard, another) = (told.clone(), claim::another(resources.clone(), run.clone()));
-        let others = AbortOnDropHandle::new(tokio::spawn(async move {
-            another.await;
-            heard.beside_others();
-        }));
+        let others = claim::look_for_others(resources.clone(), run.clone(), told.clone());
+        let others = AbortOnDropHandle::new(tokio::spawn(others));
         match claim(&resources, &run, task, place.alone).await {
-            Ok(true) => told.beside_others(),
-            Ok(false) => {}
+            Ok(has_others) => told.beside_others(has_others),
             // What a run that comes back holds is still its own.
             Err(refused) if session.state().borrow().found => {
                 session.abandon().await;
@@ -359,8 +356,8 @@ impl Performer {
         &self.run
     }
 
-    /// Begins to perform a command.
-    pub(super) fn perform(&mut self, command: Command) -> anyhow::Result<()> {
+    /// Begins to perform a command, where it cannot be undone when everything before it is safe.
+    pub(super) fn perform_when(&mut self, safe: Option<Mark>, command: Command) -> anyhow::Result<()> {
         while self.giving_back.try_join_next().is_some() {}
         match command {
             // Waking is the shell's: it has the clock.
@@ -378,7 +375,7 @@ impl Performer {
                 let asked = Projecting { attempt, base, changes, writers, reads, lease, first, named: None };
                 self.project(instance, asked)?;
             }
-            Command::Start { instance, attempt, goal } => self.start(instance, attempt, *goal, Given::Now),
+            Command::Start { instance, attempt, goal } => self.start(instance, attempt, *goal, Given::Now, safe),
             Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
                 Some(job) if job.attempt == attempt => self.stopping.stop(job),
                 _ => {
@@ -388,17 +385,17 @@ impl Performer {
             Command::Release { instance, lease, projection } => {
                 let goes_back = |id: &LeaseId| self.handover.as_ref().is_none_or(|handover| handover.lease.id != *id);
                 let lease = lease.filter(goes_back);
-                self.release(instance, lease, projection);
+                self.release(instance, lease, projection, safe);
             }
             Command::Commit { instance, writer, changes, evidence, revision } => {
                 let decided = Decided { instance, writer, changes, evidence, revision };
                 self.outside.decided(&self.run, &decided);
                 self.decided = decided.revision;
-                self.record(Record::Commit(decided))?;
+                self.record(Record::Commit { decided, safe })?;
             }
             Command::Operate { instance, operations } => {
                 self.operations += 1;
-                self.record(Record::Operate { instance, number: self.operations, operations })?;
+                self.record(Record::Operate { instance, number: self.operations, operations, safe })?;
             }
         }
         Ok(())
@@ -523,7 +520,7 @@ impl Performer {
             Answer::World(change) => {
                 self.record(Record::Known(change.revision))?;
                 if told::maker(&change.commit).is_some_and(|(run, _)| run != self.run) {
-                    self.told.beside_others();
+                    self.told.beside_others(true);
                 }
                 return Ok(self.outside.told(change, mirror));
             }
@@ -576,7 +573,7 @@ impl Performer {
     }
 
     /// Gives a goal to its provider, or waits for one that was given before.
-    fn start(&mut self, instance: InstanceId, attempt: u32, goal: Goal, given: Given) {
+    fn start(&mut self, instance: InstanceId, attempt: u32, goal: Goal, given: Given, safe: Option<Mark>) {
         let stop = CancellationToken::new();
         let lease = goal.lease.as_ref().map(|lease| lease.id);
         let provider = self.provider_of(&goal);
@@ -603,6 +600,7 @@ impl Performer {
             stop: stop.clone(),
             results: Mutex::default(),
             outputs: self.outputs_of(&goal),
+            safe,
             told: self.told.clone(),
             goal: types::Goal {
                 id: format!("{}/{instance}/{attempt}", self.run),
@@ -657,15 +655,32 @@ impl Performer {
         })
     }
 
-    fn release(&mut self, instance: InstanceId, lease: Option<LeaseId>, projection: Option<ProjectionId>) {
+    fn release(
+        &mut self,
+        instance: InstanceId,
+        lease: Option<LeaseId>,
+        projection: Option<ProjectionId>,
+        safe: Option<Mark>,
+    ) {
         let over = |id: InstanceId, job: &Job| id == instance || (lease.is_some() && job.lease == lease);
         let (ended, going_on) = std::mem::take(&mut self.jobs).into_iter().partition(|(id, job)| over(*id, job));
         self.jobs = going_on;
-        self.give_back(instance, Vec::from_iter(BTreeMap::into_values(ended)), lease, projection);
+        self.give_back_when(safe, instance, Vec::from_iter(BTreeMap::into_values(ended)), lease, projection);
     }
 
     fn give_back(
         &mut self,
+        instance: InstanceId,
+        jobs: Vec<Job>,
+        lease: Option<LeaseId>,
+        projection: Option<ProjectionId>,
+    ) {
+        self.give_back_when(None, instance, jobs, lease, projection);
+    }
+
+    fn give_back_when(
+        &mut self,
+        safe: Option<Mark>,
         instance: InstanceId,
         jobs: Vec<Job>,
         lease: Option<LeaseId>,
@@ -686,6 +701,10 @@ impl Performer {
             // Whoever gets the resources next finds them idle.
             for job in jobs {
                 let _ = job.ended.await;
+            }
+            // What others do then stands on what is known here.
+            if let Some(safe) = safe {
+                safe.safe().await;
             }
             if let Some(projection) = there {
                 end_projection(&world, instance, projection).await;

@@ -84,7 +84,7 @@ impl Performer {
         if self.session.state().borrow().found {
             for (number, instance, operations) in &ledger.operated {
                 let (number, instance, operations) = (*number, *instance, operations.clone());
-                self.record(Record::Operate { instance, number, operations })?;
+                self.record(Record::Operate { instance, number, operations, safe: None })?;
             }
             self.sweep(&ledger).await?;
         } else {
@@ -100,7 +100,7 @@ impl Performer {
             self.record(Record::Project { instance, asked, named })?;
         }
         for (instance, (attempt, goal)) in ledger.goals {
-            self.start(instance, attempt, goal, Given::Before);
+            self.start(instance, attempt, goal, Given::Before, None);
         }
         let mut waiting: Vec<_> = ledger.waiting.into_iter().collect();
         waiting.sort_by_key(|(instance, asked)| (Reverse(asked.priority), *instance));

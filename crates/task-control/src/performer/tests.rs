@@ -42,6 +42,7 @@ fn place_of(endpoints: &Endpoints) -> Place {
         tls: ClientTls::none(),
         directory: std::path::PathBuf::new(),
         catalogue: Arc::default(),
+        robot: String::new(),
         speed: 1.0,
         messages: Messages::nowhere(),
         alone: false,
@@ -62,6 +63,13 @@ fn finished(instance: InstanceId) -> Event {
         measured: Vec::new(),
         evidence: Vec::new(),
         reason: String::new(),
+    }
+}
+
+impl Performer {
+    /// As where everything before it is safe.
+    fn perform(&mut self, command: Command) -> anyhow::Result<()> {
+        self.perform_when(None, command)
     }
 }
 

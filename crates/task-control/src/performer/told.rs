@@ -67,7 +67,7 @@ struct Heard {
     revision: Revision,
     /// Of runs, its own among them: their own numbers of their last commits.
     runs: BTreeMap<String, Revision>,
-    /// Whether another run is, or was, under way beside this one.
+    /// Whether another run is under way beside this one, as far as was heard lately.
     has_others: bool,
 }
 
@@ -101,12 +101,12 @@ impl Told {
         self.0.borrow().revision
     }
 
-    /// Another run is under way beside this one.
-    pub(super) fn beside_others(&self) {
-        self.0.send_modify(|heard| heard.has_others = true);
+    /// Another run is under way beside this one, or none is.
+    pub(super) fn beside_others(&self, has_others: bool) {
+        self.0.send_if_modified(|heard| std::mem::replace(&mut heard.has_others, has_others) != has_others);
     }
 
-    /// Whether another run is, or was, under way beside this one.
+    /// Whether another run is under way beside this one.
     pub(super) fn has_others(&self) -> bool {
         self.0.borrow().has_others
     }
@@ -139,7 +139,6 @@ impl Told {
         if others.is_empty() {
             return Ok(());
         }
-        self.beside_others();
         if self.is_told(&others, USUAL).await {
             return Ok(());
         }

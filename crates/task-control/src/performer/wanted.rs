@@ -48,7 +48,7 @@ impl ToldOf {
     }
 }
 
-/// Looks from the moment on that other runs are known of; ends with the run.
+/// Looks while other runs are known of; ends with the run.
 pub(super) async fn listen(
     resources: ResourceClient,
     run: String,
@@ -57,9 +57,8 @@ pub(super) async fn listen(
     events: mpsc::Sender<Answer>,
 ) {
     let mut told_of = ToldOf::default();
-    told.others_after(Duration::ZERO).await;
     loop {
-        tokio::time::sleep(LOOK_AGAIN).await;
+        told.others_after(LOOK_AGAIN).await;
         if !holds.get() {
             continue;
         }

@@ -1,7 +1,7 @@
 //! Going on with a run from its event log: the executive is brought to where it was, what was open is taken up, and the loop goes
 //! on as ever.
 
-use super::{Ended, LOOK, Place, Shell, advisor_of, unix_ms};
+use super::{Ended, LOOK, Place, Shell, advisor_of, syncer_of, unix_ms};
 use crate::checkpoint::{Checkpointer, ReplayedState};
 use crate::control::Control;
 use crate::history::{History, HistoryError};
@@ -9,7 +9,7 @@ use crate::interrupt::Interrupt;
 use crate::performer::{self, Performer};
 use crate::replay::{self, Replayed};
 use crate::shell::MAX_PENDING_EVENTS;
-use crate::spans::trace_of;
+use crate::spans::{Before, Spans, trace_of};
 use anyhow::Context;
 use ratn_event_log::{Log, LogWriter};
 use ratn_executive::lookahead::Lookout;
@@ -93,7 +93,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
     let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
     // One that is refused takes no ear away from the run that listens.
     let origin = &ledger.origin;
-    // Of the same trace as before. What the nodes were before is in the log, and its export has their spans.
+    // Of the same trace as before.
     let trace = trace_of(&origin.run, &program.name, seed, origin.began_unix_ms);
     let performer = Performer::connect(place, &origin.run, &program.name, trace, events).await;
     let performer = performer.context("cannot go on with the run")?;
@@ -105,6 +105,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         progress,
         messages: place.messages.clone(),
         program,
+        syncer: syncer_of(&log)?,
         log,
         checkpointer,
         clock: RobotClock::going_on(replay::now(&ledger, unix_ms(), place.speed), place.speed),
@@ -121,6 +122,8 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
     let begin = async |shell: &mut Shell| {
         let mirror = shell.executive.root().clone();
         shell.log.append_commands(ledger.last, &missing)?;
+        let before = Before { log: shell.log.path().to_owned(), bytes: shell.log.written(), last: ledger.last };
+        shell.spans = Spans::of_a_run_that_goes_on(before, shell.clock.now(), place.speed, &place.messages);
         // Request ids of now on have the number of this resumption: it is in the log before they are used.
         let (now, commands) = shell.decide(&Event::Resumed)?;
         shell.log.make_durable()?;
@@ -129,7 +132,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         let changed = shell.performer.take_up(ledger, &mirror).await?;
         // Commits are there by now.
         let missing = missing.into_iter().filter(|command| !matches!(command, Command::Commit { .. }));
-        let ended = shell.perform(now, missing.chain(commands))?;
+        let ended = shell.perform(now, missing.chain(commands), None)?;
         match changed {
             Some(changed) if ended.is_none() => shell.step(changed),
             _ => Ok(ended),

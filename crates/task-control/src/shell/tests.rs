@@ -50,6 +50,7 @@ impl Bench {
             tls: ratn_worker::tls::ClientTls::none(),
             directory: directory.path().to_owned(),
             catalogue: Arc::new(catalogue),
+            robot: String::new(),
             speed: 10.0,
             messages: Messages::nowhere(),
             alone: false,

@@ -7,23 +7,7 @@ impl Maker {
     pub(super) fn barrier(&mut self, id: StateId, path: &str, depth: u64, room: &Room, visible: &Visible) -> StateKind {
         let count = 2 + self.dice.below(2) as usize;
         let shares = self.features.weak && self.dice.percent(50);
-        let mut rooms =
-            vec![Room { is_alone: false, writable: Vec::new(), actuators: Vec::new(), ..room.clone() }; count];
-        for region in &mut rooms {
-            region.readable.retain(|predicate| shares || !room.writable.contains(predicate));
-        }
-        for predicate in &room.writable {
-            let owner = self.dice.below(count as u64 + 1) as usize;
-            for (number, region) in rooms.iter_mut().enumerate() {
-                // Of nobody: all may read it.
-                if (number == owner || owner == count) && !region.readable.contains(predicate) {
-                    region.readable.push(*predicate);
-                }
-                if number == owner || shares {
-                    region.writable.push(*predicate);
-                }
-            }
-        }
+        let mut rooms = self.rooms(count, room, shares);
         if room.tolerant {
             let owner = self.dice.below(count as u64) as usize;
             rooms.iter_mut().enumerate().for_each(|(number, region)| region.tolerant = number == owner);
@@ -53,6 +37,28 @@ impl Maker {
         self.concurrency(id, regions, false, room, visible)
     }
 
+    /// Rooms of regions beside each other: what one may write no other one sees, unless they share it.
+    fn rooms(&mut self, count: usize, room: &Room, shares: bool) -> Vec<Room> {
+        let mut rooms =
+            vec![Room { is_alone: false, writable: Vec::new(), actuators: Vec::new(), ..room.clone() }; count];
+        for region in &mut rooms {
+            region.readable.retain(|predicate| shares || !room.writable.contains(predicate));
+        }
+        for predicate in &room.writable {
+            let owner = self.dice.below(count as u64 + 1) as usize;
+            for (number, region) in rooms.iter_mut().enumerate() {
+                // Of nobody: all may read it.
+                if (number == owner || owner == count) && !region.readable.contains(predicate) {
+                    region.readable.push(*predicate);
+                }
+                if number == owner || shares {
+                    region.writable.push(*predicate);
+                }
+            }
+        }
+        rooms
+    }
+
     /// Two regions of a few actions.
     pub(super) fn preemptive(
         &mut self,
@@ -64,8 +70,13 @@ impl Maker {
     ) -> StateKind {
         let actuators = [vec!["Arm", "Base"], vec!["Head"]];
         let mut regions = Vec::new();
-        for (number, actuators) in actuators.into_iter().enumerate() {
-            let room = Room { actuators, is_preemptive: true, tolerant: false, ..room.clone() };
+        let rooms = match self.features.ways_out {
+            // What the reference has a verdict on.
+            true => self.rooms(actuators.len(), room, false),
+            false => vec![room.clone(); actuators.len()],
+        };
+        for (number, (actuators, room)) in actuators.into_iter().zip(rooms).enumerate() {
+            let room = Room { actuators, is_preemptive: true, tolerant: false, ..room };
             let inner = Visible { assignable: Vec::new(), ..visible.clone() };
             regions.push(self.region(id, path, number, depth.max(2), &room, &inner));
         }

@@ -53,6 +53,14 @@ pub(in super::super) fn end(wanted: &ReferenceResult, run: &Run) -> Option<Strin
     (left != found).then(|| differ("task resources", left, found))
 }
 
+/// Whether a run that was told to end did just this: outcome, PIAs, changes, world. What stands for task resources depends on who was asked meanwhile.
+pub(in super::super) fn is_cut(program: &Program, wanted: &ReferenceResult, run: &Run, story: &Story) -> bool {
+    wanted.outcome == run.outcome
+        && acts(program, wanted, story).is_none()
+        && wanted.changes == story.changes
+        && wanted.facts.iter().eq(run.world.iter().map(|(key, fact)| (key, &fact.value)))
+}
+
 fn acts(program: &Program, wanted: &ReferenceResult, story: &Story) -> Option<String> {
     let expected = threads(program, wanted.acts.iter().map(|(path, goal)| (&**path, &**goal)));
     let found = threads(program, story.acts.iter().map(|act| (&*act.path, &*act.goal)));

@@ -86,6 +86,8 @@ impl Reference<'_> {
         let annotations = &state.annotations;
         loop {
             self.meets(state, &variables.to_vec())?;
+            // It waits for what it asks for, be it refused, and for what it sees.
+            self.may_be_cut()?;
             if !in_routine {
                 self.asks(state, variables)?;
             }
@@ -94,6 +96,13 @@ impl Reference<'_> {
             }
             let (goal, performance) = self.perform(state, path, variables, tries, attempt)?;
             *inputs = goal.inputs;
+            let seconds = performance.duration_s.min(annotations.timeout_s.unwrap_or(f64::INFINITY));
+            if let Err(cut) = self.may_be_cut().and_then(|()| self.takes(seconds)) {
+                if cut == Fail::Cut && (is_irreversible(state) || self.has_lost()) {
+                    self.say_cut_short(state, variables);
+                }
+                return Err(cut);
+            }
             if self.is_violated(state, variables)? {
                 return Ok(violated(true));
             }
@@ -122,6 +131,13 @@ impl Reference<'_> {
             }
             return ended.ok_or_else(|| Fail::Wrong("it took too long".to_owned()));
         }
+    }
+
+    /// What a state says of being cut short is true, where it has a value and is allowed.
+    pub(super) fn say_cut_short(&mut self, state: &State, variables: &[(String, Value)]) {
+        let Some(declared) = state.annotations.effects.get(PREEMPTED) else { return };
+        let changes = effects::bound(declared, &self.place(variables, Some(&Outputs::new())));
+        self.races.has_failed |= changes.and_then(|changes| self.change(changes)).is_err();
     }
 
     /// Whether something does not hold that has to while it goes on.

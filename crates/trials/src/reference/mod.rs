@@ -9,8 +9,8 @@
 //! - the [`Oracle`], which is the environment. It wants a `World`, so one is built from the facts only to be handed to it.
 //!
 //! There is no clock. A goal that takes longer than its timeout is one that has aborted; regions run one after another,
-//! which is the same because they touch nothing of each other. What depends on time (preemptive concurrencies, deadlines)
-//! or on a wait without an end (resources that are never there) is [`Fail::NotMine`]: there is no verdict. What is refused, it is told
+//! which is the same because they touch nothing of each other. What depends on time otherwise than a race of regions that touch nothing of
+//! each other does (deadlines, races for the same), or on a wait without an end (resources that are never there) is [`Fail::NotMine`]: there is no verdict. What is refused, it is told
 //! by the paths of the states.
 //!
 //! | | |
@@ -18,7 +18,7 @@
 //! | facts and effects | `facts`, `effects` |
 //! | expressions | `evaluate`, `function`, `query` |
 //! | what is known of a run's log alone | `preconditions` |
-//! | what runs | `walk` (states that contain others), `goal` (one action), `waits` (a state that waits), `shown` (what its provider sees), `resources` |
+//! | what runs | `walk` (states that contain others), `race` (what ends before all that is in it has), `goal` (one action), `waits` (a state that waits), `shown` (what its provider sees), `resources` |
 
 mod compare;
 mod comprehension;
@@ -29,6 +29,7 @@ mod function;
 mod goal;
 mod preconditions;
 mod query;
+mod race;
 mod resources;
 mod shown;
 mod waits;
@@ -37,12 +38,13 @@ mod walk;
 #[cfg(test)]
 mod tests;
 
-pub(super) use compare::{disagreement, end, outcomes};
+pub(super) use compare::{disagreement, end, is_cut, outcomes};
 pub(super) use preconditions::unmet;
 
 use super::story::Real;
 use evaluate::{Place, Read};
 use facts::Facts;
+use race::Races;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::Change;
 use ratn_model::id::StateId;
@@ -66,10 +68,12 @@ pub(super) enum Fail {
     Wrong(String),
     /// The reference does not evaluate this: there is no verdict on the program.
     NotMine(&'static str),
+    /// What is under way is cut short: the run was told to end here, or a race was decided.
+    Cut,
 }
 
 /// What should become of a program.
-#[derive(Debug, Default, PartialEq)]
+#[derive(Debug, Default, Clone, PartialEq)]
 pub(super) struct ReferenceResult {
     pub(super) outcome: String,
     pub(super) outputs: Outputs,
@@ -115,7 +119,64 @@ struct Reference<'a> {
     /// How regions ended.
     regions: BTreeMap<StateId, String>,
     steps: usize,
+    /// Whether the run is told to end at the places where an action waits or is under way, as they come in each region.
+    choices: Option<Choices>,
+    /// This thread of control is on its way out.
+    is_leaving: bool,
+    /// What was cut short had not been entered.
+    is_outside: bool,
+    /// What this thread of control is in.
+    races: Races,
     result: ReferenceResult,
+}
+
+/// Where a run is told to end: of the places where it could be, one after another, whether it is. A region that is not told at the first is
+/// at a later one, or has ended.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Choices {
+    made: Vec<bool>,
+    next: usize,
+}
+
+impl Choices {
+    /// The next of all; none after the last.
+    pub(super) fn next(mut self) -> Option<Choices> {
+        while self.made.pop()? {}
+        self.made.push(true);
+        Some(Choices { made: self.made, next: 0 })
+    }
+
+    fn choose(&mut self) -> bool {
+        if self.next == self.made.len() {
+            self.made.push(false);
+        }
+        self.next += 1;
+        self.made[self.next - 1]
+    }
+}
+
+/// Evaluates a program up to where the run is told to end, and what is done on the way out; with the choices as far as they were needed. `None`
+/// where it is not told to.
+///
+/// # Errors
+/// [`Fail::NotMine`].
+pub(super) fn evaluate_cut(
+    given: Given<'_>,
+    choices: Choices,
+    outcome: &str,
+) -> Result<(Option<ReferenceResult>, Choices), Fail> {
+    let (mut reference, mut variables) = Reference::of(given);
+    reference.choices = Some(choices);
+    let end = reference.task(&mut variables);
+    let choices = reference.choices.unwrap_or_default();
+    match end {
+        Err(Fail::Cut) => {
+            reference.result.outcome = outcome.to_owned();
+            Ok((Some(reference.result), choices))
+        }
+        Err(problem) => Err(problem),
+        Ok(_) => Ok((None, choices)),
+    }
 }
 
 /// Evaluates a program from its start to its end.
@@ -123,25 +184,42 @@ struct Reference<'a> {
 /// # Errors
 /// [`Fail::NotMine`].
 pub(super) fn evaluate(given: Given<'_>) -> Result<ReferenceResult, Fail> {
-    let Given { program, seed, parameters, facts, units, refused, outside, signals, oracle } = given;
-    let mut reference = Reference {
-        program,
-        seed,
-        oracle,
-        refused,
-        outside,
-        signals,
-        outputs: BTreeMap::new(),
-        regions: BTreeMap::new(),
-        steps: 0,
-        result: ReferenceResult { facts, units, ..ReferenceResult::default() },
-    };
-    let mut variables: Vec<(String, Value)> = parameters.into_iter().collect();
+    let (mut reference, mut variables) = Reference::of(given);
     reference.result.outcome = reference.task(&mut variables)?;
     Ok(reference.result)
 }
 
+impl<'a> Reference<'a> {
+    /// At the start of a program, with the variables in sight.
+    fn of(given: Given<'a>) -> (Reference<'a>, Vec<(String, Value)>) {
+        let Given { program, seed, parameters, facts, units, refused, outside, signals, oracle } = given;
+        let reference = Reference {
+            program,
+            seed,
+            oracle,
+            refused,
+            outside,
+            signals,
+            outputs: BTreeMap::new(),
+            regions: BTreeMap::new(),
+            steps: 0,
+            choices: None,
+            is_leaving: false,
+            is_outside: false,
+            races: Races::default(),
+            result: ReferenceResult { facts, units, ..ReferenceResult::default() },
+        };
+        (reference, parameters.into_iter().collect())
+    }
+}
+
 impl Reference<'_> {
+    /// A place where the run may be told to end.
+    fn may_be_cut(&mut self) -> Result<(), Fail> {
+        let is_cut = !self.is_leaving && self.choices.as_mut().is_some_and(Choices::choose);
+        if is_cut { Err(self.cut_by_the_run()) } else { Ok(()) }
+    }
+
     fn task(&mut self, variables: &mut Vec<(String, Value)>) -> Result<String, Fail> {
         let program = self.program;
         if program.deadline_s.is_some() {
@@ -199,6 +277,7 @@ impl Reference<'_> {
 fn fails<T>(result: Result<T, Fail>) -> Result<Result<T, Fail>, Fail> {
     match result {
         Err(Fail::NotMine(what)) => Err(Fail::NotMine(what)),
+        Err(Fail::Cut) => Err(Fail::Cut),
         other => Ok(other),
     }
 }

@@ -18,6 +18,7 @@ impl Reference<'_> {
         variables: &mut Vec<(String, Value)>,
         in_routine: bool,
     ) -> Result<String, Fail> {
+        self.may_be_cut()?;
         let ended = fails(self.waited(state, path, variables))?;
         let assigned = match &ended {
             Ok((_, outputs)) => fails(self.assigned(state, variables, outputs))?,
@@ -56,6 +57,7 @@ impl Reference<'_> {
                         None => drop(self.result.facts.remove(&key)),
                     }
                 }
+                self.is_watched()?;
                 if condition.is_true(&self.place(variables, None))? {
                     return Ok((SUCCESS.to_owned(), Outputs::new()));
                 }

@@ -1,7 +1,9 @@
 //! States that contain others: which state comes next, and what happens when one is left.
 
 use super::evaluate::Read;
+use super::race::merge;
 use super::{Fail, MAX_STEPS, Outputs, Reference, effects, fails};
+use crate::around;
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Again, Finally, PREEMPTED, Program, SUCCESS, State, StateKind, Target, VIOLATED};
 use ratn_model::value::Value;
@@ -11,8 +13,31 @@ use std::collections::BTreeMap;
 type Variables = Vec<(String, Value)>;
 
 impl Reference<'_> {
-    /// Visits a state at a path; its outcome.
+    /// Visits a state at a path; its outcome. Where it is cut short, it says what that means.
     pub(super) fn visit(
+        &mut self,
+        id: StateId,
+        path: &str,
+        variables: &mut Variables,
+        in_routine: bool,
+    ) -> Result<String, Fail> {
+        let outside = variables.len();
+        let ended = self.visited(id, path, variables, in_routine);
+        let state = self.program.state(id);
+        let is_composite = !matches!(state.kind, StateKind::Action { .. });
+        if ended == Err(Fail::Cut) && is_composite && !std::mem::take(&mut self.is_outside) {
+            let has_finally = |state: &State| state.annotations.finally.is_some();
+            // A run that is told to end leaves what is inside of something that has to be done.
+            let is_left = self.has_lost() || around(self.program, state).skip(1).any(has_finally);
+            if !has_finally(state) && is_left {
+                self.say_cut_short(state, variables);
+            }
+            variables.truncate(outside);
+        }
+        ended
+    }
+
+    fn visited(
         &mut self,
         id: StateId,
         path: &str,
@@ -25,6 +50,10 @@ impl Reference<'_> {
         if self.steps > MAX_STEPS {
             return Err(Fail::NotMine("a run without an end"));
         }
+        if let Err(cut) = self.is_watched() {
+            self.is_outside = !matches!(state.kind, StateKind::Action { .. });
+            return Err(cut);
+        }
         if let StateKind::Action { .. } = state.kind {
             if state.is_pause() {
                 return self.wait(state, path, variables, in_routine);
@@ -35,6 +64,10 @@ impl Reference<'_> {
             return Ok(ABORTED.to_owned());
         }
         let begins_routine = state.is_routine() && !in_routine;
+        if begins_routine && let Err(cut) = self.may_be_cut() {
+            self.is_outside = true;
+            return Err(cut);
+        }
         if begins_routine && fails(self.asks(state, variables))?.is_err() {
             return Ok(ABORTED.to_owned());
         }
@@ -93,9 +126,13 @@ impl Reference<'_> {
             StateKind::While { predicate, body_first, index, body } => {
                 self.repeat(predicate, *body_first, index.as_deref(), body, path, variables, inside)?
             }
-            StateKind::Concurrency { preemptive: true, .. } => {
-                return Err(Fail::NotMine("a preemptive concurrency"));
-            }
+            StateKind::Concurrency { preemptive: true, .. } => match self.race(state, path, variables, inside)? {
+                Some(outcome) => Some(outcome),
+                None => {
+                    variables.truncate(outside);
+                    return Ok(VIOLATED.to_owned());
+                }
+            },
             StateKind::Concurrency { regions, decide, .. } => {
                 Some(self.regions(regions, decide, path, variables, inside)?)
             }
@@ -207,13 +244,43 @@ impl Reference<'_> {
         variables: &mut Variables,
         in_routine: bool,
     ) -> Result<String, Fail> {
-        let outcome = self.visit(finally.body, &below(path, "body"), variables, in_routine)?;
+        let outcome = match self.visit(finally.body, &below(path, "body"), variables, in_routine) {
+            Err(Fail::Cut) => return self.cut_lastly(finally, path, variables, "finally_preempted", in_routine),
+            ended => ended?,
+        };
         let Some(last) = finally.lastly.get(&outcome) else {
             return Err(Fail::Wrong(format!("nothing is done on the way out by {outcome}")));
         };
         let name = if outcome == SUCCESS { "finally".to_owned() } else { format!("finally_{outcome}") };
-        let last = self.visit(*last, &below(path, &name), variables, in_routine)?;
+        if self.is_watched().is_err() {
+            return self.cut_lastly(finally, path, variables, "finally_preempted", in_routine);
+        }
+        let last = match self.visit(*last, &below(path, &name), variables, in_routine) {
+            Err(Fail::Cut) => {
+                let again = if outcome == PREEMPTED { "finally_preempted#2" } else { "finally_preempted" };
+                return self.cut_lastly(finally, path, variables, again, in_routine);
+            }
+            ended => ended?,
+        };
         Ok(if last == SUCCESS { outcome } else { last })
+    }
+
+    /// It is done, whatever comes of it; then what is around is left. Of a run that is told to end nothing is in a routine any more.
+    fn cut_lastly(
+        &mut self,
+        finally: &Finally,
+        path: &str,
+        variables: &mut Variables,
+        name: &str,
+        in_routine: bool,
+    ) -> Result<String, Fail> {
+        let Some(last) = finally.lastly.get(PREEMPTED) else { return Err(Fail::Cut) };
+        let in_routine = in_routine && self.has_lost();
+        let cut = self.races.clone();
+        let ended = fails(self.visit(*last, &below(path, name), variables, in_routine))?;
+        self.races.resume(cut);
+        self.races.has_failed |= !matches!(ended.as_deref(), Ok(SUCCESS | PREEMPTED));
+        Err(Fail::Cut)
     }
 
     #[expect(clippy::too_many_arguments, reason = "all of it is one loop")]
@@ -261,21 +328,32 @@ impl Reference<'_> {
     ) -> Result<String, Fail> {
         let before = variables.clone();
         let mut outcomes = Vec::new();
+        let mut beside = self.beside();
         for region in regions {
             let mut own = before.clone();
             let name = &self.program.state(*region).name;
-            let outcome = self.visit(*region, &below(path, name), &mut own, in_routine)?;
-            for (number, variable) in own.into_iter().enumerate() {
-                if variable.1 != before[number].1 {
-                    variables[number] = variable;
-                }
+            beside.begin(self);
+            match self.visit(*region, &below(path, name), &mut own, in_routine) {
+                Err(Fail::Cut) => beside.is_cut(self, regions.len())?,
+                ended => outcomes.push((*region, ended?)),
             }
-            outcomes.push((*region, outcome));
+            merge(variables, &before, own);
         }
+        beside.end(self, regions.len())?;
         // How a region ended is seen when all have.
-        for (region, outcome) in &outcomes {
-            self.regions.insert(*region, outcome.clone());
-        }
+        self.regions.extend(outcomes.iter().cloned());
+        let outcomes: Vec<String> = outcomes.into_iter().map(|(_, outcome)| outcome).collect();
+        self.decided(decide, variables, &outcomes, None)
+    }
+
+    /// The outcome of a concurrency whose regions have ended.
+    pub(super) fn decided(
+        &mut self,
+        decide: &[(String, ratn_model::expression::Expr)],
+        variables: &mut Variables,
+        outcomes: &[String],
+        otherwise: Option<String>,
+    ) -> Result<String, Fail> {
         for (outcome, holds) in decide {
             match fails(holds.is_true(&self.place(variables, None)))? {
                 Ok(true) => return Ok(outcome.clone()),
@@ -283,16 +361,16 @@ impl Reference<'_> {
                 Err(_) => return Ok(ABORTED.to_owned()),
             }
         }
-        let by = |wanted: &str| outcomes.iter().any(|(_, outcome)| outcome == wanted);
-        let all_well = outcomes.iter().all(|(_, outcome)| outcome == SUCCESS);
-        Ok(if all_well {
-            SUCCESS
-        } else if by(ABORTED) {
-            ABORTED
-        } else {
-            PREEMPTED
-        }
-        .to_owned())
+        let by = |wanted: &str| outcomes.iter().any(|outcome| outcome == wanted);
+        let all_well = outcomes.iter().all(|outcome| outcome == SUCCESS);
+        Ok(otherwise.unwrap_or_else(|| {
+            let outcome = match all_well {
+                true => SUCCESS,
+                false if by(ABORTED) || by(VIOLATED) => ABORTED,
+                false => PREEMPTED,
+            };
+            outcome.to_owned()
+        }))
     }
 
     /// What happens when a state is left: outputs, effects and resources; what it assigns.

@@ -71,7 +71,9 @@ impl<'t> Lines<'t> {
                 continue;
             }
             let is_item = depth == indent && (own == "-" || own.starts_with("- "));
-            if depth <= indent && !is_item {
+            // No key begins so: it closes a list or mapping in brackets.
+            let closes = own.starts_with([']', '}']);
+            if depth <= indent && !is_item && !closes {
                 break;
             }
             last = line;

@@ -57,7 +57,10 @@ fn frame(old: &str, new: &str) -> (usize, usize) {
 /// Values that a key may have, short and long ones, in other words than any example.
 fn values(key: &str) -> Vec<Option<Document>> {
     let texts: &[&str] = match key {
-        "computes" => &["true", "false"],
+        "computes" | "pia" | "deterministic" | "routine" => &["true", "false"],
+        "attempts" => &["5", "1"],
+        "exceptional" => &["[aborted]", "[violated, aborted]"],
+        "exceptions" => &["imprecise", "precise"],
         "duration" => &["3.25", "\"max($i, 2)\""],
         "resources" => {
             &["[{ block: Other }]", "[world_model, { create: Made, class: task, with: { what: \"a: b\" } }]"]
@@ -77,7 +80,7 @@ fn values(key: &str) -> Vec<Option<Document>> {
 /// So many changes are loaded: one of these.
 const EVERY: usize = 17;
 
-/// Over every example, every state, every key that it may have, and some values by turns (`RATN_EDIT_EXHAUSTIVE=1`: all of them): the tree is the old one with the change alone, all
+/// Over every example, every state, every key that it has, some that it may have, and some values by turns (`RATN_EDIT_EXHAUSTIVE=1`: all of them): the tree is the old one with the change alone, all
 /// lines but those of the key are the same, all comments are there, and where it loads nothing but this state is otherwise.
 #[test]
 fn only_the_lines_of_the_key_change_in_every_state_of_every_example() {
@@ -98,8 +101,12 @@ fn only_the_lines_of_the_key_change_in_every_state_of_every_example() {
                 };
                 let all: Vec<Option<Document>> = values(key).into_iter().chain(more).collect();
                 turn += 1;
+                // Of keys that are new every second one is enough.
+                if old.is_none() && turn % 2 == 0 && !is_exhaustive {
+                    continue;
+                }
                 let count = if is_exhaustive { all.len() } else { 1 };
-                for new in all.into_iter().cycle().skip(turn).take(count) {
+                for new in all.into_iter().cycle().skip(turn / 2).take(count) {
                     let place = format!("{name}: {} {key}: {new:?}", state.path);
                     let after = edited(&text, &state.path, key, new.as_ref())
                         .unwrap_or_else(|error| panic!("{place}: {error}"));
@@ -239,6 +246,44 @@ fn in_brackets_an_entry_is_replaced_and_goes_with_its_comma() {
 }
 
 #[test]
+fn a_list_that_is_closed_in_the_column_of_its_key_is_the_value_of_the_key() {
+    let text = "\
+task: t
+states:
+  - a:
+      action: x/y
+      reads: [
+        b, # first
+        c,
+      ]
+      duration: 1
+  - d:
+      action: x/y
+      reads: [
+        e
+      ]
+";
+    let new = "      # first\n      reads: [f]\n";
+    check(
+        text,
+        "a",
+        "reads",
+        Some("[f]"),
+        &text.replace("      reads: [\n        b, # first\n        c,\n      ]\n", new),
+    );
+    check(
+        text,
+        "a",
+        "reads",
+        None,
+        &text.replace("      reads: [\n        b, # first\n        c,\n      ]\n", "      # first\n"),
+    );
+    check(text, "d", "reads", Some("[f]"), &text.replace("reads: [\n        e\n      ]", "reads: [f]"));
+    check(text, "a", "duration", Some("2"), &text.replace("duration: 1", "duration: 2"));
+    check(text, "d", "duration", Some("2"), &format!("{text}      duration: 2\n"));
+}
+
+#[test]
 fn line_ends_of_another_system_stay_and_a_last_line_without_one_does() {
     let text = "task: t\r\nstates:\r\n  - a:\r\n      action: x/y # §\r\n      duration: 1";
     let after = edited(text, "a", "reads", Some(&value("[b]"))).unwrap();
@@ -279,7 +324,7 @@ fn what_cannot_be_done_safely_is_refused_with_what_where_why_and_what_next() {
     `reads` of `a` (line 3) is not changed: a comment stands inside of its value; change it in an editor
     `w/else` (line 7) has no text of its own: it is written out from a shorter form; change it in an editor
     there is no state `library/inside` in this file: read the file again; a state of a library is changed in the library's file
-    `for_x` cannot have `senses`: a state with `for: x in [1]` may say reads, resources, duration
+    `for_x` cannot have `senses`: a state with `for: x in [1]` may say reads, resources, duration, routine, exceptional, exceptions, shared
     line 1: unclosed bracket '[': the file cannot be read as a task; correct it in an editor first
     ");
     // What stands in a case has a text of its own.

@@ -1,0 +1,149 @@
+//! What was written of a run is made safe on the disk beside everything else: only what cannot be undone waits for that.
+//!
+//! A thread makes the event log safe when it is asked to; everything that was written before one look at the disk is safe after it, so many marks
+//! that come meanwhile cost one more look.
+
+use std::fs::File;
+use std::io;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, channel};
+use tokio::sync::watch;
+
+/// How far the log is safe.
+#[derive(Debug, Clone, Default)]
+struct Safe {
+    through: u64,
+    /// Nothing more will be.
+    failed: Option<Arc<str>>,
+}
+
+/// Makes the log safe. Ends its thread when it is dropped.
+#[derive(Debug)]
+pub(super) struct Syncer {
+    /// `None` where there is no disk.
+    wanted: Option<Sender<u64>>,
+    safe: watch::Receiver<Safe>,
+    last: u64,
+}
+
+/// A place in the log: what cannot be undone waits until everything before it is safe.
+#[derive(Debug, Clone)]
+pub(super) struct Mark {
+    number: u64,
+    safe: watch::Receiver<Safe>,
+}
+
+impl Syncer {
+    /// Of a file that others write; `None`: it is on no disk.
+    ///
+    /// # Errors
+    /// Where the thread cannot be started.
+    pub(super) fn start(file: Option<File>) -> io::Result<Syncer> {
+        let (told, safe) = watch::channel(Safe::default());
+        let Some(file) = file else { return Ok(Syncer { wanted: None, safe, last: 0 }) };
+        let (wanted, marks) = channel();
+        let sync = move || file.sync_data();
+        std::thread::Builder::new().name("event-log".to_owned()).spawn(move || work(&marks, &told, sync))?;
+        Ok(Syncer { wanted: Some(wanted), safe, last: 0 })
+    }
+
+    /// Everything that was written so far, which is made safe as soon as possible.
+    pub(super) fn mark(&mut self) -> Mark {
+        if let Some(wanted) = &self.wanted {
+            self.last += 1;
+            // Where the thread is gone it has said why.
+            let _ = wanted.send(self.last);
+        }
+        Mark { number: self.last, safe: self.safe.clone() }
+    }
+
+    /// Resolves when the log cannot be made safe any more, with the reason.
+    pub(super) async fn failed(&self) -> Arc<str> {
+        let mut safe = self.safe.clone();
+        let looked = safe.wait_for(|safe| safe.failed.is_some()).await;
+        let reason = looked.ok().and_then(|safe| safe.failed.clone());
+        match reason {
+            Some(reason) => reason,
+            // There is no thread that could.
+            None => std::future::pending().await,
+        }
+    }
+}
+
+impl Mark {
+    /// Waits until everything before it is safe; false where it never will be.
+    pub(super) async fn safe(mut self) -> bool {
+        let number = self.number;
+        // Where the thread is gone it has said the last that is to be said.
+        let _ = self.safe.wait_for(|safe| safe.through >= number || safe.failed.is_some()).await;
+        self.safe.borrow().through >= number
+    }
+}
+
+fn work(marks: &Receiver<u64>, told: &watch::Sender<Safe>, sync: impl Fn() -> io::Result<()>) {
+    while let Ok(mark) = marks.recv() {
+        let through = marks.try_iter().last().unwrap_or(mark);
+        match sync() {
+            Ok(()) => told.send_modify(|safe| safe.through = through),
+            Err(error) => {
+                // What a disk has lost once it may not tell again.
+                told.send_modify(|safe| safe.failed = Some(error.to_string().into()));
+                return;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+    use std::time::Duration;
+
+    fn started(sync: impl Fn() -> io::Result<()> + Send + 'static) -> Syncer {
+        let (told, safe) = watch::channel(Safe::default());
+        let (wanted, marks) = channel();
+        std::thread::spawn(move || work(&marks, &told, sync));
+        Syncer { wanted: Some(wanted), safe, last: 0 }
+    }
+
+    #[tokio::test]
+    async fn marks_that_come_while_the_disk_is_slow_are_safe_together() {
+        let count = Arc::new(AtomicUsize::new(0));
+        let counted = count.clone();
+        let mut syncer = started(move || {
+            std::thread::sleep(Duration::from_millis(50));
+            counted.fetch_add(1, Ordering::SeqCst);
+            Ok(())
+        });
+        let first = syncer.mark();
+        tokio::time::sleep(Duration::from_millis(10)).await;
+        let others: Vec<Mark> = (0..10).map(|_| syncer.mark()).collect();
+        assert!(first.safe().await);
+        for mark in others {
+            assert!(mark.safe().await);
+        }
+        assert!(count.load(Ordering::SeqCst) < 8, "eleven marks cost fewer looks");
+    }
+
+    #[tokio::test]
+    async fn nothing_is_safe_behind_a_failure_and_it_is_told() {
+        let looks = AtomicUsize::new(0);
+        let mut syncer = started(move || match looks.fetch_add(1, Ordering::SeqCst) {
+            0 => Ok(()),
+            _ => Err(io::Error::other("the disk is gone")),
+        });
+        let first = syncer.mark();
+        assert!(first.clone().safe().await);
+        assert!(!syncer.mark().safe().await);
+        assert_eq!(&*syncer.failed().await, "the disk is gone");
+        assert!(first.safe().await, "what was safe stays so");
+        assert!(!syncer.mark().safe().await);
+    }
+
+    #[tokio::test]
+    async fn without_a_disk_nobody_waits() {
+        let mut syncer = Syncer::start(None).expect("no thread is needed");
+        assert!(syncer.mark().safe().await);
+    }
+}

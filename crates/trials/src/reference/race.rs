@@ -1,0 +1,456 @@
+//! A concurrency that ends before all of its regions have, and a state with a limit or a watch, which is one.
+//!
+//! The only clock of the reference is here: actions take what the environment says, everything else takes no time. Of a race, each region is
+//! evaluated by itself to find out when it would end, which says when the race is decided; then once more, up to that moment. What is
+//! under way in a region then is cut short, and the region leaves the states in which it is.
+//!
+//! There is no verdict where regions touch what another one does, and where two ends are so close to each other that it matters what
+//! everything else takes.
+
+use super::evaluate::Read;
+use super::{Fail, Reference, fails};
+use ratn_model::expression::{EffectExpr, Expr};
+use ratn_model::id::StateId;
+use ratn_model::program::{ABORTED, Nature, PREEMPTED, SUCCESS, State, StateKind, VIOLATED};
+use ratn_model::value::Value;
+use ratn_model::wait::Wait;
+use std::collections::BTreeSet;
+
+/// All that takes no time here takes less, together.
+const CLOSE_S: f64 = 400.0;
+
+type Variables = Vec<(String, Value)>;
+
+/// What must hold, with the variables that it sees.
+type Watch = (Vec<Expr>, Variables);
+
+/// The races that a thread of control is in, and what became of it there.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Races {
+    /// The seconds since the outermost began.
+    now_s: f64,
+    /// When one is decided, and its number; the outermost has the first.
+    until: Option<(f64, usize)>,
+    /// Of every race.
+    watches: Vec<Option<Watch>>,
+    /// What cut it short.
+    cut: Option<Cut>,
+    /// Something failed on its way out.
+    pub(super) has_failed: bool,
+}
+
+impl Races {
+    /// What was done on the way out took its time, and nothing else of it counts.
+    pub(super) fn resume(&mut self, cut: Races) {
+        *self = Races { now_s: self.now_s, ..cut };
+    }
+}
+
+/// The regions of a concurrency that waits for all of them, one after another.
+pub(super) struct Beside {
+    races: Races,
+    is_leaving: bool,
+    end_s: f64,
+    has_failed: bool,
+    cut: Option<Option<Cut>>,
+}
+
+impl Beside {
+    /// A region begins.
+    pub(super) fn begin(&mut self, reference: &mut Reference<'_>) {
+        self.end_s = self.end_s.max(reference.races.now_s);
+        (reference.races, reference.is_leaving) = (self.races.clone(), self.is_leaving);
+    }
+
+    /// A region was cut short.
+    pub(super) fn is_cut(&mut self, reference: &mut Reference<'_>, regions: usize) -> Result<(), Fail> {
+        if regions > 1 && reference.races.cut.is_some_and(|cut| cut.watch.is_some()) {
+            // Where the others are then is not known here.
+            return Err(Fail::NotMine("regions that are watched"));
+        }
+        self.has_failed |= reference.races.has_failed;
+        self.cut = Some(reference.races.cut);
+        Ok(())
+    }
+
+    /// All of them have ended.
+    pub(super) fn end(mut self, reference: &mut Reference<'_>, regions: usize) -> Result<(), Fail> {
+        self.begin(reference);
+        reference.races.now_s = self.end_s;
+        if self.cut.is_none() && regions > 1 && reference.is_broken() {
+            // What made a condition false may have been done while another region went on.
+            return Err(Fail::NotMine("regions that are watched"));
+        }
+        let Some(cut) = self.cut else { return Ok(()) };
+        reference.races.has_failed |= self.has_failed;
+        Err(reference.cut(cut))
+    }
+}
+
+/// A race that was decided while something went on.
+#[derive(Debug, Clone, Copy)]
+struct Cut {
+    race: usize,
+    /// How its watch ended, if that decided it.
+    watch: Option<&'static str>,
+}
+
+/// One evaluation of a region.
+struct Region {
+    outcome: String,
+    end_s: f64,
+    /// What cut it short; `Some(None)` where the run was told to end.
+    cut: Option<Option<Cut>>,
+    has_failed: bool,
+}
+
+impl Reference<'_> {
+    /// Nothing begins inside of a watched state whose condition does not hold any more.
+    pub(super) fn is_watched(&mut self) -> Result<(), Fail> {
+        if self.is_leaving {
+            return Ok(());
+        }
+        for race in 0..self.races.watches.len() {
+            let Some(watch) = self.races.watches[race].clone() else { continue };
+            if let Some(outcome) = self.broken(&watch)? {
+                return Err(self.cut(Some(Cut { race, watch: Some(outcome) })));
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether a condition of what is around does not hold any more.
+    fn is_broken(&self) -> bool {
+        !self.is_leaving && self.races.watches.iter().flatten().any(|watch| self.broken(watch) != Ok(None))
+    }
+
+    /// Something goes on for so long.
+    pub(super) fn takes(&mut self, seconds: f64) -> Result<(), Fail> {
+        self.is_watched()?;
+        if self.races.watches.is_empty() {
+            return Ok(());
+        }
+        let end_s = self.races.now_s + seconds;
+        if let Some((until_s, race)) = self.races.until.filter(|_| !self.is_leaving) {
+            if (end_s - until_s).abs() < CLOSE_S {
+                return Err(Fail::NotMine("what ends as a race does"));
+            }
+            if end_s > until_s {
+                self.races.now_s = until_s;
+                return Err(self.cut(Some(Cut { race, watch: None })));
+            }
+        }
+        self.races.now_s = end_s;
+        Ok(())
+    }
+
+    /// The regions of a concurrency begin here.
+    pub(super) fn beside(&self) -> Beside {
+        let (races, is_leaving, end_s) = (self.races.clone(), self.is_leaving, self.races.now_s);
+        Beside { races, is_leaving, end_s, has_failed: false, cut: None }
+    }
+
+    /// What is under way is cut short because the run is told to end.
+    pub(super) fn cut_by_the_run(&mut self) -> Fail {
+        self.cut(None)
+    }
+
+    fn cut(&mut self, cut: Option<Cut>) -> Fail {
+        self.races.cut = cut;
+        self.is_leaving = true;
+        Fail::Cut
+    }
+
+    /// Whether a race cut short what is left.
+    pub(super) fn has_lost(&self) -> bool {
+        self.is_leaving && self.races.cut.is_some()
+    }
+
+    /// By which outcome a watch ends, if something does not hold.
+    fn broken(&self, (holds, variables): &Watch) -> Result<Option<&'static str>, Fail> {
+        for holds in holds {
+            match fails(holds.is_true(&self.place(variables, None)))? {
+                Ok(true) => {}
+                Ok(false) => return Ok(Some(VIOLATED)),
+                Err(_) => return Ok(Some(ABORTED)),
+            }
+        }
+        Ok(None)
+    }
+
+    /// A preemptive concurrency; its outcome, or none where it is violated before anything in it begins.
+    pub(super) fn race(
+        &mut self,
+        state: &State,
+        path: &str,
+        variables: &mut Variables,
+        in_routine: bool,
+    ) -> Result<Option<String>, Fail> {
+        let StateKind::Concurrency { regions, .. } = &state.kind else { return Err(Fail::NotMine("a race of one")) };
+        let program = self.program;
+        let is_body = |region: &&StateId| !program.state(**region).is_watch();
+        let bodies: Vec<StateId> = regions.iter().filter(is_body).copied().collect();
+        match bodies.as_slice() {
+            [body] if regions.len() > 1 => self.limited(state, *body, path, variables, in_routine),
+            [_, _, ..] if bodies.len() == regions.len() => self.first_of(state, path, variables, in_routine).map(Some),
+            _ => Err(Fail::NotMine("a race of another kind")),
+        }
+    }
+
+    /// A state with a limit, a watch or both.
+    fn limited(
+        &mut self,
+        state: &State,
+        body: StateId,
+        path: &str,
+        variables: &mut Variables,
+        in_routine: bool,
+    ) -> Result<Option<String>, Fail> {
+        let program = self.program;
+        let StateKind::Concurrency { regions, .. } = &state.kind else { return Ok(None) };
+        let (mut watch, mut limit_s): (Option<Watch>, Option<f64>) = (None, None);
+        for region in regions {
+            match program.state(*region).wait() {
+                Some(Wait::Watch(holds)) => watch = Some((holds.into_iter().cloned().collect(), variables.clone())),
+                Some(Wait::Limit(seconds)) => match seconds.read(&self.place(variables, None))? {
+                    Value::Float(seconds) => limit_s = Some(seconds),
+                    _ => return Err(Fail::NotMine("a limit of another kind")),
+                },
+                _ => {}
+            }
+        }
+        if let Some(watch) = &watch
+            && let Some(outcome) = self.broken(watch)?
+        {
+            self.ends(regions, |region| if region == body { PREEMPTED } else { outcome });
+            return Ok((outcome != VIOLATED).then(|| outcome.to_owned()));
+        }
+        let number = self.races.watches.len();
+        let until = limit_s.map(|seconds| (self.races.now_s + seconds, number));
+        let (outer, is_leaving) = (self.races.clone(), self.is_leaving);
+        let within = within(&outer, is_leaving, until, watch);
+        let end = self.region(body, path, variables, in_routine, &within)?;
+        let outcome = match end.cut {
+            None => end.outcome.clone(),
+            Some(Some(cut)) if cut.race == number => cut.watch.unwrap_or(ABORTED).to_owned(),
+            Some(by) => {
+                self.after(outer, is_leaving, &[end])?;
+                return Err(self.cut(by));
+            }
+        };
+        let is_timed = |region: StateId| matches!(program.state(region).wait(), Some(Wait::Limit(_)));
+        let decided = end.cut.flatten();
+        self.ends(regions, |region| match decided {
+            _ if region == body => &end.outcome,
+            Some(Cut { watch: None, .. }) if is_timed(region) => ABORTED,
+            Some(Cut { watch: Some(outcome), .. }) if !is_timed(region) => outcome,
+            _ => PREEMPTED,
+        });
+        self.after(outer, is_leaving, &[end])?;
+        Ok(Some(outcome))
+    }
+
+    /// Regions of which the first that ends ends the others, or as soon as enough have succeeded.
+    fn first_of(
+        &mut self,
+        state: &State,
+        path: &str,
+        variables: &mut Variables,
+        in_routine: bool,
+    ) -> Result<String, Fail> {
+        let StateKind::Concurrency { regions, decide, successes, .. } = &state.kind else {
+            return Err(Fail::NotMine("a race of one"));
+        };
+        if self.choices.is_some() && !self.is_leaving {
+            return Err(Fail::NotMine("a run told to end that has races"));
+        }
+        if !self.outside.is_empty() || self.touch(regions) {
+            return Err(Fail::NotMine("regions that race for the same"));
+        }
+        let number = self.races.watches.len();
+        let (outer, is_leaving) = (self.races.clone(), self.is_leaving);
+        let by_itself = within(&outer, is_leaving, None, None);
+        // How each would end by itself, in the order of their ends.
+        let mut ends: Vec<(f64, usize, String)> = Vec::new();
+        for (place, region) in regions.iter().enumerate() {
+            let before = (self.result.clone(), self.outputs.clone(), self.regions.clone());
+            let end = self.region(*region, path, &mut variables.clone(), in_routine, &by_itself)?;
+            (self.result, self.outputs, self.regions) = before;
+            match end.cut {
+                None => ends.push((end.end_s, place, end.outcome)),
+                Some(Some(Cut { watch: None, .. })) => {}
+                Some(_) => return Err(Fail::NotMine("a watch around a race")),
+            }
+        }
+        ends.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let (mut first, mut enough) = (None, None);
+        let mut succeeded = 0;
+        for (past, (at_s, place, outcome)) in ends.iter().enumerate() {
+            succeeded += u32::from(outcome == SUCCESS);
+            let going_on = (regions.len() - past - 1) as u32;
+            let is_decided = successes.is_none_or(|wanted| succeeded >= wanted || succeeded + going_on < wanted);
+            if is_decided {
+                first = Some((*at_s, *place));
+                enough = successes.map(|wanted| succeeded >= wanted);
+                break;
+            }
+        }
+        let until = first.map(|(at_s, _)| (at_s, number));
+        let is_close = |at_s: f64| until.is_some_and(|(until_s, _)| (at_s - until_s).abs() < CLOSE_S);
+        let others = ends.iter().filter(|(_, place, _)| first.is_some_and(|(_, first)| first != *place));
+        if others.map(|(at_s, ..)| *at_s).chain(outer.until.map(|(at_s, _)| at_s)).any(is_close) {
+            return Err(Fail::NotMine("ends that are close to each other"));
+        }
+        // The same again, up to there.
+        let before = variables.clone();
+        let mut all = Vec::new();
+        for (place, region) in regions.iter().enumerate() {
+            let has_ended = ends.iter().any(|(at_s, of, _)| *of == place && until.is_some_and(|(t, _)| *at_s <= t));
+            let within = within(&outer, is_leaving, until.filter(|_| !has_ended), None);
+            let mut own = before.clone();
+            all.push(self.region(*region, path, &mut own, in_routine, &within)?);
+            merge(variables, &before, own);
+        }
+        let by_what_is_around =
+            all.iter().find_map(|end| end.cut.filter(|cut| cut.is_none_or(|cut| cut.race != number)));
+        self.after(outer, is_leaving, &all)?;
+        if let Some(by) = by_what_is_around {
+            return Err(self.cut(by));
+        }
+        let Some((_, first)) = first else { return Err(Fail::NotMine("a race without an end")) };
+        let outcomes: Vec<String> = all.into_iter().map(|end| end.outcome).collect();
+        let place = |region| regions.iter().position(|other| *other == region).unwrap_or_default();
+        self.ends(regions, |region| &outcomes[place(region)]);
+        let said = match enough {
+            Some(true) => Some(SUCCESS.to_owned()),
+            Some(false) => Some(ABORTED.to_owned()),
+            None => decide.is_empty().then(|| outcomes[first].clone()),
+        };
+        self.decided(decide, variables, &outcomes, said)
+    }
+
+    fn ends<'o>(&mut self, regions: &[StateId], outcome: impl Fn(StateId) -> &'o str) {
+        self.regions.extend(regions.iter().map(|region| (*region, outcome(*region).to_owned())));
+    }
+
+    /// A region, as far as it comes within these races.
+    fn region(
+        &mut self,
+        region: StateId,
+        path: &str,
+        variables: &mut Variables,
+        in_routine: bool,
+        within: &Races,
+    ) -> Result<Region, Fail> {
+        (self.races, self.is_leaving) = (within.clone(), false);
+        let name = &self.program.state(region).name;
+        let outcome = match self.visit(region, &format!("{path}/{name}"), variables, in_routine) {
+            Err(Fail::Cut) => Ok(if self.races.has_failed { ABORTED } else { PREEMPTED }.to_owned()),
+            ended => ended,
+        }?;
+        let cut = self.is_leaving.then_some(self.races.cut);
+        Ok(Region { outcome, end_s: self.races.now_s, cut, has_failed: self.races.has_failed })
+    }
+
+    /// All regions have ended.
+    fn after(&mut self, outer: Races, is_leaving: bool, regions: &[Region]) -> Result<(), Fail> {
+        let end_s = regions.iter().fold(outer.now_s, |latest, region| latest.max(region.end_s));
+        let number = outer.watches.len();
+        let is_inner = |region: &Region| region.cut.flatten().is_some_and(|cut| cut.race == number);
+        let is_outer = |region: &Region| region.cut.is_some() && !is_inner(region);
+        (self.races, self.is_leaving) = (Races { now_s: end_s, ..outer }, is_leaving);
+        if regions.iter().any(is_outer) {
+            self.races.has_failed |= regions.iter().any(|region| region.cut.is_some() && region.has_failed);
+            return Ok(());
+        }
+        if regions.len() == 1 && !regions.iter().any(is_inner) {
+            return Ok(());
+        }
+        // What is around may be decided, or broken, while this is on its way out.
+        let is_late = !is_leaving && self.races.until.is_some_and(|(until_s, _)| end_s + CLOSE_S > until_s);
+        if is_late || self.is_broken() {
+            return Err(Fail::NotMine("a race that is cut short on its way out"));
+        }
+        Ok(())
+    }
+
+    /// Whether a region writes what another one reads or writes.
+    fn touch(&self, regions: &[StateId]) -> bool {
+        let touched: Vec<Touched> = regions.iter().map(|region| self.touched(*region)).collect();
+        touched.iter().enumerate().any(|(place, one)| {
+            let others = touched.iter().enumerate().filter(|(other, _)| *other != place);
+            others.map(|(_, other)| other).any(|other| {
+                let meets = one.writes.iter().any(|fact| other.reads.contains(fact) || other.writes.contains(fact));
+                let writes = !one.writes.is_empty() || one.writes_any;
+                meets || one.writes_any || other.reads_any && writes
+            })
+        })
+    }
+
+    fn touched(&self, region: StateId) -> Touched {
+        let mut touched = Touched::default();
+        let mut open = vec![region];
+        while let Some(id) = open.pop() {
+            let state = self.program.state(id);
+            open.extend(state.children());
+            state.each_expression(&mut |_, expression: &Expr| {
+                touched.reads.extend(expression.fact_expressions().into_iter().map(|fact| fact.predicate.clone()));
+            });
+            let annotations = &state.annotations;
+            annotations.effects.values().for_each(|effects| written(effects, &mut touched.writes));
+            let StateKind::Action { .. } = state.kind else { continue };
+            match (&annotations.nature, &annotations.reads) {
+                (Nature::Senses(facts), _) | (_, Some(facts)) => {
+                    touched.reads.extend(facts.iter().map(|fact| fact.predicate.clone()));
+                }
+                (_, None) => touched.reads_any |= !state.is_pause(),
+            }
+            // What it measures is said nowhere.
+            let mut outcomes = state.outcomes.iter().map(String::as_str).chain([SUCCESS]);
+            let is_said = |outcome: &str| annotations.effects.contains_key(outcome);
+            touched.writes_any |= annotations.nature != Nature::Computes && !outcomes.all(is_said);
+        }
+        touched
+    }
+}
+
+/// What a region touches.
+#[derive(Default)]
+struct Touched {
+    reads: BTreeSet<String>,
+    writes: BTreeSet<String>,
+    reads_any: bool,
+    writes_any: bool,
+}
+
+fn written(effects: &[EffectExpr], predicates: &mut BTreeSet<String>) {
+    for effect in effects {
+        match effect {
+            EffectExpr::Set(fact, _) | EffectExpr::Delete(fact) | EffectExpr::Increase(fact, _) => {
+                predicates.insert(fact.predicate.clone());
+            }
+            EffectExpr::ForEach { effects, .. } => written(effects, predicates),
+        }
+    }
+}
+
+/// The races inside of one; on the way out, what is around cuts nothing short any more.
+fn within(outer: &Races, is_leaving: bool, until: Option<(f64, usize)>, watch: Option<Watch>) -> Races {
+    let mut watches = if is_leaving { vec![None; outer.watches.len()] } else { outer.watches.clone() };
+    watches.push(watch);
+    let around = outer.until.filter(|_| !is_leaving);
+    let until = match (until, around) {
+        (Some(own), Some(around)) if around.0 < own.0 => Some(around),
+        (own, around) => own.or(around),
+    };
+    Races { now_s: outer.now_s, until, watches, cut: None, has_failed: false }
+}
+
+/// What a region assigned is seen outside.
+pub(super) fn merge(variables: &mut Variables, before: &Variables, own: Variables) {
+    for (number, variable) in own.into_iter().enumerate().take(before.len()) {
+        if variable.1 != before[number].1 {
+            variables[number] = variable;
+        }
+    }
+}
