@@ -434,8 +434,9 @@ fn fingers_that_open_a_little_count_as_open_as_those_do_that_stand() {
         if opens {
             starts(&mut bench, LEFT, Request::OpenTo { width: 0.02 });
         }
+        // 1.5 mm beside the finger where that is open.
         let [x, y, z] = between_the_fingers(0.0);
-        let reason = refused(&mut bench, RIGHT, to([x, y + 0.045, z], 0.5));
+        let reason = refused(&mut bench, RIGHT, to([x, y + 0.0565, z], 0.5));
         assert!(reason.contains("left_finger"), "{opens}: {reason}");
     }
 }
