@@ -584,6 +584,7 @@ impl Simulation<'_> {
             }
             Command::Release { lease, projection, .. } => {
                 if let Some(lease) = lease {
+                    self.busy.given_back(lease);
                     self.leases.remove(&lease);
                     if !self.lost.contains(&lease) {
                         self.pool.release(self.now, Some(&self.session), lease).map_err(|e| self.broken(e))?;

@@ -166,7 +166,8 @@ impl Current {
     /// What it holds, to be given back.
     pub(super) fn take_held(&mut self) -> Current {
         let (lease, projection) = (self.lease.take(), self.projection.take());
-        Current { lease, projection, path: String::new(), ..*self }
+        let units = std::mem::take(&mut self.units);
+        Current { lease, projection, path: String::new(), units, ..*self }
     }
 }
 

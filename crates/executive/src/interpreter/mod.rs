@@ -187,6 +187,8 @@ struct Current {
     #[serde(with = "leases")]
     lease: Option<Lease>,
     projection: Option<ProjectionId>,
+    /// In a routine: the units of its lease that the goal works with.
+    units: Vec<String>,
 }
 
 /// The interpreter of one state.

@@ -39,6 +39,7 @@ impl Interpreter {
             timeout: None,
             lease: None,
             projection: None,
+            units: Vec::new(),
         };
         if let Some(thread) = self.threads.get_mut(&thread) {
             thread.current = Some(current);
@@ -221,7 +222,7 @@ impl Interpreter {
             action: action.as_str().into(),
             inputs,
             seed: seed.of_try(tries),
-            lease: self.routine_of(thread).map_or(&current.lease, |routine| &routine.lease).clone(),
+            lease: self.lease_of(context, thread),
             projection: current.projection,
             expected_s: self.with_scope(context, thread, None, |scope| binding::expected_s(state, scope)),
             timeout_s: state.annotations.timeout_s,

@@ -2,7 +2,7 @@
 //! too many, and the simulated run is broken.
 
 use ratn_executive::protocol::Goal;
-use ratn_model::id::{InstanceId, StateId};
+use ratn_model::id::{InstanceId, LeaseId, StateId};
 use ratn_model::program::{Program, WORLD_MODEL};
 use ratn_model::resource::{ResourceClass, ResourceOperation};
 use ratn_resources::Pool;
@@ -13,7 +13,8 @@ use std::sync::Arc;
 pub(super) struct Busy {
     program: Arc<Program>,
     states: BTreeMap<InstanceId, StateId>,
-    goals: BTreeMap<String, (InstanceId, u32)>,
+    /// By unit: for whom, and under which lease.
+    goals: BTreeMap<String, (InstanceId, u32, LeaseId)>,
 }
 
 impl Busy {
@@ -42,7 +43,7 @@ impl Busy {
             if is_shared(&unit.id) {
                 continue;
             }
-            if let Some((other, _)) = self.goals.insert(unit.id.clone(), (instance, attempt))
+            if let Some((other, ..)) = self.goals.insert(unit.id.clone(), (instance, attempt, lease.id))
                 && other != instance
             {
                 return Err((unit.id.clone(), other));
@@ -53,6 +54,11 @@ impl Busy {
 
     /// A goal has ended, or was told to stop.
     pub(super) fn end(&mut self, instance: InstanceId, attempt: u32) {
-        self.goals.retain(|_, goal| *goal != (instance, attempt));
+        self.goals.retain(|_, goal| (goal.0, goal.1) != (instance, attempt));
+    }
+
+    /// A lease goes back: in reality when the goals under it have ended.
+    pub(super) fn given_back(&mut self, lease: LeaseId) {
+        self.goals.retain(|_, goal| goal.2 != lease);
     }
 }

@@ -11,7 +11,8 @@ use super::evaluate::Read;
 use super::{Fail, Reference, fails};
 use ratn_model::expression::{EffectExpr, Expr};
 use ratn_model::id::StateId;
-use ratn_model::program::{ABORTED, Nature, PREEMPTED, SUCCESS, State, StateKind, VIOLATED};
+use ratn_model::program::{ABORTED, Nature, PREEMPTED, SUCCESS, State, StateKind, VIOLATED, WORLD_MODEL};
+use ratn_model::resource::ResourceOperation;
 use ratn_model::value::Value;
 use ratn_model::wait::Wait;
 use std::collections::BTreeSet;
@@ -374,13 +375,15 @@ impl Reference<'_> {
         Ok(())
     }
 
-    /// Whether a region writes what another one reads or writes.
+    /// Whether a region writes what another one reads or writes, or works with a kind of resource that another one works with: under the one
+    /// lease of the race they may have to take turns.
     fn touch(&self, regions: &[StateId]) -> bool {
         let touched: Vec<Touched> = regions.iter().map(|region| self.touched(*region)).collect();
         touched.iter().enumerate().any(|(place, one)| {
             let others = touched.iter().enumerate().filter(|(other, _)| *other != place);
             others.map(|(_, other)| other).any(|other| {
-                let meets = one.writes.iter().any(|fact| other.reads.contains(fact) || other.writes.contains(fact));
+                let meets = one.works_with.iter().any(|kind| other.works_with.contains(kind))
+                    || one.writes.iter().any(|fact| other.reads.contains(fact) || other.writes.contains(fact));
                 let writes = !one.writes.is_empty() || one.writes_any;
                 meets || one.writes_any || other.reads_any && writes
             })
@@ -398,6 +401,8 @@ impl Reference<'_> {
             });
             let annotations = &state.annotations;
             annotations.effects.values().for_each(|effects| written(effects, &mut touched.writes));
+            let blocks = annotations.resources.iter().filter(|line| line.operation == ResourceOperation::Block);
+            touched.works_with.extend(blocks.filter(|line| line.kind != WORLD_MODEL).map(|line| line.kind.clone()));
             let StateKind::Action { .. } = state.kind else { continue };
             match (&annotations.nature, &annotations.reads) {
                 (Nature::Senses(facts), _) | (_, Some(facts)) => {
@@ -419,6 +424,7 @@ impl Reference<'_> {
 struct Touched {
     reads: BTreeSet<String>,
     writes: BTreeSet<String>,
+    works_with: BTreeSet<String>,
     reads_any: bool,
     writes_any: bool,
 }
