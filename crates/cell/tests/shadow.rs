@@ -22,7 +22,7 @@ fn hidden(bench: &mut Bench, object: usize) -> f64 {
             commands.iter().find_map(|command| match command {
                 Command::Ended {
                     ticket: ended, ending: Ending::Done(Product::Captured { camera, exposures }), ..
-                } if *ended == ticket => Some((camera.clone(), exposures.clone())),
+                } if *ended == ticket => Some((*camera, exposures.clone())),
                 _ => None,
             })
         };
