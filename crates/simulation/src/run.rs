@@ -436,6 +436,8 @@ impl Simulation<'_> {
             Entry::Event(event) => event,
             Entry::Loss { lease, instance, attempt } => {
                 self.lose(lease)?;
+                // In reality what is performed under it ends before anything else begins there.
+                self.busy.given_back(lease);
                 Event::Crashed { instance, attempt, reason: "its lease was lost".to_owned() }
             }
         };

@@ -151,7 +151,7 @@ fn only_the_lines_of_the_key_change_in_every_state_of_every_example() {
                         let is_inside = one.path.starts_with(&format!("{}/", state.path));
                         if one.path == state.path
                             || one.path == format!("{}/try", state.path)
-                            || (key == "exceptions" && is_inside)
+                            || (*key == "exceptions" && is_inside)
                         {
                             other.annotations = one.annotations.clone();
                         }
