@@ -210,7 +210,7 @@ fn a_run_that_goes_on_after_its_task_control_was_killed_goes_on_in_its_trace() -
     std::fs::write(&task, KILLED)?;
     let (task, log_name) = (task.to_str().context("a path")?, log.to_str().context("a path")?);
     let run = place.start_as("run", &["run", task, "--log", log_name, "--checkpoint-every", "20"])?;
-    let waits = || Ok(std::fs::read_to_string(&log)?.contains("\"signal\":\"go\"").then_some(()));
+    let waits = || Ok(std::fs::read_to_string(&log).unwrap_or_default().contains("\"signal\":\"go\"").then_some(()));
     wait_for("the wait for the signal", waits).with_context(|| run.said())?;
     run.process()?.kill()?;
     drop(run);

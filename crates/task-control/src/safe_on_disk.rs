@@ -54,6 +54,11 @@ impl Syncer {
             // Where the thread is gone it has said why.
             let _ = wanted.send(self.last);
         }
+        self.marked()
+    }
+
+    /// Everything that was marked so far.
+    pub(super) fn marked(&self) -> Mark {
         Mark { number: self.last, safe: self.safe.clone() }
     }
 

@@ -221,6 +221,9 @@ fn syncer_of(log: &LogWriter) -> anyhow::Result<Syncer> {
     Syncer::start(log.handle()?).context("cannot make the event log safe")
 }
 
+/// A disk that takes longer at the end of a run is said to be waited for.
+const SLOW_DISK: Duration = Duration::from_secs(2);
+
 /// A run under way.
 struct Shell {
     program: Arc<Program>,
@@ -263,6 +266,7 @@ impl Shell {
     ) -> anyhow::Result<Ended> {
         let ended = self.until_ended(begin, interrupt).await;
         let spans = self.spans.take();
+        self.all_is_safe().await;
         let closed = self.performer.close().await;
         Spans::end(spans).await;
         match (ended, closed) {
@@ -270,6 +274,15 @@ impl Shell {
             (Ok(ended), Err(error)) if ended.outcome == SUCCESS => Err(error),
             // The reason is in the outcome already, or matters less.
             (ended, _) => ended,
+        }
+    }
+
+    /// Waits until the event log is safe on its disk, or never will be: what the run has decided is not given up because that is slow.
+    async fn all_is_safe(&mut self) {
+        let mut safe = std::pin::pin!(self.syncer.mark().safe());
+        if tokio::time::timeout(SLOW_DISK, &mut safe).await.is_err() {
+            self.messages.say(format_args!("{} is being made safe on its disk", self.log.path().display()));
+            safe.await;
         }
     }
 
@@ -307,12 +320,14 @@ impl Shell {
         let commands = self.executive.handle(now, event.clone());
         commands.iter().for_each(|command| replay::follow(&mut self.states, command));
         self.log.append(now, event, &commands)?;
-        if !self.confirm.is_empty() {
-            self.log.make_durable()?;
-        }
-        for (say, said) in self.confirm.drain(..) {
-            // Whoever sent it may have gone.
-            let _ = say.send(Ok(said));
+        for (say, said) in std::mem::take(&mut self.confirm) {
+            let safe = self.syncer.mark();
+            tokio::spawn(async move {
+                let unsafe_on_disk =
+                    || "the event log cannot be made safe on its disk: it is not known whether this counts".to_owned();
+                // Whoever sent it may have gone.
+                let _ = say.send(if safe.safe().await { Ok(said) } else { Err(unsafe_on_disk()) });
+            });
         }
         if let Some(checkpointer) = &mut self.checkpointer {
             checkpointer.follow(now, event, &commands);
@@ -342,9 +357,12 @@ impl Shell {
                 Command::Wake { at } => drop(self.timers.insert(at)),
                 Command::End { .. } => return Ok(ended(command, now)),
                 command => {
-                    let waits = matches!(command, Command::Release { .. })
-                        || replay::must_be_durable(&self.program, &self.states, std::slice::from_ref(&command));
-                    self.performer.perform_when(safe.clone().filter(|_| waits), command)?;
+                    let waits = replay::must_be_durable(&self.program, &self.states, std::slice::from_ref(&command));
+                    let safe = match &command {
+                        Command::Release { .. } => Some(self.syncer.marked()),
+                        _ => safe.clone().filter(|_| waits),
+                    };
+                    self.performer.perform_when(safe, command)?;
                 }
             }
         }

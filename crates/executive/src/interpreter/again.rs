@@ -117,7 +117,12 @@ impl Interpreter {
         if self.uses_lease(context.program, routine) {
             return;
         }
-        let Some(thread) = self.stalled(routine).first().copied() else { return };
+        // Who waits for a turn asks, too, where whoever has asked was cut short.
+        let is_away =
+            self.routines.get(&routine).is_some_and(|one| one.lease.is_none() && !one.requirements.is_empty());
+        let mut queued = self.queued(routine).filter(|_| is_away);
+        let Some(thread) = self.stalled(routine).first().copied().or_else(|| queued.next()) else { return };
+        drop(queued);
         let Some(instance) = self.current(thread).map(|current| current.instance) else { return };
         let Some(routine) = self.routines.get_mut(&routine) else { return };
         if let Some(lease) = routine.lease.take() {
@@ -157,6 +162,10 @@ impl Interpreter {
         self.threads_of(routine).filter(|thread| self.phase(*thread) == Some(Phase::Stalled)).collect()
     }
 
+    fn queued(&self, routine: u64) -> impl Iterator<Item = u64> {
+        self.threads_of(routine).filter(|thread| matches!(self.phase(*thread), Some(Phase::Queued(_))))
+    }
+
     fn threads_of(&self, routine: u64) -> impl Iterator<Item = u64> + '_ {
         self.threads.iter().filter(move |(_, thread)| thread.routine == Some(routine)).map(|(id, _)| *id)
     }
@@ -166,8 +175,7 @@ impl Current {
     /// What it holds, to be given back.
     pub(super) fn take_held(&mut self) -> Current {
         let (lease, projection) = (self.lease.take(), self.projection.take());
-        let units = std::mem::take(&mut self.units);
-        Current { lease, projection, path: String::new(), units, ..*self }
+        Current { lease, projection, path: String::new(), units: Vec::new(), ..*self }
     }
 }
 

@@ -222,7 +222,7 @@ impl Interpreter {
             action: action.as_str().into(),
             inputs,
             seed: seed.of_try(tries),
-            lease: self.lease_of(context, thread),
+            lease: self.lease_of(thread),
             projection: current.projection,
             expected_s: self.with_scope(context, thread, None, |scope| binding::expected_s(state, scope)),
             timeout_s: state.annotations.timeout_s,

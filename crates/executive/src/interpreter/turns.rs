@@ -1,11 +1,14 @@
-//! Turns within a routine: its lease serves all threads of control in it, and a unit of it performs one goal at a time. Each goal gets free
-//! units; one for which there are too few waits until there are, and who waits first is first.
+//! Turns within a routine: its lease serves all threads of control in it, and a unit of it performs one goal at a time. Goals that select the
+//! same have so many units as were granted for that; one for which there are too few waits until there are, and who waits first is first. Which
+//! unit of several alike each has is said by the lease that it is given, which lacks those of the others.
 //!
 //! Outside of a routine every goal has a lease of its own, so that the resource manager sees to the turns.
 
 use super::{Current, Interpreter, Phase};
 use crate::context::Context;
-use ratn_model::resource::{Lease, LeasedResource};
+use ratn_model::program::ResourceExpr;
+use ratn_model::resource::{Lease, LeasedResource, Requirement, ResourceOperation};
+use std::collections::BTreeSet;
 
 impl Interpreter {
     /// Whether a goal waits for units that another thread of its routine works with.
@@ -41,57 +44,105 @@ impl Interpreter {
         has_begun
     }
 
-    /// The units that a goal works with from now on; `None` where another thread of its routine works with what it needs, or waits for that
-    /// since before.
+    /// The units that a goal works with from now on, as far as they can be told apart; `None` where other goals of its routine work with as
+    /// many as there are of what it needs, or wait for that since before.
     fn free_units(&self, context: &Context<'_>, thread: u64) -> Option<Vec<String>> {
         let none = || Some(Vec::new());
         let Some(own) = self.threads.get(&thread) else { return none() };
         let (Some(routine), Some(current)) = (own.routine, own.current.as_ref()) else { return none() };
-        let Some(lease) = self.routines.get(&routine).and_then(|routine| routine.lease.as_ref()) else { return none() };
-        let wanted = &context.plan.state(current.state).works_with;
-        let others = self.threads.iter().filter(|(id, other)| **id != thread && other.routine == Some(routine));
-        let others: Vec<&Current> = others.filter_map(|(_, other)| other.current.as_ref()).collect();
-        let is_before = |other: &&Current| match (&other.phase, &current.phase) {
+        let Some(routine) = self.routines.get(&routine) else { return none() };
+        let Some(lease) = &routine.lease else { return none() };
+        let others = self.others(thread);
+        let wanted = |other: &Current, line: &ResourceExpr| {
+            let lines = context.plan.state(other.state).works_with.iter();
+            lines.filter(|other| other.selects_the_same(line)).map(units_of).sum::<usize>()
+        };
+        let is_before = |other: &Current| match (other.phase, current.phase) {
             (Phase::Queued(turn), Phase::Queued(own)) => turn < own,
             (Phase::Queued(_), _) => true,
             _ => false,
         };
-        let is_wanted = |kind: &str| wanted.iter().any(|(other, _)| other == kind);
-        let wants_the_same =
-            |other: &&Current| context.plan.state(other.state).works_with.iter().any(|(kind, _)| is_wanted(kind));
-        if others.iter().copied().filter(is_before).any(|other| wants_the_same(&other)) {
-            return None;
-        }
-        let works = |other: &&&Current| matches!(other.phase, Phase::Projecting | Phase::Running | Phase::Stalled);
-        let taken: Vec<&str> = others.iter().filter(works).flat_map(|other| &other.units).map(String::as_str).collect();
-        let mut units: Vec<String> = Vec::new();
-        for (kind, count) in wanted {
-            // Of subclasses only where there is none of the kind itself, as for who performs a goal.
-            let is_exact = lease.resources.iter().any(|unit| unit.kind == *kind);
-            let fits = |unit: &&LeasedResource| if is_exact { unit.kind == *kind } else { unit.is_a(kind) };
-            let of_kind = lease.resources.iter().filter(fits);
-            let count = of_kind.clone().count().min(*count);
-            let is_free = |id: &str| !taken.contains(&id) && !units.iter().any(|unit| unit == id);
-            let free: Vec<String> = of_kind.map(|unit| unit.id.clone()).filter(|id| is_free(id)).take(count).collect();
-            if free.len() < count {
+        let mut units = Vec::new();
+        for line in &context.plan.state(current.state).works_with {
+            let there = Granted::of(&routine.requirements, lease, line);
+            let needs = units_of(line).min(there.count);
+            let of_others = others.iter().map(|other| (*other, wanted(other, line))).filter(|(_, wanted)| *wanted > 0);
+            let works = of_others.clone().filter(|(other, _)| other.works());
+            let taken: usize = works.map(|(_, wanted)| wanted.min(there.count)).sum();
+            if taken + needs > there.count || of_others.clone().any(|(other, _)| is_before(other)) {
                 return None;
             }
-            units.extend(free);
+            let is_free =
+                |unit: &&str| !others.iter().any(|other| other.works() && other.units.iter().any(|u| u == unit));
+            units.extend(there.units.iter().copied().filter(is_free).take(needs).map(str::to_owned));
         }
         Some(units)
     }
 
-    /// The lease under which a goal is given: in a routine without the units that others work with.
-    pub(super) fn lease_of(&self, context: &Context<'_>, thread: u64) -> Option<Lease> {
+    /// What the other threads of its routine are at.
+    fn others(&self, thread: u64) -> Vec<&Current> {
+        let routine = self.threads.get(&thread).and_then(|thread| thread.routine);
+        let others = self.threads.iter().filter(|(id, other)| **id != thread && other.routine == routine);
+        others.filter_map(|(_, other)| other.current.as_ref()).collect()
+    }
+
+    /// The lease under which a goal is given: in a routine without the units that other goals work with.
+    pub(super) fn lease_of(&self, thread: u64) -> Option<Lease> {
         let current = self.threads.get(&thread)?.current.as_ref()?;
         let Some(routine) = self.routine_of(thread) else { return current.lease.clone() };
         let mut lease = routine.lease.clone()?;
-        let kinds = &context.plan.state(current.state).works_with;
-        let is_anothers =
-            |unit: &LeasedResource| kinds.iter().any(|(kind, _)| unit.is_a(kind)) && !current.units.contains(&unit.id);
-        if !current.units.is_empty() {
-            lease.resources.retain(|unit| !is_anothers(unit));
-        }
+        let others = self.others(thread);
+        let of_others = |unit: &LeasedResource| {
+            let works_with = |other: &&Current| other.works() && other.units.contains(&unit.id);
+            others.iter().any(works_with) && !current.units.contains(&unit.id)
+        };
+        lease.resources.retain(|unit| !of_others(unit));
         Some(lease)
+    }
+}
+
+impl Current {
+    /// Whether its goal is under way, or the worker that it had is still to be replaced.
+    fn works(&self) -> bool {
+        matches!(self.phase, Phase::Projecting | Phase::Running | Phase::Stalled)
+    }
+}
+
+/// How many units a line wants.
+fn units_of(line: &ResourceExpr) -> usize {
+    usize::try_from(line.count.thousandths() / 1_000).unwrap_or(usize::MAX)
+}
+
+/// What a routine has of what a line wants.
+struct Granted<'a> {
+    count: usize,
+    /// Which, where nothing else of the lease can be meant.
+    units: Vec<&'a str>,
+}
+
+impl Granted<'_> {
+    fn of<'a>(requirements: &[Requirement], lease: &'a Lease, line: &ResourceExpr) -> Granted<'a> {
+        // What the lease has none of nobody works with.
+        if !lease.resources.iter().any(|unit| unit.is_a(&line.kind)) {
+            return Granted { count: usize::MAX, units: Vec::new() };
+        }
+        // Whose attributes or conditions select it is one by itself: which one is not known here.
+        let unknown = || Granted { count: units_of(line), units: Vec::new() };
+        if !line.attributes.is_empty() || !line.conditions.is_empty() {
+            return unknown();
+        }
+        let blocks = || requirements.iter().filter(|one| one.operation == ResourceOperation::Block);
+        let is_plain =
+            |one: &&Requirement| one.kind == line.kind && one.attributes.is_empty() && one.conditions.is_empty();
+        let Some(granted) = blocks().find(is_plain) else { return unknown() };
+        let count = usize::try_from(granted.count.thousandths() / 1_000).unwrap_or(usize::MAX);
+        let units: Vec<&LeasedResource> = lease.resources.iter().filter(|unit| unit.is_a(&line.kind)).collect();
+        let may_be_anothers = |other: &Requirement| units.iter().any(|unit| unit.is_a(&other.kind));
+        let ids: BTreeSet<&str> = units.iter().map(|unit| unit.id.as_str()).collect();
+        let is_clear = ids.len() == count
+            && units.len() == count
+            && !blocks().any(|one| !std::ptr::eq(one, granted) && may_be_anothers(one));
+        let units = if is_clear { units.into_iter().map(|unit| unit.id.as_str()).collect() } else { Vec::new() };
+        Granted { count, units }
     }
 }

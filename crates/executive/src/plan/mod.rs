@@ -89,8 +89,8 @@ pub(crate) struct StatePlan {
     /// What it acquires when it starts: blocks (its own and those of the hierarchies around it and of what it contains, merged by
     /// maximum), consumes and exists.
     pub(crate) requirements: Vec<ResourceExpr>,
-    /// The kinds of what an action works with, and how many units of each: a unit performs one goal at a time.
-    pub(crate) works_with: Vec<(String, usize)>,
+    /// What an action works with, each selection once: a unit performs one goal at a time.
+    pub(crate) works_with: Vec<ResourceExpr>,
     /// What it does to resources when it ends with success.
     pub(crate) operations: Vec<ResourceExpr>,
     /// Whether something is used up when it gets what it acquires: that is not given back.

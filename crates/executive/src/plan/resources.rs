@@ -8,7 +8,7 @@ use std::collections::BTreeSet;
 /// The resources of one state; its fields are those of [`super::StatePlan`].
 pub(super) struct Resources {
     pub(super) requirements: Vec<ResourceExpr>,
-    pub(super) works_with: Vec<(String, usize)>,
+    pub(super) works_with: Vec<ResourceExpr>,
     pub(super) operations: Vec<ResourceExpr>,
     pub(super) kinds: Vec<Predicate>,
     pub(super) operated: Vec<Predicate>,
@@ -34,15 +34,17 @@ pub(super) fn of(subject: &Subject<'_>, operated_anywhere: &BTreeSet<&str>, name
 }
 
 /// What an action blocks itself, else what the innermost state around it blocks that blocks anything. Many look at a world model at once.
-fn works_with(subject: &Subject<'_>) -> Vec<(String, usize)> {
+fn works_with(subject: &Subject<'_>) -> Vec<ResourceExpr> {
     if !is_action(subject.state) || subject.state.is_pause() {
         return Vec::new();
     }
     let blocks = |state: &State| {
         let lines = state.annotations.resources.iter();
         let blocked = lines.filter(|line| line.operation == ResourceOperation::Block && line.kind != WORLD_MODEL);
-        let units = |line: &ResourceExpr| usize::try_from(line.count.thousandths() / 1_000).unwrap_or(usize::MAX);
-        blocked.filter(|line| line.count.is_whole()).map(|line| (line.kind.clone(), units(line))).collect::<Vec<_>>()
+        let mut merged = Vec::new();
+        let whole = blocked.filter(|line| line.count.is_whole());
+        whole.for_each(|line| merge(&mut merged, line, |have, more| have + more));
+        merged
     };
     let states = std::iter::once(subject.state).chain(subject.around.iter().copied());
     states.map(blocks).find(|blocked| !blocked.is_empty()).unwrap_or_default()

@@ -101,6 +101,8 @@ pub(super) struct Performing {
     pub(super) outputs: Vec<String>,
     /// What has to be safe before it begins.
     pub(super) safe: Option<Mark>,
+    /// The run is over: nothing begins any more.
+    pub(super) over: CancellationToken,
     pub(super) told: Told,
 }
 
@@ -116,16 +118,22 @@ impl Performing {
     pub(super) async fn perform(mut self, given: Given) {
         if let Some(safe) = self.safe.take() {
             tokio::select! {
+                biased;
+                () = self.stop.cancelled() => return,
+                () = self.over.cancelled() => return,
                 // Where it never will be the run ends.
                 is_safe = safe.safe() => if !is_safe { return },
-                () = self.stop.cancelled() => return,
             }
         }
         for before in &self.before {
             tokio::select! {
-                () = before.cancelled() => {}
+                biased;
                 () = self.stop.cancelled() => return,
+                () = before.cancelled() => {}
             }
+        }
+        if self.stop.is_cancelled() {
+            return;
         }
         let event = match &self.endpoint {
             Ok(endpoint) => self.execute(endpoint, given).await,
@@ -152,6 +160,8 @@ impl Performing {
         };
         let mut ending = std::pin::pin!(ending);
         let event = tokio::select! {
+            // It is given before it is told to stop.
+            biased;
             event = &mut ending => event,
             () = self.stop.cancelled() => {
                 let stopping = async {
@@ -444,6 +454,7 @@ mod tests {
                 results: Mutex::default(),
                 outputs: Vec::new(),
                 safe: None,
+                over: CancellationToken::new(),
                 told: Told::new(),
                 goal: Goal {
                     id: format!("run/1/{action}"),

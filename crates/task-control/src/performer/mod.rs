@@ -166,6 +166,8 @@ pub(super) struct Performer {
     /// Ids for projections that goals are given before they are there.
     promises: Promises,
     making: Making,
+    /// Nothing begins any more.
+    over: CancellationToken,
     asking: Waiting,
     /// Since when instances have waited that have not got what they need, however often they ask.
     waiting_since: BTreeMap<InstanceId, Instant>,
@@ -275,6 +277,7 @@ impl Performer {
             following: None,
             cancelled,
             recorded,
+            over: CancellationToken::new(),
             promises,
             making: Making::default(),
             asking: Waiting::default(),
@@ -406,6 +409,7 @@ impl Performer {
     /// # Errors
     /// When something that was decided is not recorded: the world pool or the resource manager know less than what happened.
     pub(super) async fn close(mut self) -> anyhow::Result<()> {
+        self.over.cancel();
         let recording = async {
             let (done, recorded) = oneshot::channel();
             self.records.send(Record::Flush(done)).await.map_err(|_| "the recorder is gone".to_owned())?;
@@ -601,6 +605,7 @@ impl Performer {
             results: Mutex::default(),
             outputs: self.outputs_of(&goal),
             safe,
+            over: self.over.clone(),
             told: self.told.clone(),
             goal: types::Goal {
                 id: format!("{}/{instance}/{attempt}", self.run),
