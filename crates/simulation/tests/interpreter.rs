@@ -12,7 +12,7 @@ use ratn_model::fact::{FactKey, Term};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, Revision};
 use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::program::{Program, StateKind, Target};
-use ratn_model::resource::Lease;
+use ratn_model::resource::{Lease, LeasedResource};
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
@@ -217,6 +217,14 @@ impl Bench {
         self.tell(Event::Granted { instance: InstanceId(instance), lease });
     }
 
+    /// As [`Bench::grant`], with the one brain under the lease.
+    fn grant_brain(&mut self, instance: u64, lease: u64) {
+        let (endpoint, superclasses) = Default::default();
+        let brain = LeasedResource { id: "Brain-1".to_owned(), kind: "Brain".to_owned(), endpoint, superclasses };
+        let lease = Lease { id: LeaseId(lease), token: FencingToken(lease), resources: vec![brain] };
+        self.tell(Event::Granted { instance: InstanceId(instance), lease });
+    }
+
     fn finish(&mut self, instance: u64, attempt: u32) {
         self.tell(Event::Finished {
             instance: InstanceId(instance),
@@ -306,6 +314,30 @@ fn a_routine_whose_worker_died_asks_anew_when_none_of_its_regions_uses_its_lease
     bench.finish(3, 2);
     bench.finish(4, 2);
     assert_eq!(bench.heard(), ["start 3.2 under 2", "start 4.2 under 2", "release 2", "end success"]);
+}
+
+#[test]
+fn who_waits_for_a_unit_whose_worker_died_begins_under_the_new_lease() {
+    let text = "states:
+  - both:
+      routine: true
+      states:
+        - fork:
+            concurrency: barrier
+            regions:
+              - left: { THINK, computes: true, reads: [] }
+              - right: { THINK, computes: true, reads: [] }";
+    let mut bench = Bench::new(text, Mode::Cdtn);
+    bench.grant_brain(1, 1);
+    assert_eq!(bench.heard(), ["acquire 1", "start 3.1 under 1"], "there is one brain");
+    bench.crash(3, 1);
+    assert_eq!(bench.heard(), ["acquire 3", "release 1"]);
+    bench.grant_brain(3, 2);
+    assert_eq!(bench.heard(), ["start 4.1 under 2"], "it has waited for longer");
+    bench.finish(4, 1);
+    assert_eq!(bench.heard(), ["start 3.2 under 2"]);
+    bench.finish(3, 2);
+    assert_eq!(bench.heard(), ["release 2", "end success"]);
 }
 
 #[test]

@@ -76,6 +76,13 @@ impl Syncer {
 }
 
 impl Mark {
+    /// One that is not safe as long as what is returned with it lives.
+    #[cfg(test)]
+    pub(super) fn not_yet() -> (impl Sized, Mark) {
+        let (told, safe) = watch::channel(Safe::default());
+        (told, Mark { number: 1, safe })
+    }
+
     /// Waits until everything before it is safe; false where it never will be.
     pub(super) async fn safe(mut self) -> bool {
         let number = self.number;

@@ -110,7 +110,7 @@ impl Current {
 
 /// How many units a line wants.
 fn units_of(line: &ResourceExpr) -> usize {
-    usize::try_from(line.count.thousandths() / 1_000).unwrap_or(usize::MAX)
+    line.count.units() as usize
 }
 
 /// What a routine has of what a line wants.
@@ -135,7 +135,7 @@ impl Granted<'_> {
         let is_plain =
             |one: &&Requirement| one.kind == line.kind && one.attributes.is_empty() && one.conditions.is_empty();
         let Some(granted) = blocks().find(is_plain) else { return unknown() };
-        let count = usize::try_from(granted.count.thousandths() / 1_000).unwrap_or(usize::MAX);
+        let count = granted.count.units() as usize;
         let units: Vec<&LeasedResource> = lease.resources.iter().filter(|unit| unit.is_a(&line.kind)).collect();
         let may_be_anothers = |other: &Requirement| units.iter().any(|unit| unit.is_a(&other.kind));
         let ids: BTreeSet<&str> = units.iter().map(|unit| unit.id.as_str()).collect();
@@ -144,5 +144,68 @@ impl Granted<'_> {
             && !blocks().any(|one| !std::ptr::eq(one, granted) && may_be_anothers(one));
         let units = if is_clear { units.into_iter().map(|unit| unit.id.as_str()).collect() } else { Vec::new() };
         Granted { count, units }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_model::expression::Expr;
+    use ratn_model::id::{FencingToken, LeaseId};
+
+    fn line(kind: &str) -> ResourceExpr {
+        ResourceExpr::new(ResourceOperation::Block, kind)
+    }
+
+    fn block(kind: &str, count: u32) -> Requirement {
+        Requirement { count: count.into(), ..Requirement::new(ResourceOperation::Block, kind) }
+    }
+
+    /// Units by id and kind; a vacuum gripper is a gripper.
+    fn lease(units: &[(&str, &str)]) -> Lease {
+        let unit = |(id, kind): &(&str, &str)| LeasedResource {
+            id: (*id).to_owned(),
+            kind: (*kind).to_owned(),
+            endpoint: String::new(),
+            superclasses: Vec::from_iter((*kind == "VacuumGripper").then(|| "Gripper".to_owned())),
+        };
+        Lease { id: LeaseId(1), token: FencingToken(1), resources: units.iter().map(unit).collect() }
+    }
+
+    #[test]
+    fn units_that_are_alike_are_told_apart() {
+        let lease = lease(&[("p1", "Planner"), ("p2", "Planner"), ("arm", "Arm")]);
+        let granted = Granted::of(&[block("Planner", 2), block("Arm", 1)], &lease, &line("Planner"));
+        assert_eq!((granted.count, granted.units), (2, vec!["p1", "p2"]));
+        assert_eq!(Granted::of(&[], &lease, &line("Head")).count, usize::MAX, "nobody shares what is not there");
+    }
+
+    #[test]
+    fn which_of_two_arms_is_meant_by_their_attributes_is_not_guessed() {
+        let lease = lease(&[("left", "Arm"), ("right", "Arm")]);
+        let of = |side: &str| {
+            let attributes = [("arm".to_owned(), ratn_model::value::Value::String(side.to_owned()))].into();
+            Requirement { attributes, ..block("Arm", 1) }
+        };
+        let right = Expr::Literal(ratn_model::value::Value::String("right".to_owned()));
+        let right = ResourceExpr { attributes: vec![("arm".to_owned(), right)], ..line("Arm") };
+        let granted = Granted::of(&[of("left"), of("right")], &lease, &right);
+        assert_eq!((granted.count, granted.units.len()), (1, 0));
+        // One of two lines of its kind: the lease stays whole.
+        let granted = Granted::of(&[block("Arm", 1), of("right")], &lease, &line("Arm"));
+        assert_eq!((granted.count, granted.units.len()), (1, 0));
+    }
+
+    #[test]
+    fn what_may_be_anothers_and_one_resource_for_several_is_left_in_the_lease() {
+        let both = [block("Gripper", 1), block("VacuumGripper", 1)];
+        let grippers = lease(&[("v1", "VacuumGripper"), ("p1", "Gripper")]);
+        for kind in ["Gripper", "VacuumGripper"] {
+            let granted = Granted::of(&both, &grippers, &line(kind));
+            assert_eq!((granted.count, granted.units.len()), (1, 0), "{kind}");
+        }
+        let twice = lease(&[("camera", "Camera"), ("camera", "Camera")]);
+        let granted = Granted::of(&[block("Camera", 2)], &twice, &line("Camera"));
+        assert_eq!((granted.count, granted.units.len()), (2, 0));
     }
 }

@@ -538,6 +538,26 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn a_goal_that_was_told_to_stop_before_it_left_is_never_given() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        let performing = bench.performing("hang", None, 0);
+        performing.stop.cancel();
+        performing.perform(Given::Now).await;
+        // Nor is one that waits for the disk when the run is over.
+        let mut performing = bench.performing("hang", None, 0);
+        let ((_disk, slow), over) = (Mark::not_yet(), performing.over.clone());
+        performing.safe = Some(slow);
+        let waits = tokio::spawn(performing.perform(Given::Now));
+        over.cancel();
+        waits.await?;
+        bench.performing("hang", None, 0).perform(Given::Before).await;
+        let event = bench.event().await;
+        let is_unknown = |reason: &str| reason.contains("not known here");
+        assert!(matches!(&event, Some(Event::Crashed { reason, .. }) if is_unknown(reason)), "{event:?}");
+        Ok(())
+    }
+
+    #[tokio::test]
     async fn who_comes_back_to_a_goal_hears_of_the_result_that_it_has_given() -> anyhow::Result<()> {
         let mut bench = Bench::new().await?;
         let endless = |bench: &Bench| {
