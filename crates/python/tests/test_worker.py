@@ -163,7 +163,7 @@ def test_async_def_performs_goals_and_tells_how_far_it_is(tester: Place) -> None
 def test_a_result_gets_better_until_it_is_used(tester: Place) -> None:
     states = (
         state("move", "tester/nap", "Tester", "{ seconds: 1.0 }", "pia: true, effects: []")
-        + state("price", "tester/price", "Tester", "{ item: cup }", "description: it computes, as its action says")
+        + state("price", "tester/price", "Tester", "{ item: cup }", "description: 'it computes, as its action says'")
         + state("pay", "tester/pay", "Tester", "{ cost: price.cost }", "pia: true, effects: []")
     )
     text = task("better", states, "outputs:\n  paid: { type: int, value: pay.paid }\n")

@@ -155,6 +155,7 @@ class _Gripper:
         self,
         *,
         arm: str | Value = ...,
+        width_m: float | Value = ...,
         **annotations: Unpack[Annotations],
     ) -> _GripperRelease: ...
 
