@@ -17,6 +17,7 @@ use ratn_model::expression::EffectExpr;
 use ratn_model::fact::FactKey;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS};
+use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
@@ -316,7 +317,8 @@ fn cut_short(context: &mut Context<'_>, interpreter: &mut Interpreter, outcome: 
 
 /// Acquires of one event in the order of their priority, and what is given back after them: so that what is free, and what
 /// becomes free, goes to whom it serves most. The resource manager grants as requests arrive; it cannot know what comes next.
-/// What one event both asked for and withdrew is not asked for.
+/// What one event both asked for and withdrew is not asked for. Where something is deleted or used up it is the other way round: what is given
+/// back may be that, and nobody is granted what the program has removed before.
 fn most_urgent_first(commands: Vec<Command>) -> Vec<Command> {
     let asks = |c: &Command| matches!(c, Command::Acquire { .. } | Command::Withdraw { .. } | Command::Release { .. });
     if !commands.iter().any(asks) {
@@ -338,13 +340,22 @@ fn most_urgent_first(commands: Vec<Command>) -> Vec<Command> {
     let mut needed = needed.into_iter();
     let mut ordered = commands;
     ordered.retain(|_| needed.next().unwrap_or(true));
+    let removes = ordered.iter().any(is_removal);
     ordered.sort_by_key(|command| match command {
-        Command::Acquire { priority, .. } => (1, Reverse(*priority)),
-        Command::Release { .. } => (2, Reverse(0)),
-        Command::End { .. } => (3, Reverse(0)),
+        Command::Release { .. } if removes => (1, Reverse(0)),
+        Command::Operate { .. } if removes => (2, Reverse(0)),
+        Command::Acquire { priority, .. } => (3, Reverse(*priority)),
+        Command::Release { .. } => (4, Reverse(0)),
+        Command::End { .. } => (5, Reverse(0)),
         _ => (0, Reverse(0)),
     });
     ordered
+}
+
+fn is_removal(command: &Command) -> bool {
+    let Command::Operate { operations, .. } = command else { return false };
+    let removes = |one: &Requirement| matches!(one.operation, ResourceOperation::Delete | ResourceOperation::Consume);
+    operations.iter().any(removes)
 }
 
 fn commit_initial(context: &mut Context<'_>, parameters: &BTreeMap<String, Value>) -> Result<(), String> {

@@ -116,6 +116,8 @@ pub(crate) struct Leaving {
     /// What is being done, and in which scope.
     current: Option<(usize, Box<Interpreter>)>,
     until: Timestamp,
+    /// When the last event was.
+    last: Timestamp,
     /// The user has asked for the end: when he does so again, it comes at once.
     is_asked: bool,
 }
@@ -127,7 +129,7 @@ impl Leaving {
         steps.sort_by_key(|step| (step.depth, std::cmp::Reverse(step.state)));
         let until = context.now + Duration::from_secs(LIMIT_S);
         let is_asked = end.outcome == PREEMPTED;
-        let mut leaving = Leaving { end, steps, scopes, hold, current: None, until, is_asked };
+        let mut leaving = Leaving { end, steps, scopes, hold, current: None, until, last: context.now, is_asked };
         match leaving.go_on(context) {
             Some(end) => Err(Box::new(end)),
             None => {
@@ -139,7 +141,13 @@ impl Leaving {
 
     /// Takes an event; the end of the run, when this was it.
     pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Option<End> {
+        let before = std::mem::replace(&mut self.last, context.now);
         match event {
+            // The time in which nobody was there is not its own.
+            Event::Resumed => {
+                self.until = self.until + context.now.since(before);
+                context.commands.push(Command::Wake { at: self.until });
+            }
             // The run is over its deadline, and the user asks for the first time.
             Event::AbortRequested { at_once: false, .. } if !self.is_asked => self.is_asked = true,
             Event::AbortRequested { reason, .. } => return self.cut_short(context, &reason),

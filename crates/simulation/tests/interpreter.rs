@@ -206,6 +206,10 @@ impl Bench {
             Command::Start { instance, attempt, goal } => {
                 Some(format!("start {}.{attempt} under {}", instance.0, goal.lease.map_or(0, |lease| lease.id.0)))
             }
+            Command::Operate { instance, operations } => {
+                let operations: Vec<String> = operations.iter().map(ToString::to_string).collect();
+                Some(format!("{} {}", operations.join(", "), instance.0))
+            }
             Command::End { outcome, .. } => Some(format!("end {outcome}")),
             _ => None,
         };
@@ -276,6 +280,62 @@ fn a_pia_that_gets_its_resources_during_a_pause_begins_when_the_pause_ends() {
     bench.grant(1, 2);
     bench.finish(1, 1);
     assert_eq!(bench.heard(), ["acquire 1", "start 1.1 under 2", "release 2", "end success"]);
+}
+
+#[test]
+fn what_goes_back_is_back_before_something_is_used_up_and_that_is_gone_for_what_comes_behind_it() {
+    let text = "states:
+  - group:
+      resources: [{ consume: Token }]
+      states: [ inside: { MOVE } ]
+  - next: { TURN }";
+    for mode in MODES {
+        let mut bench = Bench::new(text, mode);
+        // In CDTN mode `next` asks ahead: it waits for nothing of that kind.
+        bench.heard();
+        let inside = if mode == Mode::Hsm { 1 } else { 2 };
+        bench.grant(inside, 1);
+        bench.heard();
+        bench.finish(inside, 1);
+        let heard = bench.heard();
+        let at = |word: &str| heard.iter().position(|one| one.starts_with(word));
+        assert!(at("release") < at("consume") && at("consume").is_some(), "{heard:?}");
+        assert!(at("acquire").is_none_or(|acquire| Some(acquire) > at("consume")), "{heard:?}");
+    }
+}
+
+#[test]
+fn a_way_out_has_its_minute_whatever_time_nobody_was_there() {
+    let text = "states:
+  - outer:
+      states: [ inside: { MOVE } ]
+      finally: [ back: { TURN, effects: [] } ]";
+    for mode in MODES {
+        let mut bench = Bench::new(text, mode);
+        let ask = |bench: &mut Bench| -> u64 {
+            let heard = bench.heard();
+            let last = heard.iter().rfind(|word| word.starts_with("acquire")).cloned();
+            last.and_then(|word| word.split(' ').nth(1)?.parse().ok()).unwrap_or_else(|| panic!("{heard:?}"))
+        };
+        let abort = || Event::AbortRequested { reason: "enough".to_owned(), at_once: false };
+        ask(&mut bench);
+        bench.tell(abort());
+        let back = ask(&mut bench);
+        // Longer than a way out may take.
+        bench.now += 100;
+        bench.tell(Event::Resumed);
+        bench.grant(back, 2);
+        bench.finish(back, 1);
+        assert_eq!(bench.heard(), [format!("start {back}.1 under 2"), "release 2".to_owned(), "end preempted".to_owned()]);
+        // What is done in it does count.
+        let mut bench = Bench::new(text, mode);
+        ask(&mut bench);
+        bench.tell(abort());
+        let back = ask(&mut bench);
+        bench.now += 100;
+        bench.grant(back, 2);
+        assert_eq!(bench.heard().last().map(String::as_str), Some("end preempted"));
+    }
 }
 
 #[test]

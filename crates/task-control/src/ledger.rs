@@ -18,6 +18,9 @@ const KEPT: usize = 256;
 /// session wait for more at a time (`waiters_per_session`).
 const KEPT_WITHDRAWN: usize = 4096;
 
+/// So many goals that were told to stop are kept: more have not ended at a time, as each has a few seconds for that.
+const KEPT_STOPPED: usize = 64;
+
 /// The open items of a run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Ledger {
@@ -43,6 +46,8 @@ pub(super) struct Ledger {
     pub(super) projecting: BTreeMap<InstanceId, Projecting>,
     /// Goals under way.
     pub(super) goals: BTreeMap<InstanceId, (u32, Goal)>,
+    /// The last goals that were told to stop. Whether they were told, and have ended, is not known.
+    pub(super) stopped: Vec<(InstanceId, u32, Goal)>,
     /// Every commit, in order, without those that were forgotten.
     pub(super) commits: Vec<Decided>,
     /// How many commits were forgotten, all older than the others: see [`Ledger::forget`].
@@ -168,7 +173,11 @@ impl Ledger {
                 self.goals.insert(*instance, (*attempt, (**goal).clone()));
             }
             Command::Cancel { instance, attempt } => {
-                self.goals.retain(|id, goal| id != instance || goal.0 != *attempt);
+                let is_meant = self.goals.get(instance).is_some_and(|goal| goal.0 == *attempt);
+                if let Some((_, goal)) = is_meant.then(|| self.goals.remove(instance)).flatten() {
+                    self.stopped.push((*instance, *attempt, goal));
+                    self.stopped.drain(..self.stopped.len().saturating_sub(KEPT_STOPPED));
+                }
                 self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt);
             }
             Command::Release { instance, lease, projection } => {

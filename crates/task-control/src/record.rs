@@ -24,7 +24,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 use tokio::sync::{mpsc, oneshot};
-use tokio_util::sync::CancellationToken;
+use tokio_util::sync::{CancellationToken, DropGuard};
 
 /// How far the world pool may be behind before the run is given up.
 pub(super) const MAX_PENDING_RECORDS: usize = 65_536;
@@ -58,11 +58,21 @@ pub(super) enum Record {
         /// Its number in the run.
         number: u64,
         operations: Vec<Requirement>,
-        /// What has to be safe before.
-        safe: Option<Mark>,
+        order: Order,
     },
     /// Answers once everything before it is done: with the first failure of the run, if there was one.
     Flush(oneshot::Sender<Result<(), String>>),
+}
+
+/// The place of an operation among the leases of the run.
+#[derive(Debug)]
+pub(super) struct Order {
+    /// What has to be safe before.
+    pub(super) safe: Option<Mark>,
+    /// Leases that were given back before and may be what is used up or deleted: each token is cancelled when its lease is back.
+    pub(super) after: Vec<CancellationToken>,
+    /// Is dropped when it has its answer: what is asked for behind it leaves then.
+    pub(super) _ends: DropGuard,
 }
 
 /// A projection that was named before it is there.
@@ -158,7 +168,7 @@ impl Recorder {
                     None => return,
                 },
             };
-            let confirms = confirms(&record);
+            let (confirms, mut behind) = (confirms(&record), None);
             let event = match record {
                 Record::Project { instance, asked, named } => {
                     self.project(instance, asked, named, None);
@@ -187,8 +197,11 @@ impl Recorder {
                     self.root.reached(revision);
                     None
                 }
-                Record::Operate { instance, number, operations, safe } => {
-                    trace::within(self.of(instance), self.operate(instance, number, operations, safe)).await
+                Record::Operate { instance, number, operations, order } => {
+                    let operating = self.operate(instance, number, operations, &order);
+                    let event = trace::within(self.of(instance), operating).await;
+                    behind = Some(order);
+                    event
                 }
                 Record::Flush(done) => {
                     let _ = done.send(recorded.clone());
@@ -207,6 +220,8 @@ impl Recorder {
             {
                 return;
             }
+            // Nobody is granted anything behind an operation before it is heard that this has failed.
+            drop(behind);
         }
     }
 
@@ -272,10 +287,13 @@ impl Recorder {
         instance: InstanceId,
         number: u64,
         operations: Vec<Requirement>,
-        safe: Option<Mark>,
+        order: &Order,
     ) -> Option<Event> {
-        if let Some(refused) = unsafe_on_disk(instance, safe).await {
+        if let Some(refused) = unsafe_on_disk(instance, order.safe.clone()).await {
             return Some(refused);
+        }
+        for lease in &order.after {
+            lease.cancelled().await;
         }
         for (index, operation) in operations.into_iter().enumerate() {
             let request = operation_request(&self.run, instance, number, index);

@@ -266,6 +266,7 @@ impl Shell {
     ) -> anyhow::Result<Ended> {
         let ended = self.until_ended(begin, interrupt).await;
         let spans = self.spans.take();
+        self.performer.begin_no_more();
         self.all_is_safe().await;
         let closed = self.performer.close().await;
         Spans::end(spans).await;

@@ -154,7 +154,7 @@ async fn a_goal_that_may_improve_its_result_gives_one_as_soon_as_it_will_do_and_
     let goal = Goal { improves: Some(vec!["end".to_owned()]), ..system.grasp("a", &[]) };
     let (mut given, begun) = (Vec::new(), Instant::now());
     let mut first_after = None;
-    let last = system.client.execute_hearing(&system.planner, goal, |said| {
+    let last = system.client.execute_hearing(&system.planner, goal, || true, |said| {
         let Said::Improved(better) = said else { return };
         first_after.get_or_insert(begun.elapsed());
         given.push(better);
@@ -179,7 +179,7 @@ async fn a_goal_with_a_budget_gives_its_result_when_that_is_over_and_ends() {
     let goal = Goal { improves: Some(Vec::new()), ..goal };
     let mut given = 0;
     let heard = |said| given += usize::from(matches!(said, Said::Improved(_)));
-    assert!(system.client.execute_hearing(&system.planner, goal, heard).await.unwrap().is_success());
+    assert!(system.client.execute_hearing(&system.planner, goal, || true, heard).await.unwrap().is_success());
     assert_eq!(given, 0);
 }
 

@@ -104,6 +104,8 @@ pub(super) struct Acquiring {
     pub(super) options: AcquireOptions,
     /// So long its instance has waited before, with other priorities.
     pub(super) waited: Duration,
+    /// It leaves when these operations of the run are done: each token is cancelled then.
+    pub(super) after: Vec<CancellationToken>,
     pub(super) withdrawn: CancellationToken,
     pub(super) handed: oneshot::Receiver<Lease>,
     pub(super) resources: ResourceClient,
@@ -124,6 +126,13 @@ impl Acquiring {
         if let Ok(lease) = self.handed.try_recv() {
             self.tell(Event::Granted { instance: self.instance, lease }, &events).await;
             return;
+        }
+        for operation in &self.after {
+            tokio::select! {
+                biased;
+                () = self.withdrawn.cancelled() => return,
+                () = operation.cancelled() => {}
+            }
         }
         let unheard = AtomicBool::new(false);
         let got = self.got(&unheard).await;
@@ -149,7 +158,8 @@ impl Acquiring {
                     // An answer that was lost before the refusal may have been a grant.
                     self.withdraw().await;
                 }
-                self.event_of(answer).await
+                let Some(event) = self.event_of(answer).await else { return };
+                event
             }
         };
         self.tell(event, &events).await;
@@ -198,23 +208,21 @@ impl Acquiring {
     }
 
     /// What an answer of the resource manager is to the executive, once the run has been told what whoever had the resources before left.
-    async fn event_of(&self, answer: Result<(Lease, Vec<HolderNote>), CallError>) -> Event {
+    /// `None` where it is not wanted any more before that: then it goes back, and what was left stays to be told to whoever comes next.
+    async fn event_of(&self, answer: Result<(Lease, Vec<HolderNote>), CallError>) -> Option<Event> {
         let instance = self.instance;
         let (lease, notes) = match answer {
             Ok(granted) => granted,
-            Err(error) => return Event::Refused { instance, reason: said(&error) },
+            Err(error) => return Some(Event::Refused { instance, reason: said(&error) }),
         };
-        let is_told = tokio::select! {
-            told = self.told.until(&self.run, &notes, &self.whom) => told,
-            // It goes back as it is.
-            () = self.withdrawn.cancelled() => Ok(()),
+        let event = tokio::select! {
+            told = self.told.until(&self.run, &notes, &self.whom) => match told {
+                Ok(()) => return Some(Event::Granted { instance, lease }),
+                Err(reason) => Some(Event::Refused { instance, reason }),
+            },
+            () = self.withdrawn.cancelled() => None,
         };
-        match is_told {
-            Ok(()) => Event::Granted { instance, lease },
-            Err(reason) => {
-                let _ = retry_unanswered(|| self.resources.release(lease.id)).await;
-                Event::Refused { instance, reason }
-            }
-        }
+        let _ = retry_unanswered(|| self.resources.release(lease.id)).await;
+        event
     }
 }

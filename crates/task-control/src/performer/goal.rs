@@ -24,6 +24,8 @@ use tokio_util::sync::CancellationToken;
 
 /// A provider that was told to stop and does not is left alone after this long.
 const CANCEL_DEADLINE: Duration = Duration::from_secs(2);
+/// So often it is told to stop where it was not under way yet.
+const TELL_AGAIN: Duration = Duration::from_millis(50);
 /// How long a goal goes on without task control, so that a run that is resumed finds it under way: as long as its lease would
 /// live.
 pub(super) const GRACE_MS: u64 = DEFAULT_TTL.as_millis() as u64;
@@ -77,6 +79,8 @@ pub(super) enum Given {
     Now,
     /// Task control gave it before it was killed, or was about to: it is not given again.
     Before,
+    /// Likewise, and it was told to stop, or was about to be.
+    ToStop,
 }
 
 /// A goal's way.
@@ -129,10 +133,11 @@ impl Performing {
             tokio::select! {
                 biased;
                 () = self.stop.cancelled() => return,
+                () = self.over.cancelled() => return,
                 () = before.cancelled() => {}
             }
         }
-        if self.stop.is_cancelled() {
+        if given != Given::ToStop && self.stop.is_cancelled() || self.over.is_cancelled() {
             return;
         }
         let event = match &self.endpoint {
@@ -165,14 +170,26 @@ impl Performing {
             event = &mut ending => event,
             () = self.stop.cancelled() => {
                 let stopping = async {
-                    let _ = self.actions.cancel(endpoint, &self.goal.id).await;
-                    let _ = ending.await;
+                    tokio::select! {
+                        _ = &mut ending => {}
+                        () = self.tell_to_stop(endpoint) => drop(ending.await),
+                    }
                 };
                 let _ = tokio::time::timeout(CANCEL_DEADLINE, stopping).await;
                 return None;
             }
         };
         Some(self.in_time(event, begun))
+    }
+
+    /// Until it has been heard: a goal and its cancel go different ways, and one that is given again for a while may come after that.
+    async fn tell_to_stop(&self, endpoint: &Endpoint) {
+        while match self.actions.cancel(endpoint, &self.goal.id).await {
+            Ok(under_way) => !under_way,
+            Err(error) => error.is_crash(),
+        } {
+            tokio::time::sleep(TELL_AGAIN).await;
+        }
     }
 
     /// Resolves when the goal only improves a result that it has given, beside other runs: what others may want is not held for that.
@@ -196,7 +213,11 @@ impl Performing {
             }
             Ok(fate) => self.finished(fate.outcome),
             // Task control was killed when it had written down that it gives the goal, and before it did.
-            Err(error) if error.code() == Some(tonic::Code::NotFound) && self.would_be_known(endpoint).await => {
+            Err(error)
+                if error.code() == Some(tonic::Code::NotFound)
+                    && self.would_be_known(endpoint).await
+                    && !self.stop.is_cancelled() =>
+            {
                 self.given(endpoint).await
             }
             Err(error) if error.code() == Some(tonic::Code::NotFound) => {
@@ -207,7 +228,8 @@ impl Performing {
     }
 
     async fn given(&self, endpoint: &Endpoint) -> Event {
-        match self.actions.execute_hearing(endpoint, self.goal.clone(), |said| self.said(said)).await {
+        let is_wanted = || !self.stop.is_cancelled();
+        match self.actions.execute_hearing(endpoint, self.goal.clone(), is_wanted, |said| self.said(said)).await {
             Ok(outcome) => self.finished(outcome),
             // What was wrong with the goal is wrong with it the next time, too.
             Err(error) if error.code() == Some(tonic::Code::InvalidArgument) => self.aborted(said(&error)),
@@ -379,7 +401,19 @@ mod tests {
     use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
     use ratn_worker::server::{Services, bind};
     use ratn_worker::tls::ClientTls;
+    use ratn_proto::v1::action_service_server::{ActionService, ActionServiceServer};
+    use ratn_proto::v1::{
+        CancelRequest, CancelResponse, DescribeRequest, DescribeResponse, ExecuteRequest, ExecuteResponse,
+        PerformRequest, PerformResponse,
+    };
+    use std::collections::HashMap;
+    use std::pin::Pin;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU32, Ordering};
+    use futures::Stream;
     use tokio_util::sync::DropGuard;
+    use tonic::{Code, Request, Response, Status, Streaming};
+    use tonic_types::{ErrorDetails, StatusExt};
 
     /// `work`: is done at once. `hang`: never, unless it is told to stop. `better`: with results before that, not each of which is better.
     struct Named(&'static str);
@@ -554,6 +588,80 @@ mod tests {
         let event = bench.event().await;
         let is_unknown = |reason: &str| reason.contains("not known here");
         assert!(matches!(&event, Some(Event::Crashed { reason, .. }) if is_unknown(reason)), "{event:?}");
+        Ok(())
+    }
+
+    /// A provider to which goals come late: it refuses the first for now, and one that it takes is under way a while after that.
+    struct Late {
+        refuses: AtomicU32,
+        begun: AtomicU32,
+        stop: CancellationToken,
+    }
+
+    type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+    #[tonic::async_trait]
+    impl ActionService for Late {
+        type ExecuteStream = Answers<ExecuteResponse>;
+        type PerformStream = Answers<PerformResponse>;
+
+        async fn execute(&self, _: Request<ExecuteRequest>) -> Result<Response<Self::ExecuteStream>, Status> {
+            if self.refuses.fetch_sub(1, Ordering::SeqCst) > 0 {
+                let details = ErrorDetails::with_error_info("MANAGER_UNHEARD", "ratn", HashMap::new());
+                return Err(Status::with_error_details(Code::Unavailable, "not now", details));
+            }
+            tokio::time::sleep(Duration::from_millis(200)).await;
+            self.begun.fetch_add(1, Ordering::SeqCst);
+            self.stop.cancelled().await;
+            Err(Status::aborted("stopped"))
+        }
+
+        async fn perform(&self, _: Request<Streaming<PerformRequest>>) -> Result<Response<Self::PerformStream>, Status> {
+            Err(Status::unimplemented(""))
+        }
+
+        async fn cancel(&self, _: Request<CancelRequest>) -> Result<Response<CancelResponse>, Status> {
+            let under_way = self.begun.load(Ordering::SeqCst) > 0;
+            if under_way {
+                self.stop.cancel();
+            }
+            Ok(Response::new(CancelResponse { under_way }))
+        }
+
+        async fn describe(&self, _: Request<DescribeRequest>) -> Result<Response<DescribeResponse>, Status> {
+            Err(Status::unimplemented(""))
+        }
+    }
+
+    async fn told_to_stop_at_once(refuses: u32) -> anyhow::Result<Arc<Late>> {
+        let bench = Bench::new().await?;
+        let late = Late { refuses: refuses.into(), begun: 0.into(), stop: CancellationToken::new() };
+        let late = Arc::new(late);
+        let bound = bind(&Endpoint::Unix(bench._place.path().join("late.sock"))).await?;
+        let mut performing = bench.performing("hang", None, 0);
+        performing.endpoint = Ok(bound.endpoint().clone());
+        let services = Services::new().with(ActionServiceServer::from_arc(late.clone()));
+        tokio::spawn(bound.serve(services, CancellationToken::new()));
+        let stop = performing.stop.clone();
+        let performed = tokio::spawn(performing.perform(Given::Now));
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        stop.cancel();
+        performed.await?;
+        Ok(late)
+    }
+
+    #[tokio::test]
+    async fn a_cancel_that_comes_before_its_goal_comes_again() -> anyhow::Result<()> {
+        let late = told_to_stop_at_once(0).await?;
+        assert!(late.begun.load(Ordering::SeqCst) == 1 && late.stop.is_cancelled());
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn a_goal_that_was_refused_for_now_is_not_given_again_once_it_was_told_to_stop() -> anyhow::Result<()> {
+        let late = told_to_stop_at_once(1).await?;
+        tokio::time::sleep(Duration::from_millis(500)).await;
+        assert_eq!(late.begun.load(Ordering::SeqCst), 0);
         Ok(())
     }
 

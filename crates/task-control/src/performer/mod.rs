@@ -5,6 +5,7 @@ mod acquiring;
 mod claim;
 mod goal;
 mod handover;
+mod order;
 mod resume;
 mod stopping;
 #[cfg(test)]
@@ -47,6 +48,7 @@ use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
+use order::Operations;
 use stopping::Stopping;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::{JoinHandle, JoinSet};
@@ -180,6 +182,7 @@ pub(super) struct Performer {
     jobs: BTreeMap<InstanceId, Job>,
     stopping: Stopping,
     giving_back: JoinSet<()>,
+    order: Operations,
     acquires: u64,
     operations: u64,
     /// How often task control has come back to this run.
@@ -289,6 +292,7 @@ impl Performer {
             jobs: BTreeMap::new(),
             stopping: Stopping::default(),
             giving_back: JoinSet::new(),
+            order: Operations::default(),
             acquires: 0,
             operations: 0,
             resumptions: 0,
@@ -341,9 +345,10 @@ impl Performer {
                 _ => {}
             }
         }
-        // Beside other runs it is the resource manager's to say who comes next.
-        let alone = !self.told.has_others();
-        let handover = alone.then(|| self.leases.handover(event, commands, &self.asking, Instant::now()));
+        // Beside other runs it is the resource manager's to say who comes next. What goes back may be what the run uses up.
+        let operates = |command: &Command| matches!(command, Command::Operate { .. });
+        let is_free = !self.told.has_others() && self.order.operating.is_empty() && !commands.iter().any(operates);
+        let handover = is_free.then(|| self.leases.handover(event, commands, &self.asking, Instant::now()));
         self.handover = handover.flatten();
         // To one whose answer is on its way nothing is handed over: the lease goes back.
         self.handover.take_if(|one| one.waits && self.asking.hand(one.to, &one.lease) != Some(Ok(())));
@@ -398,10 +403,15 @@ impl Performer {
             }
             Command::Operate { instance, operations } => {
                 self.operations += 1;
-                self.record(Record::Operate { instance, number: self.operations, operations, safe })?;
+                self.operate(instance, self.operations, operations, safe)?;
             }
         }
         Ok(())
+    }
+
+    /// The run is over, or has failed: what has not begun does not.
+    pub(super) fn begin_no_more(&self) {
+        self.over.cancel();
     }
 
     /// Waits until what was decided is recorded and given back, and ends the session.
@@ -409,7 +419,7 @@ impl Performer {
     /// # Errors
     /// When something that was decided is not recorded: the world pool or the resource manager know less than what happened.
     pub(super) async fn close(mut self) -> anyhow::Result<()> {
-        self.over.cancel();
+        self.begin_no_more();
         let recording = async {
             let (done, recorded) = oneshot::channel();
             self.records.send(Record::Flush(done)).await.map_err(|_| "the recorder is gone".to_owned())?;
@@ -433,6 +443,17 @@ impl Performer {
             bail!("the world pool is more than {MAX_PENDING_RECORDS} requests behind, or gone");
         }
         Ok(())
+    }
+
+    fn operate(
+        &mut self,
+        instance: InstanceId,
+        number: u64,
+        operations: Vec<Requirement>,
+        safe: Option<Mark>,
+    ) -> anyhow::Result<()> {
+        let order = self.order.next(safe);
+        self.record(Record::Operate { instance, number, operations, order })
     }
 
     /// Where it need not be there first its goal leaves at once, if an id was promised.
@@ -472,6 +493,7 @@ impl Performer {
             requirements: asked,
             options,
             waited,
+            after: self.order.operating.all(),
             withdrawn: withdrawal,
             handed,
             resources: self.resources.clone(),
@@ -536,12 +558,12 @@ impl Performer {
         };
         Ok(match event {
             Event::Granted { instance, lease } if withdrawn => {
-                self.give_back(instance, Vec::new(), Some(lease.id), None);
+                self.give_back(instance, Some(lease.id), None);
                 None
             }
             _ if withdrawn => None,
             Event::Projected { instance, attempt, projection } if self.was_cancelled(instance, attempt) => {
-                self.give_back(instance, Vec::new(), None, Some(projection));
+                self.give_back(instance, None, Some(projection));
                 None
             }
             Event::Crashed { instance, attempt, .. } if self.was_cancelled(instance, attempt) => None,
@@ -588,7 +610,8 @@ impl Performer {
             ),
             Err(reason) => (String::new(), Err(reason)),
         };
-        let (resource, before, over) = (source.clone(), self.stopping.before(&source), CancellationToken::new());
+        let (resource, over) = (source.clone(), CancellationToken::new());
+        let before = if given == Given::Now { self.stopping.before(&source) } else { Vec::new() };
         let performing = Performing {
             instance,
             attempt,
@@ -627,7 +650,12 @@ impl Performer {
             drop(ends);
         };
         let ended = tokio::spawn(trace::within(self.of(instance), performing));
-        self.jobs.insert(instance, Job { attempt, lease, resource, stop, ended, over });
+        let job = Job { attempt, lease, resource, stop, ended, over };
+        if given == Given::ToStop {
+            return self.stopping.stop(&job);
+        }
+        let before = self.jobs.insert(instance, job);
+        before.iter().for_each(|job| self.stopping.leave(job));
     }
 
     /// The outputs that a result of the goal's action has to have.
@@ -668,26 +696,23 @@ impl Performer {
         safe: Option<Mark>,
     ) {
         let over = |id: InstanceId, job: &Job| id == instance || (lease.is_some() && job.lease == lease);
-        let (ended, going_on) = std::mem::take(&mut self.jobs).into_iter().partition(|(id, job)| over(*id, job));
+        let (ended, going_on): (BTreeMap<_, Job>, _) =
+            std::mem::take(&mut self.jobs).into_iter().partition(|(id, job)| over(*id, job));
         self.jobs = going_on;
-        self.give_back_when(safe, instance, Vec::from_iter(BTreeMap::into_values(ended)), lease, projection);
+        ended.values().for_each(|job| self.stopping.leave(job));
+        let idle = ended.into_values().map(|job| job.over).collect();
+        self.give_back_when(safe, instance, idle, lease, projection);
     }
 
-    fn give_back(
-        &mut self,
-        instance: InstanceId,
-        jobs: Vec<Job>,
-        lease: Option<LeaseId>,
-        projection: Option<ProjectionId>,
-    ) {
-        self.give_back_when(None, instance, jobs, lease, projection);
+    fn give_back(&mut self, instance: InstanceId, lease: Option<LeaseId>, projection: Option<ProjectionId>) {
+        self.give_back_when(None, instance, Vec::new(), lease, projection);
     }
 
     fn give_back_when(
         &mut self,
         safe: Option<Mark>,
         instance: InstanceId,
-        jobs: Vec<Job>,
+        mut idle: Vec<CancellationToken>,
         lease: Option<LeaseId>,
         projection: Option<ProjectionId>,
     ) {
@@ -696,6 +721,8 @@ impl Performer {
             self.holds.set(self.leases.has_speculative());
         }
         let (resources, world) = (self.resources.clone(), self.world.clone());
+        idle.extend(lease.into_iter().flat_map(|lease| self.stopping.under(lease)));
+        let returns = lease.map(|_| self.order.returning.begin());
         let note = self.told.left(&self.run, self.decided).to_string();
         let (there, coming) = match projection.map(|id| (id, self.making.end(id))) {
             Some((id, None)) => (Some(id), None),
@@ -704,8 +731,8 @@ impl Performer {
         };
         let returning = async move {
             // Whoever gets the resources next finds them idle.
-            for job in jobs {
-                let _ = job.ended.await;
+            for goal in idle {
+                goal.cancelled().await;
             }
             // What others do then stands on what is known here.
             if let Some(safe) = safe {
@@ -719,6 +746,7 @@ impl Performer {
             {
                 tracing::warn!(%instance, "a lease was not given back: {}", said(&error));
             }
+            drop(returns);
             // The lease is not kept until it is there.
             if let Some((projection, coming)) = coming
                 && coming.await.is_ok()

@@ -5,6 +5,7 @@
 //! with it (their goals end as the providers say), and what the run had created and used up is made so again.
 
 use super::Performer;
+use super::acquiring::late_request;
 use super::goal::Given;
 use crate::ledger::{Confirmed, Ledger};
 use crate::outside;
@@ -13,7 +14,7 @@ use crate::shell::Place;
 use anyhow::bail;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
-use ratn_model::id::{InstanceId, LeaseId, Revision};
+use ratn_model::id::{LeaseId, Revision};
 use ratn_proto::types::{Resource, WorldUpdate};
 use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{Channels, WorldClient};
@@ -81,19 +82,21 @@ impl Performer {
         let changed = self.commit_again(&ledger, mirror).await?;
         let commit = ledger.commits.last().map(|decided| decided.revision).unwrap_or_default();
         self.confirm(Confirmed { commit, ..Confirmed::default() });
+        for (instance, attempt, goal) in &ledger.stopped {
+            self.start(*instance, *attempt, goal.clone(), Given::ToStop, None);
+        }
         if self.session.state().borrow().found {
-            for (number, instance, operations) in &ledger.operated {
-                let (number, instance, operations) = (*number, *instance, operations.clone());
-                self.record(Record::Operate { instance, number, operations, safe: None })?;
-            }
             self.sweep(&ledger).await?;
+            for (number, instance, operations) in &ledger.operated {
+                self.operate(*instance, *number, operations.clone(), None)?;
+            }
         } else {
             self.make_anew(&ledger).await?;
             self.confirm(Confirmed { commit, operation: ledger.operations });
         }
         // What crossed with the end of task control goes back; a waiting one has left the queue with its connection.
-        for request in &ledger.withdrawn {
-            let _ = retry_unanswered(|| self.resources.withdraw(request)).await;
+        for request in ledger.withdrawn.iter().flat_map(|request| [request.clone(), late_request(request)]) {
+            let _ = retry_unanswered(|| self.resources.withdraw(&request)).await;
         }
         for (instance, asked) in ledger.projecting {
             let named = asked.named.map(|id| Named { id, made: self.making.begin(id), again: true });
@@ -178,10 +181,20 @@ impl Performer {
         }
     }
 
-    /// Gives back what the session holds and the run does not know of: grants that nobody heard of.
+    /// Gives back what the session holds and the run does not know of: grants that nobody heard of. What others left to be told stays there.
     async fn sweep(&mut self, ledger: &Ledger) -> anyhow::Result<()> {
         for lease in self.living_leases().await?.difference(&ledger.held) {
-            self.give_back(InstanceId(0), Vec::new(), Some(*lease), None);
+            let (lease, resources) = (*lease, self.resources.clone());
+            let (idle, returns) = (self.stopping.under(lease), self.order.returning.begin());
+            self.giving_back.spawn(async move {
+                for goal in idle {
+                    goal.cancelled().await;
+                }
+                if let Err(error) = retry_unanswered(|| resources.release(lease)).await {
+                    tracing::warn!("a lease that was left from before was not given back: {}", said(&error));
+                }
+                drop(returns);
+            });
         }
         Ok(())
     }

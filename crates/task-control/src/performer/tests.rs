@@ -393,6 +393,134 @@ async fn who_gets_what_another_run_had_has_been_told_what_that_had_committed() -
     bench.performer.close().await
 }
 
+#[tokio::test]
+async fn what_is_asked_for_behind_a_deletion_does_not_get_what_is_deleted() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let [first, second, third] = [1, 2, 3].map(InstanceId);
+    let of = |color: &str| {
+        let color = BTreeMap::from([("color".to_owned(), Value::String(color.to_owned()))]);
+        Requirement { attributes: color, ..create("Token", 1) }
+    };
+    let delete = Requirement::new(ResourceOperation::Delete, "Token");
+    let block = |kind: &str| vec![Requirement::new(ResourceOperation::Block, kind)];
+    let operate = |operation: Requirement| Command::Operate { instance: first, operations: vec![operation] };
+    bench.performer.perform(operate(of("red")))?;
+    let acquire = |instance, kind| Command::Acquire { instance, requirements: block(kind), priority: 0 };
+    bench.performer.perform(acquire(first, "Token"))?;
+    let lease = bench.granted(first).await?;
+    // It is given back, deleted, and asked for: the commands of one step. The disk has time.
+    let (disk, slow) = Mark::not_yet();
+    bench.performer.perform(Command::Release { instance: first, lease: Some(lease), projection: None })?;
+    bench.performer.perform_when(Some(slow), operate(delete))?;
+    bench.performer.perform(acquire(second, "Token"))?;
+    bench.performer.perform(Command::Acquire { instance: third, requirements: arm(), priority: 0 })?;
+    let early = tokio::time::timeout(Duration::from_millis(200), bench.event()).await;
+    assert!(early.is_err(), "{early:?}");
+    drop(disk);
+    // The disk is gone: that is heard first.
+    let failed = bench.event().await;
+    assert!(matches!(&failed, Some(Event::RetirementFailed { .. })), "{failed:?}");
+    bench.performer.close().await.expect_err("what was deleted is there");
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_lease_is_back_before_what_it_held_is_used_up() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let [first, second] = [1, 2].map(InstanceId);
+    let operate = |operation: Requirement| Command::Operate { instance: first, operations: vec![operation] };
+    let consume = Requirement::new(ResourceOperation::Consume, "Token");
+    bench.performer.perform(operate(create("Token", 20)))?;
+    for _ in 0..20 {
+        let all = Requirement { count: 1.into(), ..Requirement::new(ResourceOperation::Block, "Token") };
+        bench.performer.perform(Command::Acquire { instance: second, requirements: vec![all], priority: 0 })?;
+        let lease = bench.granted(second).await?;
+        bench.performer.perform(Command::Release { instance: second, lease: Some(lease), projection: None })?;
+        bench.performer.perform(operate(consume.clone()))?;
+    }
+    // None is left: whoever asks behind it waits.
+    let exists = vec![Requirement::new(ResourceOperation::Exists, "Token")];
+    bench.performer.perform(Command::Acquire { instance: first, requirements: exists, priority: 0 })?;
+    let early = tokio::time::timeout(Duration::from_millis(300), bench.event()).await;
+    assert!(early.is_err(), "{early:?}");
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn who_comes_back_tells_a_goal_to_stop_that_may_not_have_been_told() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (routine, motion) = (InstanceId(1), InstanceId(2));
+    bench.ask(routine)?;
+    let lease = bench.granted(routine).await?;
+    let (arm, endpoint) = serve_arm(&mut bench).await?;
+    let started = start(motion, 1, "brake", lease, &endpoint);
+    bench.performer.perform(started.clone())?;
+    while arm.running() == 0 {
+        tokio::task::yield_now().await;
+    }
+    // Task control is killed when it has written that down, and before it has told the arm.
+    let run = bench.performer.run.clone();
+    let acquire = Command::Acquire { instance: routine, requirements: self::arm(), priority: 0 };
+    let mut ledger = ledger(&run, &[]);
+    ledger.command(&acquire);
+    let resource = LeasedResource { id: "arm".into(), kind: "Arm".into(), endpoint: endpoint.clone(), superclasses: Vec::new() };
+    let held = Lease { id: lease, token: FencingToken(1), resources: vec![resource] };
+    ledger.event(Timestamp(0), &Event::Granted { instance: routine, lease: held });
+    ledger.command(&started);
+    ledger.command(&Command::Cancel { instance: motion, attempt: 1 });
+    ledger.event(Timestamp(0), &Event::Resumed);
+    let catalogue = bench.performer.catalogue.clone();
+    let mut bench = bench.comes_back(true).await?;
+    bench.performer.catalogue = catalogue;
+    bench.performer.take_up(ledger, &World::default()).await?;
+    // The next goal of that arm leaves when it stands still.
+    bench.performer.perform(start(InstanceId(3), 1, "work", lease, &endpoint))?;
+    let event = bench.event().await;
+    assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == SUCCESS), "{event:?}");
+    assert_eq!(arm.running(), 0);
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn what_was_left_is_told_to_the_next_holder_when_the_last_one_gave_up_before_it_was_told() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (events, _unheard) = mpsc::channel(16);
+    let mut second = connect(&bench.endpoints, "second", events).await?;
+    let (events, mut answers) = mpsc::channel(16);
+    let mut third = connect(&bench.endpoints, "third", events).await?;
+    for performer in [&mut bench.performer, &mut second, &mut third] {
+        performer.root().await?;
+    }
+    let (first, instance) = (InstanceId(1), InstanceId(2));
+    bench.ask(first)?;
+    let (lease, _) = granted_after(&mut bench.performer, &mut bench.answers).await?;
+    // What it has committed is on its way for long.
+    bench.performer.resources.release_with_note(lease, "0 12".to_owned()).await?;
+    second.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })?;
+    let holds = async |performer: &Performer| {
+        let arms = performer.resources.list(&["Arm"]).await?;
+        anyhow::Ok(arms.iter().any(|arm| arm.holdings.iter().any(|holding| holding.session == performer.run)))
+    };
+    while !holds(&second).await? {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    second.perform(Command::Withdraw { instance })?;
+    third.perform(Command::Acquire { instance, requirements: arm(), priority: 0 })?;
+    let early = tokio::time::timeout(Duration::from_millis(300), granted_after(&mut third, &mut answers)).await;
+    assert!(early.is_err() && holds(&third).await?, "{early:?}");
+    bench.performer.perform(Command::Commit {
+        instance: first,
+        writer: "place".into(),
+        changes: done(),
+        evidence: Vec::new(),
+        revision: Revision(12),
+    })?;
+    granted_after(&mut third, &mut answers).await?;
+    third.close().await?;
+    second.close().await?;
+    bench.performer.close().await
+}
+
 #[test]
 fn what_is_certain_comes_first_then_the_urgent_run_then_the_own_order() {
     let (certain, speculative) = (CERTAIN | 5, CERTAIN - 1);
@@ -721,7 +849,7 @@ async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() ->
     bench.performer.close().await
 }
 
-/// `hang` ends when it is told to stop, a while after that; `work` at once.
+/// `hang` ends when it is told to stop, `brake` a while after that; `work` at once.
 struct Arm(&'static str);
 
 #[tonic::async_trait]
@@ -735,23 +863,37 @@ impl Action for Arm {
             goal.cancelled.cancelled().await;
             return Err(goal.stopped());
         }
+        if self.0 == "brake" {
+            goal.cancelled.cancelled().await;
+            tokio::time::sleep(Duration::from_millis(300)).await;
+            return Err(goal.stopped());
+        }
         Ok(GoalOutcome::success())
     }
 }
 
-#[tokio::test]
-async fn a_goal_waits_for_one_of_the_same_resource_that_was_told_to_stop() -> anyhow::Result<()> {
-    let mut bench = Bench::new().await?;
-    let arm = ActionServer::builder("").one_at_a_time().action(Arm("hang")).action(Arm("work")).build();
+/// The bench's arm performs goals.
+async fn serve_arm(bench: &mut Bench) -> anyhow::Result<(ActionServer, String)> {
+    let arm = ActionServer::builder("").one_at_a_time().action(Arm("hang")).action(Arm("brake")).action(Arm("work"));
+    let arm = arm.build();
     let bound = bind(&Endpoint::Unix(bench._place.path().join("arm.sock"))).await?;
     let endpoint = bound.endpoint().to_string();
     tokio::spawn(bound.serve(Services::new().with(arm.clone().into_service()), CancellationToken::new()));
     let provider = Provider { resource: "Arm".to_owned(), joints: None, chain: None, actions: BTreeMap::new() };
     bench.performer.catalogue =
         Arc::new(Catalogue { providers: BTreeMap::from([("arm".to_owned(), provider)]), ..Catalogue::default() });
-    let resource = LeasedResource { id: "arm".to_owned(), kind: "Arm".to_owned(), endpoint, superclasses: Vec::new() };
-    let lease = Lease { id: LeaseId(1), token: FencingToken(1), resources: vec![resource] };
-    let start = |instance: InstanceId, attempt: u32, action: &str| Command::Start {
+    Ok((arm, endpoint))
+}
+
+/// A goal for it under this lease.
+fn start(instance: InstanceId, attempt: u32, action: &str, lease: LeaseId, endpoint: &str) -> Command {
+    let resource = LeasedResource {
+        id: "arm".to_owned(),
+        kind: "Arm".to_owned(),
+        endpoint: endpoint.to_owned(),
+        superclasses: Vec::new(),
+    };
+    Command::Start {
         instance,
         attempt,
         goal: Box::new(Goal {
@@ -759,13 +901,49 @@ async fn a_goal_waits_for_one_of_the_same_resource_that_was_told_to_stop() -> an
             action: action.into(),
             inputs: BTreeMap::new(),
             seed: 0,
-            lease: Some(lease.clone()),
+            lease: Some(Lease { id: lease, token: FencingToken(1), resources: vec![resource] }),
             projection: None,
             expected_s: None,
             timeout_s: None,
             improves: None,
         }),
-    };
+    }
+}
+
+#[tokio::test]
+async fn a_lease_goes_back_when_every_goal_under_it_has_ended() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (routine, motion, other) = (InstanceId(1), InstanceId(2), InstanceId(3));
+    let (events, mut answers) = mpsc::channel(8);
+    let mut second = connect(&bench.endpoints, "second", events).await?;
+    bench.ask(routine)?;
+    let lease = bench.granted(routine).await?;
+    let (arm, endpoint) = serve_arm(&mut bench).await?;
+    // A motion of the routine loses a race: it is told to stop, what it looked at goes back, and the routine ends.
+    bench.performer.perform(start(motion, 1, "brake", lease, &endpoint))?;
+    while arm.running() == 0 {
+        tokio::task::yield_now().await;
+    }
+    second.perform(Command::Acquire { instance: other, requirements: self::arm(), priority: 0 })?;
+    let projection = Some(ProjectionId(999));
+    for command in [
+        Command::Cancel { instance: motion, attempt: 1 },
+        Command::Release { instance: motion, lease: None, projection },
+        Command::Release { instance: routine, lease: Some(lease), projection: None },
+    ] {
+        bench.performer.perform(command)?;
+    }
+    granted_after(&mut second, &mut answers).await?;
+    assert_eq!(arm.running(), 0, "whoever gets the arm finds it idle");
+    second.close().await?;
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn a_goal_waits_for_one_of_the_same_resource_that_was_told_to_stop() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (arm, endpoint) = serve_arm(&mut bench).await?;
+    let start = |instance, attempt, action: &str| start(instance, attempt, action, LeaseId(1), &endpoint);
     for round in 0..20 {
         let (first, second, third) = (InstanceId(3 * round + 1), InstanceId(3 * round + 2), InstanceId(3 * round + 3));
         bench.performer.perform(start(first, 1, "hang"))?;

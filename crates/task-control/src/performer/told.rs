@@ -145,10 +145,12 @@ impl Told {
         let began = Instant::now();
         while began.elapsed() < PATIENCE {
             for (run, left) in &mut others {
-                if left.pending > Revision::default() && ask.is_under_way(run).await == Some(false) {
-                    left.pending = Revision::default();
+                if left.pending > Revision::default()
+                    && ask.is_under_way(run).await == Some(false)
+                    && let Some(root) = ask.root().await
+                {
                     // What it had made until then.
-                    left.told = ask.root().await.unwrap_or(left.told);
+                    *left = Left { told: root, pending: Revision::default() };
                 }
             }
             // Nobody was told more than there is.
@@ -194,12 +196,12 @@ mod tests {
     use crate::record::Decided;
     use ratn_model::id::InstanceId;
 
-    /// A pool that is at a revision, and a run that is under way or not.
-    struct Known(u64, bool);
+    /// A pool that is at a revision, or does not answer, and a run that is under way or not.
+    struct Known(Option<u64>, bool);
 
     impl Ask for Known {
         async fn root(&self) -> Option<Revision> {
-            Some(Revision(self.0))
+            self.0.map(Revision)
         }
 
         async fn is_under_way(&self, _: &str) -> Option<bool> {
@@ -213,7 +215,7 @@ mod tests {
     }
 
     async fn waits(told: &Told, note: &str) -> bool {
-        waits_knowing(told, "run-b", note, Known(100, true)).await
+        waits_knowing(told, "run-b", note, Known(Some(100), true)).await
     }
 
     #[tokio::test]
@@ -227,7 +229,7 @@ mod tests {
         told.hear(Revision(7), Some(("run-b".to_owned(), Revision(4))));
         assert!(!waits(&told, "6 4").await);
         assert!(!waits(&told, "nonsense").await);
-        assert!(!waits_knowing(&told, "run-a", "99 9", Known(100, true)).await, "its own");
+        assert!(!waits_knowing(&told, "run-a", "99 9", Known(Some(100), true)).await, "its own");
         assert_eq!(told.left("run-b", Revision(4)).to_string(), "7 0");
         assert_eq!(told.left("run-b", Revision(5)).to_string(), "7 5");
         assert_eq!(told.left("run-c", Revision::default()).to_string(), "7 0");
@@ -237,9 +239,10 @@ mod tests {
     async fn what_a_run_had_on_its_way_that_has_ended_is_there_or_never_will_be() {
         let told = Told::new();
         told.root(Revision(5));
-        assert!(!waits_knowing(&told, "run-b", "5 9", Known(5, false)).await);
-        assert!(waits_knowing(&told, "run-b", "5 9", Known(6, false)).await, "what there is by then is to be told");
-        assert!(!waits_knowing(&told, "liar", "18446744073709551615 0", Known(5, true)).await);
+        assert!(!waits_knowing(&told, "run-b", "5 9", Known(Some(5), false)).await);
+        assert!(waits_knowing(&told, "run-b", "5 9", Known(Some(6), false)).await, "what there is by then is to be told");
+        assert!(waits_knowing(&told, "run-b", "5 9", Known(None, false)).await, "nobody knows what there is");
+        assert!(!waits_knowing(&told, "liar", "18446744073709551615 0", Known(Some(5), true)).await);
     }
 
     #[test]

@@ -101,10 +101,11 @@ impl ActionClient {
         goal: Goal,
         on_progress: impl FnMut(String, BTreeMap<String, Value>),
     ) -> Result<GoalOutcome, CallError> {
-        Box::pin(self.execute_hearing(endpoint, goal, only_progress(on_progress))).await
+        Box::pin(self.execute_hearing(endpoint, goal, || true, only_progress(on_progress))).await
     }
 
-    /// As [`ActionClient::execute`], hearing also the results that a goal gives before its end.
+    /// As [`ActionClient::execute`], hearing also the results that a goal gives before its end. Once it is not `wanted` any more it is not
+    /// given again.
     ///
     /// # Errors
     /// As [`ActionClient::execute`].
@@ -112,13 +113,19 @@ impl ActionClient {
         &self,
         endpoint: &Endpoint,
         goal: Goal,
+        wanted: impl Fn() -> bool,
         mut on_said: impl FnMut(Said),
     ) -> Result<GoalOutcome, CallError> {
         let question = v1::ExecuteRequest { goal: Some(goal.into()), known_only: false };
         for _ in 1..TRIES {
             match self.listen(endpoint, question.clone(), &mut on_said).await {
                 // It has begun nothing.
-                Err(error) if error.is_unconfirmed() => tokio::time::sleep(PAUSE).await,
+                Err(error) if error.is_unconfirmed() => {
+                    tokio::time::sleep(PAUSE).await;
+                    if !wanted() {
+                        return Err(error);
+                    }
+                }
                 ended => return ended.map(|fate| fate.outcome),
             }
         }

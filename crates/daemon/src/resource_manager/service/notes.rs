@@ -1,5 +1,6 @@
-//! What whoever gives a resource back leaves to be told to its next holder, and the session that left it. It is kept in memory only: whoever
-//! starts anew knows of nothing.
+//! What whoever gives a resource back leaves to be told to its next holders, and the session that left it. Whoever was told something stands
+//! for it: what they leave takes its place. Of those who hold one beside each other nobody was told of the others, and what each leaves is
+//! kept. All of it is in memory only: whoever starts anew knows of nothing.
 
 use ratn_model::id::LeaseId;
 use ratn_model::resource::Lease;
@@ -12,6 +13,8 @@ use std::time::{Duration, Instant};
 const LIFE: Duration = Duration::from_secs(60);
 /// Of more leases or resources nothing is kept; the oldest are given up first.
 const MOST: usize = 65_536;
+/// At one resource the last so many are kept: as many as there are runs beside each other.
+const MOST_OF_ONE: usize = 64;
 
 /// The notes; clones share them.
 #[derive(Debug, Clone, Default)]
@@ -21,16 +24,15 @@ pub(super) struct Notes(Arc<Mutex<Kept>>);
 struct Kept {
     /// Leases that were granted.
     held: BTreeMap<LeaseId, Held>,
-    /// The last lease of each resource.
-    last: HashMap<String, LeaseId>,
-    /// By resource.
-    notes: HashMap<String, Note>,
+    /// By resource, each session's last.
+    notes: HashMap<String, Vec<Note>>,
 }
 
 #[derive(Debug, Clone)]
 struct Held {
     session: String,
     resources: Vec<String>,
+    since: Instant,
 }
 
 #[derive(Debug, Clone)]
@@ -44,7 +46,8 @@ struct Note {
 #[derive(Debug, Default)]
 pub(super) struct Left {
     held: Option<Held>,
-    before: Vec<(String, Option<Note>)>,
+    /// What was there at each resource.
+    before: Vec<(String, Vec<Note>)>,
 }
 
 impl Notes {
@@ -53,7 +56,7 @@ impl Notes {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let resources: Vec<String> = lease.resources.iter().map(|resource| resource.id.clone()).collect();
         let mut told: Vec<HolderNote> = Vec::new();
-        for note in resources.iter().filter_map(|id| kept.notes.get(id)) {
+        for note in resources.iter().filter_map(|id| kept.notes.get(id)).flatten() {
             let is_fresh = now.saturating_duration_since(note.since) < LIFE;
             let note = HolderNote { session_id: note.session.clone(), note: note.text.to_string() };
             if is_fresh && !told.contains(&note) {
@@ -64,18 +67,11 @@ impl Notes {
         if kept.held.len() >= MOST {
             kept.held.pop_first();
         }
-        if kept.last.len() >= MOST {
-            kept.last.clear();
-        }
-        for resource in &resources {
-            kept.last.insert(resource.clone(), lease.id);
-        }
-        kept.held.insert(lease.id, Held { session: session.to_owned(), resources });
+        kept.held.insert(lease.id, Held { session: session.to_owned(), resources, since: now });
         told
     }
 
-    /// A lease is to be given back by this session with this note; an empty one leaves what there is. Of a lease that has ended, and whose
-    /// resources are another's by now, nothing is left.
+    /// A lease is to be given back by this session with this note; an empty one leaves what there is.
     pub(super) fn left(&self, lease: LeaseId, session: &str, note: &str, now: Instant) -> Left {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if kept.held.get(&lease).is_none_or(|held| held.session != session) {
@@ -87,10 +83,13 @@ impl Notes {
         }
         let text: Arc<str> = note.into();
         let mut before = Vec::new();
-        for resource in held.iter().flat_map(|held| &held.resources) {
-            if !text.is_empty() && kept.last.get(resource) == Some(&lease) {
-                let note = Note { session: session.to_owned(), text: Arc::clone(&text), since: now };
-                before.push((resource.clone(), kept.notes.insert(resource.clone(), note)));
+        for (held, resource) in held.iter().flat_map(|held| held.resources.iter().map(move |id| (held, id))) {
+            if !text.is_empty() {
+                let notes = kept.notes.entry(resource.clone()).or_default();
+                before.push((resource.clone(), notes.clone()));
+                notes.retain(|note| note.session != session && note.since >= held.since);
+                notes.truncate(MOST_OF_ONE - 1);
+                notes.insert(0, Note { session: session.to_owned(), text: Arc::clone(&text), since: now });
             }
         }
         Left { held, before }
@@ -99,11 +98,8 @@ impl Notes {
     /// It was not given back after all: not by whoever asked for that.
     pub(super) fn take_back(&self, lease: LeaseId, left: Left) {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        for (resource, note) in left.before {
-            match note {
-                Some(note) => drop(kept.notes.insert(resource, note)),
-                None => drop(kept.notes.remove(&resource)),
-            }
+        for (resource, notes) in left.before {
+            kept.notes.insert(resource, notes);
         }
         kept.held.extend(left.held.map(|held| (lease, held)));
     }
@@ -139,14 +135,30 @@ mod tests {
         leaves(2, "b", "");
         assert_eq!(told(3, &["arm"], LIFE / 2), ["a: one"], "who has nothing to tell takes nothing away");
         assert_eq!(told(4, &["arm"], LIFE), [""; 0], "what is long ago");
-        // Lease 3 has ended by itself: its holder comes back too late.
-        leaves(3, "b", "late");
+        // Lease 3 has ended by itself: its holder comes back too late, and is refused.
+        notes.take_back(LeaseId(3), leaves(3, "b", "late"));
         leaves(4, "a", "not its own");
         assert_eq!(told(5, &["arm"], Duration::ZERO), ["a: one"]);
         let refused = leaves(5, "b", "of a stranger in its name");
         notes.take_back(LeaseId(5), refused);
-        assert_eq!(told(6, &["arm"], Duration::ZERO), ["a: one"]);
+        assert_eq!(told(6, &["arm"], LIFE / 4), ["a: one"]);
         leaves(6, "b", "six");
         assert_eq!(told(7, &["arm", "eye"], Duration::ZERO), ["b: six"]);
+    }
+
+    #[test]
+    fn what_those_leave_who_hold_one_beside_each_other_is_all_told() {
+        let (notes, now) = (Notes::default(), Instant::now());
+        let at = |seconds| now + Duration::from_secs(seconds);
+        let told = |id: u64, session: &str, after| -> Vec<String> {
+            notes.of(&lease(id, &["table"]), session, at(after)).into_iter().map(|note| note.note).collect()
+        };
+        assert_eq!(told(1, "a", 0), [""; 0]);
+        assert_eq!(told(2, "b", 1), [""; 0]);
+        notes.left(LeaseId(1), "a", "of a", at(2));
+        notes.left(LeaseId(2), "b", "of b", at(3));
+        assert_eq!(told(3, "c", 4), ["of b", "of a"]);
+        notes.left(LeaseId(3), "c", "of c", at(5));
+        assert_eq!(told(4, "d", 6), ["of c"], "who was told of both stands for them");
     }
 }

@@ -1,0 +1,50 @@
+//! What is on its way to the resource manager and has to be there before something else leaves. What the run has used up or deleted is gone for
+//! what comes behind it in the program, and what it gave back just before may be exactly that:
+//!
+//! ```text
+//! leases go back ─► an operation ─► what is asked for behind it
+//! ```
+
+use crate::record::Order;
+use crate::safe_on_disk::Mark;
+use tokio_util::sync::{CancellationToken, DropGuard};
+
+/// Calls of one kind that have no answer yet.
+#[derive(Debug, Default)]
+pub(super) struct OnTheWay(Vec<CancellationToken>);
+
+impl OnTheWay {
+    /// One more, until what is returned is dropped.
+    pub(super) fn begin(&mut self) -> DropGuard {
+        let over = CancellationToken::new();
+        self.0.push(over.clone());
+        over.drop_guard()
+    }
+
+    /// Each token is cancelled when its call is over.
+    pub(super) fn all(&mut self) -> Vec<CancellationToken> {
+        self.0.retain(|over| !over.is_cancelled());
+        self.0.clone()
+    }
+
+    /// Whether there is none.
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.iter().all(CancellationToken::is_cancelled)
+    }
+}
+
+/// Where a run's operations stand among its leases.
+#[derive(Debug, Default)]
+pub(super) struct Operations {
+    /// Leases that go back.
+    pub(super) returning: OnTheWay,
+    /// Operations.
+    pub(super) operating: OnTheWay,
+}
+
+impl Operations {
+    /// The place of the next operation.
+    pub(super) fn next(&mut self, safe: Option<Mark>) -> Order {
+        Order { safe, after: self.returning.all(), _ends: self.operating.begin() }
+    }
+}
