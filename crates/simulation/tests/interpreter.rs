@@ -216,6 +216,13 @@ impl Bench {
         std::mem::take(&mut self.commands).into_iter().filter_map(word).collect()
     }
 
+    /// Who has asked last since the last time.
+    fn asks(&mut self) -> u64 {
+        let heard = self.heard();
+        let last = heard.iter().rfind(|word| word.starts_with("acquire")).cloned();
+        last.and_then(|word| word.split(' ').nth(1)?.parse().ok()).unwrap_or_else(|| panic!("{heard:?}"))
+    }
+
     fn grant(&mut self, instance: u64, lease: u64) {
         let lease = Lease { id: LeaseId(lease), token: FencingToken(lease), resources: Vec::new() };
         self.tell(Event::Granted { instance: InstanceId(instance), lease });
@@ -286,14 +293,12 @@ fn a_pia_that_gets_its_resources_during_a_pause_begins_when_the_pause_ends() {
 fn what_goes_back_is_back_before_something_is_used_up_and_that_is_gone_for_what_comes_behind_it() {
     let text = "states:
   - group:
-      resources: [{ consume: Token }]
+      resources: [{ consume: Charge }]
       states: [ inside: { MOVE } ]
   - next: { TURN }";
     for mode in MODES {
         let mut bench = Bench::new(text, mode);
-        // In CDTN mode `next` asks ahead: it waits for nothing of that kind.
-        bench.heard();
-        let inside = if mode == Mode::Hsm { 1 } else { 2 };
+        let inside = bench.asks();
         bench.grant(inside, 1);
         bench.heard();
         bench.finish(inside, 1);
@@ -312,15 +317,10 @@ fn a_way_out_has_its_minute_whatever_time_nobody_was_there() {
       finally: [ back: { TURN, effects: [] } ]";
     for mode in MODES {
         let mut bench = Bench::new(text, mode);
-        let ask = |bench: &mut Bench| -> u64 {
-            let heard = bench.heard();
-            let last = heard.iter().rfind(|word| word.starts_with("acquire")).cloned();
-            last.and_then(|word| word.split(' ').nth(1)?.parse().ok()).unwrap_or_else(|| panic!("{heard:?}"))
-        };
         let abort = || Event::AbortRequested { reason: "enough".to_owned(), at_once: false };
-        ask(&mut bench);
+        bench.asks();
         bench.tell(abort());
-        let back = ask(&mut bench);
+        let back = bench.asks();
         // Longer than a way out may take.
         bench.now += 100;
         bench.tell(Event::Resumed);
@@ -329,9 +329,9 @@ fn a_way_out_has_its_minute_whatever_time_nobody_was_there() {
         assert_eq!(bench.heard(), [format!("start {back}.1 under 2"), "release 2".to_owned(), "end preempted".to_owned()]);
         // What is done in it does count.
         let mut bench = Bench::new(text, mode);
-        ask(&mut bench);
+        bench.asks();
         bench.tell(abort());
-        let back = ask(&mut bench);
+        let back = bench.asks();
         bench.now += 100;
         bench.grant(back, 2);
         assert_eq!(bench.heard().last().map(String::as_str), Some("end preempted"));
