@@ -326,7 +326,10 @@ fn a_way_out_has_its_minute_whatever_time_nobody_was_there() {
         bench.tell(Event::Resumed);
         bench.grant(back, 2);
         bench.finish(back, 1);
-        assert_eq!(bench.heard(), [format!("start {back}.1 under 2"), "release 2".to_owned(), "end preempted".to_owned()]);
+        assert_eq!(
+            bench.heard(),
+            [format!("start {back}.1 under 2"), "release 2".to_owned(), "end preempted".to_owned()]
+        );
         // What is done in it does count.
         let mut bench = Bench::new(text, mode);
         bench.asks();

@@ -154,11 +154,16 @@ async fn a_goal_that_may_improve_its_result_gives_one_as_soon_as_it_will_do_and_
     let goal = Goal { improves: Some(vec!["end".to_owned()]), ..system.grasp("a", &[]) };
     let (mut given, begun) = (Vec::new(), Instant::now());
     let mut first_after = None;
-    let last = system.client.execute_hearing(&system.planner, goal, || true, |said| {
-        let Said::Improved(better) = said else { return };
-        first_after.get_or_insert(begun.elapsed());
-        given.push(better);
-    });
+    let last = system.client.execute_hearing(
+        &system.planner,
+        goal,
+        || true,
+        |said| {
+            let Said::Improved(better) = said else { return };
+            first_after.get_or_insert(begun.elapsed());
+            given.push(better);
+        },
+    );
     let last = last.await.unwrap();
     assert!(last.is_success(), "{}", last.reason);
     assert!(!given.is_empty(), "nothing was given before the end");

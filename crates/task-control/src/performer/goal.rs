@@ -398,19 +398,19 @@ impl Performing {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
-    use ratn_worker::server::{Services, bind};
-    use ratn_worker::tls::ClientTls;
+    use futures::Stream;
     use ratn_proto::v1::action_service_server::{ActionService, ActionServiceServer};
     use ratn_proto::v1::{
         CancelRequest, CancelResponse, DescribeRequest, DescribeResponse, ExecuteRequest, ExecuteResponse,
         PerformRequest, PerformResponse,
     };
+    use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
+    use ratn_worker::server::{Services, bind};
+    use ratn_worker::tls::ClientTls;
     use std::collections::HashMap;
     use std::pin::Pin;
     use std::sync::Arc;
     use std::sync::atomic::{AtomicU32, Ordering};
-    use futures::Stream;
     use tokio_util::sync::DropGuard;
     use tonic::{Code, Request, Response, Status, Streaming};
     use tonic_types::{ErrorDetails, StatusExt};
@@ -616,7 +616,10 @@ mod tests {
             Err(Status::aborted("stopped"))
         }
 
-        async fn perform(&self, _: Request<Streaming<PerformRequest>>) -> Result<Response<Self::PerformStream>, Status> {
+        async fn perform(
+            &self,
+            _: Request<Streaming<PerformRequest>>,
+        ) -> Result<Response<Self::PerformStream>, Status> {
             Err(Status::unimplemented(""))
         }
 

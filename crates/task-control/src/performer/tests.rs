@@ -463,7 +463,8 @@ async fn who_comes_back_tells_a_goal_to_stop_that_may_not_have_been_told() -> an
     let acquire = Command::Acquire { instance: routine, requirements: self::arm(), priority: 0 };
     let mut ledger = ledger(&run, &[]);
     ledger.command(&acquire);
-    let resource = LeasedResource { id: "arm".into(), kind: "Arm".into(), endpoint: endpoint.clone(), superclasses: Vec::new() };
+    let resource =
+        LeasedResource { id: "arm".into(), kind: "Arm".into(), endpoint: endpoint.clone(), superclasses: Vec::new() };
     let held = Lease { id: lease, token: FencingToken(1), resources: vec![resource] };
     ledger.event(Timestamp(0), &Event::Granted { instance: routine, lease: held });
     ledger.command(&started);

@@ -240,7 +240,10 @@ mod tests {
         let told = Told::new();
         told.root(Revision(5));
         assert!(!waits_knowing(&told, "run-b", "5 9", Known(Some(5), false)).await);
-        assert!(waits_knowing(&told, "run-b", "5 9", Known(Some(6), false)).await, "what there is by then is to be told");
+        assert!(
+            waits_knowing(&told, "run-b", "5 9", Known(Some(6), false)).await,
+            "what there is by then is to be told"
+        );
         assert!(waits_knowing(&told, "run-b", "5 9", Known(None, false)).await, "nobody knows what there is");
         assert!(!waits_knowing(&told, "liar", "18446744073709551615 0", Known(Some(5), true)).await);
     }
