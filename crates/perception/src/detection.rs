@@ -309,7 +309,7 @@ fn detection(view: &View<'_>, fit: &Fit, planar: &Covariance, common: Vector, co
     }
 }
 
-/// The fit's covariance and the plane's together, turned into the world.
+/// The covariances of the fit and of the plane, and what the fit does not know, together; turned into the world.
 fn covariance(view: &View<'_>, fit: &Fit, planar: &Covariance, common: Vector) -> [[f64; 6]; 6] {
     let mut local = [[0.0; 6]; 6];
     // x, y and yaw are the fit's, height and slopes the plane's; half of the height's error is the centre's.
@@ -319,6 +319,13 @@ fn covariance(view: &View<'_>, fit: &Fit, planar: &Covariance, common: Vector) -
         }
     }
     local[2][2] = view.plane_variance[0] + planar.height / 4.0;
+    let [along, across, up] = fit.class.off_beyond_fit().map(|deviation| deviation * deviation);
+    let (sin, cos) = fit.yaw().sin_cos();
+    local[0][0] += along * cos * cos + across * sin * sin;
+    local[1][1] += along * sin * sin + across * cos * cos;
+    local[0][1] += (along - across) * sin * cos;
+    local[1][0] += (along - across) * sin * cos;
+    local[2][2] += up;
     local[3][3] = view.plane_variance[1];
     local[4][4] = view.plane_variance[1];
     for (i, row) in local.iter_mut().take(3).enumerate() {

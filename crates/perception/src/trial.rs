@@ -4,10 +4,12 @@
 //! [`GAP_M`] apart, and so that each shows most of what it would show alone: what stands behind something else is found when the
 //! robot looks from elsewhere, and is no matter of estimation.
 
+use crate::calibration::Calibration;
 use crate::camera::{Camera, DepthImage, Intrinsics};
 use crate::detection::{Detection, Model, ObjectClass, Region, Symmetry};
 use crate::noise::{Noise, observe};
 use crate::render::{Body, Surface, render, scan};
+use crate::sensor::field::{hash, normal};
 use crate::sensor::{Sensor, sense};
 use crate::shapes::{HANDLE_M, Individual, drawn};
 use crate::vector::{cross, dot};
@@ -63,6 +65,12 @@ impl Match {
         right && self.position <= TOLERANCE.0 && self.angle <= TOLERANCE.1
     }
 
+    /// Whether the position is within the ellipsoid that its covariance gives 95 % to.
+    pub fn is_inside(&self) -> Option<bool> {
+        // The 95 % of a χ² distribution with three degrees of freedom.
+        self.normalised_square().map(|square| 3.0 * square <= 7.815)
+    }
+
     /// The position's squared error by its covariance, over its three dimensions: 1 in the mean where covariances are true, less
     /// where they are too large (the normalised estimation error squared; Bar-Shalom, Li and Kirubarajan 2001, section 5.4).
     pub fn normalised_square(&self) -> Option<f64> {
@@ -79,6 +87,14 @@ impl Match {
 /// A camera where the robot's mast holds it, that looks at the table's middle from 1.85 m.
 pub fn mast_camera(intrinsics: Intrinsics) -> Camera {
     Camera::looking([-0.62, 0.0, 1.88], TABLE, intrinsics)
+}
+
+/// Where a camera is that the robot takes to be at `believed`: its place and direction along and about the axes of its optical frame are off
+/// by as much as its calibration says. The same seed gives the same error.
+pub fn miscalibrated(believed: &Camera, calibration: &Calibration, seed: u64) -> Camera {
+    let off = |axis: usize| calibration[axis].sqrt() * normal(hash(hash(seed ^ 0xCA11) ^ axis as u64));
+    let error = Pose::from_rpy([off(0), off(1), off(2)], off(3), off(4), off(5));
+    Camera { pose: believed.pose.compose(&error), ..*believed }
 }
 
 /// The table as a region.

@@ -34,7 +34,8 @@ fn a_single_frame_from_the_mast_shows_where_they_stand_forks_too() {
     are_found(1, 0.3);
 }
 
-/// At least 98 %, at most 1 % that is not there, and covariances that hold.
+/// At least 98 %, at most 1 % that is not there, and covariances that hold. These are exact models, and no thing is one: covariances are those
+/// of things, so that they may be too large here, but not too small.
 fn are_found(frames: u32, least_confidence: f64) {
     let camera = mast_camera(OPTICS);
     let (mut objects, mut good, mut phantoms) = (0, 0, 0);
@@ -60,13 +61,14 @@ fn are_found(frames: u32, least_confidence: f64) {
     assert!(phantoms as f64 <= 0.01 * objects as f64, "{phantoms} of {objects}");
     // 1 in the mean where covariances are true.
     let consistency = squares.iter().sum::<f64>() / squares.len() as f64;
-    assert!((0.5..1.5).contains(&consistency), "{consistency}");
+    assert!(consistency < 1.5, "{consistency}");
 }
 
 #[test]
 fn things_that_no_model_is_exactly_are_found_by_a_sensor_with_flying_pixels_too() {
     let camera = mast_camera(OPTICS);
     let (mut objects, mut good, mut phantoms) = (0, 0, 0);
+    let (mut squares, mut inside) = (Vec::new(), 0);
     for seed in 500..516 {
         let table = random_things(seed, 1 + seed as usize % 8, &camera);
         let image = things_image(&table, &camera, &Sensor::DEFAULT, seed, FRAMES);
@@ -75,7 +77,13 @@ fn things_that_no_model_is_exactly_are_found_by_a_sensor_with_flying_pixels_too(
         objects += matches.len();
         good += matches.iter().filter(|m| m.is_good()).count();
         phantoms += phantom.len();
+        squares.extend(matches.iter().filter(|m| m.is_good()).filter_map(trial::Match::normalised_square));
+        inside += matches.iter().filter(|m| m.is_inside() == Some(true)).count();
     }
+    // Covariances hold for what is no exact model: 1 in the mean, and 95 % inside, where they are true.
+    let consistency = squares.iter().sum::<f64>() / squares.len() as f64;
+    assert!((0.5..1.5).contains(&consistency), "{consistency}");
+    assert!(inside as f64 >= 0.85 * objects as f64, "{inside} of {objects}");
     assert!(good as f64 >= 0.9 * objects as f64 && phantoms == 0, "{good} of {objects}, {phantoms} false");
 }
 

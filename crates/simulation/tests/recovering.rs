@@ -108,7 +108,8 @@ impl Room {
             let number = numbers.entry(thing.class).or_insert(first);
             let id = format!("{}_{number}", thing.class.to_lowercase());
             *number += 1;
-            let fields = [("id", Value::String(id))].into_iter().chain(described(thing));
+            let seen_so = as_seen(thing, middle.position[2]);
+            let fields = [("id", Value::String(id))].into_iter().chain(described(&seen_so));
             seen.push(Value::Map(fields.map(|(name, value)| (name.to_owned(), value)).collect()));
         }
         Ok(vec![("boxes", Value::List(seen))])
@@ -235,6 +236,17 @@ impl Room {
         self.things[held].pose = pose;
         Vec::new()
     }
+}
+
+/// As the detector takes it: what is round stands on the surface, so with something flat below it, it is higher.
+fn as_seen(thing: &Thing, surface: f64) -> Thing {
+    let mut seen = thing.clone();
+    let below = thing.pose.position[2] - thing.size[2] / 2.0 - surface;
+    if matches!(thing.class, "Bowl" | "Cup" | "Plate") && below > 0.0 {
+        seen.size[2] += below;
+        seen.pose.position[2] -= below / 2.0;
+    }
+    seen
 }
 
 fn described(thing: &Thing) -> [(&'static str, Value); 5] {

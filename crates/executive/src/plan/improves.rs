@@ -4,7 +4,8 @@
 //! plan_approach ─ trajectory ─► in: { trajectory } of move_approach      free: looked at when that motion begins, and not before
 //!       └──────── end ────────► effects of move_approach, plan_transfer  kept: what is computed ahead is made of it
 //! ```
-//! So nothing is ever made again because of an improvement: what somebody may have used stays as it was at first.
+//! So nothing is ever made again because of an improvement: what somebody may have used stays as it was at first. What senses may go on looking in
+//! the same way, until a motion begins that uses what it saw or changes what it looks at.
 
 use super::{NodeNature, Plan, is_action};
 use ratn_model::expression::Expr;
@@ -35,7 +36,7 @@ pub(super) fn of(program: &Program, plan: &Plan) -> BTreeMap<StateId, Box<[Strin
         let StateKind::Action { outputs, .. } = &state.kind else { return None };
         let own = plan.state(state.id);
         let can = state.annotations.anytime
-            && own.nature == NodeNature::Computes
+            && own.nature != NodeNature::Irreversible
             // What it changes, and measures, is said once, at its end.
             && own.may_write.as_ref().is_some_and(Vec::is_empty)
             && is_own_node(program, plan, state);

@@ -4,18 +4,20 @@
 //! goal ── first result ── better ── better ──┬─ a motion begins that uses it        ┐
 //!           │ finished: whoever             ├─ somebody wants what it holds         ├─ harvested: the best counts, what it
 //!           ▼ computes with it goes on      ├─ it is discarded, or made again       │  held is given back
+//!                                           ├─ a motion begins that it would see     │
 //!                                           └─ its provider has no better one       ┘
 //! ```
 //! What anybody may have used before a motion begins stays as it was at first ([`crate::plan`], `improves`): nothing is made again because
 //! of an improvement, and what becomes of the world does not depend on when it is harvested.
 
 use super::Window;
-use super::graph::instance::{Ended, Status};
+use super::graph::instance::{Ended, Instance, Status};
 use super::improving::Improvement;
 use super::waits::Timer;
 use crate::binding::{self, Outputs};
 use crate::context::Context;
 use crate::protocol::Command;
+use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{SUCCESS, StateKind};
 
@@ -39,8 +41,9 @@ impl Window {
         }
         let Some(producer) = instance.producer.clone() else { return };
         let state = instance.state;
+        let senses = if instance.is_sensing() { self.senses(context, instance) } else { Footprint::NOTHING };
         let held = self.graph.take_held(id);
-        self.improving.begin(id, Improvement { state, attempt, held, producer, best: None });
+        self.improving.begin(id, Improvement { state, attempt, held, senses, producer, best: None });
         self.finish(context, id, Ended::with(SUCCESS, outputs));
         if self.graph.get(id).is_some_and(|instance| instance.outputs().is_none()) {
             // What it assigns could not be worked out.
@@ -98,18 +101,31 @@ impl Window {
         Some(improvement)
     }
 
-    /// A motion begins: what it uses is final. Whether any of it was not.
+    /// A motion begins: what it uses is final, and so is what was seen of what it changes: from now on it would be in the picture. Whether any of
+    /// it was not.
     pub(super) fn harvest_for(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
-        let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return false };
         if self.improving.is_empty() {
             return false;
         }
+        let Some(instance) = self.graph.get(id).filter(|instance| instance.is_pia()) else { return false };
         let flows = context.plan.state(instance.state).flows.iter();
         let used: Vec<InstanceId> =
             flows.filter_map(|state| instance.environment.producer(*state)).map(|producer| producer.instance).collect();
+        let would_see = self.would_see(context, instance);
         let before = context.commands.len();
-        used.into_iter().for_each(|producer| self.harvest(context, producer));
+        used.into_iter().chain(would_see).for_each(|producer| self.harvest(context, producer));
         context.commands.len() > before
+    }
+
+    /// Who goes on looking at what an instance may change.
+    fn would_see(&self, context: &Context<'_>, instance: &Instance) -> Vec<InstanceId> {
+        let looking = self.improving.iter().filter(|(_, improvement)| !improvement.senses.is_nothing());
+        let mut looking = looking.peekable();
+        if looking.peek().is_none() {
+            return Vec::new();
+        }
+        let writes = self.writes(context, instance);
+        looking.filter(|(_, improvement)| improvement.senses.overlaps(&writes)).map(|(id, _)| id).collect()
     }
 
     /// The run is over.

@@ -5,6 +5,7 @@ use super::graph::instance::Held;
 use super::growth::environment::{Collector, Producer, Restored};
 use crate::binding::Outputs;
 use crate::checkpoint::Broken;
+use ratn_model::fact::Footprint;
 use ratn_model::id::{InstanceId, StateId};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -20,6 +21,8 @@ pub(crate) struct Improvement {
     pub(crate) state: StateId,
     pub(crate) attempt: u32,
     pub(crate) held: Held,
+    /// What it goes on looking at, if it senses.
+    pub(crate) senses: Footprint,
     /// Where its outputs stand.
     #[serde(skip)]
     pub(crate) producer: Arc<Producer>,

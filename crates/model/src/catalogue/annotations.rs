@@ -33,7 +33,7 @@ pub struct Annotations {
     /// How long it usually takes, in seconds.
     #[serde(skip_serializing_if = "Option::is_none", deserialize_with = "number_or_text")]
     pub duration: Option<String>,
-    /// It gives a result that can be used, and better ones later, until it is stopped: any of them will do. Only what computes can be so.
+    /// It gives a result that can be used, and better ones later, until it is stopped: any of them will do. Only what computes or senses can be so.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub anytime: bool,
 }
@@ -89,9 +89,9 @@ impl Annotations {
         if self.computes && self.effects.as_ref().is_some_and(|effects| !effects.is_empty()) {
             return wrong("computes", "true", "what only computes has no effects", "leave one of them out");
         }
-        if self.anytime && !self.computes {
-            let message = "only an action that computes can give a better result later: one that moves or looks is real when it ends";
-            return wrong("anytime", "true", message, "say `computes` too, or leave `anytime` out");
+        if self.anytime && !self.computes && self.senses.is_empty() {
+            let message = "only an action that computes or senses can give a better result later: one that moves is real when it ends";
+            return wrong("anytime", "true", message, "say `computes` or `senses` too, or leave `anytime` out");
         }
         for (key, texts) in self.lists() {
             for text in texts {

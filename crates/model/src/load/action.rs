@@ -219,9 +219,9 @@ impl<'b> Sources<'b> {
         fields.out.findings.warning("annotation-not-in-force", *at, &path, message, format!("say `{key}` here"));
     }
 
-    /// Whether its action gives better results later: only where it counts as one that computes.
+    /// Whether its action gives better results later: only where it counts as one that computes or senses.
     pub(crate) fn is_anytime(&mut self, nature: &Nature) -> bool {
-        let is = *nature == Nature::Computes && self.action.as_ref().is_some_and(|(said, ..)| said.anytime);
+        let is = *nature != Nature::Irreversible && self.action.as_ref().is_some_and(|(said, ..)| said.anytime);
         if is {
             self.origin.insert("anytime".to_owned(), Origin::Action);
         }

@@ -63,7 +63,7 @@ class Worker:
         ``effects`` (``[]``: none; left out: unknown, so any), what it ``senses`` and ``requires``, which kinds of resources it ``blocks`` beside its own, and
         how many seconds it usually ``takes``. One that
         ``suspends`` stands still while its goal is suspended, because the resource manager is not heard (``goal.while_held()`` between its steps);
-        the others end then. An ``anytime`` action computes, and gives results before it returns (``goal.improved``) where its goal may
+        the others end then. An ``anytime`` action computes or senses, and gives results before it returns (``goal.improved``) where its goal may
         (``goal.improves``): any of them will do.
         """
 

@@ -23,6 +23,9 @@
 //! outcome = "empty"
 //! outputs = { x = ["cup"] }
 //! duration = 2.0
+//! [[better.look]]                         # where it may give better results after its first: another, so many seconds later
+//! after = 1.0
+//! outputs = { x = 2 }
 //! [crashes]
 //! plan = 2                                # so many attempts
 //! [[events]]
@@ -54,7 +57,9 @@ use ratn_model::pose::Pose;
 use ratn_model::program::Program;
 use ratn_model::resource::Quantity;
 use ratn_model::value::Value;
-use ratn_simulation::run::{Answer, Circumstances, Oracle, Performance, Run, RunError, Setup, Trigger, run_under};
+use ratn_simulation::run::{
+    Answer, Better, Circumstances, Oracle, Performance, Run, RunError, Setup, Trigger, run_under,
+};
 use ratn_world::world::World;
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -74,6 +79,7 @@ pub(crate) struct Script {
     outputs: BTreeMap<String, BTreeMap<String, toml::Value>>,
     measured: BTreeMap<String, BTreeMap<String, toml::Value>>,
     answers: BTreeMap<String, Vec<Reply>>,
+    better: BTreeMap<String, Vec<Later>>,
     crashes: BTreeMap<String, u32>,
     choices: BTreeMap<String, Choice>,
     events: Vec<Outside>,
@@ -103,6 +109,13 @@ struct Reply {
     outcome: Option<String>,
     outputs: BTreeMap<String, toml::Value>,
     duration: Option<f64>,
+}
+
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Later {
+    after: f64,
+    outputs: BTreeMap<String, toml::Value>,
 }
 
 #[derive(Debug, Clone, Deserialize)]
@@ -239,6 +252,15 @@ impl Oracle for Script {
         let measured = self.measured.get(path).into_iter().flatten();
         let measured: Vec<(FactKey, Value)> = measured.map(|(key, v)| (fact(key), value(v))).collect();
         Performance { duration_s, answer: Answer::Finished { outcome, outputs, measured } }
+    }
+
+    fn better(&mut self, path: &str, _: u32, _: &Goal, first: &BTreeMap<String, Value>) -> Option<Better> {
+        let later = self.better.get(path)?;
+        let better = |(number, Later { after, outputs }): (usize, &Later)| {
+            let own = outputs.iter().map(|(port, v)| (port.clone(), value(v)));
+            (*after, first.clone().into_iter().chain(own).collect(), (later.len() - number) as f64)
+        };
+        Some(Better { results: later.iter().enumerate().map(better).collect(), end: None })
     }
 
     fn awaited(&mut self, path: &str, instance: InstanceId) -> Option<(f64, Event)> {

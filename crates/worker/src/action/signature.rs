@@ -171,7 +171,7 @@ impl Signature {
     }
 
     /// The action gives a result that can be used, and better ones later, where its goal may ([`super::GoalContext::improved`]). Any of them
-    /// will do: what uses one comes to the same with a better one. Only for what computes.
+    /// will do: what uses one comes to the same with a better one. Only for what computes or senses.
     #[must_use]
     pub fn anytime(mut self) -> Signature {
         self.said.annotations.anytime = true;
