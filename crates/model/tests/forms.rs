@@ -153,7 +153,7 @@ states:
     );
     let program = program(&source);
     let printed = |path: &str| {
-        let StateKind::While { predicate, body_first, index, body } = &state(&program, path).kind else {
+        let StateKind::While { predicate, body_first, index, body, .. } = &state(&program, path).kind else {
             panic!("a loop")
         };
         format!("{predicate} {body_first} {index:?} {}", program.state(body[0]).path)

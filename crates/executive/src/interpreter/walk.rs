@@ -125,6 +125,7 @@ impl Interpreter {
         if let Some(thread) = self.threads.get_mut(&thread) {
             thread.variables.extend(bound);
         }
+        let inside = base + state.variables.len();
         let wrong = |what: &str, error: &dyn std::fmt::Display| format!("{path}: {what}: {error}");
         match &state.kind {
             StateKind::Action { .. } => {}
@@ -134,7 +135,7 @@ impl Interpreter {
                 match list {
                     Ok(Value::List(elements)) => {
                         self.decided(context, &path, elements.len().to_string());
-                        self.push_frame(thread, id, 0, path, base, Some((usize::MAX, Some(elements))));
+                        self.push_frame(thread, id, 0, path, inside, Some((usize::MAX, Some(elements))));
                         self.set(thread, Todo::Iterate);
                     }
                     Ok(other) => {
@@ -146,14 +147,14 @@ impl Interpreter {
             }
             StateKind::While { body_first, .. } => {
                 let before = if *body_first { 0 } else { usize::MAX };
-                self.push_frame(thread, id, 0, path, base, Some((before, None)));
+                self.push_frame(thread, id, 0, path, inside, Some((before, None)));
                 if *body_first {
                     self.begin_iteration(program, thread);
                 } else {
                     self.set(thread, Todo::Iterate);
                 }
             }
-            StateKind::Condition { predicate, then, otherwise } => {
+            StateKind::Condition { predicate, then, otherwise, .. } => {
                 match self.with_scope(context, thread, None, |scope| predicate.holds(scope)) {
                     Ok(taken) => {
                         self.decided(context, &path, if taken { "then" } else { "else" }.to_owned());
@@ -266,7 +267,7 @@ impl Interpreter {
                         if let Some(thread) = self.threads.get_mut(&id)
                             && let Some(frame) = thread.frames.pop()
                         {
-                            thread.variables.truncate(frame.variables);
+                            thread.variables.truncate(super::exit::outside(program.state(owner), frame.variables));
                         }
                         self.ended(id, owner, ABORTED, format!("{path}: its predicate: {error}"));
                     }

@@ -7,7 +7,7 @@ use crate::id::StateId;
 use crate::program::{ABORTED, Program, SUCCESS, State, StateKind, Target, is_failure};
 use petgraph::graph::{DiGraph, NodeIndex};
 use petgraph::visit::EdgeRef;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// A point of the control flow.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -134,6 +134,34 @@ impl ControlFlow {
             Some(surely) => (surely.contains(state), self.maybe[place.index()].contains(state)),
             None => (true, true),
         }
+    }
+
+    /// Whether one of these states has written its outputs, whichever way the control flow came to a point. Where it comes to a state around one
+    /// of them, that one is forgotten, and then none is sure.
+    pub(crate) fn one_is_written(&self, program: &Program, point: Point, states: &BTreeSet<StateId>) -> bool {
+        let (Some(begin), Some(goal)) = (self.places.get(&Point::Begin(Program::ROOT)), self.places.get(&point)) else {
+            return true;
+        };
+        let parent = |id: &StateId| program.state(*id).parent;
+        let around: BTreeSet<StateId> =
+            states.iter().flat_map(|id| std::iter::successors(parent(id), parent)).collect();
+        // Per place: whether it was come to with none of them, and with one.
+        let mut seen = vec![[false; 2]; self.graph.node_count()];
+        let mut open = vec![(*begin, false)];
+        while let Some((place, mut is_written)) = open.pop() {
+            if std::mem::replace(&mut seen[place.index()][usize::from(is_written)], true) {
+                continue;
+            }
+            match self.graph[place] {
+                Point::Begin(id) => is_written &= !around.contains(&id),
+                Point::End(id, number) => {
+                    is_written |= states.contains(&id) && !is_failure(&self.outcomes[id.0 as usize][number]);
+                }
+                Point::Middle(_) => {}
+            }
+            open.extend(self.graph.neighbors(place).map(|next| (next, is_written)));
+        }
+        !seen[goal.index()][0]
     }
 
     /// The outcomes of a state.

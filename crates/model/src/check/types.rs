@@ -139,8 +139,8 @@ fn wanted(subject: &Subject<'_>, state: &State, slot: Slot<'_>) -> Option<Type> 
             let signature = subject.catalogue.action(provider, action)?;
             signature.inputs.get(port).or_else(|| signature.optional.get(port)).cloned()
         }
-        (Slot::Output(name), StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. }) => {
-            let own = if state.id == Program::ROOT { &subject.program.outputs } else { outputs };
+        (Slot::Output(name), _) => {
+            let own = if state.id == Program::ROOT { &subject.program.outputs } else { state.outputs() };
             own.iter().find(|output| output.name == name).map(|output| output.ty.clone())
         }
         (Slot::Requires(_) | Slot::Holds(_) | Slot::Decide(_) | Slot::Condition | Slot::While, _) => Some(Type::Bool),
@@ -347,11 +347,10 @@ impl Types<'_> {
     fn port(&self, state: &State, port: &str) -> Type {
         match &state.kind {
             StateKind::Action { outputs, .. } => outputs.get(port).cloned().unwrap_or(Type::Any),
-            StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } => {
-                let output = outputs.iter().find(|output| output.name == port);
+            _ => {
+                let output = state.outputs().iter().find(|output| output.name == port);
                 output.map_or(Type::Any, |output| self.output(state, output))
             }
-            _ => Type::Any,
         }
     }
 
@@ -430,6 +429,14 @@ fn call(function: Function, arguments: &[Expr], types: &[Type]) -> Result<Type, 
                 (_, true) => types[1].clone(),
                 _ => common(types[1..].iter().cloned()),
             }
+        }
+        Function::Either => {
+            let fit = |(a, b): &(&Type, &Type)| a.accepts_type(b) || b.accepts_type(a);
+            let pairs = types.iter().enumerate().flat_map(|(n, a)| types[n + 1..].iter().map(move |b| (a, b)));
+            if let Some((a, b)) = pairs.into_iter().find(|pair| !fit(pair)) {
+                return Err(format!("one way gives {a}, another {b}"));
+            }
+            common(types.iter().cloned())
         }
         Function::Pose => {
             all(Type::Float)?;
