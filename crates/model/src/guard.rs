@@ -263,7 +263,7 @@ impl Unfolding<'_> {
         Ok(new)
     }
 
-    /// The body of a loop, within a state that says at its end what this iteration gives, where the loop collects that.
+    /// The body of a loop; within a state that says at its end what this iteration gives, where the loop collects that ([`Program::is_pass`]).
     fn passes(
         &mut self,
         id: StateId,

@@ -399,6 +399,14 @@ impl Program {
         &self.states[id.0 as usize]
     }
 
+    /// Whether a state is what the body of a loop stands in that collects something of each iteration ([`crate::guard::Collected`]). What is inside
+    /// of it is inside of the loop, as in any other loop: it is seen from there, and forgotten when the loop is entered.
+    pub fn is_pass(&self, id: StateId) -> bool {
+        let state = self.state(id);
+        let collects = |around: &State| around.is_loop() && !around.variables.is_empty();
+        matches!(state.kind, StateKind::Sequence { .. }) && state.parent.is_some_and(|id| collects(self.state(id)))
+    }
+
     /// Where an outcome of a state leads. An outcome that is not connected: `success` goes on with the next sibling, and after the
     /// last one out by `success`; any other leaves by its own name. A region leads nowhere else.
     pub fn target(&self, id: StateId, outcome: &str) -> Target {

@@ -754,6 +754,14 @@ fn switches_and_fallbacks_that_cannot_be_are_refused() {
             "concurrency: barrier, regions: { for: 'x in [a]', do: [{ for: 'x in [1]', do: [] }] }",
             "another variable inside is called `x`",
         ),
+        (
+            "concurrency: barrier, regions: { for: 'x in [a]', do: [{ b: { states: [], effects: ['p(len(map($x in [1], $x)))'] } }] }",
+            "another variable inside is called `x`",
+        ),
+        (
+            "concurrency: barrier, regions: { for: 'x in [a]', outputs: { y: 'any( $x  in [1], $x = 1)' }, do: [] }",
+            "another variable inside is called `x`",
+        ),
         ("selector: []", "there is no form `selector`"),
     ] {
         let found = findings(&format!("task: t\nstates:\n  - a: {{ {keys} }}\n"));

@@ -110,7 +110,9 @@ impl Interpreter {
     pub(super) fn enter_composite(&mut self, context: &mut Context<'_>, thread: u64, id: StateId, path: String) {
         let program = context.program;
         let state = program.state(id);
-        self.forget_inside(program, id);
+        if !program.is_pass(id) {
+            self.forget_inside(program, id);
+        }
         let base = self.threads.get(&thread).map_or(0, |thread| thread.variables.len());
         let mut bound = Vec::new();
         for (name, value) in &state.variables {

@@ -121,7 +121,9 @@ enum Relation<'a> {
 
 fn relation<'a>(subject: &Subject<'a>, to: &State, slot: Slot<'_>, from: &'a State) -> Relation<'a> {
     let up: Vec<&'a State> = subject.around(to.id).collect();
-    let down: Vec<&'a State> = subject.around(from.id).collect();
+    // What is inside of a pass is inside of its loop.
+    let is_between = |state: &&State| subject.program.is_pass(state.id) && !up.iter().any(|other| other.id == state.id);
+    let down: Vec<&'a State> = subject.around(from.id).filter(|state| !is_between(state)).collect();
     if from.id == to.id {
         return Relation::Itself;
     }

@@ -143,8 +143,8 @@ impl ControlFlow {
             return true;
         };
         let parent = |id: &StateId| program.state(*id).parent;
-        let around: BTreeSet<StateId> =
-            states.iter().flat_map(|id| std::iter::successors(parent(id), parent)).collect();
+        let around = states.iter().flat_map(|id| std::iter::successors(parent(id), parent));
+        let around: BTreeSet<StateId> = around.filter(|id| !program.is_pass(*id)).collect();
         // Per place: whether it was come to with none of them, and with one.
         let mut seen = vec![[false; 2]; self.graph.node_count()];
         let mut open = vec![(*begin, false)];
@@ -284,7 +284,7 @@ impl ControlFlow {
             let Some(mut surely) = self.surely[place.index()].clone() else { continue };
             let mut maybe = self.maybe[place.index()].clone();
             match self.graph[place] {
-                Point::Begin(id) => {
+                Point::Begin(id) if !program.is_pass(id) => {
                     for forgotten in &inside[id.0 as usize] {
                         surely.remove(*forgotten);
                         maybe.remove(*forgotten);
@@ -296,7 +296,7 @@ impl ControlFlow {
                         maybe.insert(id);
                     }
                 }
-                Point::Middle(_) => {}
+                Point::Begin(_) | Point::Middle(_) => {}
             }
             let next: Vec<NodeIndex> = self.graph.edges(place).map(|edge| edge.target()).collect();
             for to in next {

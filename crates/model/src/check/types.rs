@@ -24,7 +24,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
                 continue;
             }
             let at = subject.place_of(state, slot);
-            match types.of(expr) {
+            match types.collected(state, expr).map_or_else(|| types.of(expr), Ok) {
                 Err(Wrong { rule, message, help }) => findings.error(rule, at, &state.path, message, help),
                 Ok(found) => {
                     if let Some(wanted) = wanted(subject, state, slot)
@@ -354,10 +354,25 @@ impl Types<'_> {
         }
     }
 
+    /// The type of the list that a loop collects, if that is what an expression of it is.
+    fn collected(&self, state: &State, value: &Expr) -> Option<Type> {
+        let Expr::Variable(list) = value else { return None };
+        let pass = state.children().find(|child| self.subject.program.is_pass(*child))?;
+        let pass = self.subject.program.state(pass);
+        let (_, longer) = pass.assign.iter().find(|(name, _)| name == list)?;
+        let Expr::Binary(BinaryOperator::Add, _, added) = longer else { return None };
+        let (subject, indirection) = (self.subject, self.indirection + 1);
+        let variables = variables(subject, pass);
+        Types { subject, state: pass, variables, elements: Variables::new(), indirection }.of(added).ok()
+    }
+
     /// The declared type of a hierarchy's output, else that of its expression.
     fn output(&self, state: &State, output: &TaskOutput) -> Type {
         if output.ty != Type::Any || self.indirection >= MAX_INDIRECTION {
             return output.ty.clone();
+        }
+        if let Some(list) = self.collected(state, &output.value) {
+            return list;
         }
         let (subject, variables, indirection) = (self.subject, self.variables.clone(), self.indirection + 1);
         Types { subject, state, variables, elements: Variables::new(), indirection }

@@ -71,7 +71,9 @@ impl Reference<'_> {
         if begins_routine && fails(self.asks(state, variables))?.is_err() {
             return Ok(ABORTED.to_owned());
         }
-        self.forget(id);
+        if !program.is_pass(id) {
+            self.forget(id);
+        }
         let outside = variables.len();
         for (name, value) in &state.variables {
             // None sees another.
