@@ -260,6 +260,12 @@ impl Unfolding<'_> {
             }
         };
         self.at(new).kind = kind;
+        let (path, guards) = (self.at(new).path.clone(), self.guards);
+        for Collected { name, .. } in guards.get(&id).into_iter().flat_map(|guard| &guard.collected) {
+            let list = Expr::Variable(format!("{name} of {path}"));
+            let outputs = self.at(new).kind.outputs_mut().into_iter().flatten();
+            outputs.filter(|output| output.name == *name).for_each(|output| output.value = list.clone());
+        }
         Ok(new)
     }
 
@@ -280,11 +286,9 @@ impl Unfolding<'_> {
         for Collected { name, value } in collected {
             let variable = format!("{name} of {path}");
             let list = Box::new(Expr::Variable(variable.clone()));
-            let longer = Expr::Binary(BinaryOperator::Add, list.clone(), Box::new(Expr::List(vec![value.clone()])));
+            let longer = Expr::Binary(BinaryOperator::Add, list, Box::new(Expr::List(vec![value.clone()])));
             self.at(pass).assign.push((variable.clone(), longer));
             self.at(new).variables.push((variable, Expr::Literal(Value::List(Vec::new()))));
-            let outputs = self.at(new).kind.outputs_mut().into_iter().flatten();
-            outputs.filter(|output| output.name == *name).for_each(|output| output.value = (*list).clone());
         }
         Ok(vec![pass])
     }

@@ -45,7 +45,9 @@ fn outputs(program: &Program, path: &str) -> Vec<String> {
 
 /// An action with a float `pan` as output.
 fn look(name: &str) -> String {
-    format!("{name}: {{ action: pan_tilt/look_at, in: {{ target: \"pose(1, 0, 1)\" }}, resources: [{{ block: PanTilt }}] }}")
+    format!(
+        "{name}: {{ action: pan_tilt/look_at, in: {{ target: \"pose(1, 0, 1)\" }}, resources: [{{ block: PanTilt }}] }}"
+    )
 }
 
 fn condition(then: &str, otherwise: &str, outputs: &str) -> String {
@@ -105,7 +107,10 @@ fn a_way_that_leaves_early_gives_nothing_and_is_a_way_all_the_same() {
     program(&states("either(a.pan, c.pan)"));
     program(&states("either(a.pan, 0)"));
     let found = refused(&states("either(a.pan, a.tilt)"));
-    assert!(found[0].starts_with("branch-may-not-have-written: on some way that leads here none of `a.pan`, `a.tilt`"), "{found:?}");
+    assert!(
+        found[0].starts_with("branch-may-not-have-written: on some way that leads here none of `a.pan`, `a.tilt`"),
+        "{found:?}"
+    );
     assert!(refused(&states("a.pan"))[0].starts_with("branch-may-not-have-written"));
 }
 
@@ -169,6 +174,20 @@ fn a_loop_that_collects_sees_what_any_loop_sees() {
     assert!(found[0].starts_with("unknown-key"), "{found:?}");
 }
 
+/// What only an iteration gives that leaves the loop is given all the same.
+#[test]
+fn a_loop_that_is_left_by_an_outcome_of_its_own_gives_what_that_iteration_gave() {
+    let states = |value: &str| {
+        format!(
+            "  - search:\n      for: n in [1, 2]\n      outcomes: [found]\n      outputs: {{ at: {value} }}\n      do:\n        - {}\n        - is_it:\n            condition: a.pan > 0\n            outcomes: [found]\n            then: [{{ hit: {{ states: [], outputs: {{ at: $n }}, transitions: {{ success: found }} }} }}]\n            transitions: {{ found: found }}\n      transitions: {{ found: success }}\n",
+            look("a")
+        )
+    };
+    let made = program(&states("{ value: hit.at, default: 0 }"));
+    assert_eq!(outputs(&made, "search"), ["at: either(search/is_it/hit.at, 0)"]);
+    assert!(refused(&states("hit.at"))[0].starts_with("branch-may-not-have-written"));
+}
+
 #[test]
 fn only_a_loop_has_a_value_of_each_iteration() {
     let found = refused(&condition(&in_braces(&look("a")), "", "{ pan: { each: a.pan } }"));
@@ -180,7 +199,9 @@ fn a_race_gives_what_the_winner_gives() {
     let race = |kind: &str, outputs: &str| {
         let open = "open: { action: gripper/feel, pia: true, reads: [], effects: [], resources: [{ block: Gripper }] }";
         let turn = look("turn").replace("resources:", "pia: true, reads: [], effects: [], resources:");
-        format!("  - both:\n      concurrency: {kind}\n      outputs: {outputs}\n      regions:\n        - {open}\n        - {turn}\n")
+        format!(
+            "  - both:\n      concurrency: {kind}\n      outputs: {outputs}\n      regions:\n        - {open}\n        - {turn}\n"
+        )
     };
     program(&race("preemptive", "{ got: \"either(turn.pan, open.width_m)\" }"));
     program(&race("preemptive", "{ got: { value: turn.pan, default: 0 } }"));

@@ -246,8 +246,14 @@ fn programs_that_once_failed_because_a_pause_was_refused_leave_the_same_world() 
 
 #[test]
 fn the_reference_has_a_verdict_on_more_than_three_of_four_programs() {
-    let all =
-        [Features::ALL, Features::EVERYTHING, Features::GUARDS, Features::WAYS_OUT, Features::OUTPUTS, Features::IMPRECISE];
+    let all = [
+        Features::ALL,
+        Features::EVERYTHING,
+        Features::GUARDS,
+        Features::WAYS_OUT,
+        Features::OUTPUTS,
+        Features::IMPRECISE,
+    ];
     for features in all {
         let without =
             (0..400).filter_map(|seed| no_verdict(&program(seed, &features), &Conditions::of(seed, &features)));

@@ -21,7 +21,8 @@ const NO_OUTPUTS: &str = ", outputs: []";
 fn without_outputs(text: &str) -> String {
     let mut next = String::new();
     let mut rest = text;
-    let list = |text: &str| ["body: [", "otherwise: ["].iter().filter_map(|key| Some(text.find(key)? + key.len())).min();
+    let list =
+        |text: &str| ["body: [", "otherwise: ["].iter().filter_map(|key| Some(text.find(key)? + key.len())).min();
     while let Some(begin) = list(rest) {
         let end = rest[begin..].find(']').map_or(rest.len(), |end| begin + end + 1);
         next.push_str(&rest[..end]);

@@ -43,7 +43,7 @@ fn refused(
     let program = subject.program;
     let source = program.state(from);
     let flow = format!("`{}.{port}`", source.name);
-    let (_, maybe) = written(subject.control, to, slot, from);
+    let maybe = may_be_written(subject.control, to, slot, from);
     let relation = relation(subject, to, slot, source);
     if !matches!(relation, Relation::Hidden(_) | Relation::Beside) {
         if is_there(subject, to, slot, (from, port)) || (maybe && is_one_of_several) {
@@ -168,10 +168,18 @@ fn relation<'a>(subject: &Subject<'a>, to: &State, slot: Slot<'_>, from: &'a Sta
     if depth > 1 { Relation::Hidden(side) } else { Relation::Before }
 }
 
-/// Whether the source has surely, and whether it may have, written its outputs when the expression of the target is evaluated.
-fn written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: StateId) -> (bool, bool) {
-    let all = points(control, to, slot).into_iter().map(|point| control.written(point, from));
-    all.fold((true, false), |(surely, maybe), (s, m)| (surely && s, maybe || m))
+/// Whether the source has surely written its outputs when the expression of the target is evaluated.
+fn is_written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: StateId) -> bool {
+    points(control, to, slot).into_iter().all(|point| control.written(point, from).0)
+}
+
+/// Whether it may have: what an output is made of also where the state is left by an outcome of its own.
+fn may_be_written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: StateId) -> bool {
+    let mut all = points(control, to, slot);
+    if matches!(slot, Slot::Output(_)) {
+        all.extend(ends(control, to, None));
+    }
+    all.into_iter().any(|point| control.written(point, from).1)
 }
 
 /// Where the expression of the target is evaluated.
@@ -193,6 +201,11 @@ fn points(control: &ControlFlow, to: &State, slot: Slot<'_>) -> Vec<Point> {
         Slot::Output(_) => Some(SUCCESS),
         _ => None,
     };
+    ends(control, to, only)
+}
+
+/// The ends of a state by this outcome, or by any that is no failure.
+fn ends(control: &ControlFlow, to: &State, only: Option<&str>) -> Vec<Point> {
     let outcomes = control.outcomes(to.id).iter().enumerate().filter(|(_, outcome)| match only {
         Some(only) => outcome.as_str() == only,
         None => !is_failure(outcome),
@@ -293,7 +306,7 @@ fn none_refused(
 fn is_there(subject: &Subject<'_>, to: &State, slot: Slot<'_>, (from, port): (StateId, &str)) -> bool {
     let source = subject.program.state(from);
     source.defaults.contains_key(port)
-        || written(subject.control, to, slot, from).0
+        || is_written(subject.control, to, slot, from)
         || (port == "outcome" && is_region_of(to, from) && at_join(to, slot))
         || join(subject, to, slot, &BTreeSet::from([from])) == Some(true)
 }

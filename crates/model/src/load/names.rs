@@ -6,8 +6,8 @@
 use super::functions::Functions;
 use super::outline::{Form, Outline};
 use crate::catalogue::{Catalogue, no_states};
-use crate::expression::{Expr, Function};
 use crate::expression::parse::{NameError, Names};
+use crate::expression::{Expr, Function};
 use crate::id::StateId;
 use crate::ontology::Ontology;
 use crate::program::Program;
