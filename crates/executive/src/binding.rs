@@ -20,6 +20,8 @@ pub(crate) trait Names {
     fn variable(&self, name: &str) -> Option<Cow<'_, Value>>;
     /// `state.port`
     fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>>;
+    /// Whether the way to here has come through a state that writes `state.port`, or it has a default.
+    fn is_given(&self, state: StateId, port: &str) -> bool;
 }
 
 /// The scope of one instance at its place in the program.
@@ -45,6 +47,10 @@ impl Scope for Bindings<'_> {
 
     fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
         self.names.port(state, port)
+    }
+
+    fn is_given(&self, state: StateId, port: &str) -> bool {
+        self.names.is_given(state, port)
     }
 
     fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {

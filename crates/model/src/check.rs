@@ -35,6 +35,7 @@ use crate::id::StateId;
 use crate::load::Places;
 use crate::program::{Location, Program, State, StateKind};
 use crate::slot::Slot;
+use crate::value::Value;
 use graph::ControlFlow;
 use std::collections::BTreeMap;
 
@@ -107,15 +108,17 @@ pub(crate) fn expressions<'a>(program: &'a Program, state: &'a State) -> Vec<(Sl
 
 /// An expression with the names of states instead of their ids.
 pub(crate) fn named(program: &Program, expr: &Expr) -> String {
-    named_in(program, expr.to_string(), expr.flows())
+    let mut named = expr.clone();
+    named.rewrite(&mut |part| name_state(program, part));
+    named.to_string()
 }
 
-/// A text in which states stand as numbers, with their names.
-pub(crate) fn named_in(program: &Program, mut text: String, states: impl IntoIterator<Item = StateId>) -> String {
-    for id in states {
-        text = text.replace(&format!("{id}."), &format!("{}.", program.state(id).name));
+/// An output of a state becomes what is displayed as the output of a state of its name.
+pub(crate) fn name_state(program: &Program, part: &mut Expr) {
+    if let Expr::Port { state, port } = part {
+        let name = Expr::Literal(Value::String(program.state(*state).name.clone()));
+        *part = Expr::Field(Box::new(name), std::mem::take(port));
     }
-    text
 }
 
 /// The children of a state by branch.

@@ -140,6 +140,9 @@ pub enum Function {
     Sum,
     /// `if(condition, a, b)`; only the chosen one is evaluated
     If,
+    /// `either(a, b, …)`: the first whose outputs were written on the way to where it is evaluated, or have defaults; else the last. Only
+    /// that is evaluated.
+    Either,
     /// `pose(x, y, z)` or `pose(x, y, z, roll, pitch, yaw)`: metres, radians
     Pose,
     /// `joints(a, b, …)`: radians

@@ -1,6 +1,5 @@
-//! States that are tried again, states that are watched, and states with something to do on every way out, in terms of the
-//! transitions, scoped variables and
-//! conditions that every program has. Both modes and routines execute them as they execute those.
+//! States that are tried again, states that are watched, states with something to do on every way out, and loops that collect what each
+//! iteration gives, in terms of the transitions, scoped variables and conditions that every program has. Both modes and routines execute them as they execute those.
 //!
 //! ```text
 //! grasp: retry {times: 2, on: [aborted], before: [open]}       finally: [tuck]
@@ -15,6 +14,10 @@
 //! carry ┬ while    ─ violated ► violated        all of them at once: the first that ends stops the others
 //!       ├ timeout  ─ aborted ─► aborted
 //!       └ body     ─────────────► as it ends
+//!
+//! for: outputs {all: {each: look.boxes}}
+//!
+//! loop ── pass     the body; at its end `look.boxes` is added to the list that is the output `all`
 //! ```
 //!
 //! Each try is watched anew; what is done on every way out is not watched.
@@ -46,6 +49,17 @@ pub struct Guard {
     pub limits: Option<Limits>,
     /// What is done on every way out; states whose parent is the guarded one, and that are in none of its lists.
     pub finally: Vec<StateId>,
+    /// Of a loop: the outputs that have a value of each iteration.
+    pub collected: Vec<Collected>,
+}
+
+/// An output of a loop that is a list: a value of each iteration that ended well.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Collected {
+    /// The output. Whatever its value is said to be, it is this list.
+    pub name: String,
+    /// Evaluated at the end of an iteration, in the scope of the body.
+    pub value: Expr,
 }
 
 /// What ends a state before its own end. It becomes one node of the program (a preemptive concurrency is one).
@@ -229,21 +243,54 @@ impl Unfolding<'_> {
         let kind = match kind {
             StateKind::Action { .. } => kind,
             StateKind::Sequence { children, outputs } => StateKind::Sequence { children: listed(&children)?, outputs },
-            StateKind::ForEach { variable, index, collection, body } => {
-                StateKind::ForEach { variable, index, collection, body: listed(&body)? }
+            StateKind::ForEach { variable, index, collection, body, outputs } => {
+                let body = self.passes(id, new, &body, scope)?;
+                StateKind::ForEach { variable, index, collection, body, outputs }
             }
-            StateKind::While { predicate, body_first, index, body } => {
-                StateKind::While { predicate, body_first, index, body: listed(&body)? }
+            StateKind::While { predicate, body_first, index, body, outputs } => {
+                let body = self.passes(id, new, &body, scope)?;
+                StateKind::While { predicate, body_first, index, body, outputs }
             }
             StateKind::Concurrency { regions, preemptive, successes, decide, outputs } => {
                 StateKind::Concurrency { regions: listed(&regions)?, preemptive, successes, decide, outputs }
             }
-            StateKind::Condition { predicate, then, otherwise } => {
-                StateKind::Condition { predicate, then: listed(&then)?, otherwise: listed(&otherwise)? }
+            StateKind::Condition { predicate, then, otherwise, outputs } => {
+                let (then, otherwise) = (listed(&then)?, listed(&otherwise)?);
+                StateKind::Condition { predicate, then, otherwise, outputs }
             }
         };
         self.at(new).kind = kind;
+        let (path, guards) = (self.at(new).path.clone(), self.guards);
+        for Collected { name, .. } in guards.get(&id).into_iter().flat_map(|guard| &guard.collected) {
+            let list = Expr::Variable(format!("{name} of {path}"));
+            let outputs = self.at(new).kind.outputs_mut().into_iter().flatten();
+            outputs.filter(|output| output.name == *name).for_each(|output| output.value = list.clone());
+        }
         Ok(new)
+    }
+
+    /// The body of a loop; within a state that says at its end what this iteration gives, where the loop collects that ([`Program::is_pass`]).
+    fn passes(
+        &mut self,
+        id: StateId,
+        new: StateId,
+        body: &[StateId],
+        scope: usize,
+    ) -> Result<Vec<StateId>, TooManyStates> {
+        let collected = self.guards.get(&id).map_or(&[][..], |guard| &guard.collected);
+        if collected.is_empty() {
+            return body.iter().map(|child| self.guarded(*child, Some(new), None, scope)).collect();
+        }
+        let pass = self.sequence(id, new, "pass", body, scope)?;
+        let path = self.at(new).path.clone();
+        for Collected { name, value } in collected {
+            let variable = format!("{name} of {path}");
+            let list = Box::new(Expr::Variable(variable.clone()));
+            let longer = Expr::Binary(BinaryOperator::Add, list, Box::new(Expr::List(vec![value.clone()])));
+            self.at(pass).assign.push((variable.clone(), longer));
+            self.at(new).variables.push((variable, Expr::Literal(Value::List(Vec::new()))));
+        }
+        Ok(vec![pass])
     }
 
     /// It is tried again.
@@ -272,7 +319,8 @@ impl Unfolding<'_> {
         for outcome in &retried.on {
             let name = if retried.on.len() == 1 { "again".to_owned() } else { format!("again_{outcome}") };
             let predicate = of(BinaryOperator::Less, variable(&tries), number(i64::from(retried.count)));
-            let kind = StateKind::Condition { predicate, then: Vec::new(), otherwise: Vec::new() };
+            let (then, otherwise, outputs) = Default::default();
+            let kind = StateKind::Condition { predicate, then, otherwise, outputs };
             let state = self.made(id, around, &name, kind, scope)?;
             let enough = self.step(id, state, "enough", outcome, scope)?;
             if let StateKind::Condition { otherwise, .. } = &mut self.at(state).kind {
@@ -486,10 +534,10 @@ impl Unfolding<'_> {
             };
             let own: Vec<TaskOutput> = match &states[body.0 as usize].kind {
                 StateKind::Action { outputs, .. } => outputs.iter().map(|(name, ty)| port(name, ty)).collect(),
-                StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } => {
+                _ => {
+                    let outputs = states[body.0 as usize].outputs();
                     outputs.iter().map(|output| port(&output.name, &output.ty)).collect()
                 }
-                StateKind::ForEach { .. } | StateKind::While { .. } | StateKind::Condition { .. } => Vec::new(),
             };
             if let StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } =
                 &mut states[around.0 as usize].kind

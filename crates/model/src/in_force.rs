@@ -1,13 +1,11 @@
 //! What is in force for each state that performs an action, and who says so: the state, its action in the catalogue, or nobody. For people who
 //! wonder why a state waits.
 
-use crate::check::{named, named_in};
+use crate::check::{name_state, named};
 use crate::expression::{EffectExpr, Expr, FactExpr};
-use crate::id::StateId;
 use crate::program::{Annotations, Nature, Origin, Program, ResourceExpr, SUCCESS, StateKind};
 use crate::resource::Quantity;
 use serde::Serialize;
-use std::collections::BTreeSet;
 use std::fmt::Display;
 
 /// One state.
@@ -48,18 +46,9 @@ pub fn in_force(program: &Program) -> Vec<InForce> {
 
 fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
     let line = |key: &'static str, text: String| Line { key, text, from: said.origin.get(key).copied() };
-    let facts = |facts: &[FactExpr]| {
-        let flows = |fact: &FactExpr| fact.arguments.iter().flatten().flat_map(Expr::flows).collect();
-        listed(program, facts, flows)
-    };
-    let changed = |effects: &[EffectExpr]| {
-        let flows = |effect: &EffectExpr| {
-            let mut states = BTreeSet::new();
-            effect.each_expression(&mut |part| states.extend(part.flows()));
-            states
-        };
-        listed(program, effects, flows)
-    };
+    let name = |expr: &mut Expr| expr.rewrite(&mut |part| name_state(program, part));
+    let facts = |facts: &[FactExpr]| listed(facts, |fact| fact.arguments.iter_mut().flatten().for_each(name));
+    let changed = |effects: &[EffectExpr]| listed(effects, |effect| effect.each_expression_mut(&mut |part| name(part)));
     let unknown = || "unknown".to_owned();
     let everything = || "everything".to_owned();
     // Of other outcomes, those that change something.
@@ -73,7 +62,7 @@ fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
             Nature::Irreversible => line("pia", "true".to_owned()),
         },
         line("reads", said.reads.as_ref().map_or_else(everything, |read| facts(read))),
-        line("requires", listed(program, &said.requires, Expr::flows)),
+        line("requires", listed(&said.requires, name)),
         line("effects", effects.join("; ")),
         line(
             "resources",
@@ -85,7 +74,7 @@ fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
         all.push(line("anytime", "true".to_owned()));
     }
     if !said.holds.is_empty() {
-        all.push(line("while", listed(program, &said.holds, Expr::flows)));
+        all.push(line("while", listed(&said.holds, name)));
     }
     all
 }
@@ -103,11 +92,13 @@ fn resources(program: &Program, lines: &[ResourceExpr]) -> String {
 }
 
 /// With the names of states in the place of their numbers.
-fn listed<T: Display>(program: &Program, items: &[T], flows: impl Fn(&T) -> BTreeSet<StateId>) -> String {
+fn listed<T: Display + Clone>(items: &[T], name: impl Fn(&mut T)) -> String {
     if items.is_empty() {
         return "nothing".to_owned();
     }
-    let texts: Vec<String> = items.iter().map(|item| named_in(program, item.to_string(), flows(item))).collect();
+    let mut items = items.to_vec();
+    items.iter_mut().for_each(name);
+    let texts: Vec<String> = items.iter().map(ToString::to_string).collect();
     texts.join("; ")
 }
 
@@ -116,6 +107,29 @@ mod tests {
     use super::*;
     use crate::catalogue::Catalogue;
     use crate::load::load;
+
+    /// `s1.` is how an output of the first state is displayed by itself.
+    #[test]
+    fn a_text_that_looks_like_a_state_stays_what_it_is() {
+        let task = r#"
+task: t
+states:
+  - plan: { action: path_planner/plan, in: { start: "joints(0, 0, 0, 0, 0, 0, 0)", goal: "joints(1, 0, 0, 0, 0, 0, 0)" } }
+  - follow:
+      action: arm/follow
+      in: { trajectory: plan.trajectory }
+      requires: ["concat('pos1.', s1) != 'bus1.2' or plan.length_m > 1"]
+      effects: ["at(box, 'pos1.') = plan.end_pose"]
+"#;
+        let program = load(task, "t.yaml", &Catalogue::standard()).map(|loaded| loaded.program);
+        let told = in_force(&program.unwrap_or_else(|found| panic!("{found:?}")));
+        let of = |key: &str| told[1].lines.iter().find(|line| line.key == key).map(|line| line.text.clone());
+        assert_eq!(of("requires").as_deref(), Some("concat(\"pos1.\", s1) != \"bus1.2\" or plan.length_m > 1"));
+        assert!(
+            of("effects").is_some_and(|effects| effects.contains("at(box, \"pos1.\") = plan.end_pose")),
+            "{told:?}"
+        );
+    }
 
     #[test]
     fn what_is_in_force_is_told_with_who_says_so() {

@@ -29,6 +29,7 @@ mod graft;
 mod library;
 mod names;
 mod outline;
+mod outputs;
 mod resources;
 mod state;
 mod tolerance;
@@ -477,14 +478,17 @@ fn ports(
                 Ports { types: types.collect(), open: false }
             }
         },
-        Form::Sequence { .. } | Form::Concurrency { .. } => {
+        Form::Sequence { .. }
+        | Form::Concurrency { .. }
+        | Form::ForEach { .. }
+        | Form::While { .. }
+        | Form::Condition { .. } => {
             let declared = step.body.get("outputs").map(Node::entries).unwrap_or_default();
             let typed = |entry: &yaml::Entry| entry.value.get("type").and_then(|node| type_of(node).ok());
             let types = declared.iter().map(|entry| (entry.key.clone(), typed(entry).unwrap_or(Type::Any)));
             Ports { types: types.collect(), open: false }
         }
         Form::Wait { node, asks } => Ports { types: wait::ports(node, *asks), open: false },
-        Form::ForEach { .. } | Form::While { .. } | Form::Condition { .. } => Ports::default(),
     };
     outline.steps.iter().enumerate().map(of_step).collect()
 }

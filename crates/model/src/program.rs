@@ -100,7 +100,7 @@ pub struct State {
     pub outcomes: Vec<String>,
     /// Where its outcomes lead; see [`Program::target`] for those that are not listed.
     pub transitions: BTreeMap<String, Target>,
-    /// Scoped variables of a sequence (a library's parameters are its scoped variables): bound at entry, each in the scope of
+    /// Scoped variables of a sequence or a loop (a library's parameters are its scoped variables): bound at entry, each in the scope of
     /// the state itself, seen and assigned by what it contains.
     pub variables: Vec<(String, Expr)>,
     /// Scoped variables that it gives new values when it ends with an outcome that is neither `aborted` nor `preempted`,
@@ -157,6 +157,9 @@ pub enum StateKind {
         collection: Expr,
         /// The body, in program order.
         body: Vec<StateId>,
+        /// Output ports, evaluated in the scope of the body when the last iteration has ended.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        outputs: Vec<TaskOutput>,
     },
     /// The body as long as a predicate holds.
     While {
@@ -168,6 +171,9 @@ pub enum StateKind {
         index: Option<String>,
         /// The body, in program order.
         body: Vec<StateId>,
+        /// Output ports, evaluated in the scope of the body when the last iteration has ended.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        outputs: Vec<TaskOutput>,
     },
     /// All regions at once. Each is a state with a path, a horizon and projections of its own; its outcome is seen as the port
     /// `outcome` of the region.
@@ -193,6 +199,9 @@ pub enum StateKind {
         then: Vec<StateId>,
         /// When false; may be empty.
         otherwise: Vec<StateId>,
+        /// Output ports, evaluated in the scope of both branches when the one that was taken has ended.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        outputs: Vec<TaskOutput>,
     },
 }
 
@@ -390,6 +399,14 @@ impl Program {
         &self.states[id.0 as usize]
     }
 
+    /// Whether a state is what the body of a loop stands in that collects something of each iteration ([`crate::guard::Collected`]). What is inside
+    /// of it is inside of the loop, as in any other loop: it is seen from there, and forgotten when the loop is entered.
+    pub fn is_pass(&self, id: StateId) -> bool {
+        let state = self.state(id);
+        let collects = |around: &State| around.is_loop() && !around.variables.is_empty();
+        matches!(state.kind, StateKind::Sequence { .. }) && state.parent.is_some_and(|id| collects(self.state(id)))
+    }
+
     /// Where an outcome of a state leads. An outcome that is not connected: `success` goes on with the next sibling, and after the
     /// last one out by `success`; any other leaves by its own name. A region leads nowhere else.
     pub fn target(&self, id: StateId, outcome: &str) -> Target {
@@ -458,6 +475,32 @@ impl Program {
     }
 }
 
+impl StateKind {
+    /// What it puts out of what it contains; none of an action.
+    pub fn outputs(&self) -> &[TaskOutput] {
+        match self {
+            StateKind::Action { .. } => &[],
+            StateKind::Sequence { outputs, .. }
+            | StateKind::ForEach { outputs, .. }
+            | StateKind::While { outputs, .. }
+            | StateKind::Condition { outputs, .. }
+            | StateKind::Concurrency { outputs, .. } => outputs,
+        }
+    }
+
+    /// The same, to change them; `None` of an action.
+    pub fn outputs_mut(&mut self) -> Option<&mut Vec<TaskOutput>> {
+        match self {
+            StateKind::Action { .. } => None,
+            StateKind::Sequence { outputs, .. }
+            | StateKind::ForEach { outputs, .. }
+            | StateKind::While { outputs, .. }
+            | StateKind::Condition { outputs, .. }
+            | StateKind::Concurrency { outputs, .. } => Some(outputs),
+        }
+    }
+}
+
 impl State {
     /// Whether it waits, which the executive does itself: no provider gets a goal.
     pub fn is_pause(&self) -> bool {
@@ -471,6 +514,16 @@ impl State {
             StateKind::Concurrency { preemptive: true, .. } => true,
             _ => self.annotations.routine,
         }
+    }
+
+    /// What it puts out of what it contains; none of an action.
+    pub fn outputs(&self) -> &[TaskOutput] {
+        self.kind.outputs()
+    }
+
+    /// Whether it is a loop.
+    pub fn is_loop(&self) -> bool {
+        matches!(self.kind, StateKind::ForEach { .. } | StateKind::While { .. })
     }
 
     /// The lists of states that it contains: one, or one per branch, or one per region.

@@ -21,7 +21,7 @@ pub enum Slot<'a> {
     Condition,
     /// When a concurrency has this outcome.
     Decide(&'a str),
-    /// An output port of a hierarchy or a concurrency; of the root, an output of the task.
+    /// An output port of a state that contains others; of the root, an output of the task.
     Output(&'a str),
     /// What a scoped variable is at the beginning.
     Variable(&'a str),
@@ -80,15 +80,20 @@ macro_rules! walk {
             StateKind::ForEach { collection, .. } => $visit(Slot::Collection, collection),
             StateKind::While { predicate, .. } => $visit(Slot::While, predicate),
             StateKind::Condition { predicate, .. } => $visit(Slot::Condition, predicate),
-            StateKind::Sequence { outputs, .. } => {
-                for output in outputs {
-                    $visit(Slot::Output(&output.name), &$($mut)? output.value);
-                }
-            }
-            StateKind::Concurrency { decide, outputs, .. } => {
+            StateKind::Sequence { .. } => {}
+            StateKind::Concurrency { decide, .. } => {
                 for (outcome, holds) in decide {
                     $visit(Slot::Decide(outcome), holds);
                 }
+            }
+        }
+        match &$($mut)? $state.kind {
+            StateKind::Action { .. } => {}
+            StateKind::Sequence { outputs, .. }
+            | StateKind::ForEach { outputs, .. }
+            | StateKind::While { outputs, .. }
+            | StateKind::Condition { outputs, .. }
+            | StateKind::Concurrency { outputs, .. } => {
                 for output in outputs {
                     $visit(Slot::Output(&output.name), &$($mut)? output.value);
                 }

@@ -153,7 +153,7 @@ states:
     );
     let program = program(&source);
     let printed = |path: &str| {
-        let StateKind::While { predicate, body_first, index, body } = &state(&program, path).kind else {
+        let StateKind::While { predicate, body_first, index, body, .. } = &state(&program, path).kind else {
             panic!("a loop")
         };
         format!("{predicate} {body_first} {index:?} {}", program.state(body[0]).path)
@@ -752,6 +752,14 @@ fn switches_and_fallbacks_that_cannot_be_are_refused() {
         ("concurrency: barrier, regions: { for: 'x in [a, a]', do: [] }", "`a`"),
         (
             "concurrency: barrier, regions: { for: 'x in [a]', do: [{ for: 'x in [1]', do: [] }] }",
+            "another variable inside is called `x`",
+        ),
+        (
+            "concurrency: barrier, regions: { for: 'x in [a]', do: [{ b: { states: [], effects: ['p(len(map($x in [1], $x)))'] } }] }",
+            "another variable inside is called `x`",
+        ),
+        (
+            "concurrency: barrier, regions: { for: 'x in [a]', outputs: { y: 'any( $x  in [1], $x = 1)' }, do: [] }",
             "another variable inside is called `x`",
         ),
         ("selector: []", "there is no form `selector`"),

@@ -14,7 +14,7 @@ GROUPS = {
     "Views of a run": ["Log", "Nodes", "Why", "CriticalPath", "Report", "Chart", "Network"],
     "Tasks": ["task", "Task", "Finding", "State", "Doc", "output", "variable", "Annotations"],
     "What is in a task": [
-        "sequence", "when", "otherwise", "lastly", "each", "while_", "do_while", "until", "retry", "concurrently", "action", "wait", "ask", "library", "leave", "block", "consume",
+        "sequence", "when", "otherwise", "lastly", "each", "collect", "while_", "do_while", "until", "retry", "concurrently", "action", "wait", "ask", "library", "leave", "block", "consume",
         "create", "delete",
     ],
     "Expressions": ["Value", "fn", "expr", "fact", "exists", "isin", "function"],

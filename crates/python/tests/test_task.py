@@ -101,6 +101,56 @@ def test_a_function_is_the_task_that_yaml_says_it_is() -> None:
     assert visit_boxes.parameters["most"] == {"type": "int", "default": 2, "description": "how many boxes to visit"}
 
 
+def test_what_different_ways_give_is_put_out_by_the_block_around_them() -> None:
+    @ratn.task
+    def ways(n: int = 1) -> dict[str, ratn.Value]:
+        with ratn.when(n > 1) as near:
+            look = detector.segment(region=REGION)
+            other = pan_tilt.look_at(target=TABLE)
+        with ratn.otherwise():
+            again = detector.segment(region=REGION)
+        for box in ratn.each(fn.either(look.boxes, again.boxes)):
+            plan = path_planner.plan(start=ratn.Joints([0] * 7), goal=box.pose)
+            trajectories = ratn.collect(plan.trajectory)
+            with ratn.when(n > 3):
+                one = pan_tilt.look_at(target=box.pose)
+            ratn.collect(fn.either(one.pan, 0), name="pans", type="list<float>")
+        for way in ratn.each(trajectories):
+            arm.follow(trajectory=way)
+        with ratn.concurrently("preemptive"):
+            head = pan_tilt.look_at(target=TABLE)
+            gripper.release()
+        near.outputs(panned=ratn.output(other.pan, default=0.5))
+        pan_tilt.look_at(target=fn.pose(0.1, fn.either(head.pan, 0.5), near.panned), name="last")
+        return {"length_m": fn.either(plan.length_m, 0)}
+
+    near, loop, follow, race, last = ways.document["states"]
+    assert near["near"]["outputs"] == {"boxes": "either(look.boxes, again.boxes)", "panned": {"value": "other.pan", "default": 0.5}}
+    assert loop["for_box"]["for"] == "box in near.boxes"
+    assert loop["for_box"]["outputs"] == {
+        "trajectories": {"each": "plan.trajectory"},
+        "pans": {"each": "either(condition.pan, 0)", "type": "list<float>"},
+        "length_m": "either(plan.length_m, 0)",
+    }
+    assert loop["for_box"]["do"][1]["condition"]["outputs"] == {"pan": "either(one.pan, 0)"}
+    assert follow["for"] == "way in for_box.trajectories"
+    assert race["concurrency"]["outputs"] == {"pan": "either(head.pan, 0.5)"}
+    assert last["last"]["in"]["target"] == "pose(0.1, either(concurrency.pan, 0.5), near.panned)"
+    assert ways.document["outputs"] == {"length_m": "either(for_box.length_m, 0)"}
+    assert "ratn.output(each=expr('plan.trajectory'))" in ways.to_python()
+    with pytest.raises(TypeError, match="an output has a value"):
+        ratn.output()
+
+
+def test_nothing_is_collected_outside_of_a_loop() -> None:
+    def outside() -> None:
+        look = detector.segment(region=REGION)
+        ratn.collect(look.boxes)
+
+    message, line = refused(outside)
+    assert (message.partition(":")[0], line) == ("`ratn.collect` outside of a loop", 2)
+
+
 def test_a_block_that_is_tried_again_shows_its_states_to_what_comes_after() -> None:
     @ratn.task
     def again() -> None:
@@ -241,11 +291,6 @@ def test_what_cannot_be_traced_is_refused_with_its_line_and_what_to_write_instea
         for _ in ratn.each(n):
             break
 
-    def hidden(n: int) -> None:
-        with ratn.when(n > 1):
-            look = detector.segment(region=REGION)
-        pan_tilt.look_at(target=look.boxes[0].pose)
-
     def listed(n: list) -> None:
         print(list(ratn.each(n)))
 
@@ -260,7 +305,7 @@ def test_what_cannot_be_traced_is_refused_with_its_line_and_what_to_write_instea
         if_: ("with ratn.when(condition)", 2), while_: ("with ratn.while_(condition)", 1), and_: ("`(a) & (b)`", 1), not_: ("`~(a)`", 1),
         chained: ("(a < b) & (b < c)", 1), ternary: ("fn.if_(", 1), in_: ("ratn.isin(", 1), for_: ("for x in ratn.each(list)", 1),
         range_: ("ratn.each(fn.range(n))", 1), comprehension: ("fn.map(", 1), filtered: ("fn.filter(", 1), length: ("fn.len(", 1), whole: ("fn.floor", 1),
-        posed: ("fn.pose(", 1), key: ("known now", 1), asserted: ("requires=[", 1), state: ("transitions=", 1), broken: ("`break`", 1), hidden: ("as a fact", 3),
+        posed: ("fn.pose(", 1), key: ("known now", 1), asserted: ("requires=[", 1), state: ("transitions=", 1), broken: ("`break`", 1),
         listed: ("outside of a `for`", 1), alone: ("right behind", 1), unnamed: ("tries = ratn.variable(0)", 1),
     }
     for function, (part, line) in expected.items():

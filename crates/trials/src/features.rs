@@ -61,6 +61,8 @@ pub struct Features {
     /// Limits of composites, and races whose regions touch nothing of each other; something is done on every way out of states inside of
     /// these and of regions, and being cut short changes the world.
     pub ways_out: bool,
+    /// Outputs of conditions, loops and concurrencies, and what different ways give.
+    pub outputs: bool,
 }
 
 impl Features {
@@ -94,6 +96,7 @@ impl Features {
         finds: false,
         anytime: false,
         ways_out: false,
+        outputs: false,
     };
 
     /// Sequences, hierarchies, loops over lists, conditions, routines and actions alone.
@@ -126,6 +129,7 @@ impl Features {
         finds: false,
         anytime: false,
         ways_out: false,
+        outputs: false,
     };
 
     /// [`Features::ALL`], without those assumptions.
@@ -163,6 +167,9 @@ impl Features {
 
     /// [`Features::WATCHED`], with more ways out.
     pub const WAYS_OUT: Features = Features { ways_out: true, ..Features::WATCHED };
+
+    /// [`Features::WAYS_OUT`], with outputs of everything that contains states.
+    pub const OUTPUTS: Features = Features { outputs: true, ..Features::WAYS_OUT };
 
     /// Imprecise motions that fail, in programs that never look at the world: where a failure leads is then the same in both
     /// modes, whatever younger motions have done meanwhile.

@@ -7,7 +7,7 @@
 //!
 //! | | |
 //! |---|---|
-//! | the tree | `list`, `composite`, `regions`, `action`, `guards`, `waits`, `watched`, `ways_out`, `long`, `patterns` |
+//! | the tree | `list`, `composite`, `regions`, `action`, `guards`, `waits`, `watched`, `ways_out`, `outputs`, `long`, `patterns` |
 //! | what is said of a state | `annotations`, `variables`, `supplies`, `estimates` |
 //! | facts | `facts`, `effects`, `tolerance` |
 //!
@@ -43,6 +43,7 @@ pub(super) mod facts;
 mod guards;
 mod list;
 mod long;
+mod outputs;
 mod patterns;
 mod regions;
 mod supplies;
@@ -111,6 +112,9 @@ pub fn program(seed: u64, features: &Features) -> Program {
         states: maker.states,
         digest: String::new(),
     };
+    if features.outputs {
+        outputs::add(&mut program, &mut maker.guards, &mut Dice(seed ^ 0x0000_0074_b075));
+    }
     if features.watched {
         watched::watch(&mut program, &mut maker.guards, &mut Dice(seed ^ 0x0000_3a7c_11ed));
     }

@@ -50,11 +50,12 @@ fn kind(state: &State) -> String {
             format!("{action}({}) {nature}", pairs(inputs))
         }
         StateKind::Sequence { outputs: declared, .. } => format!("sequence{}", arrow(declared)),
-        StateKind::ForEach { variable, index, collection, .. } => {
-            format!("for {variable}{} in {collection}", with_index(index))
+        StateKind::ForEach { variable, index, collection, outputs: declared, .. } => {
+            format!("for {variable}{} in {collection}{}", with_index(index), arrow(declared))
         }
-        StateKind::While { predicate, body_first, index, .. } => {
-            format!("{}{} {predicate}", if *body_first { "do while" } else { "while" }, with_index(index))
+        StateKind::While { predicate, body_first, index, outputs: declared, .. } => {
+            let kind = if *body_first { "do while" } else { "while" };
+            format!("{kind}{} {predicate}{}", with_index(index), arrow(declared))
         }
         StateKind::Concurrency { preemptive, successes, decide, outputs: declared, .. } => {
             let kind = match successes {
@@ -63,7 +64,7 @@ fn kind(state: &State) -> String {
             };
             format!("{kind} decide {{{}}}{}", pairs(decide), arrow(declared))
         }
-        StateKind::Condition { predicate, .. } => format!("if {predicate}"),
+        StateKind::Condition { predicate, outputs: declared, .. } => format!("if {predicate}{}", arrow(declared)),
     }
 }
 

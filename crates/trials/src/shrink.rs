@@ -170,6 +170,9 @@ fn simplify(program: &mut Program, at: usize, what: usize) {
                 StateKind::Sequence { outputs, .. } => outputs.clear(),
                 _ => {}
             }
+            if let Some(outputs) = state.kind.outputs_mut().filter(|_| what == 19) {
+                outputs.pop();
+            }
         }
         20..24 => {
             if let StateKind::Action { inputs, .. } = &mut state.kind

@@ -133,10 +133,11 @@ fn random_programs_leave_the_same_world_in_both_modes() {
         Ok("watched") => Features::WATCHED,
         Ok("anytime") => Features::ANYTIME,
         Ok("ways_out") => Features::WAYS_OUT,
+        Ok("outputs") => Features::OUTPUTS,
         Ok("all") | Err(_) => Features::ALL,
         Ok(other) => {
             panic!(
-                "RATN_FEATURES: basic, all, everything, lists, guards, waits, watched, anytime, ways_out, weak or imprecise, not {other}"
+                "RATN_FEATURES: basic, all, everything, lists, guards, waits, watched, anytime, ways_out, outputs, weak or imprecise, not {other}"
             )
         }
     };
@@ -226,6 +227,17 @@ fn the_reference_has_a_verdict_on_programs_in_which_something_is_cut_short() {
     assert!(of > 100 && without.len() * 3 < of, "{} of {of} programs are without: {without:?}", without.len());
 }
 
+/// What seed the programs with outputs of everything begin with.
+const OUTPUTS: u64 = 11 << 41;
+
+/// What a condition, a loop or a concurrency gives is what the way gave that was taken; what follows it is computed ahead for each.
+#[test]
+fn random_programs_with_outputs_of_everything_leave_the_same_world_in_both_modes() {
+    none_fails(trial, OUTPUTS, 300, &Features::OUTPUTS);
+    none_fails(trial_interrupted, OUTPUTS, 60, &Features::OUTPUTS);
+    none_fails(trial_from_outside, OUTPUTS, 60, &Features::OUTPUTS);
+}
+
 /// A pause asked for what a state around it blocks.
 #[test]
 fn programs_that_once_failed_because_a_pause_was_refused_leave_the_same_world() {
@@ -234,7 +246,15 @@ fn programs_that_once_failed_because_a_pause_was_refused_leave_the_same_world() 
 
 #[test]
 fn the_reference_has_a_verdict_on_more_than_three_of_four_programs() {
-    for features in [Features::ALL, Features::EVERYTHING, Features::GUARDS, Features::WAYS_OUT, Features::IMPRECISE] {
+    let all = [
+        Features::ALL,
+        Features::EVERYTHING,
+        Features::GUARDS,
+        Features::WAYS_OUT,
+        Features::OUTPUTS,
+        Features::IMPRECISE,
+    ];
+    for features in all {
         let without =
             (0..400).filter_map(|seed| no_verdict(&program(seed, &features), &Conditions::of(seed, &features)));
         let without: Vec<&str> = without.collect();

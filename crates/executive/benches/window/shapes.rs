@@ -332,6 +332,7 @@ fn looped(horizon: usize, reads: &[Vec<usize>]) -> Program {
         index: None,
         collection: range(n),
         body,
+        outputs: Vec::new(),
     };
     let first = 3;
     let body: Vec<StateId> = (first..first + reads.len()).map(|id| StateId(id as u64)).collect();

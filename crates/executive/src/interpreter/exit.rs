@@ -6,9 +6,15 @@ use crate::context::{Context, Made};
 use crate::effects;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{ABORTED, Program, SUCCESS, State, StateKind, is_failure};
+use ratn_model::program::{ABORTED, Program, SUCCESS, State, is_failure};
 use ratn_model::value::Value;
 use std::sync::Arc;
+
+/// How many variables there were before a state was entered, where `variables` are those of its frame: the scoped ones of a loop are there in
+/// every iteration, and its frame counts them.
+pub(super) fn outside(state: &State, variables: usize) -> usize {
+    if state.is_loop() { variables.saturating_sub(state.variables.len()) } else { variables }
+}
 
 impl Interpreter {
     /// A composite state is left. What fails on the way makes it `aborted`.
@@ -29,7 +35,7 @@ impl Interpreter {
         if id != Program::ROOT
             && let Some(thread) = self.threads.get_mut(&thread)
         {
-            thread.variables.truncate(variables);
+            thread.variables.truncate(outside(state, variables));
         }
         match result {
             Ok(assigned) => self.assign(thread, assigned),
@@ -52,17 +58,15 @@ impl Interpreter {
         outcome: &str,
     ) -> Result<Vec<(String, Value)>, String> {
         // Its loop variables are gone, its scoped ones are still seen.
-        if matches!(state.kind, StateKind::ForEach { .. } | StateKind::While { .. })
+        if state.is_loop()
             && let Some(thread) = self.threads.get_mut(&thread)
         {
             thread.variables.truncate(variables);
         }
         let good = !is_failure(outcome);
         let mut written = Outputs::new();
-        if let (true, StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. }) =
-            (good, &state.kind)
-        {
-            for output in outputs {
+        if good {
+            for output in state.outputs() {
                 match self.with_scope(context, thread, Some(&written), |scope| output.value.evaluate(scope)) {
                     Ok(value) => {
                         written.insert(output.name.clone(), value);
@@ -78,7 +82,7 @@ impl Interpreter {
         if outcome == SUCCESS {
             self.operate(context, thread, state, InstanceId(0), &written)?;
         }
-        if good && matches!(state.kind, StateKind::Sequence { .. } | StateKind::Concurrency { .. }) {
+        if good {
             self.outputs.insert(state.id, written);
         }
         Ok(assigned)

@@ -456,4 +456,13 @@ impl Names for Scoped<'_> {
             None => source.defaults.get(port).map(Cow::Borrowed),
         }
     }
+
+    fn is_given(&self, state: StateId, port: &str) -> bool {
+        let source = self.program.state(state);
+        let around = source.parent.map(|parent| &self.program.state(parent).kind);
+        if port == "outcome" && matches!(around, Some(StateKind::Concurrency { .. })) {
+            return self.interpreter.regions.contains_key(&state);
+        }
+        self.interpreter.outputs.contains_key(&state) || source.defaults.contains_key(port)
+    }
 }

@@ -110,7 +110,9 @@ impl Interpreter {
     pub(super) fn enter_composite(&mut self, context: &mut Context<'_>, thread: u64, id: StateId, path: String) {
         let program = context.program;
         let state = program.state(id);
-        self.forget_inside(program, id);
+        if !program.is_pass(id) {
+            self.forget_inside(program, id);
+        }
         let base = self.threads.get(&thread).map_or(0, |thread| thread.variables.len());
         let mut bound = Vec::new();
         for (name, value) in &state.variables {
@@ -125,6 +127,7 @@ impl Interpreter {
         if let Some(thread) = self.threads.get_mut(&thread) {
             thread.variables.extend(bound);
         }
+        let inside = base + state.variables.len();
         let wrong = |what: &str, error: &dyn std::fmt::Display| format!("{path}: {what}: {error}");
         match &state.kind {
             StateKind::Action { .. } => {}
@@ -134,7 +137,7 @@ impl Interpreter {
                 match list {
                     Ok(Value::List(elements)) => {
                         self.decided(context, &path, elements.len().to_string());
-                        self.push_frame(thread, id, 0, path, base, Some((usize::MAX, Some(elements))));
+                        self.push_frame(thread, id, 0, path, inside, Some((usize::MAX, Some(elements))));
                         self.set(thread, Todo::Iterate);
                     }
                     Ok(other) => {
@@ -146,14 +149,14 @@ impl Interpreter {
             }
             StateKind::While { body_first, .. } => {
                 let before = if *body_first { 0 } else { usize::MAX };
-                self.push_frame(thread, id, 0, path, base, Some((before, None)));
+                self.push_frame(thread, id, 0, path, inside, Some((before, None)));
                 if *body_first {
                     self.begin_iteration(program, thread);
                 } else {
                     self.set(thread, Todo::Iterate);
                 }
             }
-            StateKind::Condition { predicate, then, otherwise } => {
+            StateKind::Condition { predicate, then, otherwise, .. } => {
                 match self.with_scope(context, thread, None, |scope| predicate.holds(scope)) {
                     Ok(taken) => {
                         self.decided(context, &path, if taken { "then" } else { "else" }.to_owned());
@@ -266,7 +269,7 @@ impl Interpreter {
                         if let Some(thread) = self.threads.get_mut(&id)
                             && let Some(frame) = thread.frames.pop()
                         {
-                            thread.variables.truncate(frame.variables);
+                            thread.variables.truncate(super::exit::outside(program.state(owner), frame.variables));
                         }
                         self.ended(id, owner, ABORTED, format!("{path}: its predicate: {error}"));
                     }

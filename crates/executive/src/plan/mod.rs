@@ -151,7 +151,8 @@ impl Plan {
             plan.states[index(id)].improves = Some(kept);
         }
         for id in &read {
-            for parent in std::iter::successors(program.state(*id).parent, |id| program.state(*id).parent) {
+            let around = std::iter::successors(program.state(*id).parent, |id| program.state(*id).parent);
+            for parent in around.filter(|parent| !program.is_pass(*parent)) {
                 plan.states[index(parent)].read_inside.push(*id);
             }
         }

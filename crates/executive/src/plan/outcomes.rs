@@ -5,7 +5,7 @@ use super::{Names, Predicate, Subject, index};
 use crate::effects;
 use ratn_model::expression::EffectExpr;
 use ratn_model::id::StateId;
-use ratn_model::program::{Program, ResourceExpr, SUCCESS, State, StateKind, Target, is_failure};
+use ratn_model::program::{Program, ResourceExpr, SUCCESS, State, Target, is_failure};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -185,11 +185,7 @@ pub(super) fn every(ends: &Ends) -> Outcomes {
 
 /// The outcomes with which the exit of a composite state has something to do.
 pub(super) fn exits(state: &State, ends: &Ends, operations: &[ResourceExpr]) -> Outcomes {
-    let has_outputs = match &state.kind {
-        StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } => !outputs.is_empty(),
-        _ => false,
-    };
-    let gives = has_outputs || !state.assign.is_empty();
+    let gives = !state.outputs().is_empty() || !state.assign.is_empty();
     let mut exits = 0;
     for (number, outcome) in ends.names.iter().enumerate().take(MAX_OUTCOMES) {
         let changes = ends.effects[number] != Effects::Declared(Vec::new());

@@ -288,9 +288,8 @@ fn parts_of<'p>(context: &Context<'p>, instance: &Instance) -> Vec<(String, &'p 
     if marker.role == Role::Entry {
         parts.extend(state.variables.iter().map(|(n, e)| (assigned(n), e, format!("variable `{n}`"))));
     } else if gives_outputs(&own.outcomes[marker.leaves_by]) {
-        if let StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } = &state.kind {
-            parts.extend(outputs.iter().map(|o| (o.name.clone(), &o.value, format!("output `{}`", o.name))));
-        }
+        let outputs = state.outputs().iter();
+        parts.extend(outputs.map(|o| (o.name.clone(), &o.value, format!("output `{}`", o.name))));
         parts.extend(state.assign.iter().map(|(n, e)| (assigned(n), e, format!("`assign` of `{n}`"))));
     }
     parts

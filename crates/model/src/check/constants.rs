@@ -69,6 +69,8 @@ fn parts(expr: &Expr) -> Vec<&Expr> {
         Expr::Field(of, _) | Expr::Unary(_, of) | Expr::Binary(And | Or, of, _) => vec![of],
         Expr::Index(a, b) | Expr::Binary(_, a, b) => vec![a, b],
         Expr::Call(Function::If, arguments) => arguments.iter().take(1).collect(),
+        // Which of them is evaluated is known only while the task runs.
+        Expr::Call(Function::Either, _) => Vec::new(),
         Expr::List(items) | Expr::Call(_, items) => items.iter().collect(),
         Expr::Map(fields) => fields.iter().map(|(_, item)| item).collect(),
         Expr::Fact(fact) | Expr::Exists(fact) => of_fact(fact),

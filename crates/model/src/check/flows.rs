@@ -6,7 +6,7 @@
 use super::graph::{ControlFlow, Point};
 use super::{Subject, branches, expressions};
 use crate::diagnostic::Findings;
-use crate::expression::Expr;
+use crate::expression::{Expr, Function};
 use crate::id::StateId;
 use crate::program::{Program, SUCCESS, State, StateKind, is_failure};
 use crate::slot::Slot;
@@ -15,94 +15,95 @@ use std::collections::BTreeSet;
 
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
     let program = subject.program;
-    let flows: Vec<(&State, Slot<'_>, StateId, &str)> = program
-        .states
-        .iter()
-        .flat_map(|state| {
-            let parts = expressions(program, state);
-            parts.into_iter().flat_map(move |(slot, expr)| {
-                ports(expr).into_iter().map(move |(from, port)| (state, slot, from, port))
-            })
-        })
-        .collect();
-    let graph = graph(program, flows.iter().map(|(to, _, from, _)| (*from, to.id)));
-    let control = subject.control;
-    for (to, slot, from, port) in flows {
-        let at = subject.place_of(to, slot);
-        let source = program.state(from);
-        let flow = format!("`{}.{port}`", source.name);
-        let is_region =
-            matches!(source.parent.map(|parent| &program.state(parent).kind), Some(StateKind::Concurrency { .. }));
-        let (surely, maybe) = written(control, to, slot, from);
-        let relation = relation(subject, to, slot, source);
-        let hidden = matches!(relation, Relation::Hidden(_));
-        let beside = matches!(relation, Relation::Beside);
-        if !hidden && !beside && (surely || source.defaults.contains_key(port) || (is_region && at_join(to, slot))) {
-            continue;
-        }
-        if !hidden && !beside && maybe {
-            let message =
-                format!("{flow} may not have been written when this state needs it: not on every way that leads here");
-            let help = "give the port a default, or use it only where it was written";
-            findings.error("branch-may-not-have-written", at, &to.path, message, help);
-            continue;
-        }
-        match relation {
-            // A run that begins behind the state that writes it.
-            Relation::Before if subject.begins_elsewhere && control.is_reached(Point::Begin(to.id)) => {
-                let message = format!("{flow} is not there: the run begins behind `{}`, which writes it", source.path);
-                let help = "let it begin there, or before it";
-                findings.error("branch-may-not-have-written", at, &to.path, message, help);
-            }
-            Relation::Before => {}
-            Relation::Beside => {
-                let message = format!("{flow} is written in another region, which may come before or after this one");
-                let help = "put both into one region, or use it behind the concurrency, which puts it out";
-                findings.error("unservable-flow", at, &to.path, message, help);
-            }
-            Relation::Itself => {
-                let message = format!("{flow} is an output of this state itself, which needs it to start");
-                findings.error("unservable-flow", at, &to.path, message, "take it from a state before this one");
-            }
-            Relation::Around => {
-                let message = format!("{flow} is written when `{}` ends, and this state is inside of it", source.path);
-                findings.error("unservable-flow", at, &to.path, message, "take it from the state that computes it");
-            }
-            Relation::Inside => {
-                let message = format!("{flow} is written inside of this state, which needs it to start");
-                findings.error("unservable-flow", at, &to.path, message, "take it from a state before this one");
-            }
-            Relation::After => {
-                let message = format!("{flow} is written by `{}`, which comes later", source.path);
-                let help = match cycle(program, &graph, to.id, from) {
-                    Some(cycle) => format!("each waits for the next: {cycle}; break the cycle"),
-                    None => format!("move `{}` before `{}`", source.path, to.path),
-                };
-                findings.error("unservable-flow", at, &to.path, message, help);
-            }
-            Relation::OtherBranch => {
-                let message = format!("{flow} is written on the other branch: never both run");
-                findings.error(
-                    "branch-may-not-have-written",
-                    at,
-                    &to.path,
-                    message,
-                    "take it from before the condition",
-                );
-            }
-            Relation::Maybe(container) => {
-                let message = format!("{flow} is written inside of `{}`, where it may never run", container.path);
-                let help = "let its effects say it as a fact, or use it inside";
-                findings.error("branch-may-not-have-written", at, &to.path, message, help);
-            }
-            Relation::Hidden(container) => {
-                let message = format!("{flow} is written inside of `{}` and not seen from here", container.path);
-                let help =
-                    format!("add it to the `outputs` of `{}` and use `{}.{port}`", container.path, container.name);
-                findings.error("unknown-state", at, &to.path, message, help);
-            }
+    let of = |state| expressions(program, state).into_iter().map(move |part| (state, part));
+    let all = || program.states.iter().flat_map(of);
+    let flows = all().flat_map(|(to, (_, expr))| expr.flows().into_iter().map(move |from| (from, to.id)));
+    let graph = graph(program, flows);
+    for (to, (slot, expr)) in all() {
+        let ways = ways(expr);
+        let needed = ways.needed.into_iter().filter_map(|flow| refused(subject, &graph, (to, slot), flow, false));
+        let either = ways.either.iter().flat_map(|either| none_refused(subject, &graph, (to, slot), either));
+        for (rule, message, help) in needed.chain(either) {
+            findings.error(rule, subject.place_of(to, slot), &to.path, message, help);
         }
     }
+}
+
+/// What is wrong with a flow: the rule, the message, what to do.
+type Refused = (&'static str, String, String);
+
+/// Why an output cannot be used in an expression; one of several of which the first that is there is taken need not be there on every way.
+fn refused(
+    subject: &Subject<'_>,
+    graph: &FlowGraph,
+    (to, slot): (&State, Slot<'_>),
+    (from, port): (StateId, &str),
+    is_one_of_several: bool,
+) -> Option<Refused> {
+    let program = subject.program;
+    let source = program.state(from);
+    let flow = format!("`{}.{port}`", source.name);
+    let maybe = may_be_written(subject.control, to, slot, from);
+    let relation = relation(subject, to, slot, source);
+    if !matches!(relation, Relation::Hidden(_) | Relation::Beside) {
+        if is_there(subject, to, slot, (from, port)) || (maybe && is_one_of_several) {
+            return None;
+        }
+        if maybe {
+            let message =
+                format!("{flow} may not have been written when this state needs it: not on every way that leads here");
+            let help = "give the port a default, use it only where it was written, or say with `either(…)` what is used instead";
+            return Some(("branch-may-not-have-written", message, help.to_owned()));
+        }
+    }
+    let (rule, message, help) = match relation {
+        // A run that begins behind the state that writes it.
+        Relation::Before if subject.begins_elsewhere && subject.control.is_reached(Point::Begin(to.id)) => {
+            let message = format!("{flow} is not there: the run begins behind `{}`, which writes it", source.path);
+            ("branch-may-not-have-written", message, "let it begin there, or before it".to_owned())
+        }
+        Relation::Before => return None,
+        Relation::Beside => {
+            let message = format!("{flow} is written in another region, which may come before or after this one");
+            let help = "put both into one region, or use it behind the concurrency, which puts it out";
+            ("unservable-flow", message, help.to_owned())
+        }
+        Relation::Itself => {
+            let message = format!("{flow} is an output of this state itself, which needs it to start");
+            ("unservable-flow", message, "take it from a state before this one".to_owned())
+        }
+        Relation::Around => {
+            let message = format!("{flow} is written when `{}` ends, and this state is inside of it", source.path);
+            ("unservable-flow", message, "take it from the state that computes it".to_owned())
+        }
+        Relation::Inside => {
+            let message = format!("{flow} is written inside of this state, which needs it to start");
+            ("unservable-flow", message, "take it from a state before this one".to_owned())
+        }
+        Relation::After => {
+            let message = format!("{flow} is written by `{}`, which comes later", source.path);
+            let help = match cycle(program, graph, to.id, from) {
+                Some(cycle) => format!("each waits for the next: {cycle}; break the cycle"),
+                None => format!("move `{}` before `{}`", source.path, to.path),
+            };
+            ("unservable-flow", message, help)
+        }
+        Relation::OtherBranch => {
+            let message = format!("{flow} is written on the other branch: never both run");
+            ("branch-may-not-have-written", message, "take it from before the condition".to_owned())
+        }
+        Relation::Maybe(container) => {
+            let message = format!("{flow} is written inside of `{}`, where it may never run", container.path);
+            let help = format!("put it out with a default (`outputs` of `{}`), or use it inside", container.path);
+            ("branch-may-not-have-written", message, help)
+        }
+        Relation::Hidden(container) => {
+            let message = format!("{flow} is written inside of `{}` and not seen from here", container.path);
+            let help = format!("add it to the `outputs` of `{}` and use `{}.{port}`", container.path, container.name);
+            ("unknown-state", message, help)
+        }
+    };
+    Some((rule, message, help))
 }
 
 /// How the source of a flow lies to its target in the program.
@@ -120,7 +121,9 @@ enum Relation<'a> {
 
 fn relation<'a>(subject: &Subject<'a>, to: &State, slot: Slot<'_>, from: &'a State) -> Relation<'a> {
     let up: Vec<&'a State> = subject.around(to.id).collect();
-    let down: Vec<&'a State> = subject.around(from.id).collect();
+    // What is inside of a pass is inside of its loop.
+    let is_between = |state: &&State| subject.program.is_pass(state.id) && !up.iter().any(|other| other.id == state.id);
+    let down: Vec<&'a State> = subject.around(from.id).filter(|state| !is_between(state)).collect();
     if from.id == to.id {
         return Relation::Itself;
     }
@@ -134,7 +137,7 @@ fn relation<'a>(subject: &Subject<'a>, to: &State, slot: Slot<'_>, from: &'a Sta
     let (shared, side) = (down[depth], down[depth - 1]);
     if shared.id == to.id {
         let at_its_end = is_at_end(slot) || matches!(slot, Slot::Decide(_) | Slot::While);
-        if !at_its_end || matches!(to.kind, StateKind::ForEach { .. } | StateKind::Condition { .. }) {
+        if !at_its_end {
             return Relation::Inside;
         }
     } else {
@@ -165,18 +168,32 @@ fn relation<'a>(subject: &Subject<'a>, to: &State, slot: Slot<'_>, from: &'a Sta
     if depth > 1 { Relation::Hidden(side) } else { Relation::Before }
 }
 
-/// Whether the source has surely, and whether it may have, written its outputs when the expression of the target is evaluated.
-fn written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: StateId) -> (bool, bool) {
+/// Whether the source has surely written its outputs when the expression of the target is evaluated.
+fn is_written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: StateId) -> bool {
+    points(control, to, slot).into_iter().all(|point| control.written(point, from).0)
+}
+
+/// Whether it may have: what an output is made of also where the state is left by an outcome of its own.
+fn may_be_written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: StateId) -> bool {
+    let mut all = points(control, to, slot);
+    if matches!(slot, Slot::Output(_)) {
+        all.extend(ends(control, to, None));
+    }
+    all.into_iter().any(|point| control.written(point, from).1)
+}
+
+/// Where the expression of the target is evaluated.
+fn points(control: &ControlFlow, to: &State, slot: Slot<'_>) -> Vec<Point> {
     let in_the_middle = match slot {
         Slot::Decide(_) | Slot::While => true,
         Slot::Output(_) => matches!(to.kind, StateKind::Concurrency { .. }),
         _ => false,
     };
     if in_the_middle {
-        return control.written(Point::Middle(to.id), from);
+        return vec![Point::Middle(to.id)];
     }
     if matches!(to.kind, StateKind::Action { .. }) || !is_at_end(slot) {
-        return control.written(Point::Begin(to.id), from);
+        return vec![Point::Begin(to.id)];
     }
     // What an output is made of may be missing where the state is left by an outcome of its own; then it is not written.
     let only = match slot {
@@ -184,15 +201,16 @@ fn written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: StateId) -> 
         Slot::Output(_) => Some(SUCCESS),
         _ => None,
     };
+    ends(control, to, only)
+}
+
+/// The ends of a state by this outcome, or by any that is no failure.
+fn ends(control: &ControlFlow, to: &State, only: Option<&str>) -> Vec<Point> {
     let outcomes = control.outcomes(to.id).iter().enumerate().filter(|(_, outcome)| match only {
         Some(only) => outcome.as_str() == only,
         None => !is_failure(outcome),
     });
-    outcomes
-        .map(|(number, _)| Point::End(to.id, number))
-        .filter(|point| control.is_reached(*point))
-        .map(|point| control.written(point, from))
-        .fold((true, false), |(surely, maybe), (s, m)| (surely && s, maybe || m))
+    outcomes.map(|(number, _)| Point::End(to.id, number)).filter(|point| control.is_reached(*point)).collect()
 }
 
 fn is_at_end(slot: Slot<'_>) -> bool {
@@ -204,14 +222,116 @@ fn at_join(to: &State, slot: Slot<'_>) -> bool {
         && matches!(slot, Slot::Decide(_) | Slot::Output(_) | Slot::Effect(_))
 }
 
-fn ports(expr: &Expr) -> Vec<(StateId, &str)> {
-    let mut ports = BTreeSet::new();
-    expr.visit(&mut |part| {
-        if let Expr::Port { state, port } = part {
-            ports.insert((*state, port.as_str()));
+/// The outputs that an expression cannot do without, and those of which it takes the first that is there.
+#[derive(Default)]
+struct Ways<'e> {
+    needed: BTreeSet<(StateId, &'e str)>,
+    /// Each `either`, way by way.
+    either: Vec<Vec<BTreeSet<(StateId, &'e str)>>>,
+}
+
+fn ways(expr: &Expr) -> Ways<'_> {
+    fn collect<'e>(expr: &'e Expr, ways: &mut Ways<'e>) {
+        match expr {
+            Expr::Port { state, port } => drop(ways.needed.insert((*state, port.as_str()))),
+            Expr::Call(Function::Either, all) => {
+                let all = flat(all).into_iter().map(|way| {
+                    let mut own = Ways::default();
+                    collect(way, &mut own);
+                    ways.either.append(&mut own.either);
+                    own.needed
+                });
+                let all = all.collect();
+                ways.either.push(all);
+            }
+            _ => {
+                let mut parts = Vec::new();
+                expr.parts(&mut |part| parts.push(part));
+                parts.into_iter().for_each(|part| collect(part, ways));
+            }
         }
-    });
-    ports.into_iter().collect()
+    }
+    let mut ways = Ways::default();
+    collect(expr, &mut ways);
+    ways
+}
+
+/// The ways of an `either` with those of one that is itself a way.
+fn flat(ways: &[Expr]) -> Vec<&Expr> {
+    let mut all = Vec::new();
+    for way in ways {
+        match way {
+            Expr::Call(Function::Either, inner) => all.extend(flat(inner)),
+            other => all.push(other),
+        }
+    }
+    all
+}
+
+/// Why outputs of which the first that is there is taken cannot be used.
+fn none_refused(
+    subject: &Subject<'_>,
+    graph: &FlowGraph,
+    (to, slot): (&State, Slot<'_>),
+    either: &[BTreeSet<(StateId, &str)>],
+) -> Vec<Refused> {
+    let each = either.iter().flatten().filter_map(|flow| refused(subject, graph, (to, slot), *flow, true));
+    let each: Vec<Refused> = each.collect();
+    if !each.is_empty() || either.iter().any(|way| way.iter().all(|flow| is_there(subject, to, slot, *flow))) {
+        return each;
+    }
+    // Of a way that needs several states nothing is said: that one is there does not say that the others are.
+    let states = |way: &BTreeSet<(StateId, &str)>| way.iter().map(|(from, _)| *from).collect::<BTreeSet<StateId>>();
+    let of_one = either.iter().map(states).filter(|states| states.len() == 1);
+    let from: BTreeSet<StateId> = of_one.flatten().collect();
+    let is_covered = match join(subject, to, slot, &from) {
+        Some(ends_with_one) => ends_with_one,
+        None => {
+            let mut points = points(subject.control, to, slot).into_iter();
+            points.all(|point| subject.control.one_is_written(subject.program, point, &from))
+        }
+    };
+    if is_covered {
+        return Vec::new();
+    }
+    let name = |(from, port): &(StateId, &str)| format!("`{}.{port}`", subject.program.state(*from).name);
+    let names: BTreeSet<String> = either.iter().flatten().map(name).collect();
+    let names = names.into_iter().collect::<Vec<_>>().join(", ");
+    let message = format!("on some way that leads here none of {names} has been written");
+    let help = "give what is used then as the last of them, or as the `default` of the output";
+    vec![("branch-may-not-have-written", message, help.to_owned())]
+}
+
+/// Whether an output is surely there: written on every way, or with a default.
+fn is_there(subject: &Subject<'_>, to: &State, slot: Slot<'_>, (from, port): (StateId, &str)) -> bool {
+    let source = subject.program.state(from);
+    source.defaults.contains_key(port)
+        || is_written(subject.control, to, slot, from)
+        || (port == "outcome" && is_region_of(to, from) && at_join(to, slot))
+        || join(subject, to, slot, &BTreeSet::from([from])) == Some(true)
+}
+
+fn is_region_of(to: &State, from: StateId) -> bool {
+    matches!(&to.kind, StateKind::Concurrency { regions, .. } if regions.contains(&from))
+}
+
+/// Whether one of these regions has surely written its outputs when the concurrency has ended with success, as far as it is known; `None` if it
+/// is not about regions.
+fn join(subject: &Subject<'_>, to: &State, slot: Slot<'_>, from: &BTreeSet<StateId>) -> Option<bool> {
+    let StateKind::Concurrency { regions, preemptive, successes, decide, .. } = &to.kind else { return None };
+    let ours = regions.iter().filter(|region| from.contains(region)).count();
+    if ours == 0 || !at_join(to, slot) {
+        return None;
+    }
+    let watches = regions.iter().filter(|region| subject.program.state(**region).is_watch()).count();
+    // What is decided by the outcomes is up to who wrote that, and so is what an outcome changes.
+    if !matches!(slot, Slot::Output(_)) || !decide.is_empty() {
+        return Some(true);
+    }
+    Some(match successes {
+        Some(wanted) => ours + *wanted as usize > regions.len(),
+        None => !preemptive || ours + watches == regions.len(),
+    })
 }
 
 type FlowGraph = DiGraph<StateId, ()>;

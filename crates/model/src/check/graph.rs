@@ -7,7 +7,7 @@ use crate::id::StateId;
 use crate::program::{ABORTED, Program, SUCCESS, State, StateKind, Target, is_failure};
 use petgraph::graph::{DiGraph, NodeIndex};
 use petgraph::visit::EdgeRef;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// A point of the control flow.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -136,6 +136,34 @@ impl ControlFlow {
         }
     }
 
+    /// Whether one of these states has written its outputs, whichever way the control flow came to a point. Where it comes to a state around one
+    /// of them, that one is forgotten, and then none is sure.
+    pub(crate) fn one_is_written(&self, program: &Program, point: Point, states: &BTreeSet<StateId>) -> bool {
+        let (Some(begin), Some(goal)) = (self.places.get(&Point::Begin(Program::ROOT)), self.places.get(&point)) else {
+            return true;
+        };
+        let parent = |id: &StateId| program.state(*id).parent;
+        let around = states.iter().flat_map(|id| std::iter::successors(parent(id), parent));
+        let around: BTreeSet<StateId> = around.filter(|id| !program.is_pass(*id)).collect();
+        // Per place: whether it was come to with none of them, and with one.
+        let mut seen = vec![[false; 2]; self.graph.node_count()];
+        let mut open = vec![(*begin, false)];
+        while let Some((place, mut is_written)) = open.pop() {
+            if std::mem::replace(&mut seen[place.index()][usize::from(is_written)], true) {
+                continue;
+            }
+            match self.graph[place] {
+                Point::Begin(id) => is_written &= !around.contains(&id),
+                Point::End(id, number) => {
+                    is_written |= states.contains(&id) && !is_failure(&self.outcomes[id.0 as usize][number]);
+                }
+                Point::Middle(_) => {}
+            }
+            open.extend(self.graph.neighbors(place).map(|next| (next, is_written)));
+        }
+        !seen[goal.index()][0]
+    }
+
     /// The outcomes of a state.
     pub(crate) fn outcomes(&self, id: StateId) -> &[String] {
         &self.outcomes[id.0 as usize]
@@ -256,7 +284,7 @@ impl ControlFlow {
             let Some(mut surely) = self.surely[place.index()].clone() else { continue };
             let mut maybe = self.maybe[place.index()].clone();
             match self.graph[place] {
-                Point::Begin(id) => {
+                Point::Begin(id) if !program.is_pass(id) => {
                     for forgotten in &inside[id.0 as usize] {
                         surely.remove(*forgotten);
                         maybe.remove(*forgotten);
@@ -268,7 +296,7 @@ impl ControlFlow {
                         maybe.insert(id);
                     }
                 }
-                Point::Middle(_) => {}
+                Point::Begin(_) | Point::Middle(_) => {}
             }
             let next: Vec<NodeIndex> = self.graph.edges(place).map(|edge| edge.target()).collect();
             for to in next {

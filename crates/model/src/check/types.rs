@@ -24,7 +24,7 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
                 continue;
             }
             let at = subject.place_of(state, slot);
-            match types.of(expr) {
+            match types.collected(state, expr).map_or_else(|| types.of(expr), Ok) {
                 Err(Wrong { rule, message, help }) => findings.error(rule, at, &state.path, message, help),
                 Ok(found) => {
                     if let Some(wanted) = wanted(subject, state, slot)
@@ -139,8 +139,8 @@ fn wanted(subject: &Subject<'_>, state: &State, slot: Slot<'_>) -> Option<Type> 
             let signature = subject.catalogue.action(provider, action)?;
             signature.inputs.get(port).or_else(|| signature.optional.get(port)).cloned()
         }
-        (Slot::Output(name), StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. }) => {
-            let own = if state.id == Program::ROOT { &subject.program.outputs } else { outputs };
+        (Slot::Output(name), _) => {
+            let own = if state.id == Program::ROOT { &subject.program.outputs } else { state.outputs() };
             own.iter().find(|output| output.name == name).map(|output| output.ty.clone())
         }
         (Slot::Requires(_) | Slot::Holds(_) | Slot::Decide(_) | Slot::Condition | Slot::While, _) => Some(Type::Bool),
@@ -347,18 +347,32 @@ impl Types<'_> {
     fn port(&self, state: &State, port: &str) -> Type {
         match &state.kind {
             StateKind::Action { outputs, .. } => outputs.get(port).cloned().unwrap_or(Type::Any),
-            StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. } => {
-                let output = outputs.iter().find(|output| output.name == port);
+            _ => {
+                let output = state.outputs().iter().find(|output| output.name == port);
                 output.map_or(Type::Any, |output| self.output(state, output))
             }
-            _ => Type::Any,
         }
+    }
+
+    /// The type of the list that a loop collects, if that is what an expression of it is.
+    fn collected(&self, state: &State, value: &Expr) -> Option<Type> {
+        let Expr::Variable(list) = value else { return None };
+        let pass = state.children().find(|child| self.subject.program.is_pass(*child))?;
+        let pass = self.subject.program.state(pass);
+        let (_, longer) = pass.assign.iter().find(|(name, _)| name == list)?;
+        let Expr::Binary(BinaryOperator::Add, _, added) = longer else { return None };
+        let (subject, indirection) = (self.subject, self.indirection + 1);
+        let variables = variables(subject, pass);
+        Types { subject, state: pass, variables, elements: Variables::new(), indirection }.of(added).ok()
     }
 
     /// The declared type of a hierarchy's output, else that of its expression.
     fn output(&self, state: &State, output: &TaskOutput) -> Type {
         if output.ty != Type::Any || self.indirection >= MAX_INDIRECTION {
             return output.ty.clone();
+        }
+        if let Some(list) = self.collected(state, &output.value) {
+            return list;
         }
         let (subject, variables, indirection) = (self.subject, self.variables.clone(), self.indirection + 1);
         Types { subject, state, variables, elements: Variables::new(), indirection }
@@ -430,6 +444,14 @@ fn call(function: Function, arguments: &[Expr], types: &[Type]) -> Result<Type, 
                 (_, true) => types[1].clone(),
                 _ => common(types[1..].iter().cloned()),
             }
+        }
+        Function::Either => {
+            let fit = |(a, b): &(&Type, &Type)| a.accepts_type(b) || b.accepts_type(a);
+            let pairs = types.iter().enumerate().flat_map(|(n, a)| types[n + 1..].iter().map(move |b| (a, b)));
+            if let Some((a, b)) = pairs.into_iter().find(|pair| !fit(pair)) {
+                return Err(format!("one way gives {a}, another {b}"));
+            }
+            common(types.iter().cloned())
         }
         Function::Pose => {
             all(Type::Float)?;

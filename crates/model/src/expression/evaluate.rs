@@ -92,6 +92,10 @@ impl Expr {
                 [condition, yes, no] => (if condition.holds(scope)? { yes } else { no }).value(scope)?,
                 _ => return Err(self.wrong("expected `if(condition, a, b)`")),
             },
+            Expr::Call(Function::Either, arguments) => match arguments.as_slice() {
+                [others @ .., last] => others.iter().find(|one| one.is_given(scope)).unwrap_or(last).value(scope)?,
+                [] => return Err(self.wrong("expected `either(a, b, …)`")),
+            },
             Expr::Call(called, arguments) => {
                 let values = arguments.iter().map(|a| a.evaluate(scope)).collect::<Result<Vec<_>, _>>()?;
                 Cow::Owned(function::call(*called, &values).map_err(|problem| self.wrong(problem))?)
@@ -126,6 +130,19 @@ impl Expr {
                 Cow::Owned(binary(*operator, a.as_ref(), b.as_ref()).map_err(|problem| self.wrong(problem))?)
             }
         })
+    }
+
+    /// Whether every output that it uses was written on the way to where it is evaluated, or has a default.
+    fn is_given(&self, scope: &dyn Scope) -> bool {
+        match self {
+            Expr::Port { state, port } => scope.is_given(*state, port),
+            Expr::Call(Function::Either, ways) => ways.iter().any(|way| way.is_given(scope)),
+            _ => {
+                let mut is_given = true;
+                self.parts(&mut |part| is_given = is_given && part.is_given(scope));
+                is_given
+            }
+        }
     }
 
     /// Whether the query `self` has an answer.

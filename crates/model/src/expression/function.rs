@@ -25,7 +25,7 @@ const MAX_TURNS: i64 = 64;
 
 impl Function {
     /// Every function.
-    pub const ALL: [Function; 25] = [
+    pub const ALL: [Function; 26] = [
         Function::Len,
         Function::Range,
         Function::Min,
@@ -35,6 +35,7 @@ impl Function {
         Function::Floor,
         Function::Sum,
         Function::If,
+        Function::Either,
         Function::Pose,
         Function::Joints,
         Function::Compose,
@@ -65,6 +66,7 @@ impl Function {
             Function::Floor => "floor",
             Function::Sum => "sum",
             Function::If => "if",
+            Function::Either => "either",
             Function::Pose => "pose",
             Function::Joints => "joints",
             Function::Compose => "compose",
@@ -101,6 +103,7 @@ impl Function {
             Function::Floor => "floor(x)",
             Function::Sum => "sum(list)",
             Function::If => "if(condition, a, b)",
+            Function::Either => "either(a, b, …)",
             Function::Pose => "pose(x, y, z) or pose(x, y, z, roll, pitch, yaw)",
             Function::Joints => "joints(a, b, …)",
             Function::Compose => "compose(pose, pose)",
@@ -146,12 +149,14 @@ impl Function {
             Function::PlacePose => matches!(arguments, 2 | 3),
             Function::If => arguments == 3,
             Function::Pose => matches!(arguments, 3 | 6),
+            Function::Either => arguments >= 2,
             Function::Min | Function::Max | Function::Joints | Function::Concat => arguments >= 1,
         }
     }
 }
 
-/// The value of a call; the error says what is wrong with the arguments. `if` is not here: it does not evaluate all.
+/// The value of a call; the error says what is wrong with the arguments. `if` and `either` are not here: they do not
+/// evaluate all.
 pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, String> {
     if !function.takes(arguments.len()) {
         return Err(format!("expected `{}`", function.usage()));

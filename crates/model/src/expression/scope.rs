@@ -28,6 +28,11 @@ pub trait Scope {
     fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
         self.outer()?.port(state, port)
     }
+    /// Whether the control flow has come through a state that writes this output, so that it has a value or will have one, or it has a
+    /// default. Unlike its value this is known as soon as the way is.
+    fn is_given(&self, state: StateId, port: &str) -> bool {
+        self.outer().is_none_or(|outer| outer.is_given(state, port))
+    }
     /// The first fact that matches, in the order of keys.
     fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
         self.outer().map_or(Lookup::Unknown, |outer| outer.fact(pattern))

@@ -6,8 +6,8 @@
 use super::functions::Functions;
 use super::outline::{Form, Outline};
 use crate::catalogue::{Catalogue, no_states};
-use crate::expression::Expr;
 use crate::expression::parse::{NameError, Names};
+use crate::expression::{Expr, Function};
 use crate::id::StateId;
 use crate::ontology::Ontology;
 use crate::program::Program;
@@ -49,12 +49,26 @@ pub(crate) struct View {
     pub(crate) state: Option<StateId>,
     /// It sees the state's children and its scoped variables (outputs of a hierarchy).
     pub(crate) inside: bool,
+    /// What it sees of a loop's own variables, when it is inside of the loop.
+    pub(crate) of_loop: OfLoop,
     /// A bare word may be an output of the state itself (its effects).
     pub(crate) own_outputs: bool,
     /// Further variables (of quantified effects).
     pub(crate) variables: Vec<String>,
     /// An annotation of the state's action is read: it sees the action's ports alone.
     pub(crate) action: Option<Rc<super::action::Ports>>,
+}
+
+/// What an expression of a loop sees of the variables that the loop binds.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) enum OfLoop {
+    /// The number of the iteration, between two of them.
+    #[default]
+    Number,
+    /// All, at the end of an iteration.
+    All,
+    /// Nothing, at the end of the loop.
+    Nothing,
 }
 
 /// The names of a task as one expression sees them.
@@ -93,15 +107,23 @@ impl Task<'_> {
 }
 
 impl NamesFrom<'_, '_> {
+    /// The state of a name inside of one; in a condition one of each branch, and of each case of a `switch`.
+    fn inside(&self, around: StateId, name: &str) -> Vec<StateId> {
+        let outline = &self.task.outline;
+        let named = |id: &&StateId| outline.step(**id).name == name;
+        let form = &outline.step(around).form;
+        let mut found: Vec<StateId> = form.first_branch().iter().find(named).copied().into_iter().collect();
+        if let Form::Condition { otherwise, .. } = form {
+            found.extend(otherwise.iter().find(named));
+            let next = otherwise.iter().filter(|id| outline.step(**id).is_next_case(otherwise));
+            found.extend(next.flat_map(|id| self.inside(*id, name)));
+        }
+        found
+    }
+
     fn find(&self, from: StateId, name: &str) -> Option<StateId> {
         let outline = &self.task.outline;
         let named = |id: &&StateId| outline.step(**id).name == name;
-        let children = outline.step(from).form.first_branch();
-        if self.view.inside
-            && let Some(found) = children.iter().find(named)
-        {
-            return Some(*found);
-        }
         let siblings = outline.around(from).find_map(|id| outline.siblings(id).iter().find(named).copied());
         siblings.or_else(|| {
             let at = outline.steps.iter().skip(1).position(|step| step.name == name)?;
@@ -118,10 +140,14 @@ impl Names for NamesFrom<'_, '_> {
         let mut known: Vec<&str> = self.view.variables.iter().map(String::as_str).collect();
         known.extend(self.view.state.iter().flat_map(|state| self.task.loop_variables(*state)));
         if let Some(state) = self.view.state {
-            if self.view.inside
-                && let Form::While { index: Some(index), .. } = &self.task.outline.step(state).form
-            {
-                known.push(index);
+            if self.view.inside {
+                let all = self.view.of_loop == OfLoop::All;
+                let bound = match &self.task.outline.step(state).form {
+                    Form::While { index, .. } if self.view.of_loop != OfLoop::Nothing => [index.as_deref(), None],
+                    Form::ForEach { variable, index, .. } if all => [Some(variable.as_str()), index.as_deref()],
+                    _ => [None, None],
+                };
+                known.extend(bound.into_iter().flatten());
             }
             known.extend(self.task.scoped_variables(state, self.view.inside));
         }
@@ -160,7 +186,12 @@ impl Names for NamesFrom<'_, '_> {
                 help: "only constants and parameters can be used here; quote a text that contains a point".to_owned(),
             });
         };
-        let Some(id) = self.find(from, state) else {
+        let inside = if self.view.inside { self.inside(from, state) } else { Vec::new() };
+        if let [_, _, ..] = inside.as_slice() {
+            let ways = inside.iter().map(|id| self.port_of(from, *id, port)).collect::<Result<Vec<_>, _>>()?;
+            return Ok(Expr::Call(Function::Either, ways));
+        }
+        let Some(id) = inside.first().copied().or_else(|| self.find(from, state)) else {
             let names = self.task.outline.steps.iter().skip(1).map(|step| step.name.as_str());
             return Err(NameError {
                 rule: "unknown-state",
@@ -168,7 +199,23 @@ impl Names for NamesFrom<'_, '_> {
                 help: suggestion(state, names, "", "name a state of this task, or quote a text that contains a point"),
             });
         };
+        self.port_of(from, id, port)
+    }
+
+    fn has_function(&self, name: &str) -> bool {
+        self.view.action.is_none() && self.task.functions.has(name)
+    }
+
+    fn call(&mut self, name: &str, arguments: Vec<Expr>) -> Result<Expr, NameError> {
+        self.task.functions.call(name, &arguments)
+    }
+}
+
+impl NamesFrom<'_, '_> {
+    /// A port of a state that was found.
+    fn port_of(&self, from: StateId, id: StateId, port: &str) -> Result<Expr, NameError> {
         let ports = &self.task.ports[id.0 as usize];
+        let state = &self.task.outline.step(id).name;
         if port == OUTCOME && self.task.outline.is_region(id) {
             return Ok(Expr::Port { state: id, port: port.to_owned() });
         }
@@ -176,9 +223,8 @@ impl Names for NamesFrom<'_, '_> {
             let none = match self.task.outline.step(id).form {
                 Form::Action { .. } => "its action has no outputs",
                 Form::Wait { .. } => "a wait for a signal has the output `value`, a question `answer`",
-                Form::Sequence { .. } | Form::Concurrency { .. } => "declare it under the state's `outputs`",
                 Form::Library { .. } => "declare it under the `outputs` of the library",
-                _ => "loops and conditions have no outputs",
+                _ => "declare it under the state's `outputs`",
             };
             return Err(NameError {
                 rule: "unknown-port",
@@ -190,14 +236,6 @@ impl Names for NamesFrom<'_, '_> {
             return Ok(Expr::Output(port.to_owned()));
         }
         Ok(Expr::Port { state: id, port: port.to_owned() })
-    }
-
-    fn has_function(&self, name: &str) -> bool {
-        self.view.action.is_none() && self.task.functions.has(name)
-    }
-
-    fn call(&mut self, name: &str, arguments: Vec<Expr>) -> Result<Expr, NameError> {
-        self.task.functions.call(name, &arguments)
     }
 }
 

@@ -204,6 +204,11 @@ impl Outline<'_> {
 }
 
 impl<'a> Step<'a> {
+    /// Whether it is what a `switch` becomes from its second case on: the only state of the branch, a condition called `else`.
+    pub(crate) fn is_next_case(&self, branch: &[StateId]) -> bool {
+        branch.len() == 1 && self.name == "else" && matches!(self.form, Form::Condition { .. })
+    }
+
     /// What must hold as long as it goes on: `while` beside what the step is.
     pub(crate) fn holds(&self) -> Option<&'a Node> {
         match self.form {

@@ -5,19 +5,19 @@ use super::fields::{Fields, Output};
 use super::names::{Task, View};
 use super::outline::{Form, Step, Tests};
 use super::yaml::{Content, Node};
-use super::{effects, flow, library, resources, wait};
+use super::{effects, flow, library, outputs, resources, wait};
 use crate::expression::parse::parse_expression;
 use crate::expression::{Expr, FactExpr, UnaryOperator};
 use crate::fact::SCENE_PREDICATES;
 use crate::id::StateId;
-use crate::program::{ABORTED, Annotations, Nature, PREEMPTED, SUCCESS, State, StateKind, TaskOutput};
+use crate::program::{ABORTED, Annotations, Nature, PREEMPTED, SUCCESS, State, StateKind};
 use crate::value::{Type, Value};
 
 const ACTION_KEYS: [&str; 3] = ["action", "in", "out"];
 const SEQUENCE_KEYS: [&str; 3] = ["states", "outputs", "variables"];
-const LOOP_KEYS: [&str; 3] = ["for", "index", "do"];
-const WHILE_KEYS: [&str; 5] = ["while", "do_while", "until", "index", "do"];
-const CONDITION_KEYS: [&str; 3] = ["condition", "then", "else"];
+const LOOP_KEYS: [&str; 4] = ["for", "index", "do", "outputs"];
+const WHILE_KEYS: [&str; 6] = ["while", "do_while", "until", "index", "do", "outputs"];
+const CONDITION_KEYS: [&str; 4] = ["condition", "then", "else", "outputs"];
 const CONCURRENCY_KEYS: [&str; 4] = ["concurrency", "regions", "decide", "outputs"];
 const LIBRARY_KEYS: [&str; 2] = ["library", "with"];
 const WAIT_KEYS: [&str; 2] = ["wait", "ask"];
@@ -50,7 +50,7 @@ pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
     if id.0 > 0 {
         fields.keys(step.body, &known_keys(&step.form));
     }
-    let kind = kind(&mut fields, step);
+    let mut kind = kind(&mut fields, step);
     let outcomes = flow::outcomes(&mut fields, id);
     let transitions = flow::transitions(&mut fields, id);
     let variables = match step.form {
@@ -59,6 +59,9 @@ pub(crate) fn state(task: &Task<'_>, id: StateId, out: &mut Output) -> State {
     };
     let assign = flow::assign(&mut fields, id, step.body);
     let defaults = defaults(&mut fields, step.body);
+    if let Some(outputs) = kind.outputs_mut() {
+        outputs::with_defaults(outputs, &defaults);
+    }
     let annotations = if id.0 > 0 { annotations(&mut fields, step, &kind) } else { boundary(Vec::new()) };
     let mut state = State {
         id,
@@ -111,15 +114,11 @@ fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
             if provider.is_empty() {
                 fields.error("unknown-action", action.at, "expected `action: provider/action`", "");
             }
-            StateKind::Action { provider, action: name, inputs: inputs(fields, step.body), outputs: outputs(fields) }
+            StateKind::Action { provider, action: name, inputs: inputs(fields, step.body), outputs: ports(fields) }
         }
         Form::Sequence { children } => {
             let children = children.clone();
-            fields.view.inside = true;
-            let node = step.body.get("outputs");
-            let outputs = node.map(|node| task_outputs(fields, node)).unwrap_or_default();
-            fields.view.inside = false;
-            StateKind::Sequence { children, outputs }
+            StateKind::Sequence { children, outputs: outputs::read(fields, step) }
         }
         Form::ForEach { variable, collection, index, body } => {
             for name in std::iter::once(variable).chain(index) {
@@ -135,6 +134,7 @@ fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
                 index: index.clone(),
                 collection: list.unwrap_or_else(nothing),
                 body: body.clone(),
+                outputs: outputs::read(fields, step),
             }
         }
         Form::While { predicate, tests, index, body } => {
@@ -150,7 +150,8 @@ fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
                 Tests::Before | Tests::After => holds,
             };
             let body_first = *tests != Tests::Before;
-            StateKind::While { predicate, body_first, index: index.clone(), body: body.clone() }
+            let outputs = outputs::read(fields, step);
+            StateKind::While { predicate, body_first, index: index.clone(), body: body.clone(), outputs }
         }
         Form::Concurrency { kind, regions } => {
             let (preemptive, successes) = match &kind.content {
@@ -174,10 +175,7 @@ fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
                 }
             };
             let decide = flow::decide(fields, step.body);
-            fields.view.inside = true;
-            let node = step.body.get("outputs");
-            let outputs = node.map(|node| task_outputs(fields, node)).unwrap_or_default();
-            fields.view.inside = false;
+            let outputs = outputs::read(fields, step);
             StateKind::Concurrency { regions: regions.clone(), preemptive, successes, decide, outputs }
         }
         Form::Wait { node, asks } => wait::kind(fields, node, *asks),
@@ -186,7 +184,8 @@ fn kind(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> StateKind {
         Form::Condition { predicate, then, otherwise } => {
             fields.note("condition", predicate.at);
             let predicate = fields.expression(predicate).unwrap_or_else(nothing);
-            StateKind::Condition { predicate, then: then.clone(), otherwise: otherwise.clone() }
+            let outputs = outputs::read(fields, step);
+            StateKind::Condition { predicate, then: then.clone(), otherwise: otherwise.clone(), outputs }
         }
     }
 }
@@ -214,7 +213,7 @@ fn inputs(fields: &mut Fields<'_, '_>, body: &Node) -> Vec<(String, Expr)> {
     inputs
 }
 
-fn outputs(fields: &Fields<'_, '_>) -> std::collections::BTreeMap<String, Type> {
+fn ports(fields: &Fields<'_, '_>) -> std::collections::BTreeMap<String, Type> {
     let own = fields.view.state.map(|id| fields.task.ports[id.0 as usize].types.clone());
     own.unwrap_or_default()
 }
@@ -225,7 +224,7 @@ fn defaults(fields: &mut Fields<'_, '_>, body: &Node) -> std::collections::BTree
     let of_action = body.get("out").map(Node::entries).unwrap_or_default();
     let of_hierarchy = body.get("outputs").map(Node::entries).unwrap_or_default();
     let long = of_action.iter().filter(|entry| super::is_port_form(&entry.value));
-    for entry in long.chain(of_hierarchy.iter().filter(|entry| entry.value.get("value").is_some())) {
+    for entry in long.chain(of_hierarchy.iter().filter(|entry| outputs::is_long(&entry.value))) {
         if let Some(node) = entry.value.get("default")
             && let Some(value) = super::constant(fields, node)
         {
@@ -235,29 +234,12 @@ fn defaults(fields: &mut Fields<'_, '_>, body: &Node) -> std::collections::BTree
             }
             defaults.insert(entry.key.clone(), value);
         }
+        // Before the first iteration there is nothing of any.
+        if entry.value.get("each").is_some() {
+            defaults.entry(entry.key.clone()).or_insert_with(|| Value::List(Vec::new()));
+        }
     }
     defaults
-}
-
-/// `outputs: {name: expression}` or `{name: {type: int, value: expression}}`.
-pub(crate) fn task_outputs(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<TaskOutput> {
-    let mut outputs = Vec::new();
-    for entry in node.entries() {
-        fields.note(format!("outputs.{}", entry.key), entry.at);
-        let long = entry.value.get("value").is_some();
-        let ty = match entry.value.get("type") {
-            Some(node) if long => super::declared_type(fields, node),
-            _ => None,
-        };
-        if long {
-            fields.keys(&entry.value, &["type", "value", "default", "description"]);
-        }
-        let value = if long { entry.value.get("value").unwrap_or(&entry.value) } else { &entry.value };
-        if let Some(value) = fields.expression(value) {
-            outputs.push(TaskOutput { name: entry.key.clone(), ty: ty.unwrap_or(Type::Any), value });
-        }
-    }
-    outputs
 }
 
 /// Of a state that contains others: it reads and changes nothing beside what they do, and what its own keys say.

@@ -19,6 +19,7 @@
 use super::suggestion;
 use super::yaml::{Content, Entry, Node};
 use crate::diagnostic::Findings;
+use crate::expression::Comprehension;
 use crate::expression::display::is_word;
 use crate::parameters::constant;
 use crate::program::{ABORTED, SUCCESS};
@@ -256,7 +257,7 @@ fn alike(node: &mut Node, name: &str, findings: &mut Findings) {
         let message = format!("there are 1 to {MAX_REGIONS} regions that are alike, and not {}", values.len());
         return findings.error("invalid-state", at, name, message, help);
     }
-    if binds(&body, &variable) {
+    if binds(&body, &variable) || rest.iter().any(|one| binds(&one.value, &variable)) {
         let message = format!("another variable inside is called `{variable}`, too");
         return findings.error("invalid-state", at, name, message, "give one of them another name");
     }
@@ -280,7 +281,19 @@ fn constant_text(value: &Value) -> String {
     if is_plain { value.to_string() } else { format!("({value})") }
 }
 
-/// Whether a loop or variables inside bind this name.
+/// Whether a text says `map($name in …`, or the same of another function of elements.
+fn is_element(text: &str, variable: &str) -> bool {
+    let name = format!("${variable}");
+    text.match_indices(&name).any(|(at, _)| {
+        let behind = text[at + name.len()..].strip_prefix(char::is_whitespace);
+        let is_list_behind = behind.is_some_and(|rest| rest.trim_start().starts_with("in "));
+        let called = text[..at].trim_end().strip_suffix('(').map(str::trim_end);
+        let called = called.and_then(|called| called.rsplit(|c: char| !(c.is_alphanumeric() || c == '_')).next());
+        is_list_behind && called.is_some_and(|called| Comprehension::named(called).is_some())
+    })
+}
+
+/// Whether a loop, variables or a comprehension inside bind this name.
 fn binds(node: &Node, variable: &str) -> bool {
     let by_entry = |Entry { key, value, .. }: &Entry| {
         let is_bound = match (&value.content, key.as_str()) {
@@ -293,6 +306,7 @@ fn binds(node: &Node, variable: &str) -> bool {
         is_bound || binds(value, variable)
     };
     match &node.content {
+        Content::Text(text) => is_element(text, variable),
         Content::List(items) => items.iter().any(|item| binds(item, variable)),
         Content::Map(entries) => entries.iter().any(by_entry),
         _ => false,

@@ -35,7 +35,7 @@ A task is a function, which is called once and makes the same model as a task fi
 import pkgutil
 
 from ratn._annotations import Annotations, block, consume, create, delete, output
-from ratn._blocks import concurrently, do_while, each, lastly, otherwise, retry, sequence, until, when, while_
+from ratn._blocks import collect, concurrently, do_while, each, lastly, otherwise, retry, sequence, until, when, while_
 from ratn._expression import Functions, Untraceable, Value, exists, expr, fact, fn, isin
 
 from ratn._ratn import (
@@ -129,6 +129,7 @@ __all__ = [
     "action",
     "ask",
     "block",
+    "collect",
     "concurrently",
     "consume",
     "create",

@@ -105,9 +105,10 @@ class Output:
     default: object = None
     has_default: bool = False
     description: str | None = None
+    is_of_each: bool = False
 
     def entry(self) -> dict[str, Any]:
-        said: dict[str, Any] = {"value": entry(self.value)}
+        said: dict[str, Any] = {"each" if self.is_of_each else "value": entry(self.value)}
         if self.type is not None:
             said["type"] = self.type
         if self.has_default:
@@ -120,9 +121,15 @@ class Output:
 _NOTHING = object()
 
 
-def output(value: object, *, type: str | None = None, default: object = _NOTHING, description: str | None = None) -> Output:
-    """An output of a task or block with a type, a default or a description."""
-    return Output(value, type, None if default is _NOTHING else default, default is not _NOTHING, description)
+def output(
+    value: object = _NOTHING, *, each: object = _NOTHING, type: str | None = None, default: object = _NOTHING, description: str | None = None
+) -> Output:
+    """An output of a task or block with a type, a default or a description; of a loop also the list of a value of each iteration, ``each=``."""
+    if (value is _NOTHING) == (each is _NOTHING):
+        raise TypeError("an output has a value, or of a loop `each=`")
+    is_of_each = value is _NOTHING
+    said = each if is_of_each else value
+    return Output(said, type, None if default is _NOTHING else default, default is not _NOTHING, description, is_of_each)
 
 
 def block(kind: str, **said: Any) -> dict[str, Any]:

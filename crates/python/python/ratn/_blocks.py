@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import ast
+import itertools
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from ratn._annotations import annotate, entry, outputs_said
+from ratn._annotations import annotate, entry, output, outputs_said
 from ratn._expression import Value, refuse, statements_at_work, user_line, written
-from ratn._trace import AnyState, Node, Trace, assigned_name, calls
+from ratn._trace import AnyState, Node, Port, Trace, assigned_name, calls
 
 
 class Block(AnyState):
@@ -37,25 +38,24 @@ class Block(AnyState):
 
     def _say(self, key: str, said: dict[str, Any]) -> None:
         """Something about what is inside, said inside or after it."""
-        inside = (self._node.branches[self._FORM], self._node)
-        is_open = any(one[0] is inside[0] for one in self._trace.open)
-        if not is_open:
-            self._trace.open.append(inside)
+        is_open = {id(states) for states, _ in self._trace.open}
+        lists = [(states, self._node) for branch, states in self._node.branches.items() if branch != "finally"]
+        depth = len(self._trace.open)
+        self._trace.open += [one for one in lists if id(one[0]) not in is_open]
         try:
             self._node.body.setdefault(key, {}).update(outputs_said(said) if key == "outputs" else entry(said))
         finally:
-            if not is_open:
-                self._trace.open.pop()
+            del self._trace.open[depth:]
+
+    def outputs(self, **outputs: Any) -> None:
+        """What is seen of it outside: ``think.outputs(way=plan.trajectory)``. What is used outside is seen without that, too."""
+        self._say("outputs", outputs)
 
 
 class Ordered(Block):
     """States in order, as one state."""
 
     __slots__ = ()
-
-    def outputs(self, **outputs: Any) -> None:
-        """What is seen of it outside: ``think.outputs(way=plan.trajectory)``. What is used outside is seen without that, too."""
-        self._say("outputs", outputs)
 
 
 class Retry(Ordered):
@@ -140,10 +140,6 @@ class Concurrency(Block):
 
     __slots__ = ()
     _FORM = "regions"
-
-    def outputs(self, **outputs: Any) -> None:
-        """What is seen of it outside."""
-        self._say("outputs", outputs)
 
     def decide(self, **outcomes: Any) -> None:
         """Its outcome is the first whose condition holds: ``both.decide(blind=head.outcome == "aborted")``."""
@@ -275,6 +271,25 @@ def each(elements: object, *, variable: str | None = None, index: str | bool | N
     With ``index=True`` also their numbers: ``for i, box in ratn.each(look.boxes, index=True):``.
     """
     return Each(elements, variable, index, name, annotations)
+
+
+def collect(value: object, *, name: str | None = None, type: str | None = None) -> Value:
+    """Inside of a loop: the list of what the value is at the end of each iteration, for what comes after the loop. ``seen = ratn.collect(look.boxes)``."""
+    at = user_line()
+    trace = Trace.now("`ratn.collect`")
+    place = trace.collects()
+    name = name or assigned_name("collect", at) or "all"
+    innermost, trace.open[place + 1 :] = trace.open[place + 1 :], []
+    try:
+        said = output(each=value, type=type).entry()
+    finally:
+        trace.open += innermost
+    loop = trace.open[place][1]
+    assert loop is not None
+    outputs = loop.body.setdefault("outputs", {})
+    free = next(n for n in itertools.chain([name], (f"{name}_{i}" for i in itertools.count(2))) if n not in outputs or outputs[n] == said)
+    outputs[free] = said
+    return Value(Port(loop, free))
 
 
 def _loop(key: str, function: str, condition: object, index: str | None, name: str | None, annotations: dict[str, Any]) -> Loop:

@@ -393,6 +393,11 @@ class Functions:
 
 
 def _applied(name: str, arguments: tuple[object, ...]) -> Value:
+    if name == "either":
+        from ratn._trace import Either
+
+        # Where it is written down depends on where the states are that give the values.
+        return Value(Either(arguments))
     if name not in _OF_ELEMENTS:
         return call(name, *arguments)
     if len(arguments) != 2 or not callable(arguments[1]):

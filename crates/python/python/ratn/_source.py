@@ -40,11 +40,12 @@ def _expression(value: Any) -> str:
 
 
 def _output(said: Any) -> str:
-    if not isinstance(said, dict) or "value" not in said:
+    if not isinstance(said, dict) or not ("value" in said or "each" in said):
         return _expression(said)
     more = {"type": repr, "default": _expression, "description": repr}
     rest = "".join(f", {key}={show(said[key])}" for key, show in more.items() if key in said)
-    return f"ratn.output({_expression(said['value'])}{rest})"
+    value = f"each={_expression(said['each'])}" if "each" in said else _expression(said["value"])
+    return f"ratn.output({value}{rest})"
 
 
 def _annotations(body: dict[str, Any], without: tuple[str, ...]) -> list[str]:

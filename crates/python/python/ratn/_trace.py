@@ -5,9 +5,10 @@ from __future__ import annotations
 import ast
 import contextvars
 import typing
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from ratn._expression import Value, refuse, statements_at_work, user_line
+from ratn._expression import Value, refuse, statements_at_work, user_line, written
 from ratn._yaml import Body
 
 if typing.TYPE_CHECKING:
@@ -43,10 +44,14 @@ class Node:
             self.name = self._unique(self.default)
         return self.name
 
-    @property
-    def shows_outputs(self) -> bool:
-        """Whether states inside are seen from outside, through outputs."""
-        return "states" in self.branches or "regions" in self.branches
+    def put_out(self, text: str, *names: str) -> str:
+        """The name of the output with this value, which is added where there is none."""
+        outputs = self.body.setdefault("outputs", {})
+        known = [name for name, said in outputs.items() if said == text]
+        free = [name for name in names if name not in outputs] or [f"{names[-1]}_{len(outputs)}"]
+        name = known[0] if known else free[0]
+        outputs[name] = text
+        return str(name)
 
     def item(self) -> Body:
         """As it stands in a list of states."""
@@ -110,20 +115,51 @@ class Trace:
         owner = node.owner
         if owner is None:
             refuse(f"`{node.named()}` is a state of another task", "states see those of their own task only")
-        if node.siblings in (owner.before, owner.branches.get("finally")) or not owner.shows_outputs:
+        if node.siblings is owner.before or node.siblings is owner.branches.get("finally"):
             where = f"{owner.line[0]}:{owner.line[1]}"
             refuse(
                 f"`{node.named()}` is not seen outside of the block that begins at {where}",
-                "a loop, a condition, a `before` or a `lastly` has no outputs: let an effect say it as a fact, and read that",
+                "a `before` or a `lastly` has no outputs: let an effect say it as a fact, and read that",
             )
         if port == "outcome":
             refuse(f"how `{node.named()}` ended is seen only beside it", "let an effect say it as a fact, or give the block around an outcome")
-        outputs = owner.body.setdefault("outputs", {})
-        text = f"{node.named()}.{port}"
-        known = [name for name, said in outputs.items() if said == text]
-        name = known[0] if known else port if port not in outputs else f"{node.named()}_{port}"
-        outputs[name] = text
-        return self.seen(owner, name)
+        return self.seen(owner, owner.put_out(f"{node.named()}.{port}", port, f"{node.named()}_{port}"))
+
+    def first_of(self, ways: Sequence[object]) -> str:
+        """`either` of some values. Those that are inside of one block are put out by that, as the first of them that was written there."""
+        around = [self._hides(way) for way in ways]
+        hidden = {id(block): block for block in around if block is not None}
+        if len(hidden) != 1:
+            return f"either({', '.join(str(written(way)) for way in ways)})"
+        (block,) = hidden.values()
+        inside = [way for way, hides in zip(ways, around, strict=True) if hides is not None or not _ports(way)]
+        outside = [way for way, hides in zip(ways, around, strict=True) if hides is None]
+        depth = len(self.open)
+        self.open += [(states, block) for states in block.branches.values()]
+        try:
+            text = self.first_of(inside) if len(inside) > 1 else str(written(inside[0]))
+        finally:
+            del self.open[depth:]
+        (port, *_) = _ports(next(way for way, hides in zip(ways, around, strict=True) if hides is not None))
+        seen = f"{block.named()}.{block.put_out(text, port.port, f'either_{port.port}')}"
+        return f"either({', '.join([seen, *(str(written(way)) for way in outside)])})" if outside else seen
+
+    def _hides(self, way: object) -> Node | None:
+        """The block beside what is open that a value is inside of, if it is."""
+        for port in _ports(way):
+            node = port.node
+            while not any(siblings is node.siblings for siblings, _ in self.open) and node.owner is not None:
+                node = node.owner
+            if node is not port.node:
+                return node
+        return None
+
+    def collects(self) -> int:
+        """Where among what is open the innermost loop is."""
+        for at, (states, owner) in reversed(list(enumerate(self.open))):
+            if owner is not None and states is owner.branches.get("do"):
+                return at
+        refuse("`ratn.collect` outside of a loop", "write it inside of `for x in ratn.each(list):`, or of another loop")
 
 
 class Port:
@@ -134,6 +170,28 @@ class Port:
 
     def __str__(self) -> str:
         return Trace.now(f"`{self.node.named()}.{self.port}`").seen(self.node, self.port)
+
+
+class Either:
+    """The first of some values that was written on the way that was taken."""
+
+    def __init__(self, ways: Sequence[object]) -> None:
+        self.ways = ways
+
+    def __str__(self) -> str:
+        return Trace.now("`fn.either`").first_of(self.ways)
+
+
+def _ports(value: object) -> list[Port]:
+    """The outputs that a value is made of."""
+    if isinstance(value, Port):
+        return [value]
+    if isinstance(value, Either):
+        return [port for way in value.ways for port in _ports(way)]
+    if isinstance(value, dict):
+        return _ports(list(value.values()))
+    parts = value._parts if isinstance(value, Value) else value if isinstance(value, (list, tuple)) else ()
+    return [port for part in parts for port in _ports(part)]
 
 
 class State:

@@ -84,7 +84,7 @@ impl Maker {
         outcomes.sort();
         outcomes.dedup();
         self.at(id).outcomes = outcomes;
-        StateKind::Condition { predicate, then, otherwise }
+        StateKind::Condition { predicate, then, otherwise, outputs: Vec::new() }
     }
 
     pub(super) fn for_each(
@@ -112,7 +112,7 @@ impl Maker {
         inner.variables.extend(index.clone());
         let (body, _, outcomes) = self.list(id, path, depth + 1, room, inner, true);
         self.at(id).outcomes = outcomes;
-        StateKind::ForEach { variable, index, collection, body }
+        StateKind::ForEach { variable, index, collection, body, outputs: Vec::new() }
     }
 
     /// `while` or `do … while`, counted.
@@ -137,6 +137,6 @@ impl Maker {
         };
         let predicate = Expr::Binary(BinaryOperator::And, Box::new(counted), Box::new(predicate));
         self.at(id).outcomes = outcomes;
-        StateKind::While { predicate, body_first, index: Some(index), body }
+        StateKind::While { predicate, body_first, index: Some(index), body, outputs: Vec::new() }
     }
 }

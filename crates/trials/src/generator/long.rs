@@ -78,7 +78,8 @@ impl Maker {
             self.states[part.0 as usize].defaults = BTreeMap::from(defaults);
         }
         let collection = Expr::Call(Function::Range, vec![Expr::Literal(Value::Int(LOOP))]);
-        self.at(id).kind = StateKind::ForEach { variable: "n".to_owned(), index: None, collection, body };
+        self.at(id).kind =
+            StateKind::ForEach { variable: "n".to_owned(), index: None, collection, body, outputs: Vec::new() };
         vec![id]
     }
 

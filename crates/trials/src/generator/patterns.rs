@@ -85,7 +85,13 @@ impl Maker {
                     let variable = format!("v{}", id.0);
                     let times = Expr::Literal(Value::Int(2 + self.dice.below(4) as i64));
                     let collection = Expr::Call(Function::Range, vec![times]);
-                    return Some(StateKind::ForEach { variable, index: None, collection, body: children });
+                    return Some(StateKind::ForEach {
+                        variable,
+                        index: None,
+                        collection,
+                        body: children,
+                        outputs: Vec::new(),
+                    });
                 }
                 children
             }

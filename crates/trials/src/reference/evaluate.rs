@@ -46,6 +46,28 @@ impl Place<'_> {
         Ok(FactPattern { predicate: fact.predicate.clone(), arguments })
     }
 
+    /// Whether the way here led through what an expression is made of.
+    fn has(&self, expr: &Expr) -> bool {
+        match expr {
+            Expr::Call(Function::Either, ways) => ways.iter().any(|way| self.has(way)),
+            Expr::Port { state, port } => {
+                let of = self.program.state(*state);
+                let is_end = port == "outcome" && self.regions.contains_key(state);
+                is_end || self.outputs.contains_key(state) || of.defaults.contains_key(port)
+            }
+            other => {
+                let mut has_all = true;
+                let mut is_whole = true;
+                other.visit(&mut |part| {
+                    if !std::mem::take(&mut is_whole) && matches!(part, Expr::Port { .. }) {
+                        has_all &= self.has(part);
+                    }
+                });
+                has_all
+            }
+        }
+    }
+
     fn port(&self, state: StateId, port: &str) -> Option<Value> {
         let of = self.program.state(state);
         let around = of.parent.map(|parent| &self.program.state(parent).kind);
@@ -113,6 +135,11 @@ impl Read for Expr {
                 [_, _, no] => no.read(place),
                 _ => wrong("`if` has three arguments"),
             },
+            Expr::Call(Function::Either, ways) => {
+                let last = ways.len().saturating_sub(1);
+                let chosen = ways.iter().enumerate().find(|(n, way)| *n == last || place.has(way));
+                chosen.map_or_else(|| wrong("`either` of nothing"), |(_, way)| way.read(place))
+            }
             Expr::Call(called, arguments) => {
                 let values = arguments.iter().map(|a| a.read(place)).collect::<Result<Vec<Value>, Fail>>()?;
                 function::call(*called, &values)

@@ -116,6 +116,7 @@ fn without_facts(expr: &Expr, hidden: &mut usize, all: &mut Vec<Condition>) -> E
             items.iter_mut().take(1).for_each(|first| *first = *within(first));
             Expr::Call(Function::If, items)
         }
+        Expr::Call(Function::Either, _) => expr.clone(),
         Expr::Call(called, items) => Expr::Call(*called, items.iter().map(|item| *within(item)).collect()),
         _ => expr.clone(),
     }

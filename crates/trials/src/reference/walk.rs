@@ -71,7 +71,9 @@ impl Reference<'_> {
         if begins_routine && fails(self.asks(state, variables))?.is_err() {
             return Ok(ABORTED.to_owned());
         }
-        self.forget(id);
+        if !program.is_pass(id) {
+            self.forget(id);
+        }
         let outside = variables.len();
         for (name, value) in &state.variables {
             // None sees another.
@@ -97,14 +99,14 @@ impl Reference<'_> {
                 again.map(|again| self.again(again, state, path, variables, inside)).transpose()?
             }
             StateKind::Sequence { children, .. } => Some(self.list(children, path, variables, inside)?),
-            StateKind::Condition { predicate, then, otherwise } => {
+            StateKind::Condition { predicate, then, otherwise, .. } => {
                 match fails(predicate.is_true(&self.place(variables, None)))? {
                     Ok(true) => Some(self.list(then, path, variables, inside)?),
                     Ok(false) => Some(self.list(otherwise, path, variables, inside)?),
                     Err(_) => None,
                 }
             }
-            StateKind::ForEach { variable, index, collection, body } => {
+            StateKind::ForEach { variable, index, collection, body, .. } => {
                 match fails(collection.read(&self.place(variables, None)))? {
                     Ok(Value::List(elements)) => {
                         let mut left = SUCCESS.to_owned();
@@ -123,7 +125,7 @@ impl Reference<'_> {
                     _ => None,
                 }
             }
-            StateKind::While { predicate, body_first, index, body } => {
+            StateKind::While { predicate, body_first, index, body, .. } => {
                 self.repeat(predicate, *body_first, index.as_deref(), body, path, variables, inside)?
             }
             StateKind::Concurrency { preemptive: true, .. } => match self.race(state, path, variables, inside)? {
@@ -377,10 +379,8 @@ impl Reference<'_> {
     fn leave(&mut self, state: &State, outcome: &str, variables: &Variables) -> Result<Vec<(String, Value)>, Fail> {
         let is_good = !matches!(outcome, ABORTED | PREEMPTED | VIOLATED);
         let mut written = Outputs::new();
-        if let (true, StateKind::Sequence { outputs, .. } | StateKind::Concurrency { outputs, .. }) =
-            (is_good, &state.kind)
-        {
-            for output in outputs {
+        if is_good {
+            for output in state.outputs() {
                 match output.value.read(&self.place(variables, Some(&written))) {
                     Ok(value) => drop(written.insert(output.name.clone(), value)),
                     // It was left early, before that was written.
@@ -397,7 +397,7 @@ impl Reference<'_> {
         if outcome == SUCCESS {
             self.operates(state, variables, &written)?;
         }
-        if is_good && matches!(state.kind, StateKind::Sequence { .. } | StateKind::Concurrency { .. }) {
+        if is_good {
             self.outputs.insert(state.id, written);
         }
         Ok(assigned)

@@ -63,7 +63,9 @@ impl Growth {
                 // Iterating counts on from here.
                 let before = if *body_first { 0 } else { usize::MAX };
                 let iteration = Iteration { index: before, elements: None };
-                let frame = self.frame(index, id, visit, path, base, Some(iteration));
+                // Its scoped variables are there in every iteration.
+                let inside = base + state.variables.len();
+                let frame = self.frame(index, id, visit, path, inside, Some(iteration));
                 self.cursors[index].environment.frames = Some(frame);
                 if *body_first {
                     self.begin_iteration(index, context.program);
@@ -194,9 +196,10 @@ impl Growth {
     ) {
         let own = context.plan.state(id);
         // The task's own variables are seen by its outputs.
-        let kept = if id == Program::ROOT { usize::MAX } else { variables };
+        let state = context.program.state(id);
+        let of_loop = if state.is_loop() { state.variables.len() } else { 0 };
+        let kept = if id == Program::ROOT { usize::MAX } else { variables.saturating_sub(of_loop) };
         if own.exits & (1 << outcome) != 0 {
-            let state = context.program.state(id);
             let what = What::Marker(Role::Exit, outcome);
             let instance = self.append(graph, context, index, state, what, (visit, None));
             graph.single_arm(instance, 1);

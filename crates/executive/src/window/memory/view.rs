@@ -295,6 +295,16 @@ impl Scope for View<'_> {
         }
     }
 
+    /// Who wrote an output is known as soon as the way to here is.
+    fn is_given(&self, state: StateId, port: &str) -> bool {
+        let environment = &self.instance.environment;
+        let plan = self.sight.plan;
+        if port == "outcome" && plan.state(state).is_region {
+            return environment.producers.get(plan.len() + state.0 as usize).is_some();
+        }
+        environment.producer(state).is_some() || self.sight.program.state(state).defaults.contains_key(port)
+    }
+
     fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
         if self.only_settled && self.is_changed(pattern) {
             return Lookup::Unknown;
@@ -338,6 +348,10 @@ impl Names for View<'_> {
 
     fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
         Scope::port(self, state, port)
+    }
+
+    fn is_given(&self, state: StateId, port: &str) -> bool {
+        Scope::is_given(self, state, port)
     }
 }
 

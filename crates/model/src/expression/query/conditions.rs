@@ -144,6 +144,7 @@ impl TakeOut<'_> {
             | Expr::Unknown(_) => {}
             // Facts of its body are looked up for each element.
             Expr::Each { list, .. } => self.strict(list),
+            Expr::Call(Function::Either, _) => {}
             Expr::Call(Function::If, arguments) => arguments.iter_mut().take(1).for_each(|first| self.strict(first)),
             Expr::Field(of, _) | Expr::Unary(_, of) => self.strict(of),
             Expr::Index(a, b) | Expr::Binary(_, a, b) => {

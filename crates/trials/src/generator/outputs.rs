@@ -1,0 +1,151 @@
+//! Outputs of conditions, loops and concurrencies, what different ways give, and who uses that.
+//!
+//! They are added to a program that is there: what its states read is said in another way, or they read something more. So the programs of
+//! older features stay what they are.
+
+use super::super::{Dice, around, is_preemptive};
+use ratn_model::expression::{BinaryOperator, EffectExpr, Expr, Function};
+use ratn_model::guard::{Collected, Guard};
+use ratn_model::id::StateId;
+use ratn_model::program::{Program, State, StateKind, TaskOutput};
+use ratn_model::value::{Type, Value};
+use std::collections::BTreeMap;
+
+/// What a loop collects.
+const ALL: &str = "all";
+/// What every state puts out that puts out anything.
+const X: &str = "x";
+/// More states than this do not use an output.
+const MOST_USERS: u64 = 3;
+
+/// Some states get outputs, and some use them.
+pub(super) fn add(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>, dice: &mut Dice) {
+    // What a state contains comes after it: the inner ones get theirs first.
+    for id in (1..program.states.len() as u64).rev().map(StateId) {
+        let inside = givers(program, id);
+        if inside.is_empty() || !dice.percent(75) {
+            continue;
+        }
+        let value = chosen(&inside, dice);
+        let state = &mut program.states[id.0 as usize];
+        let is_loop = state.is_loop();
+        let Some(outputs) = state.kind.outputs_mut() else { continue };
+        match outputs.iter_mut().find(|output| output.name == X) {
+            Some(output) => output.value = value,
+            None => outputs.push(TaskOutput { name: X.to_owned(), ty: Type::Any, value }),
+        }
+        if dice.percent(40) {
+            state.defaults.insert(X.to_owned(), Value::Int(dice.below(3) as i64));
+        }
+        if is_loop && dice.percent(50) {
+            collect(state, guards, &inside, dice);
+        }
+    }
+    for id in (1..program.states.len() as u64).map(StateId) {
+        for port in [X, ALL] {
+            if program.state(id).outputs().iter().any(|output| output.name == port) {
+                use_it(program, (id, port), dice);
+            }
+        }
+    }
+}
+
+/// The states directly inside of one that have an output `x`.
+fn givers(program: &Program, id: StateId) -> Vec<StateId> {
+    let gives = |state: &&State| match &state.kind {
+        StateKind::Action { outputs, .. } => outputs.contains_key(X),
+        _ => state.outputs().iter().any(|output| output.name == X),
+    };
+    program.state(id).children().map(|child| program.state(child)).filter(gives).map(|state| state.id).collect()
+}
+
+/// What one of some states gives: the first of those that were come to; seldom nothing is said of what it is where none was.
+fn chosen(from: &[StateId], dice: &mut Dice) -> Expr {
+    let port = |state: StateId| Expr::Port { state, port: X.to_owned() };
+    let mut rest = from.to_vec();
+    let mut ways = Vec::new();
+    while !rest.is_empty() && ways.len() < 3 {
+        let way = port(rest.remove(dice.below(rest.len() as u64) as usize));
+        let one = Box::new(Expr::Literal(Value::Int(1)));
+        ways.push(if dice.percent(20) { Expr::Binary(BinaryOperator::Add, Box::new(way), one) } else { way });
+    }
+    if dice.percent(80) {
+        ways.push(Expr::Literal(Value::Int(dice.below(3) as i64)));
+    }
+    match ways.len() {
+        1 => ways.remove(0),
+        3.. if dice.percent(30) => {
+            let inner = Expr::Call(Function::Either, ways.split_off(1));
+            Expr::Call(Function::Either, vec![ways.remove(0), inner])
+        }
+        _ => Expr::Call(Function::Either, ways),
+    }
+}
+
+/// A loop collects something of each iteration.
+fn collect(state: &mut State, guards: &mut BTreeMap<StateId, Guard>, inside: &[StateId], dice: &mut Dice) {
+    let value = match &state.kind {
+        StateKind::ForEach { variable, .. } if dice.percent(30) => Expr::Variable(variable.clone()),
+        StateKind::While { index: Some(index), .. } if dice.percent(30) => Expr::Variable(index.clone()),
+        _ => chosen(inside, dice),
+    };
+    let nothing = || Value::List(Vec::new());
+    state.defaults.insert(ALL.to_owned(), nothing());
+    if let Some(outputs) = state.kind.outputs_mut() {
+        outputs.push(TaskOutput { name: ALL.to_owned(), ty: Type::Any, value: Expr::Literal(nothing()) });
+    }
+    guards.entry(state.id).or_default().collected.push(Collected { name: ALL.to_owned(), value });
+}
+
+/// What comes behind a state in its list uses what it gives, and so may the task.
+fn use_it(program: &mut Program, (from, port): (StateId, &str), dice: &mut Dice) {
+    let Some(parent) = program.state(from).parent else { return };
+    let siblings = program.state(parent).list_of(from).to_vec();
+    let behind = siblings.iter().skip_while(|id| **id != from).skip(1);
+    let behind: Vec<StateId> = behind.copied().collect();
+    let is_region = matches!(program.state(parent).kind, StateKind::Concurrency { .. });
+    let is_behind = |state: &State| !is_region && around(program, state).any(|out| behind.contains(&out.id));
+    let users: Vec<StateId> = program.states.iter().filter(|state| is_behind(state)).map(|state| state.id).collect();
+    let plain = Expr::Port { state: from, port: port.to_owned() };
+    let otherwise = match port {
+        ALL => Expr::List(vec![Expr::Literal(Value::Int(7))]),
+        _ => Expr::Literal(Value::Int(2)),
+    };
+    let value = || Expr::Call(Function::Either, vec![plain.clone(), otherwise.clone()]);
+    let mut used = 0;
+    for id in users {
+        if used >= MOST_USERS || !dice.percent(50) {
+            continue;
+        }
+        let value = if dice.percent(85) { value() } else { plain.clone() };
+        let is_racing = around(program, program.state(id)).any(is_preemptive);
+        let state = &mut program.states[id.0 as usize];
+        if state.is_pause() {
+            continue;
+        }
+        let number = || if port == ALL { Expr::Call(Function::Len, vec![value.clone()]) } else { value.clone() };
+        match &mut state.kind {
+            StateKind::Action { inputs, .. } => {
+                let set = state.annotations.effects.values_mut().flatten().find_map(|effect| match effect {
+                    EffectExpr::Set(_, of @ Expr::Literal(Value::Int(_))) => Some(of),
+                    _ => None,
+                });
+                match set.filter(|_| !is_racing && dice.percent(40)) {
+                    Some(of) => *of = number(),
+                    None => inputs.push((format!("of_{port}_{}", from.0), value)),
+                }
+            }
+            StateKind::ForEach { collection, .. } if port == ALL => *collection = value,
+            StateKind::Condition { predicate, .. } if dice.percent(50) => {
+                let two = Box::new(Expr::Literal(Value::Int(1)));
+                *predicate = Expr::Binary(BinaryOperator::Greater, Box::new(number()), two);
+            }
+            _ => continue,
+        }
+        used += 1;
+    }
+    if parent == Program::ROOT && dice.percent(50) {
+        let name = format!("of_{port}_{}", from.0);
+        program.outputs.push(TaskOutput { name, ty: Type::Any, value: value() });
+    }
+}
