@@ -118,13 +118,13 @@ states:
   - follow:
       action: arm/follow
       in: { trajectory: plan.trajectory }
-      requires: ["concat('pos1.', s1) != 'bus1.2' or plan.length_m > 1"]
+      requires: ["concat('pos1.', s1) != 'bus1.2' or plan.length_rad > 1"]
       effects: ["at(box, 'pos1.') = plan.end_pose"]
 "#;
         let program = load(task, "t.yaml", &Catalogue::standard()).map(|loaded| loaded.program);
         let told = in_force(&program.unwrap_or_else(|found| panic!("{found:?}")));
         let of = |key: &str| told[1].lines.iter().find(|line| line.key == key).map(|line| line.text.clone());
-        assert_eq!(of("requires").as_deref(), Some("concat(\"pos1.\", s1) != \"bus1.2\" or plan.length_m > 1"));
+        assert_eq!(of("requires").as_deref(), Some("concat(\"pos1.\", s1) != \"bus1.2\" or plan.length_rad > 1"));
         assert!(
             of("effects").is_some_and(|effects| effects.contains("at(box, \"pos1.\") = plan.end_pose")),
             "{told:?}"

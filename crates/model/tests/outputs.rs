@@ -62,6 +62,18 @@ fn in_braces(item: &str) -> String {
 }
 
 #[test]
+fn a_way_of_an_either_may_contain_another_one() {
+    let (a, b) = (in_braces(&look("a")), in_braces(&look("b")));
+    for value in ["either(a.pan + 1, 0)", "either(either(a.pan, b.pan) + 1, 0)", "either(-either(a.pan, b.pan), b.pan)"] {
+        let text = condition(&a, &b, &format!("{{ pan: \"{value}\" }}"));
+        assert!(read(&text).is_ok(), "{value}: {:?}", read(&text).err());
+    }
+    // Neither branch has one: on each way the other part is missing.
+    let wrong = refused(&condition(&a, &b, "{ pan: \"either(a.pan + b.pan, b.pan + a.pan)\" }"));
+    assert!(wrong[0].starts_with("branch-may-not-have-written"), "{wrong:?}");
+}
+
+#[test]
 fn a_condition_gives_what_the_branch_gives_that_was_taken() {
     let (a, b) = (in_braces(&look("a")), in_braces(&look("b")));
     let made = program(&condition(&a, &b, "{ pan: \"either(a.pan, b.pan)\" }"));

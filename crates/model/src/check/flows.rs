@@ -234,16 +234,7 @@ fn ways(expr: &Expr) -> Ways<'_> {
     fn collect<'e>(expr: &'e Expr, ways: &mut Ways<'e>) {
         match expr {
             Expr::Port { state, port } => drop(ways.needed.insert((*state, port.as_str()))),
-            Expr::Call(Function::Either, all) => {
-                let all = flat(all).into_iter().map(|way| {
-                    let mut own = Ways::default();
-                    collect(way, &mut own);
-                    ways.either.append(&mut own.either);
-                    own.needed
-                });
-                let all = all.collect();
-                ways.either.push(all);
-            }
+            Expr::Call(Function::Either, all) => ways.either.push(all.iter().flat_map(alternatives).collect()),
             _ => {
                 let mut parts = Vec::new();
                 expr.parts(&mut |part| parts.push(part));
@@ -256,16 +247,23 @@ fn ways(expr: &Expr) -> Ways<'_> {
     ways
 }
 
-/// The ways of an `either` with those of one that is itself a way.
-fn flat(ways: &[Expr]) -> Vec<&Expr> {
-    let mut all = Vec::new();
-    for way in ways {
-        match way {
-            Expr::Call(Function::Either, inner) => all.extend(flat(inner)),
-            other => all.push(other),
+/// So many ways of one expression are looked at. What is sure only by further ones is refused.
+const MOST_WAYS: usize = 64;
+
+/// The outputs with which an expression has a value, way by way: what contains several `either` has a way for each choice among them.
+fn alternatives(expr: &Expr) -> Vec<BTreeSet<(StateId, &str)>> {
+    match expr {
+        Expr::Port { state, port } => vec![BTreeSet::from([(*state, port.as_str())])],
+        Expr::Call(Function::Either, all) => all.iter().flat_map(alternatives).take(MOST_WAYS).collect(),
+        _ => {
+            let mut parts = Vec::new();
+            expr.parts(&mut |part| parts.push(alternatives(part)));
+            parts.into_iter().fold(vec![BTreeSet::new()], |ways, part| {
+                let both = |way: &BTreeSet<_>| part.iter().map(|other| way | other).collect::<Vec<_>>();
+                ways.iter().flat_map(both).take(MOST_WAYS).collect()
+            })
         }
     }
-    all
 }
 
 /// Why outputs of which the first that is there is taken cannot be used.

@@ -126,23 +126,35 @@ class Trace:
         return self.seen(owner, owner.put_out(f"{node.named()}.{port}", port, f"{node.named()}_{port}"))
 
     def first_of(self, ways: Sequence[object]) -> str:
-        """`either` of some values. Those that are inside of one block are put out by that, as the first of them that was written there."""
+        """`either` of some values. Where some are inside of one block, that puts out the first of all of them, but for those that only come
+        behind the block: they stay beside it."""
         around = [self._hides(way) for way in ways]
         hidden = {id(block): block for block in around if block is not None}
         if len(hidden) != 1:
             return f"either({', '.join(str(written(way)) for way in ways)})"
         (block,) = hidden.values()
-        inside = [way for way, hides in zip(ways, around, strict=True) if hides is not None or not _ports(way)]
-        outside = [way for way, hides in zip(ways, around, strict=True) if hides is None]
+        behind = [at for at, way in enumerate(ways) if around[at] is None and self._is_behind(way, block)]
+        first = behind[-1] + 1 if behind else 0
+        if any(around[:first]):
+            refuse(
+                f"`fn.either` has a value from inside of `{block.named()}` before one from a state behind it",
+                "name the values from behind the block first, or use `fn.either` twice",
+            )
+        beside, within = ways[:first], ways[first:]
         depth = len(self.open)
         self.open += [(states, block) for states in block.branches.values()]
         try:
-            text = self.first_of(inside) if len(inside) > 1 else str(written(inside[0]))
+            text = self.first_of(within) if len(within) > 1 else str(written(within[0]))
         finally:
             del self.open[depth:]
         (port, *_) = _ports(next(way for way, hides in zip(ways, around, strict=True) if hides is not None))
         seen = f"{block.named()}.{block.put_out(text, port.port, f'either_{port.port}')}"
-        return f"either({', '.join([seen, *(str(written(way)) for way in outside)])})" if outside else seen
+        return f"either({', '.join([*(str(written(way)) for way in beside), seen])})" if beside else seen
+
+    def _is_behind(self, way: object, block: Node) -> bool:
+        """Whether a value is of a state beside a block that comes only after it."""
+        beside = [port.node for port in _ports(way) if port.node.siblings is block.siblings]
+        return any(block.siblings.index(node) > block.siblings.index(block) for node in beside)
 
     def _hides(self, way: object) -> Node | None:
         """The block beside what is open that a value is inside of, if it is."""
