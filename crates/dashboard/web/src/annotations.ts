@@ -66,6 +66,11 @@ export function changesOf(state: AnnotatedState, draft: Draft): Change[] {
   });
 }
 
+/** What is said first of a key of which nothing is said yet; a field that is shown empty says nothing. */
+export function begin(key: string, items: string[]): void {
+  if (items.every((item) => item.trim() === "")) items.splice(0, items.length, FIRST[key] ?? "");
+}
+
 /** Findings of a state by key, those of the state that are of no key of the form, and all others. */
 export function sorted(findings: Finding[], state: string, keys: string[]): { byKey: Map<string, Finding[]>; own: Finding[]; others: Finding[] } {
   const byKey = new Map<string, Finding[]>();
@@ -380,7 +385,7 @@ export function annotationsPage(desk: Desk): Page {
     }
     own.addEventListener("change", () => {
       said.said = own.checked;
-      if (said.said && said.items.length === 0) said.items.push(FIRST[one.key] ?? "");
+      if (said.said) begin(one.key, said.items);
       showItems();
       edited();
     });
