@@ -168,6 +168,10 @@ mod tests {
         assert!(has("segment_table", "for_box/detect_pose", "condition"), "{:?}", task.flows);
         assert!(task.flows.iter().all(|flow| flow.from != flow.to));
         let stops = |path: &str| task.stops.iter().any(|stop| stop == path);
-        assert!(stops("for_box") && stops("for_box/move_approach") && !stops("for_box/plan_approach"), "{:?}", task.stops);
+        assert!(
+            stops("for_box") && stops("for_box/move_approach") && !stops("for_box/plan_approach"),
+            "{:?}",
+            task.stops
+        );
     }
 }

@@ -86,9 +86,12 @@ pub(crate) async fn measure() {
     note("rounds".to_owned(), rounds as f64);
     note("without_cpu_us".to_owned(), without.at(0.5));
     note("with_cpu_us".to_owned(), with.at(0.5));
-    for (key, ratios) in
-        [("cpu_ratio", &mut all), ("task_control_cpu_ratio", &mut own), ("hop_ratio", &mut hop), ("same_cpu_ratio", &mut same)]
-    {
+    for (key, ratios) in [
+        ("cpu_ratio", &mut all),
+        ("task_control_cpu_ratio", &mut own),
+        ("hop_ratio", &mut hop),
+        ("same_cpu_ratio", &mut same),
+    ] {
         for (ending, part) in [("", 0.5), ("_q1", 0.25), ("_q3", 0.75)] {
             note(format!("{key}{ending}"), ratios.at(part) / SCALE);
         }
