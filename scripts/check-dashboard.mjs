@@ -249,6 +249,7 @@ async function control() {
   await page.click("dialog button[value=yes]");
   await page.waitForFunction(() => document.querySelector(".summary .badge")?.textContent.startsWith("paused before for_box["));
   const stopped = await page.locator(".summary .badge").textContent();
+  await page.locator('[data-key="unchoose"]').press("Enter");
   await page.locator("#waiting button", { hasText: "the run is paused at a breakpoint here" }).first().click();
   await page.waitForSelector("[data-chosen]");
   await shot(page, "breakpoint-stopped");

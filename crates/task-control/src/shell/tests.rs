@@ -279,7 +279,13 @@ async fn a_run_that_waits_has_what_it_was_sent_also_after_it_was_killed() -> any
         ended = run(bench.run.clone(), place, &interrupt) => panic!("it ended: {ended:?}"),
         () = killed => {}
     }
-    let log = LogWriter::go_on(&bench.run.log)?;
+    // Threads of what was dropped hold the log a moment longer.
+    let log = loop {
+        match LogWriter::go_on(&bench.run.log) {
+            Err(ratn_event_log::LogError::UnderWay { .. }) => tokio::task::yield_now().await,
+            opened => break opened?,
+        }
+    };
     let history = crate::history::History::of(&log, Messages::nowhere())?;
     let resumption = Resumption::new((*bench.run.program).clone(), history, log, 1)?;
     let resumed = resume(resumption, place, &interrupt);
