@@ -790,6 +790,8 @@ async function annotations() {
   await page.locator("dialog button[value=yes]").press("Enter");
   await page.locator('[data-key="duration 0"]').fill("7");
   await until("what was saved is written", () => readFileSync(file, "utf8").includes("exceptional: [aborted], duration: 6 }"));
+  // The file is read again; what is typed is checked anew then.
+  await page.waitForFunction(() => document.querySelector('[data-key="state open"]')?.parentElement.textContent.includes("duration"));
   await page.waitForFunction(() => document.querySelector("pre")?.textContent.includes("duration: 7"));
   assert.equal(await page.locator('[data-key="duration 0"]').inputValue(), "7");
   await page.unroute("**/api/annotations/save*", late);

@@ -59,7 +59,7 @@ export function breakpointOf(steering: Steering, state: string): Child[] {
 /** The list of states at which a run can stop. Told when something has changed. */
 export class Breakpoints {
   readonly element: HTMLElement;
-  private readonly list = h("ul", { class: "tree" });
+  private readonly list = h("ul", { class: "tree", tabindex: 0, "aria-label": "Breakpoints" });
   private readonly summary = h("summary", {});
   private known = "";
 
@@ -85,7 +85,7 @@ export class Breakpoints {
       const is = breakpoints.includes(path);
       if (run?.controllable !== true) return h("li", {}, path);
       const press = () => ask(this.steering, path, !is);
-      return h("li", {}, h("button", { class: "link", "aria-pressed": String(is), "data-key": `break ${path}`, onclick: press }, path));
+      return h("li", {}, h("button", { class: "link", "aria-pressed": String(is), "data-key": `break ${path}`, onclick: press }, `${is ? "●" : "○"} ${path}`));
     };
     const more = all.length - MOST;
     fill(
