@@ -223,6 +223,47 @@ async function control() {
   await page.click("dialog button[value=yes]");
   await page.waitForTimeout(1500);
   assert.ok(readFileSync(log, "utf8").includes("step_requested"));
+  // A breakpoint is set in the list of states, by keys alone, and once that was confirmed.
+  await go(page, "network");
+  await page.locator("summary:has-text('Breakpoints')").press("Enter");
+  const listed = page.locator('[data-key="break for_box/release"]');
+  assert.equal(await page.locator('[data-key="break for_box/plan_transfer"]').count(), 0, "what computes cannot be stopped at");
+  await listed.press("Enter");
+  await page.waitForSelector("dialog[open]");
+  await axe(page, "the question whether to set a breakpoint");
+  await page.locator("dialog button[value=no]").press("Enter");
+  await page.waitForTimeout(600);
+  assert.equal(await listed.getAttribute("aria-pressed"), "false");
+  await listed.press("Enter");
+  await page.locator("dialog button[value=yes]").press("Enter");
+  await page.waitForSelector('[data-key="break for_box/release"][aria-pressed=true]');
+  await page.waitForFunction(() => document.querySelector(".summary")?.textContent.includes("breakpoints: for_box/release"));
+  await axe(page, "the network with breakpoints");
+  await shot(page, "breakpoints");
+  const fromOutside = spawnSync(RATN, ["control", "break", "for_box/grasp", "--runtime-dir", directory], { encoding: "utf8" });
+  assert.equal(fromOutside.status, 0, fromOutside.stderr);
+  await page.waitForFunction(() => document.querySelector(".summary")?.textContent.includes("breakpoints: for_box/release, for_box/grasp"));
+  step("a breakpoint is set, once that was confirmed; one that somebody else has set is shown, too");
+  await page.locator("summary:has-text('Breakpoints')").press("Enter");
+  await page.click("text=Go on");
+  await page.click("dialog button[value=yes]");
+  await page.waitForFunction(() => document.querySelector(".summary .badge")?.textContent.startsWith("paused before for_box["));
+  const stopped = await page.locator(".summary .badge").textContent();
+  await page.locator('[data-key="unchoose"]').press("Enter");
+  await page.locator("#waiting button", { hasText: "the run is paused at a breakpoint here" }).first().click();
+  await page.waitForSelector("[data-chosen]");
+  await shot(page, "breakpoint-stopped");
+  await axe(page, "a run that has stopped at a breakpoint");
+  await page.locator('aside [data-key="breakpoint"]').press("Enter");
+  await page.locator("dialog button[value=yes]").press("Enter");
+  await page.waitForFunction(() => document.querySelector('aside [data-key="breakpoint"]')?.textContent === "Pause before it");
+  step(`the run is ${stopped}; there its breakpoint is taken away`);
+  await page.locator("summary:has-text('Breakpoints')").press("Enter");
+  await page.locator("details[open] li button").first().press("Enter");
+  await page.locator("dialog button[value=yes]").press("Enter");
+  await page.waitForFunction(() => !document.querySelector(".summary")?.textContent.includes("breakpoints:"));
+  await page.locator("summary:has-text('Breakpoints')").press("Enter");
+  await go(page, "run");
   await page.click("text=Go on");
   await page.click("dialog button[value=yes]");
   await page.waitForFunction(() => document.querySelector(".badge.live") !== null);
@@ -692,7 +733,7 @@ async function annotations() {
   assert.ok(await page.locator('[data-key="save"]').isDisabled());
   // What is typed is text wherever it is shown.
   await duration.fill(INJECTED);
-  await page.waitForFunction((text) => document.querySelector("#findings-duration")?.textContent.includes(text), "window.hit");
+  await page.waitForFunction((text) => document.querySelector("main pre")?.textContent.includes(text), "<img src=x onerror=");
   assert.equal(await page.evaluate(() => window.hit), undefined);
   assert.equal(await page.locator("main img").count(), 0);
   await duration.fill("4");
@@ -709,14 +750,14 @@ async function annotations() {
   await page.waitForFunction(() => document.querySelector('[data-key="duration 0"]')?.value === "4");
   step("a task file's annotations are changed in a form and written");
 
-  // Individuals are offered for each place of a predicate, by keys alone.
+  // Individuals are offered for each place of a predicate, by keys alone; the base is one that the planner's action reads.
   const offered = (key) => page.locator(`#words-${key} option`).evaluateAll((options) => options.map((option) => option.value));
   await page.locator('[data-key="said reads"]').press("Space");
   await page.locator('[data-key="reads 0"]').press("End");
   await page.keyboard.type("on(");
-  assert.deepEqual(await offered("reads"), ["on(cup, ", "on(table, ", "on(?, "]);
+  assert.deepEqual(await offered("reads"), ["on(base, ", "on(cup, ", "on(table, ", "on(?, "]);
   await page.keyboard.type("cup, ");
-  assert.deepEqual(await offered("reads"), ["on(cup, cup)", "on(cup, table)", "on(cup, ?)"]);
+  assert.deepEqual(await offered("reads"), ["on(cup, base)", "on(cup, cup)", "on(cup, table)", "on(cup, ?)"]);
   await page.keyboard.type("table)");
   await page.waitForFunction(() => document.querySelector("main")?.textContent.includes("+       reads: "));
   step("individuals are offered for each place of a predicate");
@@ -749,6 +790,8 @@ async function annotations() {
   await page.locator("dialog button[value=yes]").press("Enter");
   await page.locator('[data-key="duration 0"]').fill("7");
   await until("what was saved is written", () => readFileSync(file, "utf8").includes("exceptional: [aborted], duration: 6 }"));
+  // The file is read again; what is typed is checked anew then.
+  await page.waitForFunction(() => document.querySelector('[data-key="state open"]')?.parentElement.textContent.includes("duration"));
   await page.waitForFunction(() => document.querySelector("pre")?.textContent.includes("duration: 7"));
   assert.equal(await page.locator('[data-key="duration 0"]').inputValue(), "7");
   await page.unroute("**/api/annotations/save*", late);
@@ -785,7 +828,7 @@ async function annotations() {
   await page.locator('[data-key="undo"]').press("Enter");
   await page.locator('[data-key="again"]').press("Enter");
   await page.locator('[data-key="state plan"]').press("Enter");
-  writeFileSync(file, text);
+  writeFileSync(file, `${text}# by somebody else\n`);
   await page.locator('[data-key="duration 0"]').fill("5");
   await page.waitForFunction(() => document.querySelector("main [role=alert]")?.textContent.includes("has changed on the disk"));
   await axe(page, "Annotations of a file that has changed");

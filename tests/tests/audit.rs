@@ -77,6 +77,8 @@ fn record_of(path: &str) -> (&'static str, &'static str) {
         "SafetyService/GoOn" => ("go_on", ""),
         "RunService/SendSignal" => ("signal", r#""signal":"a""#),
         "RunService/SendAnswer" => ("answer", r#""choice":"a""#),
+        "RunService/SetBreakpoint" => ("set_breakpoint", r#""state":"a""#),
+        "RunService/ClearBreakpoint" => ("clear_breakpoint", r#""state":"a""#),
         "CellService/Reset" => ("reset", r#""seed":"#),
         "CellService/InjectFault" => ("inject_fault", r#""fault":"a""#),
         "CellService/PutBack" => ("put_back", ""),

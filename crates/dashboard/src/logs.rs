@@ -144,6 +144,10 @@ impl Logs {
             frame.run.live = one.status().is_some();
             let now = one.status().filter(|_| asked.at_s.is_none());
             frame.run.awaits = now.map(tell::awaits).unwrap_or_default();
+            // Of a long log the line that sets them may not have been read.
+            if let Some(status) = now {
+                frame.run.breakpoints = tell::breakpoints(status);
+            }
             frame.run.last_s = frame.run.at_s.max(one.parts.as_ref().map_or(0.0, |parts| parts.last().seconds()));
             frame
         })

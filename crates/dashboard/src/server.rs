@@ -233,6 +233,8 @@ enum Told {
     Answer { state: String, choice: String },
     /// Of this name, without a value.
     Signal(String),
+    /// At a state, or at all where none is said.
+    Breakpoint { state: Option<String>, set: bool },
 }
 
 /// What a page is answered.
@@ -632,9 +634,19 @@ impl Shown {
             "abort" => Told::Word(Word::Abort, "The run is told to end: what moves stops and holds."),
             "answer" => Told::Answer { state: query.text("state"), choice: query.text("choice") },
             "signal" => Told::Signal(query.text("signal")),
+            "break" if query.text("state").is_empty() => {
+                let problem = "say before which state the run shall pause: `state=PATH`".to_owned();
+                return Answer::Refused(StatusCode::BAD_REQUEST, problem);
+            }
+            "break" => Told::Breakpoint { state: Some(query.text("state")), set: true },
+            "clear" => {
+                let state = Some(query.text("state")).filter(|state| !state.is_empty());
+                Told::Breakpoint { state, set: false }
+            }
             other => {
-                let problem =
-                    format!("a run can be told pause, resume, step, abort, answer and signal, and not `{other}`");
+                let problem = format!(
+                    "a run can be told pause, resume, step, abort, answer, signal, break and clear, and not `{other}`"
+                );
                 return Answer::Refused(StatusCode::BAD_REQUEST, problem);
             }
         };
@@ -650,6 +662,7 @@ impl Shown {
                 self.system.send(&Message::Answer { run, state: Some(state), choice }).await
             }
             Told::Signal(signal) => self.system.send(&Message::Signal { run, signal, value: Value::Null }).await,
+            Told::Breakpoint { state, set } => self.system.send(&Message::Breakpoint { run, state, set }).await,
         };
         match said {
             Ok(said) => json(&wire::Told { said }),

@@ -2,6 +2,7 @@
 //! another. A log tells what happened; this says what was meant. Pure: it takes a program that was loaded.
 
 use crate::wire;
+use ratn_executive::executive::Executive;
 use ratn_model::expression::Expr;
 use ratn_model::id::StateId;
 use ratn_model::program::{Program, State, StateKind};
@@ -28,6 +29,7 @@ pub(crate) fn told(program: &Program) -> wire::Task {
         note: String::new(),
         states: states.map(|state| wire::State { path: state.path.clone(), kind: kind(state) }).collect(),
         flows: flows.map(|(from, to, kind)| wire::Flow { from: path(from), to: path(to), kind }).collect(),
+        stops: Executive::stopping(program).into_iter().take(MOST).map(str::to_owned).collect(),
     }
 }
 
@@ -165,5 +167,11 @@ mod tests {
         // How many boxes there are is known when the table is segmented.
         assert!(has("segment_table", "for_box/detect_pose", "condition"), "{:?}", task.flows);
         assert!(task.flows.iter().all(|flow| flow.from != flow.to));
+        let stops = |path: &str| task.stops.iter().any(|stop| stop == path);
+        assert!(
+            stops("for_box") && stops("for_box/move_approach") && !stops("for_box/plan_approach"),
+            "{:?}",
+            task.stops
+        );
     }
 }

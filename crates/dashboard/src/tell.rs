@@ -12,6 +12,8 @@ use std::collections::BTreeMap;
 
 /// Sentences in one answer.
 const MOST_WAITING: usize = 100;
+/// Breakpoints that are told of; a run has no more.
+const MOST_BREAKPOINTS: usize = 256;
 /// Instances in the queue that are told of.
 const MOST_QUEUED: usize = 200;
 /// Of an instance so many stages, jobs, waits and invalidations, the last ones.
@@ -59,6 +61,8 @@ fn whole(run: &Timeline, from_s: f64) -> wire::Run {
         at_s: run.end_s,
         last_s: run.end_s,
         paused: run.is_paused(),
+        stopped_at: run.stopped_at().map(|one| cut(&one.path)),
+        breakpoints: cut_all(&run.breakpoints),
         pauses: run.pauses.iter().map(span).collect(),
         absences: run.absences.iter().map(span).collect(),
         expanded: run.count.expanded,
@@ -198,6 +202,15 @@ pub(crate) fn awaits(status: &RunStatus) -> Vec<wire::Awaits> {
         wire::Awaits { path: one.path.clone(), kind, text, choices, until_s: one.until_s }
     };
     status.awaits.iter().take(MOST_WAITING).map(told).collect()
+}
+
+/// Before which states a run says that it pauses.
+pub(crate) fn breakpoints(status: &RunStatus) -> Vec<String> {
+    cut_all(&status.breakpoints)
+}
+
+fn cut_all(texts: &[String]) -> Vec<String> {
+    texts.iter().take(MOST_BREAKPOINTS).map(|text| cut(text)).collect()
 }
 
 fn last<T>(mut all: Vec<T>, most: usize) -> Vec<T> {

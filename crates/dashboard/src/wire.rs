@@ -163,8 +163,12 @@ wire! {
         controllable: bool,
         /// States that wait for somebody, or for something that they look at themselves; only of a run that goes on.
         awaits: Vec<Awaits>,
-        /// Whether the user has paused it.
+        /// Whether the user has paused it, or a breakpoint has.
         paused: bool,
+        /// The state at whose breakpoint it is paused, by path.
+        stopped_at: Option<String>,
+        /// Before which states it pauses, by their paths without visits.
+        breakpoints: Vec<String>,
         /// From each request for a pause to its end.
         pauses: Vec<Span>,
         /// When task control was gone.
@@ -353,6 +357,8 @@ wire! {
         states: Vec<State>,
         /// What goes from one to another.
         flows: Vec<Flow>,
+        /// Where a breakpoint pauses a run: states that may change the environment, and what they are inside of; in the order of the file.
+        stops: Vec<String>,
     }
 
     /// A state.

@@ -3,16 +3,19 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use ratn_dashboard::{Dashboard, DashboardError, Editing, MAX_LOGS, Options, Robots};
+use ratn_executive::protocol::Mode;
 use ratn_model::catalogue::Catalogue;
 use ratn_model::load::load;
 use ratn_motion::robot::Robot;
+use ratn_task_control::control::RunStatus;
 use ratn_worker::tls::ClientTls;
-use serde_json::Value;
+use serde_json::{Value, json};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::net::{TcpStream, UnixListener};
+use tokio::sync::mpsc;
 
 /// A name that would do something wherever it is taken for markup or code.
 const INJECTED: &str = "<img src=x onerror=alert(1)></script><script>alert(2)</script>";
@@ -422,6 +425,7 @@ async fn pages_only_look_unless_their_user_said_otherwise() {
     assert_eq!(refused.status, 403);
     assert!(refused.json()["problem"].as_str().unwrap().contains("--control"), "{}", refused.body);
     assert_eq!(served.ask("POST", "/api/scale?host=h&template=t&min=0").await.status, 403);
+    assert_eq!(served.ask("POST", "/api/control?log=1&word=break&state=a").await.status, 403);
     let served = serve(&[&two_boxes()], true).await;
     let log = served.log().await;
     for (path, status) in [
@@ -430,6 +434,9 @@ async fn pages_only_look_unless_their_user_said_otherwise() {
         ("/api/control?word=pause".to_owned(), 409),
         (format!("/api/control?log={log}&word=answer&state=a&choice=b"), 409),
         (format!("/api/control?log={log}&word=signal&signal=a"), 409),
+        (format!("/api/control?log={log}&word=break&state=a"), 409),
+        (format!("/api/control?log={log}&word=break"), 400),
+        (format!("/api/control?log={log}&word=clear"), 409),
         ("/api/scale?host=h&template=t&min=-1".to_owned(), 400),
         ("/api/scale?host=h&template=t&min=1".to_owned(), 409),
     ] {
@@ -437,6 +444,92 @@ async fn pages_only_look_unless_their_user_said_otherwise() {
     }
     // A link or an image cannot do it.
     assert_eq!(served.get(&format!("/api/control?log={log}&word=pause")).await.status, 405);
+}
+
+/// A run as far as its control socket shows: it says what it is doing, and takes what it is sent.
+async fn listen(listener: UnixListener, status: RunStatus, taken: mpsc::Sender<String>) {
+    while let Ok((mut connection, _)) = listener.accept().await {
+        let (reader, mut writer) = connection.split();
+        let mut line = String::new();
+        // Whoever only looks whether a run listens says nothing.
+        if BufReader::new(reader).read_line(&mut line).await.is_err() || line.is_empty() {
+            continue;
+        }
+        let answer = if line.trim() == "status" {
+            serde_json::to_string(&status).unwrap()
+        } else {
+            taken.send(line.trim().to_owned()).await.unwrap();
+            "ok the run pauses before that".to_owned()
+        };
+        writer.write_all(format!("{answer}\n").as_bytes()).await.unwrap();
+    }
+}
+
+#[tokio::test]
+async fn breakpoints_are_told_as_a_run_has_them_and_set_and_cleared_in_it() {
+    let place = tempfile::tempdir().unwrap();
+    let log = place.path().join("run.jsonl");
+    let lines = [
+        started("stops").replace(r#""capacity""#, r#""breakpoints":["early"],"capacity""#),
+        r#"{"at":1000000000,"command":"note","note":"expanded","instance":1,"state":1,"path":"late[2]","speculative":false}"#.to_owned(),
+        r#"{"at":2000000000,"event":"breakpoints_set","states":["late"]}"#.to_owned(),
+        r#"{"at":3000000000,"command":"note","note":"stopped","instance":1}"#.to_owned(),
+    ];
+    std::fs::write(&log, lines.join("\n") + "\n").unwrap();
+    let dashboard = Dashboard::bind(Options { control: true, ..options(&[&log], place.path()) }).await.unwrap();
+    let url = dashboard.url();
+    let (address, token) = url.strip_prefix("http://").unwrap().split_once("/#token=").unwrap();
+    let served = Served { address: address.to_owned(), token: token.to_owned(), _place: tempfile::tempdir().unwrap() };
+    tokio::spawn(dashboard.serve());
+    let id = served.log().await;
+    let run = async |moment: &str| served.get(&format!("/api/run?log={id}{moment}")).await.json()["run"].clone();
+    for (moment, breakpoints, paused, stopped_at) in [
+        ("&at=1.5", json!(["early"]), false, Value::Null),
+        ("&at=2.5", json!(["late"]), false, Value::Null),
+        ("", json!(["late"]), true, json!("late[2]")),
+    ] {
+        let told = run(moment).await;
+        assert_eq!((&told["breakpoints"], &told["stopped_at"]), (&breakpoints, &stopped_at), "{moment}");
+        assert_eq!(told["paused"], paused, "{moment}");
+    }
+
+    // A run that goes on knows better than what was read of its log.
+    let listener = UnixListener::bind(place.path().join("run-1.control")).unwrap();
+    let status = RunStatus {
+        run: "run-1".to_owned(),
+        task: "stops".to_owned(),
+        mode: Mode::Cdtn,
+        log: log.clone(),
+        at_s: 4.0,
+        paused: true,
+        ended: 0,
+        under_way: Vec::new(),
+        waits: Vec::new(),
+        awaits: Vec::new(),
+        breakpoints: vec![INJECTED.to_owned(), "late".to_owned()],
+    };
+    let (taken, mut told) = mpsc::channel(4);
+    tokio::spawn(listen(listener, status, taken));
+    while served.get("/api/about").await.json()["logs"][0]["live"] != true {}
+    assert_eq!(run("").await["breakpoints"], json!([INJECTED, "late"]), "as text");
+    assert_eq!(run("&at=1.5").await["breakpoints"], json!(["early"]), "a replay shows those of its moment");
+    for (question, message) in [
+        (
+            "word=break&state=for_box%2Fgrasp",
+            r#"{"message":"breakpoint","run":"run-1","state":"for_box/grasp","set":true}"#,
+        ),
+        ("word=clear&state=late", r#"{"message":"breakpoint","run":"run-1","state":"late","set":false}"#),
+        ("word=clear", r#"{"message":"breakpoint","run":"run-1","state":null,"set":false}"#),
+    ] {
+        let answer = served.ask("POST", &format!("/api/control?log={id}&{question}")).await;
+        assert_eq!(
+            (answer.status, answer.json()["said"].as_str()),
+            (200, Some("the run pauses before that")),
+            "{question}"
+        );
+        assert_eq!(told.recv().await.as_deref(), Some(message));
+    }
+    assert!(told.try_recv().is_err(), "nothing else was said to the run");
 }
 
 #[tokio::test]

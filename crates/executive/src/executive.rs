@@ -123,6 +123,11 @@ impl Executive {
         hold::stops_for(program, path)
     }
 
+    /// Every path at which a breakpoint stops a run of a program, in its order.
+    pub fn stopping(program: &Program) -> Vec<&str> {
+        hold::stopping(program)
+    }
+
     /// What every instance that has not begun waits for, as sentences; empty in HSM mode.
     pub fn explain(&self) -> Vec<String> {
         let State::Cdtn(window) = &self.state else { return Vec::new() };

@@ -1,7 +1,7 @@
 //! Pause, single step and breakpoints: whether PIAs may begin.
 
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::{Nature, Program, StateKind};
+use ratn_model::program::{Nature, Program, State, StateKind};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
@@ -89,15 +89,39 @@ fn states_at(program: &Program, path: &str) -> impl Iterator<Item = StateId> {
 
 /// Whether a run stops anywhere for a breakpoint at a path: a PIA is there, is inside of it, or is a routine around it.
 pub(crate) fn stops_for(program: &Program, path: &str) -> bool {
-    states_at(program, path).any(|id| {
-        let state = program.state(id);
-        let acts = matches!(state.kind, StateKind::Action { .. }) && state.annotations.nature == Nature::Irreversible;
-        acts || state.is_pause() || state.is_routine()
-    })
+    states_at(program, path).any(|id| acts(program.state(id)))
+}
+
+/// A state that waits for the operator's leave.
+fn acts(state: &State) -> bool {
+    let is_pia = matches!(state.kind, StateKind::Action { .. }) && state.annotations.nature == Nature::Irreversible;
+    is_pia || state.is_pause() || state.is_routine()
+}
+
+/// Every path at which a breakpoint stops a run, as [`stops_for`] says of each, in the order of the program.
+pub(crate) fn stopping(program: &Program) -> Vec<&str> {
+    let (mut around, mut routines) = (BTreeSet::new(), BTreeSet::new());
+    for state in program.states.iter().filter(|state| acts(state)) {
+        around.extend(outer(&state.path));
+        around.insert(state.path.as_str());
+        if state.is_routine() {
+            routines.insert(state.path.as_str());
+        }
+    }
+    let stops = |path: &str| around.contains(path) || outer(path).any(|outer| routines.contains(outer));
+    let mut told = BTreeSet::new();
+    let paths = program.states.iter().map(|state| state.path.as_str());
+    paths.filter(|path| !path.is_empty() && stops(path) && told.insert(*path)).collect()
+}
+
+/// The paths around a path.
+fn outer(path: &str) -> impl Iterator<Item = &str> {
+    path.match_indices('/').map(|(end, _)| &path[..end])
 }
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
 
     const STATE: StateId = StateId(3);
@@ -132,5 +156,28 @@ mod tests {
             !hold.lets_begin(other, StateId(0)) && !hold.stops_at(other, StateId(0)),
             "it is the pause of the step"
         );
+    }
+
+    #[test]
+    fn every_path_at_which_a_run_stops_is_told_and_no_other() {
+        let examples = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples");
+        let (mut stopping_there, mut quiet_there) = (0, 0);
+        for file in std::fs::read_dir(examples).unwrap() {
+            let path = file.unwrap().path();
+            if path.extension().is_none_or(|ending| ending != "yaml") {
+                continue;
+            }
+            let source = std::fs::read_to_string(&path).unwrap();
+            let loaded = ratn_model::load::load(&source, "task.yaml", &ratn_model::catalogue::Catalogue::standard());
+            let Ok(loaded) = loaded else { continue };
+            let program = loaded.program;
+            let told: BTreeSet<&str> = stopping(&program).into_iter().collect();
+            for state in program.states.iter().filter(|state| !state.path.is_empty()) {
+                let stops = stops_for(&program, &state.path);
+                assert_eq!(told.contains(state.path.as_str()), stops, "{} of {}", state.path, path.display());
+                *(if stops { &mut stopping_there } else { &mut quiet_there }) += 1;
+            }
+        }
+        assert!(stopping_there > 20 && quiet_there > 20, "{stopping_there} and {quiet_there}: are the examples read?");
     }
 }

@@ -70,6 +70,9 @@ pub struct RunStatus {
     /// The states that wait by themselves, and for what.
     #[serde(default)]
     pub awaits: Vec<Awaiting>,
+    /// Before which states it pauses, by their paths without visits.
+    #[serde(default)]
+    pub breakpoints: Vec<String>,
 }
 
 /// A state that waits for a time, a condition, a signal or an answer.
@@ -450,6 +453,7 @@ mod tests {
                 awaited: Awaited::Signal { signal: "lid".to_owned() },
                 until_s: Some(20.0),
             }],
+            breakpoints: vec!["place/move".to_owned()],
         };
         let said = doing.clone();
         let answering = tokio::spawn(async move {

@@ -403,6 +403,7 @@ impl Shell {
             under_way: self.progress.under_way(now, |instance| self.usually_s(instance)),
             awaits: self.progress.awaiting().map(|(_, awaiting)| awaiting).collect(),
             waits: self.executive.explain().into_iter().take(RunStatus::MOST_WAITS).collect(),
+            breakpoints: self.executive.breakpoints().to_vec(),
         }
     }
 

@@ -55,6 +55,8 @@ pub enum Mutation {
     // ----- a run -----
     Signal { signal: String },
     Answer { state: String, choice: String },
+    SetBreakpoint { state: String },
+    ClearBreakpoint { state: String },
     // ----- the cell -----
     Reset { seed: u64 },
     InjectFault { fault: String },

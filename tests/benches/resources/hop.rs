@@ -29,7 +29,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
-const NODES: usize = 1_000;
+pub(crate) const NODES: usize = 1_000;
 const TURNS: usize = 5;
 const CALLS: usize = 500;
 const KIND: &str = "Noop";
@@ -75,13 +75,13 @@ pub(crate) async fn measure() {
 }
 
 /// The daemons, and the worker that the process manager starts.
-struct System {
-    directory: std::path::PathBuf,
+pub(crate) struct System {
+    pub(crate) directory: std::path::PathBuf,
     daemons: Vec<Process>,
 }
 
 impl System {
-    async fn start(directory: &Path, durability: &str) -> System {
+    pub(crate) async fn start(directory: &Path, durability: &str) -> System {
         std::fs::create_dir_all(directory).unwrap();
         std::fs::write(directory.join("config.toml"), config()).unwrap();
         let mut system = System { directory: directory.to_owned(), daemons: Vec::new() };
@@ -137,7 +137,7 @@ outputs = {{ x = "int" }}
 }
 
 /// A task, and what its runs have taken.
-struct Chain {
+pub(crate) struct Chain {
     name: &'static str,
     times: Times,
     /// By role: microseconds and switches of all runs.
@@ -145,8 +145,16 @@ struct Chain {
     runs: f64,
 }
 
+/// What one run has taken.
+pub(crate) struct Ran {
+    /// By role: microseconds and switches.
+    pub(crate) used: Vec<(&'static str, f64, f64)>,
+    /// From the end of each node to the end of the next.
+    pub(crate) hops_us: Vec<f64>,
+}
+
 impl Chain {
-    fn new(system: &System, name: &'static str, world: bool) -> Chain {
+    pub(crate) fn new(system: &System, name: &'static str, world: bool) -> Chain {
         let mut task = format!("task: {name}\nworld: [\"done(s0)\"]\nstates:\n");
         for node in 1..=NODES {
             let before = node - 1;
@@ -167,6 +175,21 @@ impl Chain {
     }
 
     fn run(&mut self, system: &System, turn: usize) {
+        let Ran { used, hops_us } = self.ran(system, turn);
+        if self.used.is_empty() {
+            self.used = used;
+        } else {
+            for (sum, (_, us, switches)) in self.used.iter_mut().zip(used) {
+                sum.1 += us;
+                sum.2 += switches;
+            }
+        }
+        self.runs += 1.0;
+        hops_us.into_iter().for_each(|us| self.times.add_us(us));
+    }
+
+    /// Runs it once.
+    pub(crate) fn ran(&self, system: &System, turn: usize) -> Ran {
         let at = |name: String| system.directory.join(name);
         let log = at(format!("{}-{turn}.jsonl", self.name));
         let before = system.used();
@@ -188,26 +211,18 @@ impl Chain {
             .into_iter()
             .zip(system.used())
             .map(|((role, us, n), (_, more_us, more))| (role, more_us - us, more - n));
-        let used: Vec<_> = used.chain([("task-control", own.0, own.1)]).collect();
-        if self.used.is_empty() {
-            self.used = used;
-        } else {
-            for (sum, (_, us, switches)) in self.used.iter_mut().zip(used) {
-                sum.1 += us;
-                sum.2 += switches;
-            }
-        }
-        self.runs += 1.0;
-        let mut last = None;
+        let used = used.chain([("task-control", own.0, own.1)]).collect();
+        let (mut last, mut hops_us) = (None, Vec::new());
         for line in std::fs::read_to_string(log).unwrap().lines() {
             let line: Value = serde_json::from_str(line).unwrap();
             if line["event"] == "finished" {
                 let at = line["at"].as_u64().unwrap();
                 if let Some(last) = last.replace(at) {
-                    self.times.add_us((at - last) as f64 / 1e3);
+                    hops_us.push((at - last) as f64 / 1e3);
                 }
             }
         }
+        Ran { used, hops_us }
     }
 
     fn report(mut self, key: &str, echo_us: f64, note: &mut impl FnMut(String, f64)) {

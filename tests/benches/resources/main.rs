@@ -15,6 +15,7 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr, reason = "a benchmark prints and may panic")]
 
+mod dashboard;
 mod echo;
 mod etcd;
 mod hop;
@@ -71,6 +72,9 @@ fn main() {
     }
     if std::env::args().any(|argument| argument == "--hop") {
         return runtime.block_on(hop::measure());
+    }
+    if std::env::args().any(|argument| argument == "--dashboard") {
+        return runtime.block_on(dashboard::measure());
     }
     if std::env::args().any(|argument| argument == "--restart") {
         return runtime.block_on(restart::measure());

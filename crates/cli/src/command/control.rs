@@ -83,6 +83,7 @@ mod tests {
             }],
             waits: Vec::new(),
             awaits: Vec::new(),
+            breakpoints: Vec::new(),
         };
         let pause = said(Word::Pause, Some(&run));
         assert!(pause.starts_with("fetch is paused") && pause.ends_with("under way: move[1]"), "{pause}");

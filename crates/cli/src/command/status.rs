@@ -136,6 +136,8 @@ impl Status {
             section(&mut lines, &colours.yellow("waiting by themselves"), rows.collect());
             let rows = run.waits.iter().map(|sentence| [sentence.clone(), String::new()]);
             section(&mut lines, &colours.yellow("states that wait"), rows.collect());
+            let rows = run.breakpoints.iter().map(|state| [state.clone(), String::new()]);
+            section(&mut lines, &colours.bold("breakpoints"), rows.collect());
         }
         if !self.elsewhere.is_empty() {
             lines.push(format!("{}: {}", colours.bold("runs elsewhere"), self.elsewhere.join(", ")));
@@ -199,6 +201,7 @@ mod tests {
                     awaited: Awaited::Signal { signal: "lid_closed".to_owned() },
                     until_s: Some(20.0),
                 }],
+                breakpoints: vec!["place/move".to_owned()],
             }],
             held: vec![Held {
                 resource: "path-planner-1@compute".to_owned(),
@@ -218,6 +221,8 @@ mod tests {
           check  for the signal `lid_closed`, until 20.0 s
         states that wait:
           place[2]/move waits for an output of place[2]/plan
+        breakpoints:
+          place/move
         held:
           path-planner-1@compute  sort_boxes: place[2]/plan
         waiting:

@@ -66,6 +66,11 @@ export function changesOf(state: AnnotatedState, draft: Draft): Change[] {
   });
 }
 
+/** What is said first of a key of which nothing is said yet; a field that is shown empty says nothing. */
+export function begin(key: string, items: string[]): void {
+  if (items.every((item) => item.trim() === "")) items.splice(0, items.length, FIRST[key] ?? "");
+}
+
 /** Findings of a state by key, those of the state that are of no key of the form, and all others. */
 export function sorted(findings: Finding[], state: string, keys: string[]): { byKey: Map<string, Finding[]>; own: Finding[]; others: Finding[] } {
   const byKey = new Map<string, Finding[]>();
@@ -167,7 +172,7 @@ function findingsList(findings: Finding[], where: boolean): HTMLElement | null {
     h(
       "li",
       { class: one.severity === "error" ? "bad" : "warn" },
-      `${one.severity}, line ${one.line}: ${where && one.path !== "" ? `${one.path}: ` : ""}${one.message}${one.help === "" ? "" : `. ${one.help}`}`,
+      `${one.severity}, line ${one.line}: ${where && one.path !== "" ? `${one.path}: ` : ""}${one.message}${one.help === "" ? "" : `; ${one.help}`}`,
     );
   return h("ul", { class: "plain" }, ...findings.map(item));
 }
@@ -200,6 +205,8 @@ export function annotationsPage(desk: Desk): Page {
   const form = h("section", { class: "annotations-form", "aria-label": "Annotations of the state" });
   const others = h("section", { "aria-label": "What else is wrong" });
   const result = h("section", { "aria-label": "What the change does", "aria-live": "polite" });
+  // However many states there are, what a change does is in view.
+  const said = h("div", { class: "does", role: "group", tabindex: 0, "aria-label": "What was checked" }, result, others);
   const fields = new Map<string, { findings: HTMLElement; force: HTMLElement }>();
   const save = h("button", { class: "first", disabled: true, "data-key": "save", onclick: askToSave }, "Save …");
   const undo = h("button", { disabled: true, "data-key": "undo", onclick: () => choose(chosen) }, "Undo all");
@@ -380,7 +387,7 @@ export function annotationsPage(desk: Desk): Page {
     }
     own.addEventListener("change", () => {
       said.said = own.checked;
-      if (said.said && said.items.length === 0) said.items.push(FIRST[one.key] ?? "");
+      if (said.said) begin(one.key, said.items);
       showItems();
       edited();
     });
@@ -429,7 +436,8 @@ export function annotationsPage(desk: Desk): Page {
       showFindings(answer.findings);
       const at = fields.get(answer.key);
       if (answer.problem !== "" && at !== undefined) append(at.findings, [h("p", { class: "bad" }, answer.problem)]);
-      for (const [key, { force }] of fields) fill(force, inForce(answer.in_force, key));
+      // Of a file that does not read it is not known: what was in force stays, so that nothing jumps while somebody types.
+      if (answer.in_force.length > 0) for (const [key, { force }] of fields) fill(force, inForce(answer.in_force, key));
       const gain = h("p", {}, "What it gains is simulated …");
       fill(result, ...outcome(answer), answer.problem === "" && !answer.refused ? gain : null);
       update();
@@ -481,7 +489,7 @@ export function annotationsPage(desk: Desk): Page {
   const element = h(
     "main",
     { id: "page", class: "annotations", tabindex: -1 },
-    h("section", { "aria-label": "States of the task" }, h("h1", { class: "hidden-text" }, "Annotations"), head, list, result, others),
+    h("section", { "aria-label": "States of the task" }, h("h1", { class: "hidden-text" }, "Annotations"), head, list, said),
     h("div", {}, notice, form),
   );
   return { element, wide: true, begin: () => void (all === null ? load() : undefined), update: () => undefined };

@@ -59,5 +59,7 @@ export const api = {
   saveAnnotations: (proposal: Proposal) => ask<Told>("annotations/save", {}, "POST", proposal),
   control: (log: number, word: string) => ask<Told>("control", { log, word }, "POST"),
   answer: (log: number, state: string, choice: string) => ask<Told>("control", { log, word: "answer", state, choice }, "POST"),
+  breakAt: (log: number, state: string) => ask<Told>("control", { log, word: "break", state }, "POST"),
+  clearBreakpoint: (log: number, state: string) => ask<Told>("control", { log, word: "clear", state }, "POST"),
   signal: (log: number, signal: string) => ask<Told>("control", { log, word: "signal", signal }, "POST"),
 };

@@ -4,7 +4,8 @@ import { type Child, h, seconds } from "./dom";
 import { jobText, stageText, waited } from "./say";
 import type { Store } from "./store";
 
-export function details(store: Store, choose: (id: number) => void): Child[] {
+/** `more` is said, and can be pressed, of the state that is chosen. */
+export function details(store: Store, choose: (id: number) => void, more: (state: string) => Child[]): Child[] {
   const one = store.selected === null ? undefined : store.instances.get(store.selected);
   if (one === undefined) return [h("h2", {}, "What waits"), ...waitingList(store, choose)];
   const link = (id: number, text: string) =>
@@ -26,6 +27,7 @@ export function details(store: Store, choose: (id: number) => void): Child[] {
       h("dd", {}, `${one.id}, expanded at ${seconds(one.expanded_s)}`),
     ),
     why !== null && h("p", { class: "warn" }, why),
+    ...more(one.state),
     ...list(
       "What was done for it",
       one.jobs.map((job) => jobText(job, store.at)),

@@ -289,7 +289,7 @@ function showSummary(run: Run): void {
         ? badge("replayed", "")
         : run.live
           ? run.paused
-            ? badge("paused", "paused")
+            ? badge(run.stopped_at === null ? "paused" : `paused before ${run.stopped_at}`, "paused")
             : badge("live", "live")
           : badge("ended without an outcome, or not heard of", "bad");
   // Screen readers hear when it changes, not every time that it is looked at.
@@ -304,6 +304,7 @@ function showSummary(run: Run): void {
     state,
     h("span", {}, `${count(run.retired)} of ${count(run.expanded - run.squashed)} known states have ended`),
     ahead,
+    run.breakpoints.length > 0 && h("span", { title: run.breakpoints.join("\n") }, `breakpoints: ${run.breakpoints.join(", ")}`),
     run.problem !== "" && h("span", { class: "bad" }, run.problem),
     run.reason !== "" && h("span", { class: "bad" }, run.reason),
     run.from_s > 0 && h("span", { class: "warn" }, `read from ${seconds(run.from_s)} on: the log is long`),

@@ -3,6 +3,7 @@
 // A row is a state, in the order of the hierarchy; from left to right everything stands behind what it depended on. A collapsed state
 // stands for all that is inside it.
 
+import { pausesBefore } from "./breakpoints";
 import { DASHES, count } from "./dom";
 import { hint, lastName, parent } from "./say";
 import { type Store, splitPath } from "./store";
@@ -326,10 +327,12 @@ export class Network implements Painter {
     context.stroke();
     context.setLineDash([]);
     if (this.scale > 0.45) {
+      const stops = this.store.run?.breakpoints ?? [];
+      const pauses = pausesBefore(stops, node.row) || node.members.some((one) => pausesBefore(stops, one.state)) ? "● " : "";
       const mark = none ? "" : some("running") ? "▶ " : waits ? "… " : all("squashed") ? "✕ " : all("retired") ? "✓ " : "";
       const times = node.members.length > 1 ? ` ×${count(node.members.length)}` : "";
       context.fillStyle = colour("ink");
-      context.fillText(fitted(context, `${mark}${node.label}${times}`, WIDE - 14), node.x + 7, node.y + TALL / 2 + 1);
+      context.fillText(fitted(context, `${pauses}${mark}${node.label}${times}`, WIDE - 14), node.x + 7, node.y + TALL / 2 + 1);
     }
     context.globalAlpha = 1;
   }

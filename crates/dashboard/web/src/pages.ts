@@ -1,6 +1,7 @@
 // The pages. Each has an element that is made once, and is told when something has changed.
 
 import { Refused, api } from "./api";
+import { Breakpoints, breakpointOf } from "./breakpoints";
 import type { CellView } from "./cell";
 import { confirm } from "./confirm";
 import { details, waitingList } from "./details";
@@ -212,8 +213,10 @@ export function networkPage(site: Site): Page {
     view.repaint();
   };
   const search = h("input", { type: "search", placeholder: "part of a path", "aria-label": "Only instances with this in their path" });
+  const breakpoints = new Breakpoints(site, () => search.value);
   search.addEventListener("input", () => {
     network.search = search.value;
+    breakpoints.update();
     again();
   });
   const edges = KINDS.map((kind) => {
@@ -252,8 +255,9 @@ export function networkPage(site: Site): Page {
     h("button", { "aria-label": "Zoom out", onclick: scale(1 / 1.4) }, "−"),
     h("button", { onclick: () => (network.fit(), view.repaint()) }, "All of it"),
     tree,
+    breakpoints.element,
   );
-  const legend = h("div", { class: "row legend" }, "depends on: ", ...edges, h("span", { class: "more" }, "dashed: speculative, faded: discarded"));
+  const legend = h("div", { class: "row legend" }, "depends on: ", ...edges, h("span", { class: "more" }, "dashed: speculative, faded: discarded, ●: breakpoint"));
   let known = "";
   const note = h("span", { class: "warn" });
   legend.append(note);
@@ -285,6 +289,7 @@ export function networkPage(site: Site): Page {
     update: () => {
       network.layOut();
       showGroups();
+      breakpoints.update();
       const unknown = store.task !== null && !store.task.known ? `only what the log tells: ${store.task.note}` : "";
       if (note.textContent !== unknown) note.textContent = unknown;
       causes.disabled = store.selected === null;
@@ -294,7 +299,7 @@ export function networkPage(site: Site): Page {
         if (shown !== null) network.show(shown);
       }
       view.repaint();
-      fill(side, ...details(store, site.choose));
+      fill(side, ...details(store, site.choose, (state) => breakpointOf(site, state)));
     },
   };
 }

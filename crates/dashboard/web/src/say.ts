@@ -1,5 +1,6 @@
 // What is said of an instance in words, for hints and screen readers.
 
+import { pausesBefore } from "./breakpoints";
 import { seconds } from "./dom";
 import type { Store } from "./store";
 import type { Instance, Job, Phase, Wait } from "./wire";
@@ -51,6 +52,7 @@ export function hint(store: Store, one: Instance, job: Job | null): string {
   const lines = [one.path];
   if (job !== null) lines.push(jobText(job, store.at));
   lines.push(`${stageText(one)} since ${seconds(one.since_s)}`);
+  if (pausesBefore(store.run?.breakpoints ?? [], one.state)) lines.push("breakpoint: the run pauses before it");
   const why = store.why(one.id);
   if (why !== null) lines.push(why);
   lines.push(...waited(one));

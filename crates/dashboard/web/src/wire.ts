@@ -88,8 +88,12 @@ export interface Run {
   controllable: boolean;
   /** States that wait for somebody, or for something that they look at themselves; only of a run that goes on. */
   awaits: Awaits[];
-  /** Whether the user has paused it. */
+  /** Whether the user has paused it, or a breakpoint has. */
   paused: boolean;
+  /** The state at whose breakpoint it is paused, by path. */
+  stopped_at: string | null;
+  /** Before which states it pauses, by their paths without visits. */
+  breakpoints: string[];
   /** From each request for a pause to its end. */
   pauses: Span[];
   /** When task control was gone. */
@@ -278,6 +282,8 @@ export interface Task {
   states: State[];
   /** What goes from one to another. */
   flows: Flow[];
+  /** Where a breakpoint pauses a run: states that may change the environment, and what they are inside of; in the order of the file. */
+  stops: string[];
 }
 
 /** A state. */

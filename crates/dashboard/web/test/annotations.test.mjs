@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { changesOf, completions, draftOf, gainText, isOther, maySave, sorted, wordsFor } from "../src/annotations.ts";
+import { begin, changesOf, completions, draftOf, gainText, isOther, maySave, sorted, wordsFor } from "../src/annotations.ts";
 
 const key = (name, items = null) => ({ key: name, said: items !== null, items: items ?? [], listed: name !== "duration" });
 const state = { path: "a/b", depth: 1, form: "action: x/y", line: 3, fixed: "", in_force: [], keys: [key("reads", ["at(table)"]), key("effects"), key("duration", ["2"])] };
@@ -78,4 +78,12 @@ test("within a predicate's brackets the individuals of each place are offered", 
   assert.deepEqual(completions("effects", "not on(cup, ", all), ["not on(cup, cup)", "not on(cup, table)", "not on(cup, ?)"]);
   assert.deepEqual(completions("reads", "on(cup, table, ", all), [], "it has two places");
   assert.deepEqual(completions("reads", "compose(", all), wordsFor("reads", all), "no predicate");
+});
+
+test("a key that is said from now on says something at once, and what was typed stays", () => {
+  const of = (key, items) => (begin(key, items), items);
+  assert.deepEqual(of("pia", [""]), ["true"], "its field was shown empty");
+  assert.deepEqual(of("exceptional", []), ["aborted"]);
+  assert.deepEqual(of("duration", [""]), [""]);
+  assert.deepEqual(of("computes", ["false"]), ["false"]);
 });

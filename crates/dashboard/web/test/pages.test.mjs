@@ -2,6 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
+import { pausesBefore } from "../src/breakpoints.ts";
 import { Gantt } from "../src/gantt.ts";
 import { Network } from "../src/network.ts";
 import { waited } from "../src/say.ts";
@@ -34,7 +35,7 @@ function storeOf(instances, more = {}) {
   return store;
 }
 
-const task = (flows) => ({ known: true, note: "", states: [], flows });
+const task = (flows) => ({ known: true, note: "", states: [], flows, stops: [] });
 
 test("frames are put together, and a fresh one replaces everything", () => {
   const store = storeOf([instance(1, "a"), instance(2, "b")]);
@@ -139,4 +140,9 @@ test("what was waited for longest is said first", () => {
     phases: [{ stage: "waiting", from_s: 2, to_s: 9, awaited: "c" }, { stage: "running", from_s: 9, to_s: 99, awaited: "d" }],
   });
   assert.deepEqual(waited(one).map((line) => line.replaceAll("\u00a0", " ")), ["waited 7.0 s for c", "waited 1.0 s for Arm: b had arm@sim"]);
+});
+
+test("a breakpoint pauses before its state and what is inside of it, and before no other of a longer name", () => {
+  assert.ok(pausesBefore(["for_box/grasp"], "for_box/grasp") && pausesBefore(["for_box"], "for_box/grasp"));
+  assert.ok(!pausesBefore(["for_box/grasp"], "for_box") && !pausesBefore(["for_box"], "for_boxes/grasp") && !pausesBefore([], "a"));
 });

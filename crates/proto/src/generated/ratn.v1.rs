@@ -8153,6 +8153,63 @@ pub struct SendAnswerResponse {
     #[prost(string, tag = "1")]
     pub said: ::prost::alloc::string::String,
 }
+/// Asks for the breakpoints of a run.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetBreakpointsRequest {
+    /// The run: its id or the name of its task; empty for the one that is under way.
+    #[prost(string, tag = "1")]
+    pub run: ::prost::alloc::string::String,
+}
+/// The breakpoints of a run.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetBreakpointsResponse {
+    /// The run's id.
+    #[prost(string, tag = "1")]
+    pub run: ::prost::alloc::string::String,
+    /// The name of its task.
+    #[prost(string, tag = "2")]
+    pub task: ::prost::alloc::string::String,
+    /// The paths of states, without visits, in the order in which they were set.
+    #[prost(string, repeated, tag = "3")]
+    pub states: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// The run is paused, for whatever reason.
+    #[prost(bool, tag = "4")]
+    pub paused: bool,
+}
+/// A breakpoint.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SetBreakpointRequest {
+    /// The run: its id or the name of its task; empty for the one that is under way.
+    #[prost(string, tag = "1")]
+    pub run: ::prost::alloc::string::String,
+    /// The path of the state, with or without visits: each visit counts.
+    #[prost(string, tag = "2")]
+    pub state: ::prost::alloc::string::String,
+}
+/// What becomes of it.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SetBreakpointResponse {
+    /// A sentence.
+    #[prost(string, tag = "1")]
+    pub said: ::prost::alloc::string::String,
+}
+/// A breakpoint that is taken away.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ClearBreakpointRequest {
+    /// The run: its id or the name of its task; empty for the one that is under way.
+    #[prost(string, tag = "1")]
+    pub run: ::prost::alloc::string::String,
+    /// The path of the state, with or without visits; empty for all breakpoints.
+    #[prost(string, tag = "2")]
+    pub state: ::prost::alloc::string::String,
+}
+/// What becomes of it.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ClearBreakpointResponse {
+    /// A sentence.
+    #[prost(string, tag = "1")]
+    pub said: ::prost::alloc::string::String,
+}
 /// Generated client implementations.
 pub mod run_service_client {
     #![allow(
@@ -8323,6 +8380,84 @@ pub mod run_service_client {
                 .insert(GrpcMethod::new("ratn.v1.RunService", "SendAnswer"));
             self.inner.unary(req, path, codec).await
         }
+        /// The breakpoints of a run, and whether it is paused. FAILED_PRECONDITION where it is not known which run is meant.
+        pub async fn get_breakpoints(
+            &mut self,
+            request: impl tonic::IntoRequest<super::GetBreakpointsRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::GetBreakpointsResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/ratn.v1.RunService/GetBreakpoints",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("ratn.v1.RunService", "GetBreakpoints"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Sets a breakpoint: the run pauses before something that may change the environment begins at this state, inside of it, or in the routine
+        /// around it. Answered when it is in the run's log, on the disk. FAILED_PRECONDITION where the task has no such state, where a run never pauses for it,
+        /// where there are too many, where there is no such run, or where it is not known which of several is meant. Setting one that is set changes nothing.
+        pub async fn set_breakpoint(
+            &mut self,
+            request: impl tonic::IntoRequest<super::SetBreakpointRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::SetBreakpointResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/ratn.v1.RunService/SetBreakpoint",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("ratn.v1.RunService", "SetBreakpoint"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Takes a breakpoint away, or all. A run that is paused stays so. Answered when it is in the run's log, on the disk. FAILED_PRECONDITION where
+        /// there is no such breakpoint, where there is no such run, or where it is not known which of several is meant.
+        pub async fn clear_breakpoint(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ClearBreakpointRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ClearBreakpointResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/ratn.v1.RunService/ClearBreakpoint",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("ratn.v1.RunService", "ClearBreakpoint"));
+            self.inner.unary(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -8363,6 +8498,33 @@ pub mod run_service_server {
             request: tonic::Request<super::SendAnswerRequest>,
         ) -> std::result::Result<
             tonic::Response<super::SendAnswerResponse>,
+            tonic::Status,
+        >;
+        /// The breakpoints of a run, and whether it is paused. FAILED_PRECONDITION where it is not known which run is meant.
+        async fn get_breakpoints(
+            &self,
+            request: tonic::Request<super::GetBreakpointsRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::GetBreakpointsResponse>,
+            tonic::Status,
+        >;
+        /// Sets a breakpoint: the run pauses before something that may change the environment begins at this state, inside of it, or in the routine
+        /// around it. Answered when it is in the run's log, on the disk. FAILED_PRECONDITION where the task has no such state, where a run never pauses for it,
+        /// where there are too many, where there is no such run, or where it is not known which of several is meant. Setting one that is set changes nothing.
+        async fn set_breakpoint(
+            &self,
+            request: tonic::Request<super::SetBreakpointRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::SetBreakpointResponse>,
+            tonic::Status,
+        >;
+        /// Takes a breakpoint away, or all. A run that is paused stays so. Answered when it is in the run's log, on the disk. FAILED_PRECONDITION where
+        /// there is no such breakpoint, where there is no such run, or where it is not known which of several is meant.
+        async fn clear_breakpoint(
+            &self,
+            request: tonic::Request<super::ClearBreakpointRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ClearBreakpointResponse>,
             tonic::Status,
         >;
     }
@@ -8563,6 +8725,141 @@ pub mod run_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = SendAnswerSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/ratn.v1.RunService/GetBreakpoints" => {
+                    #[allow(non_camel_case_types)]
+                    struct GetBreakpointsSvc<T: RunService>(pub Arc<T>);
+                    impl<
+                        T: RunService,
+                    > tonic::server::UnaryService<super::GetBreakpointsRequest>
+                    for GetBreakpointsSvc<T> {
+                        type Response = super::GetBreakpointsResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::GetBreakpointsRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as RunService>::get_breakpoints(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = GetBreakpointsSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/ratn.v1.RunService/SetBreakpoint" => {
+                    #[allow(non_camel_case_types)]
+                    struct SetBreakpointSvc<T: RunService>(pub Arc<T>);
+                    impl<
+                        T: RunService,
+                    > tonic::server::UnaryService<super::SetBreakpointRequest>
+                    for SetBreakpointSvc<T> {
+                        type Response = super::SetBreakpointResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::SetBreakpointRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as RunService>::set_breakpoint(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = SetBreakpointSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/ratn.v1.RunService/ClearBreakpoint" => {
+                    #[allow(non_camel_case_types)]
+                    struct ClearBreakpointSvc<T: RunService>(pub Arc<T>);
+                    impl<
+                        T: RunService,
+                    > tonic::server::UnaryService<super::ClearBreakpointRequest>
+                    for ClearBreakpointSvc<T> {
+                        type Response = super::ClearBreakpointResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ClearBreakpointRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as RunService>::clear_breakpoint(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ClearBreakpointSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

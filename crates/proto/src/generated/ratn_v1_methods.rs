@@ -53,4 +53,7 @@
     Method { service: "ratn.v1.RunService", name: "GetWaits", operation: Some(Operation::Look) },
     Method { service: "ratn.v1.RunService", name: "SendSignal", operation: Some(Operation::Perform) },
     Method { service: "ratn.v1.RunService", name: "SendAnswer", operation: Some(Operation::Perform) },
+    Method { service: "ratn.v1.RunService", name: "GetBreakpoints", operation: Some(Operation::Look) },
+    Method { service: "ratn.v1.RunService", name: "SetBreakpoint", operation: Some(Operation::Perform) },
+    Method { service: "ratn.v1.RunService", name: "ClearBreakpoint", operation: Some(Operation::Perform) },
 ]

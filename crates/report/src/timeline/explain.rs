@@ -14,6 +14,9 @@ impl Timeline {
         let instance = self.instance(id)?;
         let why = match instance.stage {
             Stage::Asking => return self.resources.asked(id).map(|asked| self.asking(instance, asked)),
+            Stage::Waiting if self.stopped_at == Some(id) => {
+                "the operator: the run is paused at a breakpoint here".to_owned()
+            }
             Stage::Waiting if self.is_paused() && self.hints.is_pia(&instance.path) => {
                 "the operator: the run is paused".to_owned()
             }

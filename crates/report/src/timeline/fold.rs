@@ -169,7 +169,7 @@ impl Timeline {
             Event::Progressed { .. } => return,
         };
         match event {
-            Event::Started { task, mode, parameters, seed, capacity, origin, .. } => {
+            Event::Started { task, mode, parameters, seed, capacity, breakpoints, origin, .. } => {
                 self.hints = Hints::of(origin);
                 self.task.clone_from(task);
                 self.run.clone_from(&origin.run);
@@ -179,6 +179,7 @@ impl Timeline {
                 self.mode = *mode;
                 self.parameters.clone_from(parameters);
                 self.seed = *seed;
+                self.breakpoints = breakpoints.to_vec();
                 self.resources.begin(capacity);
             }
             Event::Granted { instance, lease } => {
@@ -211,10 +212,11 @@ impl Timeline {
             Event::StepRequested => {
                 self.paused.get_or_insert(at);
                 self.steps += 1;
+                self.stopped_at = None;
             }
             Event::ResumeRequested => self.goes_on(at),
-            Event::BreakpointsSet { .. }
-            | Event::Projected { .. }
+            Event::BreakpointsSet { states } => self.breakpoints.clone_from(states),
+            Event::Projected { .. }
             | Event::Progressed { .. }
             | Event::WorldChanged { .. }
             | Event::RetirementFailed { .. }
@@ -307,7 +309,10 @@ impl Timeline {
                 }
             }
             Note::Running { .. } => {}
-            Note::Stopped { .. } => _ = self.paused.get_or_insert(at),
+            Note::Stopped { .. } => {
+                self.paused.get_or_insert(at);
+                self.stopped_at = Some(id);
+            }
             Note::Awaiting { awaited, .. } => self.known(id, at).awaits = Some(awaited.to_string()),
             Note::Finished { outcome, .. } => {
                 let instance = self.known(id, at);
@@ -416,6 +421,7 @@ impl Timeline {
     }
 
     fn goes_on(&mut self, at: f64) {
+        self.stopped_at = None;
         if let Some(from_s) = self.paused.take() {
             self.pauses.push(Span { from_s, to_s: at });
         }

@@ -57,6 +57,8 @@ pub struct Timeline {
     pub pauses: Vec<Span>,
     /// How many single steps were asked for.
     pub steps: usize,
+    /// Before which states the run pauses, by their paths without visits.
+    pub breakpoints: Vec<String>,
     /// When task control was gone.
     pub absences: Vec<Span>,
     /// PIAs that began beside an older one that was still running and might have failed: its path, then theirs.
@@ -73,6 +75,8 @@ pub struct Timeline {
     /// The event that the commands which follow it were made of.
     cause: Cause,
     paused: Option<f64>,
+    /// What would have begun, when a breakpoint paused the run.
+    stopped_at: Option<InstanceId>,
     /// Expanded, and without an outcome.
     open: BTreeSet<InstanceId>,
     /// With a job under way.
@@ -182,6 +186,7 @@ impl Timeline {
             end_s: 0.0,
             pauses: Vec::new(),
             steps: 0,
+            breakpoints: Vec::new(),
             absences: Vec::new(),
             beside: Vec::new(),
             commits: VecDeque::new(),
@@ -192,6 +197,7 @@ impl Timeline {
             hints: fold::Hints::default(),
             cause: Cause::Start,
             paused: None,
+            stopped_at: None,
             open: BTreeSet::new(),
             at_work: BTreeSet::new(),
             results: BTreeMap::new(),
@@ -257,6 +263,11 @@ impl Timeline {
     /// Whether no PIA is to begin.
     pub fn is_paused(&self) -> bool {
         self.paused.is_some()
+    }
+
+    /// The instance at whose breakpoint the run is paused.
+    pub fn stopped_at(&self) -> Option<&Instance> {
+        self.instance(self.stopped_at?)
     }
 
     /// What work ahead of time was good for.

@@ -188,3 +188,34 @@ fn a_loop_that_decides_is_no_instance_and_nothing_is_ahead_of_it() {
     run.apply(&serde_json::from_str(decided).unwrap());
     assert_eq!((run.instances().len(), run.count.expanded, run.oldest_open().is_none()), (0, 0, true));
 }
+
+/// `a` is reached while a breakpoint stands at it; then it is let go, and the breakpoints are otherwise.
+const STOPPED: &str = r#"
+{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":1,"world":[],"revision":0,"capacity":{},"breakpoints":["a"]}
+{"at":0,"command":"note","note":"expanded","instance":1,"state":1,"path":"a","speculative":false}
+{"at":1000000000,"command":"note","note":"stopped","instance":1}
+{"at":3000000000,"event":"breakpoints_set","states":["b/c","d"]}
+{"at":4000000000,"event":"step_requested"}
+"#;
+
+#[test]
+fn a_breakpoint_pauses_a_run_and_says_where() {
+    let lines = lines(STOPPED);
+    let at = |moment_s: f64| {
+        let mut run = Timeline::new();
+        for line in lines.iter().take_while(|line| line.at.seconds() <= moment_s) {
+            run.apply(line);
+        }
+        let stopped_at = run.stopped_at().map(|one| one.path.to_string());
+        (run.breakpoints.join(", "), run.is_paused(), stopped_at)
+    };
+    let stopped = Some("a".to_owned());
+    assert_eq!(at(0.5), ("a".to_owned(), false, None));
+    assert_eq!(at(2.0), ("a".to_owned(), true, stopped.clone()));
+    assert_eq!(at(3.0), ("b/c, d".to_owned(), true, stopped), "what is set meanwhile lets nothing go");
+    assert_eq!(at(4.0), ("b/c, d".to_owned(), true, None), "the step lets it go, and the run stays paused");
+    let mut run = Timeline::new();
+    lines.iter().take(3).for_each(|line| _ = run.apply(line));
+    let why = run.explain(InstanceId(1)).unwrap();
+    assert_eq!(why, "a waits for the operator: the run is paused at a breakpoint here");
+}

@@ -1,4 +1,4 @@
-//! gRPC in front of a run's ear: signals and answers from clients of any language, and what is waited for.
+//! gRPC in front of a run's ear: signals, answers and breakpoints from clients of any language, and what is waited for.
 //!
 //! It says the same as the sockets of [`super`], which it tells. Served at the Unix socket `run.sock` of the runtime directory, whose
 //! endpoint file is `run.endpoint`, by one of the runs for all of them; when that ends, by the next one. Who may is what the table of roles says
@@ -163,6 +163,46 @@ impl RunService for RunServer {
         let said = self.say(message).await;
         pending.ended(&said);
         Ok(Response::new(v1::SendAnswerResponse { said: said? }))
+    }
+
+    async fn get_breakpoints(
+        &self,
+        request: Request<v1::GetBreakpointsRequest>,
+    ) -> Result<Response<v1::GetBreakpointsResponse>, Status> {
+        let wanted = named(request.into_inner().run);
+        label(&wanted, "run")?;
+        let RunStatus { run, task, paused, breakpoints, .. } = self.status(&wanted).await?;
+        Ok(Response::new(v1::GetBreakpointsResponse { run, task, states: breakpoints, paused }))
+    }
+
+    async fn set_breakpoint(
+        &self,
+        request: Request<v1::SetBreakpointRequest>,
+    ) -> Result<Response<v1::SetBreakpointResponse>, Status> {
+        let caller = Caller::of(&request);
+        let v1::SetBreakpointRequest { run, state } = request.into_inner();
+        if state.is_empty() {
+            return Err(Status::invalid_argument("`state` is empty: say before which state the run shall pause"));
+        }
+        let message = Message::Breakpoint { run: named(run), state: Some(state.clone()), set: true }.checked()?;
+        let pending = audit::begin(&caller, "", || Mutation::SetBreakpoint { state });
+        let said = self.say(message).await;
+        pending.ended(&said);
+        Ok(Response::new(v1::SetBreakpointResponse { said: said? }))
+    }
+
+    async fn clear_breakpoint(
+        &self,
+        request: Request<v1::ClearBreakpointRequest>,
+    ) -> Result<Response<v1::ClearBreakpointResponse>, Status> {
+        let caller = Caller::of(&request);
+        let v1::ClearBreakpointRequest { run, state } = request.into_inner();
+        let meant = Some(state.clone()).filter(|state| !state.is_empty());
+        let message = Message::Breakpoint { run: named(run), state: meant, set: false }.checked()?;
+        let pending = audit::begin(&caller, "", || Mutation::ClearBreakpoint { state });
+        let said = self.say(message).await;
+        pending.ended(&said);
+        Ok(Response::new(v1::ClearBreakpointResponse { said: said? }))
     }
 }
 

@@ -165,6 +165,48 @@ async fn over_grpc(place: &Place) {
     assert_eq!(said, "it is kept for the next state that waits for `later`");
 }
 
+/// A client of gRPC sets breakpoints, sees them, and takes them away.
+async fn breakpoints_over_grpc(place: &Place) {
+    use ratn_proto::v1;
+    let runtime = RuntimeDirectory::at(&place.directory);
+    let endpoint = runtime.wait_for(crate::control::ROLE, READY).await.expect("it is served");
+    let channel = ratn_worker::client::Channels::new(&place.tls).get(&endpoint).expect("a channel");
+    let mut client = v1::run_service_client::RunServiceClient::new(channel);
+    let there = async |client: &mut v1::run_service_client::RunServiceClient<_>| {
+        let there = client.get_breakpoints(v1::GetBreakpointsRequest::default()).await.expect("it says").into_inner();
+        assert_eq!((there.task.as_str(), there.run.is_empty()), ("two", false));
+        (there.states, there.paused)
+    };
+    let named = |states: &[&str]| states.iter().map(|state| (*state).to_owned()).collect::<Vec<_>>();
+    assert_eq!(there(&mut client).await, (named(&["first"]), true));
+    let set = |run: &str, state: &str| v1::SetBreakpointRequest { run: run.to_owned(), state: state.to_owned() };
+    let clear = |run: &str, state: &str| v1::ClearBreakpointRequest { run: run.to_owned(), state: state.to_owned() };
+    let said = client.set_breakpoint(set("two", "second[3]/inner")).await.expect("it is taken").into_inner().said;
+    assert_eq!(said, "the run pauses before first, second/inner");
+    client.set_breakpoint(set("", "second/inner")).await.expect("it is taken again");
+    assert_eq!(there(&mut client).await, (named(&["first", "second/inner"]), true));
+    let gone = client.clear_breakpoint(clear("", "second/inner")).await.expect("it is taken").into_inner().said;
+    assert_eq!(gone, "the run pauses before first");
+    let unknown = client.set_breakpoint(set("", "secnod")).await.expect_err("there is none");
+    assert!(unknown.code() == tonic::Code::FailedPrecondition && unknown.message().contains("did you mean `second`?"));
+    let quiet = client.set_breakpoint(set("", "name")).await.expect_err("it never stops there");
+    assert_eq!(quiet.code(), tonic::Code::FailedPrecondition);
+    let none = client.clear_breakpoint(clear("", "second/inner")).await.expect_err("it was taken away");
+    assert_eq!(none.code(), tonic::Code::FailedPrecondition);
+    let other = client.set_breakpoint(set("fetch", "first")).await.expect_err("there is no such run");
+    assert_eq!(other.code(), tonic::Code::FailedPrecondition);
+    let long = "a".repeat(2_000);
+    for (run, state) in [("", ""), ("", "a\u{1b}[31m"), ("a\nb", "first"), ("", long.as_str())] {
+        let refused = client.set_breakpoint(set(run, state)).await.expect_err("it is no name");
+        assert_eq!(refused.code(), tonic::Code::InvalidArgument, "{run:?} {state:?}: {refused}");
+        if !state.is_empty() {
+            let refused = client.clear_breakpoint(clear(run, state)).await.expect_err("it is no name");
+            assert_eq!(refused.code(), tonic::Code::InvalidArgument, "{run:?} {state:?}: {refused}");
+        }
+    }
+    assert_eq!(there(&mut client).await, (named(&["first"]), true), "what was refused has changed nothing");
+}
+
 fn breakpoint(state: Option<&str>, set: bool) -> Message {
     Message::Breakpoint { run: ANY_RUN.to_owned(), state: state.map(str::to_owned), set }
 }
@@ -192,6 +234,7 @@ states:
     };
     let telling = async {
         stopped(0).await;
+        breakpoints_over_grpc(place).await;
         let unknown = sent(place, breakpoint(Some("secnod"), true)).await.expect_err("there is none");
         assert!(unknown.contains("two has no state `secnod`: did you mean `second`?"), "{unknown}");
         let quiet = sent(place, breakpoint(Some("name"), true)).await.expect_err("it never stops there");
@@ -236,7 +279,13 @@ async fn a_run_that_waits_has_what_it_was_sent_also_after_it_was_killed() -> any
         ended = run(bench.run.clone(), place, &interrupt) => panic!("it ended: {ended:?}"),
         () = killed => {}
     }
-    let log = LogWriter::go_on(&bench.run.log)?;
+    // Threads of what was dropped hold the log a moment longer.
+    let log = loop {
+        match LogWriter::go_on(&bench.run.log) {
+            Err(ratn_event_log::LogError::UnderWay { .. }) => tokio::task::yield_now().await,
+            opened => break opened?,
+        }
+    };
     let history = crate::history::History::of(&log, Messages::nowhere())?;
     let resumption = Resumption::new((*bench.run.program).clone(), history, log, 1)?;
     let resumed = resume(resumption, place, &interrupt);
