@@ -26,6 +26,7 @@ fn way(bench: &Bench, scene: &Scene, goal: [f64; 3]) -> Trajectory {
         goals: vec![goal],
         position_tolerance_m: 0.0,
         heading_tolerance_rad: 0.0,
+        seen: None,
         speed: 0.7,
         seed: 2,
     };

@@ -71,6 +71,7 @@ fn under_way(drives: bool) -> (Bench, Ticket, Vec<Configuration>) {
                 goals: vec![[-2.0, 0.3, 0.8]],
                 position_tolerance_m: 0.0,
                 heading_tolerance_rad: 0.0,
+                seen: None,
                 speed: 1.0,
                 seed: 1,
             };

@@ -48,6 +48,7 @@ fn the_base_believes_to_stand_beside_where_it_stands_and_elsewhere_beside_at_eve
             goals: vec![goal],
             position_tolerance_m: 0.0,
             heading_tolerance_rad: 0.0,
+            seen: None,
             speed: 0.7,
             seed: 2,
         };

@@ -120,9 +120,20 @@ fn cover(link: &mut Link) {
 /// # Errors
 /// [`LineError`] where limits or a singular posture end the line early.
 pub fn line(reach: &Reach, start: &JointVector, offset: [f64; 3]) -> Result<Vec<JointVector>, LineError> {
+    line::line(reach, start, &moved(reach, start, offset))
+}
+
+/// The same of the nearest postures alone, each solved from the one before.
+///
+/// # Errors
+/// [`LineError`] where limits or a singular posture end the line early.
+pub fn line_of_nearest(reach: &Reach, start: &JointVector, offset: [f64; 3]) -> Result<Vec<JointVector>, LineError> {
+    line::line_of_nearest(reach, start, &moved(reach, start, offset))
+}
+
+fn moved(reach: &Reach, start: &JointVector, offset: [f64; 3]) -> Pose {
     let tool = reach.pose(start);
-    let to = Pose { position: std::array::from_fn(|i| tool.position[i] + offset[i]), ..tool };
-    line::line(reach, start, &to)
+    Pose { position: std::array::from_fn(|i| tool.position[i] + offset[i]), ..tool }
 }
 
 /// A posture of the vector checks, within the arm's limits.

@@ -2,8 +2,9 @@
 //! are followed.
 //!
 //! The path is that of `drive`, its corners are rounded and it is timed like the arm's (`timing`), in x, y and heading. What
-//! stands on the deck, and what is held, rides along. Headings of a trajectory go on beyond half a turn; those of a place do not.
+//! stands on the deck, and what is held, rides along. What a camera saw is kept away from, but for the floor. Headings of a trajectory go on beyond half a turn; those of a place do not.
 
+use crate::cloud::{CloudError, MAX_RADIUS_M};
 use crate::collision::length;
 use crate::connect::{Budget, ConnectError};
 use crate::drive::{Vehicle, drive_in, wrapped};
@@ -13,7 +14,9 @@ use crate::joint_vector::JointVector;
 use crate::pace::Control;
 use crate::request::{MIN_SPEED, Outside, outside_of_limits};
 use crate::robot::{Configuration, Joint, Robot, to_f32};
+use crate::seen::Seen;
 use crate::space::{Obstacle, Space, state};
+use crate::surroundings::Surroundings;
 use crate::timing::{Section, timed};
 use crate::trajectory::{Curve, TrajectoryError};
 use crate::validate::{Violation, check_limits, check_rest};
@@ -62,6 +65,9 @@ pub struct DriveRequest {
     pub heading_tolerance_rad: f64,
     /// Fraction of the base's velocity and acceleration limits.
     pub speed: f64,
+    /// What a depth camera saw beside the scene, as long as the base stands where the scene has it. Points so near to the floor that they may be
+    /// of it are left out, as those at other known things are.
+    pub seen: Option<Seen>,
     /// The same request, scene and seed give the same plan.
     pub seed: u64,
 }
@@ -89,6 +95,12 @@ pub enum DriveError {
         value: String,
         /// What it should be.
         expected: String,
+    },
+    /// What was seen is no obstacle that can be kept away from.
+    #[error("what was seen: {error}")]
+    Seen {
+        /// Why.
+        error: CloudError,
     },
     /// It has no base that drives.
     #[error("{robot} has no base that drives: its description has no `[base]`")]
@@ -187,7 +199,10 @@ pub fn plan_drive(
     let riding = riding(robot, scene);
     let (vehicle, obstacles) = Vehicle::of(robot, scene, &here, &riding, PADDING_M);
     let mechanism = vehicle.mechanism();
-    let mut space = Space::new(&mechanism, &obstacles);
+    let seen = request.seen.as_ref().map(|seen| seen.beside_the_floor(robot, scene, &here)).transpose();
+    let seen = seen.map_err(|error| DriveError::Seen { error })?;
+    let surroundings = Surroundings { obstacles: &obstacles, clouds: seen.as_slice(), meshes: &[] };
+    let mut space = Space::new(&mechanism, surroundings);
     let budget = Budget { iterations: ITERATIONS, seed: request.seed };
     let found = match drive_in(&vehicle, &mut space, request.start.base, &request.goals, budget, control) {
         Err(ConnectError::Goal { .. }) => {
@@ -197,7 +212,7 @@ pub fn plan_drive(
     };
     let (path, _) = found.map_err(|error| match error {
         ConnectError::Start => {
-            DriveError::Start { touch: Exact::new(&mechanism, &obstacles).touch(&request.start.base) }
+            DriveError::Start { touch: Exact::new(&mechanism, surroundings).touch(&request.start.base) }
         }
         ConnectError::Goal { .. } => DriveError::Goal {
             goals: request.goals.len(),
@@ -317,6 +332,11 @@ impl DriveRequest {
             if !(0.0..=MAX_TOLERANCE).contains(&value) {
                 return malformed(what, value.to_string(), format!("0 to {MAX_TOLERANCE} {unit}"));
             }
+        }
+        if let Some(within) = self.seen.as_ref().map(|seen| seen.known_within_m)
+            && !(0.0..=MAX_RADIUS_M).contains(&within)
+        {
+            return malformed("cloud_known_within_m", within.to_string(), format!("0 to {MAX_RADIUS_M} m"));
         }
         if !(1..=MAX_GOALS).contains(&self.goals.len()) {
             return malformed("the number of goals", self.goals.len().to_string(), format!("1 to {MAX_GOALS}"));

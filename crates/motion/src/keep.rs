@@ -13,7 +13,7 @@ use crate::plan::PlanError;
 use crate::reach::{Reach, Target};
 use crate::robot_model::Joint;
 use crate::space::align;
-use crate::timing::{Section, timed_while};
+use crate::timing::{Section, Speed, timed_while};
 use crate::trajectory::Curve;
 use ratn_model::pose::Pose;
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -115,16 +115,17 @@ impl Keep {
 pub fn timed_keeping(
     joints: &[Joint],
     sections: &[Section],
-    speed: f64,
+    speed: impl Into<Speed>,
     constraint: &Constraint,
     is_free: &mut dyn FnMut(&JointVector, &JointVector) -> bool,
     goes_on: &mut dyn FnMut() -> bool,
 ) -> Option<Curve> {
+    let speed: Speed = speed.into();
     let keeps = |curve: &Curve| {
         let room = &mut |positions: &JointVector| constraint.room(positions);
         first_breach(curve, constraint.levers(), room).is_none()
     };
-    let curve = timed_while(joints, sections, speed, is_free, goes_on);
+    let curve = timed_while(joints, sections, speed.clone(), is_free, goes_on);
     if keeps(&curve) {
         return Some(curve);
     }
@@ -134,7 +135,7 @@ pub fn timed_keeping(
         given => given.clone(),
     };
     let closer: Vec<Section> = sections.iter().map(closely).collect();
-    let curve = timed_while(joints, &closer, speed, is_free, goes_on);
+    let curve = timed_while(joints, &closer, speed.clone(), is_free, goes_on);
     if keeps(&curve) {
         return Some(curve);
     }

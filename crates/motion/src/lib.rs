@@ -28,6 +28,7 @@ pub mod heightfield;
 pub mod inside;
 pub mod joint_vector;
 pub mod keep;
+mod ladder;
 mod levers;
 pub mod line;
 pub mod mechanism;

@@ -2,11 +2,13 @@
 //! sharp or rounded.
 //!
 //! The arm is solved at postures a few millimetres apart (closer together where the joints go far), each from the one before. The tool is exactly
-//! on the line there; where the joints go straight from one of them to the next it is at most [`STRAY_M`] beside the line, which is bounded and not sampled (`levers`). All or
-//! an error, which says how far the arm gets and which joint ends the line. Any robot.
+//! on the line there; where the joints go straight from one of them to the next it is at most [`STRAY_M`] beside the line, which is bounded and not sampled (`levers`).
+//! Where that ends early and the arm has a joint more than a pose needs, other postures of the same poses are tried (`ladder`). All or
+//! an error, which says how far the nearest postures get and which joint ends the line. Any robot.
 
 use crate::frame::{compose, difference, norm};
 use crate::joint_vector::JointVector;
+use crate::ladder;
 use crate::pace::{Control, Stop};
 use crate::reach::{Reach, Target, rotation_vector};
 use crate::robot_model::Joint;
@@ -17,20 +19,20 @@ use std::fmt;
 pub const STRAY_M: f64 = 2.5e-4;
 
 /// The tool's way and turn between two solved postures, in metres and radians.
-const STEP_M: f64 = 0.0025;
-const STEP_RAD: f64 = 0.01;
+pub(crate) const STEP_M: f64 = 0.0025;
+pub(crate) const STEP_RAD: f64 = 0.01;
 
 /// Where the joints go far, steps are halved down to this part of one.
-const FINEST: f64 = 1.0 / 16.0;
+pub(crate) const FINEST: f64 = 1.0 / 16.0;
 
 /// The most solved postures of one motion.
-const MAX_STEPS: usize = 16_000;
+pub(crate) const MAX_STEPS: usize = 16_000;
 
 /// Solved postures of a rounded corner at the least: so many that none of them is a kink at which the arm would stop.
 const CORNER_STEPS: usize = 48;
 
 /// A joint that moves more than this between two solved postures jumps to another branch, in radians or metres.
-const MAX_JUMP: f64 = 0.1;
+pub(crate) const MAX_JUMP: f64 = 0.1;
 
 /// A joint this close to a limit is taken as held by it, in radians or metres.
 const AT_LIMIT: f64 = 0.01;
@@ -67,6 +69,11 @@ pub enum Cause {
     },
     /// More postures than are solved for one motion.
     TooLong,
+    /// Something is in the way.
+    Blocked {
+        /// What it is.
+        reason: String,
+    },
 }
 
 impl fmt::Display for Cause {
@@ -75,6 +82,7 @@ impl fmt::Display for Cause {
             Cause::Limit { joint } => write!(f, "{joint} is at its limit"),
             Cause::OutOfReach => write!(f, "what follows is out of its reach"),
             Cause::Flip { joint } => write!(f, "{joint} would have to flip there (a singular posture)"),
+            Cause::Blocked { reason } => write!(f, "{reason}"),
             Cause::TooLong => write!(f, "it would take more than {MAX_STEPS} postures: divide the motion"),
         }
     }
@@ -91,14 +99,35 @@ pub struct Traced {
     pub towards: Vec<usize>,
     /// The length of all lines, in metres.
     pub wanted_m: f64,
+    /// Which pose they were last on the way to.
+    pub whither: usize,
     /// What ends the lines early.
     pub ended: Option<Cause>,
 }
 
 impl Traced {
-    fn beginning(lines: &Lines, start: &JointVector) -> Traced {
+    pub(crate) fn beginning(lines: &Lines, start: &JointVector) -> Traced {
         let wanted_m = lines.pieces.iter().map(|piece| piece.length_m).sum();
-        Traced { postures: vec![*start], along_m: vec![0.0], towards: vec![0], wanted_m, ended: None }
+        Traced { postures: vec![*start], along_m: vec![0.0], towards: vec![0], wanted_m, whither: 0, ended: None }
+    }
+
+    /// The postures, where they lead to the end of the lines.
+    fn whole(self) -> Result<Vec<JointVector>, LineError> {
+        match self.ended {
+            None => Ok(self.postures),
+            Some(cause) => {
+                let reached_m = self.along_m[self.along_m.len() - 1];
+                Err(LineError { reached_m, wanted_m: self.wanted_m, cause })
+            }
+        }
+    }
+
+    /// One more posture, at a share of a piece.
+    pub(crate) fn push(&mut self, posture: JointVector, lines: &Lines, piece: usize, share: f64) {
+        let before_m: f64 = lines.pieces[..piece].iter().map(|piece| piece.length_m).sum();
+        self.postures.push(posture);
+        self.along_m.push(before_m + share * lines.pieces[piece].length_m);
+        self.towards.push(lines.pieces[piece].towards);
     }
 }
 
@@ -108,23 +137,31 @@ impl Traced {
 /// # Errors
 /// [`LineError`] where limits or a singular posture end the line early.
 pub fn line(reach: &Reach, start: &JointVector, to: &Pose) -> Result<Vec<JointVector>, LineError> {
-    let Traced { postures, along_m, wanted_m, ended, .. } = through(reach, start, &[*to], 0.0);
-    match ended {
-        None => Ok(postures),
-        Some(cause) => Err(LineError { reached_m: along_m[along_m.len() - 1], wanted_m, cause }),
-    }
+    through(reach, start, &[*to], 0.0).whole()
+}
+
+/// As [`line`] of the nearest postures alone: each is solved from the one before.
+///
+/// # Errors
+/// [`LineError`] where limits or a singular posture end the line early.
+pub fn line_of_nearest(reach: &Reach, start: &JointVector, to: &Pose) -> Result<Vec<JointVector>, LineError> {
+    let lines = Lines::new(reach.pose(start), &[*to], 0.0);
+    let traced = nearest(reach, &lines, start, &mut |_, _| Ok(()), &mut || Control::Continue);
+    // It is never told to stop.
+    traced.unwrap_or_else(|_| Traced::beginning(&lines, start)).whole()
 }
 
 /// Postures along straight lines from where the frame of `reach` is in the posture `start` through poses (in the frame of the root), as far as
 /// the arm gets. At each pose but the last the tool may leave the lines as far as `blend_m` from it.
 pub fn through(reach: &Reach, start: &JointVector, to: &[Pose], blend_m: f64) -> Traced {
     let lines = Lines::new(reach.pose(start), to, blend_m);
-    let traced = trace(reach, &lines, start, &mut || Control::Continue);
+    let traced = trace(reach, &lines, start, &mut |_, _| Ok(()), &mut || Control::Continue);
     // It is never told to stop.
     traced.unwrap_or_else(|_| Traced::beginning(&lines, start))
 }
 
-/// Postures along lines, each solved from the one before; `control` is asked between them.
+/// Postures along lines: each solved from the one before, or over other postures of the same poses where that way ends or is not free.
+/// `is_free` says what is in the way of a straight motion of the joints; `control` is asked between the postures.
 ///
 /// # Errors
 /// What `control` said, when that was not to go on.
@@ -132,20 +169,36 @@ pub(crate) fn trace(
     reach: &Reach,
     lines: &Lines,
     start: &JointVector,
+    is_free: &mut dyn FnMut(&JointVector, &JointVector) -> Result<(), String>,
+    control: &mut dyn FnMut() -> Control,
+) -> Result<Traced, Stop> {
+    let nearest = nearest(reach, lines, start, is_free, control)?;
+    if nearest.ended.is_none() {
+        return Ok(nearest);
+    }
+    let other = ladder::climb(reach, lines, start, &mut |from, to| is_free(from, to).is_ok(), control)?;
+    Ok(other.unwrap_or(nearest))
+}
+
+/// Each posture solved from the one before.
+fn nearest(
+    reach: &Reach,
+    lines: &Lines,
+    start: &JointVector,
+    is_free: &mut dyn FnMut(&JointVector, &JointVector) -> Result<(), String>,
     control: &mut dyn FnMut() -> Control,
 ) -> Result<Traced, Stop> {
     let mut traced = Traced::beginning(lines, start);
-    let mut before_m = 0.0;
-    for piece in &lines.pieces {
-        let steps = (piece.length_m / STEP_M).max(piece.turn_rad / STEP_RAD).ceil() as usize;
-        let steps = steps.max(if matches!(piece.curve, Curve::Corner(_)) { CORNER_STEPS } else { 1 });
+    for (index, piece) in lines.pieces.iter().enumerate() {
+        traced.whither = piece.towards;
+        let steps = piece.steps();
         if traced.postures.len() + steps > MAX_STEPS {
             traced.ended = Some(Cause::TooLong);
             return Ok(traced);
         }
         for i in 1..=steps {
             let answer = control();
-            if answer != Control::Continue {
+            if !answer.goes_on() {
                 return Err(answer.into());
             }
             let share = |part: f64| (i as f64 - 1.0 + part) / steps as f64;
@@ -153,12 +206,14 @@ pub(crate) fn trace(
             let (mut done, mut part) = (0.0, 1.0);
             while done < 1.0 {
                 let here = traced.postures[traced.postures.len() - 1];
-                match step(reach, &here, &piece.curve.at(share(done + part))) {
+                match step(reach, &here, &here, &piece.curve.at(share(done + part))) {
                     Ok(next) => {
+                        if let Err(reason) = is_free(&here, &next) {
+                            traced.ended = Some(Cause::Blocked { reason });
+                            return Ok(traced);
+                        }
                         done += part;
-                        traced.postures.push(next);
-                        traced.along_m.push(before_m + share(done) * piece.length_m);
-                        traced.towards.push(piece.towards);
+                        traced.push(next, lines, index, share(done));
                     }
                     Err(Cause::Flip { .. }) if part > FINEST && traced.postures.len() < MAX_STEPS => part /= 2.0,
                     Err(cause) => {
@@ -168,15 +223,14 @@ pub(crate) fn trace(
                 }
             }
         }
-        before_m += piece.length_m;
     }
     Ok(traced)
 }
 
-/// From one posture to the next on a line.
-fn step(reach: &Reach, here: &JointVector, to: &Pose) -> Result<JointVector, Cause> {
+/// From one posture to the next on a line: the one that a descent from `seed` finds.
+pub(crate) fn step(reach: &Reach, here: &JointVector, seed: &JointVector, to: &Pose) -> Result<JointVector, Cause> {
     let joints = reach.limits();
-    let Some(next) = reach.descend(&Target::at(*to), here) else {
+    let Some(next) = reach.descend(&Target::at(*to), seed) else {
         let held = |(joint, q): &(&Joint, &f64)| (joint.upper - **q).min(**q - joint.lower) < AT_LIMIT;
         let limit = joints.iter().zip(here).find(held).map(|(joint, _)| joint.name.clone());
         return Err(limit.map_or(Cause::OutOfReach, |joint| Cause::Limit { joint }));
@@ -192,18 +246,18 @@ fn step(reach: &Reach, here: &JointVector, to: &Pose) -> Result<JointVector, Cau
 /// Lines from pose to pose with their corners, piece after piece.
 #[derive(Debug, Clone)]
 pub(crate) struct Lines {
-    pieces: Vec<Piece>,
+    pub(crate) pieces: Vec<Piece>,
 }
 
 /// A part of a line, or a rounded corner.
 #[derive(Debug, Clone)]
-struct Piece {
+pub(crate) struct Piece {
     curve: Curve,
     /// Of a corner at the most.
     length_m: f64,
     turn_rad: f64,
     /// The index of the pose that it leads to.
-    towards: usize,
+    pub(crate) towards: usize,
 }
 
 #[derive(Debug, Clone)]
@@ -246,6 +300,19 @@ impl Lines {
             }
         }
         Lines { pieces }
+    }
+}
+
+impl Piece {
+    /// Into how many steps it is cut where the joints do not go far.
+    pub(crate) fn steps(&self) -> usize {
+        let steps = (self.length_m / STEP_M).max(self.turn_rad / STEP_RAD).ceil() as usize;
+        steps.max(if matches!(self.curve, Curve::Corner(_)) { CORNER_STEPS } else { 1 })
+    }
+
+    /// The pose at a share of it.
+    pub(crate) fn at(&self, share: f64) -> Pose {
+        self.curve.at(share)
     }
 }
 

@@ -44,6 +44,13 @@ const DRAWS: usize = 8;
 /// solved in closed form.
 const DESCENTS: usize = 2;
 
+/// Between postures of a family the elbow turns by this much at the most, in radians; at the edge of an arc they are this share of it inside.
+const FAMILY_TURN: f64 = 0.15;
+const ARC_EDGE: f64 = 1e-3;
+
+/// A joint that is held is at so many places in the postures of a family; several of them are so together.
+const FAMILY_HELD: usize = 48;
+
 /// Two postures closer than this are the same one, in radians.
 const SAME: f64 = 0.05;
 
@@ -403,6 +410,47 @@ impl Reach {
             }
             (Form::OutOfReach, _) => Vec::new(),
             _ => (0..DESCENTS).find_map(|_| self.descend(&postures.target, &seed())).into_iter().collect(),
+        }
+    }
+
+    /// Whether poses have whole families of postures that are known: the chain has more joints than they need, and is solved in closed form.
+    pub(crate) fn has_families(&self) -> bool {
+        self.spherical.is_some() || self.closed_form.as_ref().is_some_and(|form| !form.held.is_empty())
+    }
+
+    /// Postures of a pose all over its families, close to each other. Joints that do not move the link are as in `near`, and what turns
+    /// round and round is in the turn nearest to it.
+    pub(crate) fn family(&self, target: &Target, near: &JointVector) -> Vec<JointVector> {
+        let postures = self.postures(target);
+        match (&postures.form, &self.closed_form) {
+            (Form::Arcs(arcs), _) => {
+                let mut all = Vec::new();
+                for arc in arcs {
+                    let parts = (arc.width / FAMILY_TURN).ceil().max(1.0);
+                    let inside = arc.width * ARC_EDGE;
+                    for i in 0..=parts as usize {
+                        let along = inside + (arc.width - 2.0 * inside) * i as f64 / parts;
+                        all.extend(self.solve(&postures, arc.bend, arc.from + along, near));
+                    }
+                }
+                all
+            }
+            (Form::Held, Some(form)) => {
+                let mut held = vec![*near];
+                let each = (FAMILY_HELD as f64).powf(1.0 / form.held.len().max(1) as f64).floor().max(2.0) as usize;
+                for joint in &form.held {
+                    let Joint { lower, upper, .. } = self.joints[*joint];
+                    let at = |i: usize| lower + (upper - lower) * i as f64 / (each - 1) as f64;
+                    let moved = |posture: &JointVector, i: usize| {
+                        let mut moved = *posture;
+                        moved[*joint] = at(i);
+                        moved
+                    };
+                    held = held.iter().flat_map(|posture| (0..each).map(|i| moved(posture, i))).collect();
+                }
+                held.iter().flat_map(|held| self.solve_held(form, &postures.target, held)).collect()
+            }
+            _ => Vec::new(),
         }
     }
 

@@ -51,4 +51,20 @@ impl Seen {
         let points: Vec<[f32; 3]> = points.map(|(point, _)| *point).collect();
         Cloud::new(&self.cloud.name, &points, self.cloud.radius_m())
     }
+
+    /// What is left of that beside the floor, at z = 0, which robots drive on.
+    ///
+    /// # Errors
+    /// None that the cloud does not have already.
+    pub(crate) fn beside_the_floor(
+        &self,
+        robot: &Robot,
+        scene: &Scene,
+        here: &Configuration,
+    ) -> Result<Cloud, CloudError> {
+        let unknown = self.unknown(robot, scene, here)?;
+        let is_above = |point: &&[f32; 3]| f64::from(point[2]) > self.known_within_m;
+        let points: Vec<[f32; 3]> = unknown.points().iter().filter(is_above).copied().collect();
+        Cloud::new(&unknown.name, &points, unknown.radius_m())
+    }
 }

@@ -2,12 +2,14 @@
 //!
 //! The greatest speed of the tool on the curve is bounded, not sampled: at the middle of a piece it is worked out, and within the piece it
 //! differs by no more than the joints' motions and speeds do there, times the levers of the arm; pieces are halved until the bound is as
-//! close as a thousandth. Where a limit is exceeded the whole motion is slowed by one factor, so that its fastest moment keeps the limit:
-//! whatever else held goes on to hold, and nothing but the time changes. Any robot.
+//! close as a thousandth. Where a limit is exceeded the path is timed again with the limit as one of the path's own (`timing`), so that the motion
+//! is slower only where the tool would be too fast. What is left between the places that the timing looks at slows the whole motion by one factor, so
+//! that its fastest moment keeps the limit: whatever else held goes on to hold, and nothing but the time changes. Any robot.
 
 use crate::joint_vector::JointVector;
 use crate::plan::PlanError;
 use crate::reach::Reach;
+use crate::timing::Speed;
 use crate::trajectory::{Curve, Knot};
 
 /// How close the bound is, as a share.
@@ -39,9 +41,34 @@ impl ToolSpeed {
         Ok(())
     }
 
-    /// The curve, slowed where the frame of `reach` would be too fast on it.
+    /// The quickest curve of `time` on which the frame of `reach` is nowhere too fast. It is asked for a second one at most, with the limits.
+    ///
+    /// # Errors
+    /// Those of the first curve.
+    pub fn within<E>(
+        &self,
+        reach: &Reach,
+        speed: &Speed,
+        time: &mut dyn FnMut(&Speed) -> Result<Curve, E>,
+    ) -> Result<Curve, E> {
+        let curve = time(speed)?;
+        let (free_s, slow) = (curve.duration_s(), self.keep(reach, curve));
+        if slow.duration_s() <= free_s {
+            return Ok(slow);
+        }
+        Ok(match time(&speed.clone().with_tool(reach, self.limits())).map(|curve| self.keep(reach, curve)) {
+            Ok(curve) if curve.duration_s() < slow.duration_s() => curve,
+            _ => slow,
+        })
+    }
+
+    fn limits(&self) -> [f64; 2] {
+        [self.m_per_s, self.rad_per_s].map(|limit| limit.unwrap_or(f64::INFINITY))
+    }
+
+    /// The curve, the whole of it slowed by one factor if the frame of `reach` would be too fast on it.
     pub fn keep(&self, reach: &Reach, curve: Curve) -> Curve {
-        let limits = [self.m_per_s, self.rad_per_s].map(|limit| limit.unwrap_or(f64::INFINITY));
+        let limits = self.limits();
         if limits == [f64::INFINITY; 2] {
             return curve;
         }

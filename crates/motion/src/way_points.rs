@@ -10,7 +10,7 @@
 use crate::collision::{Checker, Contact, length};
 use crate::constrained::Constraint;
 use crate::joint_vector::JointVector;
-use crate::line::{Lines, Traced, trace};
+use crate::line::{Cause, Lines, Traced, trace};
 use crate::pace::{Pace, Stop};
 use crate::plan::{Goal, PlanError, Request, straight_collision};
 use crate::reach::Reach;
@@ -125,19 +125,19 @@ impl Follower<'_, '_> {
         let mut poses: Vec<Pose> = way.through.iter().map(|pose| self.base.inverse().compose(pose)).collect();
         poses.push(entry);
         let lines = Lines::new(self.reach.pose(start), &poses, way.blend_m);
-        let traced = trace(self.reach, &lines, start, &mut || pace.answer())?;
-        if let Some(reason) = self.obstacle(&traced, pace)? {
-            return Ok(Err(said(&traced, way, reason)));
-        }
+        let (checker, constraint) = (&mut *self.checker, self.constraint);
+        let is_free = &mut |from: &JointVector, to: &JointVector| free(checker, constraint, from, to);
+        let traced = trace(self.reach, &lines, start, is_free, &mut || pace.answer())?;
         if let Some(cause) = &traced.ended {
-            return Ok(Err(said(&traced, way, (traced.postures.len() - 1, cause.to_string()))));
+            return Ok(Err(said(&traced, way, cause)));
         }
         let lines: Vec<JointVector> = traced.postures.clone();
         let last = traced.postures[traced.postures.len() - 1];
         if !request.approach.is_some() {
             return Ok(Ok(Followed { approach: vec![last], lines }));
         }
-        let traced = trace(self.reach, &Lines::new(entry, &[*goal], 0.0), &last, &mut || pace.answer())?;
+        let lines_in = Lines::new(entry, &[*goal], 0.0);
+        let traced = trace(self.reach, &lines_in, &last, &mut |_, _| Ok(()), &mut || pace.answer())?;
         let approach: Vec<JointVector> = traced.postures.clone();
         let reason = match &traced.ended {
             Some(cause) => Some(cause.to_string()),
@@ -147,22 +147,6 @@ impl Follower<'_, '_> {
             Some(reason) => Err(format!("approaching the goal {}: {reason}", request.approach)),
             None => Ok(Followed { lines, approach }),
         })
-    }
-
-    /// The first posture from which the way cannot go on, and why.
-    fn obstacle(&mut self, traced: &Traced, pace: &mut Pace<'_>) -> Result<Option<(usize, String)>, Stop> {
-        for (i, pair) in traced.postures.windows(2).enumerate() {
-            pace.poll()?;
-            let [from, to] = [pair[0], pair[1]];
-            if let Some(collision) = self.checker.edge_collision(&from, &to, Contact::None) {
-                return Ok(Some((i, collision.to_string())));
-            }
-            if self.constraint.is_some_and(|c| !c.holds_along(&state(&from), &state(&to))) {
-                let constraint = self.constraint.map(|c| c.breach(&state(&to))).unwrap_or_default();
-                return Ok(Some((i, constraint)));
-            }
-        }
-        Ok(None)
     }
 
     /// What the tool does not keep on an approach.
@@ -187,13 +171,28 @@ impl Follower<'_, '_> {
     }
 }
 
+/// What is in the way of a straight motion of the joints.
+fn free(
+    checker: &mut Checker<'_>,
+    constraint: Option<&Constraint>,
+    from: &JointVector,
+    to: &JointVector,
+) -> Result<(), String> {
+    if let Some(collision) = checker.edge_collision(from, to, Contact::None) {
+        return Err(collision.to_string());
+    }
+    match constraint.filter(|constraint| !constraint.holds_along(&state(from), &state(to))) {
+        Some(constraint) => Err(constraint.breach(&state(to))),
+        None => Ok(()),
+    }
+}
+
 /// How far the tool gets, and why no further.
-fn said(traced: &Traced, way: &WayPoints, (last, reason): (usize, String)) -> String {
-    let (reached_m, wanted_m) = (traced.along_m[last], traced.wanted_m);
-    let next = traced.towards.get(last + 1).copied().unwrap_or(traced.towards[last]);
-    let whither = match next < way.through.len() {
-        true => format!("way point {} of {}", next + 1, way.through.len()),
+fn said(traced: &Traced, way: &WayPoints, cause: &Cause) -> String {
+    let (reached_m, wanted_m) = (traced.along_m[traced.along_m.len() - 1], traced.wanted_m);
+    let whither = match traced.whither < way.through.len() {
+        true => format!("way point {} of {}", traced.whither + 1, way.through.len()),
         false => "the goal".to_owned(),
     };
-    format!("the tool can go straight for {reached_m:.3} m of {wanted_m:.3} m, on the way to {whither}: {reason}")
+    format!("the tool can go straight for {reached_m:.3} m of {wanted_m:.3} m, on the way to {whither}: {cause}")
 }

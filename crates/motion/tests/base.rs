@@ -5,11 +5,14 @@
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::base::{DriveError, DrivePlan, DriveRequest, DriveViolation, check_drive, plan_drive, riding};
+use ratn_motion::cloud::Cloud;
 use ratn_motion::pace::Control;
 use ratn_motion::robot::{Configuration, Robot, UNSAID};
+use ratn_motion::seen::Seen;
 use ratn_motion::trajectory::Curve;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::{FRAC_PI_2, PI};
+use std::sync::Arc;
 
 const STANDING: Configuration =
     Configuration { base: [0.0; 3], arm: aimm::STOWED, pan: 0.0, tilt: 0.0, finger: 0.055, others: UNSAID };
@@ -30,6 +33,7 @@ fn to(goal: [f64; 3]) -> DriveRequest {
         goals: vec![goal],
         position_tolerance_m: 0.0,
         heading_tolerance_rad: 0.0,
+        seen: None,
         speed: 0.5,
         seed: 4,
     }
@@ -97,6 +101,68 @@ fn a_goal_that_is_not_free_is_missed_within_the_tolerance_and_no_further() {
     let end = planned(&scene, &loose).unwrap().end;
     let missed = (end[0] - 0.21).hypot(end[1]);
     assert!(missed > 0.0 && missed <= 0.15 + 1e-6 && end[2].abs() <= 0.1 + 1e-6, "{end:?}");
+}
+
+/// Balls of 1 cm about points, of which the camera may be 2 cm off.
+fn seen(points: &[[f32; 3]]) -> Seen {
+    Seen { cloud: Arc::new(Cloud::new("what was seen", points, 0.01).unwrap()), known_within_m: 0.02 }
+}
+
+/// Points on a grid of a rectangle that stands or lies, 2 cm apart.
+fn grid([x0, x1]: [i16; 2], [y0, y1]: [i16; 2], [z0, z1]: [i16; 2]) -> Vec<[f32; 3]> {
+    let steps = |from: i16, to: i16| (from..=to).step_by(2).map(|cm| f32::from(cm) / 100.0);
+    let mut points = Vec::new();
+    for x in steps(x0, x1) {
+        for y in steps(y0, y1) {
+            points.extend(steps(z0, z1).map(|z| [x, y, z]));
+        }
+    }
+    points
+}
+
+#[test]
+fn the_base_drives_around_what_a_camera_saw_and_over_the_floor_that_it_saw() {
+    let scene = cell(Pose::IDENTITY, &[]);
+    let goal = [-2.5, 0.0, 0.0];
+    let straight = planned(&scene, &to(goal)).unwrap();
+    assert!((straight.length - 2.5).abs() < 1e-3);
+    // The floor, measured 1.9 cm too high at the most; and what is seen of robot and table is of these.
+    let mut points = grid([-400, 200], [-200, 200], [0, 0]);
+    points.iter_mut().enumerate().for_each(|(i, point)| point[2] = [0.0, 0.012, 0.019][i % 3]);
+    points.extend(grid([-30, 30], [-20, 20], [30, 40]));
+    let with = |points: &[[f32; 3]]| planned(&scene, &DriveRequest { seen: Some(seen(points)), ..to(goal) });
+    assert_eq!(with(&points).unwrap(), straight);
+    // A post on the way.
+    let post = grid([-126, -124], [-2, 2], [10, 60]);
+    points.extend(&post);
+    let around = with(&points).unwrap();
+    assert!(around.length > straight.length + 0.05, "{} m", around.length);
+    let robot = Robot::aimm();
+    let posts = block("post", Pose::at(-1.25, 0.0, 0.35), [0.02, 0.04, 0.5]);
+    let refused = check_drive(&robot, &cell(Pose::IDENTITY, &[posts.clone()]), &STANDING, &[], &straight.trajectory);
+    assert!(matches!(refused, Err(DriveViolation::Touch { .. })));
+    check_drive(&robot, &cell(Pose::IDENTITY, &[posts]), &STANDING, &[], &around.trajectory).unwrap();
+}
+
+#[test]
+fn a_base_that_is_walled_in_by_what_was_seen_says_so() {
+    let scene = cell(Pose::IDENTITY, &[]);
+    let with = |seen: Seen| planned(&scene, &DriveRequest { seen: Some(seen), ..to([-2.5, 0.0, 0.0]) });
+    // Closer to the base than it keeps from anything, and further than what counts as of the robot.
+    let robot = Robot::aimm();
+    let behind = robot.model.links[robot.body().unwrap()].bodies[0];
+    let ratn_motion::geometry::Geometry::Box { half } = behind.geometry else { panic!("{behind:?}") };
+    let x = ((behind.pose.position[0] - half[0] - 0.025) * 1000.0).round() as f32 / 1000.0;
+    let error = with(seen(&[[x, 0.0, 0.3]])).unwrap_err();
+    assert!(matches!(&error, DriveError::Start { touch: Some(touch) } if touch.other == "what was seen"), "{error}");
+    let wall = grid([-150, -150], [-100, 100], [10, 40]);
+    let around = grid([-150, 150], [-100, -100], [10, 40]).into_iter().chain(grid([-150, 150], [100, 100], [10, 40]));
+    let ahead = grid([150, 150], [-100, 100], [10, 40]);
+    let walls: Vec<[f32; 3]> = wall.into_iter().chain(around).chain(ahead).collect();
+    let error = with(seen(&walls)).unwrap_err();
+    assert!(matches!(error, DriveError::NoPath(_)), "{error}");
+    let error = with(Seen { known_within_m: f64::NAN, ..seen(&walls) }).unwrap_err();
+    assert_eq!(error.to_string(), "cloud_known_within_m is NaN: expected 0 to 1 m");
 }
 
 #[test]

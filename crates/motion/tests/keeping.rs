@@ -19,9 +19,10 @@ use ratn_motion::keep::{Keep, KeptAxis, Region, timed_keeping};
 use ratn_motion::pace::Control;
 use ratn_motion::plan::{Goal, Plan, PlanError, Request};
 use ratn_motion::reach::Reach;
+use ratn_motion::robot::Joint;
 use ratn_motion::space::{Space, State, state};
 use ratn_motion::straight::{Frame, Straight};
-use ratn_motion::timing::{Section, timed};
+use ratn_motion::timing::{Section, Speed, timed, timed_while};
 use ratn_motion::tool_speed::ToolSpeed;
 use ratn_motion::trajectory::{Curve, Knot};
 use ratn_motion::way_points::WayPoints;
@@ -269,6 +270,69 @@ fn the_tool_of_any_arm_is_never_faster_than_its_limit_and_just_as_fast() {
     check_speed(&robots::seven(), 1);
     check_speed(&robots::six(), 2);
     check_speed(&robots::lifted(), 3);
+}
+
+/// What a curve uses of the joints' limits of velocity, acceleration and jerk, as a share.
+fn used(joints: &[Joint], curve: &Curve) -> f64 {
+    let mut used = 0.0_f64;
+    for pair in curve.knots().windows(2) {
+        let h = pair[1].time_s - pair[0].time_s;
+        for (j, joint) in joints.iter().enumerate() {
+            let mean = (pair[1].positions[j] - pair[0].positions[j]) / h;
+            let (v0, v1) = (pair[0].velocities[j], pair[1].velocities[j]);
+            let jerk = 6.0 * (v0 + v1 - 2.0 * mean) / (h * h);
+            let acceleration = (6.0 * mean - 4.0 * v0 - 2.0 * v1) / h;
+            used = used.max(jerk.abs() / joint.jerk);
+            for i in 0..=20 {
+                let t = h * f64::from(i) / 20.0;
+                used = used.max((acceleration + jerk * t).abs() / joint.acceleration);
+                used = used.max((v0 + t * (acceleration + jerk * t / 2.0)).abs() / joint.velocity);
+            }
+        }
+    }
+    used
+}
+
+/// The sums of the durations where the whole motion is slowed, and where it is slowed as it has to be.
+fn check_slowed_in_places(arm: &Arm, seed: u64) -> [f64; 2] {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut sums = [0.0; 2];
+    for _ in 0..4 {
+        let path = vec![arm.home, arm.tool.random(&mut random), arm.tool.random(&mut random)];
+        let sections = [vec![path[0], path[1]], path.clone()].map(Section::Blended);
+        for section in sections {
+            let joints = &arm.mechanism.joints;
+            let mut time = |speed: &Speed| -> Result<Curve, ()> {
+                Ok(timed_while(joints, std::slice::from_ref(&section), speed.clone(), &mut |_, _| true, &mut || true))
+            };
+            let curve = time(&1.0.into()).unwrap();
+            let (speed, turning) = fastest(&arm.tool, &curve);
+            for [m, rad] in [[0.7 * speed, f64::MAX], [f64::MAX, 0.7 * turning], [0.4 * speed, 0.6 * turning]] {
+                let limits = ToolSpeed { m_per_s: Some(m), rad_per_s: Some(rad) };
+                let whole = limits.keep(&arm.tool, curve.clone());
+                let slow = limits.within(&arm.tool, &1.0.into(), &mut time).unwrap();
+                let (slow_m, slow_rad) = fastest(&arm.tool, &slow);
+                assert!(
+                    slow_m <= m * (1.0 + 1e-6) && slow_rad <= rad * (1.0 + 1e-6),
+                    "{slow_m} of {m}, {slow_rad} of {rad}"
+                );
+                assert!(slow.duration_s() <= whole.duration_s());
+                assert!(used(joints, &slow) <= 1.001, "{}", used(joints, &slow));
+                assert_eq!((slow.knots()[0].positions, slow.end()), (curve.knots()[0].positions, curve.end()));
+                sums[0] += whole.duration_s();
+                sums[1] += slow.duration_s();
+            }
+        }
+    }
+    sums
+}
+
+#[test]
+fn a_motion_is_slower_only_where_its_tool_would_be_too_fast() {
+    for (arm, seed) in [(robots::seven(), 4), (robots::six(), 5), (robots::lifted(), 6)] {
+        let [whole, slow] = check_slowed_in_places(&arm, seed);
+        assert!(slow < 0.9 * whole, "{}: {slow} s of {whole} s", arm.mechanism.name);
+    }
 }
 
 #[test]

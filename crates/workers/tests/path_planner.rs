@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
+use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::{Change, FactKey, Term};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId};
 use ratn_model::pose::Pose;
@@ -11,6 +12,7 @@ use ratn_model::value::Value;
 use ratn_motion::aimm;
 use ratn_motion::arm::assumed;
 use ratn_motion::collision::Contact;
+use ratn_motion::description::RobotDescription;
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_motion::validate::validate_trajectory;
 use ratn_proto::types::Goal;
@@ -318,14 +320,7 @@ async fn what_a_camera_saw_is_in_the_way_and_bytes_that_are_no_points_are_refuse
             points.push(std::array::from_fn::<f64, 3, _>(|k| tool.position[k] + point[k]));
         }
     }
-    let mut cloud = format!(
-        "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA ascii\n",
-        points.len()
-    );
-    for [x, y, z] in points {
-        cloud += &format!("{x} {y} {z}\n");
-    }
-    let more = [("cloud", Value::Bytes(cloud.into_bytes())), ("cloud_radius_m", Value::Float(0.03))];
+    let more = [("cloud", pcd(&points)), ("cloud_radius_m", Value::Float(0.03))];
     let outcome = system.client.execute(&system.planner, system.grasp("caged", &more), |_, _| ()).await.unwrap();
     assert!(!outcome.is_success() && outcome.reason.contains("what was seen"), "{}", outcome.reason);
     let outcome = system.client.execute(&system.planner, system.grasp("free", &more[1..]), |_, _| ()).await.unwrap();
@@ -333,6 +328,127 @@ async fn what_a_camera_saw_is_in_the_way_and_bytes_that_are_no_points_are_refuse
     let wrong = [("cloud", Value::Bytes(b"nonsense".to_vec()))];
     let outcome = system.client.execute(&system.planner, system.grasp("wrong", &wrong), |_, _| ()).await.unwrap();
     assert!(outcome.reason.starts_with("input `cloud`: "), "{}", outcome.reason);
+}
+
+/// Points as the bytes of a PCD file.
+fn pcd(points: &[[f64; 3]]) -> Value {
+    let mut cloud = format!(
+        "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA ascii\n",
+        points.len()
+    );
+    for [x, y, z] in points {
+        cloud += &format!("{x} {y} {z}\n");
+    }
+    Value::Bytes(cloud.into_bytes())
+}
+
+fn drive(system: &System, id: &str, arm: &[f64], more: &[(&str, Value)]) -> Goal {
+    let to = Value::Pose(Pose::at(-2.5, 0.0, 0.0));
+    let inputs = [("goal", to), ("arm", Value::Joints(arm.to_vec()))];
+    Goal { action: "drive".to_owned(), ..system.goal(id, &[&inputs[..], more].concat()) }
+}
+
+#[tokio::test]
+async fn a_drive_keeps_away_from_what_a_camera_saw() {
+    let system = system().await;
+    let length_m = async |id: &str, more: &[(&str, Value)]| {
+        let goal = drive(&system, id, &aimm::STOWED, more);
+        let outcome = system.client.execute(&system.planner, goal, |_, _| {}).await.unwrap();
+        match outcome.outputs.get("length_m") {
+            Some(Value::Float(length_m)) => Ok(*length_m),
+            _ => Err(outcome.reason),
+        }
+    };
+    let post: Vec<[f64; 3]> = (5..30).map(|i| [-1.25, 0.0, f64::from(i) * 0.02]).collect();
+    let cloud = ("cloud", pcd(&post));
+    let straight = length_m("straight", &[]).await.unwrap();
+    assert!((straight - 2.5).abs() < 1e-3, "{straight} m");
+    let around = length_m("around", std::slice::from_ref(&cloud)).await.unwrap();
+    assert!(around > straight + 0.05, "{around} m");
+    // All of them are taken to be of the floor.
+    let low = [cloud, ("cloud_known_within_m", Value::Float(0.7))];
+    assert_eq!(length_m("low", &low).await.unwrap(), straight);
+    let wrong = length_m("wrong", &[("cloud", Value::Bytes(b"nonsense".to_vec()))]).await.unwrap_err();
+    assert!(wrong.starts_with("input `cloud`: "), "{wrong}");
+    let others =
+        length_m("others", &[("other_arms", Value::Map([("left".to_owned(), Value::Joints(vec![0.0]))].into()))]);
+    let refused = others.await.unwrap_err();
+    assert!(refused.starts_with("input `other_arms`: "), "{refused}");
+}
+
+/// A base with an arm of one joint on each side, which lies along the base at zero and sticks out where it is turned.
+fn two_armed() -> Robot {
+    let mut urdf = "<robot name='two'><link name='world'/><link name='along_x'/><link name='along_y'/>\
+        <link name='base'><collision><origin xyz='0 0 0.2'/><geometry><box size='0.6 0.4 0.3'/></geometry></collision></link>"
+        .to_owned();
+    let mut joint = |name: &str, kind: &str, [parent, child]: [&str; 2], xyz: &str, axis: &str, most: f64| {
+        urdf += &format!(
+            "<joint name='{name}' type='{kind}'><parent link='{parent}'/><child link='{child}'/><origin xyz='{xyz}'/>\
+             <axis xyz='{axis}'/><limit lower='-{most}' upper='{most}' effort='1' velocity='1'/></joint>"
+        );
+    };
+    joint("base_x", "prismatic", ["world", "along_x"], "0 0 0", "1 0 0", 5.0);
+    joint("base_y", "prismatic", ["along_x", "along_y"], "0 0 0", "0 1 0", 5.0);
+    joint("base_yaw", "revolute", ["along_y", "base"], "0 0 0", "0 0 1", 7.0);
+    joint("left_joint", "revolute", ["base", "left"], "-0.25 0.15 0.4", "0 0 1", 1.6);
+    joint("right_joint", "revolute", ["base", "right"], "-0.25 -0.15 0.4", "0 0 1", 1.6);
+    for side in ["left", "right"] {
+        urdf += &format!(
+            "<link name='{side}'><collision><origin xyz='0.25 0 0'/><geometry><box size='0.5 0.06 0.06'/></geometry></collision></link>"
+        );
+    }
+    urdf += "</robot>";
+    let description = r#"
+name = "two"
+urdf = "two.urdf"
+[arm]
+name = "left"
+joints = ["left_joint"]
+tool = "left"
+[base]
+joints = ["base_x", "base_y", "base_yaw"]
+body = "base"
+area = { x = [-4.5, 4.5], y = [-4.5, 4.5] }
+[postures]
+home = [0]
+[[other_arm]]
+name = "right"
+joints = ["right_joint"]
+tool = "right"
+postures = { home = [0] }
+"#;
+    Robot::of(RobotDescription::read(description).unwrap(), &urdf, None, &mut |_| unreachable!("no meshes")).unwrap()
+}
+
+#[tokio::test]
+async fn a_drive_takes_the_other_arms_to_be_where_they_are_said_to_be() {
+    let system = system_of(two_armed()).await;
+    // A point beside the right arm where that sticks out: 1.5 cm of room are less than the 2 cm that a drive keeps.
+    let cloud = [("cloud", pcd(&[[-0.315, -0.5, 0.4]])), ("cloud_radius_m", Value::Float(0.02))];
+    let run = async |id: &str, arm: f64, more: &[(&str, Value)]| {
+        let goal = drive(&system, id, &[arm], &[&cloud[..], more].concat());
+        system.client.execute(&system.planner, goal, |_, _| {}).await.unwrap()
+    };
+    let right_at = |q: f64| [("other_arms", Value::Map([("right".to_owned(), Value::Joints(vec![q]))].into()))];
+    let home = run("home", 0.0, &[]).await;
+    assert!(home.is_success(), "{}", home.reason);
+    let said = run("said", 0.0, &right_at(0.0)).await;
+    assert!(said.is_success(), "{}", said.reason);
+    let out = run("out", 0.0, &right_at(-std::f64::consts::FRAC_PI_2)).await;
+    assert!(out.reason.contains("the robot cannot drive off"), "{}", out.reason);
+    let wrong = run("wrong", 0.0, &right_at(9.0)).await;
+    assert!(wrong.reason.starts_with("input `other_arms`: "), "{}", wrong.reason);
+}
+
+#[test]
+fn tasks_may_give_a_cloud_to_both_planners() {
+    let catalogue = Catalogue::standard();
+    for action in ["plan", "drive"] {
+        let optional = &catalogue.action("path_planner", action).unwrap().optional;
+        for port in ["cloud", "cloud_radius_m", "cloud_known_within_m", "other_arms"] {
+            assert!(optional.contains_key(port), "{action} has no {port}");
+        }
+    }
 }
 
 #[tokio::test]

@@ -100,6 +100,7 @@ fn way(cell: &Cell, from: [f64; 3], to: [f64; 3]) -> Trajectory {
         goals: vec![to],
         position_tolerance_m: 0.0,
         heading_tolerance_rad: 0.0,
+        seen: None,
         speed: 0.5,
         seed: 1,
     };

@@ -24,7 +24,7 @@ use crate::space::{Space, State, state};
 use crate::straight::Straight;
 use crate::surroundings::Surroundings;
 use crate::timing::rough::Rough;
-use crate::timing::{Section, timed_while};
+use crate::timing::{Section, Speed, timed_while};
 use crate::trajectory::Curve;
 use crate::way_points::{Followed, Follower, WayPoints};
 use rand::{RngExt, SeedableRng};
@@ -123,6 +123,11 @@ impl<'a> ArmInScene<'a> {
         self.robot.tool_pose(&Configuration { arm: *arm, ..self.here })
     }
 
+    /// The tool in the frame of the base.
+    pub(super) fn tool_from_base(&self, arm: &JointVector) -> Pose {
+        self.reach.pose(arm)
+    }
+
     /// Has the exact shapes checked with another padding from now on.
     pub(super) fn pad(&mut self, padding_m: f64) {
         if self.checker.padding() != padding_m {
@@ -164,7 +169,11 @@ impl<'a> ArmInScene<'a> {
         let tool = self.reach.pose(from);
         // A request that names an object which is not there has been refused.
         let way = part.way(self.scene, &self.base, &tool).unwrap_or_default();
-        arm::line(&self.reach, from, way.map(|c| sense * c))
+        match sense > 0.0 {
+            true => arm::line(&self.reach, from, way),
+            // From another posture at the goal it may be followed: these are tried anyway.
+            false => arm::line_of_nearest(&self.reach, from, way.map(|c| -c)),
+        }
     }
 
     /// From a posture in straight lines of the tool through way points to a goal.
@@ -319,15 +328,15 @@ impl<'a> ArmInScene<'a> {
             let (from, to) = (state(from), state(to));
             constraint.as_ref().is_none_or(|c| c.holds_along(&from, &to)) && space.is_free_motion(&from, &to)
         };
-        let curve = match constraint {
-            None => timed_while(&joints, sections, request.speed, &mut is_free, goes_on),
-            Some(constraint) => timed_keeping(&joints, sections, request.speed, constraint, &mut is_free, goes_on)
+        let mut time = |speed: &Speed| match constraint {
+            None => Ok(timed_while(&joints, sections, speed.clone(), &mut is_free, goes_on)),
+            Some(constraint) => timed_keeping(&joints, sections, speed.clone(), constraint, &mut is_free, goes_on)
                 .ok_or(PlanError::NotKept {
                     place: "on the way",
                     reason: "the tool does not keep what it is to keep between the postures that were planned"
                         .to_owned(),
-                })?,
+                }),
         };
-        Ok(request.tool_speed.keep(&self.reach, curve))
+        request.tool_speed.within(&self.reach, &request.speed.into(), &mut time)
     }
 }

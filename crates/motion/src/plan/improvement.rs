@@ -5,6 +5,7 @@ use super::Plan;
 use super::arm_in_scene::ArmInScene;
 use super::candidates::{Candidate, Candidates};
 use super::error::PlanError;
+use crate::collision::length;
 use crate::joint_vector::JointVector;
 use crate::pace::{BETTER, Control, Pace, Progress, Stop};
 use crate::refine::{End, Refinement};
@@ -14,6 +15,7 @@ use crate::space::{State, state};
 use crate::timing::Section;
 use crate::trajectory::Curve;
 use rand::RngExt;
+use ratn_model::pose::Pose;
 use std::ops::Range;
 
 /// Of a hundred steps of improvement, those that look for a new candidate.
@@ -220,10 +222,15 @@ impl<'p, 'a> Improvement<'p, 'a> {
     /// The whole motion along a way, as quick as the limits allow.
     fn motion(&mut self, way: Way, goes_on: &mut dyn FnMut() -> bool) -> Result<Motion, PlanError> {
         let chosen = &self.candidates[way.candidate];
+        let backwards: Vec<JointVector> = chosen.approach.iter().rev().copied().collect();
+        let [after, before] = [self.before.depart, backwards.as_slice()].map(|straight| {
+            let tools: Vec<Pose> = straight.iter().map(|posture| self.arm.tool_from_base(posture)).collect();
+            blended_share(straight, &tools)
+        });
         let sections = [
-            Section::Loose(self.before.depart.to_vec(), [0.0, BLENDED_SHARE]),
+            Section::Loose(self.before.depart.to_vec(), [0.0, after]),
             Section::Blended(self.whole(&way.path, chosen)),
-            Section::Loose(chosen.approach.clone(), [BLENDED_SHARE, 0.0]),
+            Section::Loose(chosen.approach.clone(), [before, 0.0]),
         ];
         let curve = self.arm.timed(&sections, goes_on)?;
         Ok(Motion { way, curve })
@@ -269,6 +276,34 @@ impl<'p, 'a> Improvement<'p, 'a> {
     }
 }
 
+/// The share of the way of the joints along a straight part, at its far end, that is beyond what the tool has to follow: [`BLENDED_SHARE`] at
+/// the most. `tools` has the tool at each posture.
+fn blended_share(postures: &[JointVector], tools: &[Pose]) -> f64 {
+    let [first, .., last] = tools else { return BLENDED_SHARE };
+    let followed_m = (1.0 - BLENDED_SHARE) * first.distance(last);
+    let beyond = tools.iter().position(|tool| tool.distance(first) >= followed_m).unwrap_or(tools.len() - 1);
+    (length(&postures[beyond..]) / length(postures)).min(BLENDED_SHARE)
+}
+
 fn not_cancelled<'p>(pace: &'p mut Pace<'_>) -> impl FnMut() -> bool + 'p {
     move || pace.answer() != Control::Cancelled
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_a_straight_part_half_of_the_way_of_the_tool_is_followed_however_far_the_joints_go() {
+        let tool = |z: f64| Pose::at(0.0, 0.0, z);
+        let share = |joints: &[f64], tools: &[f64]| {
+            let postures: Vec<JointVector> = joints.iter().map(|q| JointVector::of([*q])).collect();
+            blended_share(&postures, &tools.iter().map(|z| tool(*z)).collect::<Vec<_>>())
+        };
+        // Evenly; the elbow turns first while the tool stands; the joints hardly move in the first half of the tool's way.
+        assert!((share(&[0.0, 1.0, 2.0, 3.0, 4.0], &[0.0, 0.1, 0.2, 0.3, 0.4]) - 0.5).abs() < 1e-12);
+        assert!((share(&[0.0, 8.0, 9.0, 10.0], &[0.0, 0.0, 0.1, 0.2]) - 0.1).abs() < 1e-12);
+        assert!((share(&[0.0, 0.1, 1.0], &[0.0, 0.1, 0.2]) - BLENDED_SHARE).abs() < 1e-12);
+        assert_eq!(share(&[0.0], &[0.0]), BLENDED_SHARE);
+    }
 }

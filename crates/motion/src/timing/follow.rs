@@ -8,10 +8,12 @@
 
 use super::cubics;
 use super::double_s::{self, double_s};
-use super::path::{Path, norm};
+use super::path::{Derivatives, Path, norm};
 use super::reachability::{Grid, squares};
 use super::third_order::{Limits, Mesh, quickest};
+use super::{Speed, Tool};
 use crate::cubic::Cubic;
+use crate::joint_vector::JointVector;
 use crate::robot::Joint;
 use crate::trajectory::Knot;
 
@@ -21,6 +23,9 @@ pub(crate) struct Bounds<const N: usize> {
     pub(crate) velocities: [f64; N],
     pub(crate) accelerations: [f64; N],
     pub(crate) jerks: [f64; N],
+    tool: Option<Tool>,
+    /// How many of the `N` joints the robot has.
+    joints: usize,
 }
 
 /// Points of the grid of the second order on a path at least, how many on each of its segments, and how far the path turns from
@@ -46,6 +51,9 @@ const GROWTH: f64 = 0.35;
 /// The first cell takes this share of the time in which the acceleration is reached.
 const FIRST: f64 = 0.35;
 
+/// Places on a straight line at which the speed of the tool is looked at, but for the first.
+const LINE_PLACES: usize = 64;
+
 /// Knots in the first cell and in the last.
 const FIRST_KNOTS: usize = 8;
 
@@ -57,14 +65,37 @@ const CLOSE: f64 = 1.003;
 
 impl<const N: usize> Bounds<N> {
     /// The limits of joints; those of velocity and acceleration are multiplied by the speed.
-    pub(crate) fn new(joints: &[Joint], speed: f64) -> Bounds<N> {
+    pub(crate) fn new(joints: &[Joint], Speed { share: speed, tool }: Speed) -> Bounds<N> {
         // Those beyond stand still, so any limits do.
         let joint = |j: usize| joints.get(j).unwrap_or(&joints[0]);
         Bounds {
             velocities: std::array::from_fn(|j| joint(j).velocity * speed),
             accelerations: std::array::from_fn(|j| joint(j).acceleration * speed),
             jerks: std::array::from_fn(|j| joint(j).jerk),
+            tool,
+            joints: joints.len(),
         }
+    }
+
+    /// How fast the path may be followed at a place, for the tool.
+    fn fastest(&self, at: &Derivatives<N>) -> f64 {
+        let of_joints = |padded: &[f64; N]| JointVector::from_fn(self.joints, |j| padded[j]);
+        self.tool.as_ref().map_or(f64::INFINITY, |tool| tool.fastest(&of_joints(&at.position), &of_joints(&at.first)))
+    }
+
+    /// The limits along a line whose tool is nowhere too fast.
+    fn along_line(&self, path: &Path<N>) -> double_s::Limits {
+        let mut limits = self.along(&path.segments()[0].at(0.0).first);
+        if self.tool.is_some() {
+            let places = (0..=LINE_PLACES).map(|i| path.at(path.length() * i as f64 / LINE_PLACES as f64));
+            limits.velocity = places.map(|place| self.fastest(&place)).fold(limits.velocity, f64::min);
+        }
+        limits
+    }
+
+    /// Whether the tool would be too fast on a line if it did not limit the motion.
+    fn is_slowed(&self, path: &Path<N>) -> bool {
+        self.tool.is_some() && self.along_line(path).velocity < self.along(&path.segments()[0].at(0.0).first).velocity
     }
 
     /// The limits along a direction.
@@ -91,9 +122,22 @@ pub(crate) fn follow<const N: usize>(
     bounds: &Bounds<N>,
     goes_on: &mut dyn FnMut() -> bool,
 ) -> Option<Vec<Knot<[f64; N]>>> {
-    if path.is_line() {
-        return Some(straight(path, bounds));
+    if !path.is_line() {
+        return curved(path, bounds, goes_on);
     }
+    let straight = straight(path, bounds);
+    // Where the tool is too fast somewhere on the line, it need not be slow elsewhere.
+    let other = if bounds.is_slowed(path) { curved(path, bounds, goes_on) } else { None };
+    let lasts_s = |knots: &[Knot<[f64; N]>]| knots[knots.len() - 1].time_s;
+    Some(other.filter(|other| lasts_s(other) < lasts_s(&straight)).unwrap_or(straight))
+}
+
+/// Any path, as [`follow`].
+fn curved<const N: usize>(
+    path: &Path<N>,
+    bounds: &Bounds<N>,
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Option<Vec<Knot<[f64; N]>>> {
     let second = Second::of(path, bounds, 1.0);
     let knots = match bounds.limits_jerk() {
         true => third(path, bounds, &second, goes_on),
@@ -105,7 +149,7 @@ pub(crate) fn follow<const N: usize>(
 /// About how long the path takes, for less than following it costs.
 pub(crate) fn estimate<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> f64 {
     if path.is_line() {
-        let instants = double_s(path.length(), bounds.along(&path.segments()[0].at(0.0).first));
+        let instants = double_s(path.length(), bounds.along_line(path));
         return instants[instants.len() - 1].time_s;
     }
     let second = Second::of(path, bounds, 1.0);
@@ -117,7 +161,7 @@ pub(crate) fn estimate<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> f6
 fn straight<const N: usize>(path: &Path<N>, bounds: &Bounds<N>) -> Vec<Knot<[f64; N]>> {
     let line = &path.segments()[0];
     let direction = line.at(0.0).first;
-    let instants = double_s(path.length(), bounds.along(&direction));
+    let instants = double_s(path.length(), bounds.along_line(path));
     let knot = |i: &double_s::Instant| Knot {
         time_s: i.time_s,
         positions: line.at(i.way).position,
@@ -146,7 +190,8 @@ impl<const N: usize> Second<N> {
                 grid.points.push(segment.at(along));
             }
         }
-        let squares = squares(&grid, &bounds.velocities, &bounds.accelerations);
+        let fastest: Vec<f64> = grid.points.iter().map(|point| bounds.fastest(point)).collect();
+        let squares = squares(&grid, &fastest, &bounds.velocities, &bounds.accelerations);
         let mut times = vec![0.0];
         for (i, pair) in squares.windows(2).enumerate() {
             let mean = (pair[0].sqrt() + pair[1].sqrt()).max(1e-9) / 2.0;
@@ -192,6 +237,7 @@ fn third<const N: usize>(
     let mesh = mesh(path, bounds, second);
     let cells = mesh.s.len() - 1;
     let mut limits = Limits {
+        fastest: mesh.ends.iter().map(|ends| ends.each_ref().map(|end| bounds.fastest(end))).collect(),
         velocities: vec![bounds.velocities; cells],
         accelerations: vec![bounds.accelerations; cells],
         jerks: vec![bounds.jerks; cells],

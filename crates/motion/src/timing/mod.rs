@@ -19,6 +19,7 @@ mod third_order;
 use crate::collision::distance;
 use crate::joint_vector::JointVector;
 use crate::mechanism::MAX_JOINTS;
+use crate::reach::Reach;
 use crate::robot::{Joint, Robot};
 use crate::trajectory::{Curve, Knot};
 use blend::rounded;
@@ -45,8 +46,49 @@ const STRIDES: [usize; 2] = [2, 4];
 const FOLLOWED: usize = 2;
 const CLOSE: f64 = 1.03;
 
+/// A tool that is slower than this, per radian of the joints' way, stands still and limits nothing.
+const STANDS: f64 = 1e-9;
+
 /// How much of a blended section a seam may take at each end: two seams leave the middle.
 const LOOSE_SHARE: f64 = 0.5;
+
+/// How fast a path is followed.
+#[derive(Debug, Clone)]
+pub struct Speed {
+    /// A fraction of the joints' limits of velocity and acceleration; those of jerk hold as they are.
+    share: f64,
+    tool: Option<Tool>,
+}
+
+/// What may not be too fast.
+#[derive(Debug, Clone)]
+struct Tool {
+    reach: Reach,
+    /// In metres and in radians per second.
+    limits: [f64; 2],
+}
+
+impl From<f64> for Speed {
+    fn from(share: f64) -> Speed {
+        Speed { share, tool: None }
+    }
+}
+
+impl Speed {
+    /// The same, and the frame of `reach` is at most so fast, in metres and in radians per second. That holds at many places of the path and
+    /// nearly between them: [`ToolSpeed::keep`](crate::tool_speed::ToolSpeed::keep) makes it hold everywhere.
+    pub fn with_tool(self, reach: &Reach, limits: [f64; 2]) -> Speed {
+        Speed { tool: Some(Tool { reach: reach.clone(), limits }), ..self }
+    }
+}
+
+impl Tool {
+    /// How many times as fast as with these velocities the joints may be.
+    fn fastest(&self, positions: &JointVector, velocities: &JointVector) -> f64 {
+        let speeds = self.reach.speeds(positions, velocities);
+        (0..2).map(|k| self.limits[k] / speeds[k].max(STANDS)).fold(f64::INFINITY, f64::min)
+    }
+}
 
 /// A section of a path.
 #[derive(Debug, Clone, PartialEq)]
@@ -111,15 +153,16 @@ pub fn timed(
     timed_while(joints, sections, speed, is_free, &mut || true)
 }
 
-/// As [`timed`]; where `goes_on`, which is asked several times per millisecond, says no, what has not been rounded yet is followed with
+/// As [`timed`], at any [`Speed`]; where `goes_on`, which is asked several times per millisecond, says no, what has not been rounded yet is followed with
 /// a stop at every corner.
 pub fn timed_while(
     joints: &[Joint],
     sections: &[Section],
-    speed: f64,
+    speed: impl Into<Speed>,
     is_free: &mut dyn FnMut(&JointVector, &JointVector) -> bool,
     goes_on: &mut dyn FnMut() -> bool,
 ) -> Curve {
+    let speed = speed.into();
     // What follows computes with arrays of fixed sizes; joints up to the next size stand still at zero.
     match joints.len() {
         ..=3 => timed_as::<3>(joints, sections, speed, is_free, goes_on),
@@ -131,7 +174,7 @@ pub fn timed_while(
 fn timed_as<const N: usize>(
     joints: &[Joint],
     sections: &[Section],
-    speed: f64,
+    speed: Speed,
     is_free: &mut dyn FnMut(&JointVector, &JointVector) -> bool,
     goes_on: &mut dyn FnMut() -> bool,
 ) -> Curve {

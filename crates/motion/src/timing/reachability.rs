@@ -24,10 +24,18 @@ struct Lines<const N: usize> {
 /// Below this share of the others a joint does not move, and does not count.
 const NEGLIGIBLE: f64 = 1e-9;
 
-/// ṡ² at every point of the grid, zero at both ends.
-pub(crate) fn squares<const N: usize>(grid: &Grid<N>, velocities: &[f64; N], accelerations: &[f64; N]) -> Vec<f64> {
+/// ṡ² at every point of the grid, zero at both ends; ṡ is at most `fastest` at each.
+pub(crate) fn squares<const N: usize>(
+    grid: &Grid<N>,
+    fastest: &[f64],
+    velocities: &[f64; N],
+    accelerations: &[f64; N],
+) -> Vec<f64> {
     let last = grid.s.len() - 1;
-    let steps: Vec<Lines<N>> = (0..last).map(|i| Lines::new(grid, i, velocities, accelerations)).collect();
+    let mut steps: Vec<Lines<N>> = (0..last).map(|i| Lines::new(grid, i, velocities, accelerations)).collect();
+    for (step, fastest) in steps.iter_mut().zip(fastest) {
+        step.greatest = step.greatest.min(fastest.powi(2));
+    }
     let mut greatest = vec![0.0; last + 1];
     for i in (0..last).rev() {
         greatest[i] = steps[i].greatest_square(grid.s[i + 1] - grid.s[i], greatest[i + 1]);

@@ -23,6 +23,8 @@ pub(crate) struct Mesh<const N: usize> {
 /// Limits of the joints in each cell of a mesh.
 #[derive(Debug, Clone)]
 pub(crate) struct Limits<const N: usize> {
+    /// Of ṡ, at both ends of each cell.
+    pub(crate) fastest: Vec<[f64; 2]>,
     pub(crate) velocities: Vec<[f64; N]>,
     pub(crate) accelerations: Vec<[f64; N]>,
     pub(crate) jerks: Vec<[f64; N]>,
@@ -140,7 +142,7 @@ impl<const N: usize> Problem<N> {
             let rise = std::array::from_fn(|c| (nodes[1].1[c] - nodes[0].1[c]) / cell(k));
             for (end, (x, u)) in nodes.into_iter().enumerate() {
                 let path = &mesh.ends[k][end];
-                let mut greatest = f64::INFINITY;
+                let mut greatest = limits.fastest[k][end].powi(2);
                 for j in 0..N {
                     greatest = greatest.min((limits.velocities[k][j] / path.first[j].abs().max(1e-12)).powi(2));
                 }

@@ -1,5 +1,6 @@
 //! Which arm of the robot moves, and where the others are: the optional inputs `arm` (its name; unless said, the only or first one) and
-//! `other_arms` (joints by the names of arms; an arm that is left out is in its posture `home`, else at zero).
+//! `other_arms` (joints by the names of arms; an arm that is left out is in its posture `home`, else at zero). While the base drives, no arm
+//! moves: the first one is where the input `arm` says.
 
 use ratn_model::value::Value;
 use ratn_motion::robot::{Robot, RobotFault};
@@ -13,9 +14,20 @@ pub(super) fn moving(robot: &Arc<Robot>, goal: &GoalContext) -> Result<Arc<Robot
     if others.is_none() && arm.is_none_or(|arm| arm == robot.arm_name()) {
         return Ok(Arc::clone(robot));
     }
-    let wrong = |port: &str, fault: RobotFault| ActionFailure::aborted(format!("input `{port}`: {fault}"));
-    let mut seen = robot.with_arm(arm.unwrap_or(robot.arm_name())).map_err(|fault| wrong("arm", fault))?;
-    if let Some(others) = others {
+    let seen = robot.with_arm(arm.unwrap_or(robot.arm_name())).map_err(|fault| wrong("arm", fault))?;
+    Ok(Arc::new(with_others(seen, goal)?))
+}
+
+/// The robot with the arms beside its first one where they are said to be.
+pub(super) fn standing(robot: &Arc<Robot>, goal: &GoalContext) -> Result<Arc<Robot>, ActionFailure> {
+    match goal.port("other_arms").optional() {
+        None => Ok(Arc::clone(robot)),
+        Some(_) => Ok(Arc::new(with_others(Robot::clone(robot), goal)?)),
+    }
+}
+
+fn with_others(mut seen: Robot, goal: &GoalContext) -> Result<Robot, ActionFailure> {
+    if let Some(others) = goal.port("other_arms").optional() {
         let Value::Map(postures) = others.any()? else {
             let found = others.any()?.type_name();
             return Err(ActionFailure::aborted(format!(
@@ -27,5 +39,9 @@ pub(super) fn moving(robot: &Arc<Robot>, goal: &GoalContext) -> Result<Arc<Robot
             seen = seen.with_other_arm_at(name, joints).map_err(|fault| wrong("other_arms", fault))?;
         }
     }
-    Ok(Arc::new(seen))
+    Ok(seen)
+}
+
+fn wrong(port: &str, fault: RobotFault) -> ActionFailure {
+    ActionFailure::aborted(format!("input `{port}`: {fault}"))
 }

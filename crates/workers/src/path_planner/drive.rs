@@ -1,8 +1,9 @@
 //! `path_planner/drive`: a way for the base in the goal's projection. Inputs: `arm` (the posture that the arm is in), `goal` (a pose on
-//! the floor, or a list of such poses); optional `start`, `position_tolerance_m`, `heading_tolerance_rad`, `speed`, and `pan`, `tilt`, `width_m` as for
-//! `path_planner/plan`.
+//! the floor, or a list of such poses); optional `start`, `position_tolerance_m`, `heading_tolerance_rad`, `speed`, and `pan`, `tilt`, `width_m`,
+//! `other_arms`, `cloud` with what belongs to it as for `path_planner/plan`.
 
-use super::goal::Said;
+use super::arms;
+use super::goal::{Said, seen};
 use ratn_model::pose::Pose;
 use ratn_model::value::Value;
 use ratn_motion::base::{DriveError, DriveRequest, plan_drive};
@@ -42,9 +43,10 @@ impl Action for DriveAction {
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let begin = Instant::now();
+        let robot = arms::standing(&self.robot, &goal)?;
         let scene = goal.unless_cancelled(goal.scene(&self.scenes)).await??;
-        let request = request(&goal, &self.robot, &scene)?;
-        let (robot, goal) = (Arc::clone(&self.robot), Arc::new(goal));
+        let request = request(&goal, &robot, &scene)?;
+        let goal = Arc::new(goal);
         let asking = Arc::clone(&goal);
         let mut control = move |_| if asking.cancelled.is_cancelled() { Control::Cancelled } else { Control::Continue };
         let planning = tokio::task::spawn_blocking(move || plan_drive(&robot, &scene, &request, &mut control));
@@ -73,6 +75,7 @@ fn request(goal: &GoalContext, robot: &Robot, scene: &Scene) -> Result<DriveRequ
         position_tolerance_m: goal.optional_float("position_tolerance_m")?.unwrap_or(0.0),
         heading_tolerance_rad: goal.optional_float("heading_tolerance_rad")?.unwrap_or(0.0),
         speed: goal.optional_float("speed")?.unwrap_or(DEFAULT_SPEED),
+        seen: seen(goal)?,
         seed: goal.seed,
     })
 }

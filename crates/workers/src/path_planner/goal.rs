@@ -147,7 +147,7 @@ fn way_points(goal: &GoalContext) -> Result<Option<WayPoints>, ActionFailure> {
 }
 
 /// What a depth camera saw: `cloud`, a PCD or PLY file with points in the world frame, with `cloud_radius_m` and `cloud_known_within_m`.
-fn seen(goal: &GoalContext) -> Result<Option<Seen>, ActionFailure> {
+pub(super) fn seen(goal: &GoalContext) -> Result<Option<Seen>, ActionFailure> {
     let radius_m = goal.optional_float("cloud_radius_m")?.unwrap_or(POINT_RADIUS_M);
     let known_within_m = goal.optional_float("cloud_known_within_m")?.unwrap_or(KNOWN_WITHIN_M);
     let Some(port) = goal.port("cloud").optional() else { return Ok(None) };
