@@ -1,6 +1,7 @@
 //! Going on with a run from its event log: the executive is brought to where it was, what was open is taken up, and the loop goes
 //! on as ever.
 
+use crate::alarm::Alarm;
 use super::{Ended, LOOK, Place, Shell, advisor_of, syncer_of, unix_ms};
 use crate::checkpoint::{Checkpointer, ReplayedState};
 use crate::control::Control;
@@ -114,6 +115,8 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         lookout: Lookout::default(),
         ask_at: None,
         look_at: Instant::now() + LOOK,
+        wake_at: None,
+        alarm: Alarm::at(Instant::now() + LOOK),
         confirm: Vec::new(),
         performer,
         answers,
