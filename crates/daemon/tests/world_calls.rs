@@ -99,7 +99,10 @@ async fn answers_come_as_they_are_there_and_each_as_if_its_call_had_come_alone()
     for (id, released) in [(6, true), (7, false)] {
         line.ask(id, Some(Asked::Release(v1::WorldPoolServiceReleaseRequest { projection_id }))).await;
         let answer = line.hear().await;
-        assert!(matches!(&answer, (heard, Kind::Release(ended)) if *heard == id && ended.released == released), "{answer:?}");
+        assert!(
+            matches!(&answer, (heard, Kind::Release(ended)) if *heard == id && ended.released == released),
+            "{answer:?}"
+        );
     }
     // The same commit again is made once.
     line.ask(8, commit("run/i1/1", 1)).await;
@@ -203,7 +206,8 @@ async fn a_pool_without_the_stream_is_asked_by_calls_of_their_own() {
 async fn every_call_of_a_stream_counts_for_the_quotas_of_its_caller() {
     let system = TestSystem::new();
     let quotas = QuotaConfig { calls_per_s: 1, ..QuotaConfig::default() };
-    let serving = ServiceConfig { quotas, ..ServiceConfig::default() }.serving(&Arc::new(Metrics::new(world_pool::ROLE)));
+    let serving =
+        ServiceConfig { quotas, ..ServiceConfig::default() }.serving(&Arc::new(Metrics::new(world_pool::ROLE)));
     // On loopback all are one caller, who is no operator.
     let config = WorldPoolConfig { listen: "127.0.0.1:0".parse().unwrap(), ..system.world_pool_config() };
     let pool = system.world_pool_serving(config, serving).await;

@@ -524,7 +524,10 @@ impl Shell {
         let others = [
             self.wake_at.map(|(_, at)| (Due::Timer, at)),
             self.ask_at.filter(|_| self.advisor.is_some()).map(|at| (Due::Advice, at)),
-            self.checkpointer.as_mut().and_then(|checkpointer| checkpointer.due(&self.log)).map(|at| (Due::Checkpoint, at)),
+            self.checkpointer
+                .as_mut()
+                .and_then(|checkpointer| checkpointer.due(&self.log))
+                .map(|at| (Due::Checkpoint, at)),
         ];
         let look = (Due::Look, self.look_at);
         others.into_iter().flatten().chain([look]).min_by_key(|(_, at)| *at).unwrap_or(look)

@@ -344,7 +344,10 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
 
     type CallsStream = Answers<WorldCalls, CallerService>;
 
-    async fn calls(&self, request: Request<Streaming<v1::CallsRequest>>) -> Result<Response<Self::CallsStream>, Status> {
+    async fn calls(
+        &self,
+        request: Request<Streaming<v1::CallsRequest>>,
+    ) -> Result<Response<Self::CallsStream>, Status> {
         let caller = StreamCaller::of(&request, self.metrics.clone());
         let calls = CallerService::new(self.clone(), caller);
         Ok(Response::new(Answers::new(calls, request.into_inner(), Some(self.shutdown.clone()))))

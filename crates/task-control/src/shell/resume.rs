@@ -1,8 +1,8 @@
 //! Going on with a run from its event log: the executive is brought to where it was, what was open is taken up, and the loop goes
 //! on as ever.
 
-use crate::alarm::Alarm;
 use super::{Ended, LOOK, Place, Shell, advisor_of, syncer_of, unix_ms};
+use crate::alarm::Alarm;
 use crate::checkpoint::{Checkpointer, ReplayedState};
 use crate::control::Control;
 use crate::history::{History, HistoryError};

@@ -339,8 +339,12 @@ impl WorldClient {
         let mut client = self.client.clone();
         let answer = match call {
             Asked::Commit(commit) => client.commit(commit).await.map(|answer| Answered::Commit(answer.into_inner())),
-            Asked::Project(project) => client.project(project).await.map(|answer| Answered::Project(answer.into_inner())),
-            Asked::Release(release) => client.release(release).await.map(|answer| Answered::Release(answer.into_inner())),
+            Asked::Project(project) => {
+                client.project(project).await.map(|answer| Answered::Project(answer.into_inner()))
+            }
+            Asked::Release(release) => {
+                client.release(release).await.map(|answer| Answered::Release(answer.into_inner()))
+            }
         };
         answer.map_err(|status| self.failed(&status))
     }
