@@ -63,7 +63,7 @@ fn record_of(path: &str) -> (&'static str, &'static str) {
         "ResourceService/ReportShortage" => ("report_shortage", r#""kind":"a""#),
         "WorldPoolService/Commit" => ("commit", r#""writer":"a""#),
         "WorldPoolService/Project" => ("project", r#""base_revision":"#),
-        "WorldPoolService/Release" | "WorldPoolService/Calls" => ("release_projection", r#""projection":"#),
+        "WorldPoolService/Release" => ("release_projection", r#""projection":"#),
         "ProcessService/Spawn" => ("spawn", r#""template":"a""#),
         "ProcessService/Stop" => ("stop", r#""worker":"a""#),
         "ProcessService/Restart" => ("restart", r#""target":"a""#),

@@ -39,9 +39,12 @@ impl StreamCaller {
     ) -> Result<T, Status> {
         let StreamCaller { caller, quotas, metrics } = self;
         let began = Instant::now();
-        caller.admit(path)?;
-        let _permit = quotas.map(|quotas| quotas.admit(&caller, path, began)).transpose()?;
-        let answered = performed.await;
+        let admitted = async {
+            caller.admit(path)?;
+            let _permit = quotas.map(|quotas| quotas.admit(&caller, path, began)).transpose()?;
+            performed.await
+        };
+        let answered = admitted.await;
         let code = answered.as_ref().map_or_else(Status::code, |_| Code::Ok);
         metrics.call(path, code, began.elapsed());
         answered

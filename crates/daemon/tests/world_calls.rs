@@ -11,6 +11,7 @@ use ratn_daemon::world_pool::{self, WorldPoolConfig};
 use ratn_model::fact::{Change, FactKey, Footprint};
 use ratn_model::id::Revision;
 use ratn_model::value::Value;
+use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_proto::v1::calls_request::Kind as Asked;
 use ratn_proto::v1::calls_response::Kind;
 use ratn_proto::v1::world_pool_service_client::WorldPoolServiceClient;
@@ -130,34 +131,47 @@ async fn what_was_asked_for_on_a_stream_that_breaks_may_be_asked_for_again() {
     pool.end().await;
 }
 
+fn wanted() -> Projection {
+    Projection {
+        request: "run/i3/1".to_owned(),
+        base: Revision(1),
+        changes: Vec::new(),
+        writers: Vec::new(),
+        reads: Footprint::Everything,
+        lease: None,
+    }
+}
+
 #[tokio::test]
-async fn calls_under_way_are_answered_when_the_pool_ends_and_the_next_one_reaches_its_successor() {
+async fn a_call_after_the_end_of_a_pool_reaches_its_successor() {
     let system = TestSystem::new();
     let pool = system.world_pool(2).await;
     let world = system.world(&pool);
     assert_eq!(world.commit("run/i1/1", full(1), None).await.unwrap(), Revision(1));
-    let waits = {
-        let world = world.clone();
-        let wanted = Projection {
-            request: "run/i3/1".to_owned(),
-            base: Revision(1),
-            changes: Vec::new(),
-            writers: Vec::new(),
-            reads: Footprint::Everything,
-            lease: None,
-        };
-        let early = Early { after: Some("run/i2/2".to_owned()), ..Early::default() };
-        tokio::spawn(async move { world.project_early(wanted, early).await })
-    };
-    tokio::time::sleep(Duration::from_millis(20)).await;
-    assert_eq!(world.commit("run/i2/2", full(2), None).await.unwrap(), Revision(2));
-    assert!(waits.await.unwrap().is_ok());
     pool.end().await;
-    let refused = world.commit("run/i4/3", full(3), None).await.unwrap_err();
+    let refused = world.commit("run/i4/2", full(3), None).await.unwrap_err();
     assert!(refused.is_crash(), "{refused}");
     let pool = system.world_pool(2).await;
-    let committed = ratn_worker::client::retry_unanswered(|| world.commit("run/i4/3", full(3), None)).await.unwrap();
-    assert_eq!(committed, Revision(3));
+    let committed = ratn_worker::client::retry_unanswered(|| world.commit("run/i4/2", full(3), None)).await.unwrap();
+    assert_eq!(committed, Revision(2));
+    pool.end().await;
+}
+
+#[tokio::test]
+async fn a_request_that_is_too_large_is_refused_alone() {
+    let system = TestSystem::new();
+    let pool = system.world_pool(2).await;
+    let world = system.world(&pool);
+    assert_eq!(world.commit("run/i1/1", full(1), None).await.unwrap(), Revision(1));
+    let early = Early { after: Some("run/i2/2".to_owned()), ..Early::default() };
+    let mut waits = std::pin::pin!(world.project_early(wanted(), early));
+    assert!(tokio::time::timeout(Duration::from_millis(20), &mut waits).await.is_err(), "it waits for its commit");
+    let fact = FactKey { predicate: "text".to_owned(), arguments: Vec::new() };
+    let large = vec![Change::Set { fact, value: Value::String("x".repeat(MAX_MESSAGE_BYTES)) }];
+    let refused = world.commit("run/i9/9", large, None).await.unwrap_err();
+    assert_eq!(refused.code(), Some(Code::OutOfRange), "{refused}");
+    assert_eq!(world.commit("run/i2/2", full(2), None).await.unwrap(), Revision(2));
+    in_time(waits).await.unwrap();
     pool.end().await;
 }
 
@@ -227,7 +241,7 @@ async fn every_call_of_a_stream_counts_for_the_quotas_of_its_caller() {
 }
 
 #[test]
-fn who_may_only_look_opens_no_stream() {
+fn who_may_only_look_may_open_no_stream() {
     let viewer = Caller { name: "eve".into(), roles: [Role::Viewer].as_slice().into() };
     assert_eq!(viewer.admit(CALLS).unwrap_err().code(), Code::PermissionDenied);
     let task = Caller { name: "run".into(), roles: [Role::Task].as_slice().into() };

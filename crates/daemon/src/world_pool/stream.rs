@@ -16,6 +16,9 @@ use ratn_worker::trace::{self, TraceContext};
 use tonic::{Code, Status};
 use tracing::Instrument;
 
+/// What a request that asks for nothing counts as.
+const CALLS: &str = "/ratn.v1.WorldPoolService/Calls";
+
 /// What performs the calls of one caller.
 #[derive(Debug)]
 pub(super) struct CallerService {
@@ -35,7 +38,7 @@ impl Serve<WorldCalls> for CallerService {
     fn begin(&mut self, call: Option<Asked>, context: Option<TraceContext>) -> CallAnswers<WorldCalls> {
         let Some(call) = call else {
             let missing = status(Code::InvalidArgument, "MALFORMED", "kind: is missing: set one of the calls");
-            return once(std::future::ready(Err(missing))).boxed();
+            return once(self.caller.clone().call(CALLS, std::future::ready(Err(missing)))).boxed();
         };
         let (path, caller) = (WorldCalls::path(&call), self.caller.caller.clone());
         let performed = performed(self.service.clone(), caller, call);

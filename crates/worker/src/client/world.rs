@@ -22,6 +22,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use tonic::{Code, Status, Streaming};
 use tonic_types::StatusExt;
 
+/// What a stream adds to a call: its id and its place in the trace.
+const ENVELOPE_BYTES: usize = 128;
+
 /// Asks one world pool.
 #[derive(Debug, Clone)]
 pub struct WorldClient {
@@ -328,6 +331,7 @@ impl WorldClient {
 
     /// Asks over the stream of calls, or over a stream of its own where the pool takes it only so.
     async fn ask(&self, call: Asked) -> Result<Answered, CallError> {
+        self.fits(&call)?;
         if !self.alone.load(Ordering::Relaxed) {
             let mut client = self.client.clone();
             let open = |questions| async move { client.calls(questions).await };
@@ -347,6 +351,18 @@ impl WorldClient {
             }
         };
         answer.map_err(|status| self.failed(&status))
+    }
+
+    /// A message that is too large would end the stream, and every other call on it.
+    fn fits(&self, call: &Asked) -> Result<(), CallError> {
+        let bytes = call.encoded_len();
+        if bytes <= MAX_MESSAGE_BYTES - ENVELOPE_BYTES {
+            return Ok(());
+        }
+        let most = MAX_MESSAGE_BYTES;
+        let message =
+            format!("the request has {bytes} bytes: more than a message may have ({most} bytes); ask for less at once");
+        Err(CallError::from_status(&self.endpoint, &Status::out_of_range(message)))
     }
 
     fn another(&self, what: &str) -> CallError {
