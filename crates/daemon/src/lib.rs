@@ -24,6 +24,7 @@ pub mod reload;
 pub mod resource_manager;
 pub mod service;
 mod standby;
+mod stream_calls;
 pub mod supervisor;
 pub mod telemetry;
 mod watch_stream;

@@ -8,6 +8,7 @@ mod support;
 
 use bytes::{Buf, BufMut};
 use messages::{Schema, spelt};
+use prost::Message;
 use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_worker::action::ActionServer;
 use ratn_worker::endpoint::Endpoint;
@@ -23,11 +24,16 @@ use tonic::codegen::http::uri::PathAndQuery;
 use tonic::{Code, Request, Status};
 
 /// Texts that say what they like: data of a task, and what the standard wants ignored when it is bad.
-const FREE: [(&str, &str); 3] = [
+const FREE: [(&str, &str); 4] = [
     ("text", ".ratn.v1.Value"),
+    ("traceparent", ".ratn.v1.CallsRequest"),
     ("traceparent", ".ratn.v1.SessionRequest"),
     ("traceparent", ".ratn.v1.PerformRequest"),
 ];
+
+/// Streams that carry calls.
+const CARRIERS: [&str; 3] =
+    ["/ratn.v1.ResourceService/Session", "/ratn.v1.ActionService/Perform", "/ratn.v1.WorldPoolService/Calls"];
 
 /// A refusal waits for nothing.
 const PATIENCE: Duration = Duration::from_secs(2);
@@ -81,21 +87,25 @@ async fn call(channel: &Traced, path: &str, message: Vec<u8>) -> Result<Vec<u8>,
     answers.message().await?.ok_or_else(|| Status::ok("no answer"))
 }
 
-/// What a session's stream says of a call it carries, and a stream of goals of an execute.
+/// What a stream of calls says of one that it carries.
 fn failure(path: &str, answer: &[u8]) -> Option<Status> {
-    use ratn_proto::v1::{PerformResponse, SessionResponse, perform_response, session_response};
-    let failure = if path.ends_with("/Perform") {
-        let answer: PerformResponse = prost::Message::decode(answer).ok()?;
-        answer
-            .kind
-            .and_then(|kind| if let perform_response::Kind::Failure(failure) = kind { Some(failure) } else { None })
-    } else {
-        let answer: SessionResponse = prost::Message::decode(answer).ok()?;
-        answer
-            .kind
-            .and_then(|kind| if let session_response::Kind::Failure(failure) = kind { Some(failure) } else { None })
+    use ratn_proto::v1::{CallsResponse, PerformResponse, SessionResponse};
+    use ratn_proto::v1::{calls_response, perform_response, session_response};
+    let failure = match path.rsplit('/').next()? {
+        "Perform" => match PerformResponse::decode(answer).ok()?.kind? {
+            perform_response::Kind::Failure(failure) => failure,
+            _ => return None,
+        },
+        "Calls" => match CallsResponse::decode(answer).ok()?.kind? {
+            calls_response::Kind::Failure(failure) => failure,
+            _ => return None,
+        },
+        _ => match SessionResponse::decode(answer).ok()?.kind? {
+            session_response::Kind::Failure(failure) => failure,
+            _ => return None,
+        },
     };
-    failure.map(|failure| Status::new(Code::from(failure.code), failure.message))
+    Some(Status::new(Code::from(failure.code), failure.message))
 }
 
 /// Whose texts their own tests refuse.
@@ -180,11 +190,15 @@ async fn control_characters_and_texts_without_end_are_refused_in_every_field_of_
 async fn a_message_beyond_the_limit_is_refused_by_every_service() {
     let system = TestSystem::new();
     let (channels, daemons, end) = channels(&system).await;
+    let mut carriers = 0;
     for (path, _, streamed) in Schema::read().methods {
-        let Some(channel) = channels.get(service_of(&path)).filter(|_| !streamed) else { continue };
+        let carries = CARRIERS.contains(&path.as_str());
+        carriers += usize::from(carries);
+        let Some(channel) = channels.get(service_of(&path)).filter(|_| !streamed || carries) else { continue };
         let refused = in_time(call(channel, &path, vec![0; MAX_MESSAGE_BYTES + 1])).await.unwrap_err();
         assert_eq!(refused.code(), Code::OutOfRange, "{path}: {refused:?}");
     }
+    assert_eq!(carriers, CARRIERS.len());
     for daemon in daemons {
         daemon.end().await;
     }

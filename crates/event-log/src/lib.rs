@@ -10,12 +10,15 @@ pub use parts::Parts;
 
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_model::time::Timestamp;
+use serde::Serialize;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{BufRead, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 /// A longer line is not written by any task; whoever wrote it is not `ratn`.
 const MAX_LINE_BYTES: usize = 16 << 20;
+/// Room that is kept for the next line, however long one was.
+const USUAL_LINE_BYTES: usize = 64 << 10;
 /// A run whose log grows beyond this is ended rather than filling the disk.
 const MAX_LOG_BYTES: u64 = 4 << 30;
 
@@ -90,6 +93,16 @@ pub struct LogWriter {
     on_disk: bool,
     /// What was behind the last whole line is away.
     is_cut: bool,
+    /// Room for the next line.
+    text: Vec<u8>,
+}
+
+/// A [`LogLine`] as it is written: nothing is copied for it.
+#[derive(Serialize)]
+struct Written<'a, T> {
+    at: Timestamp,
+    #[serde(flatten)]
+    entry: &'a T,
 }
 
 impl LogWriter {
@@ -158,6 +171,7 @@ impl LogWriter {
             lines: 0,
             on_disk,
             is_cut: false,
+            text: Vec::new(),
         })
     }
 
@@ -171,14 +185,14 @@ impl LogWriter {
 
     /// Writes what happened and what was decided then, and hands it to the operating system.
     pub fn append(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Result<(), LogError> {
-        self.write(&LogLine { at, entry: LogEntry::Event(event.clone()) })?;
+        self.write(&Written { at, entry: event })?;
         self.append_commands(at, commands)
     }
 
     /// Writes what was decided on the last event.
     pub fn append_commands(&mut self, at: Timestamp, commands: &[Command]) -> Result<(), LogError> {
         for command in commands {
-            self.write(&LogLine { at, entry: LogEntry::Command(command.clone()) })?;
+            self.write(&Written { at, entry: command })?;
         }
         self.file.flush().map_err(|source| self.io(source))
     }
@@ -200,16 +214,18 @@ impl LogWriter {
         Ok(())
     }
 
-    fn write(&mut self, line: &LogLine) -> Result<(), LogError> {
-        let mut text = serde_json::to_vec(line).map_err(|source| self.io(source.into()))?;
-        text.push(b'\n');
+    fn write(&mut self, line: &Written<impl Serialize>) -> Result<(), LogError> {
+        self.text.clear();
+        self.text.shrink_to(USUAL_LINE_BYTES);
+        serde_json::to_writer(&mut self.text, line).map_err(|source| self.io(source.into()))?;
+        self.text.push(b'\n');
         self.cut()?;
-        self.written += text.len() as u64;
+        self.written += self.text.len() as u64;
         self.lines += 1;
         if self.written > MAX_LOG_BYTES {
             return Err(LogError::TooLong { path: self.path.clone() });
         }
-        self.file.write_all(&text).map_err(|source| self.io(source))
+        self.file.write_all(&self.text).map_err(|source| self.io(source))
     }
 
     fn io(&self, source: std::io::Error) -> LogError {
@@ -459,6 +475,9 @@ mod tests {
         assert_eq!(lines[2], LogLine { at: Timestamp(0), entry: LogEntry::Command(wake) });
         assert_eq!(lines[0], LogLine { at: Timestamp(0), entry: LogEntry::Event(started()) });
         assert_eq!(lines[1], LogLine { at: Timestamp(0), entry: LogEntry::Command(command) });
+        let written = std::fs::read_to_string(file.path()).unwrap();
+        let of_lines: String = lines.iter().map(|line| format!("{}\n", serde_json::to_string(line).unwrap())).collect();
+        assert_eq!(written, of_lines);
     }
 
     #[test]

@@ -6,6 +6,7 @@ import json
 import pathlib
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 
@@ -190,6 +191,39 @@ def broken(function: object, **said: object) -> str:
     with pytest.raises(TypeError) as refused:
         ratn.Worker("broken").action(function, **said)  # type: ignore[arg-type]
     return str(refused.value)
+
+
+def test_a_worker_reads_nothing_that_only_tasks_and_systems_need() -> None:
+    program = """
+import sys, ratn
+w = ratn.Worker("bench")
+
+@w.action
+def add(goal: ratn.Goal, value: int) -> dict:
+    return {}
+
+print(*(module for module in ("asyncio", "numpy", "socket", "ssl", "subprocess", "tempfile", "ratn._system", "ratn._task") if module in sys.modules))
+
+@w.action
+async def wait(goal: ratn.Goal) -> dict:
+    return {}
+
+assert "asyncio" in sys.modules, "what its goals need is read before the first"
+"""
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout == "\n"
+
+
+def test_every_name_is_there_when_it_is_asked_for_and_no_other() -> None:
+    program = """
+import ratn
+assert set(ratn.__all__) <= set(dir(ratn)) and "System" not in vars(ratn)
+for name in ratn.__all__:
+    assert getattr(ratn, name) is getattr(ratn, name)
+from ratn import *
+assert System is ratn.System and "System" in vars(ratn)
+assert not hasattr(ratn, "asyncio")
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_what_is_no_port_is_refused_with_the_line_of_the_function() -> None:

@@ -10,6 +10,7 @@
 //! event log by `ratn-report`.
 
 mod advisor;
+mod alarm;
 mod background_runtime;
 pub mod checkpoint;
 pub mod control;

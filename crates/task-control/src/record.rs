@@ -51,8 +51,6 @@ pub(super) enum Record {
         /// What has to be safe before.
         safe: Option<Mark>,
     },
-    /// The pool's root is at this revision, or has been.
-    Known(Revision),
     Operate {
         instance: InstanceId,
         /// Its number in the run.
@@ -143,7 +141,8 @@ impl Root {
         Revision(self.0.load(Ordering::SeqCst))
     }
 
-    fn reached(&self, revision: Revision) {
+    /// The pool's root is at this revision, or has been.
+    pub(super) fn reached(&self, revision: Revision) {
         self.0.fetch_max(revision.0, Ordering::SeqCst);
     }
 }
@@ -192,10 +191,6 @@ impl Recorder {
                             },
                         }
                     }
-                }
-                Record::Known(revision) => {
-                    self.root.reached(revision);
-                    None
                 }
                 Record::Operate { instance, number, operations, order } => {
                     let operating = self.operate(instance, number, operations, &order);

@@ -9,20 +9,15 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use tokio::sync::watch;
 
-/// How far the log is safe.
-#[derive(Debug, Clone, Default)]
-struct Safe {
-    through: u64,
-    /// Nothing more will be.
-    failed: Option<Arc<str>>,
-}
-
 /// Makes the log safe. Ends its thread when it is dropped.
 #[derive(Debug)]
 pub(super) struct Syncer {
     /// `None` where there is no disk.
     wanted: Option<Sender<u64>>,
-    safe: watch::Receiver<Safe>,
+    /// Through which mark it is safe. Closed when no more will be.
+    safe: watch::Receiver<u64>,
+    /// Why no more will be.
+    failure: watch::Receiver<Option<Arc<str>>>,
     last: u64,
 }
 
@@ -30,7 +25,14 @@ pub(super) struct Syncer {
 #[derive(Debug, Clone)]
 pub(super) struct Mark {
     number: u64,
-    safe: watch::Receiver<Safe>,
+    safe: watch::Receiver<u64>,
+}
+
+/// What the thread tells.
+#[derive(Debug)]
+struct Tell {
+    safe: watch::Sender<u64>,
+    failure: watch::Sender<Option<Arc<str>>>,
 }
 
 impl Syncer {
@@ -39,12 +41,16 @@ impl Syncer {
     /// # Errors
     /// Where the thread cannot be started.
     pub(super) fn start(file: Option<File>) -> io::Result<Syncer> {
-        let (told, safe) = watch::channel(Safe::default());
-        let Some(file) = file else { return Ok(Syncer { wanted: None, safe, last: 0 }) };
-        let (wanted, marks) = channel();
+        let Some(file) = file else { return Ok(Syncer::telling().0) };
+        let ((syncer, tell), (wanted, marks)) = (Syncer::telling(), channel());
         let sync = move || file.sync_data();
-        std::thread::Builder::new().name("event-log".to_owned()).spawn(move || work(&marks, &told, sync))?;
-        Ok(Syncer { wanted: Some(wanted), safe, last: 0 })
+        std::thread::Builder::new().name("event-log".to_owned()).spawn(move || work(&marks, &tell, sync))?;
+        Ok(Syncer { wanted: Some(wanted), ..syncer })
+    }
+
+    fn telling() -> (Syncer, Tell) {
+        let ((safe, is_safe), (failure, has_failed)) = (watch::channel(0), watch::channel(None));
+        (Syncer { wanted: None, safe: is_safe, failure: has_failed, last: 0 }, Tell { safe, failure })
     }
 
     /// Everything that was written so far, which is made safe as soon as possible.
@@ -64,9 +70,9 @@ impl Syncer {
 
     /// Resolves when the log cannot be made safe any more, with the reason.
     pub(super) async fn failed(&self) -> Arc<str> {
-        let mut safe = self.safe.clone();
-        let looked = safe.wait_for(|safe| safe.failed.is_some()).await;
-        let reason = looked.ok().and_then(|safe| safe.failed.clone());
+        let mut failure = self.failure.clone();
+        let looked = failure.wait_for(Option::is_some).await;
+        let reason = looked.ok().and_then(|reason| reason.clone());
         match reason {
             Some(reason) => reason,
             // There is no thread that could.
@@ -79,7 +85,7 @@ impl Mark {
     /// One that is not safe as long as what is returned with it lives.
     #[cfg(test)]
     pub(super) fn not_yet() -> (impl Sized, Mark) {
-        let (told, safe) = watch::channel(Safe::default());
+        let (told, safe) = watch::channel(0);
         (told, Mark { number: 1, safe })
     }
 
@@ -87,19 +93,19 @@ impl Mark {
     pub(super) async fn safe(mut self) -> bool {
         let number = self.number;
         // Where the thread is gone it has said the last that is to be said.
-        let _ = self.safe.wait_for(|safe| safe.through >= number || safe.failed.is_some()).await;
-        self.safe.borrow().through >= number
+        let _ = self.safe.wait_for(|safe| *safe >= number).await;
+        *self.safe.borrow() >= number
     }
 }
 
-fn work(marks: &Receiver<u64>, told: &watch::Sender<Safe>, sync: impl Fn() -> io::Result<()>) {
+fn work(marks: &Receiver<u64>, tell: &Tell, sync: impl Fn() -> io::Result<()>) {
     while let Ok(mark) = marks.recv() {
         let through = marks.try_iter().last().unwrap_or(mark);
         match sync() {
-            Ok(()) => told.send_modify(|safe| safe.through = through),
+            Ok(()) => tell.safe.send_modify(|safe| *safe = through),
             Err(error) => {
                 // What a disk has lost once it may not tell again.
-                told.send_modify(|safe| safe.failed = Some(error.to_string().into()));
+                tell.failure.send_replace(Some(error.to_string().into()));
                 return;
             }
         }
@@ -113,10 +119,9 @@ mod tests {
     use std::time::Duration;
 
     fn started(sync: impl Fn() -> io::Result<()> + Send + 'static) -> Syncer {
-        let (told, safe) = watch::channel(Safe::default());
-        let (wanted, marks) = channel();
-        std::thread::spawn(move || work(&marks, &told, sync));
-        Syncer { wanted: Some(wanted), safe, last: 0 }
+        let ((syncer, tell), (wanted, marks)) = (Syncer::telling(), channel());
+        std::thread::spawn(move || work(&marks, &tell, sync));
+        Syncer { wanted: Some(wanted), ..syncer }
     }
 
     #[tokio::test]

@@ -9,6 +9,7 @@ pub use resume::{Resumption, resume};
 
 use super::Endpoints;
 use super::advisor::{self, Advisor};
+use super::alarm::Alarm;
 use super::checkpoint::Checkpointer;
 use super::control::{ANY_RUN, Asked, Control, Message, RunStatus};
 use super::ledger::Ledger;
@@ -158,6 +159,8 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
         lookout: Lookout::default(),
         ask_at: None,
         look_at: Instant::now() + LOOK,
+        wake_at: None,
+        alarm: Alarm::at(Instant::now() + LOOK),
         confirm: Vec::new(),
         performer,
         answers,
@@ -249,6 +252,10 @@ struct Shell {
     ask_at: Option<Instant>,
     /// When what waits is looked at again.
     look_at: Instant,
+    /// When the first of the timers is due, by the wall clock.
+    wake_at: Option<(Timestamp, Instant)>,
+    /// Rings when the next of these is due.
+    alarm: Alarm,
     /// Who is to be told that what was sent is in the log, and what becomes of it.
     confirm: Vec<(oneshot::Sender<Result<String, String>>, String)>,
     performer: Performer,
@@ -510,30 +517,29 @@ impl Shell {
         }
     }
 
+    /// What is to be done next without an answer that leads to it, and when.
+    fn next_due(&mut self) -> (Due, Instant) {
+        let timer = self.timers.first().copied();
+        if self.wake_at.map(|(of, _)| of) != timer {
+            self.wake_at = timer.map(|of| (of, Instant::now() + self.clock.until(of)));
+        }
+        let others = [
+            self.wake_at.map(|(_, at)| (Due::Timer, at)),
+            self.ask_at.filter(|_| self.advisor.is_some()).map(|at| (Due::Advice, at)),
+            self.checkpointer
+                .as_mut()
+                .and_then(|checkpointer| checkpointer.due(&self.log))
+                .map(|at| (Due::Checkpoint, at)),
+        ];
+        let look = (Due::Look, self.look_at);
+        others.into_iter().flatten().chain([look]).min_by_key(|(_, at)| *at).unwrap_or(look)
+    }
+
     /// The next event that the executive has to know of.
     async fn next(&mut self, interrupt: &Interrupt, asked: &mut Asks) -> anyhow::Result<Event> {
         loop {
-            let timer = self.timers.first().copied();
-            let due = async {
-                match timer {
-                    Some(at) => tokio::time::sleep(self.clock.until(at)).await,
-                    None => std::future::pending().await,
-                }
-            };
-            let ask_at = self.ask_at.filter(|_| self.advisor.is_some());
-            let to_ask = async {
-                match ask_at {
-                    Some(at) => tokio::time::sleep_until(at.into()).await,
-                    None => std::future::pending().await,
-                }
-            };
-            let checkpoint_at = self.checkpointer.as_mut().and_then(|checkpointer| checkpointer.due(&self.log));
-            let to_keep = async {
-                match checkpoint_at {
-                    Some(at) => tokio::time::sleep_until(at.into()).await,
-                    None => std::future::pending().await,
-                }
-            };
+            let (due, at) = self.next_due();
+            self.alarm.set(at);
             let advised = async {
                 match &mut self.advisor {
                     Some(advisor) => advisor.told().await,
@@ -548,7 +554,29 @@ impl Shell {
             };
             let answer = tokio::select! {
                 answer = self.answers.recv() => answer.context("nothing can answer any more")?,
-                () = due => return Ok(Event::Woken),
+                () = self.alarm.rings() => match due {
+                    Due::Timer => {
+                        self.wake_at = None;
+                        return Ok(Event::Woken);
+                    }
+                    Due::Advice => {
+                        self.ask_for_advice();
+                        continue;
+                    }
+                    Due::Checkpoint => {
+                        self.make_checkpoint();
+                        continue;
+                    }
+                    Due::Look => {
+                        self.look_at = Instant::now() + LOOK;
+                        if let Some(instance) = self.performer.waits()
+                            && let Some(path) = self.progress.waits(instance)
+                        {
+                            self.performer.say_why(self.clock.now(), instance, path);
+                        }
+                        continue;
+                    }
+                },
                 asked = told => match asked {
                     Asked::Told(event) => return Ok(*event),
                     Asked::Status(say) => {
@@ -573,21 +601,6 @@ impl Shell {
                 reason = self.syncer.failed() => {
                     bail!("{} cannot be made safe on its disk: {reason}", self.log.path().display())
                 }
-                () = to_ask => {
-                    self.ask_for_advice();
-                    continue;
-                }
-                () = to_keep => {
-                    self.make_checkpoint();
-                    continue;
-                }
-                () = tokio::time::sleep_until(self.look_at.into()) => {
-                    self.look_at = Instant::now() + LOOK;
-                    if let Some(instance) = self.performer.waits() && let Some(path) = self.progress.waits(instance) {
-                        self.performer.say_why(self.clock.now(), instance, path);
-                    }
-                    continue;
-                }
                 // Asked once it does what is to be done on the way out, asked twice it ends at once.
                 () = interrupt.asked_times(asked.by_the_user + 1), if asked.by_the_user < 2 => {
                     asked.by_the_user += 1;
@@ -599,11 +612,24 @@ impl Shell {
                     return Ok(Event::AbortRequested { reason, at_once: true });
                 }
             };
-            if let Some(event) = self.performer.accept(answer, self.executive.root())? {
+            if let Some(event) = self.performer.accept(answer, self.executive.root()) {
                 return Ok(event);
             }
         }
     }
+}
+
+/// What a run does at a moment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Due {
+    /// The executive is woken.
+    Timer,
+    /// The advisor is asked.
+    Advice,
+    /// A checkpoint is made.
+    Checkpoint,
+    /// What waits is looked at.
+    Look,
 }
 
 /// What has asked the run to end.

@@ -170,7 +170,8 @@ impl Calls {
 }
 
 /// Streams that carry calls, each of which has a span of its own.
-const CARRIERS: [&str; 2] = ["/ratn.v1.ResourceService/Session", "/ratn.v1.ActionService/Perform"];
+const CARRIERS: [&str; 3] =
+    ["/ratn.v1.ResourceService/Session", "/ratn.v1.ActionService/Perform", "/ratn.v1.WorldPoolService/Calls"];
 
 /// Whether a call is one of the daemon's own services.
 fn is_counted(path: &str) -> bool {

@@ -4,8 +4,8 @@
 use super::service::Service;
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
-use crate::details::{retry_later, status};
-use crate::quota::Quotas;
+use crate::details::status;
+use crate::stream_calls::StreamCaller;
 use futures::StreamExt;
 use futures::stream::once;
 use ratn_model::id::LeaseId;
@@ -18,12 +18,9 @@ use ratn_worker::multiplex::server::{CallAnswers, Serve};
 use ratn_worker::multiplex::{Protocol, SessionCalls};
 use ratn_worker::trace::{self, TraceContext};
 use std::collections::{BTreeMap, VecDeque};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 use tonic::{Code, Status};
 use tracing::Instrument;
-
-/// When to ask again after a refusal for the number of calls.
-const RETRY_DELAY: Duration = Duration::from_millis(10);
 
 /// What a withdraw on a stream counts as.
 const WITHDRAW: &str = "/ratn.v1.ResourceService/Withdraw";
@@ -31,16 +28,11 @@ const WITHDRAW: &str = "/ratn.v1.ResourceService/Withdraw";
 /// Grants of a stream that are known by the ids of their calls: more than can be under way to a client that reads.
 const GRANTS: usize = 4_096;
 
-/// The reason of a refusal for the number of calls.
-const TOO_MANY: &str = "TOO_MANY";
-
 /// What performs the calls of one caller.
 #[derive(Debug)]
 pub(super) struct CallerService {
     service: Service,
-    caller: Caller,
-    /// What its calls count for.
-    quotas: Option<Quotas>,
+    caller: StreamCaller,
     grants: Grants,
 }
 
@@ -65,8 +57,8 @@ impl Grants {
 }
 
 impl CallerService {
-    pub(super) fn new(service: Service, caller: Caller, quotas: Option<Quotas>) -> CallerService {
-        CallerService { service, caller, quotas, grants: Grants::default() }
+    pub(super) fn new(service: Service, caller: StreamCaller) -> CallerService {
+        CallerService { service, caller, grants: Grants::default() }
     }
 }
 
@@ -74,10 +66,12 @@ impl Serve<SessionCalls> for CallerService {
     const MAX_CALLS: usize = 4_096;
 
     fn begin(&mut self, call: Option<Asked>, context: Option<TraceContext>) -> CallAnswers<SessionCalls> {
-        let performed = measured(self.service.clone(), self.caller.clone(), self.quotas.clone(), call);
+        let path = call.as_ref().map_or("/ratn.v1.ResourceService/KeepAlive", SessionCalls::path);
+        let performed = performed(self.service.clone(), self.caller.caller.clone(), call);
+        let counted = self.caller.clone().call(path, performed);
         match context {
-            None => once(performed).boxed(),
-            Some(context) => once(trace::within(context, performed).instrument(context.entered())).boxed(),
+            None => once(counted).boxed(),
+            Some(context) => once(trace::within(context, counted).instrument(context.entered())).boxed(),
         }
     }
 
@@ -103,42 +97,24 @@ impl Serve<SessionCalls> for CallerService {
         if !withdrawn && let Some(lease) = self.grants.leases.remove(&ended) {
             self.service.return_later(lease);
             let withdraw = || Mutation::Withdraw { session: session_id.clone() };
-            audit::begin(&self.caller, &request_id, withdraw).ended(&Ok(()));
+            audit::begin(&self.caller.caller, &request_id, withdraw).ended(&Ok(()));
             withdrawn = true;
         }
         // The end of a call was counted with the call. What counts anew is refused before it makes any work.
-        let counts = self.quotas.as_ref().filter(|_| !withdrawn);
-        if let Some(Err(refused)) = counts.map(|quotas| quotas.admit(&self.caller, WITHDRAW, Instant::now())) {
+        let StreamCaller { caller, quotas, .. } = &self.caller;
+        let counts = quotas.as_ref().filter(|_| !withdrawn);
+        if let Some(Err(refused)) = counts.map(|quotas| quotas.admit(caller, WITHDRAW, Instant::now())) {
             return Some(Err(refused));
         }
         if unheard {
-            self.service.undo_later(&self.caller, &session_id, request_id);
+            self.service.undo_later(caller, &session_id, request_id);
         }
         Some(Ok(Kind::Withdraw(v1::WithdrawResponse { withdrawn })))
     }
 
     fn too_many(&self) -> Status {
-        self.service.metrics().refused("call", TOO_MANY.to_owned());
-        let message = format!("{} calls are under way on this stream: wait for answers", Self::MAX_CALLS);
-        retry_later(Code::ResourceExhausted, TOO_MANY, message, RETRY_DELAY)
+        self.caller.too_many(Self::MAX_CALLS)
     }
-}
-
-async fn measured(
-    service: Service,
-    caller: Caller,
-    quotas: Option<Quotas>,
-    call: Option<Asked>,
-) -> Result<Kind, Status> {
-    let began = Instant::now();
-    let path = call.as_ref().map_or("/ratn.v1.ResourceService/KeepAlive", SessionCalls::path);
-    caller.admit(path)?;
-    let _permit = quotas.map(|quotas| quotas.admit(&caller, path, began)).transpose()?;
-    let metrics = service.metrics().clone();
-    let answered = performed(service, caller, call).await;
-    let code = answered.as_ref().map_or_else(Status::code, |_| Code::Ok);
-    metrics.call(path, code, began.elapsed());
-    answered
 }
 
 async fn performed(service: Service, caller: Caller, call: Option<Asked>) -> Result<Kind, Status> {

@@ -23,6 +23,7 @@ mod record;
 mod scenes;
 mod service;
 mod status;
+mod stream;
 
 pub use config::WorldPoolConfig;
 
@@ -118,6 +119,7 @@ pub async fn run_as(
         shutdown: shutdown.clone(),
         sizes,
         long_reads: service::LongReads::default(),
+        metrics,
     })
     .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES)
     .max_encoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);

@@ -4,10 +4,13 @@ use super::actor::{Handle, Message, NewProjection, Update, WATCH_AGAIN_AFTER};
 use super::history::Commit;
 use super::leases::{Known, LiveLeases};
 use super::query::{Found, View};
+use super::stream::CallerService;
 use crate::access::Caller;
 use crate::audit::{self, Mutation};
 use crate::details::{retry_later, status};
+use crate::metrics::Metrics;
 use crate::paging::{self, Filled, Page};
+use crate::stream_calls::StreamCaller;
 use crate::watch_stream;
 use futures::StreamExt;
 use futures::stream::BoxStream;
@@ -18,13 +21,15 @@ use ratn_proto::MAX_PAGE_BYTES;
 use ratn_proto::convert::{Malformed, all, digest, each, few, label, name, required};
 use ratn_proto::types::{FactDifference, FactRecord, FactVersion, WorldChange, WorldUpdate};
 use ratn_proto::v1;
+use ratn_worker::multiplex::WorldCalls;
+use ratn_worker::multiplex::server::Answers;
 use ratn_world::digest::Digest;
 use ratn_world::world::Fact;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
-use tonic::{Code, Request, Response, Status};
+use tonic::{Code, Request, Response, Status, Streaming};
 
 /// A grant may reach the client before the watch tells of it: so long a projection waits for that.
 const LEASE_PATIENCE: Duration = Duration::from_secs(1);
@@ -46,6 +51,7 @@ pub(super) struct Service {
     pub(super) shutdown: CancellationToken,
     pub(super) sizes: Sizes,
     pub(super) long_reads: LongReads,
+    pub(super) metrics: Arc<Metrics>,
 }
 
 /// What takes long to read is read in threads of its own, a few at a time: the others are for everybody else.
@@ -334,6 +340,17 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         pending.ended(&released);
         let released = released?;
         Ok(Response::new(v1::WorldPoolServiceReleaseResponse { released }))
+    }
+
+    type CallsStream = Answers<WorldCalls, CallerService>;
+
+    async fn calls(
+        &self,
+        request: Request<Streaming<v1::CallsRequest>>,
+    ) -> Result<Response<Self::CallsStream>, Status> {
+        let caller = StreamCaller::of(&request, self.metrics.clone());
+        let calls = CallerService::new(self.clone(), caller);
+        Ok(Response::new(Answers::new(calls, request.into_inner(), Some(self.shutdown.clone()))))
     }
 }
 

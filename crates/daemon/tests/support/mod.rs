@@ -2,16 +2,19 @@
 #![allow(clippy::unwrap_used, dead_code, reason = "a test may panic; not every test file uses everything")]
 
 use nix::mount::{MntFlags, MsFlags, mount, umount2};
+use ratn_daemon::metrics::Metrics;
 use ratn_daemon::{process_manager, resource_manager, world_pool};
 use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_proto::types::{ResourceEvent, ResourceEventKind, ResourceUpdate};
 use ratn_worker::client::{Channels, ProcessClient, ResourceClient, ResourceWatch, WorldClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::server::Serving;
 use ratn_worker::session::Session;
 use ratn_worker::tls::ClientTls;
 use std::future::Future;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
@@ -103,6 +106,13 @@ impl TestSystem {
     pub(crate) async fn world_pool_with(&self, config: world_pool::WorldPoolConfig) -> Daemon {
         let shutdown = CancellationToken::new();
         let run = world_pool::run(config, self.directory.clone(), shutdown.clone());
+        self.started(world_pool::ROLE, shutdown, run).await
+    }
+
+    pub(crate) async fn world_pool_serving(&self, config: world_pool::WorldPoolConfig, serving: Serving) -> Daemon {
+        let (shutdown, metrics) = (CancellationToken::new(), Arc::new(Metrics::new(world_pool::ROLE)));
+        let (directory, tls) = (self.directory.clone(), ClientTls::none());
+        let run = world_pool::run_as(config, directory, serving, metrics, tls, shutdown.clone());
         self.started(world_pool::ROLE, shutdown, run).await
     }
 

@@ -46,7 +46,9 @@ fn refused(
     let maybe = may_be_written(subject.control, to, slot, from);
     let relation = relation(subject, to, slot, source);
     if !matches!(relation, Relation::Hidden(_) | Relation::Beside) {
-        if is_there(subject, to, slot, (from, port)) || (maybe && is_one_of_several) {
+        // What a state contains is forgotten when it is entered, also where it is one of several that may be there.
+        let is_forgotten = matches!(relation, Relation::Inside);
+        if is_there(subject, to, slot, (from, port)) || (maybe && is_one_of_several && !is_forgotten) {
             return None;
         }
         if maybe {
@@ -58,7 +60,7 @@ fn refused(
     }
     let (rule, message, help) = match relation {
         // A run that begins behind the state that writes it.
-        Relation::Before if subject.begins_elsewhere && subject.control.is_reached(Point::Begin(to.id)) => {
+        Relation::Before if subject.begins_elsewhere && !is_one_of_several && subject.control.is_reached(Point::Begin(to.id)) => {
             let message = format!("{flow} is not there: the run begins behind `{}`, which writes it", source.path);
             ("branch-may-not-have-written", message, "let it begin there, or before it".to_owned())
         }

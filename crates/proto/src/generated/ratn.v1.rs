@@ -3174,6 +3174,64 @@ pub mod resource_service_server {
         const NAME: &'static str = SERVICE_NAME;
     }
 }
+/// A question on a stream of calls.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct CallsRequest {
+    /// Chosen by the client; the answer has it too. Another one for each call under way; 0 for calls that need not be told apart.
+    #[prost(uint64, tag = "1")]
+    pub id: u64,
+    /// The W3C trace context of the call, as the header `traceparent` of a call of its own has it; may be empty.
+    #[prost(string, tag = "5")]
+    pub traceparent: ::prost::alloc::string::String,
+    /// Exactly one is set.
+    #[prost(oneof = "calls_request::Kind", tags = "2, 3, 4")]
+    pub kind: ::core::option::Option<calls_request::Kind>,
+}
+/// Nested message and enum types in `CallsRequest`.
+pub mod calls_request {
+    /// Exactly one is set.
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Kind {
+        /// As Commit.
+        #[prost(message, tag = "2")]
+        Commit(super::CommitRequest),
+        /// As Project.
+        #[prost(message, tag = "3")]
+        Project(super::ProjectRequest),
+        /// As Release.
+        #[prost(message, tag = "4")]
+        Release(super::WorldPoolServiceReleaseRequest),
+    }
+}
+/// An answer on a stream of calls.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct CallsResponse {
+    /// The question's.
+    #[prost(uint64, tag = "1")]
+    pub id: u64,
+    /// Exactly one is set.
+    #[prost(oneof = "calls_response::Kind", tags = "2, 3, 4, 5")]
+    pub kind: ::core::option::Option<calls_response::Kind>,
+}
+/// Nested message and enum types in `CallsResponse`.
+pub mod calls_response {
+    /// Exactly one is set.
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Kind {
+        /// As Commit.
+        #[prost(message, tag = "2")]
+        Commit(super::CommitResponse),
+        /// As Project.
+        #[prost(message, tag = "3")]
+        Project(super::ProjectResponse),
+        /// As Release.
+        #[prost(message, tag = "4")]
+        Release(super::WorldPoolServiceReleaseResponse),
+        /// The call failed; the stream goes on.
+        #[prost(message, tag = "5")]
+        Failure(super::CallFailure),
+    }
+}
 /// Asks for the root.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetRootRequest {
@@ -3924,6 +3982,33 @@ pub mod world_pool_service_client {
                 .insert(GrpcMethod::new("ratn.v1.WorldPoolService", "Release"));
             self.inner.unary(req, path, codec).await
         }
+        /// Any number of commits, projections and releases over one stream, which saves each the cost of a stream of its own: for who asks often.
+        /// Answers come as they are there, not in the order of questions. What was asked for on a stream that breaks may have been done: the
+        /// same ids may be asked for again.
+        pub async fn calls(
+            &mut self,
+            request: impl tonic::IntoStreamingRequest<Message = super::CallsRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::CallsResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/ratn.v1.WorldPoolService/Calls",
+            );
+            let mut req = request.into_streaming_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("ratn.v1.WorldPoolService", "Calls"));
+            self.inner.streaming(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -4023,6 +4108,19 @@ pub mod world_pool_service_server {
             tonic::Response<super::WorldPoolServiceReleaseResponse>,
             tonic::Status,
         >;
+        /// Server streaming response type for the Calls method.
+        type CallsStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::CallsResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Any number of commits, projections and releases over one stream, which saves each the cost of a stream of its own: for who asks often.
+        /// Answers come as they are there, not in the order of questions. What was asked for on a stream that breaks may have been done: the
+        /// same ids may be asked for again.
+        async fn calls(
+            &self,
+            request: tonic::Request<tonic::Streaming<super::CallsRequest>>,
+        ) -> std::result::Result<tonic::Response<Self::CallsStream>, tonic::Status>;
     }
     /// Holds the root world model and the projections of it.
     #[derive(Debug)]
@@ -4553,6 +4651,54 @@ pub mod world_pool_service_server {
                                 max_encoding_message_size,
                             );
                         let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/ratn.v1.WorldPoolService/Calls" => {
+                    #[allow(non_camel_case_types)]
+                    struct CallsSvc<T: WorldPoolService>(pub Arc<T>);
+                    impl<
+                        T: WorldPoolService,
+                    > tonic::server::StreamingService<super::CallsRequest>
+                    for CallsSvc<T> {
+                        type Response = super::CallsResponse;
+                        type ResponseStream = T::CallsStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<
+                                tonic::Streaming<super::CallsRequest>,
+                            >,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as WorldPoolService>::calls(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = CallsSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.streaming(method, req).await;
                         Ok(res)
                     };
                     Box::pin(fut)

@@ -28,6 +28,7 @@
     Method { service: "ratn.v1.WorldPoolService", name: "WatchProjection", operation: Some(Operation::Look) },
     Method { service: "ratn.v1.WorldPoolService", name: "GetScene", operation: Some(Operation::Look) },
     Method { service: "ratn.v1.WorldPoolService", name: "Release", operation: Some(Operation::Project) },
+    Method { service: "ratn.v1.WorldPoolService", name: "Calls", operation: Some(Operation::Project) },
     Method { service: "ratn.v1.ProcessService", name: "ListPools", operation: Some(Operation::Look) },
     Method { service: "ratn.v1.ProcessService", name: "Spawn", operation: Some(Operation::Administer) },
     Method { service: "ratn.v1.ProcessService", name: "Stop", operation: Some(Operation::Administer) },

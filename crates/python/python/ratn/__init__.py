@@ -32,11 +32,9 @@ A task is a function, which is called once and makes the same model as a task fi
             ...
 """
 
+import importlib
 import pkgutil
-
-from ratn._annotations import Annotations, block, consume, create, delete, output
-from ratn._blocks import collect, concurrently, do_while, each, lastly, otherwise, retry, sequence, until, when, while_
-from ratn._expression import Functions, Untraceable, Value, exists, expr, fact, fn, isin
+import typing
 
 from ratn._ratn import (
     Aborted,
@@ -66,13 +64,46 @@ from ratn._ratn import (
     Unimplemented,
     WorldWatch,
 )
-from ratn._states import action, ask, function, leave, library, variable, wait
-from ratn._step import Step, step
-from ratn._system import Result, Run, System
-from ratn._task import Doc, Finding, Task, task
-from ratn._trace import State
-from ratn._views import Chart, CriticalPath, Log, Network, Nodes, Report, Why
 from ratn._worker import Driver, Outcome, Worker
+
+if typing.TYPE_CHECKING:
+    from ratn._annotations import Annotations, block, consume, create, delete, output
+    from ratn._blocks import collect, concurrently, do_while, each, lastly, otherwise, retry, sequence, until, when, while_
+    from ratn._expression import Functions, Untraceable, Value, exists, expr, fact, fn, isin
+    from ratn._states import action, ask, function, leave, library, variable, wait
+    from ratn._step import Step, step
+    from ratn._system import Result, Run, System
+    from ratn._task import Doc, Finding, Task, task
+    from ratn._trace import State
+    from ratn._views import Chart, CriticalPath, Log, Network, Nodes, Report, Why
+
+# What tasks and systems need is read when it is asked for: a worker needs none of it, and there are many workers.
+_LATER = {
+    "_annotations": "Annotations block consume create delete output",
+    "_blocks": "collect concurrently do_while each lastly otherwise retry sequence until when while_",
+    "_expression": "Functions Untraceable Value exists expr fact fn isin",
+    "_states": "action ask function leave library variable wait",
+    "_step": "Step step",
+    "_system": "Result Run System",
+    "_task": "Doc Finding Task task",
+    "_trace": "State",
+    "_views": "Chart CriticalPath Log Network Nodes Report Why",
+}
+_PLACES = {name: module for module, names in _LATER.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> typing.Any:
+    """Of a name that is not read yet: PEP 562."""
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_PLACES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
 
 # What `protoc` makes of the protocol's files is `ratn.v1`, in a folder of its own.
 __path__ = pkgutil.extend_path(__path__, __name__)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextvars
 import inspect
 import logging
@@ -90,6 +89,9 @@ class Worker:
             )
             if action.name in self._actions:
                 raise ValueError(f"{_ports.where(function)}: there is an action `{action.name}` already")
+            if inspect.iscoroutinefunction(function):
+                # Here, and not with the first goal: reading it takes a while.
+                import asyncio  # noqa: F401
             action.perform = lambda goal, given: _performed(function, action, goal, given)
             self._actions[action.name] = action
             return function
@@ -192,6 +194,8 @@ def _performed(
     # What a goal sets there is its own: its thread performs others after it.
     ended = contextvars.copy_context().run(function, goal, **given)
     if inspect.isawaitable(ended):
+        import asyncio
+
         ended = asyncio.run(_until_cancelled(goal, ended))
     if isinstance(ended, Outcome):
         return ended.name, ended.outputs, ended.reason
@@ -204,6 +208,8 @@ def _performed(
 
 async def _until_cancelled(goal: Goal, work: Any) -> Any:
     """Awaits the work of an ``async def``, which is cancelled as asyncio does it when the goal shall stop."""
+    import asyncio
+
     task = asyncio.ensure_future(work)
     loop = asyncio.get_running_loop()
 

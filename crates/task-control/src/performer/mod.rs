@@ -157,6 +157,8 @@ pub(super) struct Performer {
     _others: [AbortOnDropHandle<()>; 2],
     events: mpsc::Sender<Answer>,
     records: mpsc::Sender<Record>,
+    /// How far the pool's root is known.
+    root: Root,
     outside: Outside,
     told: Told,
     /// The run's own number of its last commit.
@@ -243,7 +245,7 @@ impl Performer {
         let listening = AbortOnDropHandle::new(tokio::spawn(listening));
         let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
         let (cancelled, recorded) = (Cancelled::default(), Recorded::default());
-        let promises = Promises::default();
+        let (promises, root) = (Promises::default(), Root::default());
         let recorder = Recorder {
             run: run.clone(),
             world: world.clone(),
@@ -253,7 +255,7 @@ impl Performer {
             events: events.clone(),
             trust: session.trust(),
             trace,
-            root: Root::default(),
+            root: root.clone(),
             promises: promises.clone(),
         };
         tracing::debug!(run, trace = %trace.trace_id(), "calls of this run are of one trace");
@@ -274,6 +276,7 @@ impl Performer {
             _others: [others, listening],
             events,
             records,
+            root,
             outside: Outside::default(),
             told,
             decided: Revision::default(),
@@ -303,17 +306,16 @@ impl Performer {
     /// The root world as it is now; of every revision after it [`Performer::accept`] will hear.
     pub(super) async fn root(&mut self) -> anyhow::Result<(Revision, Vec<(FactKey, Value)>)> {
         let (revision, facts) = retry_unanswered(|| self.world.root()).await?;
-        self.follow(revision)?;
+        self.follow(revision);
         Ok((revision, facts.into_iter().map(|fact| (fact.key, fact.value)).collect()))
     }
 
     /// Hears of every revision of the root after this one.
-    fn follow(&mut self, after: Revision) -> anyhow::Result<()> {
-        self.record(Record::Known(after))?;
+    fn follow(&mut self, after: Revision) {
+        self.root.reached(after);
         self.told.root(after);
         let following = watch::follow(self.world.clone(), after, self.events.clone(), self.told.clone());
         self.following = Some(AbortOnDropHandle::new(tokio::spawn(following)));
-        Ok(())
     }
 
     /// How far what was decided is done.
@@ -537,26 +539,23 @@ impl Performer {
     }
 
     /// The event of an answer; `None` when what it answers was withdrawn or cancelled: what crossed with that goes back.
-    ///
-    /// # Errors
-    /// Where nothing can be recorded any more.
-    pub(super) fn accept(&mut self, answer: Answer, mirror: &World) -> anyhow::Result<Option<Event>> {
+    pub(super) fn accept(&mut self, answer: Answer, mirror: &World) -> Option<Event> {
         let (event, withdrawn) = match answer {
             Answer::Event { event, withdrawn } => (*event, withdrawn.is_some_and(|token| token.is_cancelled())),
             Answer::World(change) => {
-                self.record(Record::Known(change.revision))?;
+                self.root.reached(change.revision);
                 if told::maker(&change.commit).is_some_and(|(run, _)| run != self.run) {
                     self.told.beside_others(true);
                 }
-                return Ok(self.outside.told(change, mirror));
+                return self.outside.told(change, mirror);
             }
             Answer::Wanted(leases) => {
                 let holders: Vec<InstanceId> =
                     leases.into_iter().filter_map(|lease| self.leases.speculative_holder(lease)).collect();
-                return Ok((!holders.is_empty()).then_some(Event::WantedByOthers { holders }));
+                return (!holders.is_empty()).then_some(Event::WantedByOthers { holders });
             }
         };
-        Ok(match event {
+        match event {
             Event::Granted { instance, lease } if withdrawn => {
                 self.give_back(instance, Some(lease.id), None);
                 None
@@ -586,7 +585,7 @@ impl Performer {
                 }
                 Some(event)
             }
-        })
+        }
     }
 
     /// The place of an instance in the trace of the run.

@@ -2,6 +2,7 @@
 //! on as ever.
 
 use super::{Ended, LOOK, Place, Shell, advisor_of, syncer_of, unix_ms};
+use crate::alarm::Alarm;
 use crate::checkpoint::{Checkpointer, ReplayedState};
 use crate::control::Control;
 use crate::history::{History, HistoryError};
@@ -114,6 +115,8 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         lookout: Lookout::default(),
         ask_at: None,
         look_at: Instant::now() + LOOK,
+        wake_at: None,
+        alarm: Alarm::at(Instant::now() + LOOK),
         confirm: Vec::new(),
         performer,
         answers,

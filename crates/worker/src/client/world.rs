@@ -1,26 +1,38 @@
-//! The client of the world pool.
+//! The client of the world pool. The calls that a task makes all the time (commit, project, release) share one stream per client.
 
 use super::{CallError, Channels, snapshot};
 use crate::endpoint::Endpoint;
+use crate::multiplex::WorldCalls;
+use crate::multiplex::client::Multiplexer;
 use crate::trace::Traced;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId, Revision};
 use ratn_model::measurement::Evidence;
-use ratn_proto::convert::{all, each};
+use ratn_proto::convert::{Malformed, all, each};
 use ratn_proto::types::{Contradiction, FactDifference, FactRecord, FactVersion, WorldUpdate};
 use ratn_proto::v1;
+use ratn_proto::v1::calls_request::Kind as Asked;
+use ratn_proto::v1::calls_response::Kind as Answered;
 use ratn_proto::v1::world_pool_service_client::WorldPoolServiceClient;
 use ratn_proto::{MAX_MESSAGE_BYTES, PAGE_BYTES};
 use ratn_world::digest::Digest;
 use ratn_world::scene::delta::SceneDelta;
 use std::sync::Arc;
-use tonic::Streaming;
+use std::sync::atomic::{AtomicBool, Ordering};
+use tonic::{Code, Status, Streaming};
+use tonic_types::StatusExt;
+
+/// What a stream adds to a call: its id and its place in the trace.
+const ENVELOPE_BYTES: usize = 128;
 
 /// Asks one world pool.
 #[derive(Debug, Clone)]
 pub struct WorldClient {
     endpoint: Endpoint,
     client: WorldPoolServiceClient<Traced>,
+    calls: Multiplexer<WorldCalls>,
+    /// The pool is of a version that takes every call alone.
+    alone: Arc<AtomicBool>,
 }
 
 /// A projection that is to be made.
@@ -114,7 +126,7 @@ impl WorldClient {
         let client = WorldPoolServiceClient::new(channels.get(endpoint)?)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
             .max_encoding_message_size(MAX_MESSAGE_BYTES);
-        Ok(WorldClient { endpoint: endpoint.clone(), client })
+        Ok(WorldClient { endpoint: endpoint.clone(), client, calls: Multiplexer::default(), alone: Arc::default() })
     }
 
     /// Where the world pool is.
@@ -158,7 +170,9 @@ impl WorldClient {
             writer: commit.writer,
             evidence: all(commit.evidence),
         };
-        let answer = self.client.clone().commit(question).await.map_err(|status| self.failed(&status))?.into_inner();
+        let Answered::Commit(answer) = self.ask(Asked::Commit(question)).await? else {
+            return Err(self.another("a commit"));
+        };
         let contradictions = each(answer.contradictions, "contradictions");
         Ok((Revision(answer.revision), contradictions.map_err(|m| CallError::malformed(&self.endpoint, m))?))
     }
@@ -193,7 +207,9 @@ impl WorldClient {
             promise: early.promise,
             after_commit_id: early.after.unwrap_or_default(),
         };
-        let answer = self.client.clone().project(question).await.map_err(|status| self.failed(&status))?.into_inner();
+        let Answered::Project(answer) = self.ask(Asked::Project(question)).await? else {
+            return Err(self.another("a projection"));
+        };
         Ok((ProjectionId(answer.projection_id), answer.promised.into_iter().map(ProjectionId).collect()))
     }
 
@@ -307,8 +323,50 @@ impl WorldClient {
     /// [`CallError`].
     pub async fn release(&self, projection: ProjectionId) -> Result<bool, CallError> {
         let question = v1::WorldPoolServiceReleaseRequest { projection_id: projection.0 };
-        let answer = self.client.clone().release(question).await.map_err(|status| self.failed(&status))?;
-        Ok(answer.into_inner().released)
+        match self.ask(Asked::Release(question)).await? {
+            Answered::Release(ended) => Ok(ended.released),
+            _ => Err(self.another("a release")),
+        }
+    }
+
+    /// Asks over the stream of calls, or over a stream of its own where the pool takes it only so.
+    async fn ask(&self, call: Asked) -> Result<Answered, CallError> {
+        self.fits(&call)?;
+        if !self.alone.load(Ordering::Relaxed) {
+            let mut client = self.client.clone();
+            let open = |questions| async move { client.calls(questions).await };
+            match self.calls.call(open, call.clone()).await {
+                Err(status) if has_no_calls(&status) => self.alone.store(true, Ordering::Relaxed),
+                answer => return answer.map_err(|status| self.failed(&status)),
+            }
+        }
+        let mut client = self.client.clone();
+        let answer = match call {
+            Asked::Commit(commit) => client.commit(commit).await.map(|answer| Answered::Commit(answer.into_inner())),
+            Asked::Project(project) => {
+                client.project(project).await.map(|answer| Answered::Project(answer.into_inner()))
+            }
+            Asked::Release(release) => {
+                client.release(release).await.map(|answer| Answered::Release(answer.into_inner()))
+            }
+        };
+        answer.map_err(|status| self.failed(&status))
+    }
+
+    /// A message that is too large would end the stream, and every other call on it.
+    fn fits(&self, call: &Asked) -> Result<(), CallError> {
+        let bytes = call.encoded_len();
+        if bytes <= MAX_MESSAGE_BYTES - ENVELOPE_BYTES {
+            return Ok(());
+        }
+        let most = MAX_MESSAGE_BYTES;
+        let message =
+            format!("the request has {bytes} bytes: more than a message may have ({most} bytes); ask for less at once");
+        Err(CallError::from_status(&self.endpoint, &Status::out_of_range(message)))
+    }
+
+    fn another(&self, what: &str) -> CallError {
+        CallError::malformed(&self.endpoint, Malformed::new("kind", format!("is not that of an answer to {what}")))
     }
 
     /// All pages of an answer, which are of one revision.
@@ -333,4 +391,10 @@ impl WorldClient {
     fn failed(&self, status: &tonic::Status) -> CallError {
         CallError::from_status(&self.endpoint, status)
     }
+}
+
+/// Whether a pool does not know the stream of calls: its version is of before that.
+fn has_no_calls(status: &Status) -> bool {
+    let closed = || status.get_details_error_info().is_some_and(|info| info.reason == "METHOD_CLOSED");
+    status.code() == Code::Unimplemented || (status.code() == Code::PermissionDenied && closed())
 }

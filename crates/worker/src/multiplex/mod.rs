@@ -13,6 +13,7 @@ pub(crate) mod client;
 pub mod server;
 
 use ratn_proto::v1::{self, CallFailure, LeaveRequest, WithdrawRequest};
+use ratn_proto::v1::{calls_request, calls_response};
 use ratn_proto::v1::{perform_request, perform_response, session_request, session_response};
 use tonic::{Code, Status};
 
@@ -154,6 +155,32 @@ impl Protocol for GoalCalls {
 
     fn when_dropped(id: u64, _: &perform_request::Kind) -> Option<(u64, perform_request::Kind)> {
         Some((id, perform_request::Kind::Leave(LeaveRequest {})))
+    }
+}
+
+/// Commits, projections and releases of one client at the world pool: `WorldPoolService.Calls`.
+#[derive(Debug)]
+pub enum WorldCalls {}
+
+impl Protocol for WorldCalls {
+    messages!(CallsRequest calls_request, CallsResponse calls_response);
+
+    fn path(call: &calls_request::Kind) -> &'static str {
+        use calls_request::Kind;
+        match call {
+            Kind::Commit(_) => "/ratn.v1.WorldPoolService/Commit",
+            Kind::Project(_) => "/ratn.v1.WorldPoolService/Project",
+            Kind::Release(_) => "/ratn.v1.WorldPoolService/Release",
+        }
+    }
+
+    fn ends_call(_: u64, _: &calls_request::Kind) -> Option<u64> {
+        None
+    }
+
+    /// What was asked for is done: a commit may count already, and a projection ends with its lease.
+    fn when_dropped(_: u64, _: &calls_request::Kind) -> Option<(u64, calls_request::Kind)> {
+        None
     }
 }
 

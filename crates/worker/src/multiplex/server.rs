@@ -2,7 +2,8 @@
 //! hands out their answers, all in the connection's task, so that a call costs no hop between tasks of its own.
 //!
 //! Dropped, it drops the calls under way. A client that does not read its answers is not read from either. When the process drains,
-//! no more requests are taken; what is under way is answered, then the stream ends with [`ending`].
+//! no more requests are taken; what is under way is answered, then the stream ends with [`ending`]. So it does, with that, behind a
+//! request that is too large.
 
 use super::Protocol;
 use crate::gate::ending;
@@ -49,7 +50,8 @@ pub struct Answers<P: Protocol, S> {
     /// What ends a call early, by its id. An id of 0 is that of calls that need not be told apart.
     by_id: BTreeMap<u64, AbortHandle>,
     draining: Option<Pin<Box<WaitForCancellationFutureOwned>>>,
-    drained: bool,
+    /// With what the stream ends when everything under way is answered.
+    ends_with: Option<Status>,
 }
 
 /// A call under way.
@@ -70,7 +72,7 @@ impl<P: Protocol, S: Serve<P>> Answers<P, S> {
             under_way: 0,
             by_id: BTreeMap::new(),
             draining: draining.map(|draining| Box::pin(draining.cancelled_owned())),
-            drained: false,
+            ends_with: None,
         }
     }
 
@@ -110,7 +112,8 @@ impl<P: Protocol, S: Serve<P>> Answers<P, S> {
 
     fn poll_drain(&mut self, context: &mut Context<'_>) {
         if self.draining.as_mut().is_some_and(|draining| draining.poll_unpin(context).is_ready()) {
-            (self.draining, self.requests, self.drained) = (None, None, true);
+            (self.draining, self.requests) = (None, None);
+            self.ends_with.get_or_insert_with(ending);
         }
     }
 }
@@ -136,8 +139,13 @@ impl<P: Protocol, S: Serve<P>> Stream for Answers<P, S> {
                 }
                 // There are no more requests; what is under way is still answered.
                 Poll::Ready(None) => this.requests = None,
-                // Nobody is there to read an answer.
-                Poll::Ready(Some(Err(_))) => return Poll::Ready(None),
+                // A request is too large: none is read after it, and what is under way is still answered.
+                Poll::Ready(Some(Err(status))) if status.code() == Code::OutOfRange => {
+                    this.requests = None;
+                    this.ends_with.get_or_insert(status);
+                }
+                // Most often nobody is there to read an answer.
+                Poll::Ready(Some(Err(status))) => return Poll::Ready(Some(Err(status))),
                 Poll::Pending => break,
             }
         }
@@ -150,11 +158,7 @@ impl<P: Protocol, S: Serve<P>> Stream for Answers<P, S> {
                 }
                 Poll::Ready(Some(Ok(P::response(id, answer))))
             }
-            Poll::Ready(None) if this.drained => {
-                this.drained = false;
-                Poll::Ready(Some(Err(ending())))
-            }
-            Poll::Ready(None) if this.requests.is_none() => Poll::Ready(None),
+            Poll::Ready(None) if this.requests.is_none() => Poll::Ready(this.ends_with.take().map(Err)),
             Poll::Ready(None) | Poll::Pending => Poll::Pending,
         }
     }

@@ -23,6 +23,7 @@ use super::stream::CallerService;
 use crate::access::{Caller, speaker};
 use crate::metrics::Metrics;
 use crate::quota::Quotas;
+use crate::stream_calls::StreamCaller;
 use futures::stream::BoxStream;
 use notes::Notes;
 use ratn_model::id::LeaseId;
@@ -181,8 +182,8 @@ impl v1::resource_service_server::ResourceService for Service {
         &self,
         request: Request<Streaming<v1::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let quotas = request.extensions().get::<Quotas>().cloned();
-        let calls = CallerService::new(self.clone(), Caller::of(&request), quotas);
+        let caller = StreamCaller::of(&request, self.metrics().clone());
+        let calls = CallerService::new(self.clone(), caller);
         Ok(Response::new(Answers::new(calls, request.into_inner(), Some(self.shutdown.clone()))))
     }
 
