@@ -25,6 +25,7 @@ pub mod exact;
 mod frame;
 pub mod geometry;
 pub mod heightfield;
+pub mod hands;
 pub mod inside;
 pub mod joint_vector;
 pub mod keep;

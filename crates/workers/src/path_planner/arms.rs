@@ -2,8 +2,10 @@
 //! `other_arms` (joints by the names of arms; an arm that is left out is in its posture `home`, else at zero).
 
 use ratn_model::value::Value;
+use ratn_motion::hands;
 use ratn_motion::robot::{Robot, RobotFault};
 use ratn_worker::action::{ActionFailure, GoalContext};
+use ratn_world::scene::{Placement, Scene};
 use std::sync::Arc;
 
 /// The robot seen from the arm that moves.
@@ -28,4 +30,13 @@ pub(super) fn moving(robot: &Arc<Robot>, goal: &GoalContext) -> Result<Arc<Robot
         }
     }
     Ok(Arc::new(seen))
+}
+
+/// The scene with what the arms hold in their hands: what the arm holds that moves, and what the others hold where they stand.
+pub(super) fn in_hands(robot: &Robot, scene: Arc<Scene>) -> Result<Arc<Scene>, ActionFailure> {
+    if !scene.objects.iter().any(|object| matches!(object.placement, Placement::Hand { .. })) {
+        return Ok(scene);
+    }
+    let seen = hands::seen_from(robot, Scene::clone(&scene)).map(Arc::new);
+    seen.map_err(|fault| ActionFailure::aborted(format!("a fact `in_gripper`: {fault}")))
 }

@@ -43,6 +43,7 @@ impl Action for DriveAction {
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let begin = Instant::now();
         let scene = goal.unless_cancelled(goal.scene(&self.scenes)).await??;
+        let scene = super::arms::in_hands(&self.robot, scene)?;
         let request = request(&goal, &self.robot, &scene)?;
         let (robot, goal) = (Arc::clone(&self.robot), Arc::new(goal));
         let asking = Arc::clone(&goal);
