@@ -176,7 +176,7 @@ pub fn fit(robot: &Robot, config: &CellConfig) -> Result<Pads, PlacementError> {
 /// Checks that the gripper can open as far as the config says, and that every box fits in between then.
 fn check_opening(robot: &Robot, config: &CellConfig) -> Result<(), PlacementError> {
     let Some(opening_m) = config.gripper.opening_m else { return Ok(()) };
-    let (most, name, widest) = (2.0 * robot.open_finger_m(), robot.name(), workplace(robot).boxes.greatest[1]);
+    let (most, name, widest) = (2.0 * robot.open_finger_m(), robot.name(), widest(workplace(robot)));
     let reason = if opening_m > most {
         format!("the gripper of `{name}` opens to {most} m")
     } else if config.scene == Setting::Boxes && opening_m <= widest {
@@ -187,6 +187,11 @@ fn check_opening(robot: &Robot, config: &CellConfig) -> Result<(), PlacementErro
         return Ok(());
     };
     Err(PlacementError::Opening { opening_m, reason })
+}
+
+/// How wide the widest box across the fingers is.
+fn widest(workplace: &Workplace) -> f64 {
+    workplace.shares().map(|(boxes, _)| boxes.greatest[1]).fold(0.0, f64::max)
 }
 
 /// What never moves, as objects of the scene.
