@@ -441,7 +441,7 @@ mod tests {
             }
         }
         assert_eq!(workplace.middle.unwrap().y, [-0.09, 0.09]);
-        assert!(text.contains("beyond($arm, 0.09)") && text.contains("beyond($arm, -0.05)"));
+        assert!(text.contains("beyond($arm, 0.09)") && text.contains("beyond($arm, -0.03)"));
         assert_eq!(ARMS.to_vec(), robot.arm_names().collect::<Vec<_>>());
     }
 }
