@@ -38,7 +38,10 @@ mod tests {
     #[test]
     fn what_the_arm_holds_moves_with_it_and_what_another_one_holds_is_where_that_one_stands() {
         let twin = Robot::built_in("twin").unwrap();
-        let placed = |robot: &Robot, by: &str| seen_from(robot, held_by(by)).map(|scene| scene.objects[0].placement.clone());
+        let placed = |robot: &Robot, by: &str| {
+            let scene = seen_from(robot, held_by(by)).map_err(|fault| fault.to_string());
+            scene.map(|scene| scene.objects[0].placement.clone())
+        };
         let right = twin.with_arm("right").unwrap();
         for (robot, own, other) in [(&twin, "left", "right"), (&right, "right", "left")] {
             assert_eq!(placed(robot, own), Ok(Placement::Gripper(Pose::at(0.0, 0.0, 0.02))));
@@ -50,7 +53,7 @@ mod tests {
             assert!(side(&at_home) > 0.3 && side(&elsewhere) > 0.3, "{at_home:?} {elsewhere:?}");
             assert!(at_home.distance(&elsewhere) > 0.1);
         }
-        let fault = placed(&twin, "middle").unwrap_err().to_string();
+        let fault = placed(&twin, "middle").unwrap_err();
         assert!(fault.contains("middle") && fault.contains("left, right"), "{fault}");
         let one_arm = Robot::built_in("panda").unwrap();
         assert_eq!(placed(&one_arm, "arm"), Ok(Placement::Gripper(Pose::at(0.0, 0.0, 0.02))));

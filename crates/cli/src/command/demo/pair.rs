@@ -164,7 +164,7 @@ impl Setup<'_> {
         let [left, right] = ARMS.map(|arm| self.one(way, arm, &place, interrupt));
         let began = Instant::now();
         let runs = async {
-            Ok(match way {
+            anyhow::Ok(match way {
                 Way::InTurn => {
                     let left = Box::pin(left).await?;
                     (left, Box::pin(right).await?)
