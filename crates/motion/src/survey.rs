@@ -53,7 +53,8 @@ pub fn survey(robot: &Robot) -> Survey {
     match robot.workplace() {
         None => lines.push("workplace none: the simulated cell does not take it".to_owned()),
         Some(workplace) => {
-            for (what, points) in [("boxes", region(workplace, &workplace.boxes)), ("places", workplace.places.poses())] {
+            for (what, points) in [("boxes", region(workplace, &workplace.boxes)), ("places", workplace.places.poses())]
+            {
                 // Boxes stand where the first arm takes them; it may be another one that brings them away.
                 let others = if what == "places" { &others[..] } else { &[] };
                 let able = others.iter().filter(|other| other.posture(HOME).is_some());
@@ -68,8 +69,10 @@ pub fn survey(robot: &Robot) -> Survey {
             for share in &workplace.others {
                 let whose = others.iter().find(|other| other.arm_name() == share.arm);
                 for (what, points) in [("boxes", region(workplace, &share.boxes)), ("places", share.places.poses())] {
-                    let beyond: Vec<String> =
-                        whose.iter().flat_map(|arm| points.iter().filter_map(|at| beyond(arm, workplace, at))).collect();
+                    let beyond: Vec<String> = whose
+                        .iter()
+                        .flat_map(|arm| points.iter().filter_map(|at| beyond(arm, workplace, at)))
+                        .collect();
                     let (all, good) = (points.len(), points.len() - beyond.len());
                     lines.push(format!("{what:<10}`{}`: {good} of {all} points can be served from above", share.arm));
                     faults.extend(beyond.into_iter().map(|why| format!("{what} of the arm `{}`: {why}", share.arm)));

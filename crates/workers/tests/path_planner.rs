@@ -406,7 +406,11 @@ async fn what_a_goal_keeps_out_of_is_in_the_way_though_nothing_stands_there() {
     let outcome = asked("beyond", Some(beyond(0.3, 2.0))).await;
     assert!(!outcome.is_success() && outcome.reason.contains("keep_out[0]"), "{}", outcome.reason);
     let outcome = asked("flat", Some(beyond(0.3, 0.0))).await;
-    assert!(outcome.reason.contains("`keep_out[0].size`") && outcome.reason.contains("edges above 0"), "{}", outcome.reason);
+    assert!(
+        outcome.reason.contains("`keep_out[0].size`") && outcome.reason.contains("edges above 0"),
+        "{}",
+        outcome.reason
+    );
 }
 
 #[tokio::test]

@@ -243,13 +243,7 @@ struct Ground {
 }
 
 /// Adds so many to those that are there, all of them clear of each other; whether there was room.
-fn add(
-    placed: &mut Vec<Footprint>,
-    random: &mut ChaCha8Rng,
-    ground: &Ground,
-    count: usize,
-    crowding: f64,
-) -> bool {
+fn add(placed: &mut Vec<Footprint>, random: &mut ChaCha8Rng, ground: &Ground, count: usize, crowding: f64) -> bool {
     let Boxes { x, y, least, greatest } = ground.boxes;
     for _ in 0..count {
         let new = (0..MAX_PLACES).find_map(|_| {

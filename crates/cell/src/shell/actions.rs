@@ -180,7 +180,9 @@ impl Action for ModuleAction {
         if let (Some(hand), Some(arm)) = (&hand, &performer.arm_name)
             && hand != arm
         {
-            let why = format!("input `hand` is `{hand}`, and the goal is for the arm `{arm}`: what it takes is in its own hand");
+            let why = format!(
+                "input `hand` is `{hand}`, and the goal is for the arm `{arm}`: what it takes is in its own hand"
+            );
             return Err(ActionFailure::Aborted(why));
         }
         goal.while_held().await?;

@@ -61,7 +61,9 @@ impl Cell {
 
     pub fn approach(&self, name: &str) -> Request {
         let object = self.object(name);
-        let (Placement::World(pose), Shape::Box { size }) = (object.placement.clone(), object.shape) else { panic!("{name}") };
+        let (Placement::World(pose), Shape::Box { size }) = (object.placement.clone(), object.shape) else {
+            panic!("{name}")
+        };
         let goals = aimm::grasp_poses(&pose, size).map(Goal::Pose).to_vec();
         Request { approach: Straight::down(aimm::APPROACH_M), ..self.request(goals) }
     }

@@ -48,7 +48,9 @@ pub(super) fn with_kept_out(goal: &GoalContext, scene: Arc<Scene>) -> Result<Arc
     for (i, one) in boxes.iter().enumerate() {
         let (pose, size) = (one.field("pose").pose()?, one.field("size").vector3()?);
         if size.iter().any(|edge| !edge.is_finite() || *edge <= 0.0) {
-            return Err(ActionFailure::aborted(format!("input `keep_out[{i}].size` is {size:?}: expected edges above 0")));
+            return Err(ActionFailure::aborted(format!(
+                "input `keep_out[{i}].size` is {size:?}: expected edges above 0"
+            )));
         }
         // A name that no fact has.
         let name = format!("keep_out[{i}]");

@@ -34,8 +34,7 @@ const TWIN: &str = "twin";
 /// Its arms, and what the task's parameter calls them.
 const ARMS: [&str; 2] = ["left", "right"];
 /// The task of either.
-const FETCH: (&str, &str) =
-    ("fetch_boxes_pair.yaml", include_str!("../../../../../examples/fetch_boxes_pair.yaml"));
+const FETCH: (&str, &str) = ("fetch_boxes_pair.yaml", include_str!("../../../../../examples/fetch_boxes_pair.yaml"));
 
 /// How the two tasks go.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -197,13 +196,7 @@ impl Setup<'_> {
     }
 
     /// The run of one arm's task.
-    async fn one(
-        &self,
-        way: Way,
-        arm: &'static str,
-        place: &Place,
-        interrupt: &Interrupt,
-    ) -> anyhow::Result<OneRun> {
+    async fn one(&self, way: Way, arm: &'static str, place: &Place, interrupt: &Interrupt) -> anyhow::Result<OneRun> {
         let set = [("arm".to_owned(), arm.to_owned()), ("boxes".to_owned(), self.arguments.boxes.to_string())];
         let file = |ending: &str| self.directory.join(format!("{}-{arm}.{ending}", way.file_stem()));
         let log = file("jsonl");
@@ -363,7 +356,10 @@ impl fmt::Display for Demonstration {
                 )?;
             }
         }
-        writeln!(f, "  (planning: while the arm did not move and nothing was looked at; idle: waiting for the middle, among others)")?;
+        writeln!(
+            f,
+            "  (planning: while the arm did not move and nothing was looked at; idle: waiting for the middle, among others)"
+        )?;
         writeln!(f, "\nfiles")?;
         for run in self.outcomes.iter().flat_map(|outcome| &outcome.runs) {
             writeln!(f, "  {}", run.log.display())?;
