@@ -378,23 +378,6 @@ mod tests {
     }
 
     #[test]
-    fn each_arm_has_as_many_boxes_on_its_own_side_of_the_table() {
-        let robot = Robot::built_in("twin").unwrap();
-        let workplace = workplace(&robot);
-        for seed in 1..=5 {
-            let table = boxes(&robot, 3, seed).unwrap();
-            assert_eq!(table.len(), 6);
-            for (i, placed) in table.iter().enumerate() {
-                let (share, _) = workplace.shares().nth(i / 3).unwrap();
-                let [_, y, _] = placed.pose.position;
-                assert!((share.y[0]..=share.y[1]).contains(&y), "{placed:?}");
-            }
-            assert_eq!(table, boxes(&robot, 3, seed).unwrap());
-        }
-        assert!(matches!(boxes(&robot, 4, 1), Err(PlacementError::Places { count: 4, places: 3, .. })));
-    }
-
-    #[test]
     fn every_rack_is_laid_and_the_same_seed_lays_the_same() {
         let robot = Robot::aimm();
         for (bowls, forks, cups, plates) in
