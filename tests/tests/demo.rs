@@ -93,7 +93,7 @@ fn what_does_not_go_with_two_robots_is_refused_before_anything_starts() -> anyho
         (&["--robot", "panda"][..], "made for the built-in robot `twin`"),
         (&["--boxes", "4"], "each arm has places for 3 boxes, not for 4"),
         (&["--scenario", "table"], "use `--scenario boxes`"),
-        (&["--fault", "slip"], "leave out --fault"),
+        (&["--fault", "grasp_slips:1"], "leave out --fault"),
     ] {
         let output = place.ratn(&[&["demo", "--robots", "2"][..], more].concat()).output()?;
         let (_, said) = support::texts(&output);
