@@ -56,6 +56,53 @@ fn an_arm_behind_a_table_fetches_a_box_as_the_mobile_robot_does() -> anyhow::Res
 }
 
 #[test]
+fn two_arms_at_one_table_fetch_their_boxes_together_and_touch_nothing() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let out = place.path().join("out");
+    let out = out.to_str().context("a path")?;
+    let two = ["demo", "--robots", "2", "--boxes", "1", "--seed", "2"];
+    let mut demo = place.start(&[&two[..], &["--speed", "10", "--json", "--out", out]].concat())?;
+    let (code, document, said) = demo.finish()?;
+    ensure!(code == Some(0), "{code:?}\n{said}");
+    let document: Value = serde_json::from_str(&document).with_context(|| document.clone())?;
+    for key in ["in_turn_s", "together_s", "saving_percent"] {
+        ensure!(document[key].as_f64().is_some_and(|n| n > 0.0), "{key} in {document}\n{said}");
+    }
+    ensure!(document["unintended_contacts"] == 0, "{document}\n{said}");
+    let ways = document["ways"].as_array().context("no ways")?;
+    ensure!(ways.len() == 2, "{document}");
+    for way in ways {
+        ensure!(way["delivered"] == 2, "{way}");
+        let runs = way["runs"].as_array().context("no runs")?;
+        ensure!(runs.iter().map(|run| &run["arm"]).eq(["left", "right"]), "{way}");
+        for run in runs {
+            let log = std::path::Path::new(run["log"].as_str().context("a path")?);
+            ensure!(run["outcome"] == "success" && log.with_extension("html").is_file(), "{run}");
+        }
+    }
+    // Both arms were under way at once: together is shorter than the sum of what each took in it.
+    let sum: f64 = ways[1]["runs"].as_array().into_iter().flatten().filter_map(|run| run["makespan_s"].as_f64()).sum();
+    ensure!(document["together_s"].as_f64().is_some_and(|together| together < sum), "{document}");
+    place.wait_until_empty()
+}
+
+#[test]
+fn what_does_not_go_with_two_robots_is_refused_before_anything_starts() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    for (more, why) in [
+        (&["--robot", "panda"][..], "made for the built-in robot `twin`"),
+        (&["--boxes", "4"], "each arm has places for 3 boxes, not for 4"),
+        (&["--scenario", "table"], "use `--scenario boxes`"),
+        (&["--fault", "grasp_slips:1"], "leave out --fault"),
+    ] {
+        let output = place.ratn(&[&["demo", "--robots", "2"][..], more].concat()).output()?;
+        let (_, said) = support::texts(&output);
+        ensure!(output.status.code() == Some(2) && said.contains(why), "{more:?}: {:?}\n{said}", output.status);
+    }
+    place.wait_until_empty()
+}
+
+#[test]
 fn nothing_is_left_of_a_demo_that_is_killed() -> anyhow::Result<()> {
     let place = Place::new()?;
     let out = place.path().join("out");

@@ -11,4 +11,5 @@ mod photo;
 mod shell;
 
 pub use photo::photo;
+pub use shell::link::MIDDLE;
 pub use shell::{ROLE, run, run_as};

@@ -235,7 +235,7 @@ fn objects(scene: &Scene) -> Vec<wire::Object> {
     let told = |object: &SceneObject| {
         let (pose, held) = match object.placement {
             Placement::World(pose) => (pose, false),
-            Placement::Gripper(pose) => (pose, true),
+            Placement::Gripper(pose) | Placement::Hand { pose, .. } => (pose, true),
         };
         let (kind, size) = match object.shape {
             Shape::Box { size } => ("box", size.to_vec()),

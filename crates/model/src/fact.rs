@@ -67,7 +67,8 @@ pub enum Change {
 }
 
 /// The predicates that the geometric scene is derived from; `reads: [scene]` stands for them.
-pub const SCENE_PREDICATES: [(&str, usize); 4] = [("at", 1), ("shape", 1), ("in_gripper", 1), ("on", 2)];
+pub const SCENE_PREDICATES: [(&str, usize); 5] =
+    [("at", 1), ("shape", 1), ("in_gripper", 1), ("in_gripper", 2), ("on", 2)];
 
 /// As people write it, without saying which kind it is.
 #[derive(Serialize, Deserialize)]

@@ -153,7 +153,7 @@ states:
             .collect();
         insta::assert_snapshot!(told.join("\n"), @r"
         plan computes: true (Some(Action))
-        plan reads: at(?); shape(?); in_gripper(?); on(?, ?) (Some(Action))
+        plan reads: at(?); shape(?); in_gripper(?); in_gripper(?, ?); on(?, ?) (Some(Action))
         plan requires: nothing (None)
         plan effects: nothing (None)
         plan resources: block PathPlanner; block WorldModel (Some(Action))

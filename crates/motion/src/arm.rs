@@ -62,6 +62,8 @@ pub fn in_scene(robot: &Robot, scene: &Scene, here: &Configuration) -> (Mechanis
                 cover(&mut arm.links[held]);
                 grips.push(held);
             }
+            // `hands` says where that is.
+            Placement::Hand { .. } => {}
         }
     }
     (arm, obstacles)

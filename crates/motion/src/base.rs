@@ -176,7 +176,7 @@ pub fn riding(robot: &Robot, scene: &Scene) -> Vec<String> {
     };
     let on_deck = scene.objects.iter().filter(|object| match object.placement {
         Placement::World(pose) => stands(&pose, &Geometry::from(&object.shape)),
-        Placement::Gripper(_) => false,
+        Placement::Gripper(_) | Placement::Hand { .. } => false,
     });
     on_deck.map(|object| object.name.clone()).collect()
 }

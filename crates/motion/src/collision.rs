@@ -184,6 +184,8 @@ impl<'a> Checker<'a> {
                     let body = geometry.at(*pose);
                     self.add_moving(format!("held {}", object.name), self.robot.tool, Role::Held, &body);
                 }
+                // `hands` says where that is.
+                Placement::Hand { .. } => {}
             }
         }
     }

@@ -61,6 +61,8 @@ impl Vehicle {
         for object in &scene.objects {
             let geometry = Geometry::from(&object.shape);
             match object.placement {
+                // `hands` says where that is.
+                Placement::Hand { .. } => {}
                 Placement::Gripper(pose) => bodies.push(placed(&poses[robot.tool], &geometry.at(pose))),
                 Placement::World(pose) if riding.contains(&object.name) => {
                     bodies.push(geometry.at(base.compose(&pose)));

@@ -24,6 +24,7 @@ mod ellipsoid;
 pub mod exact;
 mod frame;
 pub mod geometry;
+pub mod hands;
 pub mod heightfield;
 pub mod inside;
 pub mod joint_vector;

@@ -205,7 +205,7 @@ pub enum RobotFault {
 }
 
 /// The robots that we ship: name, description, URDF and SRDF.
-const BUILT_IN: [(&str, &str, &str, &str); 3] = [
+const BUILT_IN: [(&str, &str, &str, &str); 4] = [
     (
         "aimm",
         include_str!("../robots/aimm.toml"),
@@ -219,6 +219,12 @@ const BUILT_IN: [(&str, &str, &str, &str); 3] = [
         include_str!("../robots/panda.srdf"),
     ),
     ("ur5", include_str!("../robots/ur5.toml"), include_str!("../robots/ur5.urdf"), include_str!("../robots/ur5.srdf")),
+    (
+        "twin",
+        include_str!("../robots/twin.toml"),
+        include_str!("../robots/twin.urdf"),
+        include_str!("../robots/twin.srdf"),
+    ),
 ];
 
 impl Configuration {

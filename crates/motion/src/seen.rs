@@ -32,11 +32,13 @@ impl Seen {
         let links = robot.model.links.iter().enumerate();
         let own = links.flat_map(|(link, of)| of.bodies.iter().map(move |body| (link, body)));
         let mut known: Vec<Body> = own.map(|(link, body)| on_robot(body, link)).collect();
-        known.extend(scene.objects.iter().map(|object| {
+        known.extend(scene.objects.iter().filter_map(|object| {
             let geometry = Geometry::from(&object.shape);
             match &object.placement {
-                Placement::World(pose) => geometry.at(*pose),
-                Placement::Gripper(pose) => on_robot(&geometry.at(*pose), robot.tool),
+                Placement::World(pose) => Some(geometry.at(*pose)),
+                Placement::Gripper(pose) => Some(on_robot(&geometry.at(*pose), robot.tool)),
+                // `hands` says where that is.
+                Placement::Hand { .. } => None,
             }
         }));
         let mut is_known = vec![false; self.cloud.points().len()];

@@ -80,6 +80,7 @@ impl Straight {
             Frame::Object(name) => match &scene.objects.iter().find(|object| object.name == *name)?.placement {
                 Placement::World(pose) => from_world.rotate(pose.rotate(direction)),
                 Placement::Gripper(pose) => tool.rotate(pose.rotate(direction)),
+                Placement::Hand { .. } => return None,
             },
         })
     }

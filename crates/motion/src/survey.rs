@@ -7,7 +7,7 @@ use crate::joint_vector::JointVector;
 use crate::reach::Target;
 use crate::robot::{Joint, Robot};
 use crate::top_grasp::{APPROACH_M, grasp_poses};
-use crate::workplace::{HOME, Surface, Workplace};
+use crate::workplace::{Boxes, HOME, Surface, Workplace};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
@@ -53,7 +53,8 @@ pub fn survey(robot: &Robot) -> Survey {
     match robot.workplace() {
         None => lines.push("workplace none: the simulated cell does not take it".to_owned()),
         Some(workplace) => {
-            for (what, points) in [("boxes", region(workplace)), ("places", workplace.places.poses())] {
+            for (what, points) in [("boxes", region(workplace, &workplace.boxes)), ("places", workplace.places.poses())]
+            {
                 // Boxes stand where the first arm takes them; it may be another one that brings them away.
                 let others = if what == "places" { &others[..] } else { &[] };
                 let able = others.iter().filter(|other| other.posture(HOME).is_some());
@@ -64,6 +65,18 @@ pub fn survey(robot: &Robot) -> Survey {
                 let (all, good) = (points.len(), points.len() - beyond.len());
                 lines.push(format!("{what:<10}{good} of {all} points can be served from above"));
                 faults.extend(beyond.into_iter().map(|why| format!("{what}: {why}")));
+            }
+            for share in &workplace.others {
+                let whose = others.iter().find(|other| other.arm_name() == share.arm);
+                for (what, points) in [("boxes", region(workplace, &share.boxes)), ("places", share.places.poses())] {
+                    let beyond: Vec<String> = whose
+                        .iter()
+                        .flat_map(|arm| points.iter().filter_map(|at| beyond(arm, workplace, at)))
+                        .collect();
+                    let (all, good) = (points.len(), points.len() - beyond.len());
+                    lines.push(format!("{what:<10}`{}`: {good} of {all} points can be served from above", share.arm));
+                    faults.extend(beyond.into_iter().map(|why| format!("{what} of the arm `{}`: {why}", share.arm)));
+                }
             }
         }
     }
@@ -131,8 +144,8 @@ fn range(Joint { lower, upper, .. }: &Joint, slides: bool) -> RangeInclusive<f64
 }
 
 /// The corners and the middle of the region in which boxes stand.
-fn region(workplace: &Workplace) -> Vec<Pose> {
-    let ([x_low, x_high], [y_low, y_high]) = (workplace.boxes.x, workplace.boxes.y);
+fn region(workplace: &Workplace, boxes: &Boxes) -> Vec<Pose> {
+    let ([x_low, x_high], [y_low, y_high]) = (boxes.x, boxes.y);
     let middle = ((x_low + x_high) / 2.0, (y_low + y_high) / 2.0);
     let points = [(x_low, y_low), (x_low, y_high), (x_high, y_low), (x_high, y_high), middle];
     points.map(|(x, y)| Pose::at(x, y, workplace.table.top_m())).to_vec()

@@ -77,7 +77,7 @@ fn a_motion_keeps_away_from_what_was_seen_and_touches_what_is_known() {
         // The camera sees all there is.
         let mut points = sides(SIZE, &pose);
         for object in &cell.scene.objects {
-            if let (Placement::World(pose), Shape::Box { size }) = (object.placement, object.shape) {
+            if let (Placement::World(pose), Shape::Box { size }) = (&object.placement, object.shape) {
                 points.extend(sides(size, &pose));
             }
         }
@@ -93,7 +93,7 @@ fn a_motion_keeps_away_from_what_was_seen_and_touches_what_is_known() {
 
         // Something lies on the box that is to be grasped.
         let (Placement::World(pose), Shape::Box { size: [.., height] }) =
-            (cell.object("box_1").placement, cell.object("box_1").shape)
+            (cell.object("box_1").placement.clone(), cell.object("box_1").shape)
         else {
             unreachable!("it is a box that stands")
         };

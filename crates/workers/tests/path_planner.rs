@@ -506,6 +506,35 @@ async fn what_bounds_a_motion_is_read_from_the_goal() {
 }
 
 #[tokio::test]
+async fn what_a_goal_keeps_out_of_is_in_the_way_though_nothing_stands_there() {
+    let system = system_of(Robot::built_in("twin").unwrap()).await;
+    let swung = |by: f64| Value::Joints(vec![by, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]);
+    let beyond = |y: f64, width: f64| {
+        let size = Value::List([4.0, width, 2.6].map(Value::Float).to_vec());
+        Value::List(vec![Value::map([("pose", Value::Pose(Pose::at(0.5, y - width / 2.0, 1.2))), ("size", size)])])
+    };
+    // The left arm turns towards the middle of the table: its tool comes to y = 0.15.
+    let asked = async |id: &str, keep_out: Option<Value>| {
+        let inputs = [("start", swung(0.0)), ("goal", swung(-1.3)), ("budget_s", Value::Float(0.0))];
+        let more: Vec<(&str, Value)> = keep_out.into_iter().map(|boxes| ("keep_out", boxes)).collect();
+        let goal = system.goal(id, &[&inputs[..], &more].concat());
+        system.client.execute(&system.planner, goal, |_, _| {}).await.unwrap()
+    };
+    for (id, keep_out) in [("free", None), ("far", Some(beyond(-0.3, 2.0))), ("none", Some(Value::List(Vec::new())))] {
+        let outcome = asked(id, keep_out).await;
+        assert!(outcome.is_success(), "{id}: {}", outcome.reason);
+    }
+    let outcome = asked("beyond", Some(beyond(0.3, 2.0))).await;
+    assert!(!outcome.is_success() && outcome.reason.contains("keep_out[0]"), "{}", outcome.reason);
+    let outcome = asked("flat", Some(beyond(0.3, 0.0))).await;
+    assert!(
+        outcome.reason.contains("`keep_out[0].size`") && outcome.reason.contains("edges above 0"),
+        "{}",
+        outcome.reason
+    );
+}
+
+#[tokio::test]
 async fn a_plan_for_a_crawling_arm_is_refused_and_not_written_out_for_hours_of_motion() {
     let system = system().await;
     let goal = system.grasp("a", &[("speed", Value::Float(0.001))]);

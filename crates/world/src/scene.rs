@@ -2,7 +2,7 @@
 //!
 //! `shape(o) = {type: box, size: [x, y, z]}` or `{type: cylinder, radius: r, length: l}` (metres, centred, axis z) gives an
 //! object its shape; `at(o) = pose` puts it into the world; `in_gripper(o) = pose` attaches it to the gripper's tool frame
-//! (then `at(o)`, if any, is ignored). `on(o, carrier)` attaches it to what it stands on or in: true, or its pose as seen from the
+//! (then `at(o)`, if any, is ignored). Of a robot with several arms `in_gripper(o, arm) = pose` says whose gripper it is, by the arm's name. `on(o, carrier)` attaches it to what it stands on or in: true, or its pose as seen from the
 //! carrier. What is on a held thing is held with it, where it was on it: between the two `at`, unless the pose is said. The mobile
 //! base stands at `at(base)`, which needs no shape.
 //!
@@ -64,13 +64,20 @@ pub enum Shape {
 }
 
 /// Where an object is.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Placement {
     /// In the world frame.
     World(Pose),
-    /// Held: as seen from the gripper's tool frame.
+    /// Held: as seen from the gripper's tool frame. Of several arms it is the one that is planned for.
     Gripper(Pose),
+    /// Held by the arm of this name: as seen from its tool frame.
+    Hand {
+        /// The arm, as the robot's description names it.
+        arm: String,
+        /// In its tool frame.
+        pose: Pose,
+    },
 }
 
 /// A geometric fact that makes no geometry.
@@ -135,24 +142,45 @@ fn placement(world: &World, individual: &Term, depth: usize) -> Result<Option<Pl
     if let Some(pose) = pose_of(world, "in_gripper", individual)? {
         return Ok(Some(Placement::Gripper(pose)));
     }
+    if let Some((arm, pose)) = hand(world, individual)? {
+        return Ok(Some(Placement::Hand { arm, pose }));
+    }
     let at = pose_of(world, "at", individual)?;
     if let Some((carrier, said)) = carrier(world, individual)? {
         let below = placement(world, &carrier, depth + 1)?;
-        let placed = match (below, said) {
-            (Some(Placement::Gripper(held)), None) => {
+        let seen = match (&below, said) {
+            (Some(Placement::Gripper(_) | Placement::Hand { .. }), None) => {
                 let of_carrier = pose_of(world, "at", &carrier)?;
-                let seen = of_carrier.zip(at).map(|(carrier, at)| carrier.inverse().compose(&at));
-                seen.map(|seen| Placement::Gripper(held.compose(&seen)))
+                of_carrier.zip(at).map(|(carrier, at)| carrier.inverse().compose(&at))
             }
-            (Some(Placement::Gripper(held)), Some(seen)) => Some(Placement::Gripper(held.compose(&seen))),
-            (Some(Placement::World(pose)), Some(seen)) => Some(Placement::World(pose.compose(&seen))),
-            _ => None,
+            (_, said) => said,
         };
+        let placed = below.zip(seen).map(|(below, seen)| match below {
+            Placement::World(pose) => Placement::World(pose.compose(&seen)),
+            Placement::Gripper(pose) => Placement::Gripper(pose.compose(&seen)),
+            Placement::Hand { arm, pose } => Placement::Hand { arm, pose: pose.compose(&seen) },
+        });
         if placed.is_some() {
             return Ok(placed);
         }
     }
     Ok(at.map(Placement::World))
+}
+
+/// Whose gripper an individual is in, by name, and its pose there: the first in the order of keys.
+fn hand(world: &World, individual: &Term) -> Result<Option<(String, Pose)>, SceneError> {
+    let held = FactPattern { predicate: "in_gripper".to_owned(), arguments: vec![Some(individual.clone()), None] };
+    for (key, fact) in world.matching(&held) {
+        match &fact.value {
+            Value::Pose(pose) => return Ok(Some((key.arguments[1].to_string(), *pose))),
+            Value::Null | Value::Bool(false) => {}
+            other => {
+                let (fact, value) = (key.to_string(), other.to_string());
+                return Err(SceneError::Malformed { fact, value, expected: "a pose" });
+            }
+        }
+    }
+    Ok(None)
 }
 
 /// What an individual stands on (the first in the order of keys), and its pose as seen from there, where that is said.

@@ -53,6 +53,7 @@ fn near(found: Placement, expected: Placement) {
     let close = |p: &Pose, q: &Pose| p.distance(q) < 1e-9 && p.angle(q) < 1e-6;
     let same = match (&found, &expected) {
         (Placement::World(p), Placement::World(q)) | (Placement::Gripper(p), Placement::Gripper(q)) => close(p, q),
+        (Placement::Hand { arm, pose: p }, Placement::Hand { arm: other, pose: q }) => arm == other && close(p, q),
         _ => false,
     };
     assert!(same, "{found:?} instead of {expected:?}");
@@ -69,6 +70,10 @@ fn what_stands_on_a_held_thing_is_held_with_it_and_let_go_with_it() {
     near(placement(&world, "spoon"), Placement::Gripper(Pose::at(0.1, 0.0, 0.17)));
     world.apply(&[Change::Delete { pattern: FactPattern::of(&key("in_gripper", &["tray"])) }]).unwrap();
     near(placement(&world, "cup"), Placement::World(Pose::at(1.1, 0.0, 0.6)));
+    world.apply(&[set("in_gripper", &["tray", "left"], pose(0.0, 0.0, 0.02))]).unwrap();
+    let held = |z: f64| Placement::Hand { arm: "left".to_owned(), pose: Pose::at(0.1, 0.0, z) };
+    near(placement(&world, "cup"), held(0.12));
+    near(placement(&world, "spoon"), held(0.17));
 }
 
 #[test]
@@ -140,6 +145,7 @@ fn change() -> impl Strategy<Value = Change> {
         2 => (name(), 1_u8..4).prop_map(|(o, i)| set("shape", &[o], Shape::Box { size: [f64::from(i); 3] }.to_value())),
         4 => (name(), place()).prop_map(|(o, p)| set("at", &[o], p)),
         2 => (name(), place()).prop_map(|(o, p)| set("in_gripper", &[o], p)),
+        2 => (name(), prop_oneof![Just("left"), Just("right")], place()).prop_map(|(o, arm, p)| set("in_gripper", &[o, arm], p)),
         3 => (name(), name()).prop_filter("no circles", |(o, c)| o < c).prop_map(|(o, c)| set("on", &[o, c], Value::Bool(true))),
         2 => (name(), name(), place()).prop_filter("no circles", |(o, c, _)| o < c).prop_map(|(o, c, p)| set("on", &[o, c], p)),
         1 => (name(), name()).prop_map(|(o, c)| set("on", &[o, c], Value::Bool(false))),
@@ -147,6 +153,10 @@ fn change() -> impl Strategy<Value = Change> {
         2 => (prop_oneof![Just("at"), Just("in_gripper"), Just("shape")], prop::option::of(name())).prop_map(|(p, o)| {
             let argument = o.map(|o| Term::Name(o.to_owned()));
             Change::Delete { pattern: FactPattern { predicate: p.to_owned(), arguments: vec![argument] } }
+        }),
+        1 => (prop::option::of(name()), prop::option::of(Just("left"))).prop_map(|(o, arm)| {
+            let arguments = [o, arm].map(|name| name.map(|name| Term::Name(name.to_owned()))).to_vec();
+            Change::Delete { pattern: FactPattern { predicate: "in_gripper".to_owned(), arguments } }
         }),
         1 => (prop::option::of(name()), prop::option::of(name())).prop_map(|(o, c)| {
             let arguments = [o, c].map(|name| name.map(|name| Term::Name(name.to_owned()))).to_vec();

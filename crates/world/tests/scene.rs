@@ -43,10 +43,32 @@ fn an_object_needs_a_shape_and_a_place() {
 fn a_held_object_is_where_the_gripper_is_until_it_is_let_go() {
     let mut world = world();
     world.apply(&[set("in_gripper", "box", Value::Pose(Pose::at(0.0, 0.0, 0.02)))]).unwrap();
-    let placement = Scene::of(&world).unwrap().objects[0].placement;
+    let placement = Scene::of(&world).unwrap().objects[0].placement.clone();
     assert_eq!(placement, Placement::Gripper(Pose::at(0.0, 0.0, 0.02)));
     world.apply(&[Change::Delete { pattern: FactPattern::of(&key("in_gripper", "box")) }]).unwrap();
     assert_eq!(Scene::of(&world).unwrap().objects[0].placement, Placement::World(Pose::at(0.5, 0.0, 0.75)));
+}
+
+#[test]
+fn of_several_arms_the_fact_says_whose_hand_it_is_in() {
+    let mut world = world();
+    let by = |arm: &str| FactKey {
+        predicate: "in_gripper".to_owned(),
+        arguments: ["box", arm].map(|name| Term::Name(name.to_owned())).to_vec(),
+    };
+    let placed = |world: &World| Scene::of(world).unwrap().objects[0].placement.clone();
+    let held = Pose::at(0.0, 0.0, 0.02);
+    world.apply(&[Change::Set { fact: by("right"), value: Value::Pose(held) }]).unwrap();
+    assert_eq!(placed(&world), Placement::Hand { arm: "right".to_owned(), pose: held });
+    // Who does not say whose hand it is says that of the arm that is planned for, as ever.
+    world.apply(&[set("in_gripper", "box", Value::Pose(held))]).unwrap();
+    assert_eq!(placed(&world), Placement::Gripper(held));
+    world.apply(&[Change::Delete { pattern: FactPattern::of(&key("in_gripper", "box")) }]).unwrap();
+    world.apply(&[Change::Delete { pattern: FactPattern::of(&by("right")) }]).unwrap();
+    assert_eq!(placed(&world), Placement::World(Pose::at(0.5, 0.0, 0.75)));
+    world.apply(&[Change::Set { fact: by("left"), value: Value::Int(3) }]).unwrap();
+    let error = Scene::of(&world).unwrap_err();
+    assert!(matches!(&error, SceneError::Malformed { fact, .. } if fact == "in_gripper(box, left)"), "{error}");
 }
 
 #[test]

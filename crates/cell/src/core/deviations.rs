@@ -94,14 +94,15 @@ impl Cell {
 
     /// Somebody takes an object that is still to be fetched and puts it down elsewhere on what it stands on, where it stands apart.
     fn move_something(&mut self) {
-        let (support, height, [[x_low, x_high], [y_low, y_high]]) = match self.config.scene {
+        let (support, height, regions) = match self.config.scene {
             Setting::Boxes => {
                 let workplace = placement::workplace(&self.robot);
-                (TABLE, workplace.table.top_m(), [workplace.boxes.x, workplace.boxes.y])
+                let regions: Vec<_> = workplace.shares().map(|(boxes, _)| [boxes.x, boxes.y]).collect();
+                (TABLE, workplace.table.top_m(), regions)
             }
             Setting::Table => {
                 let Some(tableware) = &placement::workplace(&self.robot).tableware else { return };
-                (tableware::RACK, tableware::top_m(&tableware.rack), [tableware.region.x, tableware.region.y])
+                (tableware::RACK, tableware::top_m(&tableware.rack), vec![[tableware.region.x, tableware.region.y]])
             }
         };
         let movable: Vec<usize> = (0..self.ids.len())
@@ -115,6 +116,8 @@ impl Cell {
             return;
         }
         let object = movable[self.faults.random().random_range(0..movable.len())];
+        // Each arm has as many boxes, the first arm's first: a box stays where its own arm fetches it.
+        let [[x_low, x_high], [y_low, y_high]] = regions[object * regions.len() / self.ids.len()];
         let radius = |i: usize| self.size_of(i)[0].hypot(self.size_of(i)[1]) / 2.0;
         let others: Vec<([f64; 3], f64)> = (0..self.ids.len())
             .filter(|i| *i != object)

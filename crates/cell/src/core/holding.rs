@@ -243,13 +243,14 @@ impl Cell {
     /// Whether an object stands at one of the places that boxes are brought to, on whichever of its faces: a box has no top.
     pub(super) fn is_delivered(&self, pose: &Pose, on: &str) -> bool {
         let upright = |axis: usize| pose.rotate(unit(axis))[2].abs() >= MAX_LEAN_RAD.cos();
-        let places = &placement::workplace(&self.robot).places;
-        let (support, seen) = match places.on {
-            Surface::Base => (ON_BASE, self.base_pose().inverse().compose(pose).position),
-            Surface::Table => (TABLE, pose.position),
-        };
-        let off = |place: &[f64; 3]| (place[0] - seen[0]).hypot(place[1] - seen[1]);
-        on == support && (0..3).any(upright) && places.at.iter().any(|place| off(place) <= MAX_OFF_PLACE_M)
+        placement::workplace(&self.robot).shares().any(|(_, places)| {
+            let (support, seen) = match places.on {
+                Surface::Base => (ON_BASE, self.base_pose().inverse().compose(pose).position),
+                Surface::Table => (TABLE, pose.position),
+            };
+            let off = |place: &[f64; 3]| (place[0] - seen[0]).hypot(place[1] - seen[1]);
+            on == support && (0..3).any(upright) && places.at.iter().any(|place| off(place) <= MAX_OFF_PLACE_M)
+        })
     }
 }
 

@@ -21,6 +21,7 @@ use ratn_motion::top_grasp::{APPROACH_M, grasp_poses};
 use ratn_motion::workplace::{Boxes, HOME, Slab, Workplace};
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::f64::consts::FRAC_PI_2;
+use std::ops::Range;
 
 /// No scene was laid.
 #[derive(Debug, thiserror::Error)]
@@ -109,34 +110,34 @@ fn dishes(robot: &Robot, goods: Goods, seed: u64) -> Result<Vec<Placed>, Placeme
     feasible.ok_or(PlacementError::Crowded { count: goods.count(Setting::Table), seed })
 }
 
-/// Boxes on the table.
+/// Boxes on the table: so many for each arm that has a share of the workplace, the first arm's first.
 fn boxes(robot: &Robot, count: usize, seed: u64) -> Result<Vec<Placed>, PlacementError> {
     let workplace = workplace(robot);
-    let places = workplace.places.at.len();
+    let places = workplace.shares().map(|(_, places)| places.at.len()).min().unwrap_or(0);
     if count > places {
         return Err(PlacementError::Places { count, places, robot: robot.name().to_owned() });
     }
-    let (thick, half_width) = Pads::of(robot).map_or((0.0, 0.0), |pads| (pads.thick, (pads.x[1] - pads.x[0]) / 2.0));
-    let ground = Ground {
-        boxes: workplace.boxes,
-        height_m: workplace.table.top_m(),
-        finger_reach_m: robot.open_finger_m() + thick + FINGER_ROOM_M,
-        finger_half_width_m: half_width + FINGER_ROOM_ALONG_M,
-    };
+    // A share is of an arm that the robot has: the description was checked.
+    let others = workplace.others.iter().filter_map(|share| robot.with_arm(&share.arm).ok());
+    let views: Vec<Robot> = std::iter::once(robot.clone()).chain(others).collect();
+    let grounds = workplace.shares().zip(&views).map(|((boxes, _), view)| Ground::of(view, boxes));
+    let shares: Vec<(&Robot, Ground)> = views.iter().zip(grounds).collect();
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     for table in 0..MAX_TABLES {
         // Long boxes get rarer as the table gets fuller, and the more tries have failed.
         let crowding = (count as f64 / 9.0).powi(2) * 0.6 + 0.4 * table as f64 / MAX_TABLES as f64;
-        let footprints = footprints(&mut random, &ground, count, crowding.min(1.0));
-        let placed: Option<Vec<Placed>> =
-            footprints.map(|footprints| footprints.iter().enumerate().map(|(i, f)| f.as_box(&ground, i)).collect());
-        if let Some(placed) = placed
-            && all_graspable(robot, Setting::Boxes, &placed)
-        {
+        let mut footprints = Vec::with_capacity(count * shares.len());
+        if !shares.iter().all(|(_, ground)| add(&mut footprints, &mut random, ground, count, crowding.min(1.0))) {
+            continue;
+        }
+        let placed: Vec<Placed> =
+            footprints.iter().enumerate().map(|(i, f)| f.as_box(workplace.table.top_m(), i)).collect();
+        let of_share = |share: usize| share * count..(share + 1) * count;
+        if (0..shares.len()).all(|i| graspable(robot, shares[i].0, Setting::Boxes, &placed, of_share(i))) {
             return Ok(placed);
         }
     }
-    Err(PlacementError::Crowded { count, seed })
+    Err(PlacementError::Crowded { count: count * shares.len(), seed })
 }
 
 /// Where the robot of a cell fetches boxes.
@@ -175,7 +176,7 @@ pub fn fit(robot: &Robot, config: &CellConfig) -> Result<Pads, PlacementError> {
 /// Checks that the gripper can open as far as the config says, and that every box fits in between then.
 fn check_opening(robot: &Robot, config: &CellConfig) -> Result<(), PlacementError> {
     let Some(opening_m) = config.gripper.opening_m else { return Ok(()) };
-    let (most, name, widest) = (2.0 * robot.open_finger_m(), robot.name(), workplace(robot).boxes.greatest[1]);
+    let (most, name, widest) = (2.0 * robot.open_finger_m(), robot.name(), widest(workplace(robot)));
     let reason = if opening_m > most {
         format!("the gripper of `{name}` opens to {most} m")
     } else if config.scene == Setting::Boxes && opening_m <= widest {
@@ -186,6 +187,11 @@ fn check_opening(robot: &Robot, config: &CellConfig) -> Result<(), PlacementErro
         return Ok(());
     };
     Err(PlacementError::Opening { opening_m, reason })
+}
+
+/// How wide the widest box across the fingers is.
+fn widest(workplace: &Workplace) -> f64 {
+    workplace.shares().map(|(boxes, _)| boxes.greatest[1]).fold(0.0, f64::max)
 }
 
 /// What never moves, as objects of the scene.
@@ -230,16 +236,15 @@ struct Rectangle {
 #[derive(Debug, Clone, Copy)]
 struct Ground {
     boxes: Boxes,
-    height_m: f64,
     /// What the fingers need across a box, from its middle.
     finger_reach_m: f64,
     /// What they need along it, from its middle.
     finger_half_width_m: f64,
 }
 
-fn footprints(random: &mut ChaCha8Rng, ground: &Ground, count: usize, crowding: f64) -> Option<Vec<Footprint>> {
+/// Adds so many to those that are there, all of them clear of each other; whether there was room.
+fn add(placed: &mut Vec<Footprint>, random: &mut ChaCha8Rng, ground: &Ground, count: usize, crowding: f64) -> bool {
     let Boxes { x, y, least, greatest } = ground.boxes;
-    let mut placed: Vec<Footprint> = Vec::with_capacity(count);
     for _ in 0..count {
         let new = (0..MAX_PLACES).find_map(|_| {
             let [longest, widest, highest] = greatest;
@@ -254,10 +259,23 @@ fn footprints(random: &mut ChaCha8Rng, ground: &Ground, count: usize, crowding: 
                 size: [length, width, height],
             };
             placed.iter().all(|other| new.clear_of(other, ground) && other.clear_of(&new, ground)).then_some(new)
-        })?;
+        });
+        let Some(new) = new else { return false };
         placed.push(new);
     }
-    Some(placed)
+    true
+}
+
+impl Ground {
+    /// Where the boxes of an arm are put, from which the robot is seen.
+    fn of(view: &Robot, boxes: &Boxes) -> Ground {
+        let (thick, half_width) = Pads::of(view).map_or((0.0, 0.0), |pads| (pads.thick, (pads.x[1] - pads.x[0]) / 2.0));
+        Ground {
+            boxes: *boxes,
+            finger_reach_m: view.open_finger_m() + thick + FINGER_ROOM_M,
+            finger_half_width_m: half_width + FINGER_ROOM_ALONG_M,
+        }
+    }
 }
 
 impl Footprint {
@@ -272,10 +290,10 @@ impl Footprint {
         !grown.overlaps(&other.base()) && !fingers.overlaps(&other.base())
     }
 
-    fn as_box(&self, ground: &Ground, index: usize) -> Placed {
+    fn as_box(&self, height_m: f64, index: usize) -> Placed {
         let model = Model { kind: Kind::Box, size: self.size };
         let [x, y] = self.centre;
-        let pose = Pose::from_rpy([x, y, ground.height_m + self.size[2] / 2.0], 0.0, 0.0, self.yaw);
+        let pose = Pose::from_rpy([x, y, height_m + self.size[2] / 2.0], 0.0, 0.0, self.yaw);
         Placed { id: format!("slc_{}", index + 1), model, pose }
     }
 }
@@ -299,6 +317,11 @@ impl Rectangle {
 
 /// Whether each object that can be taken from above at all can be so while all of them stand there.
 fn all_graspable(robot: &Robot, setting: Setting, placed: &[Placed]) -> bool {
+    graspable(robot, robot, setting, placed, 0..placed.len())
+}
+
+/// The same of some of the objects, with the arm from which `view` sees the robot.
+fn graspable(robot: &Robot, view: &Robot, setting: Setting, placed: &[Placed], which: Range<usize>) -> bool {
     let parts = placed.iter().flat_map(|object| {
         object.model.parts().into_iter().map(|(part, shape)| SceneObject {
             name: object.id.clone(),
@@ -307,10 +330,10 @@ fn all_graspable(robot: &Robot, setting: Setting, placed: &[Placed]) -> bool {
         })
     });
     let scene = Scene { base: Pose::IDENTITY, objects: parts.chain(fixed(robot, setting)).collect() };
-    let mut checker = Checker::new(robot, &scene, &arm::assumed(robot, &scene), PADDING_M);
-    let (reach, home) = (arm::reach(robot), home(robot));
+    let mut checker = Checker::new(view, &scene, &arm::assumed(view, &scene), PADDING_M);
+    let (reach, home) = (arm::reach(view), home(view));
     let mut random = ChaCha8Rng::seed_from_u64(0);
-    placed.iter().filter(|object| object.model.slips_off().is_none()).all(|object| {
+    placed[which].iter().filter(|object| object.model.slips_off().is_none()).all(|object| {
         grasps(object).iter().any(|grasp| {
             reach.solutions(&Target::at(*grasp), &home, 6, 20, &mut random).iter().any(|posture| {
                 line(&reach, posture, [0.0, 0.0, APPROACH_M]).is_ok_and(|postures| {

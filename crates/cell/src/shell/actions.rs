@@ -174,7 +174,17 @@ impl Action for ModuleAction {
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
         let request = (self.read)(&goal)?;
-        let arm = self.performer(goal.inputs.get("arm"), goal.lease.as_ref())?.arm;
+        let performer = self.performer(goal.inputs.get("arm"), goal.lease.as_ref())?;
+        let arm = performer.arm;
+        let hand = goal.port("hand").optional().map(|port| port.string()).transpose()?.map(str::to_owned);
+        if let (Some(hand), Some(arm)) = (&hand, &performer.arm_name)
+            && hand != arm
+        {
+            let why = format!(
+                "input `hand` is `{hand}`, and the goal is for the arm `{arm}`: what it takes is in its own hand"
+            );
+            return Err(ActionFailure::Aborted(why));
+        }
         goal.while_held().await?;
         let mut suspended = goal.suspended();
         let mut motion = self.handle.perform_with(arm, request)?;
@@ -193,7 +203,7 @@ impl Action for ModuleAction {
             }
         };
         match ending? {
-            Ending::Done(product) => self.outcome(product).await,
+            Ending::Done(product) => self.outcome(product, hand.as_deref()).await,
             Ending::Aborted(reason) => Err(ActionFailure::Aborted(reason)),
             Ending::Preempted(reason) => Err(ActionFailure::Preempted(reason)),
             Ending::Stopped(reason) => Err(ActionFailure::emergency_stop(&reason)),
@@ -250,7 +260,7 @@ impl ModuleAction {
         }
     }
 
-    async fn outcome(&self, product: Product) -> ActionResult {
+    async fn outcome(&self, product: Product, hand: Option<&str>) -> ActionResult {
         let success = GoalOutcome::success();
         Ok(match product {
             Product::Driven { end, tracking } => success
@@ -267,7 +277,8 @@ impl ModuleAction {
                 .with_output("tracking_rms_rad", Value::Float(tracking.rms_rad)),
             Product::Grasped { object, width, in_gripper } => {
                 let outcome = success.with_output("width_m", Value::Float(width));
-                let fact = FactKey { predicate: "in_gripper".to_owned(), arguments: vec![Term::Name(object)] };
+                let arguments = std::iter::once(object).chain(hand.map(str::to_owned)).map(Term::Name).collect();
+                let fact = FactKey { predicate: "in_gripper".to_owned(), arguments };
                 match in_gripper {
                     Some(pose) => outcome.with_measured(fact, Value::Pose(pose)),
                     None => outcome,

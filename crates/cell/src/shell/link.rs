@@ -23,6 +23,9 @@ use tokio_util::sync::CancellationToken;
 const RESOURCE_MANAGER: &str = "resource-manager";
 /// How long one wait for its endpoint file lasts; then it is looked for again.
 const FIND_DEADLINE: Duration = Duration::from_secs(60);
+/// The kind of the resource that the middle of a workplace is, into which several arms reach.
+pub const MIDDLE: &str = "Middle";
+
 /// How often the battery is looked at, and whether the manager has moved.
 const LOOK_INTERVAL: Duration = Duration::from_millis(500);
 /// The battery's level is told again when it has changed by this much.
@@ -105,6 +108,9 @@ impl Link {
                 }
                 provider.offer(resource.on_host(&self.config.host)).await?;
             }
+            if self.handle.robot().workplace().is_some_and(|workplace| workplace.middle.is_some()) {
+                provider.offer(self.middle()).await?;
+            }
             let mut told = f64::NEG_INFINITY;
             loop {
                 let level = self.handle.state().await.map_or(0.0, |state| state.battery);
@@ -125,6 +131,10 @@ impl Link {
             // The next one has another id.
             () = session.taken() => Ok(()),
         }
+    }
+
+    fn middle(&self) -> Resource {
+        Resource::new(format!("middle@{}", self.config.host), ResourceClass::System, MIDDLE).on_host(&self.config.host)
     }
 
     fn battery(&self, level: f64) -> Resource {

@@ -9,7 +9,7 @@
 
 mod actions;
 mod cell_actor;
-mod link;
+pub(crate) mod link;
 #[cfg(test)]
 mod pace;
 mod recorder;

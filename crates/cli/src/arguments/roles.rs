@@ -40,7 +40,7 @@ pub(crate) struct RoleArguments {
 pub(crate) struct CellArguments {
     #[command(flatten)]
     pub(crate) role: RoleArguments,
-    /// The robot: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml; the config's unless given
+    /// The robot: the name of a built-in one (aimm, panda, ur5, twin), or the path of a robot.toml; the config's unless given
     #[arg(long, value_name = "ROBOT")]
     pub(crate) robot: Option<String>,
     #[command(flatten)]
@@ -120,7 +120,7 @@ pub(crate) struct WorkerArguments {
     /// Robot's seconds per second
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = speed)]
     pub(crate) speed: f64,
-    /// The robot: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml
+    /// The robot: the name of a built-in one (aimm, panda, ur5, twin), or the path of a robot.toml
     #[arg(long, value_name = "ROBOT", default_value = "aimm")]
     pub(crate) robot: String,
     /// Of a detector: keep what it sees and finds as PNG files in this folder

@@ -27,7 +27,7 @@ pub(crate) struct UpArguments {
 /// What differs from a system's config.
 #[derive(Debug, Clone, Default, Args)]
 pub(crate) struct SystemArguments {
-    /// The robot: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml; the config's unless given
+    /// The robot: the name of a built-in one (aimm, panda, ur5, twin), or the path of a robot.toml; the config's unless given
     #[arg(long, value_name = "ROBOT")]
     pub(crate) robot: Option<String>,
     /// What the cell is furnished for: boxes on a table, or tableware on a rack
@@ -104,9 +104,12 @@ pub(crate) enum Budget {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct DemoArguments {
-    /// The robot: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml with a workplace; the config's unless given
+    /// The robot: the name of a built-in one (aimm, panda, ur5, twin), or the path of a robot.toml with a workplace; the config's unless given
     #[arg(long, value_name = "ROBOT")]
     pub(crate) robot: Option<String>,
+    /// With 2, two arms at one table fetch boxes, a task each: one after the other, and both at once
+    #[arg(long, value_name = "1..2", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=2))]
+    pub(crate) robots: u32,
     /// Which of the paper's experiments: boxes are fetched onto the base, or a table is set with tableware from a rack
     #[arg(long, value_name = "SCENARIO", default_value = "boxes", value_parser = scene)]
     pub(crate) scenario: Setting,

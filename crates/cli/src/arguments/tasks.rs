@@ -29,7 +29,7 @@ pub(crate) struct CheckArguments {
     /// Check against the system that runs there, too: what its workers say of themselves extends the catalogue, or is compared with it
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
-    /// The robot: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml; the config's unless given. The robot of a
+    /// The robot: the name of a built-in one (aimm, panda, ur5, twin), or the path of a robot.toml; the config's unless given. The robot of a
     /// system that runs is its own
     #[arg(long, value_name = "ROBOT", conflicts_with = "runtime_dir")]
     pub(crate) robot: Option<String>,
@@ -94,7 +94,7 @@ pub(crate) struct RunArguments {
     /// The system's config, TOML; without it the built-in default
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
-    /// The robot: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml; the config's unless given
+    /// The robot: the name of a built-in one (aimm, panda, ur5, twin), or the path of a robot.toml; the config's unless given
     #[arg(long, value_name = "ROBOT")]
     pub(crate) robot: Option<String>,
     /// Where a running system's endpoint files are; without it, a system is started where none runs
@@ -233,7 +233,7 @@ pub(crate) struct DashboardArguments {
     /// A task file whose annotations the page "Annotations" shows, checks while they are typed and, after a question, writes
     #[arg(long, value_name = "TASK")]
     pub(crate) edit: Option<PathBuf>,
-    /// The robot of the logs: the name of a built-in one (aimm, panda, ur5), or the path of a robot.toml; the system's unless given
+    /// The robot of the logs: the name of a built-in one (aimm, panda, ur5, twin), or the path of a robot.toml; the system's unless given
     #[arg(long, value_name = "ROBOT")]
     pub(crate) robot: Option<String>,
     /// Where pages are served: an address of this machine alone, with port 0 at one that is free
@@ -409,7 +409,7 @@ pub(crate) struct RobotArguments {
 pub(crate) enum RobotCommand {
     /// Read it with its URDF, SRDF and meshes, and look at its postures and its workplace
     Check {
-        /// The name of a built-in one (aimm, panda, ur5), or the path of a robot.toml
+        /// The name of a built-in one (aimm, panda, ur5, twin), or the path of a robot.toml
         #[arg(value_name = "ROBOT")]
         robot: String,
     },

@@ -2,6 +2,7 @@
 //!
 //! Every run gets a system of its own, started fresh from the same seed, so that nothing of one run helps or hinders the next.
 
+mod pair;
 mod result;
 mod table_task;
 
@@ -69,6 +70,9 @@ impl Files for BuiltIn {
 
 /// Runs the task in every way and compares.
 pub(crate) fn run(arguments: &DemoArguments, tls: &ClientTls) -> Result<(), Failure> {
+    if arguments.robots == 2 {
+        return pair::run(arguments, tls);
+    }
     let config = SystemConfig::load_for(arguments.config.as_deref(), arguments.robot.as_deref())?;
     let tls = &config.client_tls(tls)?;
     let (file, text) = match arguments.scenario {

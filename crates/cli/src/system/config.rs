@@ -5,6 +5,7 @@ use crate::arguments::SystemArguments;
 use crate::failure::Failure;
 use crate::input;
 use anyhow::Context;
+use ratn_cell::MIDDLE;
 use ratn_cell::config::{AIMM, CellConfig};
 use ratn_cell::core::protocol::Module;
 use ratn_daemon::config::Check;
@@ -85,6 +86,8 @@ struct Parts {
     chain: Option<JointChain>,
     /// The attributes of the modules of a kind, one after the other: which arm each is, of a robot with several.
     attributes: ModuleAttributes,
+    /// Whether its workplace has a middle, into which several arms reach.
+    middle: bool,
 }
 
 /// By the kind of a module, for each module of this kind.
@@ -108,6 +111,7 @@ impl Default for Parts {
             joints: ArmJoints::AsSaid,
             chain: None,
             attributes: ModuleAttributes::new(),
+            middle: false,
         }
     }
 }
@@ -117,8 +121,10 @@ impl Parts {
     /// it has. Providers of one's own are as they say.
     fn fit(&self, catalogue: &mut Catalogue, templates: &[Template]) {
         let standard = Catalogue::standard();
-        let lacks =
-            |kind: &str| Module::ALL.iter().any(|module| module.kind() == kind && !self.modules.contains(module));
+        let lacks = |kind: &str| {
+            kind == MIDDLE && !self.middle
+                || Module::ALL.iter().any(|module| module.kind() == kind && !self.modules.contains(module))
+        };
         let started = |kind: &str| templates.iter().any(|template| template.kind == kind);
         catalogue.providers.retain(|name, provider| {
             !lacks(&provider.resource) || started(&provider.resource) || !standard.providers.contains_key(name)
@@ -283,7 +289,8 @@ impl SystemConfig {
                 let said = [("arm".to_owned(), Value::String(arm.to_owned()))].into();
                 attributes.entry(module.kind().to_owned()).or_default().push(said);
             }
-            self.parts = Parts { modules, joints, chain, attributes };
+            let middle = robot.workplace().is_some_and(|workplace| workplace.middle.is_some());
+            self.parts = Parts { modules, joints, chain, attributes, middle };
         }
         self.catalogue.check().context("`catalogue`")?;
         self.parts.fit(&mut self.catalogue, &self.process_manager.templates);
@@ -376,7 +383,8 @@ impl SystemConfig {
     /// How much of each kind is there once the system is ready.
     pub(crate) fn promised_resources(&self) -> BTreeMap<String, Quantity> {
         let mut promised: BTreeMap<String, Quantity> = BTreeMap::new();
-        for kind in self.parts.modules.iter().map(|module| module.kind()).chain([BATTERY]) {
+        let middle = self.parts.middle.then_some(MIDDLE);
+        for kind in self.parts.modules.iter().map(|module| module.kind()).chain([BATTERY]).chain(middle) {
             *promised.entry(kind.to_owned()).or_default() += Quantity::ONE;
         }
         promised.insert(self.world_pool.kind.clone(), self.world_pool.capacity.into());

@@ -65,7 +65,8 @@ impl Shown {
 fn entity(object: &SceneObject, at: Timestamp) -> SceneEntity {
     let (frame, pose) = match object.placement {
         Placement::World(pose) => (WORLD, pose),
-        Placement::Gripper(pose) => (TOOL, pose),
+        // One tool has a frame there, whoever holds it.
+        Placement::Gripper(pose) | Placement::Hand { pose, .. } => (TOOL, pose),
     };
     let pose =
         Some(Pose { position: Some(vector(pose.position)), orientation: Some(quaternion(pose.quaternion_xyzw)) });

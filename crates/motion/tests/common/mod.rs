@@ -61,13 +61,15 @@ impl Cell {
 
     pub fn approach(&self, name: &str) -> Request {
         let object = self.object(name);
-        let (Placement::World(pose), Shape::Box { size }) = (object.placement, object.shape) else { panic!("{name}") };
+        let (Placement::World(pose), Shape::Box { size }) = (object.placement.clone(), object.shape) else {
+            panic!("{name}")
+        };
         let goals = aimm::grasp_poses(&pose, size).map(Goal::Pose).to_vec();
         Request { approach: Straight::down(aimm::APPROACH_M), ..self.request(goals) }
     }
 
     pub fn transfer(&self, name: &str, slot: usize) -> Request {
-        let (Placement::Gripper(_), Shape::Box { size }) = (self.object(name).placement, self.object(name).shape)
+        let (Placement::Gripper(_), Shape::Box { size }) = (&self.object(name).placement, self.object(name).shape)
         else {
             panic!("{name}")
         };

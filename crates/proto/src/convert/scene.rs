@@ -48,15 +48,17 @@ fn wire(individual: Term, object: &SceneObject) -> v1::SceneObject {
         Shape::Box { size } => Kind::Box(v1::SceneBox { size_m: size.to_vec() }),
         Shape::Cylinder { radius, length } => Kind::Cylinder(v1::SceneCylinder { radius_m: radius, length_m: length }),
     };
-    let (pose, held) = match object.placement {
-        Placement::World(pose) => (pose, false),
-        Placement::Gripper(pose) => (pose, true),
+    let (pose, held, held_by) = match &object.placement {
+        Placement::World(pose) => (*pose, false, String::new()),
+        Placement::Gripper(pose) => (*pose, true, String::new()),
+        Placement::Hand { arm, pose } => (*pose, true, arm.clone()),
     };
     v1::SceneObject {
         individual: Some(individual.into()),
         shape: Some(v1::SceneShape { kind: Some(kind) }),
         pose: Some(pose.into()),
         held,
+        held_by,
     }
 }
 
@@ -87,7 +89,11 @@ impl TryFrom<v1::SceneObject> for Placed {
             return Err(Malformed::new("shape", "lengths are numbers above 0"));
         }
         let pose = required(object.pose, "pose")?;
-        let placement = if object.held { Placement::Gripper(pose) } else { Placement::World(pose) };
+        let placement = match (object.held, object.held_by) {
+            (false, _) => Placement::World(pose),
+            (true, arm) if arm.is_empty() => Placement::Gripper(pose),
+            (true, arm) => Placement::Hand { arm, pose },
+        };
         Ok(Placed((individual.clone(), SceneObject { name: individual.to_string(), shape, placement })))
     }
 }

@@ -3602,6 +3602,9 @@ pub struct SceneObject {
     /// as seen from the gripper's tool frame.
     #[prost(bool, tag = "4")]
     pub held: bool,
+    /// Of a robot with several arms: the name of the arm whose gripper that is, where the facts say it; else empty.
+    #[prost(string, tag = "5")]
+    pub held_by: ::prost::alloc::string::String,
 }
 /// A shape.
 #[derive(Clone, PartialEq, ::prost::Message)]

@@ -3,8 +3,10 @@
 //! moves: the first one is where the input `arm` says.
 
 use ratn_model::value::Value;
+use ratn_motion::hands;
 use ratn_motion::robot::{Robot, RobotFault};
 use ratn_worker::action::{ActionFailure, GoalContext};
+use ratn_world::scene::{Placement, Scene};
 use std::sync::Arc;
 
 /// The robot seen from the arm that moves.
@@ -44,4 +46,13 @@ fn with_others(mut seen: Robot, goal: &GoalContext) -> Result<Robot, ActionFailu
 
 fn wrong(port: &str, fault: RobotFault) -> ActionFailure {
     ActionFailure::aborted(format!("input `{port}`: {fault}"))
+}
+
+/// The scene with what the arms hold in their hands: what the arm holds that moves, and what the others hold where they stand.
+pub(super) fn in_hands(robot: &Robot, scene: Arc<Scene>) -> Result<Arc<Scene>, ActionFailure> {
+    if !scene.objects.iter().any(|object| matches!(object.placement, Placement::Hand { .. })) {
+        return Ok(scene);
+    }
+    let seen = hands::seen_from(robot, Scene::clone(&scene)).map(Arc::new);
+    seen.map_err(|fault| ActionFailure::aborted(format!("a fact `in_gripper`: {fault}")))
 }

@@ -149,8 +149,12 @@ fn digest_of(object: &SceneObject) -> Digest {
     let (place, pose) = match &object.placement {
         Placement::World(pose) => (0, pose),
         Placement::Gripper(pose) => (1, pose),
+        Placement::Hand { pose, .. } => (2, pose),
     };
     digester.number(place);
+    if let Placement::Hand { arm, .. } = &object.placement {
+        digester.text(arm);
+    }
     digester.value(&Value::Pose(*pose));
     digester.finish()
 }

@@ -251,7 +251,7 @@ impl Demonstration {
     }
 }
 
-fn contact_json(contact: &UnintendedContact) -> Value {
+pub(super) fn contact_json(contact: &UnintendedContact) -> Value {
     json!({
         "began_s": contact.began_s,
         "ended_s": contact.ended_s,
