@@ -105,7 +105,7 @@ fn believed(found: &[(String, Detection, Placement)]) -> Scene {
             ObjectClass::Fork => Shape::Box { size: [x, y, z] },
             _ => Shape::Cylinder { radius: x / 2.0, length: z },
         };
-        SceneObject { name: name.clone(), shape, placement: *placement }
+        SceneObject { name: name.clone(), shape, placement: placement.clone() }
     });
     let robot = Robot::aimm();
     let fixed = ratn_cell::core::placement::fixed(&robot, Setting::Table);

@@ -64,7 +64,8 @@ fn in_braces(item: &str) -> String {
 #[test]
 fn a_way_of_an_either_may_contain_another_one() {
     let (a, b) = (in_braces(&look("a")), in_braces(&look("b")));
-    for value in ["either(a.pan + 1, 0)", "either(either(a.pan, b.pan) + 1, 0)", "either(-either(a.pan, b.pan), b.pan)"] {
+    for value in ["either(a.pan + 1, 0)", "either(either(a.pan, b.pan) + 1, 0)", "either(-either(a.pan, b.pan), b.pan)"]
+    {
         let text = condition(&a, &b, &format!("{{ pan: \"{value}\" }}"));
         assert!(read(&text).is_ok(), "{value}: {:?}", read(&text).err());
     }

@@ -139,7 +139,8 @@ fn the_base_drives_around_what_a_camera_saw_and_over_the_floor_that_it_saw() {
     assert!(around.length > straight.length + 0.05, "{} m", around.length);
     let robot = Robot::aimm();
     let posts = block("post", Pose::at(-1.25, 0.0, 0.35), [0.02, 0.04, 0.5]);
-    let refused = check_drive(&robot, &cell(Pose::IDENTITY, &[posts.clone()]), &STANDING, &[], &straight.trajectory);
+    let refused =
+        check_drive(&robot, &cell(Pose::IDENTITY, std::slice::from_ref(&posts)), &STANDING, &[], &straight.trajectory);
     assert!(matches!(refused, Err(DriveViolation::Touch { .. })));
     check_drive(&robot, &cell(Pose::IDENTITY, &[posts]), &STANDING, &[], &around.trajectory).unwrap();
 }

@@ -78,7 +78,7 @@ fn a_motion_keeps_away_from_what_was_seen_and_touches_what_is_known() {
         let mut points = sides(SIZE, &pose);
         for object in &cell.scene.objects {
             if let (Placement::World(pose), Shape::Box { size }) = (&object.placement, object.shape) {
-                points.extend(sides(size, &pose));
+                points.extend(sides(size, pose));
             }
         }
         let careful = cell.plan(&Request { seen: seen(&points, KNOWN_WITHIN_M), ..blind.clone() }).unwrap();

@@ -370,8 +370,8 @@ async fn a_drive_keeps_away_from_what_a_camera_saw() {
     assert_eq!(length_m("low", &low).await.unwrap(), straight);
     let wrong = length_m("wrong", &[("cloud", Value::Bytes(b"nonsense".to_vec()))]).await.unwrap_err();
     assert!(wrong.starts_with("input `cloud`: "), "{wrong}");
-    let others =
-        length_m("others", &[("other_arms", Value::Map([("left".to_owned(), Value::Joints(vec![0.0]))].into()))]);
+    let others = [("other_arms", Value::Map([("left".to_owned(), Value::Joints(vec![0.0]))].into()))];
+    let others = length_m("others", &others);
     let refused = others.await.unwrap_err();
     assert!(refused.starts_with("input `other_arms`: "), "{refused}");
 }

@@ -60,7 +60,9 @@ fn refused(
     }
     let (rule, message, help) = match relation {
         // A run that begins behind the state that writes it.
-        Relation::Before if subject.begins_elsewhere && !is_one_of_several && subject.control.is_reached(Point::Begin(to.id)) => {
+        Relation::Before
+            if subject.begins_elsewhere && !is_one_of_several && subject.control.is_reached(Point::Begin(to.id)) =>
+        {
             let message = format!("{flow} is not there: the run begins behind `{}`, which writes it", source.path);
             ("branch-may-not-have-written", message, "let it begin there, or before it".to_owned())
         }
