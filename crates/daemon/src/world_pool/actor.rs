@@ -49,6 +49,7 @@ pub(super) enum Message {
         answer: Answer<(ProjectionId, Vec<ProjectionId>)>,
     },
     Query {
+        by: Arc<str>,
         projection: Option<ProjectionId>,
         at: Option<Revision>,
         patterns: Vec<FactPattern>,
@@ -66,6 +67,7 @@ pub(super) enum Message {
         answer: Answer<(Between, Revision)>,
     },
     WatchProjection {
+        by: Arc<str>,
         projection: ProjectionId,
         answer: Answer<watch::Receiver<Option<Contradiction>>>,
     },
@@ -75,6 +77,7 @@ pub(super) enum Message {
         answer: Answer<(Vec<Version>, Revision)>,
     },
     Scene {
+        by: Arc<str>,
         projection: Option<ProjectionId>,
         bases: Vec<Digest>,
         answer: Answer<SceneDelta>,
@@ -208,7 +211,7 @@ impl Core for WorldCore {
             if lets_go_on {
                 self.take_up(context);
             }
-        } else if let Err(message) = self.parked.park(context.now(), message) {
+        } else if let Err(message) = self.parked.park(context.now(), message.whose(), message) {
             message.refused(status::too_many_wait());
         }
     }
@@ -283,6 +286,15 @@ fn is_early(pool: &WorldPool, message: &Message) -> bool {
 }
 
 impl Message {
+    /// Whose it is, of those that may have to wait.
+    fn whose(&self) -> Arc<str> {
+        match self {
+            Message::Project { projection, .. } => projection.by.name.clone(),
+            Message::Query { by, .. } | Message::Scene { by, .. } | Message::WatchProjection { by, .. } => by.clone(),
+            _ => Arc::default(),
+        }
+    }
+
     /// To who asked for something that is waited for.
     fn refused(self, status: Status) {
         match self {
@@ -329,7 +341,7 @@ impl WorldCore {
                 let projected = projected.map(|id| (id, self.pool.promise(context.now(), &by, promise)));
                 context.reply(answer, projected);
             }
-            Message::Query { projection, at, patterns, answer } => {
+            Message::Query { projection, at, patterns, answer, by: _ } => {
                 let view = self.pool.view(projection, at, &patterns).map_err(|error| status::of_query(&error));
                 context.reply(answer, view);
             }
@@ -337,7 +349,7 @@ impl WorldCore {
                 let watch = self.watch(after, context);
                 context.reply(answer, watch);
             }
-            Message::WatchProjection { projection, answer } => {
+            Message::WatchProjection { projection, answer, by: _ } => {
                 let watch = match self.pool.contradiction(projection) {
                     Ok(contradiction) => {
                         let known = contradiction.cloned();
@@ -357,7 +369,7 @@ impl WorldCore {
                 let versions = self.pool.history.versions(&key, limit);
                 context.reply(answer, Ok(versions));
             }
-            Message::Scene { projection, bases, answer } => {
+            Message::Scene { projection, bases, answer, by: _ } => {
                 let scene = self.pool.scene(projection, &bases).map_err(|error| status::of_query(&error));
                 context.reply(answer, scene);
             }
@@ -466,7 +478,9 @@ mod tests {
         };
         let look = async |id| {
             let (projection, patterns) = (Some(id), Vec::new());
-            let view = actor.request(|answer| Message::Query { projection, at: None, patterns, answer }).await;
+            let view = actor
+                .request(|answer| Message::Query { by: "adam".into(), projection, at: None, patterns, answer })
+                .await;
             view.map(|view| view.revision).map_err(|status| status.code())
         };
         let (_, ids) = project("first", None, None).await.unwrap();

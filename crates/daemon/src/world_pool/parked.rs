@@ -1,7 +1,8 @@
 //! Messages that came before what they are about: each waits a moment for that.
 
 use ratn_model::time::Timestamp;
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
 use std::time::Duration;
 
 /// So long a message waits.
@@ -10,40 +11,64 @@ pub(super) const PATIENCE: Duration = Duration::from_secs(1);
 /// So many wait at the most.
 pub(super) const MOST: usize = 4_096;
 
+/// Of these, so many of one caller: who asks in vain leaves room for the others.
+pub(super) const MOST_OF_ONE: usize = 2_048;
+
 /// The messages that wait, the oldest first, each with the end of its patience.
 #[derive(Debug)]
-pub(super) struct Parked<M>(VecDeque<(Timestamp, M)>);
+pub(super) struct Parked<M> {
+    messages: VecDeque<One<M>>,
+    /// How many of each caller wait.
+    of: BTreeMap<Arc<str>, usize>,
+}
+
+#[derive(Debug)]
+struct One<M> {
+    until: Timestamp,
+    whose: Arc<str>,
+    message: M,
+}
 
 impl<M> Default for Parked<M> {
     fn default() -> Parked<M> {
-        Parked(VecDeque::new())
+        Parked { messages: VecDeque::new(), of: BTreeMap::new() }
     }
 }
 
 impl<M> Parked<M> {
-    /// Has a message wait; gives it back where as many wait already as may.
-    pub(super) fn park(&mut self, now: Timestamp, message: M) -> Result<(), M> {
-        if self.0.len() >= MOST {
+    /// Has a message of a caller wait; gives it back where as many wait already as may, in all or of that caller.
+    pub(super) fn park(&mut self, now: Timestamp, whose: Arc<str>, message: M) -> Result<(), M> {
+        let of_caller = self.of.get(&whose).copied().unwrap_or_default();
+        if self.messages.len() >= MOST || of_caller >= MOST_OF_ONE {
             return Err(message);
         }
-        self.0.push_back((now + PATIENCE, message));
+        *self.of.entry(whose.clone()).or_default() += 1;
+        self.messages.push_back(One { until: now + PATIENCE, whose, message });
         Ok(())
     }
 
     /// When the first has waited long enough.
     pub(super) fn next_deadline(&self) -> Option<Timestamp> {
-        self.0.front().map(|(until, _)| *until)
+        self.messages.front().map(|one| one.until)
     }
 
     /// Those that need not wait any more, or have waited long enough, in the order in which they came.
     pub(super) fn take(&mut self, now: Timestamp, is_early: impl Fn(&M) -> bool) -> Vec<M> {
-        if self.0.is_empty() {
+        if self.messages.is_empty() {
             return Vec::new();
         }
-        let all = std::mem::take(&mut self.0).into_iter();
-        let (early, rest): (Vec<_>, Vec<_>) = all.partition(|(until, message)| *until > now && is_early(message));
-        self.0 = early.into();
-        rest.into_iter().map(|(_, message)| message).collect()
+        let all = std::mem::take(&mut self.messages).into_iter();
+        let (early, rest): (Vec<_>, Vec<_>) = all.partition(|one| one.until > now && is_early(&one.message));
+        self.messages = early.into();
+        for one in &rest {
+            if let Some(count) = self.of.get_mut(&one.whose) {
+                *count -= 1;
+                if *count == 0 {
+                    self.of.remove(&one.whose);
+                }
+            }
+        }
+        rest.into_iter().map(|one| one.message).collect()
     }
 }
 
@@ -51,22 +76,33 @@ impl<M> Parked<M> {
 mod tests {
     use super::*;
 
+    fn one(parked: &mut Parked<usize>, at: Timestamp, whose: &str, message: usize) -> Result<(), usize> {
+        parked.park(at, whose.into(), message)
+    }
+
     #[test]
     fn a_message_waits_for_what_it_is_about_but_not_for_ever() {
         let (mut parked, start) = (Parked::default(), Timestamp(0));
-        assert_eq!(parked.park(start, 1), Ok(()));
-        assert_eq!(parked.park(start + PATIENCE / 2, 2), Ok(()));
+        assert_eq!(one(&mut parked, start, "a", 1), Ok(()));
+        assert_eq!(one(&mut parked, start + PATIENCE / 2, "a", 2), Ok(()));
         assert_eq!(parked.next_deadline(), Some(start + PATIENCE));
         assert_eq!(parked.take(start + PATIENCE / 2, |_| true), [0; 0]);
         assert_eq!(parked.take(start + PATIENCE / 2, |message| *message == 1), [2]);
         assert_eq!(parked.take(start + PATIENCE, |_| true), [1]);
         assert_eq!(parked.next_deadline(), None);
+        assert!(parked.of.is_empty());
     }
 
     #[test]
-    fn not_more_wait_than_may() {
-        let mut parked = Parked::default();
-        assert!((0..MOST).all(|message| parked.park(Timestamp(0), message).is_ok()));
-        assert_eq!(parked.park(Timestamp(0), 9_999), Err(9_999));
+    fn not_more_wait_than_may_and_of_one_caller_no_more_than_half() {
+        let (mut parked, start) = (Parked::default(), Timestamp(0));
+        assert!((0..MOST_OF_ONE).all(|message| one(&mut parked, start, "eve", message).is_ok()));
+        assert_eq!(one(&mut parked, start, "eve", 9_999), Err(9_999));
+        assert!((MOST_OF_ONE..MOST).all(|message| one(&mut parked, start, "adam", message).is_ok()));
+        assert_eq!(one(&mut parked, start, "cain", 9_999), Err(9_999));
+        // What was answered makes room for its own caller.
+        assert_eq!(parked.take(start, |message| *message != 7), [7]);
+        assert_eq!(one(&mut parked, start, "adam", 9_998), Err(9_998));
+        assert_eq!(one(&mut parked, start, "eve", 9_998), Ok(()));
     }
 }

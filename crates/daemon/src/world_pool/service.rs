@@ -203,7 +203,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
     }
 
     async fn query(&self, request: Request<v1::QueryRequest>) -> Result<Response<v1::QueryResponse>, Status> {
-        let request = request.into_inner();
+        let (by, request) = (Caller::of(&request).name, request.into_inner());
         let projection = request.projection_id.map(ProjectionId);
         few(request.patterns.len(), "patterns")?;
         let patterns = each(request.patterns, "patterns")?;
@@ -218,7 +218,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             return Err(Malformed::new("at_revision", "is of the root: not together with projection_id").into());
         }
         let asked = patterns.clone();
-        let view = self.actor.request(|answer| Message::Query { projection, at, patterns: asked, answer }).await?;
+        let view = self.actor.request(|answer| Message::Query { by, projection, at, patterns: asked, answer }).await?;
         let (revision, seen) = (view.revision, place.map_or(0, |(_, seen)| seen));
         // Without a pattern a query looks at all that there is.
         let few = !patterns.is_empty() || view.world.len() <= AT_ONCE;
@@ -262,8 +262,8 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         &self,
         request: Request<v1::WatchProjectionRequest>,
     ) -> Result<Response<Self::WatchProjectionStream>, Status> {
-        let projection = ProjectionId(request.into_inner().projection_id);
-        let validity = self.actor.request(|answer| Message::WatchProjection { projection, answer }).await?;
+        let (by, projection) = (Caller::of(&request).name, ProjectionId(request.into_inner().projection_id));
+        let validity = self.actor.request(|answer| Message::WatchProjection { by, projection, answer }).await?;
         let told = tokio_stream::wrappers::WatchStream::new(validity).map(|contradiction| {
             let told = v1::WatchProjectionResponse { contradiction: contradiction.map(v1::Contradiction::from) };
             paging::whole(told, "the contradiction", "query the fact in the projection and in the root")
@@ -318,14 +318,14 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
     }
 
     async fn get_scene(&self, request: Request<v1::GetSceneRequest>) -> Result<Response<v1::GetSceneResponse>, Status> {
-        let request = request.into_inner();
+        let (by, request) = (Caller::of(&request).name, request.into_inner());
         let projection = request.projection_id.map(ProjectionId);
         if request.bases.len() > MOST_BASES {
             return Err(Malformed::new("bases", format!("at most {MOST_BASES} are looked at")).into());
         }
         let bases: Result<Vec<Digest>, Malformed> = request.bases.iter().map(|base| digest(base, "bases")).collect();
         let bases = bases?;
-        let scene = self.actor.request(|answer| Message::Scene { projection, bases, answer }).await?;
+        let scene = self.actor.request(|answer| Message::Scene { by, projection, bases, answer }).await?;
         Ok(Response::new(paging::whole(scene.into(), "the scene", "make a projection that reads less of it")?))
     }
 

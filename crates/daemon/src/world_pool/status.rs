@@ -70,8 +70,11 @@ pub(super) fn of_too_much(error: &TooMuch) -> Status {
 
 /// It would wait for what it is about, and too much waits.
 pub(super) fn too_many_wait() -> Status {
-    let message =
-        format!("{} calls wait for projections and commits that are on their way: ask again later", parked::MOST);
+    let message = format!(
+        "{} calls, or {} of one caller, wait for projections and commits that are on their way: ask again later",
+        parked::MOST,
+        parked::MOST_OF_ONE
+    );
     // As a daemon that is not there for a moment: what it is about may be there by then.
     retry_later(Code::Unavailable, "TOO_MANY_WAIT", message, parked::PATIENCE)
 }
