@@ -14,7 +14,7 @@ use ratn_model::program::Program;
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
-use ratn_resources::{AcquireRequest, Limits, Notice, Pool, SessionId, WaiterId};
+use ratn_resources::{AcquireRequest, Limits, NEEDED, Notice, OWN_BITS, Pool, SessionId, Turn, WaiterId};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -27,6 +27,8 @@ pub struct Together {
     pub program: Arc<Program>,
     /// How it is executed.
     pub mode: Mode,
+    /// Its share of what others want, too.
+    pub share: u32,
     /// When it begins, in virtual seconds.
     pub begins_s: f64,
     /// What an operator tells it, and so many virtual seconds after the start.
@@ -53,6 +55,36 @@ pub struct AllEnded {
     pub outcomes: Vec<(String, String)>,
     /// The root world at the end.
     pub world: World,
+    /// What happened, in order.
+    pub history: Vec<Happened>,
+}
+
+/// What happened, and to which run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Happened {
+    /// Its place among the runs.
+    pub run: usize,
+    /// When, in virtual seconds.
+    pub at_s: f64,
+    /// What.
+    pub what: What,
+}
+
+/// What may happen.
+#[derive(Debug, Clone, PartialEq)]
+pub enum What {
+    /// It was granted resources, by their ids.
+    Granted(LeaseId, Vec<String>),
+    /// It gave them back.
+    GaveBack(LeaseId),
+    /// A goal of the state with this path began.
+    Began(String),
+    /// It ended, or its worker did.
+    Ended(String),
+    /// It was told to stop, and did.
+    Cut(String),
+    /// A state's changes are real; the root after them.
+    Committed(String, World),
 }
 
 /// Makes the runs.
@@ -65,7 +97,7 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
     offer(&mut pool, &shared.resources, &BTreeMap::new()).map_err(broken)?;
     let mut root = World::default();
     root.overwrite(shared.world.iter().map(|(fact, value)| (fact.clone(), Some(value.clone()))));
-    let (agenda, next, projections) = Default::default();
+    let (agenda, next, projections, history) = Default::default();
     let mut system = System {
         now: Timestamp(0),
         pool,
@@ -76,6 +108,7 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
         latency: shared.latency,
         dice: Dice(shared.seed),
         runs: Vec::new(),
+        history,
         oracle,
     };
     for (number, together) in runs.iter().enumerate() {
@@ -86,6 +119,7 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
         system.runs.push(One {
             executive: Executive::new(together.program.clone(), Tolerance::ROBOT),
             session,
+            share: together.share,
             waiters: BTreeMap::new(),
             leases: BTreeMap::new(),
             paths: BTreeMap::new(),
@@ -101,6 +135,12 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
     system.until_all_have_ended(shared, runs)
 }
 
+/// The priority of an acquire among those of all runs, which are all as urgent.
+fn beside_others(priority: i64) -> i64 {
+    let own = (priority & (NEEDED - 1)) >> (NEEDED.trailing_zeros() - OWN_BITS);
+    (priority & NEEDED) | (1 << OWN_BITS) | own
+}
+
 /// What is due.
 enum Due {
     Begin,
@@ -111,6 +151,7 @@ enum Due {
 struct One {
     executive: Executive,
     session: SessionId,
+    share: u32,
     waiters: BTreeMap<InstanceId, WaiterId>,
     leases: BTreeMap<LeaseId, InstanceId>,
     paths: BTreeMap<InstanceId, String>,
@@ -129,6 +170,7 @@ struct System<'a> {
     latency: Duration,
     dice: Dice,
     runs: Vec<One>,
+    history: Vec<Happened>,
     oracle: &'a mut dyn Oracle,
 }
 
@@ -140,6 +182,14 @@ impl System<'_> {
 
     fn late(&mut self) -> Duration {
         Duration::from_nanos(self.dice.below(u64::try_from(self.latency.as_nanos()).unwrap_or(u64::MAX)))
+    }
+
+    fn happened(&mut self, run: usize, what: What) {
+        self.history.push(Happened { run, at_s: self.now.seconds(), what });
+    }
+
+    fn path(&self, run: usize, instance: InstanceId) -> String {
+        self.runs[run].paths.get(&instance).cloned().unwrap_or_default()
     }
 
     fn broken(&self, problem: impl ToString) -> RunError {
@@ -175,9 +225,12 @@ impl System<'_> {
                     event => event,
                 },
             };
+            if let Event::Finished { instance, .. } | Event::Crashed { instance, .. } = &event {
+                self.happened(run, What::Ended(self.path(run, *instance)));
+            }
             self.tell(run, event)?;
             if let Some(ends) = self.runs.iter().map(|run| run.end.clone()).collect::<Option<Vec<_>>>() {
-                return Ok(AllEnded { outcomes: ends, world: self.root });
+                return Ok(AllEnded { outcomes: ends, world: self.root, history: self.history });
             }
         }
         Err(RunError::Endless(MAX_EVENTS))
@@ -193,7 +246,7 @@ impl System<'_> {
         let mut told = Vec::new();
         for command in commands {
             let before = self.root.clone();
-            if let Command::Commit { changes, .. } = &command {
+            if let Command::Commit { instance, changes, .. } = &command {
                 self.root.apply(changes).map_err(|error| self.broken(error))?;
                 let written = self.root.iter().filter(|(key, fact)| before.get(key) != Some(&fact.value));
                 let gone = before.iter().filter(|(key, _)| self.root.get(key).is_none());
@@ -201,6 +254,7 @@ impl System<'_> {
                     .map(|(key, fact)| (key.clone(), Some(fact.value.clone())))
                     .chain(gone.map(|(key, _)| (key.clone(), None)))
                     .collect();
+                self.happened(run, What::Committed(self.path(run, *instance), self.root.clone()));
                 told.push(Event::WorldChanged { revision: self.root.revision(), facts });
             } else {
                 self.perform(run, command)?;
@@ -229,7 +283,9 @@ impl System<'_> {
             Command::Note(Note::Expanded { instance, path, .. }) => drop(self.runs[run].paths.insert(instance, path)),
             Command::Note(_) | Command::Commit { .. } | Command::Operate { .. } => {}
             Command::Acquire { instance, requirements, priority } => {
-                let request = AcquireRequest::new(self.runs[run].session.clone(), requirements).priority(priority);
+                let turn = Turn { share: self.runs[run].share, ..Turn::default() };
+                let request = AcquireRequest::new(self.runs[run].session.clone(), requirements);
+                let request = request.priority(beside_others(priority)).turn(turn);
                 let waiter = self.pool.acquire(self.now, request).map_err(|error| self.broken(error))?;
                 self.runs[run].waiters.insert(instance, waiter);
                 self.answers();
@@ -256,6 +312,7 @@ impl System<'_> {
                 self.at(run, late, Due::Event(Box::new(Event::Projected { instance, attempt, projection })));
             }
             Command::Start { instance, attempt, goal } => {
+                self.happened(run, What::Began(self.path(run, instance)));
                 let path = format!("{run}:{}", self.runs[run].paths.get(&instance).map_or("", String::as_str));
                 let world = goal.projection.and_then(|id| self.projections.get(&id)).unwrap_or(&self.root);
                 let Performance { duration_s, answer } = self.oracle.perform(&path, attempt, &goal, world);
@@ -270,18 +327,21 @@ impl System<'_> {
                 };
                 self.at(run, Duration::from_secs_f64(duration_s.max(0.0)), Due::Event(Box::new(event)));
             }
-            Command::Cancel { instance, attempt } => self.agenda.retain(|_, (of, due)| {
-                let of_what = match due {
-                    Due::Event(event) => match &**event {
-                        Event::Finished { instance, attempt, .. }
-                        | Event::Crashed { instance, attempt, .. }
-                        | Event::Projected { instance, attempt, .. } => Some((*instance, *attempt)),
-                        _ => None,
-                    },
-                    Due::Begin => None,
-                };
-                *of != run || of_what != Some((instance, attempt))
-            }),
+            Command::Cancel { instance, attempt } => {
+                self.happened(run, What::Cut(self.path(run, instance)));
+                self.agenda.retain(|_, (of, due)| {
+                    let of_what = match due {
+                        Due::Event(event) => match &**event {
+                            Event::Finished { instance, attempt, .. }
+                            | Event::Crashed { instance, attempt, .. }
+                            | Event::Projected { instance, attempt, .. } => Some((*instance, *attempt)),
+                            _ => None,
+                        },
+                        Due::Begin => None,
+                    };
+                    *of != run || of_what != Some((instance, attempt))
+                });
+            }
             Command::Release { lease, .. } => {
                 if let Some(lease) = lease {
                     self.give_back(run, lease)?;
@@ -309,6 +369,7 @@ impl System<'_> {
     }
 
     fn give_back(&mut self, run: usize, lease: LeaseId) -> Result<(), RunError> {
+        self.happened(run, What::GaveBack(lease));
         let one = &mut self.runs[run];
         one.leases.remove(&lease);
         let session = one.session.clone();
@@ -326,6 +387,8 @@ impl System<'_> {
             let Some((run, instance)) = asked else { continue };
             self.runs[run].waiters.remove(&instance);
             self.runs[run].leases.insert(lease.id, instance);
+            let ids = lease.resources.iter().map(|resource| resource.id.clone()).collect();
+            self.happened(run, What::Granted(lease.id, ids));
             let late = self.late();
             self.at(run, late, Due::Event(Box::new(Event::Granted { instance, lease })));
         }

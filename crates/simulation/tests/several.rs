@@ -11,7 +11,7 @@ use ratn_executive::protocol::{Event, Goal, Mode};
 use ratn_model::value::Value;
 use ratn_simulation::dice::Dice;
 use ratn_simulation::run::{Answer, Oracle, Performance};
-use ratn_simulation::several::{Shared, Together, run};
+use ratn_simulation::several::{AllEnded, Shared, Together, What, run};
 use ratn_world::world::World;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -50,32 +50,33 @@ enum Step {
     Choose((u64, i64), Motion, Motion),
 }
 
-fn motion(dice: &mut Dice, has_computed: bool) -> Motion {
+fn motion(dice: &mut Dice, facts: u64, has_computed: bool) -> Motion {
     let of = if dice.below(3) == 0 { "head" } else { "arm" };
-    let (p, n) = (dice.below(FACTS), i64::try_from(dice.below(5)).unwrap_or_default());
+    let (p, n) = (dice.below(facts), i64::try_from(dice.below(5)).unwrap_or_default());
     let effect = match dice.below(if has_computed { 5 } else { 3 }) {
         0 => Effect::Set(p, n),
         1 => Effect::Increase(p, n + 1),
-        2 => Effect::Double(p, dice.below(FACTS)),
+        2 => Effect::Double(p, dice.below(facts)),
         _ => Effect::Computed(p),
     };
     Motion { of, effect }
 }
 
-fn program(dice: &mut Dice) -> Vec<Step> {
+/// Of so many steps and facts.
+fn program(dice: &mut Dice, facts: u64, steps: Option<u64>) -> Vec<Step> {
     let mut has_computed = false;
-    let condition = |dice: &mut Dice| (dice.below(FACTS), i64::try_from(dice.below(6)).unwrap_or_default());
+    let condition = |dice: &mut Dice| (dice.below(facts), i64::try_from(dice.below(6)).unwrap_or_default());
     let crashes = |dice: &mut Dice| dice.below(4) == 0;
-    let count = 2 + dice.below(3);
+    let count = steps.unwrap_or_else(|| 2 + dice.below(3));
     (0..count)
         .map(|_| match dice.below(4) {
             0 => {
                 has_computed = true;
-                Step::Think(dice.below(FACTS), crashes(dice))
+                Step::Think(dice.below(facts), crashes(dice))
             }
-            1 => Step::Choose(condition(dice), motion(dice, has_computed), motion(dice, has_computed)),
-            2 => Step::Move(Some(condition(dice)), motion(dice, has_computed), crashes(dice)),
-            _ => Step::Move(None, motion(dice, has_computed), crashes(dice)),
+            1 => Step::Choose(condition(dice), motion(dice, facts, has_computed), motion(dice, facts, has_computed)),
+            2 => Step::Move(Some(condition(dice)), motion(dice, facts, has_computed), crashes(dice)),
+            _ => Step::Move(None, motion(dice, facts, has_computed), crashes(dice)),
         })
         .collect()
 }
@@ -235,51 +236,242 @@ impl Oracle for Workers<'_> {
     }
 }
 
+/// What a pair of large programs did, event by event, beside what it may do. It knows the programs and the facts, and shares nothing with the
+/// executive: what is real is what the steps make of the world at the moment at which they are.
+struct Judge<'a> {
+    programs: &'a [Vec<Step>; 2],
+    facts: Facts,
+    runs: [Seen; 2],
+    /// Who holds a resource.
+    held: BTreeMap<String, (usize, ratn_model::id::LeaseId)>,
+}
+
+/// How far a run is.
+#[derive(Debug, Default)]
+struct Seen {
+    /// The step that comes next.
+    step: usize,
+    /// The worlds since the last of its motions that was seen.
+    worlds: Vec<Facts>,
+    /// What may have been computed last.
+    computed: BTreeSet<i64>,
+    /// The step that moves, and the choice of which branch it is.
+    moving: Option<(usize, Option<bool>)>,
+    /// The one that ended and is to be real.
+    ended: Option<(usize, Option<bool>)>,
+    motions: usize,
+}
+
+/// The number of a step in a path, and the branch.
+fn place(path: &str) -> (usize, Option<bool>) {
+    let (number, branch) =
+        path.split_once('/').map_or((path, None), |(number, branch)| (number, Some(branch == "yes")));
+    (number.trim_start_matches('s').parse().expect("a number"), branch)
+}
+
+impl Judge<'_> {
+    fn motion(&self, run: usize, (step, branch): (usize, Option<bool>)) -> Option<(&Motion, bool)> {
+        match (&self.programs[run][step], branch) {
+            (Step::Move(_, motion, crashes), None) => Some((motion, *crashes)),
+            (Step::Choose(_, then, _), Some(true)) => Some((then, false)),
+            (Step::Choose(_, _, otherwise), Some(false)) => Some((otherwise, false)),
+            _ => None,
+        }
+    }
+
+    /// A run passes the steps before this without a motion: each is decided in a world that was there, in their order.
+    fn pass(&mut self, run: usize, until: usize) -> Result<usize, String> {
+        let seen = &mut self.runs[run];
+        let mut at = 0;
+        for number in seen.step..until {
+            let found = match &self.programs[run][number] {
+                Step::Think(p, _) => {
+                    seen.computed = seen.worlds[at..].iter().map(|facts| facts[p] + 10).collect();
+                    Some(0)
+                }
+                Step::Move(Some((p, n)), ..) => seen.worlds[at..].iter().position(|facts| facts[p] <= *n),
+                Step::Move(None, ..) | Step::Choose(..) => None,
+            };
+            at += found.ok_or_else(|| format!("run {run} did not perform s{number}"))?;
+        }
+        Ok(at)
+    }
+
+    fn see(&mut self, run: usize, what: &What) -> Result<(), String> {
+        match what {
+            What::Granted(lease, resources) => {
+                for resource in resources {
+                    if let Some(other) = self.held.insert(resource.clone(), (run, *lease)) {
+                        return Err(format!("{resource} is held by {other:?} and run {run}"));
+                    }
+                }
+            }
+            What::GaveBack(lease) => self.held.retain(|_, held| held != &(run, *lease)),
+            What::Began(path) => {
+                let (step, branch) = place(path);
+                let Some((motion, _)) = self.motion(run, (step, branch)) else { return Ok(()) };
+                let of = motion.of;
+                if let Some(lost) = self.runs[run].ended {
+                    return Err(format!("what s{} of run {run} did is lost", lost.0));
+                }
+                for (other, seen) in self.runs.iter().enumerate() {
+                    if seen.moving.is_some_and(|moves| {
+                        other == run || self.motion(other, moves).is_some_and(|(motion, _)| motion.of == of)
+                    }) {
+                        return Err(format!("{path} of run {run} begins while run {other} moves"));
+                    }
+                }
+                let is_held =
+                    self.held.iter().any(|(id, (holder, _))| *holder == run && id.to_lowercase().starts_with(of));
+                if !is_held {
+                    return Err(format!("{path} of run {run} moves the {of}, which it does not hold: {:?}", self.held));
+                }
+                if step < self.runs[run].step {
+                    return Err(format!("{path} of run {run} begins again"));
+                }
+                let at = self.pass(run, step)?;
+                let decides = match (&self.programs[run][step], branch) {
+                    (Step::Choose((p, n), ..), Some(yes)) => {
+                        self.runs[run].worlds[at..].iter().any(|facts| (facts[p] > *n) == yes)
+                    }
+                    (Step::Move(Some((p, n)), ..), None) => self.facts[p] > *n,
+                    _ => true,
+                };
+                if !decides {
+                    return Err(format!(
+                        "{path} of run {run} begins, and what it requires does not hold: {:?}",
+                        self.facts
+                    ));
+                }
+                let seen = &mut self.runs[run];
+                (seen.step, seen.moving, seen.worlds) = (step + 1, Some((step, branch)), vec![self.facts.clone()]);
+                seen.motions += 1;
+            }
+            What::Ended(path) => {
+                let moved = self.runs[run].moving.take_if(|moves| *moves == place(path));
+                let crashed = moved.and_then(|moved| self.motion(run, moved)).is_some_and(|(_, crashes)| crashes);
+                if moved.is_some() {
+                    self.runs[run].ended = moved.filter(|_| !crashed);
+                }
+            }
+            What::Cut(path) => {
+                let seen = &mut self.runs[run];
+                if seen.moving == Some(place(path)) {
+                    seen.moving = None;
+                }
+            }
+            What::Committed(path, world) => {
+                let moved = self.runs[run].ended.take();
+                let Some(motion) =
+                    moved.filter(|moved| *moved == place(path)).and_then(|moved| self.motion(run, moved))
+                else {
+                    return Err(format!("{path} of run {run} commits, and {moved:?} has ended"));
+                };
+                let real = numbers(world, self.facts.len() as u64);
+                let effect = motion.0.effect.clone();
+                let computed = if let Effect::Computed(p) = effect { real[&p] } else { 0 };
+                if matches!(effect, Effect::Computed(_)) && !self.runs[run].computed.contains(&computed) {
+                    return Err(format!("{path} of run {run} writes {computed}: {:?}", self.runs[run].computed));
+                }
+                apply(&mut self.facts, &effect, computed);
+                if matches!(effect, Effect::Computed(_)) {
+                    self.runs[run].computed = BTreeSet::from([computed]);
+                }
+                if self.facts != real {
+                    return Err(format!("after {path} of run {run} there is {real:?}, not {:?}", self.facts));
+                }
+                self.runs.iter_mut().for_each(|seen| seen.worlds.push(self.facts.clone()));
+            }
+        }
+        Ok(())
+    }
+
+    fn all(mut self, ended: &AllEnded, is_cut: bool) -> Result<usize, String> {
+        for happened in &ended.history {
+            self.see(happened.run, &happened.what).map_err(|problem| format!("{:.3} s: {problem}", happened.at_s))?;
+        }
+        for run in 0..2 {
+            if run == 1 && is_cut && ended.outcomes[1].0 == "preempted" {
+                continue;
+            }
+            self.pass(run, self.programs[run].len())?;
+            if self.runs[run].moving.or(self.runs[run].ended).is_some() {
+                return Err(format!("run {run} has ended and not all that it began"));
+            }
+        }
+        let left = numbers(&ended.world, self.facts.len() as u64);
+        if left != self.facts || !self.held.is_empty() {
+            return Err(format!("{left:?} is left, and {:?} held", self.held));
+        }
+        Ok(self.runs.iter().map(|seen| seen.motions).sum())
+    }
+}
+
+fn numbers(world: &World, facts: u64) -> Facts {
+    let number = |p: u64| match world.get(&fact(&format!("p{p}()"))) {
+        Some(Value::Int(n)) => *n,
+        other => panic!("p{p} is {other:?}"),
+    };
+    (0..facts).map(|p| (p, number(p))).collect()
+}
+
+/// A pair of programs, how it ended, whether the second was told to end, and what there was at first.
+struct Pair {
+    programs: [Vec<Step>; 2],
+    ended: AllEnded,
+    is_cut: bool,
+    begin: Facts,
+    about: String,
+}
+
+/// A pair of so many facts and steps, within about so many seconds.
+fn pair(seed: u64, facts: u64, steps: Option<u64>, lasts_s: u64) -> Pair {
+    let dice = &mut Dice(seed);
+    let programs = [program(dice, facts, steps), program(dice, facts, steps)];
+    let modes: [Mode; 2] = [MODES[dice.below(2) as usize], MODES[dice.below(2) as usize]];
+    let tasks = [task("one", &programs[0]), task("two", &programs[1])];
+    let begin: Facts = (0..facts).map(|p| (p, i64::try_from(p).unwrap_or_default() + 1)).collect();
+    let loaded = |text: &str| load(text, "task.yaml", &NoFiles);
+    let shared = Shared {
+        resources: setup(loaded(&tasks[0]), Mode::Hsm).resources,
+        world: begin.iter().map(|(p, n)| (fact(&format!("p{p}()")), Value::Int(*n))).collect(),
+        latency: Duration::from_millis(900),
+        seed,
+    };
+    let mut seconds = |most: u64| dice.below(most * 1000) as f64 / 1000.0;
+    let (begins_s, pause_s, abort_s) = (seconds(lasts_s / 4), seconds(lasts_s * 3 / 4), seconds(lasts_s));
+    let resume_s = pause_s + seconds(6);
+    let pauses = vec![(pause_s, Event::PauseRequested), (resume_s, Event::ResumeRequested)];
+    let (pauses, is_cut) = (if dice.below(2) == 0 { pauses } else { Vec::new() }, dice.below(4) == 0);
+    let abort = (abort_s, Event::AbortRequested { reason: "it is enough".to_owned(), at_once: false });
+    let runs = [
+        Together { program: Arc::new(loaded(&tasks[0])), mode: modes[0], share: 1, begins_s: 0.0, told: pauses },
+        Together {
+            program: Arc::new(loaded(&tasks[1])),
+            mode: modes[1],
+            share: 1 + u32::try_from(seed % 4).unwrap_or_default(),
+            begins_s,
+            told: Vec::from_iter(is_cut.then_some(abort)),
+        },
+    ];
+    let mut workers = Workers(&programs);
+    let about = format!("seed {seed}, {modes:?}\n{}\n{}", tasks[0], tasks[1]);
+    let ended = run(&shared, &runs, &mut workers).unwrap_or_else(|error| panic!("{error}\n{about}"));
+    let is_well = |(number, (outcome, _)): (usize, &(String, String))| {
+        outcome == "success" || number == 1 && is_cut && outcome == "preempted"
+    };
+    assert!(ended.outcomes.iter().enumerate().all(is_well), "{:?}\n{about}", ended.outcomes);
+    Pair { programs, ended, is_cut, begin, about }
+}
+
 /// How many different worlds the pairs of these seeds could have left, and how many pairs could have left more than one.
 fn try_pairs(seeds: std::ops::Range<u64>) -> (usize, usize) {
     let (mut worlds, mut open) = (0, 0);
     for seed in seeds {
-        let dice = &mut Dice(seed);
-        let programs = [program(dice), program(dice)];
-        let modes: [Mode; 2] = [MODES[dice.below(2) as usize], MODES[dice.below(2) as usize]];
-        let tasks = [task("one", &programs[0]), task("two", &programs[1])];
-        let begin: Facts = (0..FACTS).map(|p| (p, i64::try_from(p).unwrap_or_default() + 1)).collect();
-        let loaded = |text: &str| load(text, "task.yaml", &NoFiles);
-        let shared = Shared {
-            resources: setup(loaded(&tasks[0]), Mode::Hsm).resources,
-            world: begin.iter().map(|(p, n)| (fact(&format!("p{p}()")), Value::Int(*n))).collect(),
-            latency: Duration::from_millis(900),
-            seed,
-        };
-        let mut seconds = |most: u64| dice.below(most * 1000) as f64 / 1000.0;
-        let (begins_s, pause_s, abort_s) = (seconds(3), seconds(9), seconds(12));
-        let resume_s = pause_s + seconds(6);
-        let pauses = vec![(pause_s, Event::PauseRequested), (resume_s, Event::ResumeRequested)];
-        let (pauses, is_cut) = (if dice.below(2) == 0 { pauses } else { Vec::new() }, dice.below(4) == 0);
-        let abort = (abort_s, Event::AbortRequested { reason: "it is enough".to_owned(), at_once: false });
-        let runs = [
-            Together { program: Arc::new(loaded(&tasks[0])), mode: modes[0], begins_s: 0.0, told: pauses },
-            Together {
-                program: Arc::new(loaded(&tasks[1])),
-                mode: modes[1],
-                begins_s,
-                told: Vec::from_iter(is_cut.then_some(abort)),
-            },
-        ];
-        let mut workers = Workers(&programs);
-        let about = || format!("seed {seed}, {modes:?}\n{}\n{}", tasks[0], tasks[1]);
-        let ended = run(&shared, &runs, &mut workers).unwrap_or_else(|error| panic!("{error}\n{}", about()));
-        let is_well = |(number, (outcome, _)): (usize, &(String, String))| {
-            outcome == "success" || number == 1 && is_cut && outcome == "preempted"
-        };
-        assert!(ended.outcomes.iter().enumerate().all(is_well), "{:?}\n{}", ended.outcomes, about());
-        let number = |p: u64| match ended.world.get(&fact(&format!("p{p}()"))) {
-            Some(Value::Int(n)) => *n,
-            other => panic!("p{p} is {other:?}\n{}", about()),
-        };
-        let left: Facts = (0..FACTS).map(|p| (p, number(p))).collect();
+        let Pair { programs, ended, is_cut, begin, about } = pair(seed, FACTS, None, 12);
+        let left = numbers(&ended.world, FACTS);
         let possible = interleaved(&programs, begin, is_cut);
-        assert!(possible.contains(&left), "{left:?} is none of {possible:?}\n{}", about());
+        assert!(possible.contains(&left), "{left:?} is none of {possible:?}\n{about}");
         worlds += possible.len();
         open += usize::from(possible.len() > 1);
     }
@@ -292,6 +484,79 @@ fn two_runs_leave_a_world_that_some_interleaving_of_their_sequential_programs_le
     let (first, count) = (given("RATN_FIRST", 0), given("RATN_PROGRAMS", 600));
     let (worlds, open) = try_pairs(first..first + count);
     assert!(open as u64 > count / 2, "the pairs hardly meet: {open} of them have several ends, {worlds} worlds in all");
+}
+
+/// Programs that are too large for all interleavings, event by event: see [`Judge`].
+///
+/// `RATN_LARGE=5000 RATN_FIRST=1000 cargo test -p ratn-simulation --test several large` tries other pairs.
+#[test]
+fn two_large_runs_do_what_their_programs_say_in_the_worlds_that_they_meet() {
+    let given = |name: &str, usual| std::env::var(name).map_or(usual, |number| number.parse().expect("a number"));
+    let (first, count) = (given("RATN_FIRST", 0), given("RATN_LARGE", 60));
+    let mut motions = 0;
+    for seed in first..first + count {
+        let Pair { programs, ended, is_cut, begin, about } = pair(seed, 8, Some(30), 60);
+        let runs = [(); 2].map(|()| Seen { worlds: vec![begin.clone()], ..Seen::default() });
+        let judge = Judge { programs: &programs, facts: begin, runs, held: BTreeMap::new() };
+        motions += judge.all(&ended, is_cut).unwrap_or_else(|problem| panic!("{problem}\n{about}"));
+    }
+    assert!(motions as u64 > count * 20, "{motions} motions are few");
+}
+
+/// Moves the arm again and again.
+fn moves(name: &str, times: usize, duration_s: u32) -> String {
+    let mut text = format!("task: {name}\nstates:\n");
+    for number in 0..times {
+        text += &format!(
+            "  - s{number}: {{ action: arm/move, pia: true, reads: [], effects: ['increase p0() by 1'], resources: [{{ block: Arm }}], duration: {duration_s} }}\n"
+        );
+    }
+    text
+}
+
+/// Both modes, motions of different lengths: the arm is divided by the shares as long as both want it.
+#[test]
+fn runs_have_the_arm_for_as_long_as_their_shares_say() {
+    let loaded = |text: &str| Arc::new(load(text, "task.yaml", &NoFiles));
+    for (modes, durations, share) in [
+        ([Mode::Cdtn, Mode::Cdtn], [2, 2], 3),
+        ([Mode::Hsm, Mode::Cdtn], [2, 5], 2),
+        ([Mode::Cdtn, Mode::Hsm], [5, 1], 4),
+    ] {
+        let tasks = [moves("large", 120, durations[0]), moves("small", 400, durations[1])];
+        let programs = tasks.each_ref().map(|text| loaded(text));
+        let shared = Shared {
+            resources: setup(load(&tasks[0], "task.yaml", &NoFiles), Mode::Hsm).resources,
+            world: vec![(fact("p0()"), Value::Int(0))],
+            latency: Duration::ZERO,
+            seed: 1,
+        };
+        let runs = [(0, share), (1, 1)].map(|(which, share)| {
+            let (program, mode): (Arc<ratn_model::program::Program>, Mode) = (programs[which].clone(), modes[which]);
+            Together { program, mode, share, begins_s: 0.0, told: Vec::new() }
+        });
+        let mut providers = Providers(|_: &str, _: u32, _: &Goal, _: &World| ("success", Value::Int(1)));
+        let ended = run(&shared, &runs, &mut providers).expect("both end");
+        let mut held_s = [0.0; 2];
+        let mut since = BTreeMap::new();
+        // Until one of them has nothing to do any more.
+        let last = |run| ended.history.iter().rposition(|one| one.run == run && matches!(one.what, What::Granted(..)));
+        let both = last(0).min(last(1)).expect("both move");
+        for one in &ended.history[..both] {
+            match &one.what {
+                What::Granted(lease, _) => drop(since.insert(*lease, one.at_s)),
+                What::GaveBack(lease) => held_s[one.run] += since.remove(lease).map_or(0.0, |since| one.at_s - since),
+                _ => {}
+            }
+        }
+        let ratio = held_s[0] / held_s[1];
+        assert!((ratio / f64::from(share) - 1.0).abs() < 0.15, "{modes:?} {durations:?}: {held_s:?}, for {share} to 1");
+    }
+}
+
+#[test]
+fn the_executive_and_the_pool_mean_the_same_by_what_is_needed_for_certain() {
+    assert_eq!(ratn_executive::protocol::CERTAIN, ratn_resources::NEEDED);
 }
 
 /// Turns its head for 6 s and computes for both of what may come of it meanwhile, which takes 4 s.
@@ -324,7 +589,7 @@ fn what_one_run_computes_in_case_gives_way_to_what_another_needs() {
         let shared = Shared { resources: resources.clone(), world: Vec::new(), latency, seed: 1 };
         let together = |task: &str, begins_s| {
             let program = Arc::new(loaded(task));
-            Together { program, mode: Mode::Cdtn, begins_s, told: Vec::new() }
+            Together { program, mode: Mode::Cdtn, share: 1, begins_s, told: Vec::new() }
         };
         let runs = [together(AHEAD, 0.0), together(CERTAINLY, 1.0)];
         let mut given = Vec::new();
