@@ -334,10 +334,13 @@ mod tests {
             assert!(robot.links[0].parent.is_none() && robot.links.iter().skip(1).all(|link| link.parent.is_some()));
             let after = |(index, link): (usize, &wire::Link)| link.parent.is_none_or(|parent| parent < index);
             assert!(robot.links.iter().enumerate().all(after), "parents come first");
-            let finger = robot.joints.iter().position(|joint| joint.name == "finger").unwrap();
-            assert_eq!(robot.links.iter().filter(|link| link.joint == Some(finger)).count(), 2, "{name}");
-            assert!(robot.joints[finger].slides && robot.joints[finger].start > 0.0, "the fingers begin open");
-            assert_eq!(robot.links[robot.tools[0]].name, "tool");
+            let fingers = robot.joints.iter().enumerate().filter(|(_, joint)| joint.name.ends_with("finger"));
+            for (finger, joint) in fingers.clone() {
+                assert_eq!(robot.links.iter().filter(|link| link.joint == Some(finger)).count(), 2, "{name}");
+                assert!(joint.slides && joint.start > 0.0, "the fingers begin open");
+            }
+            assert_eq!(fingers.count(), robot.tools.len(), "{name}");
+            assert!(robot.tools.iter().all(|tool| robot.links[*tool].name.ends_with("tool")));
         }
         let aimm = shown("aimm").told();
         let mast = aimm.links.iter().find(|link| link.name == "mast").unwrap();

@@ -244,7 +244,7 @@ states:
         let reads = state(path).annotations.reads.as_ref();
         reads.map(|facts| facts.iter().map(ToString::to_string).collect::<Vec<_>>().join(" "))
     };
-    assert_eq!(reads("each/think/plan").as_deref(), Some("at(?) shape(?) in_gripper(?) on(?, ?)"));
+    assert_eq!(reads("each/think/plan").as_deref(), Some("at(?) shape(?) in_gripper(?) in_gripper(?, ?) on(?, ?)"));
     assert_eq!(reads("each/near").as_deref(), Some(""));
     assert_eq!(reads("each/near/go"), None);
     assert_eq!(

@@ -75,6 +75,16 @@ fn a_way_of_an_either_may_contain_another_one() {
 }
 
 #[test]
+fn what_a_state_contains_is_no_way_of_what_it_needs_to_begin() {
+    let text = format!(
+        "  - h: {{ requires: [\"either(a.pan, 10) > 5\"], states: [{{ {} }}] }}\n  - again: {{ condition: exists at(cup), then: [], else: [], transitions: {{ success: h }} }}\n",
+        look("a")
+    );
+    let wrong = refused(&text);
+    assert!(wrong.iter().any(|found| found.starts_with("unservable-flow")), "{wrong:?}");
+}
+
+#[test]
 fn a_condition_gives_what_the_branch_gives_that_was_taken() {
     let (a, b) = (in_braces(&look("a")), in_braces(&look("b")));
     let made = program(&condition(&a, &b, "{ pan: \"either(a.pan, b.pan)\" }"));

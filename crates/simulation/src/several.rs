@@ -14,7 +14,7 @@ use ratn_model::program::Program;
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
-use ratn_resources::{AcquireRequest, Limits, NEEDED, Notice, OWN_BITS, Pool, SessionId, Turn, WaiterId};
+use ratn_resources::{AcquireRequest, Limits, Notice, Pool, SessionId, WaiterId};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -27,8 +27,6 @@ pub struct Together {
     pub program: Arc<Program>,
     /// How it is executed.
     pub mode: Mode,
-    /// Its share of what others want, too.
-    pub share: u32,
     /// When it begins, in virtual seconds.
     pub begins_s: f64,
     /// What an operator tells it, and so many virtual seconds after the start.
@@ -119,7 +117,6 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
         system.runs.push(One {
             executive: Executive::new(together.program.clone(), Tolerance::ROBOT),
             session,
-            share: together.share,
             waiters: BTreeMap::new(),
             leases: BTreeMap::new(),
             paths: BTreeMap::new(),
@@ -135,12 +132,6 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
     system.until_all_have_ended(shared, runs)
 }
 
-/// The priority of an acquire among those of all runs, which are all as urgent.
-fn beside_others(priority: i64) -> i64 {
-    let own = (priority & (NEEDED - 1)) >> (NEEDED.trailing_zeros() - OWN_BITS);
-    (priority & NEEDED) | (1 << OWN_BITS) | own
-}
-
 /// What is due.
 enum Due {
     Begin,
@@ -151,7 +142,6 @@ enum Due {
 struct One {
     executive: Executive,
     session: SessionId,
-    share: u32,
     waiters: BTreeMap<InstanceId, WaiterId>,
     leases: BTreeMap<LeaseId, InstanceId>,
     paths: BTreeMap<InstanceId, String>,
@@ -283,9 +273,7 @@ impl System<'_> {
             Command::Note(Note::Expanded { instance, path, .. }) => drop(self.runs[run].paths.insert(instance, path)),
             Command::Note(_) | Command::Commit { .. } | Command::Operate { .. } => {}
             Command::Acquire { instance, requirements, priority } => {
-                let turn = Turn { share: self.runs[run].share, ..Turn::default() };
-                let request = AcquireRequest::new(self.runs[run].session.clone(), requirements);
-                let request = request.priority(beside_others(priority)).turn(turn);
+                let request = AcquireRequest::new(self.runs[run].session.clone(), requirements).priority(priority);
                 let waiter = self.pool.acquire(self.now, request).map_err(|error| self.broken(error))?;
                 self.runs[run].waiters.insert(instance, waiter);
                 self.answers();

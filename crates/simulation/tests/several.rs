@@ -445,11 +445,10 @@ fn pair(seed: u64, facts: u64, steps: Option<u64>, lasts_s: u64) -> Pair {
     let (pauses, is_cut) = (if dice.below(2) == 0 { pauses } else { Vec::new() }, dice.below(4) == 0);
     let abort = (abort_s, Event::AbortRequested { reason: "it is enough".to_owned(), at_once: false });
     let runs = [
-        Together { program: Arc::new(loaded(&tasks[0])), mode: modes[0], share: 1, begins_s: 0.0, told: pauses },
+        Together { program: Arc::new(loaded(&tasks[0])), mode: modes[0], begins_s: 0.0, told: pauses },
         Together {
             program: Arc::new(loaded(&tasks[1])),
             mode: modes[1],
-            share: 1 + u32::try_from(seed % 4).unwrap_or_default(),
             begins_s,
             told: Vec::from_iter(is_cut.then_some(abort)),
         },
@@ -503,62 +502,6 @@ fn two_large_runs_do_what_their_programs_say_in_the_worlds_that_they_meet() {
     assert!(motions as u64 > count * 20, "{motions} motions are few");
 }
 
-/// Moves the arm again and again.
-fn moves(name: &str, times: usize, duration_s: u32) -> String {
-    let mut text = format!("task: {name}\nstates:\n");
-    for number in 0..times {
-        text += &format!(
-            "  - s{number}: {{ action: arm/move, pia: true, reads: [], effects: ['increase p0() by 1'], resources: [{{ block: Arm }}], duration: {duration_s} }}\n"
-        );
-    }
-    text
-}
-
-/// Both modes, motions of different lengths: the arm is divided by the shares as long as both want it.
-#[test]
-fn runs_have_the_arm_for_as_long_as_their_shares_say() {
-    let loaded = |text: &str| Arc::new(load(text, "task.yaml", &NoFiles));
-    for (modes, durations, share) in [
-        ([Mode::Cdtn, Mode::Cdtn], [2, 2], 3),
-        ([Mode::Hsm, Mode::Cdtn], [2, 5], 2),
-        ([Mode::Cdtn, Mode::Hsm], [5, 1], 4),
-    ] {
-        let tasks = [moves("large", 120, durations[0]), moves("small", 400, durations[1])];
-        let programs = tasks.each_ref().map(|text| loaded(text));
-        let shared = Shared {
-            resources: setup(load(&tasks[0], "task.yaml", &NoFiles), Mode::Hsm).resources,
-            world: vec![(fact("p0()"), Value::Int(0))],
-            latency: Duration::ZERO,
-            seed: 1,
-        };
-        let runs = [(0, share), (1, 1)].map(|(which, share)| {
-            let (program, mode): (Arc<ratn_model::program::Program>, Mode) = (programs[which].clone(), modes[which]);
-            Together { program, mode, share, begins_s: 0.0, told: Vec::new() }
-        });
-        let mut providers = Providers(|_: &str, _: u32, _: &Goal, _: &World| ("success", Value::Int(1)));
-        let ended = run(&shared, &runs, &mut providers).expect("both end");
-        let mut held_s = [0.0; 2];
-        let mut since = BTreeMap::new();
-        // Until one of them has nothing to do any more.
-        let last = |run| ended.history.iter().rposition(|one| one.run == run && matches!(one.what, What::Granted(..)));
-        let both = last(0).min(last(1)).expect("both move");
-        for one in &ended.history[..both] {
-            match &one.what {
-                What::Granted(lease, _) => drop(since.insert(*lease, one.at_s)),
-                What::GaveBack(lease) => held_s[one.run] += since.remove(lease).map_or(0.0, |since| one.at_s - since),
-                _ => {}
-            }
-        }
-        let ratio = held_s[0] / held_s[1];
-        assert!((ratio / f64::from(share) - 1.0).abs() < 0.15, "{modes:?} {durations:?}: {held_s:?}, for {share} to 1");
-    }
-}
-
-#[test]
-fn the_executive_and_the_pool_mean_the_same_by_what_is_needed_for_certain() {
-    assert_eq!(ratn_executive::protocol::CERTAIN, ratn_resources::NEEDED);
-}
-
 /// Turns its head for 6 s and computes for both of what may come of it meanwhile, which takes 4 s.
 const AHEAD: &str = "task: ahead
 states:
@@ -589,7 +532,7 @@ fn what_one_run_computes_in_case_gives_way_to_what_another_needs() {
         let shared = Shared { resources: resources.clone(), world: Vec::new(), latency, seed: 1 };
         let together = |task: &str, begins_s| {
             let program = Arc::new(loaded(task));
-            Together { program, mode: Mode::Cdtn, share: 1, begins_s, told: Vec::new() }
+            Together { program, mode: Mode::Cdtn, begins_s, told: Vec::new() }
         };
         let runs = [together(AHEAD, 0.0), together(CERTAINLY, 1.0)];
         let mut given = Vec::new();
