@@ -100,7 +100,9 @@ fn overlapped(goods: &[&str], delivered: u64) -> anyhow::Result<()> {
     let statistics = &document["runs"][3]["statistics"];
     let beside = statistics["imprecise"].as_array().context("nothing began beside anything")?;
     let says = |motion: &Value, state: &str| motion.as_str().is_some_and(|path| path.ends_with(state));
-    let leaves = |pair: &Value| says(&pair["younger"], "/move_approach") && says(&pair["older"], "/open");
+    // To the next of the goods, or home from the last.
+    let goes = |motion: &Value| says(motion, "/move_approach") || says(motion, "stow_arm");
+    let leaves = |pair: &Value| goes(&pair["younger"]) && says(&pair["older"], "/open");
     ensure!(beside.iter().any(leaves), "no arm left while its fingers opened: {statistics}");
     let log = std::fs::read_to_string(document["logs"][3].as_str().context("no log")?)?;
     let lines: Vec<Value> = log.lines().map(serde_json::from_str).collect::<Result<_, _>>()?;

@@ -344,7 +344,8 @@ fn pcd(points: &[[f64; 3]]) -> Value {
 
 fn drive(system: &System, id: &str, arm: &[f64], more: &[(&str, Value)]) -> Goal {
     let to = Value::Pose(Pose::at(-2.5, 0.0, 0.0));
-    let inputs = [("goal", to), ("arm", Value::Joints(arm.to_vec()))];
+    let from = Value::Pose(Pose::at(0.0, 0.0, 0.0));
+    let inputs = [("start", from), ("goal", to), ("arm", Value::Joints(arm.to_vec()))];
     Goal { action: "drive".to_owned(), ..system.goal(id, &[&inputs[..], more].concat()) }
 }
 
