@@ -140,7 +140,7 @@ pub fn line(reach: &Reach, start: &JointVector, to: &Pose) -> Result<Vec<JointVe
     through(reach, start, &[*to], 0.0).whole()
 }
 
-/// As [`line`] of the nearest postures alone: each is solved from the one before.
+/// As [`line()`] of the nearest postures alone: each is solved from the one before.
 ///
 /// # Errors
 /// [`LineError`] where limits or a singular posture end the line early.
