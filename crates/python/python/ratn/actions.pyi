@@ -149,6 +149,7 @@ class _Gripper:
         object: str | Value,
         arm: str | Value = ...,
         expected: ratn.Pose | Value = ...,
+        hand: str | Value = ...,
         **annotations: Unpack[Annotations],
     ) -> _GripperGrasp: ...
     def release(
@@ -232,6 +233,7 @@ class _PathPlanner:
         jerk_scale: object = ...,
         keep_axis: Sequence[Any] | Value = ...,
         keep_direction: Sequence[Any] | Value = ...,
+        keep_out: Sequence[Any] | Value = ...,
         keep_rad: float | Value = ...,
         other_arms: Mapping[str, Any] | Value = ...,
         pan: float | Value = ...,
