@@ -142,6 +142,38 @@ def test_what_different_ways_give_is_put_out_by_the_block_around_them() -> None:
         ratn.output()
 
 
+def test_what_is_beside_a_block_and_inside_of_it_keeps_its_order() -> None:
+    @ratn.task
+    def ways(n: int = 1) -> None:
+        first = pan_tilt.look_at(target=TABLE, name="first")
+        with ratn.when(n > 1):
+            again = pan_tilt.look_at(target=TABLE, name="again")
+        pan_tilt.look_at(target=fn.pose(fn.either(again.pan, first.pan, 0), 0, 1), name="newest")
+        pan_tilt.look_at(target=fn.pose(fn.either(first.tilt, again.tilt), 0, 1), name="oldest")
+        last = pan_tilt.look_at(target=fn.pose(fn.either(again.pan, 1), 0, 1), name="last")
+        pan_tilt.look_at(target=fn.pose(fn.either(last.pan, again.pan, first.pan), 0, 1), name="behind")
+
+    _, block, newest, oldest, _, behind = ways.document["states"]
+    assert block["condition"]["outputs"] == {
+        "pan": "either(again.pan, first.pan, 0)",
+        "tilt": "either(first.tilt, again.tilt)",
+        "either_pan": "either(again.pan, 1)",
+        "either_pan_3": "either(again.pan, first.pan)",
+    }
+    assert newest["newest"]["in"]["target"] == "pose(either(condition.pan, first.pan, 0), 0, 1)"
+    assert oldest["oldest"]["in"]["target"] == "pose(either(condition.tilt, first.tilt), 0, 1)"
+    assert behind["behind"]["in"]["target"] == "pose(either(last.pan, condition.either_pan_3, first.pan), 0, 1)"
+
+    def behind_the_block(n: int = 1) -> None:
+        with ratn.when(n > 1):
+            again = pan_tilt.look_at(target=TABLE, name="again")
+        last = pan_tilt.look_at(target=TABLE, name="last")
+        pan_tilt.look_at(target=fn.pose(fn.either(again.pan, last.pan), 0, 1))
+
+    message, _ = refused(behind_the_block)
+    assert "before one from a state behind it" in message
+
+
 def test_nothing_is_collected_outside_of_a_loop() -> None:
     def outside() -> None:
         look = detector.segment(region=REGION)

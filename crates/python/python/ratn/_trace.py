@@ -149,7 +149,10 @@ class Trace:
             del self.open[depth:]
         (port, *_) = _ports(next(way for way, hides in zip(ways, around, strict=True) if hides is not None))
         seen = f"{block.named()}.{block.put_out(text, port.port, f'either_{port.port}')}"
-        return f"either({', '.join([*(str(written(way)) for way in beside), seen])})" if beside else seen
+        # The block may have failed, and that been handled: then the others are looked through beside it.
+        others = [way for at, way in enumerate(ways) if at >= first and around[at] is None]
+        all_ways = [*(str(written(way)) for way in beside), seen, *(str(written(way)) for way in others)]
+        return f"either({', '.join(all_ways)})" if len(all_ways) > 1 else seen
 
     def _is_behind(self, way: object, block: Node) -> bool:
         """Whether a value is of a state beside a block that comes only after it."""
