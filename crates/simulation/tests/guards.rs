@@ -186,3 +186,32 @@ outputs: { n: $n }
         assert!(starts(&run).iter().any(|start| start.ends_with("for_k/before/home")), "{:?}", starts(&run));
     }
 }
+
+#[test]
+fn the_time_for_which_a_region_waits_for_its_turn_counts_for_the_limit_around_it() {
+    let text = |other: &str| {
+        format!(
+            "
+states:
+  - both:
+      timeout: 1.5
+      states:
+        - beside:
+            concurrency: barrier
+            regions:
+              - one: {{ THINK }}
+              - other: {{ {other} }}
+"
+        )
+    };
+    for mode in MODES {
+        // Both block a brain: together they have the most that one of them blocks, which is one.
+        let run = run_with(&text("THINK"), mode, &|_| ("success", Value::Int(5)));
+        let begun = starts(&run);
+        assert_eq!(begun.len(), 2, "{mode:?}: {begun:?}");
+        assert!(begun[0].starts_with("0 ") && begun[1].starts_with("1 "), "{mode:?}: {begun:?}");
+        assert_eq!((run.outcome.as_str(), run.end_s), ("aborted", 1.5), "{mode:?}: {}", run.reason);
+        let run = run_with(&text("TURN"), mode, &|_| ("success", Value::Int(5)));
+        assert_eq!((run.outcome.as_str(), run.end_s), ("success", 1.0), "{mode:?}: {}", run.reason);
+    }
+}

@@ -5,7 +5,7 @@
 //! | what happens | compared |
 //! |---|---|
 //! | the user ends the run when a PIA starts, no regions | both modes end alike: PIAs, changes, world, outcome |
-//! | the same with regions; at any moment; a deadline | of each mode: its PIAs are a closed part of those of HSM mode undisturbed, with the same goals and in its order; its changes are, predicate by predicate, the first of HSM mode's; without regions, they are its first changes in one order; the outcome is `preempted`, or `aborted` at the deadline, or the run had ended before, as ever |
+//! | the same with regions; at any moment; a deadline | of each mode: its PIAs are a closed part of those of HSM mode undisturbed, with the same goals and in its order; its changes are, predicate by predicate (fact by fact where there are regions), the first of HSM mode's; without regions, they are its first changes in one order; the outcome is `preempted`, or `aborted` at the deadline, or the run had ended before, as ever |
 //! | the same of a program with something to do on every way out, or that says what being cut short means | of each mode: there is a place of the program, or one in each region, at which the reference, told to end there, does the same PIAs with the same goals, the same changes, and leaves the same world; with races of regions, the outcome |
 //! | the world changes at any moment | see [`super::outside`] |
 //!

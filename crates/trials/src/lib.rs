@@ -59,6 +59,7 @@ pub use trial::{Conditions, Verdict, execute, no_verdict, trial};
 
 use ratn_model::catalogue::ResourceOffer;
 use ratn_model::expression::{Expr, Function};
+use ratn_model::fact::Change;
 use ratn_model::program::{Program, State, StateKind, WORLD_MODEL};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::value::Value;
@@ -157,6 +158,14 @@ fn around<'a>(program: &'a Program, state: &'a State) -> impl Iterator<Item = &'
 /// Whether the state is, or is inside of, something that the window executes as one node.
 fn is_in_routine(program: &Program, state: &State) -> bool {
     around(program, state).any(State::is_routine)
+}
+
+/// Changes of what goes by the same name are compared in their order: of one fact where there are regions, which have no order and may
+/// change different facts of one predicate, else of one predicate.
+fn compared_as(program: &Program, change: &Change) -> String {
+    let pattern = change.pattern();
+    let has_regions = program.states.iter().any(|state| matches!(state.kind, StateKind::Concurrency { .. }));
+    if has_regions { pattern.to_string() } else { pattern.predicate }
 }
 
 fn is_preemptive(state: &State) -> bool {

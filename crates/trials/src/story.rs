@@ -2,7 +2,7 @@
 //! which changes became real.
 
 use super::anytime::without_cost;
-use super::{around, is_in_routine, is_preemptive, plain, state_of};
+use super::{around, compared_as, is_in_routine, is_preemptive, plain, state_of};
 use ratn_executive::protocol::{Command, Event, Goal, LogEntry, Note};
 use ratn_model::fact::Change;
 use ratn_model::id::InstanceId;
@@ -72,7 +72,7 @@ pub(super) struct Story {
     pub(super) acts: Vec<Act>,
     /// The actions that retired, by path; what is inside of routines is not told.
     pub(super) retired: BTreeMap<String, Vec<Real>>,
-    /// What became real, by predicate.
+    /// What became real, by predicate, or by fact where there are regions.
     pub(super) changes: BTreeMap<String, Vec<Change>>,
     /// PIAs that were discarded, or computed again, after they had started.
     pub(super) undone: Vec<String>,
@@ -172,11 +172,7 @@ pub(super) fn story(program: &Program, run: &Run) -> Story {
             }
             LogEntry::Command(Command::Commit { changes, .. }) => {
                 for change in changes {
-                    let predicate = match change {
-                        Change::Set { fact, .. } | Change::Increase { fact, .. } => &fact.predicate,
-                        Change::Delete { pattern } => &pattern.predicate,
-                    };
-                    story.changes.entry(predicate.clone()).or_default().push(change.clone());
+                    story.changes.entry(compared_as(program, change)).or_default().push(change.clone());
                 }
             }
             LogEntry::Event(

@@ -402,6 +402,18 @@ fn programs_that_once_failed_without_the_assumptions_are_decided_and_final() {
     once_failed(trial, &Features::WEAK, &SEEDS);
 }
 
+/// Regions inside of one node take turns with what they block, and a limit around them counts the time for which one waits.
+#[test]
+fn programs_that_once_failed_because_regions_take_turns_within_a_limit_leave_the_same_world() {
+    once_failed(trial, &Features::WAYS_OUT, &[7_000_000_604, 7_000_000_861]);
+}
+
+/// Two regions changed different facts of one predicate, which has no order.
+#[test]
+fn programs_that_once_failed_because_regions_changed_different_facts_leave_the_same_world() {
+    once_failed(trial, &Features::OUTPUTS, &[9_100_239]);
+}
+
 /// What seed the programs with results that get better begin with.
 const ANYTIME: u64 = 7 << 41;
 

@@ -41,6 +41,7 @@ mod tests;
 pub(super) use compare::{disagreement, end, is_cut, outcomes};
 pub(super) use preconditions::unmet;
 
+use super::compared_as;
 use super::story::Real;
 use evaluate::{Place, Read};
 use facts::Facts;
@@ -84,7 +85,7 @@ pub(super) struct ReferenceResult {
     pub(super) acts: Vec<(String, String)>,
     /// How actions that are in no routine ended, by path.
     pub(super) results: BTreeMap<String, Vec<Real>>,
-    /// What was changed, by predicate.
+    /// What was changed, by predicate, or by fact where there are regions.
     pub(super) changes: BTreeMap<String, Vec<Change>>,
 }
 
@@ -267,7 +268,8 @@ impl Reference<'_> {
     fn change(&mut self, changes: Vec<Change>) -> Result<(), Fail> {
         self.result.facts = effects::applied(&self.result.facts, &changes, self.program.ontology.as_ref())?;
         for change in changes {
-            self.result.changes.entry(change.pattern().predicate).or_default().push(change);
+            let name = compared_as(self.program, &change);
+            self.result.changes.entry(name).or_default().push(change);
         }
         Ok(())
     }

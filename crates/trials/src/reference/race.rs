@@ -30,6 +30,8 @@ type Watch = (Vec<Expr>, Variables);
 pub(super) struct Races {
     /// The seconds since the outermost began.
     now_s: f64,
+    /// It may be so much later: regions inside of one node take turns with what they block, and who is first is not known here.
+    late_s: f64,
     /// When one is decided, and its number; the outermost has the first.
     until: Option<(f64, usize)>,
     /// Of every race.
@@ -41,9 +43,13 @@ pub(super) struct Races {
 }
 
 impl Races {
+    fn latest_s(&self) -> f64 {
+        self.now_s + self.late_s
+    }
+
     /// What was done on the way out took its time, and nothing else of it counts.
     pub(super) fn resume(&mut self, cut: Races) {
-        *self = Races { now_s: self.now_s, ..cut };
+        *self = Races { now_s: self.now_s, late_s: self.late_s, ..cut };
     }
 }
 
@@ -52,6 +58,9 @@ pub(super) struct Beside {
     races: Races,
     is_leaving: bool,
     end_s: f64,
+    late_s: f64,
+    /// What all regions take, one after the other.
+    together_s: f64,
     has_failed: bool,
     cut: Option<Option<Cut>>,
 }
@@ -60,6 +69,8 @@ impl Beside {
     /// A region begins.
     pub(super) fn begin(&mut self, reference: &mut Reference<'_>) {
         self.end_s = self.end_s.max(reference.races.now_s);
+        self.late_s = self.late_s.max(reference.races.late_s);
+        self.together_s += reference.races.latest_s() - self.races.latest_s();
         (reference.races, reference.is_leaving) = (self.races.clone(), self.is_leaving);
     }
 
@@ -75,10 +86,18 @@ impl Beside {
     }
 
     /// All of them have ended.
-    pub(super) fn end(mut self, reference: &mut Reference<'_>, regions: usize) -> Result<(), Fail> {
+    pub(super) fn end(mut self, reference: &mut Reference<'_>, regions: &[StateId]) -> Result<(), Fail> {
         self.begin(reference);
-        reference.races.now_s = self.end_s;
-        if self.cut.is_none() && regions > 1 && reference.is_broken() {
+        (reference.races.now_s, reference.races.late_s) = (self.end_s, self.late_s);
+        if !self.races.watches.is_empty() && reference.take_turns(regions) {
+            let latest_s = self.races.latest_s() + self.together_s;
+            let until = self.races.until.filter(|_| !self.is_leaving);
+            if until.is_some_and(|(until_s, _)| latest_s + CLOSE_S > until_s) {
+                return Err(Fail::NotMine("regions that take turns until a race is decided"));
+            }
+            reference.races.late_s = latest_s - self.end_s;
+        }
+        if self.cut.is_none() && regions.len() > 1 && reference.is_broken() {
             // What made a condition false may have been done while another region went on.
             return Err(Fail::NotMine("regions that are watched"));
         }
@@ -100,6 +119,7 @@ struct Cut {
 struct Region {
     outcome: String,
     end_s: f64,
+    late_s: f64,
     /// What cut it short; `Some(None)` where the run was told to end.
     cut: Option<Option<Cut>>,
     has_failed: bool,
@@ -133,7 +153,11 @@ impl Reference<'_> {
         }
         let end_s = self.races.now_s + seconds;
         if let Some((until_s, race)) = self.races.until.filter(|_| !self.is_leaving) {
-            if (end_s - until_s).abs() < CLOSE_S {
+            let may_end = |end_s: f64| (end_s - until_s).abs() < CLOSE_S;
+            let late_s = self.races.late_s;
+            let may_be_either = late_s > 0.0 && (end_s < until_s) != (end_s + late_s < until_s);
+            let may_not_have_begun = late_s > 0.0 && end_s > until_s && self.races.now_s + late_s + CLOSE_S > until_s;
+            if may_end(end_s) || may_end(end_s + late_s) || may_be_either || may_not_have_begun {
                 return Err(Fail::NotMine("what ends as a race does"));
             }
             if end_s > until_s {
@@ -148,7 +172,7 @@ impl Reference<'_> {
     /// The regions of a concurrency begin here.
     pub(super) fn beside(&self) -> Beside {
         let (races, is_leaving, end_s) = (self.races.clone(), self.is_leaving, self.races.now_s);
-        Beside { races, is_leaving, end_s, has_failed: false, cut: None }
+        Beside { races, is_leaving, end_s, late_s: 0.0, together_s: 0.0, has_failed: false, cut: None }
     }
 
     /// What is under way is cut short because the run is told to end.
@@ -277,6 +301,9 @@ impl Reference<'_> {
             let before = (self.result.clone(), self.outputs.clone(), self.regions.clone());
             let end = self.region(*region, path, &mut variables.clone(), in_routine, &by_itself)?;
             (self.result, self.outputs, self.regions) = before;
+            if end.late_s > outer.late_s {
+                return Err(Fail::NotMine("regions that take turns in a race"));
+            }
             match end.cut {
                 None => ends.push((end.end_s, place, end.outcome)),
                 Some(Some(Cut { watch: None, .. })) => {}
@@ -350,7 +377,8 @@ impl Reference<'_> {
             ended => ended,
         }?;
         let cut = self.is_leaving.then_some(self.races.cut);
-        Ok(Region { outcome, end_s: self.races.now_s, cut, has_failed: self.races.has_failed })
+        let (end_s, late_s) = (self.races.now_s, self.races.late_s);
+        Ok(Region { outcome, end_s, late_s, cut, has_failed: self.races.has_failed })
     }
 
     /// All regions have ended.
@@ -359,7 +387,8 @@ impl Reference<'_> {
         let number = outer.watches.len();
         let is_inner = |region: &Region| region.cut.flatten().is_some_and(|cut| cut.race == number);
         let is_outer = |region: &Region| region.cut.is_some() && !is_inner(region);
-        (self.races, self.is_leaving) = (Races { now_s: end_s, ..outer }, is_leaving);
+        let late_s = regions.iter().fold(outer.late_s, |most, region| most.max(region.late_s));
+        (self.races, self.is_leaving) = (Races { now_s: end_s, late_s, ..outer }, is_leaving);
         if regions.iter().any(is_outer) {
             self.races.has_failed |= regions.iter().any(|region| region.cut.is_some() && region.has_failed);
             return Ok(());
@@ -368,7 +397,7 @@ impl Reference<'_> {
             return Ok(());
         }
         // What is around may be decided, or broken, while this is on its way out.
-        let is_late = !is_leaving && self.races.until.is_some_and(|(until_s, _)| end_s + CLOSE_S > until_s);
+        let is_late = !is_leaving && self.races.until.is_some_and(|(until_s, _)| end_s + late_s + CLOSE_S > until_s);
         if is_late || self.is_broken() {
             return Err(Fail::NotMine("a race that is cut short on its way out"));
         }
@@ -388,6 +417,14 @@ impl Reference<'_> {
                 meets || one.writes_any || other.reads_any && writes
             })
         })
+    }
+
+    /// Whether two of these regions of one node block the same: the node has as much of it as the most that one of them blocks.
+    fn take_turns(&self, regions: &[StateId]) -> bool {
+        let touched: Vec<Touched> = regions.iter().map(|region| self.touched(*region)).collect();
+        let mut pairs =
+            touched.iter().enumerate().flat_map(|(place, one)| touched[..place].iter().map(move |other| (one, other)));
+        pairs.any(|(one, other)| one.works_with.iter().any(|kind| other.works_with.contains(kind)))
     }
 
     fn touched(&self, region: StateId) -> Touched {
@@ -449,7 +486,7 @@ fn within(outer: &Races, is_leaving: bool, until: Option<(f64, usize)>, watch: O
         (Some(own), Some(around)) if around.0 < own.0 => Some(around),
         (own, around) => own.or(around),
     };
-    Races { now_s: outer.now_s, until, watches, cut: None, has_failed: false }
+    Races { now_s: outer.now_s, late_s: outer.late_s, until, watches, cut: None, has_failed: false }
 }
 
 /// What a region assigned is seen outside.

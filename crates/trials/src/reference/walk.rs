@@ -341,7 +341,7 @@ impl Reference<'_> {
             }
             merge(variables, &before, own);
         }
-        beside.end(self, regions.len())?;
+        beside.end(self, regions)?;
         // How a region ended is seen when all have.
         self.regions.extend(outcomes.iter().cloned());
         let outcomes: Vec<String> = outcomes.into_iter().map(|(_, outcome)| outcome).collect();
