@@ -33,10 +33,12 @@ pub mod executive;
 mod hold;
 mod interpreter;
 pub mod lookahead;
+mod overtaken;
 mod plan;
 pub mod protocol;
 mod signals;
 mod way_out;
 mod window;
 
+pub use overtaken::was_overtaken;
 pub use signals::MOST_SIGNALS_KEPT;

@@ -2,21 +2,29 @@
 //!
 //! What one run commits the others are told at once, as a change from outside. Leases and projections come late, at random. That the real system
 //! tells in time is not seen here: who gets a lease there has been told what its last holder committed (`ratn-task-control`).
+//!
+//! The task control of a run may die without a word and be taken up again from its event log (`death`).
+
+mod death;
+
+pub use death::{Death, REFUSED, SESSION_S};
 
 use crate::dice::Dice;
 use crate::run::{Answer, MAX_EVENTS, Oracle, Performance, RunError, offer, shown};
+use death::{Gone, reached};
 use ratn_executive::executive::Executive;
-use ratn_executive::protocol::{CERTAIN, Command, Event, Learned, Mode, Note};
+use ratn_executive::protocol::{CERTAIN, Command, Event, Learned, LogEntry, LogLine, Mode, Note};
 use ratn_model::catalogue::ResourceOffer;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId};
 use ratn_model::program::Program;
+use ratn_model::resource::Requirement;
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use ratn_resources::{AcquireRequest, Limits, Notice, Pool, SessionId, WaiterId};
 use ratn_world::world::World;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -31,6 +39,8 @@ pub struct Together {
     pub begins_s: f64,
     /// What an operator tells it, and so many virtual seconds after the start.
     pub told: Vec<(f64, Event)>,
+    /// Its task control dies.
+    pub dies: Option<Death>,
 }
 
 /// What all of them are on.
@@ -83,7 +93,17 @@ pub enum What {
     Cut(String),
     /// A state's changes are real; the root after them.
     Committed(String, World),
+    /// Its task control has died.
+    Died,
+    /// It was taken up again from its event log.
+    TakenUp {
+        /// What it held was gone.
+        has_lost: bool,
+    },
 }
+
+/// A session lives so long that is kept alive.
+const FOREVER: Duration = Duration::from_secs(10 * 365 * 24 * 3600);
 
 /// Makes the runs.
 ///
@@ -95,7 +115,7 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
     offer(&mut pool, &shared.resources, &BTreeMap::new()).map_err(broken)?;
     let mut root = World::default();
     root.overwrite(shared.world.iter().map(|(fact, value)| (fact.clone(), Some(value.clone()))));
-    let (agenda, next, projections, history) = Default::default();
+    let (agenda, next, projections, history, commits) = Default::default();
     let mut system = System {
         now: Timestamp(0),
         pool,
@@ -107,12 +127,12 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
         dice: Dice(shared.seed),
         runs: Vec::new(),
         history,
+        commits,
         oracle,
     };
     for (number, together) in runs.iter().enumerate() {
         let session = SessionId::from(format!("run-{number}").as_str());
-        let forever = Duration::from_secs(10 * 365 * 24 * 3600);
-        let alive = system.pool.keep_alive(Timestamp(0), &session, "simulation", forever);
+        let alive = system.pool.keep_alive(Timestamp(0), &session, "simulation", FOREVER);
         alive.map_err(|error| broken(error.to_string()))?;
         system.runs.push(One {
             executive: Executive::new(together.program.clone(), Tolerance::ROBOT),
@@ -120,8 +140,15 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
             waiters: BTreeMap::new(),
             leases: BTreeMap::new(),
             paths: BTreeMap::new(),
+            program: together.program.clone(),
             has_begun: false,
             end: None,
+            log: Vec::new(),
+            asked: BTreeMap::new(),
+            heard: BTreeSet::new(),
+            lost: BTreeSet::new(),
+            death: together.dies,
+            gone: None,
         });
         system.at(number, Duration::from_secs_f64(together.begins_s.max(0.0)), Due::Begin);
         for (at_s, event) in &together.told {
@@ -136,6 +163,8 @@ pub fn run(shared: &Shared, runs: &[Together], oracle: &mut dyn Oracle) -> Resul
 enum Due {
     Begin,
     Event(Box<Event>),
+    SessionEnds,
+    TakenUp,
 }
 
 /// One run.
@@ -145,8 +174,18 @@ struct One {
     waiters: BTreeMap<InstanceId, WaiterId>,
     leases: BTreeMap<LeaseId, InstanceId>,
     paths: BTreeMap<InstanceId, String>,
+    program: Arc<Program>,
     has_begun: bool,
     end: Option<(String, String)>,
+    log: Vec<LogLine>,
+    /// What it has asked for and not heard of.
+    asked: BTreeMap<InstanceId, (Vec<Requirement>, i64)>,
+    /// Grants that it has heard of.
+    heard: BTreeSet<LeaseId>,
+    /// What went with its session.
+    lost: BTreeSet<LeaseId>,
+    death: Option<Death>,
+    gone: Option<Gone>,
 }
 
 struct System<'a> {
@@ -161,6 +200,8 @@ struct System<'a> {
     dice: Dice,
     runs: Vec<One>,
     history: Vec<Happened>,
+    /// Which run has changed which facts, one commit after the other.
+    commits: Vec<(usize, Vec<FactKey>)>,
     oracle: &'a mut dyn Oracle,
 }
 
@@ -194,7 +235,15 @@ impl System<'_> {
             };
             self.now = now;
             let event = match due {
-                Due::Begin => Event::Started {
+                Due::SessionEnds => {
+                    self.session_ends(run);
+                    None
+                }
+                Due::TakenUp => {
+                    self.is_taken_up(run)?;
+                    None
+                }
+                Due::Begin => Some(Event::Started {
                     task: runs[run].program.name.clone(),
                     digest: runs[run].program.digest.clone(),
                     mode: runs[run].mode,
@@ -206,19 +255,23 @@ impl System<'_> {
                     learned: Learned::default(),
                     breakpoints: Box::default(),
                     origin: Box::default(),
-                },
-                Due::Event(event) => match *event {
-                    // Word of what was given back meanwhile is none.
-                    Event::Granted { instance, lease } if self.runs[run].leases.get(&lease.id) != Some(&instance) => {
-                        continue;
+                }),
+                Due::Event(event) => match (*event, &mut self.runs[run]) {
+                    (event, One { gone: Some(gone), .. }) => {
+                        gone.keep(now, event);
+                        None
                     }
-                    event => event,
+                    // Word of what was given back meanwhile is none.
+                    (Event::Granted { instance, lease }, one) if one.leases.get(&lease.id) != Some(&instance) => None,
+                    (event, _) => Some(event),
                 },
             };
-            if let Event::Finished { instance, .. } | Event::Crashed { instance, .. } = &event {
-                self.happened(run, What::Ended(self.path(run, *instance)));
+            if let Some(event) = event {
+                if let Event::Finished { instance, .. } | Event::Crashed { instance, .. } = &event {
+                    self.happened(run, What::Ended(self.path(run, *instance)));
+                }
+                self.tell(run, event)?;
             }
-            self.tell(run, event)?;
             if let Some(ends) = self.runs.iter().map(|run| run.end.clone()).collect::<Option<Vec<_>>>() {
                 return Ok(AllEnded { outcomes: ends, world: self.root, history: self.history });
             }
@@ -226,13 +279,54 @@ impl System<'_> {
         Err(RunError::Endless(MAX_EVENTS))
     }
 
-    /// Tells a run, performs what comes of it, and tells the others of each revision that it makes.
+    /// Tells a run, and performs what comes of it, if its task control does not die meanwhile.
     fn tell(&mut self, run: usize, event: Event) -> Result<(), RunError> {
         self.runs[run].has_begun |= matches!(event, Event::Started { .. });
-        if self.runs[run].end.is_some() || !self.runs[run].has_begun {
+        let one = &self.runs[run];
+        if one.end.is_some() || !one.has_begun || one.gone.is_some() {
             return Ok(());
         }
-        let commands = self.runs[run].executive.handle(self.now, event);
+        if let Event::Granted { instance, lease } = &event {
+            self.runs[run].asked.remove(instance);
+            self.runs[run].heard.insert(lease.id);
+        }
+        let mut commands = self.decide(run, event);
+        let ends = commands.iter().any(|command| matches!(command, Command::End { .. }));
+        let now_s = self.now.seconds();
+        let death = self.runs[run].death.take_if(|death| death.at_s <= now_s && !ends);
+        let (written, performed) = reached(death.as_ref(), commands.len());
+        let log = &mut self.runs[run].log;
+        log.truncate(log.len() - (commands.len() - written));
+        commands.truncate(written);
+        let unperformed = commands.split_off(performed);
+        self.perform_all(run, commands)?;
+        if let Some(death) = death {
+            return self.dies(run, death, unperformed);
+        }
+        let mirror = self.runs[run].executive.root();
+        let is_root = || {
+            mirror
+                .iter()
+                .map(|(key, fact)| (key, &fact.value))
+                .eq(self.root.iter().map(|(key, fact)| (key, &fact.value)))
+        };
+        if self.runs[run].end.is_none() && self.runs[run].gone.is_none() && !is_root() {
+            return Err(self.broken(format!("the mirror of run {run} is not the root")));
+        }
+        self.runs[run].executive.check_invariants().map_err(|problem| self.broken(problem))
+    }
+
+    /// What a run says to an event; both are in its log.
+    fn decide(&mut self, run: usize, event: Event) -> Vec<Command> {
+        let (at, one) = (self.now, &mut self.runs[run]);
+        let commands = one.executive.handle(at, event.clone());
+        let said = commands.iter().map(|command| LogEntry::Command(command.clone()));
+        one.log.extend(std::iter::once(LogEntry::Event(event)).chain(said).map(|entry| LogLine { at, entry }));
+        commands
+    }
+
+    /// Performs what a run has said, and tells the others of each revision that it makes.
+    fn perform_all(&mut self, run: usize, commands: Vec<Command>) -> Result<(), RunError> {
         let mut told = Vec::new();
         for command in commands {
             let before = self.root.clone();
@@ -244,6 +338,7 @@ impl System<'_> {
                     .map(|(key, fact)| (key.clone(), Some(fact.value.clone())))
                     .chain(gone.map(|(key, _)| (key.clone(), None)))
                     .collect();
+                self.commits.push((run, facts.iter().map(|(key, _)| key.clone()).collect()));
                 self.happened(run, What::Committed(self.path(run, *instance), self.root.clone()));
                 told.push(Event::WorldChanged { revision: self.root.revision(), facts });
             } else {
@@ -255,17 +350,7 @@ impl System<'_> {
                 self.tell(other, event.clone())?;
             }
         }
-        let mirror = self.runs[run].executive.root();
-        let is_root = || {
-            mirror
-                .iter()
-                .map(|(key, fact)| (key, &fact.value))
-                .eq(self.root.iter().map(|(key, fact)| (key, &fact.value)))
-        };
-        if self.runs[run].end.is_none() && !is_root() {
-            return Err(self.broken(format!("the mirror of run {run} is not the root")));
-        }
-        self.runs[run].executive.check_invariants().map_err(|problem| self.broken(problem))
+        Ok(())
     }
 
     fn perform(&mut self, run: usize, command: Command) -> Result<(), RunError> {
@@ -273,6 +358,7 @@ impl System<'_> {
             Command::Note(Note::Expanded { instance, path, .. }) => drop(self.runs[run].paths.insert(instance, path)),
             Command::Note(_) | Command::Commit { .. } | Command::Operate { .. } => {}
             Command::Acquire { instance, requirements, priority } => {
+                self.runs[run].asked.insert(instance, (requirements.clone(), priority));
                 let request = AcquireRequest::new(self.runs[run].session.clone(), requirements).priority(priority);
                 let waiter = self.pool.acquire(self.now, request).map_err(|error| self.broken(error))?;
                 self.runs[run].waiters.insert(instance, waiter);
@@ -282,6 +368,7 @@ impl System<'_> {
                 }
             }
             Command::Withdraw { instance } => {
+                self.runs[run].asked.remove(&instance);
                 if let Some(waiter) = self.runs[run].waiters.remove(&instance) {
                     self.pool.cancel(self.now, waiter).map_err(|error| self.broken(error))?;
                 } else if let Some(lease) =
@@ -298,6 +385,13 @@ impl System<'_> {
                 self.projections.insert(projection, shown(world, &reads));
                 let late = self.late();
                 self.at(run, late, Due::Event(Box::new(Event::Projected { instance, attempt, projection })));
+            }
+            // Its provider performs nothing under a lease that has ended.
+            Command::Start { instance, attempt, goal }
+                if goal.lease.as_ref().is_some_and(|lease| self.runs[run].lost.contains(&lease.id)) =>
+            {
+                let reason = "its lease has ended".to_owned();
+                self.at(run, Duration::ZERO, Due::Event(Box::new(Event::Crashed { instance, attempt, reason })));
             }
             Command::Start { instance, attempt, goal } => {
                 self.happened(run, What::Began(self.path(run, instance)));
@@ -325,13 +419,13 @@ impl System<'_> {
                             | Event::Projected { instance, attempt, .. } => Some((*instance, *attempt)),
                             _ => None,
                         },
-                        Due::Begin => None,
+                        Due::Begin | Due::SessionEnds | Due::TakenUp => None,
                     };
                     *of != run || of_what != Some((instance, attempt))
                 });
             }
             Command::Release { lease, .. } => {
-                if let Some(lease) = lease {
+                if let Some(lease) = lease.filter(|lease| !self.runs[run].lost.contains(lease)) {
                     self.give_back(run, lease)?;
                 }
                 self.answers();

@@ -11,7 +11,7 @@ use ratn_executive::protocol::{Event, Goal, Mode};
 use ratn_model::value::Value;
 use ratn_simulation::dice::Dice;
 use ratn_simulation::run::{Answer, Oracle, Performance};
-use ratn_simulation::several::{AllEnded, Shared, Together, What, run};
+use ratn_simulation::several::{AllEnded, Death, REFUSED, SESSION_S, Shared, Together, What, run};
 use ratn_world::world::World;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -133,6 +133,17 @@ struct Place {
     chosen: Option<bool>,
     moving: Option<&'static str>,
     computed: i64,
+    /// Its task control has died, or will not.
+    has_died: bool,
+    /// The resource of what it moves went with its session.
+    is_loose: bool,
+}
+
+/// The run whose task control dies and loses what it held, and whether it was refused when it was taken up again.
+#[derive(Debug, Clone, Copy)]
+struct Died {
+    run: usize,
+    is_refused: bool,
 }
 
 fn apply(facts: &mut Facts, effect: &Effect, computed: i64) {
@@ -172,15 +183,40 @@ fn next(steps: &[Step], place: &Place, facts: &Facts, other: Option<&'static str
         Some(_) if crashes => {}
         Some(_) => apply(&mut facts, &motion.effect, place.computed),
     }
-    (place.moving, place.chosen) = (None, None);
+    (place.moving, place.chosen, place.is_loose) = (None, None, false);
     place.step += 1;
     Some((place, facts))
 }
 
-/// The worlds that all interleavings leave; the second program may be told to end anywhere, where that is so.
-fn interleaved(programs: &[Vec<Step>; 2], facts: Facts, is_cut: bool) -> BTreeSet<Facts> {
-    let begin = Place { step: 0, chosen: None, moving: None, computed: 0 };
-    let mut open = vec![([begin.clone(), begin], facts)];
+/// What may become of a program whose task control dies where it moves, or is about to: what moves is cut short and changes nothing, or goes
+/// on to its end, which is made when the run is taken up again. Its resource is free meanwhile. A run that is refused then has ended there.
+fn after_death(steps: &[Step], place: &Place, is_refused: bool) -> Vec<Place> {
+    let is_motion = match steps.get(place.step) {
+        Some(Step::Move(..)) => true,
+        Some(Step::Choose(..)) => place.chosen.is_some(),
+        Some(Step::Think(..)) | None => false,
+    };
+    if place.has_died || !is_motion {
+        return Vec::new();
+    }
+    let died = Place { moving: None, chosen: None, has_died: true, ..place.clone() };
+    if is_refused {
+        return Vec::from_iter(place.moving.is_some().then_some(Place { step: steps.len(), ..died }));
+    }
+    // What follows a choice that fails is nothing.
+    let step = if matches!(steps[place.step], Step::Choose(..)) { steps.len() } else { place.step + 1 };
+    let goes_on = place.moving.map(|_| Place { has_died: true, is_loose: true, ..place.clone() });
+    std::iter::once(Place { step, ..died }).chain(goes_on).collect()
+}
+
+/// The worlds that all interleavings leave; the second program may be told to end anywhere, where that is so, and the task control of one may
+/// die once.
+fn interleaved(programs: &[Vec<Step>; 2], facts: Facts, is_cut: bool, died: Option<Died>) -> BTreeSet<Facts> {
+    let begin = |run: usize| {
+        let has_died = died.is_none_or(|died| died.run != run);
+        Place { step: 0, chosen: None, moving: None, computed: 0, has_died, is_loose: false }
+    };
+    let mut open = vec![([begin(0), begin(1)], facts)];
     let (mut seen, mut ends) = (BTreeSet::new(), BTreeSet::new());
     while let Some((places, facts)) = open.pop() {
         if !seen.insert((places.clone(), facts.clone())) {
@@ -192,8 +228,16 @@ fn interleaved(programs: &[Vec<Step>; 2], facts: Facts, is_cut: bool) -> BTreeSe
             open.push(([places[0].clone(), second], facts.clone()));
         }
         let mut is_end = true;
+        if let Some(Died { run, is_refused }) = died {
+            for place in after_death(&programs[run], &places[run], is_refused) {
+                let mut places = places.clone();
+                places[run] = place;
+                open.push((places, facts.clone()));
+            }
+            is_end = !is_refused || places[run].has_died;
+        }
         for which in 0..2 {
-            let other = places[1 - which].moving;
+            let other = places[1 - which].moving.filter(|_| !places[1 - which].is_loose);
             if let Some((place, after)) = next(&programs[which], &places[which], &facts, other) {
                 let mut places = places.clone();
                 places[which] = place;
@@ -299,6 +343,8 @@ impl Judge<'_> {
 
     fn see(&mut self, run: usize, what: &What) -> Result<(), String> {
         match what {
+            // Judged by the interleavings.
+            What::Died | What::TakenUp { .. } => {}
             What::Granted(lease, resources) => {
                 for resource in resources {
                     if let Some(other) = self.held.insert(resource.clone(), (run, *lease)) {
@@ -420,12 +466,13 @@ struct Pair {
     programs: [Vec<Step>; 2],
     ended: AllEnded,
     is_cut: bool,
+    died: Option<Died>,
     begin: Facts,
     about: String,
 }
 
-/// A pair of so many facts and steps, within about so many seconds.
-fn pair(seed: u64, facts: u64, steps: Option<u64>, lasts_s: u64) -> Pair {
+/// A pair of so many facts and steps, within about so many seconds. The task control of one dies, where that is said.
+fn pair(seed: u64, facts: u64, steps: Option<u64>, lasts_s: u64, dies: bool) -> Pair {
     let dice = &mut Dice(seed);
     let programs = [program(dice, facts, steps), program(dice, facts, steps)];
     let modes: [Mode; 2] = [MODES[dice.below(2) as usize], MODES[dice.below(2) as usize]];
@@ -444,32 +491,55 @@ fn pair(seed: u64, facts: u64, steps: Option<u64>, lasts_s: u64) -> Pair {
     let pauses = vec![(pause_s, Event::PauseRequested), (resume_s, Event::ResumeRequested)];
     let (pauses, is_cut) = (if dice.below(2) == 0 { pauses } else { Vec::new() }, dice.below(4) == 0);
     let abort = (abort_s, Event::AbortRequested { reason: "it is enough".to_owned(), at_once: false });
+    let (dying, death) = (usize::try_from(dice.below(2)).unwrap_or_default(), death(dice, lasts_s));
+    let dies_as = |run: usize| Some(death).filter(|_| dies && run == dying);
     let runs = [
-        Together { program: Arc::new(loaded(&tasks[0])), mode: modes[0], begins_s: 0.0, told: pauses },
+        Together {
+            program: Arc::new(loaded(&tasks[0])),
+            mode: modes[0],
+            begins_s: 0.0,
+            told: pauses,
+            dies: dies_as(0),
+        },
         Together {
             program: Arc::new(loaded(&tasks[1])),
             mode: modes[1],
             begins_s,
             told: Vec::from_iter(is_cut.then_some(abort)),
+            dies: dies_as(1),
         },
     ];
     let mut workers = Workers(&programs);
-    let about = format!("seed {seed}, {modes:?}\n{}\n{}", tasks[0], tasks[1]);
+    let deaths = [dies_as(0), dies_as(1)];
+    let about = format!("seed {seed}, {modes:?}, {deaths:?}, cut {is_cut}\n{}\n{}", tasks[0], tasks[1]);
     let ended = run(&shared, &runs, &mut workers).unwrap_or_else(|error| panic!("{error}\n{about}"));
+    let lost = ended.history.iter().find(|happened| happened.what == What::TakenUp { has_lost: true });
+    let died = lost.map(|lost| Died { run: lost.run, is_refused: ended.outcomes[lost.run].0 == REFUSED });
     let is_well = |(number, (outcome, _)): (usize, &(String, String))| {
-        outcome == "success" || number == 1 && is_cut && outcome == "preempted"
+        outcome == "success"
+            || number == 1 && is_cut && outcome == "preempted"
+            || died.is_some_and(|died| died.run == number) && (outcome == "aborted" || outcome == REFUSED)
     };
     assert!(ended.outcomes.iter().enumerate().all(is_well), "{:?}\n{about}", ended.outcomes);
-    Pair { programs, ended, is_cut, begin, about }
+    Pair { programs, ended, is_cut, died, begin, about }
+}
+
+/// At any moment, before or after what it has decided was written down and done, and for a moment or for longer than its session lives.
+fn death(dice: &mut Dice, lasts_s: u64) -> Death {
+    let mut some = |most: u64| usize::try_from(dice.below(most)).unwrap_or_default();
+    let (written, performed) = (if some(4) == 0 { some(6) } else { usize::MAX }, some(8));
+    let mut seconds = |most: f64| dice.below(1000) as f64 / 1000.0 * most;
+    let (at_s, away_s) = (seconds(lasts_s as f64), seconds(5.0 * SESSION_S));
+    Death { at_s, written, performed, away_s }
 }
 
 /// How many different worlds the pairs of these seeds could have left, and how many pairs could have left more than one.
 fn try_pairs(seeds: std::ops::Range<u64>) -> (usize, usize) {
     let (mut worlds, mut open) = (0, 0);
     for seed in seeds {
-        let Pair { programs, ended, is_cut, begin, about } = pair(seed, FACTS, None, 12);
+        let Pair { programs, ended, is_cut, begin, about, .. } = pair(seed, FACTS, None, 12, false);
         let left = numbers(&ended.world, FACTS);
-        let possible = interleaved(&programs, begin, is_cut);
+        let possible = interleaved(&programs, begin, is_cut, None);
         assert!(possible.contains(&left), "{left:?} is none of {possible:?}\n{about}");
         worlds += possible.len();
         open += usize::from(possible.len() > 1);
@@ -485,6 +555,36 @@ fn two_runs_leave_a_world_that_some_interleaving_of_their_sequential_programs_le
     assert!(open as u64 > count / 2, "the pairs hardly meet: {open} of them have several ends, {worlds} worlds in all");
 }
 
+/// One of the two dies without a word, and is taken up again from its event log while the other goes on. Where its session lived on, that has
+/// left no trace; else one motion of it may have ended `aborted`, or after its resource was free, or the run is refused.
+///
+/// `RATN_DEATHS=3000 RATN_FIRST=1000 cargo test -p ratn-simulation --test several dies` tries other pairs.
+#[test]
+fn a_run_that_dies_beside_another_leaves_a_world_that_some_interleaving_leaves() {
+    let given = |name: &str, usual| std::env::var(name).map_or(usual, |number| number.parse().expect("a number"));
+    let (first, count) = (given("RATN_FIRST", 0), given("RATN_DEATHS", 400));
+    let (mut lost, mut kept, mut refused, mut otherwise) = (0, 0, 0, Vec::new());
+    for seed in first..first + count {
+        let Pair { programs, ended, is_cut, died, begin, about } = pair(seed, FACTS, None, 12, true);
+        let left = numbers(&ended.world, FACTS);
+        let possible = interleaved(&programs, begin, is_cut, died);
+        if !possible.contains(&left) {
+            otherwise.push(format!("{left:?} is none of {possible:?}, {:?}\n{about}", ended.outcomes));
+        }
+        kept += usize::from(ended.history.iter().any(|it| it.what == What::TakenUp { has_lost: false }));
+        lost += usize::from(died.is_some());
+        refused += usize::from(died.is_some_and(|died| died.is_refused));
+    }
+    println!("{lost} lost their session, {kept} did not, {refused} were refused");
+    assert!(
+        otherwise.is_empty(),
+        "{} pairs:\n{}",
+        otherwise.len(),
+        otherwise.iter().take(5).cloned().collect::<String>()
+    );
+    assert!(count < 100 || lost as u64 * 5 > count && kept as u64 * 20 > count, "{lost} lost, {kept} kept");
+}
+
 /// Programs that are too large for all interleavings, event by event: see [`Judge`].
 ///
 /// `RATN_LARGE=5000 RATN_FIRST=1000 cargo test -p ratn-simulation --test several large` tries other pairs.
@@ -494,7 +594,7 @@ fn two_large_runs_do_what_their_programs_say_in_the_worlds_that_they_meet() {
     let (first, count) = (given("RATN_FIRST", 0), given("RATN_LARGE", 60));
     let mut motions = 0;
     for seed in first..first + count {
-        let Pair { programs, ended, is_cut, begin, about } = pair(seed, 8, Some(30), 60);
+        let Pair { programs, ended, is_cut, begin, about, .. } = pair(seed, 8, Some(30), 60, false);
         let runs = [(); 2].map(|()| Seen { worlds: vec![begin.clone()], ..Seen::default() });
         let judge = Judge { programs: &programs, facts: begin, runs, held: BTreeMap::new() };
         motions += judge.all(&ended, is_cut).unwrap_or_else(|problem| panic!("{problem}\n{about}"));
@@ -532,7 +632,7 @@ fn what_one_run_computes_in_case_gives_way_to_what_another_needs() {
         let shared = Shared { resources: resources.clone(), world: Vec::new(), latency, seed: 1 };
         let together = |task: &str, begins_s| {
             let program = Arc::new(loaded(task));
-            Together { program, mode: Mode::Cdtn, begins_s, told: Vec::new() }
+            Together { program, mode: Mode::Cdtn, begins_s, told: Vec::new(), dies: None }
         };
         let runs = [together(AHEAD, 0.0), together(CERTAINLY, 1.0)];
         let mut given = Vec::new();

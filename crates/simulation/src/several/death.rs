@@ -1,0 +1,232 @@
+//! A task control that dies without a word among the others, and is taken up again from its event log.
+//!
+//! ```text
+//! dies ─► its goals go on for 3 s, then they stop ─► its session ends after 3 s, and with it its leases ─► it is taken up again
+//!   └─ of the commands of its last event some are written down, and some of these performed
+//! ```
+//!
+//! It comes back as `ratn run --resume` does (`ratn-task-control`): its log is replayed, what it had decided to commit is committed or
+//! refused, what it had asked for is asked for again, of each goal it hears what became of it, and then what others have changed.
+
+use super::{Due, System, What};
+use crate::run::RunError;
+use ratn_executive::executive::Executive;
+use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
+use ratn_executive::was_overtaken;
+use ratn_model::fact::FactKey;
+use ratn_model::program::Program;
+use ratn_model::time::Timestamp;
+use ratn_model::tolerance::Tolerance;
+use ratn_model::value::Value;
+use std::cmp::Reverse;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// A session lives so long without its client, and a goal goes on so long without a listener.
+pub const SESSION_S: f64 = 3.0;
+
+/// The outcome of a run that is refused when it comes back.
+pub const REFUSED: &str = "refused";
+
+/// When a task control dies, and when it is taken up again.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Death {
+    /// With the first event from this virtual second on.
+    pub at_s: f64,
+    /// So many of the commands of that event are written down, as far as there are …
+    pub written: usize,
+    /// … and so many performed, if all are written; else none.
+    pub performed: usize,
+    /// So many virtual seconds later it is taken up again.
+    pub away_s: f64,
+}
+
+/// A run without its task control.
+pub(super) struct Gone {
+    since: Timestamp,
+    /// Written down and not performed.
+    unperformed: Vec<Command>,
+    /// What it has not heard of.
+    kept: Vec<Event>,
+    has_lost: bool,
+    /// So many commits there were of all runs.
+    commits: usize,
+}
+
+impl Gone {
+    /// What would have been told to task control.
+    pub(super) fn keep(&mut self, now: Timestamp, event: Event) {
+        match event {
+            // A grant that nobody has heard of goes back; who has to give way is nobody.
+            Event::Granted { .. } | Event::WantedByOthers { .. } | Event::WorldChanged { .. } => {}
+            event => self.kept.push(self.as_it_ended(now, event)),
+        }
+    }
+
+    /// A goal that would have gone on longer than anybody let it was stopped.
+    fn as_it_ended(&self, at: Timestamp, event: Event) -> Event {
+        match event {
+            Event::Finished { instance, attempt, .. } | Event::Crashed { instance, attempt, .. }
+                if at.since(self.since) >= Duration::from_secs_f64(SESSION_S) =>
+            {
+                Event::Crashed { instance, attempt, reason: "it was stopped while task control was gone".to_owned() }
+            }
+            event => event,
+        }
+    }
+}
+
+/// How many of so many commands a task control writes down and performs before it dies.
+pub(super) fn reached(death: Option<&Death>, commands: usize) -> (usize, usize) {
+    let Some(death) = death else { return (commands, commands) };
+    let written = death.written.min(commands);
+    (written, if written < commands { 0 } else { death.performed.min(commands) })
+}
+
+impl System<'_> {
+    pub(super) fn dies(&mut self, run: usize, death: Death, unperformed: Vec<Command>) -> Result<(), RunError> {
+        self.happened(run, What::Died);
+        let session = self.runs[run].session.clone();
+        let lives = Duration::from_secs_f64(SESSION_S);
+        self.pool.keep_alive(self.now, &session, "simulation", lives).map_err(|error| self.broken(error))?;
+        self.at(run, lives, Due::SessionEnds);
+        self.at(run, Duration::from_secs_f64(death.away_s.max(0.0)), Due::TakenUp);
+        let commits = self.commits.len();
+        self.runs[run].gone = Some(Gone { since: self.now, unperformed, kept: Vec::new(), has_lost: false, commits });
+        Ok(())
+    }
+
+    /// Its session has not been kept alive: what it holds and has asked for is gone.
+    pub(super) fn session_ends(&mut self, run: usize) {
+        let one = &mut self.runs[run];
+        let Some(gone) = &mut one.gone else { return };
+        gone.has_lost = true;
+        one.waiters.clear();
+        let leases = std::mem::take(&mut one.leases);
+        one.lost.extend(leases.keys());
+        leases.into_keys().for_each(|lease| self.happened(run, What::GaveBack(lease)));
+        self.pool.advance(self.now);
+        self.answers();
+    }
+
+    pub(super) fn is_taken_up(&mut self, run: usize) -> Result<(), RunError> {
+        let Some(gone) = self.runs[run].gone.take() else { return Ok(()) };
+        self.happened(run, What::TakenUp { has_lost: gone.has_lost });
+        let (executive, missing) =
+            replayed(&self.runs[run].program, &self.runs[run].log).map_err(|e| self.broken(e))?;
+        self.runs[run].executive = executive;
+        let decided = gone.unperformed.iter().chain(&missing);
+        let (commits, others): (Vec<Command>, Vec<Command>) =
+            decided.cloned().partition(|command| matches!(command, Command::Commit { .. }));
+        if gone.has_lost
+            && let Some(key) = self.overtaken(run, &commits, gone.commits)
+        {
+            self.agenda.retain(|_, (of, _)| *of != run);
+            let reason = format!("others have changed {key} since the run lost its resources");
+            self.runs[run].end = Some((REFUSED.to_owned(), reason));
+            return Ok(());
+        }
+        let session = self.runs[run].session.clone();
+        self.pool.keep_alive(self.now, &session, "simulation", super::FOREVER).map_err(|error| self.broken(error))?;
+        self.perform_all(run, commits)?;
+        self.hears_again(run, gone)?;
+        self.asks_again(run)?;
+        let log = &mut self.runs[run].log;
+        log.extend(missing.into_iter().map(|command| LogLine { at: self.now, entry: LogEntry::Command(command) }));
+        let commands = self.decide(run, Event::Resumed);
+        self.perform_all(run, others)?;
+        self.perform_all(run, commands)?;
+        let facts = self.differences(run);
+        if self.runs[run].end.is_none() && !facts.is_empty() {
+            self.tell(run, Event::WorldChanged { revision: self.root.revision(), facts })?;
+        }
+        Ok(())
+    }
+
+    /// The first fact that another run has changed meanwhile, and that a commit that is not made yet changes or is made of. Task control
+    /// (`performer/resume.rs`) refuses only what is overwritten.
+    fn overtaken(&self, run: usize, commits: &[Command], since: usize) -> Option<FactKey> {
+        let by_others = self.commits[since..].iter().filter(|(by, _)| *by != run).flat_map(|(_, keys)| keys);
+        let is_meant = |key: &&FactKey| {
+            commits.iter().any(|command| match command {
+                Command::Commit { writer, changes, .. } => {
+                    was_overtaken(&self.runs[run].program, writer, changes, key)
+                }
+                _ => false,
+            })
+        };
+        by_others.clone().find(is_meant).cloned()
+    }
+
+    /// What became of its goals while nobody listened, and what else came.
+    fn hears_again(&mut self, run: usize, gone: Gone) -> Result<(), RunError> {
+        let mut kept = Vec::new();
+        let is_over = self.now.since(gone.since) >= Duration::from_secs_f64(SESSION_S);
+        self.agenda.retain(|_, (of, due)| match due {
+            Due::Event(event)
+                if *of == run && is_over && matches!(**event, Event::Finished { .. } | Event::Crashed { .. }) =>
+            {
+                kept.push((**event).clone());
+                false
+            }
+            _ => true,
+        });
+        let kept: Vec<Event> = kept.into_iter().map(|event| gone.as_it_ended(self.now, event)).collect();
+        for event in gone.kept.into_iter().chain(kept) {
+            self.at(run, Duration::ZERO, Due::Event(Box::new(event)));
+        }
+        Ok(())
+    }
+
+    /// What it does not know to hold goes back, and what it waits for it asks for anew.
+    fn asks_again(&mut self, run: usize) -> Result<(), RunError> {
+        let one = &mut self.runs[run];
+        let waiters = std::mem::take(&mut one.waiters);
+        let unheard: Vec<_> = one.leases.keys().filter(|lease| !one.heard.contains(lease)).copied().collect();
+        for waiter in waiters.into_values() {
+            self.pool.cancel(self.now, waiter).map_err(|error| self.broken(error))?;
+        }
+        for lease in unheard {
+            self.give_back(run, lease)?;
+        }
+        self.answers();
+        let mut asked: Vec<_> = std::mem::take(&mut self.runs[run].asked).into_iter().collect();
+        asked.sort_by_key(|(instance, (_, priority))| (Reverse(*priority), *instance));
+        for (instance, (requirements, priority)) in asked {
+            self.perform(run, Command::Acquire { instance, requirements, priority })?;
+        }
+        Ok(())
+    }
+
+    /// What is otherwise in the root than the run believes.
+    fn differences(&self, run: usize) -> Vec<(FactKey, Option<Value>)> {
+        let mirror = self.runs[run].executive.root();
+        let written = self.root.iter().filter(|(key, fact)| mirror.get(key) != Some(&fact.value));
+        let gone = mirror.iter().filter(|(key, _)| self.root.get(key).is_none());
+        let written = written.map(|(key, fact)| (key.clone(), Some(fact.value.clone())));
+        written.chain(gone.map(|(key, _)| (key.clone(), None))).collect()
+    }
+}
+
+/// The executive that stands where the log ends, and what the log lacks of what it said last.
+fn replayed(program: &Arc<Program>, log: &[LogLine]) -> Result<(Executive, Vec<Command>), String> {
+    let mut executive = Executive::new(program.clone(), Tolerance::ROBOT);
+    let mut said: std::collections::VecDeque<Command> = Default::default();
+    for line in log {
+        match &line.entry {
+            LogEntry::Event(event) => {
+                if let Some(more) = said.front() {
+                    return Err(format!("taken up again, it says {more:?}, which it had not said"));
+                }
+                said = executive.handle(line.at, event.clone()).into();
+            }
+            LogEntry::Command(command) => {
+                let again = said.pop_front();
+                if again.as_ref() != Some(command) {
+                    return Err(format!("taken up again, it says {again:?} instead of {command:?}"));
+                }
+            }
+        }
+    }
+    Ok((executive, said.into()))
+}
