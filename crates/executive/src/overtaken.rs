@@ -12,6 +12,5 @@ pub fn was_overtaken(program: &Program, writer: &str, changes: &[Change], key: &
     let state = program.states.iter().find(|state| state.path == path);
     let effects = state.into_iter().flat_map(|state| state.annotations.effects.values());
     let mut looked_up = effects.flat_map(|effects| EffectExpr::fact_expressions(effects));
-    changes.iter().any(|change| change.pattern().matches(key))
-        || looked_up.any(|fact| fact.predicate == key.predicate)
+    changes.iter().any(|change| change.pattern().matches(key)) || looked_up.any(|fact| fact.predicate == key.predicate)
 }

@@ -149,9 +149,7 @@ impl System<'_> {
         let by_others = self.commits[since..].iter().filter(|(by, _)| *by != run).flat_map(|(_, keys)| keys);
         let is_meant = |key: &&FactKey| {
             commits.iter().any(|command| match command {
-                Command::Commit { writer, changes, .. } => {
-                    was_overtaken(&self.runs[run].program, writer, changes, key)
-                }
+                Command::Commit { writer, changes, .. } => was_overtaken(&self.runs[run].program, writer, changes, key),
                 _ => false,
             })
         };
