@@ -18,6 +18,9 @@ const KEPT: usize = 256;
 /// session wait for more at a time (`waiters_per_session`).
 const KEPT_WITHDRAWN: usize = 4096;
 
+/// So many of the leases that the run was about to give back last are kept: older ones are back.
+const KEPT_RETURNED: usize = 256;
+
 /// So many goals that were told to stop are kept: more have not ended at a time, as each has a few seconds for that.
 const KEPT_STOPPED: usize = 64;
 
@@ -40,6 +43,8 @@ pub(super) struct Ledger {
     pub(super) withdrawn: Vec<String>,
     /// Leases that were granted and not given back, with what they consumed beside.
     pub(super) held: BTreeSet<LeaseId>,
+    /// The last leases that were to go back. Whether they have is not known.
+    pub(super) returned: Vec<LeaseId>,
     /// What acquires, and operations that were forgotten, have used up for the rest of the run.
     pub(super) consumed: Vec<Requirement>,
     /// Projections that were asked for.
@@ -142,7 +147,12 @@ impl Ledger {
                     asked.named = Some(*projection);
                 }
             }
-            Event::Finished { instance, attempt, .. } | Event::Crashed { instance, attempt, .. } => {
+            // What is called so may go on, and is told to stop then.
+            Event::Crashed { instance, attempt, .. } => {
+                self.stops(*instance, *attempt);
+                self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt);
+            }
+            Event::Finished { instance, attempt, .. } => {
                 self.goals.retain(|id, goal| id != instance || goal.0 != *attempt);
                 self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt);
             }
@@ -162,6 +172,9 @@ impl Ledger {
             }
             Command::Withdraw { instance } => {
                 self.withdrawn.extend(self.waiting.remove(instance).map(|asked| asked.request));
+                if self.withdrawn.len() >= 2 * KEPT_WITHDRAWN {
+                    self.withdrawn.drain(..KEPT_WITHDRAWN);
+                }
             }
             Command::Project { instance, attempt, base, changes, writers, reads, lease, first } => {
                 let (attempt, base, changes, writers) = (*attempt, *base, changes.clone(), writers.clone());
@@ -173,18 +186,15 @@ impl Ledger {
                 self.goals.insert(*instance, (*attempt, (**goal).clone()));
             }
             Command::Cancel { instance, attempt } => {
-                let is_meant = self.goals.get(instance).is_some_and(|goal| goal.0 == *attempt);
-                if let Some((_, goal)) = is_meant.then(|| self.goals.remove(instance)).flatten() {
-                    self.stopped.push((*instance, *attempt, goal));
-                    self.stopped.drain(..self.stopped.len().saturating_sub(KEPT_STOPPED));
-                }
+                self.stops(*instance, *attempt);
                 self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt);
             }
             Command::Release { instance, lease, projection } => {
                 self.projecting
                     .retain(|id, asked| id != instance || asked.named.is_none() || asked.named != *projection);
-                if let Some(lease) = lease {
-                    self.held.remove(lease);
+                if let Some(lease) = lease.filter(|lease| self.held.remove(lease)) {
+                    self.returned.push(lease);
+                    self.returned.drain(..self.returned.len().saturating_sub(KEPT_RETURNED));
                 }
             }
             Command::Commit { instance, writer, changes, evidence, revision } => {
@@ -201,6 +211,15 @@ impl Ledger {
             }
             Command::End { outcome, .. } => self.ended = Some(outcome.clone()),
             Command::Note(_) => {}
+        }
+    }
+
+    /// A goal is told to stop.
+    fn stops(&mut self, instance: InstanceId, attempt: u32) {
+        let is_meant = self.goals.get(&instance).is_some_and(|goal| goal.0 == attempt);
+        if let Some((_, goal)) = is_meant.then(|| self.goals.remove(&instance)).flatten() {
+            self.stopped.push((instance, attempt, goal));
+            self.stopped.drain(..self.stopped.len().saturating_sub(KEPT_STOPPED));
         }
     }
 
@@ -318,6 +337,7 @@ mod tests {
         assert_eq!(ledger.waiting[&three].request, acquire_request("r", three, 3, 1));
         ledger.command(&Command::Release { instance: one, lease: Some(LeaseId(7)), projection: None });
         assert!(ledger.held.is_empty());
+        assert_eq!(ledger.returned, [LeaseId(7)]);
         assert_eq!(ledger.withdrawn, [acquire_request("r", two, 2, 0), acquire_request("r", three, 3, 0)]);
     }
 
@@ -341,6 +361,8 @@ mod tests {
         assert_eq!(ledger.goals.len(), 1);
         ledger.event(Timestamp(1), &Event::Crashed { instance, attempt: 2, reason: String::new() });
         assert!(ledger.goals.is_empty());
+        // It may go on all the same, if its projection could not be made: whoever comes back tells it to stop.
+        assert_eq!(ledger.stopped.iter().map(|(_, attempt, _)| *attempt).collect::<Vec<_>>(), [2]);
     }
 
     #[test]

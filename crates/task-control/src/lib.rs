@@ -14,6 +14,7 @@ mod alarm;
 mod background_runtime;
 pub mod checkpoint;
 pub mod control;
+mod decided;
 pub mod history;
 mod interrupt;
 pub mod learn;

@@ -2,6 +2,7 @@
 //! creation and deletion of task resources. One task; what changes something is one request at a time, and projections of what a commit makes are
 //! asked for while that is on its way.
 
+use super::decided::{Unanswered, Undone, insist};
 use super::ledger::{Confirmed, Projecting, operation_request};
 use super::performer::Answer;
 use super::promises::{Made, Promises};
@@ -210,10 +211,9 @@ impl Recorder {
             if recorded.is_ok() {
                 self.confirm(confirms);
             }
-            if let Some(event) = event
-                && self.events.send(event.into()).await.is_err()
-            {
-                return;
+            // Where nobody hears of events any more, the run has ended and is told of the first failure by a flush.
+            if let Some(event) = event {
+                let _ = self.events.send(event.into()).await;
             }
             // Nobody is granted anything behind an operation before it is heard that this has failed.
             drop(behind);
@@ -258,23 +258,15 @@ impl Recorder {
         if let Some(refused) = unsafe_on_disk(instance, safe).await {
             return Some(refused);
         }
-        let mut trust = self.trust.clone();
-        if !trust.is_kept().await {
-            let reason = "its effects are not recorded: the run's session was lost before, and whoever had its resources since may have \
-                changed the same"
-                .to_owned();
-            return Some(Event::RetirementFailed { instance, reason });
-        }
-        match commit_next(&self.world, self.root.get(), commit).await {
+        let reason = match commit_next(&self.world, &self.trust, self.root.get(), commit).await {
             Ok(revision) => {
                 self.root.reached(revision);
-                None
+                return None;
             }
-            Err(error) => Some(Event::RetirementFailed {
-                instance,
-                reason: format!("the world pool did not take its effects: {}", said(&error)),
-            }),
-        }
+            Err(lost @ Undone::Lost) => format!("its effects are not recorded: {lost}"),
+            Err(failed) => format!("the world pool did not take its effects: {failed}"),
+        };
+        Some(Event::RetirementFailed { instance, reason })
     }
 
     async fn operate(
@@ -292,8 +284,8 @@ impl Recorder {
         }
         for (index, operation) in operations.into_iter().enumerate() {
             let request = operation_request(&self.run, instance, number, index);
-            if let Err(error) = operate_once(&self.resources, &request, &operation).await {
-                let reason = format!("`{operation}` was not done: {}", said(&error));
+            if let Err(undone) = operate_once(&self.resources, &self.trust, &request, &operation).await {
+                let reason = format!("`{operation}` was not done: {undone}");
                 return Some(Event::RetirementFailed { instance, reason });
             }
         }
@@ -400,37 +392,41 @@ fn confirms(record: &Record) -> Confirmed {
     }
 }
 
-/// Commits on top of whatever others have committed; the pool's root with it. `known` is a revision that the pool has had: one that
-/// has lost it takes nothing.
+/// Commits on top of whatever others have committed, while the run has what it had; the pool's root with it. `known` is a revision that the
+/// pool has had: one that has lost it takes nothing. What others committed before the run is asked whether it has what it had, they committed while
+/// the run held what its commit is about; so that is asked behind the reading of the root and before the commit.
 pub(super) async fn commit_next(
     world: &WorldClient,
+    trust: &Trust,
     mut known: Revision,
     mut commit: Commit,
-) -> Result<Revision, CallError> {
+) -> Result<Revision, Undone> {
     let mut attempts = MAX_OVERTAKEN;
     loop {
         commit.revision = Some(Revision(known.0 + 1));
-        match retry_unanswered(|| world.commit_as(commit.clone())).await {
+        match insist(trust, Unanswered::GivenUp, || world.commit_as(commit.clone())).await {
             Ok((revision, _)) => return Ok(revision),
-            Err(error) if error.code() == Some(tonic::Code::FailedPrecondition) && attempts > 0 => {
+            Err(Undone::Failed(error)) if error.code() == Some(tonic::Code::FailedPrecondition) && attempts > 0 => {
                 attempts -= 1;
-                let (_, root) = retry_unanswered(|| world.diff(known, None, &[])).await?;
+                let (_, root) = insist(trust, Unanswered::GivenUp, || world.diff(known, None, &[])).await?;
                 if root == known {
-                    return Err(error);
+                    return Err(Undone::Failed(error));
                 }
                 known = root;
             }
-            Err(error) => return Err(error),
+            Err(undone) => return Err(undone),
         }
     }
 }
 
-/// Creates, deletes or consumes, once however often it is asked for under this request id.
+/// Creates, deletes or consumes, once however often it is asked for under this request id; a resource manager that is away is waited for as long as
+/// the run's session may live.
 pub(super) async fn operate_once(
     resources: &ResourceClient,
+    trust: &Trust,
     request: &str,
     operation: &Requirement,
-) -> Result<(), CallError> {
+) -> Result<(), Undone> {
     let ask = async || match operation.operation {
         ResourceOperation::Create => {
             let class = operation.class.unwrap_or(ResourceClass::Task);
@@ -444,7 +440,7 @@ pub(super) async fn operate_once(
         // The executive gives these to an acquire.
         ResourceOperation::Block | ResourceOperation::Exists => Ok(()),
     };
-    retry_unanswered(ask).await
+    insist(trust, Unanswered::Waits, ask).await
 }
 
 /// An error with its sources in one line.

@@ -275,6 +275,11 @@ impl Shell {
         let spans = self.spans.take();
         self.performer.begin_no_more();
         self.all_is_safe().await;
+        // What is granted to one that was withdrawn goes back, also if that is heard only now.
+        self.answers.close();
+        while let Ok(answer) = self.answers.try_recv() {
+            self.performer.accept(answer, self.executive.root());
+        }
         let closed = self.performer.close().await;
         Spans::end(spans).await;
         match (ended, closed) {

@@ -261,6 +261,11 @@ impl Trust {
         }
         self.state.borrow().generation <= 1
     }
+
+    /// Returns once it is gone for good, as [`Session::gone`] does.
+    pub async fn gone(&self) {
+        gone(self.state.clone(), self.ttl).await;
+    }
 }
 
 /// As [`Session::gone`].

@@ -1,21 +1,28 @@
 //! What a run has asked for and has no answer to, and each acquire's way: from asking the resource manager to the event of its answer, or
 //! of the lease that another node of the run has handed over meanwhile.
 
-use super::{Answer, LONG_BESIDE_OTHERS, OVERDUE, Whom};
+use super::{Answer, LONG_BESIDE_OTHERS, OVERDUE, Whom, Withdrawal};
+use crate::decided::{Unanswered, insist};
 use crate::performer::told::Told;
 use crate::record::said;
 use ratn_executive::protocol::{CERTAIN, Event};
-use ratn_model::id::InstanceId;
+use ratn_model::id::{InstanceId, LeaseId};
 use ratn_model::resource::{Lease, Requirement};
 use ratn_proto::v1::HolderNote;
+use ratn_worker::client::retry_until_answered;
 use ratn_worker::client::{AcquireOptions, CallError, ResourceClient};
-use ratn_worker::client::{retry_unanswered, retry_until_answered};
+use ratn_worker::session::Trust;
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
+use tokio::sync::mpsc::error::SendError;
 use tokio::sync::{mpsc, oneshot};
-use tokio_util::sync::CancellationToken;
+use tokio_util::sync::{CancellationToken, DropGuard};
+
+/// A resource manager that refuses an acquire for load, as some bound is reached, is asked again for so long.
+const LOAD_PATIENCE: Duration = Duration::from_secs(30);
 
 /// An acquire under way.
 #[derive(Debug)]
@@ -27,6 +34,8 @@ pub(super) struct Asking {
     pub(super) requirements: Vec<Requirement>,
     pub(super) since: Instant,
     pub(super) withdrawn: CancellationToken,
+    /// Is cancelled when nothing of it is on its way any more: also what was granted although it is withdrawn has gone back.
+    pub(super) over: CancellationToken,
     /// Takes a lease in place of the manager's answer; `None` once it has one.
     pub(super) hand: Option<oneshot::Sender<Lease>>,
 }
@@ -41,7 +50,8 @@ impl Asking {
         let (hand, handed) = oneshot::channel();
         let (since, withdrawn) = (Instant::now(), CancellationToken::new());
         let request = format!("r/{number}");
-        (Asking { request, number, priority, requirements, since, withdrawn, hand: Some(hand) }, handed)
+        let over = CancellationToken::new();
+        (Asking { request, number, priority, requirements, since, withdrawn, over, hand: Some(hand) }, handed)
     }
 }
 
@@ -99,7 +109,6 @@ pub(super) fn late_request(request: &str) -> String {
 /// One acquire's way.
 pub(super) struct Acquiring {
     pub(super) instance: InstanceId,
-    pub(super) run: String,
     pub(super) requirements: Vec<Requirement>,
     pub(super) options: AcquireOptions,
     /// So long its instance has waited before, with other priorities.
@@ -109,8 +118,11 @@ pub(super) struct Acquiring {
     pub(super) withdrawn: CancellationToken,
     pub(super) handed: oneshot::Receiver<Lease>,
     pub(super) resources: ResourceClient,
+    pub(super) trust: Trust,
     pub(super) told: Told,
     pub(super) whom: Whom,
+    /// Tells [`Asking::over`] when the last of it is dropped.
+    pub(super) over: Arc<DropGuard>,
 }
 
 enum Got {
@@ -127,12 +139,13 @@ impl Acquiring {
             self.tell(Event::Granted { instance: self.instance, lease }, &events).await;
             return;
         }
-        for operation in &self.after {
-            tokio::select! {
-                biased;
-                () = self.withdrawn.cancelled() => return,
-                () = operation.cancelled() => {}
+        if !self.operations_are_done().await {
+            // It has not asked yet. What was handed to it before it was withdrawn goes back.
+            self.handed.close();
+            if let Ok(lease) = self.handed.try_recv() {
+                self.tell(Event::Granted { instance: self.instance, lease }, &events).await;
             }
+            return;
         }
         let unheard = AtomicBool::new(false);
         let got = self.got(&unheard).await;
@@ -165,9 +178,34 @@ impl Acquiring {
         self.tell(event, &events).await;
     }
 
+    /// Waits for the operations that it comes behind; false where it is withdrawn before they are done.
+    async fn operations_are_done(&self) -> bool {
+        for operation in &self.after {
+            tokio::select! {
+                biased;
+                () = self.withdrawn.cancelled() => return false,
+                () = operation.cancelled() => {}
+            }
+        }
+        true
+    }
+
     async fn tell(&self, event: Event, events: &mpsc::Sender<Answer>) {
-        let withdrawn = Some(self.withdrawn.clone());
-        let _ = events.send(Answer::Event { event: Box::new(event), withdrawn }).await;
+        let withdrawn = Some(Withdrawal { token: self.withdrawn.clone(), over: Arc::clone(&self.over) });
+        let sent = events.send(Answer::Event { event: Box::new(event), withdrawn }).await;
+        // The run has ended, and may be about to delete what was granted.
+        if let Err(SendError(Answer::Event { event, .. })) = sent
+            && let Event::Granted { lease, .. } = *event
+        {
+            self.give_back(lease.id).await;
+        }
+    }
+
+    async fn give_back(&self, lease: LeaseId) {
+        let release = || self.resources.release(lease);
+        if let Err(undone) = insist(&self.trust, Unanswered::Waits, release).await {
+            tracing::warn!(instance = %self.instance, "a lease that is not used was not given back: {undone}");
+        }
     }
 
     async fn got(&mut self, unheard: &AtomicBool) -> Got {
@@ -185,7 +223,7 @@ impl Acquiring {
                 Ok(lease) = &mut self.handed, if !self.handed.is_terminated() => return Got::Handed(lease),
                 () = self.withdrawn.cancelled() => return Got::Nothing,
                 // A manager that does not answer is waited for until the run gives its session up ([`super::Performer::lost`]).
-                answer = retry_until_answered(ask) => return Got::Answer(answer),
+                answer = retry_until_answered(LOAD_PATIENCE, ask) => return Got::Answer(answer),
                 // Others are not let pass any more.
                 () = self.told.others_after(late), if may_be_late => {}
             }
@@ -194,7 +232,7 @@ impl Acquiring {
                 Ok(lease) = &mut self.handed, if !self.handed.is_terminated() => return Got::Handed(lease),
                 () = self.withdrawn.cancelled() => return Got::Nothing,
                 // What is asked for twice would be had twice.
-                withdrawn = retry_until_answered(|| self.resources.withdraw(&self.options.request)) => drop(withdrawn),
+                () = withdraw(&self.resources, &self.trust, &self.options.request) => {}
             }
             // Another request: a manager that was started again has not heard of the first, and refuses what was withdrawn before it came.
             self.options.request = late_request(&self.options.request);
@@ -204,7 +242,7 @@ impl Acquiring {
 
     /// The call is dropped; what was granted meanwhile goes back.
     async fn withdraw(&self) {
-        let _ = retry_unanswered(|| self.resources.withdraw(&self.options.request)).await;
+        withdraw(&self.resources, &self.trust, &self.options.request).await;
     }
 
     /// What an answer of the resource manager is to the executive, once the run has been told what whoever had the resources before left.
@@ -213,16 +251,33 @@ impl Acquiring {
         let instance = self.instance;
         let (lease, notes) = match answer {
             Ok(granted) => granted,
-            Err(error) => return Some(Event::Refused { instance, reason: said(&error) }),
+            Err(error) => return Some(Event::Refused { instance, reason: refused(&error) }),
         };
         let event = tokio::select! {
-            told = self.told.until(&self.run, &notes, &self.whom) => match told {
+            told = self.told.until(&notes, &self.whom) => match told {
                 Ok(()) => return Some(Event::Granted { instance, lease }),
                 Err(reason) => Some(Event::Refused { instance, reason }),
             },
             () = self.withdrawn.cancelled() => None,
         };
-        let _ = retry_unanswered(|| self.resources.release(lease.id)).await;
+        self.give_back(lease.id).await;
         event
+    }
+}
+
+async fn withdraw(resources: &ResourceClient, trust: &Trust, request: &str) {
+    if let Err(undone) = insist(trust, Unanswered::Waits, || resources.withdraw(request)).await {
+        tracing::warn!(request, "an acquire was not withdrawn: {undone}");
+    }
+}
+
+/// Why nothing was granted; the bound that was reached is in the resource manager's words, with its name.
+fn refused(error: &CallError) -> String {
+    let reason = said(error);
+    match (error.is_crash(), error.again_after()) {
+        (false, Some(_)) => {
+            format!("{reason} ({}; it was asked again for {} s)", error.reason(), LOAD_PATIENCE.as_secs())
+        }
+        _ => reason,
     }
 }

@@ -489,7 +489,7 @@ mod tests {
                 outputs: Vec::new(),
                 safe: None,
                 over: CancellationToken::new(),
-                told: Told::new(),
+                told: Told::new("run"),
                 goal: Goal {
                     id: format!("run/1/{action}"),
                     action: action.to_owned(),

@@ -16,10 +16,11 @@ mod watch;
 
 pub(super) use resume::{check_world, remembers};
 
+use super::decided::{Unanswered, insist};
 use super::ledger::{Confirmed, Projecting, acquire_request};
 use super::outside::Outside;
 use super::promises::{Making, Promises};
-use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Named, Record, Recorded, Recorder, Root, said};
+use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Named, Record, Recorded, Recorder, Root};
 use super::shell::{Place, Urgency};
 use crate::background_runtime::BackgroundRuntime;
 use crate::messages::Messages;
@@ -43,7 +44,7 @@ use ratn_otlp::ids;
 use ratn_proto::types::{self, ENDPOINT_ATTRIBUTE, WorldChange};
 use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
-use ratn_worker::session::{DEFAULT_TTL, Session};
+use ratn_worker::session::{DEFAULT_TTL, Session, Trust};
 use ratn_worker::trace::{self, TraceContext};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
@@ -52,7 +53,7 @@ use std::time::{Duration, Instant};
 use stopping::Stopping;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::{JoinHandle, JoinSet};
-use tokio_util::sync::CancellationToken;
+use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::AbortOnDropHandle;
 use told::Told;
 use wanted::HoldsSpeculatively;
@@ -69,8 +70,11 @@ const LONG: Duration = Duration::from_secs(30);
 const LONG_BESIDE_OTHERS: Duration = Duration::from_secs(2);
 /// The priority with which it asks then; nobody else does.
 const OVERDUE: i64 = i64::MAX;
-/// At the end of a run, for everything that is still being given back.
+/// At the end of a run, for everything that is still being recorded or given back.
 const CLOSE_DEADLINE: Duration = Duration::from_secs(3);
+/// At the end of a run, for the leases that have to be back before something is used up or deleted: for longer than a resource manager that is away
+/// is waited for.
+const RETURN_DEADLINE: Duration = Duration::from_secs(15);
 
 /// A holder's name has so many characters at the most, half of it the task's: the resource manager takes 128 unless told otherwise.
 const MAX_HOLDER: usize = 120;
@@ -85,9 +89,9 @@ fn holder(task: &str, path: &str) -> String {
     }
 }
 
-async fn end_projection(world: &WorldClient, instance: InstanceId, projection: ProjectionId) {
-    if let Err(error) = retry_unanswered(|| world.release(projection)).await {
-        tracing::warn!(%instance, "a projection was not given back: {}", said(&error));
+async fn end_projection(world: &WorldClient, trust: &Trust, instance: InstanceId, projection: ProjectionId) {
+    if let Err(undone) = insist(trust, Unanswered::GivenUp, || world.release(projection)).await {
+        tracing::warn!(%instance, "a projection was not given back: {undone}");
     }
 }
 
@@ -123,12 +127,21 @@ pub(super) enum Answer {
     Event {
         event: Box<Event>,
         /// Of an acquire: whether it was withdrawn meanwhile.
-        withdrawn: Option<CancellationToken>,
+        withdrawn: Option<Withdrawal>,
     },
     /// A revision of the root: the run's own, or another's.
     World(WorldChange),
     /// Another run waits for what these leases hold, and needs it for certain.
     Wanted(Vec<LeaseId>),
+}
+
+/// What the answer of an acquire knows of its withdrawal.
+#[derive(Debug)]
+pub(super) struct Withdrawal {
+    /// Cancelled when it is withdrawn.
+    token: CancellationToken,
+    /// Is held until what was granted all the same has gone back.
+    over: Arc<DropGuard>,
 }
 
 impl From<Event> for Answer {
@@ -151,12 +164,16 @@ pub(super) struct Performer {
     channels: Channels,
     world: WorldClient,
     session: Session,
+    /// Whether the run has what it had.
+    trust: Trust,
     /// Where the session is kept alive, whatever this thread does.
     _background: BackgroundRuntime,
     /// Look for other runs, and for what they need.
     _others: [AbortOnDropHandle<()>; 2],
     events: mpsc::Sender<Answer>,
     records: mpsc::Sender<Record>,
+    /// Performs these.
+    recorder: AbortOnDropHandle<()>,
     /// How far the pool's root is known.
     root: Root,
     outside: Outside,
@@ -224,7 +241,7 @@ impl Performer {
         let session = background.enter(open);
         session.alive(SESSION_DEADLINE).await?;
         let resources = ResourceClient::new(&channels, manager, session.id())?;
-        let told = Told::new();
+        let told = Told::new(&run);
         let others = claim::look_for_others(resources.clone(), run.clone(), told.clone());
         let others = AbortOnDropHandle::new(tokio::spawn(others));
         match claim(&resources, &run, task, place.alone).await {
@@ -245,7 +262,7 @@ impl Performer {
         let listening = AbortOnDropHandle::new(tokio::spawn(listening));
         let (records, work) = mpsc::channel(MAX_PENDING_RECORDS);
         let (cancelled, recorded) = (Cancelled::default(), Recorded::default());
-        let (promises, root) = (Promises::default(), Root::default());
+        let (promises, root, trust) = (Promises::default(), Root::default(), session.trust());
         let recorder = Recorder {
             run: run.clone(),
             world: world.clone(),
@@ -253,13 +270,13 @@ impl Performer {
             cancelled: cancelled.clone(),
             done: recorded.clone(),
             events: events.clone(),
-            trust: session.trust(),
+            trust: trust.clone(),
             trace,
             root: root.clone(),
             promises: promises.clone(),
         };
         tracing::debug!(run, trace = %trace.trace_id(), "calls of this run are of one trace");
-        tokio::spawn(trace::within(trace, recorder.work(work)));
+        let recorder = AbortOnDropHandle::new(tokio::spawn(trace::within(trace, recorder.work(work))));
         Ok(Performer {
             run,
             task: task.to_owned(),
@@ -272,10 +289,12 @@ impl Performer {
             channels,
             world,
             session,
+            trust,
             _background: background,
             _others: [others, listening],
             events,
             records,
+            recorder,
             root,
             outside: Outside::default(),
             told,
@@ -378,6 +397,7 @@ impl Performer {
             }
             Command::Withdraw { instance } => {
                 if let Some(asking) = self.asking.remove(instance) {
+                    self.order.returning.add(asking.over);
                     asking.withdrawn.cancel();
                 }
             }
@@ -427,16 +447,37 @@ impl Performer {
             self.records.send(Record::Flush(done)).await.map_err(|_| "the recorder is gone".to_owned())?;
             recorded.await.unwrap_or_else(|_| Err("the recorder is gone".to_owned()))
         };
-        let recorded = tokio::time::timeout(CLOSE_DEADLINE, recording).await;
+        // An operation waits for the leases that go back before it, and these perhaps for a resource manager that is away.
+        let returning = if self.order.operating.is_empty() { Vec::new() } else { self.order.returning.all() };
+        let in_time = async {
+            let returned = async {
+                for lease in &returning {
+                    lease.cancelled().await;
+                }
+            };
+            tokio::select! {
+                () = returned => {}
+                () = self.session.gone() => {}
+                () = tokio::time::sleep(RETURN_DEADLINE) => {}
+            }
+            tokio::time::sleep(CLOSE_DEADLINE).await;
+        };
+        let recorded = tokio::select! {
+            recorded = recording => Some(recorded),
+            () = in_time => None,
+        };
         let giving_back = async { while self.giving_back.join_next().await.is_some() {} };
         if tokio::time::timeout(CLOSE_DEADLINE, giving_back).await.is_err() {
             tracing::warn!("what was left at the end of the run was not given back in time");
         }
+        // Whoever gets the resources now changes the world; what was not recorded in time never is.
+        self.recorder.abort();
+        let _ = self.recorder.await;
         self.session.close().await;
         match recorded {
-            Ok(Ok(())) => Ok(()),
-            Ok(Err(reason)) => bail!("what the run did is not all recorded: {reason}"),
-            Err(_) => bail!("what the run did is not all recorded: the world pool has not answered in time"),
+            Some(Ok(())) => Ok(()),
+            Some(Err(reason)) => bail!("what the run did is not all recorded: {reason}"),
+            None => bail!("what the run did is not all recorded: the world pool has not answered in time"),
         }
     }
 
@@ -472,7 +513,8 @@ impl Performer {
     }
 
     fn acquire(&mut self, instance: InstanceId, number: u64, requirements: Vec<Requirement>, priority: i64) {
-        let withdrawn = CancellationToken::new();
+        let (withdrawn, over) = (CancellationToken::new(), CancellationToken::new());
+        let ends = Arc::new(over.clone().drop_guard());
         let (hand, handed) = oneshot::channel();
         let request = acquire_request(&self.run, instance, number, self.resumptions);
         let since = Instant::now();
@@ -485,13 +527,12 @@ impl Performer {
         };
         let asked = requirements.iter().map(|one| self.of_performers(one.clone())).collect();
         let (hand, withdrawal) = (Some(hand), withdrawn.clone());
-        self.asking.insert(instance, Asking { request, number, priority, requirements, since, withdrawn, hand });
+        self.asking.insert(instance, Asking { request, number, priority, requirements, since, withdrawn, over, hand });
         if let Some(handover) = self.handover.as_ref().filter(|one| one.to == instance && !one.waits) {
             let _ = self.asking.hand(instance, &handover.lease);
         }
         let acquiring = Acquiring {
             instance,
-            run: self.run.clone(),
             requirements: asked,
             options,
             waited,
@@ -499,6 +540,8 @@ impl Performer {
             withdrawn: withdrawal,
             handed,
             resources: self.resources.clone(),
+            trust: self.trust.clone(),
+            over: ends,
             told: self.told.clone(),
             whom: Whom { resources: self.resources.clone(), world: self.world.clone(), told: self.told.clone() },
         };
@@ -541,7 +584,7 @@ impl Performer {
     /// The event of an answer; `None` when what it answers was withdrawn or cancelled: what crossed with that goes back.
     pub(super) fn accept(&mut self, answer: Answer, mirror: &World) -> Option<Event> {
         let (event, withdrawn) = match answer {
-            Answer::Event { event, withdrawn } => (*event, withdrawn.is_some_and(|token| token.is_cancelled())),
+            Answer::Event { event, withdrawn } => (*event, withdrawn.filter(|one| one.token.is_cancelled())),
             Answer::World(change) => {
                 self.root.reached(change.revision);
                 if told::maker(&change.commit).is_some_and(|(run, _)| run != self.run) {
@@ -556,13 +599,13 @@ impl Performer {
             }
         };
         match event {
-            Event::Granted { instance, lease } if withdrawn => {
-                self.give_back(instance, Some(lease.id), None);
+            Event::Granted { instance, lease } if let Some(Withdrawal { over, .. }) = &withdrawn => {
+                self.give_back(instance, Some(lease.id), None, Some(Arc::clone(over)));
                 None
             }
-            _ if withdrawn => None,
+            _ if withdrawn.is_some() => None,
             Event::Projected { instance, attempt, projection } if self.was_cancelled(instance, attempt) => {
-                self.give_back(instance, None, Some(projection));
+                self.give_back(instance, None, Some(projection), None);
                 None
             }
             Event::Crashed { instance, attempt, .. } if self.was_cancelled(instance, attempt) => None,
@@ -700,11 +743,17 @@ impl Performer {
         self.jobs = going_on;
         ended.values().for_each(|job| self.stopping.leave(job));
         let idle = ended.into_values().map(|job| job.over).collect();
-        self.give_back_when(safe, instance, idle, lease, projection);
+        self.give_back_when(safe, instance, idle, lease, projection, None);
     }
 
-    fn give_back(&mut self, instance: InstanceId, lease: Option<LeaseId>, projection: Option<ProjectionId>) {
-        self.give_back_when(None, instance, Vec::new(), lease, projection);
+    fn give_back(
+        &mut self,
+        instance: InstanceId,
+        lease: Option<LeaseId>,
+        projection: Option<ProjectionId>,
+        withdrawn: Option<Arc<DropGuard>>,
+    ) {
+        self.give_back_when(None, instance, Vec::new(), lease, projection, withdrawn);
     }
 
     fn give_back_when(
@@ -714,15 +763,16 @@ impl Performer {
         mut idle: Vec<CancellationToken>,
         lease: Option<LeaseId>,
         projection: Option<ProjectionId>,
+        withdrawn: Option<Arc<DropGuard>>,
     ) {
         if let Some(lease) = lease {
             self.leases.given_back(lease);
             self.holds.set(self.leases.has_speculative());
         }
-        let (resources, world) = (self.resources.clone(), self.world.clone());
+        let (resources, world, trust) = (self.resources.clone(), self.world.clone(), self.trust.clone());
         idle.extend(lease.into_iter().flat_map(|lease| self.stopping.under(lease)));
         let returns = lease.map(|_| self.order.returning.begin());
-        let note = self.told.left(&self.run, self.decided).to_string();
+        let note = self.told.left(self.decided).to_string();
         let (there, coming) = match projection.map(|id| (id, self.making.end(id))) {
             Some((id, None)) => (Some(id), None),
             Some((id, Some(coming))) => (None, Some((id, coming))),
@@ -738,19 +788,21 @@ impl Performer {
                 safe.safe().await;
             }
             if let Some(projection) = there {
-                end_projection(&world, instance, projection).await;
+                end_projection(&world, &trust, instance, projection).await;
             }
-            if let Some(lease) = lease
-                && let Err(error) = retry_unanswered(|| resources.release_with_note(lease, note.clone())).await
-            {
-                tracing::warn!(%instance, "a lease was not given back: {}", said(&error));
+            if let Some(lease) = lease {
+                let release = || resources.release_with_note(lease, note.clone());
+                // A resource manager that is away holds it until it is told: it is waited for as long as the session may live.
+                if let Err(undone) = insist(&trust, Unanswered::Waits, release).await {
+                    tracing::warn!(%instance, "a lease was not given back: {undone}");
+                }
             }
-            drop(returns);
+            drop((returns, withdrawn));
             // The lease is not kept until it is there.
             if let Some((projection, coming)) = coming
                 && coming.await.is_ok()
             {
-                end_projection(&world, instance, projection).await;
+                end_projection(&world, &trust, instance, projection).await;
             }
         };
         self.giving_back.spawn(trace::within(self.of(instance), returning));

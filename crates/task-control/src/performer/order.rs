@@ -21,6 +21,11 @@ impl OnTheWay {
         over.drop_guard()
     }
 
+    /// What this token stands for is one of them, until it is cancelled.
+    pub(super) fn add(&mut self, over: CancellationToken) {
+        self.0.push(over);
+    }
+
     /// Each token is cancelled when its call is over.
     pub(super) fn all(&mut self) -> Vec<CancellationToken> {
         self.0.retain(|over| !over.is_cancelled());
@@ -36,7 +41,7 @@ impl OnTheWay {
 /// Where a run's operations stand among its leases.
 #[derive(Debug, Default)]
 pub(super) struct Operations {
-    /// Leases that go back.
+    /// Leases that go back, and acquires that are withdrawn: what was granted to these meanwhile goes back, too.
     pub(super) returning: OnTheWay,
     /// Operations.
     pub(super) operating: OnTheWay,

@@ -7,11 +7,13 @@
 use super::Performer;
 use super::acquiring::late_request;
 use super::goal::Given;
+use crate::decided::{Unanswered, insist};
 use crate::ledger::{Confirmed, Ledger};
 use crate::outside;
-use crate::record::{Decided, Named, Record, commit_next, operate_once, said};
+use crate::record::{Decided, Named, Record, commit_next, operate_once};
 use crate::shell::Place;
 use anyhow::bail;
+use futures::{StreamExt, stream};
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{LeaseId, Revision};
@@ -21,6 +23,9 @@ use ratn_worker::client::{Channels, WorldClient};
 use ratn_world::world::World;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
+
+/// So many withdrawals of before are under way at once.
+const WITHDRAWN_AT_ONCE: usize = 64;
 
 /// Refuses a world that is not the run's. Changes nothing.
 pub(crate) async fn check_world(place: &Place, ledger: &Ledger) -> anyhow::Result<()> {
@@ -77,13 +82,20 @@ impl Performer {
     ///
     /// # Errors
     /// Where the run cannot go on.
-    pub(crate) async fn take_up(&mut self, ledger: Ledger, mirror: &World) -> anyhow::Result<Option<Event>> {
+    pub(crate) async fn take_up(&mut self, mut ledger: Ledger, mirror: &World) -> anyhow::Result<Option<Event>> {
         (self.acquires, self.operations, self.resumptions) = (ledger.acquires, ledger.operations, ledger.resumptions);
         let changed = self.commit_again(&ledger, mirror).await?;
         let commit = ledger.commits.last().map(|decided| decided.revision).unwrap_or_default();
+        // All of it is in the root that was read.
+        self.decided = commit;
+        self.told.committed(commit);
         self.confirm(Confirmed { commit, ..Confirmed::default() });
         for (instance, attempt, goal) in &ledger.stopped {
             self.start(*instance, *attempt, goal.clone(), Given::ToStop, None);
+        }
+        // Before all that takes a while: whoever performs them waits for their run no longer than its grace.
+        for (instance, (attempt, goal)) in std::mem::take(&mut ledger.goals) {
+            self.start(instance, attempt, goal, Given::Before, None);
         }
         if self.session.state().borrow().found {
             self.sweep(&ledger).await?;
@@ -94,16 +106,10 @@ impl Performer {
             self.make_anew(&ledger).await?;
             self.confirm(Confirmed { commit, operation: ledger.operations });
         }
-        // What crossed with the end of task control goes back; a waiting one has left the queue with its connection.
-        for request in ledger.withdrawn.iter().flat_map(|request| [request.clone(), late_request(request)]) {
-            let _ = retry_unanswered(|| self.resources.withdraw(&request)).await;
-        }
+        self.withdraw_again(std::mem::take(&mut ledger.withdrawn));
         for (instance, asked) in ledger.projecting {
             let named = asked.named.map(|id| Named { id, made: self.making.begin(id), again: true });
             self.record(Record::Project { instance, asked, named })?;
-        }
-        for (instance, (attempt, goal)) in ledger.goals {
-            self.start(instance, attempt, goal, Given::Before, None);
         }
         let mut waiting: Vec<_> = ledger.waiting.into_iter().collect();
         waiting.sort_by_key(|(instance, asked)| (Reverse(asked.priority), *instance));
@@ -123,9 +129,9 @@ impl Performer {
         }
         for decided in &ledger.commits[there..] {
             let commit = decided.clone().commit(&self.run);
-            match commit_next(&self.world, root, commit).await {
+            match commit_next(&self.world, &self.trust, root, commit).await {
                 Ok(revision) => root = revision,
-                Err(error) => bail!("the world pool does not take what the run had decided: {}", said(&error)),
+                Err(undone) => bail!("the world pool does not take what the run had decided: {undone}"),
             }
         }
         let (revision, facts) = self.root().await?;
@@ -181,17 +187,39 @@ impl Performer {
         }
     }
 
-    /// Gives back what the session holds and the run does not know of: grants that nobody heard of. What others left to be told stays there.
+    /// Undoes what was withdrawn before, if that was not heard: what crossed with the end of task control goes back; a waiting one has left the queue
+    /// with its connection. Nothing waits for that but operations.
+    fn withdraw_again(&mut self, withdrawn: Vec<String>) {
+        if withdrawn.is_empty() {
+            return;
+        }
+        let (resources, trust, returns) = (self.resources.clone(), self.trust.clone(), self.order.returning.begin());
+        let requests = withdrawn.into_iter().flat_map(|request| [late_request(&request), request]);
+        self.giving_back.spawn(async move {
+            let withdrawing = stream::iter(requests).map(move |request| {
+                let (resources, trust) = (resources.clone(), trust.clone());
+                async move { insist(&trust, Unanswered::Waits, || resources.withdraw(&request)).await }
+            });
+            withdrawing.buffer_unordered(WITHDRAWN_AT_ONCE).for_each(|_| std::future::ready(())).await;
+            drop(returns);
+        });
+    }
+
+    /// Gives back what the session holds and the run does not: what it was about to give back, with word of what it has committed; and grants that
+    /// nobody heard of. What others left to be told of these stays there.
     async fn sweep(&mut self, ledger: &Ledger) -> anyhow::Result<()> {
         for lease in self.living_leases().await?.difference(&ledger.held) {
-            let (lease, resources) = (*lease, self.resources.clone());
+            let (lease, resources, trust) = (*lease, self.resources.clone(), self.trust.clone());
+            let is_known = ledger.returned.contains(&lease);
+            let note = if is_known { self.told.left(self.decided).to_string() } else { String::new() };
             let (idle, returns) = (self.stopping.under(lease), self.order.returning.begin());
             self.giving_back.spawn(async move {
                 for goal in idle {
                     goal.cancelled().await;
                 }
-                if let Err(error) = retry_unanswered(|| resources.release(lease)).await {
-                    tracing::warn!("a lease that was left from before was not given back: {}", said(&error));
+                let release = || resources.release_with_note(lease, note.clone());
+                if let Err(undone) = insist(&trust, Unanswered::Waits, release).await {
+                    tracing::warn!("a lease that was left from before was not given back: {undone}");
                 }
                 drop(returns);
             });
@@ -213,8 +241,8 @@ impl Performer {
         let created = ledger.created();
         for (index, operation) in created.iter().chain(ledger.used_up()).enumerate() {
             let request = format!("{}/again-{}.{index}", self.run, self.resumptions);
-            if let Err(error) = operate_once(&self.resources, &request, operation).await {
-                bail!("`{operation}` was so before and cannot be made so again: {}", said(&error));
+            if let Err(undone) = operate_once(&self.resources, &self.trust, &request, operation).await {
+                bail!("`{operation}` was so before and cannot be made so again: {undone}");
             }
         }
         Ok(())

@@ -278,6 +278,225 @@ async fn a_run_hears_of_who_waits_beside_it_for_what_it_holds_and_needs_that_for
     bench.performer.close().await
 }
 
+/// A bench whose resource manager can be away: it is at a place of its own.
+async fn with_manager_at(directory: &RuntimeDirectory) -> anyhow::Result<(Bench, Session)> {
+    let mut bench = Bench::new().await?;
+    let channels = Channels::new(&ClientTls::none());
+    bench.endpoints.resource_manager = directory.wait_for(resource_manager::ROLE, SESSION_DEADLINE).await?;
+    let manager = &bench.endpoints.resource_manager;
+    let robot = Session::open(&channels, manager, "robot", DEFAULT_TTL);
+    robot.alive(SESSION_DEADLINE).await?;
+    let offering = ResourceClient::new(&channels, manager, robot.id())?;
+    offering.create(Resource::new("arm", ResourceClass::Module, "Arm")).await?;
+    let (events, answers) = mpsc::channel(8);
+    let performer = connect(&bench.endpoints, "task", events).await?;
+    std::mem::replace(&mut bench.performer, performer).close().await?;
+    bench.answers = answers;
+    Ok((bench, robot))
+}
+
+#[tokio::test]
+async fn a_lease_that_goes_back_while_the_manager_is_away_for_long_is_back_when_that_is() -> anyhow::Result<()> {
+    let place = tempfile::tempdir()?;
+    let directory = RuntimeDirectory::create(place.path())?;
+    let (shutdown, ended) = manager_at(&directory);
+    let (mut bench, _robot) = with_manager_at(&directory).await?;
+    let (first, second) = (InstanceId(1), InstanceId(2));
+    bench.ask(first)?;
+    let lease = bench.granted(first).await?;
+    shutdown.cancel();
+    ended.await;
+    bench.performer.perform(Command::Release { instance: first, lease: Some(lease), projection: None })?;
+    // For longer than 16 tries, and for less than a run waits for it.
+    tokio::time::sleep(Duration::from_millis(5_500)).await;
+    let (_again, _ended) = manager_at(&directory);
+    bench.ask(second)?;
+    let next =
+        tokio::time::timeout(Duration::from_secs(8), bench.granted(second)).await.context("it waits for itself")??;
+    assert_ne!(next, lease);
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn an_operation_at_the_end_of_a_run_waits_for_a_manager_that_is_away_and_for_what_goes_back_before_it()
+-> anyhow::Result<()> {
+    let place = tempfile::tempdir()?;
+    let directory = RuntimeDirectory::create(place.path())?;
+    let (shutdown, ended) = manager_at(&directory);
+    let (mut bench, _robot) = with_manager_at(&directory).await?;
+    let instance = InstanceId(1);
+    bench.ask(instance)?;
+    let lease = bench.granted(instance).await?;
+    shutdown.cancel();
+    ended.await;
+    bench.performer.perform(Command::Release { instance, lease: Some(lease), projection: None })?;
+    bench.performer.perform(Command::Operate { instance, operations: vec![create("Box", 1)] })?;
+    let back = async {
+        tokio::time::sleep(Duration::from_millis(4_500)).await;
+        let (again, _ended) = manager_at(&directory);
+        again
+    };
+    let (closed, _again) = tokio::join!(bench.performer.close(), back);
+    closed
+}
+
+#[tokio::test]
+async fn a_commit_that_is_not_answered_is_not_made_when_the_session_is_gone() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let place = tempfile::tempdir()?;
+    let directory = RuntimeDirectory::create(place.path())?;
+    let pool = || {
+        let shutdown = CancellationToken::new();
+        let running = world_pool::run(WorldPoolConfig::default(), directory.clone(), shutdown.clone());
+        (shutdown, tokio::spawn(running))
+    };
+    let (shutdown, ended) = pool();
+    bench.endpoints.world_pool = directory.wait_for(world_pool::ROLE, SESSION_DEADLINE).await?;
+    let (events, answers) = mpsc::channel(8);
+    let performer = connect(&bench.endpoints, "task", events).await?;
+    std::mem::replace(&mut bench.performer, performer).close().await?;
+    bench.answers = answers;
+    bench.performer.root().await?;
+    // It is sent while the session lives, and the pool is away.
+    shutdown.cancel();
+    drop(ended.await);
+    bench.performer.perform(Command::Commit {
+        instance: InstanceId(1),
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(1),
+    })?;
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    // Its session ends at the manager, which makes it anew: all leases are gone.
+    let channels = Channels::new(&ClientTls::none());
+    let manager = &bench.endpoints.resource_manager;
+    let same = Session::open_as(&channels, manager, bench.performer.run.clone(), "the end", DEFAULT_TTL);
+    same.alive(SESSION_DEADLINE).await?;
+    same.close().await;
+    bench.performer.lost().await;
+    // Whoever has the resources by now commits the same fact; the pool is back for both.
+    let (_again, _ended) = pool();
+    let world = WorldClient::new(&channels, &bench.endpoints.world_pool)?;
+    let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
+    let changes = vec![Change::Set { fact, value: Value::Bool(false) }];
+    retry_unanswered(|| world.commit("other/i1/1", changes.clone(), None)).await?;
+    let event = tokio::time::timeout(SESSION_DEADLINE, bench.event()).await?;
+    let Some(Event::RetirementFailed { reason, .. }) = event else { bail!("it was to fail: {event:?}") };
+    assert!(reason.contains("the run's session was lost"), "{reason}");
+    let (revision, facts) = retry_unanswered(|| world.root()).await?;
+    assert_eq!((revision, facts.len()), (Revision(1), 1));
+    assert_eq!(facts[0].value, Value::Bool(false), "what the others know of stands");
+    bench.performer.close().await.expect_err("that is not recorded");
+    Ok(())
+}
+
+#[tokio::test]
+async fn an_acquire_that_a_bound_refuses_is_asked_for_again_until_there_is_room() -> anyhow::Result<()> {
+    let place = tempfile::tempdir()?;
+    let directory = RuntimeDirectory::create(place.path())?;
+    let mut config = ResourceManagerConfig::default();
+    config.limits.waiters_per_session = 1;
+    let shutdown = CancellationToken::new();
+    tokio::spawn(resource_manager::run(config, directory.clone(), shutdown.clone()));
+    let _shutdown = shutdown.drop_guard();
+    let (mut bench, _robot) = with_manager_at(&directory).await?;
+    let [first, second, third] = [1, 2, 3].map(InstanceId);
+    bench.ask(first)?;
+    let lease = bench.granted(first).await?;
+    bench.ask(second)?;
+    while bench.performer.resources.explain("").await?.is_empty() {
+        tokio::task::yield_now().await;
+    }
+    bench.ask(third)?;
+    let early = tokio::time::timeout(Duration::from_millis(300), bench.event()).await;
+    assert!(early.is_err(), "{early:?}");
+    bench.performer.perform(Command::Release { instance: first, lease: Some(lease), projection: None })?;
+    let lease = bench.granted(second).await?;
+    bench.performer.perform(Command::Release { instance: second, lease: Some(lease), projection: None })?;
+    bench.granted(third).await?;
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn what_is_handed_to_one_that_is_withdrawn_before_it_has_asked_goes_back() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let [first, second, third] = [1, 2, 3].map(InstanceId);
+    bench.ask(first)?;
+    let lease = bench.granted(first).await?;
+    let (disk, slow) = Mark::not_yet();
+    let operate = Command::Operate { instance: first, operations: vec![create("Box", 1)] };
+    bench.performer.perform_when(Some(slow), operate)?;
+    // It waits for the operation. That ends, and before it hears of that it is handed a lease and withdrawn.
+    bench.ask(second)?;
+    tokio::task::yield_now().await;
+    bench.performer.order.operating.all().iter().for_each(CancellationToken::cancel);
+    bench.goes_on(first, lease, None)?;
+    bench.performer.perform(Command::Withdraw { instance: second })?;
+    bench.ask(third)?;
+    let next = tokio::time::timeout(SESSION_DEADLINE, bench.granted(third)).await.context("nobody gives it back")??;
+    assert_ne!(next, lease);
+    drop(disk);
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_grant_that_crosses_its_withdrawal_is_back_before_what_it_held_is_deleted() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let [first, second] = [1, 2].map(InstanceId);
+    bench.performer.perform(Command::Operate { instance: first, operations: vec![create("Token", 1)] })?;
+    let requirements = vec![Requirement::new(ResourceOperation::Block, "Token")];
+    bench.performer.perform(Command::Acquire { instance: second, requirements, priority: 0 })?;
+    while bench.answers.is_empty() {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    // Its grant is on its way. A race is decided: what is around it is left, and deletes.
+    bench.performer.perform(Command::Withdraw { instance: second })?;
+    let delete = Requirement::new(ResourceOperation::Delete, "Token");
+    bench.performer.perform(Command::Operate { instance: first, operations: vec![delete] })?;
+    tokio::time::sleep(Duration::from_millis(200)).await;
+    let quiet = tokio::time::timeout(Duration::from_millis(300), bench.event()).await;
+    assert!(quiet.is_err(), "{quiet:?}");
+    assert_eq!(bench.units("Token").await?, 0);
+    bench.performer.close().await
+}
+
+#[tokio::test]
+async fn who_comes_back_leaves_word_with_what_the_run_was_about_to_give_back() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (first, late) = (InstanceId(1), InstanceId(2));
+    bench.ask(first)?;
+    let Some(Event::Granted { lease, .. }) = bench.event().await else { bail!("no grant") };
+    let run = bench.performer.run.clone();
+    // Killed when the log has all of it, and before any of it has left.
+    let mut ledger = ledger(&run, &[]);
+    ledger.command(&Command::Acquire { instance: first, requirements: arm(), priority: 0 });
+    ledger.event(Timestamp(0), &Event::Granted { instance: first, lease: lease.clone() });
+    ledger.command(&Command::Commit {
+        instance: first,
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(1),
+    });
+    ledger.command(&Command::Release { instance: first, lease: Some(lease.id), projection: None });
+    // It had withdrawn more than can be undone in a moment.
+    ledger.withdrawn = (0..1_000).map(|number| format!("{run}/{late}/{number}")).collect();
+    let mut bench = bench.comes_back(true).await?;
+    let mut mirror = World::default();
+    mirror.apply(&done())?;
+    bench.performer.take_up(ledger, &mirror).await?;
+    assert!(!bench.performer.order.returning.is_empty(), "it does not wait for that");
+    let channels = Channels::new(&ClientTls::none());
+    let next = Session::open(&channels, &bench.endpoints.resource_manager, "next", DEFAULT_TTL);
+    next.alive(SESSION_DEADLINE).await?;
+    let next = ResourceClient::new(&channels, &bench.endpoints.resource_manager, next.id())?;
+    let (_, notes) = next.acquire_with_notes(arm(), AcquireOptions::default()).await?;
+    let notes: Vec<(&str, &str)> = notes.iter().map(|note| (note.session_id.as_str(), note.note.as_str())).collect();
+    assert_eq!(notes, [(run.as_str(), "1 0")]);
+    bench.performer.close().await
+}
+
 /// A resource manager that a token ends, at the same place as the one before it.
 fn manager_at(directory: &RuntimeDirectory) -> (CancellationToken, impl Future<Output = ()> + use<>) {
     let shutdown = CancellationToken::new();
@@ -430,8 +649,9 @@ async fn a_lease_is_back_before_what_it_held_is_used_up() -> anyhow::Result<()> 
     let [first, second] = [1, 2].map(InstanceId);
     let operate = |operation: Requirement| Command::Operate { instance: first, operations: vec![operation] };
     let consume = Requirement::new(ResourceOperation::Consume, "Token");
-    bench.performer.perform(operate(create("Token", 20)))?;
     for _ in 0..20 {
+        // The only one, so that it is used up by nothing but what was given back.
+        bench.performer.perform(operate(create("Token", 1)))?;
         let all = Requirement { count: 1.into(), ..Requirement::new(ResourceOperation::Block, "Token") };
         bench.performer.perform(Command::Acquire { instance: second, requirements: vec![all], priority: 0 })?;
         let lease = bench.granted(second).await?;

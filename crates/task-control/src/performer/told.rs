@@ -22,7 +22,10 @@ const USUAL: Duration = Duration::from_millis(50);
 const AGAIN: Duration = Duration::from_millis(500);
 /// What is not known after this time never will be.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// When so many runs were heard of, they are forgotten: who has to know of one of them asks.
+/// A commit of a run that is under way which a pool that answers has not got after so long is not waited for: it will not come, or it was never
+/// made. Longer than a run lives that is not heard ([`ratn_worker::session::DEFAULT_TTL`]).
+const PENDING_PATIENCE: Duration = Duration::from_secs(5);
+/// Of so many other runs it is known what was heard; then the one is forgotten of which nothing was heard for longest: who has to know of it asks.
 const MOST_RUNS: usize = 1024;
 
 /// What a run had committed and had been told when it gave a lease back.
@@ -60,80 +63,114 @@ pub(super) trait Ask {
 
 /// How far the run was told. Clones share it.
 #[derive(Debug, Clone)]
-pub(super) struct Told(Arc<watch::Sender<Heard>>);
+pub(super) struct Told {
+    /// The run's id.
+    run: Arc<str>,
+    heard: Arc<watch::Sender<Heard>>,
+}
 
 #[derive(Debug, Default)]
 struct Heard {
     revision: Revision,
-    /// Of runs, its own among them: their own numbers of their last commits.
-    runs: BTreeMap<String, Revision>,
+    /// The run's own number of its last commit that it has heard of.
+    own: Revision,
+    /// Of other runs: their own numbers of their last commits, and when that was heard, as a number that grows.
+    runs: BTreeMap<String, (Revision, u64)>,
+    /// The last of those numbers.
+    hearings: u64,
     /// Whether another run is under way beside this one, as far as was heard lately.
     has_others: bool,
 }
 
+impl Heard {
+    /// Another run's own number of its last commit.
+    fn number(&self, run: &str) -> Revision {
+        self.runs.get(run).map(|(number, _)| *number).unwrap_or_default()
+    }
+
+    /// A run has committed, by its own number.
+    fn of(&mut self, own: &str, run: String, number: Revision) {
+        if run == own {
+            self.own = self.own.max(number);
+            return;
+        }
+        if self.runs.len() >= MOST_RUNS
+            && !self.runs.contains_key(&run)
+            && let Some(oldest) = self.runs.iter().min_by_key(|(_, (_, heard))| *heard)
+        {
+            let oldest = oldest.0.clone();
+            self.runs.remove(&oldest);
+        }
+        self.hearings += 1;
+        let last = self.runs.entry(run).or_default();
+        *last = (last.0.max(number), self.hearings);
+    }
+}
+
 impl Told {
-    /// Of nothing yet.
-    pub(super) fn new() -> Told {
-        Told(Arc::new(watch::Sender::default()))
+    /// A run, of nothing yet.
+    pub(super) fn new(run: &str) -> Told {
+        Told { run: run.into(), heard: Arc::new(watch::Sender::default()) }
+    }
+
+    /// The run's commits up to this one are in the root that was told.
+    pub(super) fn committed(&self, number: Revision) {
+        self.heard.send_modify(|heard| heard.own = heard.own.max(number));
     }
 
     /// The root as it was read.
     pub(super) fn root(&self, revision: Revision) {
-        self.0.send_modify(|heard| heard.revision = heard.revision.max(revision));
+        self.heard.send_modify(|heard| heard.revision = heard.revision.max(revision));
     }
 
     /// A revision whose event is before everything that is told from now on.
     pub(super) fn hear(&self, change: Revision, commit: Option<(String, Revision)>) {
-        self.0.send_modify(|heard| {
+        self.heard.send_modify(|heard| {
             heard.revision = heard.revision.max(change);
             if let Some((run, number)) = commit {
-                if heard.runs.len() >= MOST_RUNS {
-                    heard.runs.clear();
-                }
-                let last = heard.runs.entry(run).or_default();
-                *last = (*last).max(number);
+                heard.of(&self.run, run, number);
             }
         });
     }
 
     /// The revision that was told last.
     pub(super) fn revision(&self) -> Revision {
-        self.0.borrow().revision
+        self.heard.borrow().revision
     }
 
     /// Another run is under way beside this one, or none is.
     pub(super) fn beside_others(&self, has_others: bool) {
-        self.0.send_if_modified(|heard| std::mem::replace(&mut heard.has_others, has_others) != has_others);
+        self.heard.send_if_modified(|heard| std::mem::replace(&mut heard.has_others, has_others) != has_others);
     }
 
     /// Whether another run is under way beside this one.
     pub(super) fn has_others(&self) -> bool {
-        self.0.borrow().has_others
+        self.heard.borrow().has_others
     }
 
     /// Waits for so long, and until another run is known of.
     pub(super) async fn others_after(&self, time: Duration) {
         tokio::time::sleep(time).await;
-        let mut heard = self.0.subscribe();
+        let mut heard = self.heard.subscribe();
         // Whoever could tell of it is this.
         let _ = heard.wait_for(|heard| heard.has_others).await;
     }
 
-    /// What a run leaves whose last commit is its own number `decided`.
-    pub(super) fn left(&self, run: &str, decided: Revision) -> Left {
-        let heard = self.0.borrow();
-        let is_told = heard.runs.get(run).is_some_and(|told| *told >= decided);
-        let pending = if is_told { Revision::default() } else { decided };
+    /// What the run leaves whose last commit is its own number `decided`.
+    pub(super) fn left(&self, decided: Revision) -> Left {
+        let heard = self.heard.borrow();
+        let pending = if heard.own >= decided { Revision::default() } else { decided };
         Left { told: heard.revision, pending }
     }
 
-    /// Waits until everything is told that these notes, of others than `own`, speak of. What a run had on its way that is not under way any more
-    /// is in the pool, or never will be.
+    /// Waits until everything is told that these notes of others speak of. What a run had on its way that is not under way any more is in the pool,
+    /// or never will be. A note is a claim of whoever left it: where the pool answers it can delay, by [`PENDING_PATIENCE`] at the most, and not refuse;
+    /// and what a run claimed in vain is not waited for again.
     ///
     /// # Errors
-    /// Where that is not known after [`PATIENCE`]: the resources are not to be used.
-    pub(super) async fn until(&self, own: &str, notes: &[HolderNote], ask: &impl Ask) -> Result<(), String> {
-        let others = notes.iter().filter(|note| note.session_id != own);
+    /// Where the pool, or the resource manager, has not said after [`PATIENCE`] what there is: the resources are not to be used.
+    pub(super) async fn until(&self, notes: &[HolderNote], ask: &impl Ask) -> Result<(), String> {
+        let others = notes.iter().filter(|note| *note.session_id != *self.run);
         let mut others: Vec<(&str, Left)> =
             others.filter_map(|note| Some((note.session_id.as_str(), note.note.parse().ok()?))).collect();
         if others.is_empty() {
@@ -143,19 +180,32 @@ impl Told {
             return Ok(());
         }
         let began = Instant::now();
+        let mut pool_answers: Option<Instant> = None;
         while began.elapsed() < PATIENCE {
             for (run, left) in &mut others {
-                if left.pending > Revision::default()
-                    && ask.is_under_way(run).await == Some(false)
+                if left.pending == Revision::default() || self.has_heard(run, left.pending) {
+                    continue;
+                }
+                let is_claim = pool_answers.is_some_and(|since| since.elapsed() >= PENDING_PATIENCE);
+                if (is_claim || ask.is_under_way(run).await == Some(false))
                     && let Some(root) = ask.root().await
                 {
+                    if is_claim {
+                        let (pending, run) = (left.pending, (*run).to_owned());
+                        tracing::warn!(run, %pending, "what it left word of was not committed in time, and is not waited for any more");
+                        self.hear(Revision::default(), Some((run, pending)));
+                    }
                     // What it had made until then.
                     *left = Left { told: root, pending: Revision::default() };
                 }
             }
             // Nobody was told more than there is.
-            if let Some(root) = ask.root().await {
-                others.iter_mut().for_each(|(_, left)| left.told = left.told.min(root));
+            match ask.root().await {
+                Some(root) => {
+                    pool_answers.get_or_insert_with(Instant::now);
+                    others.iter_mut().for_each(|(_, left)| left.told = left.told.min(root));
+                }
+                None => pool_answers = None,
             }
             if self.is_told(&others, AGAIN).await {
                 return Ok(());
@@ -169,15 +219,17 @@ impl Told {
         ))
     }
 
+    /// Whether a commit of another run was heard of, by that run's number.
+    fn has_heard(&self, run: &str, number: Revision) -> bool {
+        self.heard.borrow().number(run) >= number
+    }
+
     /// Whether all of it is told, within this time.
     async fn is_told(&self, others: &[(&str, Left)], within: Duration) -> bool {
         let is_told = |heard: &Heard| {
-            others.iter().all(|(run, left)| {
-                let of_run = heard.runs.get(*run).copied().unwrap_or_default();
-                heard.revision >= left.told && of_run >= left.pending
-            })
+            others.iter().all(|(run, left)| heard.revision >= left.told && heard.number(run) >= left.pending)
         };
-        let mut heard = self.0.subscribe();
+        let mut heard = self.heard.subscribe();
         tokio::time::timeout(within, heard.wait_for(is_told)).await.is_ok()
     }
 }
@@ -211,7 +263,7 @@ mod tests {
 
     async fn waits_knowing(told: &Told, session: &str, note: &str, known: Known) -> bool {
         let note = HolderNote { session_id: session.to_owned(), note: note.to_owned() };
-        tokio::time::timeout(Duration::from_millis(200), told.until("run-a", &[note], &known)).await.is_err()
+        tokio::time::timeout(Duration::from_millis(200), told.until(&[note], &known)).await.is_err()
     }
 
     async fn waits(told: &Told, note: &str) -> bool {
@@ -220,7 +272,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_resource_is_used_once_what_its_last_holder_had_committed_is_told() {
-        let told = Told::new();
+        let told = Told::new("run-a");
         told.root(Revision(5));
         assert!(!waits(&told, "5 0").await);
         assert!(waits(&told, "6 0").await);
@@ -230,14 +282,49 @@ mod tests {
         assert!(!waits(&told, "6 4").await);
         assert!(!waits(&told, "nonsense").await);
         assert!(!waits_knowing(&told, "run-a", "99 9", Known(Some(100), true)).await, "its own");
-        assert_eq!(told.left("run-b", Revision(4)).to_string(), "7 0");
-        assert_eq!(told.left("run-b", Revision(5)).to_string(), "7 5");
-        assert_eq!(told.left("run-c", Revision::default()).to_string(), "7 0");
+        assert_eq!(told.left(Revision::default()).to_string(), "7 0");
+        assert_eq!(told.left(Revision(5)).to_string(), "7 5");
+        told.hear(Revision(8), Some(("run-a".to_owned(), Revision(5))));
+        assert_eq!(told.left(Revision(5)).to_string(), "8 0");
+    }
+
+    #[tokio::test]
+    async fn however_many_others_are_heard_of_a_run_knows_of_itself_and_of_those_heard_last() {
+        let told = Told::new("run-a");
+        told.hear(Revision(1), Some(("run-a".to_owned(), Revision(12))));
+        told.hear(Revision(2), Some(("run-old".to_owned(), Revision(1))));
+        told.hear(Revision(3), Some(("run-b".to_owned(), Revision(3))));
+        for number in 0..2 * MOST_RUNS as u64 {
+            told.hear(Revision(4 + number), Some((format!("other-{number}"), Revision(1))));
+            told.hear(Revision(4 + number), Some(("run-b".to_owned(), Revision(4 + number))));
+            assert!(told.heard.borrow().runs.len() <= MOST_RUNS);
+        }
+        assert_eq!(told.left(Revision(12)).pending, Revision(0), "what it has heard of itself");
+        assert!(!waits(&told, "5 1000").await, "run-b is heard of all the time");
+        assert!(waits_knowing(&told, "run-old", "5 1", Known(Some(100), true)).await, "it is forgotten, and asked for");
+    }
+
+    #[tokio::test]
+    async fn a_note_of_what_is_never_committed_delays_and_does_not_refuse() {
+        let told = Told::new("run-a");
+        told.root(Revision(5));
+        let note = |pending: u64| HolderNote { session_id: "liar".to_owned(), note: format!("0 {pending}") };
+        let (began, known) = (Instant::now(), Known(Some(5), true));
+        assert_eq!(told.until(&[note(u64::MAX)], &known).await, Ok(()));
+        let took = began.elapsed();
+        assert!(PENDING_PATIENCE <= took && took < PENDING_PATIENCE + Duration::from_secs(3), "{took:?}");
+        // Nor is it believed again.
+        assert!(!waits_knowing(&told, "liar", "0 7", Known(Some(5), true)).await);
+        // A pool that does not answer does not say that it has not got it.
+        let told = Told::new("run-a");
+        let (notes, silent) = ([note(7)], Known(None, true));
+        let silent = told.until(&notes, &silent);
+        assert!(tokio::time::timeout(PENDING_PATIENCE + Duration::from_secs(2), silent).await.is_err());
     }
 
     #[tokio::test]
     async fn what_a_run_had_on_its_way_that_has_ended_is_there_or_never_will_be() {
-        let told = Told::new();
+        let told = Told::new("run-a");
         told.root(Revision(5));
         assert!(!waits_knowing(&told, "run-b", "5 9", Known(Some(5), false)).await);
         assert!(

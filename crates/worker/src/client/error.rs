@@ -1,12 +1,18 @@
 //! How a call fails: the server refused it, or the connection broke.
 
-use super::chain;
+use super::{PAUSE, chain};
 use crate::action::{MANAGER_UNHEARD, NOT_AT_REST, TOO_MANY_WAITING};
 use crate::endpoint::Endpoint;
 use ratn_proto::convert::Malformed;
 use std::error::Error;
+use std::time::Duration;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
+
+/// A server that asks to come again is asked after at least this long, and
+const SOONEST: Duration = Duration::from_millis(10);
+/// at the most this long.
+const LATEST: Duration = Duration::from_secs(5);
 
 /// Why a call failed.
 #[derive(Debug, Clone, thiserror::Error)]
@@ -30,6 +36,8 @@ pub enum CallError {
         reason: String,
         /// The server's message.
         message: String,
+        /// Where it refused for load: after so long it may be asked again, as its `google.rpc.RetryInfo` says.
+        retry_after: Option<Duration>,
     },
     /// The answer cannot be read.
     #[error("{endpoint} answered nonsense")]
@@ -64,6 +72,15 @@ impl CallError {
         }
     }
 
+    /// After how long the call may be made again: one that was not answered, or that the server refused for load (RESOURCE_EXHAUSTED with when to
+    /// ask again). `None` for every other refusal, which is an answer.
+    pub fn again_after(&self) -> Option<Duration> {
+        match self {
+            CallError::Refused { retry_after, .. } => *retry_after,
+            _ => Some(PAUSE),
+        }
+    }
+
     /// What a status that `endpoint` answered (or that stands for its silence) means.
     pub fn from_status(endpoint: &Endpoint, status: &Status) -> CallError {
         let endpoint = endpoint.clone();
@@ -78,7 +95,10 @@ impl CallError {
         if refused {
             let reason = status.get_details_error_info().map(|info| info.reason).unwrap_or_default();
             let (code, message) = (status.code(), status.message().to_owned());
-            return CallError::Refused { endpoint, code, reason, message };
+            let is_load = code == Code::ResourceExhausted;
+            let retry_after = is_load.then(|| status.get_details_retry_info()?.retry_delay).flatten();
+            let retry_after = retry_after.map(|after| after.clamp(SOONEST, LATEST));
+            return CallError::Refused { endpoint, code, reason, message, retry_after };
         }
         let reason = match status.source() {
             Some(source) => chain(source),

@@ -1,14 +1,18 @@
 //! Retries of calls that are idempotent: they only read, or their request id makes the server answer a repetition as before.
+//!
+//! [`CallError::again_after`] says what is tried again and when: what was not answered after [`PAUSE`], and what was refused for load when the
+//! server has said to ask again. Every other refusal is an answer. The two functions differ in how long they go on.
 
 use super::CallError;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// The number of tries: for longer than a session lives ([`crate::session::DEFAULT_TTL`]), so that a daemon that is started again in time is reached.
 pub(crate) const TRIES: u32 = 16;
-/// The pause between two tries.
+/// The pause between two tries of a call that is not answered.
 pub const PAUSE: Duration = Duration::from_millis(250);
 
-/// Repeats a call that was not answered, for 4 s in all. A refusal is an answer.
+/// Repeats a call that was not answered, or was refused for load, up to 16 times: the pauses come to 4 s. A try that hangs adds its own time, which the
+/// connection bounds.
 ///
 /// # Errors
 /// The error of the last try.
@@ -18,25 +22,91 @@ where
 {
     for _ in 1..TRIES {
         match call().await {
-            Err(error) if error.is_crash() => tokio::time::sleep(PAUSE).await,
+            Err(error) if let Some(pause) = error.again_after() => tokio::time::sleep(pause).await,
             answer => return answer,
         }
     }
     call().await
 }
 
-/// As [`retry_unanswered`], without a bound: for calls that the caller drops when it gives its session up.
+/// Repeats a call for as long as it is not answered, for calls that the caller drops when it gives its session up. One that is refused for load is
+/// repeated for `patience`, counted anew after every try that was not.
 ///
 /// # Errors
 /// A refusal.
-pub async fn retry_until_answered<T, F>(mut call: impl FnMut() -> F) -> Result<T, CallError>
+pub async fn retry_until_answered<T, F>(patience: Duration, mut call: impl FnMut() -> F) -> Result<T, CallError>
 where
     F: Future<Output = Result<T, CallError>>,
 {
+    let mut refused_since: Option<Instant> = None;
     loop {
-        match call().await {
-            Err(error) if error.is_crash() => tokio::time::sleep(PAUSE).await,
-            answer => return answer,
+        let asked = Instant::now();
+        let answer = call().await;
+        let Err(error) = &answer else { return answer };
+        let Some(pause) = error.again_after() else { return answer };
+        if error.is_crash() {
+            refused_since = None;
+        } else if refused_since.get_or_insert(asked).elapsed() >= patience {
+            return answer;
         }
+        tokio::time::sleep(pause).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::endpoint::Endpoint;
+    use std::cell::Cell;
+    use tonic::{Code, Status};
+    use tonic_types::{ErrorDetails, StatusExt};
+
+    fn failed(status: &Status) -> CallError {
+        CallError::from_status(&"http://a:1".parse::<Endpoint>().unwrap(), status)
+    }
+
+    fn behind() -> CallError {
+        let mut details = ErrorDetails::with_error_info("STORAGE_BEHIND", "ratn", []);
+        details.set_retry_info(Some(Duration::from_millis(10)));
+        failed(&Status::with_error_details(Code::ResourceExhausted, "the disk is behind", details))
+    }
+
+    #[test]
+    fn what_is_refused_for_load_says_when_it_is_asked_again_and_no_other_refusal_does() {
+        assert_eq!(behind().again_after(), Some(Duration::from_millis(10)));
+        assert_eq!(failed(&Status::unavailable("nobody")).again_after(), Some(PAUSE));
+        assert_eq!(failed(&Status::resource_exhausted("a second goal")).again_after(), None);
+        let mut details = ErrorDetails::with_retry_info(Some(Duration::from_secs(3_600)));
+        let late = Status::with_error_details(Code::ResourceExhausted, "", details.clone());
+        assert_eq!(
+            failed(&late).again_after(),
+            Some(Duration::from_secs(5)),
+            "a server does not stop a run for an hour"
+        );
+        details.set_retry_info(Some(Duration::ZERO));
+        let now = Status::with_error_details(Code::ResourceExhausted, "", details.clone());
+        assert_eq!(failed(&now).again_after(), Some(Duration::from_millis(10)));
+        let other = Status::with_error_details(Code::FailedPrecondition, "", details);
+        assert_eq!(failed(&other).again_after(), None);
+    }
+
+    #[tokio::test]
+    async fn a_call_that_is_refused_for_load_is_made_again_until_its_time_is_over() {
+        let calls = Cell::new(0);
+        let taken_at = |last: u32| {
+            calls.set(calls.get() + 1);
+            let answer = if calls.get() < last { Err(behind()) } else { Ok(calls.get()) };
+            std::future::ready(answer)
+        };
+        assert_eq!(retry_unanswered(|| taken_at(5)).await.unwrap(), 5);
+        calls.set(0);
+        assert_eq!(retry_unanswered(|| taken_at(99)).await.unwrap_err().reason(), "STORAGE_BEHIND");
+        assert_eq!(calls.get(), TRIES);
+        calls.set(0);
+        assert_eq!(retry_until_answered(Duration::from_secs(60), || taken_at(30)).await.unwrap(), 30);
+        calls.set(0);
+        let refused = retry_until_answered(Duration::ZERO, || taken_at(30)).await.unwrap_err();
+        assert_eq!((calls.get(), refused.to_string()), (1, "the disk is behind".to_owned()));
     }
 }

@@ -51,7 +51,7 @@ pub(super) async fn acquire(
         ..AcquireRequest::new(session(&request.session_id)?, requirements)
     };
     let lease = wait_for_grant(requests, tickets, caller, request.request_id, acquire, request.deadline_ms).await?;
-    let notes = notes.of(&lease, &request.session_id, Instant::now());
+    let notes = notes.of(&lease, &request.session_id, &caller.name, Instant::now());
     Ok(v1::AcquireResponse { lease: Some(wire::lease(lease, request.session_id)), notes })
 }
 

@@ -21,10 +21,13 @@ pub(super) async fn release(
     let session = optional_session(&request.session_id)?;
     let lease = LeaseId(request.lease_id);
     // Before: whoever gets its resources in the same turn is told already.
-    let left = notes.left(lease, &request.session_id, &request.note, Instant::now());
+    let left = notes.left(lease, &request.session_id, &caller.name, &request.note, Instant::now());
     let performed = requests.perform(caller, request.request_id, Request::Release { session, lease }).await;
     if performed.is_err() {
-        notes.take_back(lease, left);
+        notes.take_back(left);
+    }
+    if performed.as_ref().err().is_none_or(|refused| refused.code() == Code::NotFound) {
+        notes.ended(lease);
     }
     let (released, revision) = match performed {
         Ok((_, revision)) => (true, revision),

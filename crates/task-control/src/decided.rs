@@ -1,0 +1,168 @@
+//! How a call is made that has been decided: what it says has happened or is over (a commit, an operation, a lease that goes back, a withdrawal), so nobody
+//! can do without it. It is made again while it is not answered or is refused for load, and only while the run's session has what it had: what a run has
+//! lost others may have got and changed. That is asked before every try, as a try may hang for longer than a session lives.
+
+use crate::record::said;
+use ratn_worker::client::CallError;
+use ratn_worker::session::Trust;
+use std::fmt;
+
+/// Tries of a call whose server is not there, where the run does not wait for that one as long as it waits for the resource manager: the pauses come
+/// to 4 s.
+const TRIES: u32 = 16;
+
+/// How long a server is waited for that does not answer. One that answers that it has too much to do is waited for as long as the session is kept.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Unanswered {
+    /// For 16 tries.
+    GivenUp,
+    /// As long as the session is kept.
+    Waits,
+}
+
+/// Why it is not done.
+#[derive(Debug, Clone)]
+pub(super) enum Undone {
+    /// The session was lost before. Whether the last try was performed is not known where one was made.
+    Lost,
+    /// It was refused, or not answered.
+    Failed(CallError),
+}
+
+impl fmt::Display for Undone {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Undone::Lost => write!(
+                f,
+                "the run's session was lost before, and whoever had its resources since may have changed the same"
+            ),
+            Undone::Failed(error) => write!(f, "{}", said(error)),
+        }
+    }
+}
+
+/// Whoever says whether the run has what it had.
+pub(super) trait Keeps: Clone {
+    /// Whether it has. Waits while that is not known.
+    async fn is_kept(&mut self) -> bool;
+    /// Returns once it has not.
+    async fn gone(&self);
+}
+
+impl Keeps for Trust {
+    async fn is_kept(&mut self) -> bool {
+        Trust::is_kept(self).await
+    }
+
+    async fn gone(&self) {
+        Trust::gone(self).await;
+    }
+}
+
+/// Makes a call until it is done, refused for good, or must not be made any more.
+///
+/// # Errors
+/// [`Undone`].
+pub(super) async fn insist<T, F>(
+    keeps: &impl Keeps,
+    unanswered: Unanswered,
+    mut call: impl FnMut() -> F,
+) -> Result<T, Undone>
+where
+    F: Future<Output = Result<T, CallError>>,
+{
+    let mut keeps = keeps.clone();
+    let mut tries = 0;
+    loop {
+        if !keeps.is_kept().await {
+            return Err(Undone::Lost);
+        }
+        let answer = tokio::select! {
+            biased;
+            answer = call() => answer,
+            () = keeps.gone() => return Err(Undone::Lost),
+        };
+        let error = match answer {
+            Ok(done) => return Ok(done),
+            Err(error) => error,
+        };
+        tries += u32::from(error.is_crash() && unanswered == Unanswered::GivenUp);
+        match error.again_after() {
+            Some(pause) if tries < TRIES => tokio::time::sleep(pause).await,
+            _ => return Err(Undone::Failed(error)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ratn_worker::endpoint::Endpoint;
+    use std::cell::{Cell, RefCell};
+    use std::rc::Rc;
+    use std::time::Duration;
+    use tonic::{Code, Status};
+    use tonic_types::{ErrorDetails, StatusExt};
+
+    /// Has what it had until its token is cancelled; counts how often it is asked.
+    #[derive(Clone, Default)]
+    struct Kept(tokio_util::sync::CancellationToken, Rc<Cell<u32>>);
+
+    impl Keeps for Kept {
+        async fn is_kept(&mut self) -> bool {
+            self.1.set(self.1.get() + 1);
+            !self.0.is_cancelled()
+        }
+
+        async fn gone(&self) {
+            self.0.cancelled().await;
+        }
+    }
+
+    fn failed(status: &Status) -> CallError {
+        let endpoint = Endpoint::Unix("/nowhere".into());
+        CallError::from_status(&endpoint, status)
+    }
+
+    fn busy() -> CallError {
+        let details = ErrorDetails::with_retry_info(Some(Duration::from_millis(10)));
+        failed(&Status::with_error_details(Code::ResourceExhausted, "busy", details))
+    }
+
+    #[tokio::test]
+    async fn whether_the_session_is_kept_is_asked_before_every_try() {
+        let (kept, calls) = (Kept::default(), Cell::new(0));
+        let silent = || {
+            calls.set(calls.get() + 1);
+            if calls.get() == 2 {
+                kept.0.cancel();
+            }
+            std::future::ready(Err::<(), _>(failed(&Status::unavailable("nobody"))))
+        };
+        assert!(matches!(insist(&kept, Unanswered::Waits, silent).await, Err(Undone::Lost)));
+        assert_eq!((calls.get(), kept.1.get()), (2, 3));
+        // A try that hangs is not waited for.
+        let kept = Kept::default();
+        let hangs = || {
+            kept.0.cancel();
+            std::future::pending::<Result<(), CallError>>()
+        };
+        assert!(matches!(insist(&kept, Unanswered::Waits, hangs).await, Err(Undone::Lost)));
+    }
+
+    #[tokio::test]
+    async fn what_was_decided_is_tried_again_whoever_has_too_much_to_do() {
+        let answers = |all: Vec<Result<u32, CallError>>| RefCell::new(all.into_iter());
+        let insisted = async |unanswered, all: Vec<Result<u32, CallError>>| {
+            let answers = answers(all);
+            let next = || std::future::ready(answers.borrow_mut().next().unwrap_or(Ok(0)));
+            insist(&Kept::default(), unanswered, next).await
+        };
+        let mut long: Vec<_> = (0..2 * TRIES).map(|_| Err(busy())).collect();
+        long.push(Ok(7));
+        assert!(matches!(insisted(Unanswered::GivenUp, long).await, Ok(7)));
+        let wrong = Err(failed(&Status::failed_precondition("another root")));
+        let refused = insisted(Unanswered::Waits, vec![Err(busy()), wrong]).await;
+        assert!(matches!(&refused, Err(Undone::Failed(error)) if error.to_string() == "another root"), "{refused:?}");
+    }
+}
