@@ -111,7 +111,10 @@ fn an_ontology_says_which_individuals_fit_a_place() {
     let set = |all: &[&str]| -> BTreeSet<String> { all.iter().map(|one| (*one).to_owned()).collect() };
     assert_eq!(places("hand_empty(?)"), [set(&["gripper"])]);
     let [what, where_to] = &places("on(?, ?)")[..] else { panic!("two places") };
-    assert!(!what.contains("table") && where_to.contains("table") && where_to.contains("base"), "{what:?} {where_to:?}");
+    assert!(
+        !what.contains("table") && where_to.contains("table") && where_to.contains("base"),
+        "{what:?} {where_to:?}"
+    );
     assert!(words.entities.len() > where_to.len());
 }
 

@@ -114,7 +114,8 @@ impl Cluster {
     fn has_begun(&mut self) -> bool {
         let begin = Instant::now();
         loop {
-            let ended = |member: &mut Member| member.process.as_mut().is_none_or(|own| own.try_wait().unwrap().is_some());
+            let ended =
+                |member: &mut Member| member.process.as_mut().is_none_or(|own| own.try_wait().unwrap().is_some());
             if self.members.iter_mut().any(ended) {
                 return false;
             }
