@@ -760,6 +760,12 @@ async function annotations() {
   assert.deepEqual(await offered("reads"), ["on(cup, base)", "on(cup, cup)", "on(cup, table)", "on(cup, ?)"]);
   await page.keyboard.type("table)");
   await page.waitForFunction(() => document.querySelector("main")?.textContent.includes("+       reads: "));
+  // One name of two predicates.
+  await page.locator('[data-key="reads 0"]').fill("in_gripper(");
+  const held = ["base", "cup", "table", "?"];
+  assert.deepEqual(await offered("reads"), [...held.map((one) => `in_gripper(${one})`), ...held.map((one) => `in_gripper(${one}, `)]);
+  await page.keyboard.type("cup, ");
+  assert.deepEqual(await offered("reads"), held.map((one) => `in_gripper(cup, ${one})`));
   step("individuals are offered for each place of a predicate");
 
   // Of an action that says nothing, and what few states say.

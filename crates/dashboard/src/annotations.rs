@@ -15,6 +15,7 @@ use ratn_model::in_force::{InForce, in_force};
 use ratn_model::load::Loaded;
 use ratn_model::load::edit::{self, EditError, Written};
 use ratn_model::load::{Document, MAX_SOURCE};
+use ratn_model::ontology::Domain;
 use ratn_model::program::{Location, Nature, Origin, Program};
 use ratn_model::value::Value;
 use serde::Deserialize;
@@ -35,6 +36,8 @@ const SIMULATION: Duration = Duration::from_secs(2);
 const MAX_SHOWN_LINES: usize = 60;
 /// So many words of a kind are offered for completion.
 const MAX_WORDS: usize = 500;
+/// So many words are offered for single places of predicates.
+const MAX_PLACED: usize = 5_000;
 /// Keys of one value; all others have a list.
 const SINGLE: [&str; 7] = ["computes", "pia", "duration", "attempts", "deterministic", "routine", "exceptions"];
 
@@ -180,7 +183,7 @@ pub(crate) fn told(editing: &Editing) -> Result<wire::Annotations, Problem> {
         Ok(written) => (written, String::new()),
         Err(error) => (Vec::new(), error.to_string()),
     };
-    let (predicates, entities) = words(program.as_ref());
+    let Words { predicates, entities, places } = words(program.as_ref());
     let mut by_place = by_place(program.as_ref(), &written);
     let own = |one: &Written| state(one, by_place.remove(&one.location).unwrap_or_default());
     let mut states: Vec<wire::AnnotatedState> = written.iter().map(own).collect();
@@ -196,6 +199,7 @@ pub(crate) fn told(editing: &Editing) -> Result<wire::Annotations, Problem> {
         states,
         predicates,
         entities,
+        places,
     })
 }
 
@@ -432,18 +436,42 @@ fn of_libraries(program: &Program, written: &[Written], states: &mut Vec<wire::A
     }
 }
 
-/// Predicates and individuals that can be completed to: of the ontology, and those that the file uses.
-fn words(program: Option<&Program>) -> (Vec<String>, Vec<String>) {
-    let Some(program) = program else { return (Vec::new(), Vec::new()) };
-    let with = |name: &str, arity: usize| format!("{name}({})", vec!["?"; arity].join(", "));
-    let mut predicates = BTreeSet::new();
+/// What can be completed to.
+#[derive(Debug, Default)]
+struct Words {
+    /// Of the ontology, and those that the file uses, as `at(?)`.
+    predicates: Vec<String>,
+    /// Of the ontology, and those that the file uses.
+    entities: Vec<String>,
+    /// Of predicates for whose places something else than all individuals can stand.
+    places: Vec<wire::Places>,
+}
+
+/// A place of a predicate.
+#[derive(Debug, Default)]
+struct Place<'p> {
+    /// What may stand there: nothing is known without an ontology.
+    domain: Option<&'p Domain>,
+    /// The variables that the file has there: `$box.id`.
+    variables: BTreeSet<String>,
+}
+
+fn words(program: Option<&Program>) -> Words {
+    let Some(program) = program else { return Words::default() };
+    let mut predicates: BTreeMap<(&str, usize), Vec<Place<'_>>> = BTreeMap::new();
     let mut entities = BTreeSet::new();
     match &program.ontology {
         Some(ontology) => {
-            predicates.extend(ontology.predicates().map(|(name, one)| with(name, one.domain.len())));
+            for (name, one) in ontology.predicates() {
+                let places = one.domain.iter().map(|domain| Place { domain: Some(domain), ..Place::default() });
+                predicates.insert((name, one.domain.len()), places.collect());
+            }
             entities.extend(ontology.individuals().map(str::to_owned));
         }
-        None => predicates.extend(SCENE_PREDICATES.iter().map(|(name, arity)| with(name, *arity))),
+        None => {
+            let scene = SCENE_PREDICATES.iter().map(|(name, arity)| ((*name, *arity), Vec::new()));
+            predicates.extend(scene);
+        }
     }
     let mut used = Vec::new();
     changed_facts(&program.initial, &mut used);
@@ -457,10 +485,56 @@ fn words(program: Option<&Program>) -> (Vec<String>, Vec<String>) {
         said.effects.values().for_each(|effects| changed_facts(effects, &mut used));
     }
     for fact in used {
-        predicates.insert(with(&fact.predicate, fact.arguments.len()));
-        entities.extend(fact.arguments.iter().flatten().filter_map(individual).map(str::to_owned));
+        let arity = fact.arguments.len();
+        let places = predicates.entry((&fact.predicate, arity)).or_default();
+        places.resize_with(arity, Place::default);
+        for (place, argument) in places.iter_mut().zip(&fact.arguments) {
+            let Some(argument) = argument else { continue };
+            entities.extend(individual(argument).map(str::to_owned));
+            place.variables.extend(is_variable(argument).then(|| argument.to_string()));
+        }
     }
-    (predicates.into_iter().take(MAX_WORDS).collect(), entities.into_iter().take(MAX_WORDS).collect())
+    let entities: Vec<String> = entities.into_iter().take(MAX_WORDS).collect();
+    let mut left = MAX_PLACED;
+    let mut places = Vec::new();
+    for ((name, arity), known) in predicates.iter().take(MAX_WORDS) {
+        if known.iter().all(|place| place.domain.is_none() && place.variables.is_empty()) {
+            continue;
+        }
+        let offered: Vec<Vec<String>> = known.iter().map(|place| place.offered(program, &entities)).collect();
+        // Of a predicate that is left out, all individuals are offered.
+        let Some(rest) = left.checked_sub(offered.iter().map(Vec::len).sum()) else { continue };
+        left = rest;
+        places.push(wire::Places { predicate: with_places(name, *arity), offered });
+    }
+    let predicates = predicates.keys().take(MAX_WORDS).map(|(name, arity)| with_places(name, *arity)).collect();
+    Words { predicates, entities, places }
+}
+
+impl Place<'_> {
+    /// The variables first: they are what the file has there.
+    fn offered(&self, program: &Program, entities: &[String]) -> Vec<String> {
+        let fits = |one: &&String| match (self.domain, &program.ontology) {
+            (Some(Domain::Class(class)), Some(ontology)) => ontology.is_a(one, class),
+            (Some(Domain::Integer), _) => false,
+            _ => true,
+        };
+        self.variables.iter().chain(entities.iter().filter(fits)).take(MAX_WORDS).cloned().collect()
+    }
+}
+
+/// As pages know a predicate: `on(?, ?)`.
+fn with_places(name: &str, arity: usize) -> String {
+    format!("{name}({})", vec!["?"; arity].join(", "))
+}
+
+/// A variable or a field of one, as `$box.id`.
+fn is_variable(argument: &Expr) -> bool {
+    match argument {
+        Expr::Variable(_) => true,
+        Expr::Field(of, _) => is_variable(of),
+        _ => false,
+    }
 }
 
 /// The facts that effects change.

@@ -745,10 +745,20 @@ wire! {
         kinds: Vec<String>,
         /// The predicates of the ontology, and those that the file uses, with as many arguments as they have: `at(?)`.
         predicates: Vec<String>,
-        /// The individuals of the ontology.
+        /// The individuals of the ontology, and those that the file uses.
         entities: Vec<String>,
+        /// What is offered for the places of predicates where that is not all individuals.
+        places: Vec<Places>,
         /// What is wrong with it.
         findings: Vec<Finding>,
+    }
+
+    /// What is offered for the places of a predicate: individuals of the class that the ontology says, and variables that the file has there.
+    Places {
+        /// As among the predicates: `in_gripper(?, ?)`.
+        predicate: String,
+        /// Of each place.
+        offered: Vec<Vec<String>>,
     }
 
     /// A state of a task file.

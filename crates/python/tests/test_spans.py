@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Iterator
@@ -134,6 +135,21 @@ def looks(place: Place, otlp: str) -> list[str]:
         return ended["outputs"]["threads"]
 
 
+def exported(place: Place) -> dict[str, tuple[str, str]]:
+    """The ids of the trace and of the span, by the name of the span, as `ratn export otlp` writes them of the only log."""
+    to = place.folder / "looks.otlp"
+    done = place.ratn("export", "otlp", place.folder / "looks-1.jsonl", "-o", to)
+    assert done.returncode == 0, done.stderr
+    requests = [json.loads(line) for line in to.read_text().splitlines()]
+    return {
+        span["name"]: (span["traceId"], span["spanId"])
+        for request in requests
+        for of_resource in request["resourceSpans"]
+        for of_scope in of_resource["scopeSpans"]
+        for span in of_scope["spans"]
+    }
+
+
 def test_a_goal_of_a_worker_in_python_is_a_span_in_the_trace_of_its_run(place: Place, collector: Collector) -> None:
     threads = looks(place, f'[service.otlp]\nendpoint = "{collector.endpoint}"\n')
     assert "otlp" in threads, threads
@@ -147,6 +163,8 @@ def test_a_goal_of_a_worker_in_python_is_a_span_in_the_trace_of_its_run(place: P
     (goal,) = [span for span in of_worker() if span.name == "ratn.v1.ActionService/Execute"]
     (node,) = [span for span in collector.spans if span.service == "ratn" and span.name == "it"]
     assert (goal.trace, goal.parent) == (node.trace, node.id), collector.spans
+    # What was sent while it ran, and the export of its log, are one trace.
+    assert exported(place) == {span.name: (span.trace.hex(), span.id.hex()) for span in collector.spans if span.service == "ratn"}
 
 
 def test_without_a_collector_a_worker_has_no_thread_for_spans(place: Place) -> None:

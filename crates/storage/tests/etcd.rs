@@ -25,6 +25,28 @@ fn with_logs(bounds: Bounds, test: impl Fn(promises::Make<'_>)) {
     test(&make);
 }
 
+#[test]
+fn a_cluster_whose_ports_somebody_else_has_taken_begins_at_other_ones() {
+    if !is_there() {
+        return;
+    }
+    // Nobody answers at the first; at the second another cluster does, in good health.
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let other = Cluster::start(1, &[]);
+    let port = |address: &str| address.rsplit(':').next().unwrap().parse::<u16>().unwrap();
+    let free = || std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let mut clients = vec![port(&other.members[0].client), taken.local_addr().unwrap().port()];
+    let pick = || (clients.pop().unwrap_or_else(free), free());
+    let cluster = Cluster::start_at(1, &[], pick);
+    assert!(!other.endpoints().contains(&cluster.members[0].client));
+    assert_ne!(port(&cluster.members[0].client), taken.local_addr().unwrap().port());
+    for one in [&cluster, &other] {
+        assert!(one.ctl(&["put", "key", &one.members[0].client]).status.success());
+    }
+    let held = cluster.ctl(&["get", "--print-value-only", "key"]).stdout;
+    assert_eq!(String::from_utf8(held).unwrap().trim(), cluster.members[0].client);
+}
+
 /// So that most records need several transactions.
 fn tiny() -> Bounds {
     Bounds { part: 100, ..Bounds::default() }

@@ -1,7 +1,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 use super::*;
 use ratn_model::catalogue::Catalogue;
-use ratn_model::load::load;
+use ratn_model::load::{Files, load, load_with};
 use std::os::unix::fs::PermissionsExt;
 
 const TASK: &str = "\
@@ -53,6 +53,84 @@ fn states_are_told_with_what_they_say_and_what_is_in_force() {
     assert!(told.predicates.iter().any(|one| one == "on(?, ?)"), "{:?}", told.predicates);
     // Without an ontology, those that the file and what the catalogue says of its actions name.
     assert_eq!(told.entities, ["base", "gripper"]);
+}
+
+/// What is offered at each place of a predicate of this task.
+fn offered(task: &str, predicate: &str) -> Vec<Vec<String>> {
+    let program = load(task, "t.yaml", &Catalogue::standard()).unwrap().program;
+    let words = words(Some(&program));
+    assert!(words.predicates.iter().any(|one| one == predicate), "{:?}", words.predicates);
+    let places = words.places.iter().find(|one| one.predicate == predicate);
+    places.unwrap_or_else(|| panic!("{:?}", words.places)).offered.clone()
+}
+
+#[test]
+fn at_the_places_of_a_predicate_the_individuals_and_the_variables_that_the_file_has_there_are_offered() {
+    let task = "\
+task: t
+parameters:
+  arm: { type: string, default: left }
+world: [\"on(cup, table)\"]
+states:
+  - for: box in [cup]
+    do:
+      - open:
+          action: gripper/release
+          reads: [in_gripper($box)]
+          effects: [\"in_gripper($box, $arm) = pose(0, 0, 0)\", { for: b in [cup], do: [not on($b, table)] }]
+";
+    let [of_one, of_two] = ["in_gripper(?)", "in_gripper(?, ?)"].map(|predicate| offered(task, predicate));
+    assert_eq!(of_one.len(), 1);
+    assert_eq!(of_one[0][0], "$box");
+    assert_eq!((of_two[0][0].as_str(), of_two[1][0].as_str()), ("$box", "$arm"));
+    for place in of_one.iter().chain(&of_two) {
+        let cups = place.iter().filter(|one| *one == "cup").count();
+        assert!(cups == 1 && place.contains(&"table".to_owned()), "{place:?}");
+    }
+}
+
+struct Example;
+
+impl Files for Example {
+    fn read(&self, _: &str, path: &str) -> Result<(String, String), String> {
+        Ok((path.to_owned(), include_str!("../../../../examples/aimm.ttl").to_owned()))
+    }
+}
+
+#[test]
+fn an_ontology_says_which_individuals_fit_a_place() {
+    let task = format!("{}\nontology: aimm.ttl\n", include_str!("../../../../examples/fetch_boxes.yaml"));
+    let program = load_with(&task, "t.yaml", &Catalogue::standard(), &Example).unwrap().program;
+    let words = words(Some(&program));
+    let names = |place: &Vec<String>| -> BTreeSet<String> {
+        place.iter().filter(|one| !one.starts_with('$')).cloned().collect()
+    };
+    let places = |predicate: &str| -> Vec<BTreeSet<String>> {
+        words.places.iter().find(|one| one.predicate == predicate).unwrap().offered.iter().map(names).collect()
+    };
+    let set = |all: &[&str]| -> BTreeSet<String> { all.iter().map(|one| (*one).to_owned()).collect() };
+    assert_eq!(places("hand_empty(?)"), [set(&["gripper"])]);
+    let [what, where_to] = &places("on(?, ?)")[..] else { panic!("two places") };
+    assert!(
+        !what.contains("table") && where_to.contains("table") && where_to.contains("base"),
+        "{what:?} {where_to:?}"
+    );
+    assert!(words.entities.len() > where_to.len());
+}
+
+#[test]
+fn of_very_many_individuals_no_more_than_a_bound_is_told() {
+    let facts: Vec<String> = (0..2_000).map(|one| format!("\"p{one}(i{one}, j)\"")).collect();
+    let reads: Vec<String> = (0..400).map(|one| format!("p{one}($x, ?)")).collect();
+    let task = format!(
+        "task: t\nparameters: {{ x: {{ type: string, default: y }} }}\nworld: [{}]\nstates:\n  - open: {{ action: gripper/release, reads: {} }}\n",
+        facts.join(", "),
+        serde_json::to_string(&reads).unwrap(),
+    );
+    let words = words(Some(&load(&task, "t.yaml", &Catalogue::standard()).unwrap().program));
+    assert_eq!((words.predicates.len(), words.entities.len()), (MAX_WORDS, MAX_WORDS));
+    let placed: usize = words.places.iter().flat_map(|one| &one.offered).map(Vec::len).sum();
+    assert!((1..=MAX_PLACED).contains(&placed) && words.places.len() < reads.len(), "{placed}");
 }
 
 #[test]

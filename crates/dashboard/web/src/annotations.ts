@@ -113,13 +113,23 @@ export function gainText(gained: Gained): string {
   return `What it gains cannot be said: ${obstacle}.${known}`;
 }
 
-type Words = Pick<Annotations, "kinds" | "predicates" | "entities">;
+type Words = Pick<Annotations, "kinds" | "predicates" | "entities" | "places">;
+
+/** What may stand at a place of a predicate, which is given as `on(?, ?)`. */
+function offeredAt(predicate: string, place: number, all: Words): string[] {
+  return all.places.find((one) => one.predicate === predicate)?.offered[place] ?? all.entities;
+}
+
+/** How many places a predicate has that is given as `on(?, ?)`. */
+function arity(predicate: string): number {
+  return predicate.endsWith("()") ? 0 : predicate.split(",").length;
+}
 
 /** Words for completion under a key. */
 export function wordsFor(key: string, all: Words): string[] {
-  const { kinds, predicates, entities } = all;
+  const { kinds, predicates } = all;
   // Of predicates with several places each is completed as it is typed.
-  const facts = predicates.flatMap((one) => (/^[^(]+\(\?\)$/.test(one) ? entities.map((entity) => one.replace("?", entity)) : []));
+  const facts = predicates.flatMap((one) => (arity(one) === 1 ? offeredAt(one, 0, all).map((entity) => one.replace("?", () => entity)) : []));
   const words = (): string[] => {
     switch (key) {
       case "computes":
@@ -152,18 +162,20 @@ export function wordsFor(key: string, all: Words): string[] {
 /** What may follow what was typed under a key: within the brackets of a predicate, the individuals of the place that is typed. */
 export function completions(key: string, typed: string, all: Words): string[] {
   const open = /(?:^|[^\w])(\w+)\(([^()]*)$/.exec(typed);
-  const predicate = all.predicates.find((one) => open !== null && one.startsWith(`${open[1]}(`));
-  if (open === null || predicate === undefined) return wordsFor(key, all);
-  const places = predicate.split(",").length;
+  // One name may stand for predicates with different numbers of places: `in_gripper(box)`, `in_gripper(box, arm)`.
+  const named = open === null ? [] : all.predicates.filter((one) => one.startsWith(`${open[1]}(`));
+  if (open === null || named.length === 0) return wordsFor(key, all);
   const given = (open[2] ?? "").split(",");
-  if (given.length > places) return [];
-  const last = (given[given.length - 1] ?? "").trimStart();
+  const place = given.length - 1;
+  const last = (given[place] ?? "").trimStart();
   const begun = typed.slice(0, typed.length - last.length);
   const space = begun.endsWith(",") && last === "" ? " " : "";
-  const end = given.length < places ? ", " : ")";
   // Whatever is looked at may be meant: of effects only what `not` takes away.
   const any = key === "requires" || (key === "effects" && !/\b(not|delete)\b/.test(typed)) ? [] : ["?"];
-  return [...all.entities, ...any].slice(0, MOST_WORDS).map((one) => `${begun}${space}${one}${end}`);
+  const completed = named
+    .filter((one) => arity(one) > place)
+    .flatMap((one) => [...offeredAt(one, place, all), ...any].map((word) => `${begun}${space}${word}${arity(one) > given.length ? ", " : ")"}`));
+  return [...new Set(completed)].slice(0, MOST_WORDS);
 }
 
 function findingsList(findings: Finding[], where: boolean): HTMLElement | null {
@@ -328,7 +340,7 @@ export function annotationsPage(desk: Desk): Page {
     fields.set(one.key, { findings, force });
     fill(force, inForce(now.in_force, one.key));
     const words = h("datalist", { id: `words-${one.key}` });
-    const offer = (typed: string) => fill(words, ...completions(one.key, typed, all ?? { kinds: [], predicates: [], entities: [] }).map((value) => h("option", { value })));
+    const offer = (typed: string) => fill(words, ...completions(one.key, typed, all ?? { kinds: [], predicates: [], entities: [], places: [] }).map((value) => h("option", { value })));
     offer("");
     const own = h("input", { type: "checkbox", checked: said.said, "data-key": `said ${one.key}` });
     const input = (item: string, index: number) => {

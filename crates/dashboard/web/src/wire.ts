@@ -670,10 +670,20 @@ export interface Annotations {
   kinds: string[];
   /** The predicates of the ontology, and those that the file uses, with as many arguments as they have: `at(?)`. */
   predicates: string[];
-  /** The individuals of the ontology. */
+  /** The individuals of the ontology, and those that the file uses. */
   entities: string[];
+  /** What is offered for the places of predicates where that is not all individuals. */
+  places: Places[];
   /** What is wrong with it. */
   findings: Finding[];
+}
+
+/** What is offered for the places of a predicate: individuals of the class that the ontology says, and variables that the file has there. */
+export interface Places {
+  /** As among the predicates: `in_gripper(?, ?)`. */
+  predicate: string;
+  /** Of each place. */
+  offered: string[][];
 }
 
 /** A state of a task file. */

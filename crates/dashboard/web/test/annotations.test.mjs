@@ -57,7 +57,7 @@ test("what is typed while a change is saved is told from what was sent", () => {
 });
 
 test("words are completed from the catalogue and the ontology", () => {
-  const all = { kinds: ["Arm"], predicates: ["at(?)", "on(?, ?)"], entities: ["cup"] };
+  const all = { kinds: ["Arm"], predicates: ["at(?)", "on(?, ?)"], entities: ["cup"], places: [] };
   assert.ok(wordsFor("resources", all).includes("{ block: Arm }"));
   assert.deepEqual(wordsFor("reads", all), ["scene", "at(?)", "on(?, ?)", "at(cup)"]);
   assert.ok(wordsFor("effects", all).includes("not at(cup)"));
@@ -66,7 +66,7 @@ test("words are completed from the catalogue and the ontology", () => {
 });
 
 test("within a predicate's brackets the individuals of each place are offered", () => {
-  const all = { kinds: [], predicates: ["at(?)", "on(?, ?)"], entities: ["cup", "table"] };
+  const all = { kinds: [], predicates: ["at(?)", "on(?, ?)"], entities: ["cup", "table"], places: [] };
   assert.deepEqual(completions("reads", "", all), wordsFor("reads", all));
   assert.deepEqual(completions("reads", "at(", all), ["at(cup)", "at(table)", "at(?)"]);
   assert.deepEqual(completions("reads", "on(c", all), ["on(cup, ", "on(table, ", "on(?, "]);
@@ -78,6 +78,27 @@ test("within a predicate's brackets the individuals of each place are offered", 
   assert.deepEqual(completions("effects", "not on(cup, ", all), ["not on(cup, cup)", "not on(cup, table)", "not on(cup, ?)"]);
   assert.deepEqual(completions("reads", "on(cup, table, ", all), [], "it has two places");
   assert.deepEqual(completions("reads", "compose(", all), wordsFor("reads", all), "no predicate");
+});
+
+test("a name that stands for predicates of one and of two places is completed to both", () => {
+  const all = { kinds: [], predicates: ["in_gripper(?)", "in_gripper(?, ?)"], entities: ["box", "arm"], places: [] };
+  assert.deepEqual(completions("effects", "in_gripper(", all), ["in_gripper(box)", "in_gripper(arm)", "in_gripper(box, ", "in_gripper(arm, "]);
+  assert.deepEqual(completions("effects", "in_gripper(box, ", all), ["in_gripper(box, box)", "in_gripper(box, arm)"]);
+  assert.deepEqual(completions("effects", "not in_gripper(box, a", all), ["not in_gripper(box, box)", "not in_gripper(box, arm)", "not in_gripper(box, ?)"]);
+  assert.deepEqual(completions("effects", "in_gripper(box, arm, ", all), []);
+});
+
+test("at a place of a predicate stands what fits there, and what the file has there", () => {
+  const places = [
+    { predicate: "at(?)", offered: [["$box.id", "cup"]] },
+    { predicate: "in_gripper(?, ?)", offered: [["$box.id", "cup"], ["$arm", "left"]] },
+  ];
+  const all = { kinds: [], predicates: ["at(?)", "in_gripper(?, ?)", "near(?, ?)"], entities: ["cup", "left"], places };
+  assert.deepEqual(completions("effects", "in_gripper(", all), ["in_gripper($box.id, ", "in_gripper(cup, "]);
+  assert.deepEqual(completions("effects", "in_gripper($box.id, ", all), ["in_gripper($box.id, $arm)", "in_gripper($box.id, left)"]);
+  assert.deepEqual(completions("effects", "near(cup, ", all), ["near(cup, cup)", "near(cup, left)"]);
+  assert.ok(wordsFor("reads", all).includes("at($box.id)"), "a dollar is no pattern");
+  assert.ok(!wordsFor("reads", all).includes("at(left)"));
 });
 
 test("a key that is said from now on says something at once, and what was typed stays", () => {

@@ -4,6 +4,7 @@
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
@@ -39,10 +40,37 @@ fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
 }
 
+/// A port is free when it is picked, and may be another process's when etcd listens: so often new ones are picked.
+const STARTS: usize = 5;
+/// A cluster that is not healthy by then will not be.
+const HEALTHY_WITHIN: Duration = Duration::from_secs(60);
+
+/// The ports of a member, for clients and for other members.
+pub(crate) type Ports = (u16, u16);
+
 impl Cluster {
     pub(crate) fn start(count: usize, arguments: &[&str]) -> Cluster {
+        Cluster::start_at(count, arguments, || (free_port(), free_port()))
+    }
+
+    /// At ports that are picked anew, for all members, as long as one of them ends at once.
+    pub(crate) fn start_at(count: usize, arguments: &[&str], mut pick: impl FnMut() -> Ports) -> Cluster {
+        for _ in 0..STARTS {
+            let ports: Vec<Ports> = (0..count).map(|_| pick()).collect();
+            let mut cluster = Cluster::at(&ports, arguments);
+            for index in 0..count {
+                cluster.run(index);
+            }
+            if cluster.has_begun() {
+                return cluster;
+            }
+        }
+        panic!("in each of {STARTS} starts, at other ports each time, a member of etcd has ended at once");
+    }
+
+    /// Not yet running.
+    fn at(ports: &[Ports], arguments: &[&str]) -> Cluster {
         let directory = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap();
-        let ports: Vec<(u16, u16)> = (0..count).map(|_| (free_port(), free_port())).collect();
         let initial: Vec<String> =
             ports.iter().enumerate().map(|(i, (_, peer))| format!("m{i}=http://127.0.0.1:{peer}")).collect();
         let members = ports.iter().enumerate().map(|(i, (client, peer))| {
@@ -79,12 +107,26 @@ impl Cluster {
         });
         let members = members.collect();
         let arguments = arguments.iter().map(|&argument| argument.to_owned()).collect();
-        let mut cluster = Cluster { members, arguments, _directory: directory };
-        for index in 0..count {
-            cluster.run(index);
+        Cluster { members, arguments, _directory: directory }
+    }
+
+    /// Waits until all members are healthy. Whether they are: not where one of them has ended.
+    fn has_begun(&mut self) -> bool {
+        let begin = Instant::now();
+        loop {
+            let ended =
+                |member: &mut Member| member.process.as_mut().is_none_or(|own| own.try_wait().unwrap().is_some());
+            if self.members.iter_mut().any(ended) {
+                return false;
+            }
+            // Who answers may be a member of another test, at a port that ours did not get: a member makes its data when it has its ports.
+            let is_ours = |member: &Member| Path::new(&member.argument("--data-dir")).join("member").exists();
+            if self.members.iter().all(is_ours) && self.is_healthy() {
+                return true;
+            }
+            assert!(begin.elapsed() < HEALTHY_WITHIN, "etcd does not become healthy");
+            thread::sleep(Duration::from_millis(50));
         }
-        cluster.await_health();
-        cluster
     }
 
     pub(crate) fn run(&mut self, index: usize) {
@@ -108,11 +150,7 @@ impl Cluster {
     /// Puts a snapshot of etcd in place of what the only member has.
     pub(crate) fn restore(&mut self, snapshot: &str) {
         self.kill(0);
-        let member = &self.members[0];
-        let of = |name: &str| {
-            let at = member.arguments.iter().position(|argument| argument == name).unwrap();
-            member.arguments[at + 1].clone()
-        };
+        let of = |name: &str| self.members[0].argument(name);
         std::fs::remove_dir_all(of("--data-dir")).unwrap();
         let mut command = Command::new("etcdctl");
         command.env("ETCDCTL_API", "3").args(["snapshot", "restore", snapshot, "--initial-cluster-token", "restored"]);
@@ -134,10 +172,22 @@ impl Cluster {
 
     pub(crate) fn await_health(&self) {
         let begin = Instant::now();
-        while !self.ctl(&["endpoint", "health"]).status.success() {
-            assert!(begin.elapsed() < Duration::from_secs(60), "etcd does not become healthy");
+        while !self.is_healthy() {
+            assert!(begin.elapsed() < HEALTHY_WITHIN, "etcd does not become healthy");
             thread::sleep(Duration::from_millis(50));
         }
+    }
+
+    fn is_healthy(&self) -> bool {
+        self.ctl(&["endpoint", "health"]).status.success()
+    }
+}
+
+impl Member {
+    /// What it is started with under this name.
+    fn argument(&self, name: &str) -> String {
+        let at = self.arguments.iter().position(|argument| argument == name).unwrap();
+        self.arguments[at + 1].clone()
     }
 }
 
