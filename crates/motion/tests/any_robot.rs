@@ -35,7 +35,7 @@ fn arm() -> Mechanism {
     let joints: Vec<String> = (1..=7).map(|i| format!("arm_joint_{i}")).collect();
     let mut mechanism = Mechanism::read(AIMM, None, &joints).unwrap();
     // Pairs that only the exact check sees: what is compared here is what both see.
-    mechanism.disabled.extend(mechanism.by_shapes.clone());
+    mechanism.excepted.extend(mechanism.by_shapes.clone());
     mechanism
 }
 
@@ -173,7 +173,7 @@ fn links_that_are_fixed_to_each_other_are_checked_as_one_by_one_whatever_each_ma
     mechanism.allow(tools[0], "thing 3");
     mechanism.allow(tools[2], "thing 3");
     let first = mechanism.link("l1").unwrap();
-    mechanism.disabled.insert((first, tools[1]));
+    mechanism.excepted.insert((first, tools[1]));
     let mut random = ChaCha8Rng::seed_from_u64(12);
     let (mut free, mut touching) = (0, 0);
     for _ in 0..40 {
@@ -461,7 +461,7 @@ fn padding_is_the_same_in_both_checks_and_held_by_the_spheres() {
     mechanism.pad_all(0.03);
     // Links of an arm are nearer to each other than that.
     let all = 0..mechanism.links.len();
-    mechanism.disabled = all.clone().flat_map(|b| all.clone().map(move |a| (a, b))).collect();
+    mechanism.excepted = all.clone().flat_map(|b| all.clone().map(move |a| (a, b))).collect();
     let mut random = ChaCha8Rng::seed_from_u64(6);
     let mut free = 0;
     for _ in 0..10 {
