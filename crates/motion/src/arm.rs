@@ -141,7 +141,8 @@ pub fn line_of_nearest(reach: &Reach, start: &JointVector, offset: [f64; 3]) -> 
     line::line_of_nearest(reach, start, &moved(reach, start, offset))
 }
 
-fn moved(reach: &Reach, start: &JointVector, offset: [f64; 3]) -> Pose {
+/// The tool's pose in `start`, moved by `offset`.
+pub(crate) fn moved(reach: &Reach, start: &JointVector, offset: [f64; 3]) -> Pose {
     let tool = reach.pose(start);
     Pose { position: std::array::from_fn(|i| tool.position[i] + offset[i]), ..tool }
 }

@@ -70,6 +70,8 @@ struct Moving {
     link: usize,
     /// The robot's link that it is fixed to.
     frame: usize,
+    /// No joint of the arm moves it against the tool.
+    is_with_tool: bool,
     role: Role,
     local: Pose,
     /// Grown by the padding.
@@ -199,6 +201,7 @@ impl<'a> Checker<'a> {
             name,
             link,
             frame,
+            is_with_tool: false,
             role,
             local: body.pose,
             padded: body.geometry.shape(self.padding),
@@ -234,6 +237,7 @@ impl<'a> Checker<'a> {
             let others = i + 1..self.moving.len();
             let beside = others.filter(|j| arm.is_checked(a.link, self.moving[*j].link)).map(|j| (i, j));
             self.pairs.extend(beside);
+            self.moving[i].is_with_tool = arm.carrier(self.moving[i].link) == arm.carrier(self.robot.tool);
             self.moving[i].obstacles = obstacles;
         }
     }
@@ -292,6 +296,12 @@ impl<'a> Checker<'a> {
             Other::Cloud => self.cloud.as_ref().map(|cloud| cloud.name.clone()).unwrap_or_default(),
         };
         Some(Collision { moving: self.moving[i].name.clone(), other, depth_m: depth })
+    }
+
+    /// Whether something meets what stands that moves with the tool alone: then every posture of that pose of the tool does.
+    pub(crate) fn is_of_the_tool(&self, collision: &Collision) -> bool {
+        self.moving.iter().any(|moving| moving.is_with_tool && moving.name == collision.moving)
+            && self.obstacles.iter().any(|obstacle| obstacle.name == collision.other)
     }
 
     /// How far any point of the robot moves at the most when the joints move by so much, in metres.

@@ -162,7 +162,7 @@ impl Mechanism {
     }
 
     /// The link nearest to a link towards the root, itself included, that a planned joint moves.
-    fn carrier(&self, link: usize) -> Option<usize> {
+    pub(crate) fn carrier(&self, link: usize) -> Option<usize> {
         let mut next = Some(link);
         while let Some(here) = next.filter(|here| self.links[*here].drive.is_none()) {
             next = self.links[here].parent;
