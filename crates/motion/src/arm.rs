@@ -29,41 +29,49 @@ pub fn space<'s>(mechanism: &Mechanism, surroundings: impl Into<Surroundings<'s>
     space
 }
 
-/// The arm and what is around it, in the frame of the base; everything but arm and base is as in `here`, the base where the scene has it.
-pub fn in_scene(robot: &Robot, scene: &Scene, here: &Configuration) -> (Mechanism, Vec<Obstacle>) {
-    let mut arm = robot.arm(&Configuration { base: [0.0; 3], ..*here });
-    let resting = arm.poses(&JointVector::zeros(arm.joints.len()));
-    let mut obstacles = Vec::new();
-    for (index, link) in arm.links.iter_mut().enumerate() {
-        if robot.arm_links.contains(&index) {
-            cover(link);
-            continue;
-        }
-        link.spheres.clear();
-        for (i, body) in link.bodies.drain(..).enumerate() {
-            let name = format!("link {} {i}", link.name);
-            let beside = robot.arm_links.iter().filter(|a| robot.model.is_excepted(**a, index));
-            arm.allowed.extend(beside.map(|a| (*a, name.clone())));
-            obstacles.push(Obstacle { name, pose: resting[index].compose(&body.upright()), geometry: body.geometry });
-        }
-    }
-    let inverse = on_floor(robot, &scene.base).inverse();
+/// The arm with what it holds, each held object as a link of its own named `held` and its name, in the scene's order behind the links of the
+/// robot; all of it has its exact shapes. Everything but the arm is as in `here`.
+///
+/// Every check of the arm takes its pairs of links from here ([`Mechanism::is_checked`]).
+pub fn holding(robot: &Robot, scene: &Scene, here: &Configuration) -> Mechanism {
+    let mut arm = robot.arm(here);
     // What holds something and what is held may touch each other.
     let mut grips: Vec<usize> = (0..arm.links.len()).filter(|l| is_gripper(robot, *l)).collect();
     for object in &scene.objects {
-        let geometry = Geometry::from(&object.shape);
-        match &object.placement {
-            Placement::World(pose) => {
-                obstacles.push(Obstacle { name: object.name.clone(), pose: inverse.compose(pose), geometry });
-            }
-            Placement::Gripper(pose) => {
-                let name = format!("held {}", object.name);
-                let held = arm.attach(&name, robot.tool, vec![geometry.at(*pose)], &grips);
-                cover(&mut arm.links[held]);
-                grips.push(held);
-            }
-            // `hands` says where that is.
-            Placement::Hand { .. } => {}
+        if let Placement::Gripper(pose) = &object.placement {
+            let body = Geometry::from(&object.shape).at(*pose);
+            grips.push(arm.attach(&format!("held {}", object.name), robot.tool, vec![body], &grips));
+        }
+    }
+    arm
+}
+
+/// The arm and what is around it, in the frame of the base; everything but arm and base is as in `here`, the base where the scene has it.
+pub fn in_scene(robot: &Robot, scene: &Scene, here: &Configuration) -> (Mechanism, Vec<Obstacle>) {
+    let mut arm = holding(robot, scene, &Configuration { base: [0.0; 3], ..*here });
+    let resting = arm.poses(&JointVector::zeros(arm.joints.len()));
+    let (moving, standing): (Vec<usize>, Vec<usize>) =
+        (0..arm.links.len()).partition(|link| *link >= robot.model.links.len() || robot.arm_links.contains(link));
+    let mut obstacles = Vec::new();
+    for index in standing {
+        let beside: Vec<usize> = moving.iter().copied().filter(|link| !arm.is_checked(*link, index)).collect();
+        let link = &mut arm.links[index];
+        link.spheres.clear();
+        for (i, body) in std::mem::take(&mut link.bodies).into_iter().enumerate() {
+            let name = format!("link {} {i}", arm.links[index].name);
+            arm.allowed.extend(beside.iter().map(|link| (*link, name.clone())));
+            obstacles.push(Obstacle { name, pose: resting[index].compose(&body.upright()), geometry: body.geometry });
+        }
+    }
+    for link in moving {
+        cover(&mut arm.links[link]);
+    }
+    let inverse = on_floor(robot, &scene.base).inverse();
+    for object in &scene.objects {
+        // `holding` has what is in the gripper, `hands` says where the rest is.
+        if let Placement::World(pose) = &object.placement {
+            let geometry = Geometry::from(&object.shape);
+            obstacles.push(Obstacle { name: object.name.clone(), pose: inverse.compose(pose), geometry });
         }
     }
     (arm, obstacles)
@@ -133,7 +141,8 @@ pub fn line_of_nearest(reach: &Reach, start: &JointVector, offset: [f64; 3]) -> 
     line::line_of_nearest(reach, start, &moved(reach, start, offset))
 }
 
-fn moved(reach: &Reach, start: &JointVector, offset: [f64; 3]) -> Pose {
+/// The tool's pose in `start`, moved by `offset`.
+pub(crate) fn moved(reach: &Reach, start: &JointVector, offset: [f64; 3]) -> Pose {
     let tool = reach.pose(start);
     Pose { position: std::array::from_fn(|i| tool.position[i] + offset[i]), ..tool }
 }

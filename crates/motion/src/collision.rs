@@ -2,7 +2,7 @@
 //!
 //! A [`Checker`] is made once per scene: what stands still (objects, base, mast) becomes a flat array of obstacles, what the
 //! arm moves (links, hand, fingers, the held object) an array of moving shapes. Bounding spheres decide most pairs, parry3d
-//! decides the rest. It says what touches what and how deep, and where contact is allowed; free motions are searched with the
+//! decides the rest. Which links are to be kept apart the mechanism says ([`arm::holding`](crate::arm::holding)). It says what touches what and how deep, and where contact is allowed; free motions are searched with the
 //! vector checks of `arm` and `space`. Shapes that move are grown by a padding. Between two postures no further apart than [`Checker::steps`]
 //! allows, no point is further than the padding from its place in the nearer one: where both are free, the way between is.
 
@@ -10,12 +10,14 @@ use crate::cloud::Cloud;
 use crate::frame::compose;
 use crate::joint_vector::JointVector;
 use crate::levers::Levers;
+use crate::mechanism::Mechanism;
 use crate::robot::{Body, Configuration, Geometry, Robot, to_f32};
 use parry3d::math::{Pose as Pose32, Vector};
 use parry3d::query;
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene};
+use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
 
@@ -64,7 +66,12 @@ struct Obstacle {
 #[derive(Clone)]
 struct Moving {
     name: String,
+    /// Of the arm with what it holds.
     link: usize,
+    /// The robot's link that it is fixed to.
+    frame: usize,
+    /// No joint of the arm moves it against the tool.
+    is_with_tool: bool,
     role: Role,
     local: Pose,
     /// Grown by the padding.
@@ -120,6 +127,7 @@ impl<'a> Checker<'a> {
     pub fn new(robot: &'a Robot, scene: &Scene, here: &Configuration, padding: f64) -> Checker<'a> {
         let configuration = here.with_base(&scene.base);
         let poses = robot.poses(&configuration);
+        let arm = crate::arm::holding(robot, scene, &configuration);
         let mut checker = Checker {
             robot,
             padding,
@@ -133,9 +141,9 @@ impl<'a> Checker<'a> {
             placed: Vec::new(),
             centres: Vec::new(),
         };
-        checker.add_robot();
+        checker.add_arm(&arm);
         checker.add_scene(scene);
-        checker.find_pairs();
+        checker.find_pairs(&arm);
         checker.find_reach();
         checker
     }
@@ -153,47 +161,47 @@ impl<'a> Checker<'a> {
         Checker { cloud, ..self }
     }
 
-    fn add_robot(&mut self) {
-        let hand = self.robot.hand();
-        for (i, link) in self.robot.model.links.iter().enumerate() {
+    /// The links of the robot, and what it holds.
+    fn add_arm(&mut self, arm: &Mechanism) {
+        let (hand, own) = (self.robot.hand(), self.robot.model.links.len());
+        for (i, link) in arm.links.iter().enumerate() {
+            let moving = match () {
+                () if i >= own => Some((link.name.clone(), self.robot.tool, Role::Held)),
+                () if !self.robot.arm_links.contains(&i) => None,
+                () if Some(i) == hand => Some((format!("link {}", link.name), i, Role::Hand)),
+                () if hand.is_some() && link.parent == hand => Some((format!("link {}", link.name), i, Role::Finger)),
+                () => Some((format!("link {}", link.name), i, Role::Arm)),
+            };
             for body in &link.bodies {
-                if self.robot.arm_links.contains(&i) {
-                    let role = match () {
-                        () if Some(i) == hand => Role::Hand,
-                        () if link.parent == hand => Role::Finger,
-                        () => Role::Arm,
-                    };
-                    self.add_moving(format!("link {}", link.name), i, role, body);
-                } else {
-                    let pose = self.poses[i].compose(&body.pose);
-                    self.add_obstacle(format!("link {}", link.name), Some(i), pose, &body.geometry);
+                match &moving {
+                    Some((name, frame, role)) => self.add_moving(name.clone(), [i, *frame], *role, body),
+                    None => {
+                        let pose = self.poses[i].compose(&body.pose);
+                        self.add_obstacle(format!("link {}", link.name), Some(i), pose, &body.geometry);
+                    }
                 }
             }
         }
     }
 
+    /// What stands in the scene.
     fn add_scene(&mut self, scene: &Scene) {
         for object in &scene.objects {
-            let geometry = Geometry::from(&object.shape);
-            match &object.placement {
-                Placement::World(pose) => {
-                    let body = geometry.at(*pose);
-                    self.add_obstacle(object.name.clone(), None, body.pose, &geometry);
-                }
-                Placement::Gripper(pose) => {
-                    let body = geometry.at(*pose);
-                    self.add_moving(format!("held {}", object.name), self.robot.tool, Role::Held, &body);
-                }
-                // `hands` says where that is.
-                Placement::Hand { .. } => {}
+            // What is in the gripper has been added with the arm; `hands` says where the rest is.
+            if let Placement::World(pose) = &object.placement {
+                let geometry = Geometry::from(&object.shape);
+                let body = geometry.at(*pose);
+                self.add_obstacle(object.name.clone(), None, body.pose, &geometry);
             }
         }
     }
 
-    fn add_moving(&mut self, name: String, link: usize, role: Role, body: &Body) {
+    fn add_moving(&mut self, name: String, [link, frame]: [usize; 2], role: Role, body: &Body) {
         self.moving.push(Moving {
             name,
             link,
+            frame,
+            is_with_tool: false,
             role,
             local: body.pose,
             padded: body.geometry.shape(self.padding),
@@ -219,21 +227,17 @@ impl<'a> Checker<'a> {
         });
     }
 
-    /// Which pairs can meet at all: neighbours in the chain always touch, the hand and its fingers touch what they hold.
-    fn find_pairs(&mut self) {
+    /// Which pairs are to be kept apart: the arm says so of its links, and everything of the arm is to be kept from the objects.
+    fn find_pairs(&mut self, arm: &Mechanism) {
         for i in 0..self.moving.len() {
             let a = &self.moving[i];
             let obstacles = (0..self.obstacles.len())
-                .filter(|o| self.obstacles[*o].link.is_none_or(|link| !self.robot.model.is_excepted(a.link, link)))
+                .filter(|o| self.obstacles[*o].link.is_none_or(|link| arm.is_checked(a.link, link)))
                 .collect();
-            for j in i + 1..self.moving.len() {
-                let b = &self.moving[j];
-                let gripper = |m: &Moving| m.role != Role::Arm;
-                let touching = self.robot.model.is_excepted(a.link, b.link) || gripper(a) && gripper(b);
-                if !touching {
-                    self.pairs.push((i, j));
-                }
-            }
+            let others = i + 1..self.moving.len();
+            let beside = others.filter(|j| arm.is_checked(a.link, self.moving[*j].link)).map(|j| (i, j));
+            self.pairs.extend(beside);
+            self.moving[i].is_with_tool = arm.carrier(self.moving[i].link) == arm.carrier(self.robot.tool);
             self.moving[i].obstacles = obstacles;
         }
     }
@@ -242,11 +246,21 @@ impl<'a> Checker<'a> {
     fn find_reach(&mut self) {
         let joints = self.reach.len();
         for moving in &self.moving {
-            let chain = self.robot.arm_chain(&self.configuration, moving.link);
+            let chain = self.robot.arm_chain(&self.configuration, moving.frame);
             let end_m = chain.tip.compose(&moving.local).distance(&Pose::IDENTITY) + f64::from(moving.radius);
             let shape = Levers::new(&chain.joints, end_m, self.robot.arm_joints()).per_joint(joints);
             self.reach = JointVector::from_fn(joints, |j| self.reach[j].max(shape[j]));
         }
+    }
+
+    /// The links that are kept apart, by their indices in the arm with what it holds ([`arm::holding`](crate::arm::holding)), the lower first.
+    pub fn pairs(&self) -> BTreeSet<(usize, usize)> {
+        let beside = self.moving.iter().flat_map(|moving| {
+            let links = moving.obstacles.iter().filter_map(|o| self.obstacles[*o].link);
+            links.map(|link| (moving.link, link))
+        });
+        let among = self.pairs.iter().map(|(i, j)| (self.moving[*i].link, self.moving[*j].link));
+        beside.chain(among).map(|(a, b)| (a.min(b), a.max(b))).collect()
     }
 
     /// The robot that is checked.
@@ -282,6 +296,12 @@ impl<'a> Checker<'a> {
             Other::Cloud => self.cloud.as_ref().map(|cloud| cloud.name.clone()).unwrap_or_default(),
         };
         Some(Collision { moving: self.moving[i].name.clone(), other, depth_m: depth })
+    }
+
+    /// Whether something meets what stands that moves with the tool alone: then every posture of that pose of the tool does.
+    pub(crate) fn is_of_the_tool(&self, collision: &Collision) -> bool {
+        self.moving.iter().any(|moving| moving.is_with_tool && moving.name == collision.moving)
+            && self.obstacles.iter().any(|obstacle| obstacle.name == collision.other)
     }
 
     /// How far any point of the robot moves at the most when the joints move by so much, in metres.
@@ -368,7 +388,7 @@ impl<'a> Checker<'a> {
         self.configuration.arm = *arm;
         self.robot.update_arm(&self.configuration, &mut self.poses);
         for (i, moving) in self.moving.iter().enumerate() {
-            let pose = to_f32(&compose(&self.poses[moving.link], &moving.local));
+            let pose = to_f32(&compose(&self.poses[moving.frame], &moving.local));
             self.centres[i] = pose.translation;
             self.placed[i] = pose;
         }

@@ -112,7 +112,7 @@ impl Traced {
     }
 
     /// The postures, where they lead to the end of the lines.
-    fn whole(self) -> Result<Vec<JointVector>, LineError> {
+    pub(crate) fn whole(self) -> Result<Vec<JointVector>, LineError> {
         match self.ended {
             None => Ok(self.postures),
             Some(cause) => {
@@ -181,7 +181,7 @@ pub(crate) fn trace(
 }
 
 /// Each posture solved from the one before.
-fn nearest(
+pub(crate) fn nearest(
     reach: &Reach,
     lines: &Lines,
     start: &JointVector,

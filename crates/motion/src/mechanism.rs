@@ -30,7 +30,7 @@ pub struct Mechanism {
     /// Parents before children.
     pub links: Vec<Link>,
     /// Pairs of links, the lower index first, that are never checked against each other.
-    pub disabled: BTreeSet<(usize, usize)>,
+    pub excepted: BTreeSet<(usize, usize)>,
     /// Pairs that are checked by their exact shapes alone: their spheres say nothing ([`pairs`](crate::pairs)).
     pub by_shapes: BTreeSet<(usize, usize)>,
     /// Links and the names of obstacles that they may touch.
@@ -106,8 +106,8 @@ impl Mechanism {
 
     /// Links moved by the joints that are planned for, of which those pairs are checked.
     pub(crate) fn new(name: &str, joints: Vec<Joint>, links: Vec<Link>, checks: Checks) -> Mechanism {
-        let Checks { excepted: disabled, by_shapes } = checks;
-        Mechanism { name: name.to_owned(), joints, links, disabled, by_shapes, allowed: BTreeSet::new() }
+        let Checks { excepted, by_shapes } = checks;
+        Mechanism { name: name.to_owned(), joints, links, excepted, by_shapes, allowed: BTreeSet::new() }
     }
 
     /// Poses of all links, in their order; `positions` in the order of the joints.
@@ -142,7 +142,7 @@ impl Mechanism {
         let index = self.links.len();
         let spheres = bodies.iter().flat_map(spheres::cover).collect();
         self.links.push(Link { bodies, spheres, ..Link::bare(name, Some(link), Pose::IDENTITY, None) });
-        self.disabled.extend(touching.iter().chain([&link]).map(|other| (*other, index)));
+        self.excepted.extend(touching.iter().chain([&link]).map(|other| (*other, index)));
         index
     }
 
@@ -156,13 +156,13 @@ impl Mechanism {
         self.allowed.is_empty() || !self.allowed.contains(&(link, obstacle.to_owned()))
     }
 
-    /// Whether two links are to be kept apart: not where the SRDF disables the pair, nor where no planned joint moves one against the other.
+    /// Whether two links are to be kept apart: not where the pair is excepted, nor where no planned joint moves one against the other.
     pub fn is_checked(&self, a: usize, b: usize) -> bool {
-        self.carrier(a) != self.carrier(b) && !self.disabled.contains(&(a.min(b), a.max(b)))
+        self.carrier(a) != self.carrier(b) && !self.excepted.contains(&(a.min(b), a.max(b)))
     }
 
     /// The link nearest to a link towards the root, itself included, that a planned joint moves.
-    fn carrier(&self, link: usize) -> Option<usize> {
+    pub(crate) fn carrier(&self, link: usize) -> Option<usize> {
         let mut next = Some(link);
         while let Some(here) = next.filter(|here| self.links[*here].drive.is_none()) {
             next = self.links[here].parent;

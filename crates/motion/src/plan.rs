@@ -75,7 +75,7 @@ pub fn plan(
     request.check(robot, scene)?;
     let mut pace = Pace::new(control);
     let mut arm = ArmInScene::new(robot, scene, request)?;
-    let depart = departure(&mut arm)?;
+    let depart = departure(&mut arm, &mut pace)?;
     arm.keep_from(&depart)?;
     if let Some(way) = &request.straight {
         arm.pad_at_least_tightly();

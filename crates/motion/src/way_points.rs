@@ -137,7 +137,18 @@ impl Follower<'_, '_> {
             return Ok(Ok(Followed { approach: vec![last], lines }));
         }
         let lines_in = Lines::new(entry, &[*goal], 0.0);
-        let traced = trace(self.reach, &lines_in, &last, &mut |_, _| Ok(()), &mut || pace.answer())?;
+        // What presses least is looked for along the way that is found; one that presses too deep is none.
+        let contact = Contact::Gripper(self.presses_m.last().copied().unwrap_or_default());
+        let (checker, mut leaving) = (&mut *self.checker, self.leaving.as_deref_mut());
+        let is_free = &mut |from: &JointVector, to: &JointVector| {
+            let closed = checker.edge_collision(from, to, contact);
+            let mut open = || leaving.as_mut().and_then(|leaving| leaving.edge_collision(from, to, contact));
+            let collision = closed
+                .map(|closed| closed.to_string())
+                .or_else(|| open().map(|collision| format!("leaving the goal with open fingers, {collision}")));
+            collision.map_or(Ok(()), Err)
+        };
+        let traced = trace(self.reach, &lines_in, &last, is_free, &mut || pace.answer())?;
         let approach: Vec<JointVector> = traced.postures.clone();
         let reason = match &traced.ended {
             Some(cause) => Some(cause.to_string()),

@@ -35,7 +35,7 @@ fn arm() -> Mechanism {
     let joints: Vec<String> = (1..=7).map(|i| format!("arm_joint_{i}")).collect();
     let mut mechanism = Mechanism::read(AIMM, None, &joints).unwrap();
     // Pairs that only the exact check sees: what is compared here is what both see.
-    mechanism.disabled.extend(mechanism.by_shapes.clone());
+    mechanism.excepted.extend(mechanism.by_shapes.clone());
     mechanism
 }
 
@@ -173,7 +173,7 @@ fn links_that_are_fixed_to_each_other_are_checked_as_one_by_one_whatever_each_ma
     mechanism.allow(tools[0], "thing 3");
     mechanism.allow(tools[2], "thing 3");
     let first = mechanism.link("l1").unwrap();
-    mechanism.disabled.insert((first, tools[1]));
+    mechanism.excepted.insert((first, tools[1]));
     let mut random = ChaCha8Rng::seed_from_u64(12);
     let (mut free, mut touching) = (0, 0);
     for _ in 0..40 {
@@ -232,6 +232,49 @@ fn all_instruction_sets_answer_as_the_plain_one_does() {
     assert!(answers.iter().all(|count| *count > 100), "{answers:?}");
     // The plain one rounds twice where the others round once: one in thousands is that close to something.
     assert!(differ <= 2, "{differ} of 2000 differ");
+}
+
+/// The same with all spheres larger by this, in metres.
+fn grown(mechanism: &Mechanism, by: f64) -> Mechanism {
+    let mut grown = mechanism.clone();
+    grown.links.iter_mut().flat_map(|link| &mut link.spheres).for_each(|sphere| sphere.radius += by);
+    grown
+}
+
+#[test]
+fn a_motion_is_free_just_where_all_the_postures_are_that_it_is_looked_at_in() {
+    // What differs by rounding alone is within this.
+    const ROUNDED_M: f64 = 1e-4;
+    let (urdf, names) = chain(6);
+    let mechanism = Mechanism::read(&urdf, Some(&folding(6)), &names).unwrap();
+    let (less, more) = (grown(&mechanism, -ROUNDED_M), grown(&mechanism, ROUNDED_M));
+    let mut random = ChaCha8Rng::seed_from_u64(23);
+    let mut answers = [0; 2];
+    for isa in Isa::available() {
+        for count in [3, 10, 30] {
+            for _ in 0..8 {
+                let obstacles = clutter(&mut random, count, 1.6);
+                let mut spaces = [&mechanism, &less, &more].map(|robot| Space::with_isa(robot, &obstacles, isa));
+                for _ in 0..60 {
+                    let from = posture(&mut random, &mechanism);
+                    let share = random.random_range(0.05..0.8);
+                    let to = between(&from, &posture(&mut random, &mechanism), share);
+                    let [space, less, more] = &mut spaces;
+                    let is_free = space.is_free_motion(&from, &to);
+                    let length = ratn_motion::space::distance(&from, &to);
+                    let steps = ((length * Space::RESOLUTION / 16.0).ceil() as usize).max(1) * 16;
+                    let at = |i: usize| between(&from, &to, i as f32 / steps as f32);
+                    answers[usize::from(is_free)] += 1;
+                    if is_free {
+                        assert!((1..=steps).all(|i| less.is_free(&at(i))), "{from:?} {to:?}");
+                    } else {
+                        assert!((1..=steps).any(|i| !more.is_free(&at(i))), "{from:?} {to:?}");
+                    }
+                }
+            }
+        }
+    }
+    assert!(answers.iter().all(|count| *count > 300), "{answers:?}");
 }
 
 #[test]
@@ -461,7 +504,7 @@ fn padding_is_the_same_in_both_checks_and_held_by_the_spheres() {
     mechanism.pad_all(0.03);
     // Links of an arm are nearer to each other than that.
     let all = 0..mechanism.links.len();
-    mechanism.disabled = all.clone().flat_map(|b| all.clone().map(move |a| (a, b))).collect();
+    mechanism.excepted = all.clone().flat_map(|b| all.clone().map(move |a| (a, b))).collect();
     let mut random = ChaCha8Rng::seed_from_u64(6);
     let mut free = 0;
     for _ in 0..10 {

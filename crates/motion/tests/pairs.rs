@@ -1,14 +1,21 @@
-//! Which pairs of links are checked where no SRDF says so: none is freed that can meet and part.
+//! Which pairs of links are checked: by all checks the same, and where no SRDF says so none is freed that can meet and part.
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use ratn_model::pose::Pose;
+use ratn_motion::arm;
+use ratn_motion::collision::{Checker, Contact};
+use ratn_motion::description::RobotDescription;
 use ratn_motion::exact::Exact;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
 use ratn_motion::pairs::{self, Kind, Pair};
+use ratn_motion::robot::Robot;
 use ratn_motion::robot_model::RobotModel;
 use ratn_motion::space::Space;
+use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 
 const AIMM: &str = include_str!("../robots/aimm.urdf");
 const AIMM_SRDF: &str = include_str!("../robots/aimm.srdf");
@@ -103,4 +110,81 @@ fn of_our_robot_nothing_is_freed_that_its_srdf_has_checked_and_that_can_part() {
         assert!(!space.is_free(&state) || is_free || !mechanism.by_shapes.is_empty(), "{posture:?}");
     }
     assert!(2 * free > by_shapes && free > 50, "{free} of {by_shapes}");
+}
+
+fn boxed(size: [f64; 3], at: Pose) -> Scene {
+    let placement = Placement::Gripper(at);
+    let held = SceneObject { name: "thing".to_owned(), shape: Shape::Box { size }, placement };
+    Scene { base: Pose::IDENTITY, objects: vec![held] }
+}
+
+fn nothing() -> Scene {
+    Scene { base: Pose::IDENTITY, objects: Vec::new() }
+}
+
+/// A robot without an SRDF, whose tool has a shape and carries a camera that overlaps it.
+fn tooled() -> Robot {
+    let toml = "name = 'r'\nurdf = 'r'\n[arm]\njoints = ['wrist_joint', 'tool_joint']\ntool = 'tool'\n";
+    let camera = "<link name='camera'><collision><geometry><sphere radius='0.04'/></geometry></collision></link>\
+                  <joint name='camera_mount' type='fixed'><parent link='tool'/><child link='camera'/>\
+                  <origin xyz='0.12 0 0.03'/></joint>";
+    let links = [ball("wrist", "base", "0 0 0", "0.05 0 0"), ball("tool", "wrist", "0.06 0 0", "0.08 0 0")];
+    let urdf = format!("<robot name='r'><link name='base'/>{}{camera}</robot>", links.concat());
+    Robot::of(RobotDescription::read(toml).unwrap(), &urdf, None, &mut |_| unreachable!("it has no meshes")).unwrap()
+}
+
+/// Every built-in robot as each of its arms sees it, and [`tooled`].
+fn robots() -> Vec<(String, Robot)> {
+    let mut robots = vec![("tooled".to_owned(), tooled())];
+    for name in Robot::built_in_names() {
+        let robot = Robot::built_in(name).unwrap();
+        let others: Vec<String> = robot.other_arms().map(ToString::to_string).collect();
+        robots.extend(others.iter().map(|arm| (format!("{name} {arm}"), robot.with_arm(arm).unwrap())));
+        robots.push((name.to_owned(), robot));
+    }
+    robots
+}
+
+#[test]
+fn both_checks_by_exact_shapes_judge_by_the_same_pairs_on_every_robot() {
+    let mut random = ChaCha8Rng::seed_from_u64(5);
+    let (mut touching, mut free) = (0, 0);
+    for (name, robot) in robots() {
+        let in_hand = boxed([0.05, 0.05, 0.3], Pose::at(0.0, 0.0, -0.05));
+        for (holds, scene) in [("nothing", nothing()), ("a box", in_hand)] {
+            let here = arm::assumed(&robot, &scene);
+            let mechanism = arm::holding(&robot, &scene, &here);
+            let exact = Exact::new(&mechanism, &[]);
+            let mut checker = Checker::new(&robot, &scene, &here, 0.0);
+            assert_eq!(checker.pairs(), mechanism.pairs().into_iter().collect(), "{name} holds {holds}");
+            for _ in 0..100 {
+                let joints = robot.arm_joints();
+                let posture =
+                    JointVector::from_fn(joints.len(), |j| random.random_range(joints[j].lower..joints[j].upper));
+                let touch = exact.touch(&posture);
+                let collision = checker.collision(&posture, Contact::None);
+                assert_eq!(
+                    touch.is_some(),
+                    collision.is_some(),
+                    "{name} holds {holds}, {posture:?}: {touch:?}, {collision:?}"
+                );
+                touching += usize::from(touch.is_some());
+                free += usize::from(touch.is_none());
+            }
+        }
+    }
+    assert!(touching > 100 && free > 100, "{touching} {free}");
+}
+
+#[test]
+fn what_is_fixed_to_the_tool_may_overlap_it_and_what_is_held_is_kept_from_the_links_that_the_tool_may_touch() {
+    let robot = tooled();
+    let home = JointVector::of([0.0, 0.0]);
+    // No joint moves the camera against the tool, so nothing can be done about it.
+    assert_eq!(Checker::new(&robot, &nothing(), &robot.at_zero(), 0.0).collision(&home, Contact::None), None);
+    // Tool and wrist are neighbours that are made to touch. What the tool holds is not made to touch the wrist.
+    let back = boxed([0.04; 3], Pose::at(-0.01, 0.0, 0.0));
+    let mut checker = Checker::new(&robot, &back, &robot.at_zero(), 0.0);
+    let collision = checker.collision(&home, Contact::None).unwrap();
+    assert_eq!((&collision.moving[..], &collision.other[..]), ("link wrist", "held thing"));
 }

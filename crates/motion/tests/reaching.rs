@@ -33,7 +33,7 @@ fn arm(joints: std::ops::RangeInclusive<usize>) -> Mechanism {
     static MODEL: LazyLock<RobotModel> = LazyLock::new(|| RobotModel::read(AIMM, None).unwrap());
     let mut mechanism = MODEL.planned(&names, &RobotState::neutral(&MODEL)).unwrap();
     // Pairs that only the exact check sees are nothing to the search.
-    mechanism.disabled.extend(mechanism.by_shapes.clone());
+    mechanism.excepted.extend(mechanism.by_shapes.clone());
     mechanism
 }
 

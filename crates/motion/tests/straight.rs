@@ -16,7 +16,8 @@ use ratn_motion::collision::{Checker, Contact};
 use ratn_motion::geometry::Geometry;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::line::{Cause, line, line_of_nearest};
-use ratn_motion::plan::{Goal, Plan, PlanError, Request};
+use ratn_motion::pace::Control;
+use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
 use ratn_motion::reach::{Reach, Target};
 use ratn_motion::robot::{Joint, Robot};
 use ratn_motion::straight::{Frame, Straight};
@@ -176,7 +177,7 @@ fn an_arm_with_a_joint_more_turns_its_elbow_on_a_line_where_the_nearest_postures
 
 #[test]
 fn the_elbow_makes_way_for_an_obstacle_while_the_tool_goes_straight() {
-    let (mut blocked, mut passed) = (0, 0);
+    let (mut blocked, mut passed, mut departed) = (0, 0, 0);
     for way in [[0.3, 0.0, 0.0], [-0.2, 0.0, 0.1], [0.0, 0.3, 0.0], [0.0, -0.3, 0.0], [0.0, 0.0, 0.3], [0.1, 0.2, 0.2]]
     {
         let mut cell = Cell::with_boxes(0, 1);
@@ -202,6 +203,16 @@ fn the_elbow_makes_way_for_an_obstacle_while_the_tool_goes_straight() {
             continue;
         }
         blocked += 1;
+        let length_m = way.iter().map(|c| c * c).sum::<f64>().sqrt();
+        let depart = Straight { direction: way, frame: Frame::World, length_m };
+        if let Ok(plan) = cell.plan(&Request { depart, ..request(cell.state(), vec![Goal::Joints(start)]) }) {
+            departed += 1;
+            let curve = Curve::of_arm(&cell.robot, &plan.trajectory).unwrap();
+            let mut unpadded = Checker::new(&cell.robot, &cell.scene, &cell.state(), 0.0);
+            assert!(curve.knots().iter().all(|knot| unpadded.is_free(&knot.positions, Contact::None)));
+            let there = |knot: &Knot| base.compose(&reach.pose(&knot.positions)).distance(&to);
+            assert!(curve.knots().iter().map(there).fold(f64::INFINITY, f64::min) < STRAIGHT_M);
+        }
         let straight = Some(WayPoints::default());
         let request = Request { straight, ..request(cell.state(), vec![Goal::Pose(to)]) };
         if let Ok(plan) = cell.plan(&request) {
@@ -215,7 +226,29 @@ fn the_elbow_makes_way_for_an_obstacle_while_the_tool_goes_straight() {
             }
         }
     }
-    assert!(blocked >= 3 && passed >= 2, "{passed} of {blocked}");
+    assert!(blocked >= 3 && passed >= 2 && departed >= 2, "{passed} and {departed} of {blocked}");
+}
+
+#[test]
+fn a_departure_that_cannot_be_followed_ends_where_the_caller_says_so() {
+    let (cell, _) = turned_cell();
+    let depart = Straight { direction: [1.0, 0.0, 0.0], frame: Frame::World, length_m: 0.5 };
+    let far = Request { depart, ..request(cell.state(), vec![Goal::Joints(aimm::HOME)]) };
+    let planned = |answers: &mut dyn FnMut(usize) -> Control| {
+        let mut asked = 0;
+        let found = plan(&cell.robot, &cell.scene, &far, &mut |_| {
+            asked += 1;
+            answers(asked)
+        });
+        (found.unwrap_err(), asked)
+    };
+    let (refused, asked) = planned(&mut |_| Control::Continue);
+    assert!(matches!(refused, PlanError::Depart { .. }) && asked > 10, "{refused} {asked}");
+    for at in [1, asked / 2] {
+        let stopped = |with: Control| planned(&mut |asked| if asked < at { Control::Continue } else { with });
+        assert_eq!(stopped(Control::Cancelled), (PlanError::Cancelled, at));
+        assert_eq!(stopped(Control::TimeUp), (PlanError::TimeUp, at));
+    }
 }
 
 #[test]

@@ -12,7 +12,8 @@ use crate::connect::{Budget, ConnectError, Route, connect};
 use crate::constrained::{self, Constraint};
 use crate::joint_vector::JointVector;
 use crate::keep::{KeptAxis, timed_keeping};
-use crate::line::LineError;
+use crate::ladder;
+use crate::line::{self, Cause, LineError, Lines};
 use crate::mechanism::Mechanism;
 use crate::pace::{Pace, Stop};
 use crate::reach::{Postures, Reach, Target};
@@ -164,16 +165,51 @@ impl<'a> ArmInScene<'a> {
         contact::straight_collision(&mut self.checker, postures, press_m)
     }
 
-    /// Postures along a straight part (`sense` 1) or against its direction (-1), from the first of them.
-    pub(super) fn line(&self, from: &JointVector, part: &Straight, sense: f64) -> Result<Vec<JointVector>, LineError> {
-        let tool = self.reach.pose(from);
-        // A request that names an object which is not there has been refused.
-        let way = part.way(self.scene, &self.base, &tool).unwrap_or_default();
-        match sense > 0.0 {
-            true => arm::line(&self.reach, from, way),
-            // From another posture at the goal it may be followed: these are tried anyway.
-            false => arm::line_of_nearest(&self.reach, from, way.map(|c| -c)),
+    /// Postures along a straight part from the first of them, where the fingers and what they hold may press so deep; or what ends it early. An arm
+    /// that has a joint more than a pose needs goes round what is in the way of its elbow.
+    pub(super) fn leave(
+        &mut self,
+        from: &JointVector,
+        part: &Straight,
+        press_m: f64,
+        pace: &mut Pace<'_>,
+    ) -> Result<Result<Vec<JointVector>, String>, Stop> {
+        if let Some(collision) = self.collision(from, Contact::Gripper(press_m)) {
+            return Ok(Err(collision.to_string()));
         }
+        let to = arm::moved(&self.reach, from, self.way(part, from));
+        let lines = Lines::new(self.reach.pose(from), &[to], 0.0);
+        let (checker, reach, mut met) = (&mut self.checker, &self.reach, None);
+        let is_free = &mut |from: &JointVector, to: &JointVector| {
+            met = checker.edge_collision(from, to, Contact::Gripper(press_m));
+            met.as_ref().map_or(Ok(()), |collision| Err(collision.to_string()))
+        };
+        let mut traced = line::nearest(reach, &lines, from, is_free, &mut || pace.answer())?;
+        // Another elbow does not help what the tool itself meets.
+        let is_in_vain = met.is_some_and(|collision| self.checker.is_of_the_tool(&collision));
+        if traced.ended.is_some() && !is_in_vain {
+            let checker = &mut self.checker;
+            let is_free =
+                &mut |from: &JointVector, to: &JointVector| checker.edge_is_free(from, to, Contact::Gripper(press_m));
+            let other = ladder::climb(reach, &lines, from, is_free, &mut || pace.answer())?;
+            traced = other.unwrap_or(traced);
+        }
+        Ok(match traced.ended {
+            Some(Cause::Blocked { reason }) => Err(reason),
+            _ => traced.whole().map_err(|error| error.to_string()),
+        })
+    }
+
+    /// Postures along a straight part that ends in a posture, against its direction, each solved from the one before: from another posture at the
+    /// goal it may be followed, and those are tried anyway.
+    pub(super) fn line_back(&self, from: &JointVector, part: &Straight) -> Result<Vec<JointVector>, LineError> {
+        arm::line_of_nearest(&self.reach, from, self.way(part, from).map(|c| -c))
+    }
+
+    /// The tool's way along a straight part, in the frame of the base.
+    fn way(&self, part: &Straight, at: &JointVector) -> [f64; 3] {
+        // A request that names an object which is not there has been refused.
+        part.way(self.scene, &self.base, &self.reach.pose(at)).unwrap_or_default()
     }
 
     /// From a posture in straight lines of the tool through way points to a goal.

@@ -123,7 +123,7 @@ impl<'a> Candidates<'a> {
         let part = &arm.request().approach;
         let mut approach = vec![*goal];
         if part.is_some() {
-            let back = arm.line(goal, part, -1.0);
+            let back = arm.line_back(goal, part);
             approach = back.map_err(|e| format!("approaching the goal {part}, backwards from there: {e}"))?;
             if let Some(collision) = arm.straight_collision(&approach, self.press_m) {
                 return Err(format!("approaching the goal, {collision}"));
