@@ -423,7 +423,9 @@ impl Program {
 
     /// The states that a loop goes through in each iteration.
     pub fn body_of(&self, id: StateId) -> &[StateId] {
-        let (StateKind::ForEach { body, .. } | StateKind::While { body, .. }) = &self.state(id).kind else { return &[] };
+        let (StateKind::ForEach { body, .. } | StateKind::While { body, .. }) = &self.state(id).kind else {
+            return &[];
+        };
         match body.as_slice() {
             [pass] if self.is_pass(*pass) => self.list_of(*pass),
             body => body,

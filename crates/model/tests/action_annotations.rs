@@ -198,8 +198,9 @@ fn what_an_action_says_of_large_inputs_has_a_bound() {
     let catalogue = Catalogue::from_toml(&catalogue).unwrap();
     let found = |items: usize| {
         let list = vec!["$n"; items].join(", ");
-        let task =
-            format!("task: t\nvariables: {{ n: 1 }}\nstates:\n  - think: {{ action: brain/think, in: {{ a: '[{list}]' }} }}\n");
+        let task = format!(
+            "task: t\nvariables: {{ n: 1 }}\nstates:\n  - think: {{ action: brain/think, in: {{ a: '[{list}]' }} }}\n"
+        );
         load(&task, "t.yaml", &catalogue).err().map(|found| found[0].to_string())
     };
     assert_eq!(found(18), None);

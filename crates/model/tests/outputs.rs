@@ -302,13 +302,19 @@ fn an_output_that_may_be_left_out_is_no_way_that_is_sure() {
 #[test]
 fn what_a_state_says_of_its_own_end_needs_what_it_has_written_by_then() {
     let states = |more: &str| {
-        let text = format!("  - all:\n      variables: {{ seen: 0 }}\n      states:\n{}", left_early("{ pan: a.pan }", more, "0"));
+        let text = format!(
+            "  - all:\n      variables: {{ seen: 0 }}\n      states:\n{}",
+            left_early("{ pan: a.pan }", more, "0")
+        );
         let (head, rest) = text.split_at(text.find("      states:\n").unwrap() + 14);
         head.to_owned() + &rest.replace("\n  ", "\n        ").replace("  - part", "        - part")
     };
     for more in ["\n      assign: { seen: pan }", "\n      effects: { success: [], early: ['seen() = pan'] }"] {
         let found = refused(&states(more));
-        assert!(found[0].contains("the output `pan` may not have been written where this state ends by `early`"), "{found:?}");
+        assert!(
+            found[0].contains("the output `pan` may not have been written where this state ends by `early`"),
+            "{found:?}"
+        );
     }
     program(&states("\n      effects: { success: ['seen() = pan'], early: [] }"));
 }
@@ -356,9 +362,14 @@ fn what_a_decider_says_is_what_its_regions_have_given() {
     };
     program(&both("{ odd: open.outcome = aborted and turn.outcome = success }", "{ x: turn.pan }"));
     program(&both("{ odd: open.outcome = aborted }", "{ x: { value: turn.pan, default: 0 } }"));
-    program(&both("{ success: turn.outcome = success, odd: turn.outcome = aborted }", "{ x: \"either(turn.pan, 0)\" }"));
+    program(&both(
+        "{ success: turn.outcome = success, odd: turn.outcome = aborted }",
+        "{ x: \"either(turn.pan, 0)\" }",
+    ));
     let found = refused(&both("{ odd: open.outcome = aborted }", "{ x: turn.pan }"));
     assert!(found[0].starts_with("branch-may-not-have-written: `both.x` may not"), "{found:?}");
-    let found = refused(&both("{ success: open.outcome = success }", "{ x: turn.pan }").replace("odd: next", "aborted: aborted"));
+    let found = refused(
+        &both("{ success: open.outcome = success }", "{ x: turn.pan }").replace("odd: next", "aborted: aborted"),
+    );
     assert!(found[0].starts_with("branch-may-not-have-written: `turn.pan` may not"), "{found:?}");
 }

@@ -112,7 +112,10 @@ states:
         let listed = text("for: n in [1, 2, 1, 3]", each).replace("VALUE", "$n");
         assert_eq!(noted(&listed, &[]), ["note {value: [1, 2, 1, 3]}", "note_2 {value: 3}"], "{each}");
         // A state that fails gives nothing either, and what stands behind it does instead.
-        let fails = listed.replace("x: { DO, in: { a: which.x }, transitions: { success: success }", "x: { DO, in: { a: which.x }, transitions: { success: success, aborted: success }");
+        let fails = listed.replace(
+            "x: { DO, in: { a: which.x }, transitions: { success: success }",
+            "x: { DO, in: { a: which.x }, transitions: { success: success, aborted: success }",
+        );
         let noted = noted(&fails, &["loops[2]/pass/x"]);
         assert_eq!(noted, ["note {value: [1, 2, 0, 3]}", "note_2 {value: 3}"], "{each}");
     }
@@ -155,7 +158,11 @@ states:
         "loops[2]/note_2 {value: [[[0, 1], 2], 3]}",
     ];
     assert_eq!(noted(text, &[]), expected);
-    assert_eq!(noted(&text.replace("do:", "outputs: { all: { each: x.x } }\n      do:").replace("loops:", "loops:"), &[]).len(), 6);
+    assert_eq!(
+        noted(&text.replace("do:", "outputs: { all: { each: x.x } }\n      do:").replace("loops:", "loops:"), &[])
+            .len(),
+        6
+    );
     let while_it_gives = "
 states:
   - loops:
@@ -245,7 +252,10 @@ states:
   - note: { NOTE, in: { value: loops.all } }
 ";
     assert_eq!(noted_with(text, &Library, &[]).last().map(String::as_str), Some("note {value: [1, 2]}"));
-    let own = text.replace("library: l.yaml, with: { list: 'if($n = 1, [4], $n)' }", "for: 'm in if($n = 1, [4], $n)', outputs: { all: { each: $m } }, do: [{ nothing: { states: [] } }]");
+    let own = text.replace(
+        "library: l.yaml, with: { list: 'if($n = 1, [4], $n)' }",
+        "for: 'm in if($n = 1, [4], $n)', outputs: { all: { each: $m } }, do: [{ nothing: { states: [] } }]",
+    );
     assert_eq!(noted(&own, &[]).last().map(String::as_str), Some("note {value: [1, 2]}"));
 }
 
@@ -259,7 +269,9 @@ states:
       do: [{ x: { THINK } }]
   - note: { NOTE, in: { value: 'loops.all[0] + loops.all[299] + [len(loops.all)]' } }
 ";
-    let text = text.replace("300", &std::env::var("MEASURE").unwrap_or("300".into())).replace("'[$n]'", &std::env::var("EACH").unwrap_or("'[$n]'".into()));
+    let text = text
+        .replace("300", &std::env::var("MEASURE").unwrap_or("300".into()))
+        .replace("'[$n]'", &std::env::var("EACH").unwrap_or("'[$n]'".into()));
     for mode in MODES {
         let begun = std::time::Instant::now();
         let (run, acts) = run_with(&text, mode, &NoFiles, &[]);

@@ -43,7 +43,9 @@ fn left_out(subject: &Subject<'_>, to: &State, slot: Slot<'_>, expr: &Expr) -> O
         _ => return None,
     };
     let outcomes = control.outcomes(to.id).iter().enumerate().filter(|(number, outcome)| {
-        only.is_none_or(|only| only == *outcome) && !is_failure(outcome) && control.is_reached(Point::End(to.id, *number))
+        only.is_none_or(|only| only == *outcome)
+            && !is_failure(outcome)
+            && control.is_reached(Point::End(to.id, *number))
     });
     let outcomes: Vec<&String> = outcomes.map(|(_, outcome)| outcome).collect();
     let mut found = None;

@@ -199,7 +199,8 @@ impl ControlFlow {
     /// not one.
     pub(crate) fn one_of<'e>(&self, way: &BTreeSet<Flow<'e>>) -> Option<Flow<'e>> {
         let first = way.first()?;
-        let is_left_out = |(state, port): &&Flow<'e>| self.ports.get(*state, port).is_some_and(|p| !p.left_out.is_empty());
+        let is_left_out =
+            |(state, port): &&Flow<'e>| self.ports.get(*state, port).is_some_and(|p| !p.left_out.is_empty());
         let mut left_out = way.iter().filter(is_left_out);
         let one = left_out.next().unwrap_or(first);
         (way.iter().all(|(state, _)| *state == first.0) && left_out.next().is_none()).then_some(*one)

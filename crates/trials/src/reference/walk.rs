@@ -192,7 +192,8 @@ impl Reference<'_> {
         // What the body of a loop has written before is of the iteration before, until it is passed.
         let around = self.program.state(current).parent;
         let is_body = around.is_some_and(|id| self.program.state(id).is_loop() || self.program.is_pass(id));
-        let mut earlier: Vec<StateId> = list.iter().copied().filter(|id| is_body && self.outputs.contains_key(id)).collect();
+        let mut earlier: Vec<StateId> =
+            list.iter().copied().filter(|id| is_body && self.outputs.contains_key(id)).collect();
         loop {
             let place = |id: StateId| list.iter().position(|other| *other == id);
             let (passed, later): (Vec<StateId>, Vec<StateId>) =

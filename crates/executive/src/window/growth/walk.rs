@@ -121,7 +121,17 @@ impl Growth {
         iteration: Option<Iteration>,
     ) -> Arc<Frame> {
         let below = self.cursors[index].environment.frames.clone();
-        Arc::new(Frame { below, owner, visit, path, visits: Vec::new(), iteration, variables, fork: None, earlier: Vec::new() })
+        Arc::new(Frame {
+            below,
+            owner,
+            visit,
+            path,
+            visits: Vec::new(),
+            iteration,
+            variables,
+            fork: None,
+            earlier: Vec::new(),
+        })
     }
 
     /// Begins a list of a composite state that is no loop.
