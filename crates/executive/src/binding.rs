@@ -1,6 +1,6 @@
 //! Evaluating a state's expressions in a scope: inputs, requirements, preconditions.
 
-use ratn_model::expression::{EvaluateError, Expr, Lookup, Scope};
+use ratn_model::expression::{EvaluateError, Expr, Given, Lookup, Scope};
 use ratn_model::fact::{FactKey, FactPattern, Footprint};
 use ratn_model::id::StateId;
 use ratn_model::program::{ResourceExpr, State};
@@ -20,8 +20,8 @@ pub(crate) trait Names {
     fn variable(&self, name: &str) -> Option<Cow<'_, Value>>;
     /// `state.port`
     fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>>;
-    /// Whether the way to here has come through a state that writes `state.port`, or it has a default.
-    fn is_given(&self, state: StateId, port: &str) -> bool;
+    /// Whether `state.port` is there.
+    fn given(&self, state: StateId, port: &str) -> Given;
 }
 
 /// The scope of one instance at its place in the program.
@@ -49,8 +49,8 @@ impl Scope for Bindings<'_> {
         self.names.port(state, port)
     }
 
-    fn is_given(&self, state: StateId, port: &str) -> bool {
-        self.names.is_given(state, port)
+    fn given(&self, state: StateId, port: &str) -> Given {
+        self.names.given(state, port)
     }
 
     fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {

@@ -27,6 +27,7 @@ mod preconditions;
 mod reach;
 mod resources;
 pub(crate) mod types;
+mod ways;
 
 use crate::catalogue::Catalogue;
 use crate::diagnostic::Findings;

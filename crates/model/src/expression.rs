@@ -24,8 +24,8 @@ mod token;
 pub mod walk;
 
 pub use comprehension::Comprehension;
-pub use evaluate::EvaluateError;
-pub use scope::{Lookup, Scope};
+pub use evaluate::{EvaluateError, MAX_LIST};
+pub use scope::{Given, Lookup, Scope};
 
 use crate::id::StateId;
 use crate::value::Value;

@@ -71,6 +71,19 @@ pub struct Limits {
     pub timeout_s: Option<f64>,
 }
 
+/// What is put behind the list that a variable is, where that is its new value: what an iteration gives that is collected. So the list need not be
+/// copied.
+pub fn appended<'e>(variable: &str, value: &'e Expr) -> Option<&'e Expr> {
+    let Expr::Binary(BinaryOperator::Add, list, more) = value else { return None };
+    match (&**list, &**more) {
+        (Expr::Variable(name), Expr::List(items)) if name == variable && name.contains(' ') => match items.as_slice() {
+            [one] => Some(one),
+            _ => None,
+        },
+        _ => None,
+    }
+}
+
 /// How a state is tried again.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Retried {

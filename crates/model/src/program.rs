@@ -407,6 +407,31 @@ impl Program {
         matches!(state.kind, StateKind::Sequence { .. }) && state.parent.is_some_and(|id| collects(self.state(id)))
     }
 
+    /// Whether the list of a state is gone through once in each iteration: that of a loop, or of what its body stands in.
+    pub fn is_iterated(&self, id: StateId) -> bool {
+        self.state(id).is_loop() || self.is_pass(id)
+    }
+
+    /// The list of a hierarchy or a loop.
+    pub fn list_of(&self, id: StateId) -> &[StateId] {
+        match &self.state(id).kind {
+            StateKind::Sequence { children, .. } => children,
+            StateKind::ForEach { body, .. } | StateKind::While { body, .. } => body,
+            _ => &[],
+        }
+    }
+
+    /// The states that a loop goes through in each iteration.
+    pub fn body_of(&self, id: StateId) -> &[StateId] {
+        let (StateKind::ForEach { body, .. } | StateKind::While { body, .. }) = &self.state(id).kind else {
+            return &[];
+        };
+        match body.as_slice() {
+            [pass] if self.is_pass(*pass) => self.list_of(*pass),
+            body => body,
+        }
+    }
+
     /// Where an outcome of a state leads. An outcome that is not connected: `success` goes on with the next sibling, and after the
     /// last one out by `success`; any other leaves by its own name. A region leads nowhere else.
     pub fn target(&self, id: StateId, outcome: &str) -> Target {

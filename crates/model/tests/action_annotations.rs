@@ -185,3 +185,25 @@ fn each_requirement_stands_for_itself_and_no_effects_are_something_said() {
     let effects = &loaded.program.states[1].annotations.effects;
     assert!(effects["success"].is_empty() && effects["aborted"].is_empty());
 }
+
+/// What an action says is read with what the state gives its inputs in it: neither may make something boundless of the other.
+#[test]
+fn what_an_action_says_of_large_inputs_has_a_bound() {
+    let ports = vec!["len($a)"; 100].join(" + ");
+    let catalogue = format!(
+        "[resources]\nBrain = {{ class = \"process\", count = 1 }}\n[providers.brain]\nresource = \"Brain\"\n\
+         [providers.brain.actions.think]\noptional = {{ a = \"any\" }}\n\
+         annotations = {{ computes = true, reads = [], requires = [\"{ports} > 0\", \"{ports} >= 0\"], resources = [\"Brain\"] }}\n"
+    );
+    let catalogue = Catalogue::from_toml(&catalogue).unwrap();
+    let found = |items: usize| {
+        let list = vec!["$n"; items].join(", ");
+        let task = format!(
+            "task: t\nvariables: {{ n: 1 }}\nstates:\n  - think: {{ action: brain/think, in: {{ a: '[{list}]' }} }}\n"
+        );
+        load(&task, "t.yaml", &catalogue).err().map(|found| found[0].to_string())
+    };
+    assert_eq!(found(18), None);
+    let refused = found(50).unwrap_or_default();
+    assert!(refused.contains("with what the state gives its inputs, this has more than 2000 parts"), "{refused}");
+}

@@ -255,3 +255,121 @@ fn what_is_forgotten_when_a_state_is_entered_again_is_no_way() {
     let made = program(&states);
     assert_eq!(outputs(&made, "any"), ["pan: either(any/b.pan, part.pan)"]);
 }
+
+/// A hierarchy that may be left before its output was written, and a state behind it.
+fn left_early(outputs: &str, around: &str, behind: &str) -> String {
+    format!(
+        "  - part:
+      outcomes: [early]
+      outputs: {outputs}{around}
+      states:
+        - any: {{ condition: exists at(cup), outcomes: [early], then: [{{ out: {{ states: [], transitions: {{ success: early }} }} }}], transitions: {{ early: early }} }}
+        - {}
+      transitions: {{ early: next }}
+  - next: {{ action: pan_tilt/look_at, in: {{ target: \"pose(1, {behind}, 1)\" }}, resources: [{{ block: PanTilt }}] }}
+",
+        look("a")
+    )
+}
+
+#[test]
+fn an_output_that_may_be_left_out_is_no_way_that_is_sure() {
+    for around in ["", "\n      timeout: 10", "\n      retry: { times: 1, on: [aborted] }", "\n      routine: true"] {
+        let found = refused(&left_early("{ pan: a.pan }", around, "part.pan"));
+        assert!(found[0].starts_with("branch-may-not-have-written: `part.pan` may not"), "{around}: {found:?}");
+        let found = refused(&left_early("{ pan: a.pan, two: a.pan }", around, "either(part.pan, part.two)"));
+        assert!(found[0].starts_with("branch-may-not-have-written: on some way"), "{around}: {found:?}");
+        program(&left_early("{ pan: a.pan }", around, "either(part.pan, 0)"));
+        program(&left_early("{ pan: { value: a.pan, default: 0 } }", around, "part.pan"));
+        program(&left_early("{ pan: 5 }", around, "part.pan"));
+        program(&left_early("{ pan: a.pan }", around, "0").replace("early: next", "early: success"));
+        // What another state makes of it may be missing, too.
+        let twice = left_early("{ pan: a.pan }", around, "outer.pan");
+        let (inner, next) = twice.split_once("  - next").unwrap();
+        let inner = inner.replace("early: next", "early: early").replace('\n', "\n      ");
+        let outer = |value: &str| {
+            format!(
+                "  - outer:\n      outcomes: [early]\n      outputs: {{ pan: {value} }}\n      states:\n      {}\n      transitions: {{ early: next }}\n  - next{next}",
+                inner.trim_end()
+            )
+        };
+        let found = refused(&outer("part.pan"));
+        assert!(found[0].starts_with("branch-may-not-have-written: `outer.pan` may not"), "{around}: {found:?}");
+        program(&outer("\"either(part.pan, 0)\""));
+    }
+}
+
+#[test]
+fn what_a_state_says_of_its_own_end_needs_what_it_has_written_by_then() {
+    let states = |more: &str| {
+        let text = format!(
+            "  - all:\n      variables: {{ seen: 0 }}\n      states:\n{}",
+            left_early("{ pan: a.pan }", more, "0")
+        );
+        let (head, rest) = text.split_at(text.find("      states:\n").unwrap() + 14);
+        head.to_owned() + &rest.replace("\n  ", "\n        ").replace("  - part", "        - part")
+    };
+    for more in ["\n      assign: { seen: pan }", "\n      effects: { success: [], early: ['seen() = pan'] }"] {
+        let found = refused(&states(more));
+        assert!(
+            found[0].contains("the output `pan` may not have been written where this state ends by `early`"),
+            "{found:?}"
+        );
+    }
+    program(&states("\n      effects: { success: ['seen() = pan'], early: [] }"));
+}
+
+/// What the iteration before has written is no way of this one.
+#[test]
+fn a_way_that_only_another_iteration_has_come_through_is_none() {
+    let states = |each: &str| {
+        format!(
+            "  - looks:
+      for: n in [1, 2]
+      outputs: {{ all: {{ each: \"{each}\" }} }}
+      do:
+        - any: {{ condition: exists at(cup), outcomes: [other], then: [{{ out: {{ states: [], transitions: {{ success: other }} }} }}], transitions: {{ other: b }} }}
+        - {}
+        - b: {{ states: [] }}
+",
+            look("a")
+        )
+    };
+    program(&states("either(a.pan, 0)"));
+    let found = refused(&states("either(a.pan, a.pan)"));
+    assert!(found[0].starts_with("branch-may-not-have-written: on some way"), "{found:?}");
+}
+
+#[test]
+fn what_a_while_counts_is_gone_at_its_end() {
+    let states = |value: &str| {
+        format!(
+            "  - all:\n      variables: {{ seen: 0 }}\n      states:\n        - looks:\n            while: $i < 3\n            index: i\n            assign: {{ seen: {value} }}\n            do: [{{ {} }}]\n",
+            look("a")
+        )
+    };
+    program(&states("$seen + 1"));
+    assert!(refused(&states("$i"))[0].starts_with("unknown-variable: there is no variable `$i` here"));
+}
+
+#[test]
+fn what_a_decider_says_is_what_its_regions_have_given() {
+    let both = |decide: &str, outputs: &str| {
+        let turn = look("turn").replace("resources:", "pia: true, reads: [], effects: [], resources:");
+        format!(
+            "  - both:\n      concurrency: barrier\n      decide: {decide}\n      outputs: {outputs}\n      regions:\n        - open: {{ action: gripper/feel, pia: true, reads: [], effects: [], resources: [{{ block: Gripper }}] }}\n        - {turn}\n      transitions: {{ odd: next }}\n  - next: {{ action: pan_tilt/look_at, in: {{ target: \"pose(1, both.x, 1)\" }}, resources: [{{ block: PanTilt }}] }}\n"
+        )
+    };
+    program(&both("{ odd: open.outcome = aborted and turn.outcome = success }", "{ x: turn.pan }"));
+    program(&both("{ odd: open.outcome = aborted }", "{ x: { value: turn.pan, default: 0 } }"));
+    program(&both(
+        "{ success: turn.outcome = success, odd: turn.outcome = aborted }",
+        "{ x: \"either(turn.pan, 0)\" }",
+    ));
+    let found = refused(&both("{ odd: open.outcome = aborted }", "{ x: turn.pan }"));
+    assert!(found[0].starts_with("branch-may-not-have-written: `both.x` may not"), "{found:?}");
+    let found = refused(
+        &both("{ success: open.outcome = success }", "{ x: turn.pan }").replace("odd: next", "aborted: aborted"),
+    );
+    assert!(found[0].starts_with("branch-may-not-have-written: `turn.pan` may not"), "{found:?}");
+}

@@ -43,7 +43,7 @@ use std::fmt::{self, Write};
 use std::sync::Arc;
 
 /// The version of the form. Any change of what is written takes a new number: no version reads another's.
-const FORMAT: u8 = 9;
+const FORMAT: u8 = 10;
 
 type Hash = [u8; blake3::OUT_LEN];
 

@@ -27,6 +27,7 @@ use crate::context::{Context, Made};
 use crate::hold::Hold;
 use crate::protocol::Event;
 use node::GoalEnd;
+use ratn_model::expression::Given;
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, Revision, StateId};
 use ratn_model::measurement::Evidence;
@@ -36,7 +37,7 @@ use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_world::world::World;
 use std::borrow::Cow;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 pub(crate) use checkpoint::difference;
@@ -198,6 +199,8 @@ pub(crate) struct Interpreter {
     threads: BTreeMap<u64, Thread>,
     last_thread: u64,
     outputs: BTreeMap<StateId, Outputs>,
+    /// The states of loops whose outputs are those of the iteration before.
+    earlier: BTreeSet<StateId>,
     /// How regions ended.
     regions: BTreeMap<StateId, String>,
     routines: BTreeMap<u64, Routine>,
@@ -253,6 +256,7 @@ impl Interpreter {
             threads: BTreeMap::from([(MAIN, main)]),
             last_thread: MAIN,
             outputs,
+            earlier: BTreeSet::new(),
             regions: BTreeMap::new(),
             routines: routine.map(|routine| (MAIN, routine)).into_iter().collect(),
             last_routine: MAIN,
@@ -451,18 +455,22 @@ impl Names for Scoped<'_> {
         if port == "outcome" && matches!(around, Some(StateKind::Concurrency { .. })) {
             return self.interpreter.regions.get(&state).map(|outcome| Cow::Owned(Value::String(outcome.clone())));
         }
-        match self.interpreter.outputs.get(&state) {
-            Some(outputs) => outputs.get(port).map(Cow::Borrowed),
-            None => source.defaults.get(port).map(Cow::Borrowed),
-        }
+        let written = self.interpreter.outputs.get(&state).and_then(|outputs| outputs.get(port));
+        written.or_else(|| source.defaults.get(port)).map(Cow::Borrowed)
     }
 
-    fn is_given(&self, state: StateId, port: &str) -> bool {
+    fn given(&self, state: StateId, port: &str) -> Given {
         let source = self.program.state(state);
         let around = source.parent.map(|parent| &self.program.state(parent).kind);
-        if port == "outcome" && matches!(around, Some(StateKind::Concurrency { .. })) {
-            return self.interpreter.regions.contains_key(&state);
+        let is_written = if port == "outcome" && matches!(around, Some(StateKind::Concurrency { .. })) {
+            self.interpreter.regions.contains_key(&state)
+        } else {
+            self.interpreter.outputs.get(&state).is_some_and(|outputs| outputs.contains_key(port))
+        };
+        match (is_written, source.defaults.contains_key(port)) {
+            (true, _) => Given::Written,
+            (false, true) => Given::Default,
+            (false, false) => Given::Missing,
         }
-        self.interpreter.outputs.contains_key(&state) || source.defaults.contains_key(port)
     }
 }

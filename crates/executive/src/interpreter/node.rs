@@ -310,7 +310,7 @@ impl Interpreter {
             aborted(&mut outcome, problem);
         }
         if !is_failure(&outcome) {
-            self.outputs.insert(id, outputs);
+            self.write(id, outputs);
             self.assign(thread, assigned);
         }
         self.give_back(context, &current);

@@ -1,7 +1,7 @@
 //! The walk over the tree of states: which state comes next.
 
 use super::{Frame, Interpreter, MAIN, Progress, Todo};
-use crate::binding::{self, child_path};
+use crate::binding::{self, Outputs, child_path};
 use crate::context::{Context, MAX_IDLE_VISITS, in_circles};
 use crate::protocol::Note;
 use ratn_model::id::{InstanceId, StateId};
@@ -87,6 +87,7 @@ impl Interpreter {
         if self.is_inside(thread) && !self.count_visit(thread) {
             return;
         }
+        self.forget_passed_over(program, thread, Some(id));
         if let StateKind::Action { .. } = state.kind {
             return self.begin(context, thread, id, &path);
         }
@@ -142,9 +143,9 @@ impl Interpreter {
                     }
                     Ok(other) => {
                         let reason = format!("{path}: it loops over a {}, not a list", other.type_name());
-                        self.ended(thread, id, ABORTED, reason);
+                        self.fail_at_its_list(thread, id, base, reason);
                     }
-                    Err(error) => self.ended(thread, id, ABORTED, wrong("its list", &error)),
+                    Err(error) => self.fail_at_its_list(thread, id, base, wrong("its list", &error)),
                 }
             }
             StateKind::While { body_first, .. } => {
@@ -195,10 +196,44 @@ impl Interpreter {
         }
     }
 
+    /// A loop ends before its first iteration. Its variables are gone.
+    fn fail_at_its_list(&mut self, id: u64, state: StateId, base: usize, reason: String) {
+        if let Some(thread) = self.threads.get_mut(&id) {
+            thread.variables.truncate(base);
+        }
+        self.ended(id, state, ABORTED, reason);
+    }
+
+    /// A state has ended well and gives this.
+    pub(super) fn write(&mut self, id: StateId, outputs: Outputs) {
+        self.earlier.remove(&id);
+        self.outputs.insert(id, outputs);
+    }
+
+    /// What an iteration has passed over on its way to a state of the body, or to its end, gives nothing in it. What comes only later is still that
+    /// of the iteration before.
+    fn forget_passed_over(&mut self, program: &Program, thread: u64, to: Option<StateId>) {
+        if self.earlier.is_empty() {
+            return;
+        }
+        let Some(frame) = self.threads.get(&thread).and_then(|thread| thread.frames.last()) else { return };
+        let owner = program.state(frame.owner);
+        if !program.is_iterated(owner.id) {
+            return;
+        }
+        let passed = owner.children().take_while(|child| Some(*child) != to);
+        for child in passed {
+            if self.earlier.remove(&child) {
+                self.outputs.remove(&child);
+            }
+        }
+    }
+
     /// What the states inside have written in an earlier activation is not seen in this one.
     fn forget_inside(&mut self, program: &Program, id: StateId) {
         for child in program.state(id).children() {
             self.outputs.remove(&child);
+            self.earlier.remove(&child);
             self.regions.remove(&child);
             self.forget_inside(program, child);
         }
@@ -284,6 +319,8 @@ impl Interpreter {
         }
         self.bind_iteration(program, thread);
         let Some(frame) = self.threads.get(&thread).and_then(|thread| thread.frames.last()) else { return };
+        let of_the_body = program.body_of(frame.owner).iter().copied();
+        self.earlier.extend(of_the_body.filter(|state| self.outputs.contains_key(state)));
         let body = match &program.state(frame.owner).kind {
             StateKind::ForEach { body, .. } | StateKind::While { body, .. } => body.first(),
             _ => None,
@@ -331,6 +368,7 @@ impl Interpreter {
         match context.program.target(state, &outcome) {
             Target::State(next) => self.set(id, Todo::Enter(next, None)),
             Target::Outcome(by) => {
+                self.forget_passed_over(context.program, id, None);
                 let is_loop = matches!(owner.kind, StateKind::ForEach { .. } | StateKind::While { .. });
                 debug_assert!(owner.lists().get(list).is_some_and(|list| list.contains(&state)));
                 if is_loop && by == SUCCESS {

@@ -16,7 +16,7 @@ use crate::plan::{Effects, NodeNature, Outcome, gives_outputs};
 use crate::protocol::{Command, Note};
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::InstanceId;
-use ratn_model::program::{ABORTED, SUCCESS};
+use ratn_model::program::{ABORTED, Program, SUCCESS};
 use ratn_model::value::Value;
 use smallvec::SmallVec;
 use std::collections::BTreeMap;
@@ -191,7 +191,12 @@ impl Window {
         let Some(instance) = self.graph.get(id) else { return };
         let (line, position, state) = (instance.line, instance.position, instance.state);
         let producer = instance.producer.clone().filter(|_| instance.role().is_none());
-        let environment = instance.environment.clone();
+        let mut environment = instance.environment.clone();
+        // The variables of the state itself are gone with it.
+        if state != Program::ROOT && matches!(instance.role(), Some(Role::Exit | Role::Loop | Role::Test)) {
+            let own = context.program.state(state).variables.len();
+            environment.variables.truncate(environment.variables.len().saturating_sub(own));
+        }
         self.remove_retired(context, id);
         let departure = Departure { environment, line, position, state, outcome, because };
         self.growth.depart(context, departure, producer);

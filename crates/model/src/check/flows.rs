@@ -3,10 +3,11 @@
 //! Whether an output is there is read from the control flow ([`super::graph`]). The flows of the whole program form a graph, too
 //! (petgraph): it tells a flow that reordering would repair from a cycle.
 
-use super::graph::{ControlFlow, Point};
+use super::graph::{ControlFlow, Point, decided, one_succeeds};
+use super::ways::{Flow, ways};
 use super::{Subject, branches, expressions};
 use crate::diagnostic::Findings;
-use crate::expression::{Expr, Function};
+use crate::expression::Expr;
 use crate::id::StateId;
 use crate::program::{Program, SUCCESS, State, StateKind, is_failure};
 use crate::slot::Slot;
@@ -23,7 +24,8 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
         let ways = ways(expr);
         let needed = ways.needed.into_iter().filter_map(|flow| refused(subject, &graph, (to, slot), flow, false));
         let either = ways.either.iter().flat_map(|either| none_refused(subject, &graph, (to, slot), either));
-        for (rule, message, help) in needed.chain(either) {
+        let own = left_out(subject, to, slot, expr).into_iter();
+        for (rule, message, help) in needed.chain(either).chain(own) {
             findings.error(rule, subject.place_of(to, slot), &to.path, message, help);
         }
     }
@@ -32,18 +34,44 @@ pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
 /// What is wrong with a flow: the rule, the message, what to do.
 type Refused = (&'static str, String, String);
 
+/// Why an output of the state itself cannot be used where it has ended.
+fn left_out(subject: &Subject<'_>, to: &State, slot: Slot<'_>, expr: &Expr) -> Option<Refused> {
+    let control = subject.control;
+    let only = match slot {
+        Slot::Effect(outcome) => Some(outcome),
+        Slot::Assign(_) => None,
+        _ => return None,
+    };
+    let outcomes = control.outcomes(to.id).iter().enumerate().filter(|(number, outcome)| {
+        only.is_none_or(|only| only == *outcome)
+            && !is_failure(outcome)
+            && control.is_reached(Point::End(to.id, *number))
+    });
+    let outcomes: Vec<&String> = outcomes.map(|(_, outcome)| outcome).collect();
+    let mut found = None;
+    expr.visit(&mut |part| {
+        let Expr::Output(name) = part else { return };
+        if let Some(outcome) = outcomes.iter().find(|outcome| !control.gives((to.id, name), outcome)) {
+            found = Some((name.clone(), (*outcome).clone()));
+        }
+    });
+    let (name, outcome) = found?;
+    let message = format!("the output `{name}` may not have been written where this state ends by `{outcome}`");
+    Some(("branch-may-not-have-written", message, "give the output a default".to_owned()))
+}
+
 /// Why an output cannot be used in an expression; one of several of which the first that is there is taken need not be there on every way.
 fn refused(
     subject: &Subject<'_>,
     graph: &FlowGraph,
     (to, slot): (&State, Slot<'_>),
-    (from, port): (StateId, &str),
+    (from, port): Flow<'_>,
     is_one_of_several: bool,
 ) -> Option<Refused> {
     let program = subject.program;
     let source = program.state(from);
     let flow = format!("`{}.{port}`", source.name);
-    let maybe = may_be_written(subject.control, to, slot, from);
+    let maybe = may_be_written(subject.control, to, slot, (from, port));
     let relation = relation(subject, to, slot, source);
     if !matches!(relation, Relation::Hidden(_) | Relation::Beside) {
         // What a state contains is forgotten when it is entered, also where it is one of several that may be there.
@@ -173,12 +201,12 @@ fn relation<'a>(subject: &Subject<'a>, to: &State, slot: Slot<'_>, from: &'a Sta
 }
 
 /// Whether the source has surely written its outputs when the expression of the target is evaluated.
-fn is_written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: StateId) -> bool {
+fn is_written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: Flow<'_>) -> bool {
     points(control, to, slot).into_iter().all(|point| control.written(point, from).0)
 }
 
 /// Whether it may have: what an output is made of also where the state is left by an outcome of its own.
-fn may_be_written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: StateId) -> bool {
+fn may_be_written(control: &ControlFlow, to: &State, slot: Slot<'_>, from: Flow<'_>) -> bool {
     let mut all = points(control, to, slot);
     if matches!(slot, Slot::Output(_)) {
         all.extend(ends(control, to, None));
@@ -226,77 +254,32 @@ fn at_join(to: &State, slot: Slot<'_>) -> bool {
         && matches!(slot, Slot::Decide(_) | Slot::Output(_) | Slot::Effect(_))
 }
 
-/// The outputs that an expression cannot do without, and those of which it takes the first that is there.
-#[derive(Default)]
-struct Ways<'e> {
-    needed: BTreeSet<(StateId, &'e str)>,
-    /// Each `either`, way by way.
-    either: Vec<Vec<BTreeSet<(StateId, &'e str)>>>,
-}
-
-fn ways(expr: &Expr) -> Ways<'_> {
-    fn collect<'e>(expr: &'e Expr, ways: &mut Ways<'e>) {
-        match expr {
-            Expr::Port { state, port } => drop(ways.needed.insert((*state, port.as_str()))),
-            Expr::Call(Function::Either, all) => ways.either.push(all.iter().flat_map(alternatives).collect()),
-            _ => {
-                let mut parts = Vec::new();
-                expr.parts(&mut |part| parts.push(part));
-                parts.into_iter().for_each(|part| collect(part, ways));
-            }
-        }
-    }
-    let mut ways = Ways::default();
-    collect(expr, &mut ways);
-    ways
-}
-
-/// So many ways of one expression are looked at. What is sure only by further ones is refused.
-const MOST_WAYS: usize = 64;
-
-/// The outputs with which an expression has a value, way by way: what contains several `either` has a way for each choice among them.
-fn alternatives(expr: &Expr) -> Vec<BTreeSet<(StateId, &str)>> {
-    match expr {
-        Expr::Port { state, port } => vec![BTreeSet::from([(*state, port.as_str())])],
-        Expr::Call(Function::Either, all) => all.iter().flat_map(alternatives).take(MOST_WAYS).collect(),
-        _ => {
-            let mut parts = Vec::new();
-            expr.parts(&mut |part| parts.push(alternatives(part)));
-            parts.into_iter().fold(vec![BTreeSet::new()], |ways, part| {
-                let both = |way: &BTreeSet<_>| part.iter().map(|other| way | other).collect::<Vec<_>>();
-                ways.iter().flat_map(both).take(MOST_WAYS).collect()
-            })
-        }
-    }
-}
-
 /// Why outputs of which the first that is there is taken cannot be used.
 fn none_refused(
     subject: &Subject<'_>,
     graph: &FlowGraph,
     (to, slot): (&State, Slot<'_>),
-    either: &[BTreeSet<(StateId, &str)>],
+    either: &[BTreeSet<Flow<'_>>],
 ) -> Vec<Refused> {
     let each = either.iter().flatten().filter_map(|flow| refused(subject, graph, (to, slot), *flow, true));
     let each: Vec<Refused> = each.collect();
     if !each.is_empty() || either.iter().any(|way| way.iter().all(|flow| is_there(subject, to, slot, *flow))) {
         return each;
     }
-    // Of a way that needs several states nothing is said: that one is there does not say that the others are.
-    let states = |way: &BTreeSet<(StateId, &str)>| way.iter().map(|(from, _)| *from).collect::<BTreeSet<StateId>>();
-    let of_one = either.iter().map(states).filter(|states| states.len() == 1);
-    let from: BTreeSet<StateId> = of_one.flatten().collect();
+    // Of a way that needs several outputs nothing is said: that one is there does not say that the others are.
+    let of_one: BTreeSet<Flow<'_>> = either.iter().filter_map(|way| subject.control.one_of(way)).collect();
+    let from: BTreeSet<StateId> = of_one.iter().map(|(from, _)| *from).collect();
     let is_covered = match join(subject, to, slot, &from) {
         Some(ends_with_one) => ends_with_one,
         None => {
             let mut points = points(subject.control, to, slot).into_iter();
-            points.all(|point| subject.control.one_is_written(subject.program, point, &from))
+            points.all(|point| subject.control.one_is_written(subject.program, point, &of_one))
         }
     };
     if is_covered {
         return Vec::new();
     }
-    let name = |(from, port): &(StateId, &str)| format!("`{}.{port}`", subject.program.state(*from).name);
+    let name = |(from, port): &Flow<'_>| format!("`{}.{port}`", subject.program.state(*from).name);
     let names: BTreeSet<String> = either.iter().flatten().map(name).collect();
     let names = names.into_iter().collect::<Vec<_>>().join(", ");
     let message = format!("on some way that leads here none of {names} has been written");
@@ -305,10 +288,10 @@ fn none_refused(
 }
 
 /// Whether an output is surely there: written on every way, or with a default.
-fn is_there(subject: &Subject<'_>, to: &State, slot: Slot<'_>, (from, port): (StateId, &str)) -> bool {
+fn is_there(subject: &Subject<'_>, to: &State, slot: Slot<'_>, (from, port): Flow<'_>) -> bool {
     let source = subject.program.state(from);
     source.defaults.contains_key(port)
-        || is_written(subject.control, to, slot, from)
+        || is_written(subject.control, to, slot, (from, port))
         || (port == "outcome" && is_region_of(to, from) && at_join(to, slot))
         || join(subject, to, slot, &BTreeSet::from([from])) == Some(true)
 }
@@ -320,15 +303,18 @@ fn is_region_of(to: &State, from: StateId) -> bool {
 /// Whether one of these regions has surely written its outputs when the concurrency has ended with success, as far as it is known; `None` if it
 /// is not about regions.
 fn join(subject: &Subject<'_>, to: &State, slot: Slot<'_>, from: &BTreeSet<StateId>) -> Option<bool> {
-    let StateKind::Concurrency { regions, preemptive, successes, decide, .. } = &to.kind else { return None };
+    let StateKind::Concurrency { regions, preemptive, successes, .. } = &to.kind else { return None };
     let ours = regions.iter().filter(|region| from.contains(region)).count();
     if ours == 0 || !at_join(to, slot) {
         return None;
     }
     let watches = regions.iter().filter(|region| subject.program.state(**region).is_watch()).count();
     // What is decided by the outcomes is up to who wrote that, and so is what an outcome changes.
-    if !matches!(slot, Slot::Output(_)) || !decide.is_empty() {
+    if !matches!(slot, Slot::Output(_)) {
         return Some(true);
+    }
+    if let Some(holds) = decided(to, SUCCESS) {
+        return Some(one_succeeds(holds, from));
     }
     Some(match successes {
         Some(wanted) => ours + *wanted as usize > regions.len(),

@@ -1,10 +1,14 @@
 //! The control flow of a program as a graph: where each state begins and how it ends, and what leads where.
 //!
 //! Two facts are computed over it for every point: which states have surely written their outputs by then, and which may
-//! have. A state inside of a composite is forgotten when the composite is entered again.
+//! have. A state inside of a composite is forgotten when the composite is entered again. Where a state is left by an outcome of its own, what an
+//! output is made of may not have been written; so such an output ([`Ports`]) counts for itself.
 
+use super::ways::{Flow, Ways, ways};
+use crate::expression::{BinaryOperator, Expr};
 use crate::id::StateId;
 use crate::program::{ABORTED, Program, SUCCESS, State, StateKind, Target, is_failure};
+use crate::value::Value;
 use petgraph::graph::{DiGraph, NodeIndex};
 use petgraph::visit::EdgeRef;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -25,30 +29,71 @@ pub(crate) struct ControlFlow {
     graph: DiGraph<Point, ()>,
     places: BTreeMap<Point, NodeIndex>,
     outcomes: Vec<Vec<String>>,
+    ports: Ports,
     /// By place; `None` where nothing leads.
     surely: Vec<Option<Set>>,
     maybe: Vec<Set>,
 }
 
-/// A set of states.
+/// The outputs that a state may leave out where it ends by an outcome of its own.
+#[derive(Debug, Default)]
+struct Ports {
+    of: BTreeMap<StateId, Vec<Port>>,
+}
+
+#[derive(Debug)]
+struct Port {
+    name: String,
+    /// Its number in a [`Set`].
+    number: usize,
+    /// The outcomes with which it may be left out.
+    left_out: BTreeSet<usize>,
+}
+
+impl Ports {
+    /// Before it is known with which outcomes they are there, they are with every one.
+    fn of(program: &Program, outcomes: &[Vec<String>]) -> Ports {
+        let mut number = program.states.len();
+        let mut of: BTreeMap<StateId, Vec<Port>> = BTreeMap::new();
+        for state in &program.states {
+            let has_own = outcomes[index(state.id)].iter().any(|outcome| is_own(outcome));
+            for output in state.outputs().iter().filter(|output| has_own && !output.value.flows().is_empty()) {
+                let port = Port { name: output.name.clone(), number, left_out: BTreeSet::new() };
+                of.entry(state.id).or_default().push(port);
+                number += 1;
+            }
+        }
+        Ports { of }
+    }
+
+    fn count(&self) -> usize {
+        self.of.values().map(Vec::len).sum()
+    }
+
+    fn get(&self, state: StateId, name: &str) -> Option<&Port> {
+        self.of.get(&state)?.iter().find(|port| port.name == name)
+    }
+}
+
+/// A set of states, and of outputs that count for themselves.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Set(Vec<u64>);
 
 impl Set {
-    fn none(states: usize) -> Set {
-        Set(vec![0; states.div_ceil(64)])
+    fn none(members: usize) -> Set {
+        Set(vec![0; members.div_ceil(64)])
     }
 
-    fn insert(&mut self, id: StateId) {
-        self.0[id.0 as usize / 64] |= 1 << (id.0 % 64);
+    fn insert(&mut self, member: usize) {
+        self.0[member / 64] |= 1 << (member % 64);
     }
 
-    fn remove(&mut self, id: StateId) {
-        self.0[id.0 as usize / 64] &= !(1 << (id.0 % 64));
+    fn remove(&mut self, member: usize) {
+        self.0[member / 64] &= !(1 << (member % 64));
     }
 
-    fn contains(&self, id: StateId) -> bool {
-        self.0[id.0 as usize / 64] & (1 << (id.0 % 64)) != 0
+    fn contains(&self, member: usize) -> bool {
+        self.0[member / 64] & (1 << (member % 64)) != 0
     }
 
     fn combine(&mut self, other: &Set, with: impl Fn(u64, u64) -> u64) {
@@ -60,10 +105,12 @@ impl ControlFlow {
     /// The control flow of a program.
     pub(crate) fn of(program: &Program) -> ControlFlow {
         let outcomes = program.all_outcomes();
+        let ports = Ports::of(program, &outcomes);
         let mut flow = ControlFlow {
             graph: DiGraph::new(),
             places: BTreeMap::new(),
             outcomes,
+            ports,
             surely: Vec::new(),
             maybe: Vec::new(),
         };
@@ -118,6 +165,10 @@ impl ControlFlow {
             }
         }
         flow.solve(program);
+        // An output that is left out may be what another one is made of.
+        while flow.leave_out(program) {
+            flow.solve(program);
+        }
         flow
     }
 
@@ -126,42 +177,86 @@ impl ControlFlow {
         self.places.get(&point).is_some_and(|place| self.surely[place.index()].is_some())
     }
 
-    /// Whether the state has surely, and whether it may have, written its outputs when the control flow comes to a point. Of a point that
+    /// Whether the state has surely, and whether it may have, written an output when the control flow comes to a point. Of a point that
     /// nothing leads to everything is sure.
-    pub(crate) fn written(&self, point: Point, state: StateId) -> (bool, bool) {
+    pub(crate) fn written(&self, point: Point, (state, port): Flow<'_>) -> (bool, bool) {
         let Some(place) = self.places.get(&point) else { return (true, true) };
+        let member = self.ports.get(state, port).map_or(index(state), |port| port.number);
         match &self.surely[place.index()] {
-            Some(surely) => (surely.contains(state), self.maybe[place.index()].contains(state)),
+            Some(surely) => (surely.contains(member), self.maybe[place.index()].contains(member)),
             None => (true, true),
         }
     }
 
-    /// Whether one of these states has written its outputs, whichever way the control flow came to a point. Where it comes to a state around one
-    /// of them, that one is forgotten, and then none is sure.
-    pub(crate) fn one_is_written(&self, program: &Program, point: Point, states: &BTreeSet<StateId>) -> bool {
+    /// Whether a state that ends by an outcome has surely written an output.
+    pub(crate) fn gives(&self, (state, port): Flow<'_>, outcome: &str) -> bool {
+        let number = self.outcomes[index(state)].iter().position(|known| known == outcome);
+        let left_out = self.ports.get(state, port).zip(number).is_some_and(|(port, n)| port.left_out.contains(&n));
+        !is_failure(outcome) && !left_out
+    }
+
+    /// An output that is there where all of these are, which are a way of an `either`, and not there where one of them is not. `None` where that is
+    /// not one.
+    pub(crate) fn one_of<'e>(&self, way: &BTreeSet<Flow<'e>>) -> Option<Flow<'e>> {
+        let first = way.first()?;
+        let is_left_out =
+            |(state, port): &&Flow<'e>| self.ports.get(*state, port).is_some_and(|p| !p.left_out.is_empty());
+        let mut left_out = way.iter().filter(is_left_out);
+        let one = left_out.next().unwrap_or(first);
+        (way.iter().all(|(state, _)| *state == first.0) && left_out.next().is_none()).then_some(*one)
+    }
+
+    /// Whether one of these outputs has been written, whichever way the control flow came to a point. Where it comes to a state around one of them,
+    /// or begins an iteration of a loop that goes through one of them, that one is forgotten, and then none is sure.
+    pub(crate) fn one_is_written(&self, program: &Program, point: Point, flows: &BTreeSet<Flow<'_>>) -> bool {
         let (Some(begin), Some(goal)) = (self.places.get(&Point::Begin(Program::ROOT)), self.places.get(&point)) else {
             return true;
         };
         let parent = |id: &StateId| program.state(*id).parent;
-        let around = states.iter().flat_map(|id| std::iter::successors(parent(id), parent));
-        let around: BTreeSet<StateId> = around.filter(|id| !program.is_pass(*id)).collect();
-        // Per place: whether it was come to with none of them, and with one.
-        let mut seen = vec![[false; 2]; self.graph.node_count()];
-        let mut open = vec![(*begin, false)];
-        while let Some((place, mut is_written)) = open.pop() {
-            if std::mem::replace(&mut seen[place.index()][usize::from(is_written)], true) {
+        let around = flows.iter().flat_map(|(id, _)| std::iter::successors(parent(id), parent));
+        let (passes, around): (BTreeSet<StateId>, BTreeSet<StateId>) = around.partition(|id| program.is_pass(*id));
+        let iterated = flows.iter().filter_map(|(id, _)| parent(id)).filter(|id| program.is_iterated(*id));
+        let iterated: BTreeSet<StateId> =
+            iterated.filter_map(|id| if passes.contains(&id) { parent(&id) } else { Some(id) }).collect();
+        // What may be left out where its state ends once more is told apart from the others, as far as there is room.
+        let may_be_left_out: Vec<Flow<'_>> = flows
+            .iter()
+            .filter(|(id, port)| self.ports.get(*id, port).is_some_and(|port| !port.left_out.is_empty()))
+            .copied()
+            .take(6)
+            .collect();
+        let bit_of = |flow: &Flow<'_>| may_be_left_out.iter().position(|other| other == flow).map_or(0, |n| n + 1);
+        // Per place: with which of them it was come to.
+        let mut seen = vec![0_u128; self.graph.node_count()];
+        let mut open = vec![(*begin, 0_u8)];
+        while let Some((place, mut written)) = open.pop() {
+            if seen[place.index()] & (1 << written) != 0 {
                 continue;
             }
+            seen[place.index()] |= 1 << written;
             match self.graph[place] {
-                Point::Begin(id) => is_written &= !around.contains(&id),
-                Point::End(id, number) => {
-                    is_written |= states.contains(&id) && !is_failure(&self.outcomes[id.0 as usize][number]);
+                Point::Begin(id) if around.contains(&id) => written = 0,
+                Point::End(id, number) if !is_failure(&self.outcomes[index(id)][number]) => {
+                    for flow in flows.iter().filter(|(from, _)| *from == id) {
+                        let left_out = self.ports.get(id, flow.1).is_some_and(|port| port.left_out.contains(&number));
+                        match (left_out, bit_of(flow)) {
+                            (true, 0) => {}
+                            (true, bit) => written &= !(1 << bit),
+                            (false, bit) => written |= 1 << bit,
+                        }
+                    }
                 }
-                Point::Middle(_) => {}
+                Point::Begin(_) | Point::Middle(_) | Point::End(..) => {}
             }
-            open.extend(self.graph.neighbors(place).map(|next| (next, is_written)));
+            for next in self.graph.neighbors(place) {
+                let loops = match (self.graph[place], self.graph[next]) {
+                    (Point::Middle(id), Point::Begin(_)) => iterated.contains(&id),
+                    _ => false,
+                };
+                open.push((next, if loops { 0 } else { written }));
+            }
         }
-        !seen[goal.index()][0]
+        seen[goal.index()] & 1 == 0
     }
 
     /// The outcomes of a state.
@@ -269,9 +364,62 @@ impl ControlFlow {
         self.graph.add_edge(from, to, ());
     }
 
+    /// Finds with which outcomes outputs may be left out, as far as it is known what is written by then; whether that is news.
+    fn leave_out(&mut self, program: &Program) -> bool {
+        let mut news: Vec<(StateId, usize, usize)> = Vec::new();
+        for (id, ports) in &self.ports.of {
+            for (at, port) in ports.iter().enumerate() {
+                let Some(output) = program.state(*id).outputs().iter().find(|output| output.name == port.name) else {
+                    continue;
+                };
+                let ways = ways(&output.value);
+                for (number, outcome) in self.outcomes[index(*id)].iter().enumerate() {
+                    let point = Point::End(*id, number);
+                    let is_open = is_own(outcome) && !port.left_out.contains(&number) && self.is_reached(point);
+                    if is_open && !self.are_there(program, (point, outcome), &ways) {
+                        news.push((*id, at, number));
+                    }
+                }
+            }
+        }
+        for (id, at, number) in &news {
+            let port = self.ports.of.get_mut(id).and_then(|ports| ports.get_mut(*at));
+            port.into_iter().for_each(|port| {
+                port.left_out.insert(*number);
+            });
+        }
+        !news.is_empty()
+    }
+
+    /// Whether all that an expression needs has surely been written when the control flow comes to the end of a state by an outcome, or has a default.
+    fn are_there(&self, program: &Program, (point, outcome): (Point, &str), ways: &Ways<'_>) -> bool {
+        let is_there = |(state, port): &Flow<'_>| {
+            let state = program.state(*state);
+            let around = state.parent.map(|around| program.state(around));
+            let written = match around.filter(|around| matches!(around.kind, StateKind::Concurrency { .. })) {
+                Some(_) if *port == "outcome" => true,
+                Some(around) if decided(around, outcome).is_some() => {
+                    decided(around, outcome).is_some_and(|holds| one_succeeds(holds, &BTreeSet::from([state.id])))
+                }
+                // It ends as the one region does that is no watch.
+                Some(around) => {
+                    let mut others = around.children().filter(|id| *id != state.id);
+                    !others.all(|other| program.state(other).is_watch()) || self.gives((state.id, port), outcome)
+                }
+                None => self.written(point, (state.id, port)).0,
+            };
+            written || state.defaults.contains_key(*port)
+        };
+        let one_is_there = |either: &Vec<BTreeSet<Flow<'_>>>| {
+            let single: BTreeSet<Flow<'_>> = either.iter().filter_map(|way| self.one_of(way)).collect();
+            either.iter().any(|way| way.iter().all(is_there)) || self.one_is_written(program, point, &single)
+        };
+        ways.needed.iter().all(is_there) && ways.either.iter().all(one_is_there)
+    }
+
     /// Definite assignment, forwards to a fixed point.
     fn solve(&mut self, program: &Program) {
-        let states = program.states.len();
+        let states = program.states.len() + self.ports.count();
         let inside: Vec<Vec<StateId>> = program.states.iter().map(|state| contained(program, state.id)).collect();
         self.surely = vec![None; self.graph.node_count()];
         self.maybe = vec![Set::none(states); self.graph.node_count()];
@@ -286,14 +434,24 @@ impl ControlFlow {
             match self.graph[place] {
                 Point::Begin(id) if !program.is_pass(id) => {
                     for forgotten in &inside[id.0 as usize] {
-                        surely.remove(*forgotten);
-                        maybe.remove(*forgotten);
+                        let ports = self.ports.of.get(forgotten).into_iter().flatten().map(|port| port.number);
+                        for member in std::iter::once(index(*forgotten)).chain(ports) {
+                            surely.remove(member);
+                            maybe.remove(member);
+                        }
                     }
                 }
                 Point::End(id, number) => {
                     if !is_failure(&self.outcomes[id.0 as usize][number]) {
-                        surely.insert(id);
-                        maybe.insert(id);
+                        surely.insert(index(id));
+                        maybe.insert(index(id));
+                        for port in self.ports.of.get(&id).into_iter().flatten() {
+                            match port.left_out.contains(&number) {
+                                true => surely.remove(port.number),
+                                false => surely.insert(port.number),
+                            }
+                            maybe.insert(port.number);
+                        }
                     }
                 }
                 Point::Begin(_) | Point::Middle(_) => {}
@@ -313,6 +471,37 @@ impl ControlFlow {
             }
         }
     }
+}
+
+/// When the decider of a concurrency says this outcome; `None` where it does not speak of it.
+pub(super) fn decided<'p>(state: &'p State, outcome: &str) -> Option<&'p Expr> {
+    let StateKind::Concurrency { decide, .. } = &state.kind else { return None };
+    decide.iter().find(|(decided, _)| decided == outcome).map(|(_, holds)| holds)
+}
+
+/// Whether one of these regions has surely ended with success where this holds: as far as it says so outright.
+pub(super) fn one_succeeds(holds: &Expr, regions: &BTreeSet<StateId>) -> bool {
+    let is_success = |a: &Expr, b: &Expr| match (a, b) {
+        (Expr::Port { state, port }, Expr::Literal(Value::String(outcome))) => {
+            port == "outcome" && outcome == SUCCESS && regions.contains(state)
+        }
+        _ => false,
+    };
+    match holds {
+        Expr::Binary(BinaryOperator::And, a, b) => one_succeeds(a, regions) || one_succeeds(b, regions),
+        Expr::Binary(BinaryOperator::Or, a, b) => one_succeeds(a, regions) && one_succeeds(b, regions),
+        Expr::Binary(BinaryOperator::Equal, a, b) => is_success(a, b) || is_success(b, a),
+        _ => false,
+    }
+}
+
+/// Whether an outcome gives outputs, and is not success.
+fn is_own(outcome: &str) -> bool {
+    outcome != SUCCESS && !is_failure(outcome)
+}
+
+fn index(id: StateId) -> usize {
+    id.0 as usize
 }
 
 /// The next state of the same list, by state; regions have none.

@@ -5,7 +5,7 @@
 //! The depth of an expression is bounded where it is parsed.
 
 use super::query::{self, Flow, RunError};
-use super::scope::{Lookup, Scope};
+use super::scope::{Given, Lookup, Scope};
 use super::{BinaryOperator, Expr, Function, UnaryOperator, comprehension, function};
 use crate::value::Value;
 use std::borrow::Cow;
@@ -92,9 +92,10 @@ impl Expr {
                 [condition, yes, no] => (if condition.holds(scope)? { yes } else { no }).value(scope)?,
                 _ => return Err(self.wrong("expected `if(condition, a, b)`")),
             },
-            Expr::Call(Function::Either, arguments) => match arguments.as_slice() {
-                [others @ .., last] => others.iter().find(|one| one.is_given(scope)).unwrap_or(last).value(scope)?,
-                [] => return Err(self.wrong("expected `either(a, b, …)`")),
+            Expr::Call(Function::Either, ways) => match (first_given(ways, scope), ways.last()) {
+                ((Given::NotYetKnown, _), _) => known(None)?,
+                ((_, Some(way)), _) | (_, Some(way)) => way.value(scope)?,
+                (_, None) => return Err(self.wrong("expected `either(a, b, …)`")),
             },
             Expr::Call(called, arguments) => {
                 let values = arguments.iter().map(|a| a.evaluate(scope)).collect::<Result<Vec<_>, _>>()?;
@@ -132,15 +133,15 @@ impl Expr {
         })
     }
 
-    /// Whether every output that it uses was written on the way to where it is evaluated, or has a default.
-    fn is_given(&self, scope: &dyn Scope) -> bool {
+    /// Whether the outputs that it uses are there where it is evaluated.
+    fn given(&self, scope: &dyn Scope) -> Given {
         match self {
-            Expr::Port { state, port } => scope.is_given(*state, port),
-            Expr::Call(Function::Either, ways) => ways.iter().any(|way| way.is_given(scope)),
+            Expr::Port { state, port } => scope.given(*state, port),
+            Expr::Call(Function::Either, ways) => first_given(ways, scope).0,
             _ => {
-                let mut is_given = true;
-                self.parts(&mut |part| is_given = is_given && part.is_given(scope));
-                is_given
+                let mut given = Given::Always;
+                self.parts(&mut |part| given = given.max(part.given(scope)));
+                given
             }
         }
     }
@@ -242,6 +243,23 @@ impl Expr {
             _ => return Err(self.wrong("it has no elements")),
         })
     }
+}
+
+/// Which of several ways `either` takes: the first that was written. What needs no output is always there, so nothing behind it counts. Only
+/// where none was written is it the first that has a default.
+fn first_given<'e>(ways: &'e [Expr], scope: &dyn Scope) -> (Given, Option<&'e Expr>) {
+    let mut by_default = None;
+    for way in ways {
+        match way.given(scope) {
+            Given::Written => return (Given::Written, Some(way)),
+            Given::Always if by_default.is_none() => return (Given::Always, Some(way)),
+            Given::Always => break,
+            Given::Default => by_default = by_default.or(Some(way)),
+            Given::NotYetKnown => return (Given::NotYetKnown, None),
+            Given::Missing => {}
+        }
+    }
+    (if by_default.is_some() { Given::Default } else { Given::Missing }, by_default)
 }
 
 /// A value in a message: its type, and itself where it is short.

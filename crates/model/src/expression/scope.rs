@@ -28,10 +28,9 @@ pub trait Scope {
     fn port(&self, state: StateId, port: &str) -> Option<Cow<'_, Value>> {
         self.outer()?.port(state, port)
     }
-    /// Whether the control flow has come through a state that writes this output, so that it has a value or will have one, or it has a
-    /// default. Unlike its value this is known as soon as the way is.
-    fn is_given(&self, state: StateId, port: &str) -> bool {
-        self.outer().is_none_or(|outer| outer.is_given(state, port))
+    /// Whether an output of another state is there, and why.
+    fn given(&self, state: StateId, port: &str) -> Given {
+        self.outer().map_or(Given::NotYetKnown, |outer| outer.given(state, port))
     }
     /// The first fact that matches, in the order of keys.
     fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
@@ -53,6 +52,21 @@ pub trait Scope {
     fn budget(&self) -> Option<&Cell<u64>> {
         self.outer()?.budget()
     }
+}
+
+/// Whether an output, or what is made of outputs, is there. What is made of several is as the greatest of them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Given {
+    /// It needs no output.
+    Always,
+    /// A state on the way to here has written it.
+    Written,
+    /// No state has, and the port has a default.
+    Default,
+    /// A state on the way to here may still write it.
+    NotYetKnown,
+    /// It is not there, and never will be.
+    Missing,
 }
 
 /// What a scope knows of a fact.

@@ -9,7 +9,7 @@
 
 use super::allowed::OfAction;
 use super::fields::Fields;
-use super::functions::rename_inner;
+use super::functions::{MAX_PARTS, rename_inner};
 use super::outline::{Form, Step};
 use super::state::action_name;
 use super::yaml::{Content, Node};
@@ -18,7 +18,7 @@ use crate::expression::parse::NameError;
 use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::program::{Location, Nature, Origin, SUCCESS, StateKind};
 use crate::value::Value;
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet};
 use std::rc::Rc;
 
@@ -34,18 +34,36 @@ pub(crate) struct Ports {
     written: BTreeSet<String>,
     /// What was asked for and is not there.
     missing: RefCell<Option<String>>,
+    /// How many parts the inputs have that the text being read has used.
+    parts: Cell<usize>,
 }
 
 impl Ports {
+    /// Another of the action's texts is read.
+    pub(crate) fn begins_text(&self) {
+        self.parts.set(0);
+    }
+
     /// What `$name` stands for; anything where the state does not give it.
     pub(crate) fn input(&self, name: &str) -> Result<Expr, NameError> {
         if let Some(error) = unknown_input(&self.signature, name) {
             return Err(error);
         }
-        Ok(self.inputs.get(name).cloned().unwrap_or_else(|| {
+        let Some(given) = self.inputs.get(name) else {
             self.missing.replace(Some(format!("the input `{name}`")));
-            Expr::Literal(Value::Null)
-        }))
+            return Ok(Expr::Literal(Value::Null));
+        };
+        let mut parts = self.parts.get();
+        given.visit(&mut |_| parts += 1);
+        self.parts.set(parts);
+        if parts > MAX_PARTS {
+            return Err(NameError {
+                rule: "invalid-expression",
+                message: format!("with what the state gives its inputs, this has more than {MAX_PARTS} parts"),
+                help: "bind a part of what the state gives to a variable".to_owned(),
+            });
+        }
+        Ok(given.clone())
     }
 
     /// What a bare word in effects stands for, where it is an output.
@@ -93,6 +111,7 @@ impl<'b> Sources<'b> {
                 inputs: inputs.iter().filter(|(_, given)| *given != Expr::Literal(Value::Null)).map(as_input).collect(),
                 written: outputs.keys().cloned().collect(),
                 missing: RefCell::default(),
+                parts: Cell::default(),
             };
             Some((signature.annotations.clone(), Rc::new(ports), node.at))
         };

@@ -121,6 +121,7 @@ impl<'t, 'a> Fields<'t, 'a> {
         offset: usize,
         parse: impl FnOnce(&str, &mut dyn Names) -> Result<T, ParseError>,
     ) -> Option<T> {
+        self.view.action.iter().for_each(|action| action.begins_text());
         let parsed = parse(text, &mut NamesFrom { task: self.task, view: &self.view });
         match parsed {
             Ok(parsed) => Some(parsed),

@@ -1,7 +1,7 @@
 //! How control and values flow between states: outcomes, transitions, scoped variables, retry, timeouts, conditions.
 
 use super::fields::{Fields, Output};
-use super::names::{Task, suggestion};
+use super::names::{OfLoop, Task, suggestion};
 use super::outline::{Branch, Form, Step};
 use super::yaml::{Content, Node};
 use crate::expression::Expr;
@@ -181,6 +181,8 @@ pub(crate) fn assign(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) -> V
     let inside = fields.view.inside;
     fields.view.own_outputs = true;
     fields.view.inside = !matches!(fields.task.outline.step(id).form, Form::Action { .. } | Form::Wait { .. });
+    // The loop has ended, and what it binds with it.
+    fields.view.of_loop = OfLoop::Nothing;
     for entry in fields.mapping(body, "assign", "{ tries: $tries + 1 }") {
         fields.note(format!("assign.{}", entry.key), entry.at);
         if !fields.task.scoped_variables(id, false).any(|known| known == entry.key) {
@@ -196,6 +198,7 @@ pub(crate) fn assign(fields: &mut Fields<'_, '_>, id: StateId, body: &Node) -> V
     }
     fields.view.own_outputs = false;
     fields.view.inside = inside;
+    fields.view.of_loop = OfLoop::default();
     assign
 }
 

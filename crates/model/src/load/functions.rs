@@ -19,7 +19,7 @@ const MAX_FUNCTIONS: usize = 200;
 /// How one is written.
 const EXAMPLE: &str = "write `near($a, $b): distance($a, $b) < 0.1` below `functions`";
 /// A call may not become a larger expression, in parts.
-const MAX_PARTS: usize = 2_000;
+pub(super) const MAX_PARTS: usize = 2_000;
 
 /// The functions of a file, with what they call in its place.
 #[derive(Debug, Default)]

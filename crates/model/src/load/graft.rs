@@ -1,7 +1,8 @@
 //! Putting the states of a library below the state that uses it.
 //!
 //! States get other ids and paths. A variable of the library that is called like one in sight where it is used gets the path of
-//! that state before its name: the two have nothing to do with each other.
+//! that state before its name: the two have nothing to do with each other. So does every variable that no file can name ([`crate::guard`]): the
+//! library may be used twice.
 
 use crate::expression::{EffectExpr, Expr};
 use crate::id::StateId;
@@ -11,7 +12,8 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Puts the states of a library below the state at this place, which is its root from then on; `in_sight` are the variables there.
 pub(crate) fn graft(states: &mut Vec<State>, at: StateId, library: &Program, in_sight: &BTreeSet<String>) {
     let (path, location) = (states[at.0 as usize].path.clone(), states[at.0 as usize].location);
-    let taken = bound(library).into_iter().filter(|name| in_sight.contains(*name));
+    let is_made = |name: &str| name.contains(' ');
+    let taken = bound(library).into_iter().filter(|name| in_sight.contains(*name) || is_made(name));
     let renamed = taken.map(|name| (name.to_owned(), format!("{path}/{name}"))).collect();
     // The root becomes the state itself; the others come behind all there are.
     let moving = Moving { at, offset: states.len() as u64, renamed };

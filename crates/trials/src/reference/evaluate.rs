@@ -16,6 +16,16 @@ use std::collections::BTreeMap;
 /// The longest list that an expression may make.
 pub(super) const LONGEST_LIST: usize = 100_000;
 
+/// How what an expression is made of comes to be there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Had {
+    /// It is made of no outputs.
+    Always,
+    Written,
+    Default,
+    Nothing,
+}
+
 /// Where names get their values.
 #[derive(Clone)]
 pub(super) struct Place<'a> {
@@ -46,26 +56,60 @@ impl Place<'_> {
         Ok(FactPattern { predicate: fact.predicate.clone(), arguments })
     }
 
-    /// Whether the way here led through what an expression is made of.
-    fn has(&self, expr: &Expr) -> bool {
+    /// What an expression is made of, as far as the way here led through it.
+    fn has(&self, expr: &Expr) -> Had {
         match expr {
-            Expr::Call(Function::Either, ways) => ways.iter().any(|way| self.has(way)),
+            Expr::Call(Function::Either, ways) => self.way(ways).map_or(Had::Nothing, |way| self.has(way)),
             Expr::Port { state, port } => {
-                let of = self.program.state(*state);
                 let is_end = port == "outcome" && self.regions.contains_key(state);
-                is_end || self.outputs.contains_key(state) || of.defaults.contains_key(port)
+                if is_end || self.outputs.get(state).is_some_and(|outputs| outputs.contains_key(port)) {
+                    Had::Written
+                } else if self.program.state(*state).defaults.contains_key(port) {
+                    Had::Default
+                } else {
+                    Had::Nothing
+                }
             }
             other => {
-                let mut has_all = true;
+                let mut all = Vec::new();
+                let mut within: Vec<&Expr> = Vec::new();
                 let mut is_whole = true;
                 other.visit(&mut |part| {
-                    if !std::mem::take(&mut is_whole) && matches!(part, Expr::Port { .. }) {
-                        has_all &= self.has(part);
+                    let is_either = matches!(part, Expr::Call(Function::Either, _));
+                    if !std::mem::take(&mut is_whole) && (is_either || matches!(part, Expr::Port { .. })) {
+                        within.push(part);
                     }
                 });
-                has_all
+                for part in &within {
+                    // What is inside of another `either` is that one's.
+                    let is_inner = within.iter().any(|around| {
+                        let mut is_part = false;
+                        let is_either = matches!(around, Expr::Call(Function::Either, _));
+                        around.visit(&mut |inner| is_part |= is_either && std::ptr::eq(inner, *part));
+                        is_part && !std::ptr::eq(*around, *part)
+                    });
+                    if !is_inner {
+                        all.push(self.has(part));
+                    }
+                }
+                if all.contains(&Had::Nothing) {
+                    Had::Nothing
+                } else if all.contains(&Had::Default) {
+                    Had::Default
+                } else if all.contains(&Had::Written) {
+                    Had::Written
+                } else {
+                    Had::Always
+                }
             }
         }
+    }
+
+    /// Which way an `either` takes. What needs no output is the end of the ways that are asked for.
+    fn way<'e>(&self, ways: &'e [Expr]) -> Option<&'e Expr> {
+        let asked = ways.iter().position(|way| self.has(way) == Had::Always).map_or(ways.len(), |end| end + 1);
+        let first = |had: Had| ways[..asked].iter().find(|way| self.has(way) == had);
+        first(Had::Written).or_else(|| first(Had::Default)).or_else(|| first(Had::Always))
     }
 
     fn port(&self, state: StateId, port: &str) -> Option<Value> {
@@ -74,10 +118,8 @@ impl Place<'_> {
         if port == "outcome" && matches!(around, Some(StateKind::Concurrency { .. })) {
             return self.regions.get(&state).map(|outcome| Value::String(outcome.clone()));
         }
-        match self.outputs.get(&state) {
-            Some(outputs) => outputs.get(port).cloned(),
-            None => of.defaults.get(port).cloned(),
-        }
+        let written = self.outputs.get(&state).and_then(|outputs| outputs.get(port));
+        written.or_else(|| of.defaults.get(port)).cloned()
     }
 }
 
@@ -136,9 +178,8 @@ impl Read for Expr {
                 _ => wrong("`if` has three arguments"),
             },
             Expr::Call(Function::Either, ways) => {
-                let last = ways.len().saturating_sub(1);
-                let chosen = ways.iter().enumerate().find(|(n, way)| *n == last || place.has(way));
-                chosen.map_or_else(|| wrong("`either` of nothing"), |(_, way)| way.read(place))
+                let chosen = place.way(ways).or(ways.last());
+                chosen.map_or_else(|| wrong("`either` of nothing"), |way| way.read(place))
             }
             Expr::Call(called, arguments) => {
                 let values = arguments.iter().map(|a| a.read(place)).collect::<Result<Vec<Value>, Fail>>()?;

@@ -189,24 +189,49 @@ impl Reference<'_> {
     ) -> Result<String, Fail> {
         let mut visits: BTreeMap<StateId, u32> = BTreeMap::new();
         let Some(mut current) = list.first().copied() else { return Ok(SUCCESS.to_owned()) };
+        // What the body of a loop has written before is of the iteration before, until it is passed.
+        let around = self.program.state(current).parent;
+        let is_body = around.is_some_and(|id| self.program.state(id).is_loop() || self.program.is_pass(id));
+        let mut earlier: Vec<StateId> =
+            list.iter().copied().filter(|id| is_body && self.outputs.contains_key(id)).collect();
         loop {
+            let place = |id: StateId| list.iter().position(|other| *other == id);
+            let (passed, later): (Vec<StateId>, Vec<StateId>) =
+                earlier.into_iter().partition(|id| place(*id) < place(current));
+            earlier = later;
+            self.lose(passed);
             let state = self.program.state(current);
             let visit = visits.entry(current).or_default();
             *visit += 1;
             let name = if *visit == 1 { state.name.clone() } else { format!("{}#{visit}", state.name) };
             let outcome = self.visit(current, &below(path, &name), variables, in_routine)?;
-            match state.transitions.get(&outcome) {
-                Some(Target::State(next)) => current = *next,
-                Some(Target::Outcome(by)) => return Ok(by.clone()),
-                None if outcome != SUCCESS => return Ok(outcome),
-                None => {
-                    let place = list.iter().position(|id| *id == current);
-                    match place.and_then(|place| list.get(place + 1)) {
-                        Some(next) => current = *next,
-                        None => return Ok(SUCCESS.to_owned()),
-                    }
-                }
+            if !matches!(outcome.as_str(), ABORTED | PREEMPTED | VIOLATED) {
+                earlier.retain(|id| *id != current);
             }
+            let left = match state.transitions.get(&outcome) {
+                Some(Target::State(next)) => {
+                    current = *next;
+                    continue;
+                }
+                Some(Target::Outcome(by)) => by.clone(),
+                None if outcome != SUCCESS => outcome,
+                None => match place(current).and_then(|place| list.get(place + 1)) {
+                    Some(next) => {
+                        current = *next;
+                        continue;
+                    }
+                    None => SUCCESS.to_owned(),
+                },
+            };
+            self.lose(earlier);
+            return Ok(left);
+        }
+    }
+
+    /// What these states have written is not seen any more.
+    fn lose(&mut self, states: Vec<StateId>) {
+        for id in states {
+            self.outputs.remove(&id);
         }
     }
 

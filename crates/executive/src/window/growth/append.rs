@@ -141,7 +141,9 @@ impl Growth {
         if let Some(producer) = producer {
             if own.is_read && good {
                 environment.producers.set(id.0 as usize, Some(producer.clone()));
+                self.is_of_now(index, id);
             }
+            let environment = &mut self.cursors[index].environment;
             if good || own.is_routine {
                 for name in &own.assigns {
                     environment.variables.assign(name, Binding::Assigned(producer.clone()));

@@ -80,6 +80,8 @@ pub(crate) struct Frame {
     pub(crate) variables: usize,
     /// Of a region: the fork.
     pub(crate) fork: Option<InstanceId>,
+    /// Of the body of a loop: the states whose outputs are those of the iteration before.
+    pub(crate) earlier: Vec<StateId>,
 }
 
 /// Which iteration of a loop.

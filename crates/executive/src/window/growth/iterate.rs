@@ -7,7 +7,7 @@ use super::environment::Iteration;
 use crate::context::Context;
 use crate::window::graph::Graph;
 use crate::window::graph::instance::Role;
-use ratn_model::id::InstanceId;
+use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;
 use std::sync::Arc;
@@ -62,9 +62,50 @@ impl Growth {
             StateKind::ForEach { body, .. } | StateKind::While { body, .. } => body.first(),
             _ => None,
         };
-        let base = frame.variables;
+        let (owner, base) = (frame.owner, frame.variables);
         self.cursors[index].count_visit();
         self.cursors[index].environment.variables.truncate(base);
         self.cursors[index].todo = body.map_or(Todo::Iterate, |first| Todo::Enter(*first));
+        self.note_earlier(index, program.list_of(owner));
+    }
+
+    /// An iteration begins: what the states of its body have written is of the one before.
+    pub(super) fn note_earlier(&mut self, index: usize, body: &[StateId]) {
+        let environment = &self.cursors[index].environment;
+        let earlier: Vec<StateId> = body.iter().copied().filter(|id| environment.producer(*id).is_some()).collect();
+        if earlier.is_empty() && environment.frames.as_ref().is_none_or(|frame| frame.earlier.is_empty()) {
+            return;
+        }
+        if let Some(frame) = self.top_frame(index) {
+            frame.earlier = earlier;
+        }
+    }
+
+    /// What an iteration has passed over on its way to a state of the body, or to its end, gives nothing in it. What comes only later is still that
+    /// of the iteration before.
+    pub(super) fn forget_passed_over(&mut self, program: &Program, index: usize, to: Option<StateId>) {
+        let Some(frame) = self.cursors[index].environment.frames.as_ref() else { return };
+        if frame.earlier.is_empty() {
+            return;
+        }
+        let body = program.list_of(frame.owner);
+        let end = to.and_then(|to| body.iter().position(|id| *id == to)).unwrap_or(body.len());
+        let Some(frame) = self.top_frame(index) else { return };
+        let earlier = std::mem::take(&mut frame.earlier);
+        let (passed, later): (Vec<_>, Vec<_>) = earlier.into_iter().partition(|id| body[..end].contains(id));
+        frame.earlier = later;
+        for id in passed {
+            self.cursors[index].environment.producers.set(id.0 as usize, None);
+        }
+    }
+
+    /// A state has written its outputs: they are of this iteration.
+    pub(super) fn is_of_now(&mut self, index: usize, id: StateId) {
+        let frames = self.cursors[index].environment.frames.as_ref();
+        if frames.is_some_and(|frame| frame.earlier.contains(&id))
+            && let Some(frame) = self.top_frame(index)
+        {
+            frame.earlier.retain(|earlier| *earlier != id);
+        }
     }
 }

@@ -66,6 +66,7 @@ impl Growth {
                 iteration: None,
                 variables,
                 fork: Some(fork),
+                earlier: Vec::new(),
             };
             let order = self.next_order();
             let mut cursor = Cursor { line, position: 0, order, idle_visits: 0, ..template.clone() };

@@ -19,6 +19,7 @@ impl Growth {
         let plan = context.plan;
         let own = plan.state(id);
         self.cursors[index].count_visit();
+        self.forget_passed_over(context.program, index, Some(id));
         let visit = self.count_visit(context, index, id);
         if own.is_node {
             let instance = self.append(graph, context, index, state, What::Node, (visit, None));
@@ -53,7 +54,12 @@ impl Growth {
         let path = if id == Program::ROOT { Arc::from("") } else { path };
         match &state.kind {
             StateKind::Action { .. } => {}
-            StateKind::Sequence { children, .. } => self.begin_list(index, id, visit, path, base, children),
+            StateKind::Sequence { children, .. } => {
+                self.begin_list(index, id, visit, path, base, children);
+                if context.program.is_pass(id) && !children.is_empty() {
+                    self.note_earlier(index, children);
+                }
+            }
             StateKind::ForEach { .. } => {
                 let instance = self.append(graph, context, index, state, What::marker(Role::Loop), (visit, None));
                 graph.single_arm(instance, 1);
@@ -115,7 +121,17 @@ impl Growth {
         iteration: Option<Iteration>,
     ) -> Arc<Frame> {
         let below = self.cursors[index].environment.frames.clone();
-        Arc::new(Frame { below, owner, visit, path, visits: Vec::new(), iteration, variables, fork: None })
+        Arc::new(Frame {
+            below,
+            owner,
+            visit,
+            path,
+            visits: Vec::new(),
+            iteration,
+            variables,
+            fork: None,
+            earlier: Vec::new(),
+        })
     }
 
     /// Begins a list of a composite state that is no loop.
@@ -159,6 +175,7 @@ impl Growth {
             }
             Target::Outcome(by) => by,
         };
+        self.forget_passed_over(context.program, index, None);
         let Some(frame) = &self.cursors[index].environment.frames else { return };
         let owner = frame.owner;
         if frame.fork.is_some() {

@@ -10,7 +10,7 @@ use crate::binding::{Names, Outputs};
 use crate::plan::Predicate;
 use crate::window::graph::instance::Instance;
 use crate::window::growth::environment::{Binding, Producer, assigned};
-use ratn_model::expression::{Expr, FactExpr, Lookup, Scope};
+use ratn_model::expression::{Expr, FactExpr, Given, Lookup, Scope};
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::value::Value;
@@ -137,13 +137,16 @@ impl<'a> View<'a> {
     fn produced(&self, producer: &'a Producer) -> Option<&'a Outputs> {
         self.note_used(producer.instance, Source::Outputs);
         let outputs = self.sight.outputs_of(producer).filter(|_| self.counts(producer));
-        if outputs.is_none()
-            && let Some(instance) = self.sight.graph.get(producer.instance)
-            && (instance.ended().is_none() || !self.counts(producer))
-        {
-            self.blocker.set(Some(instance.id));
+        if outputs.is_none() && self.is_awaited(producer) {
+            self.blocker.set(Some(producer.instance));
         }
         outputs
+    }
+
+    /// Whether a producer may still give outputs.
+    fn is_awaited(&self, producer: &Producer) -> bool {
+        let instance = self.sight.graph.get(producer.instance);
+        instance.is_some_and(|instance| instance.ended().is_none() || !self.counts(producer))
     }
 
     /// The effects of older instances on some facts, in program order, each writer's together.
@@ -289,20 +292,27 @@ impl Scope for View<'_> {
             let end = environment.producers.get(plan.len() + state.0 as usize)?;
             return self.produced(end)?.get(port).map(Cow::Borrowed);
         }
-        match environment.producer(state) {
-            Some(producer) => self.produced(producer)?.get(port).map(Cow::Borrowed),
-            None => self.sight.program.state(state).defaults.get(port).map(Cow::Borrowed),
-        }
+        let written = match environment.producer(state) {
+            Some(producer) => self.produced(producer)?.get(port),
+            None => None,
+        };
+        written.or_else(|| self.sight.program.state(state).defaults.get(port)).map(Cow::Borrowed)
     }
 
-    /// Who wrote an output is known as soon as the way to here is.
-    fn is_given(&self, state: StateId, port: &str) -> bool {
+    /// Who writes an output is known as soon as the way to here is; whether it did, when it has ended: an outcome of its own may leave it out.
+    fn given(&self, state: StateId, port: &str) -> Given {
         let environment = &self.instance.environment;
         let plan = self.sight.plan;
-        if port == "outcome" && plan.state(state).is_region {
-            return environment.producers.get(plan.len() + state.0 as usize).is_some();
+        let end = match port == "outcome" && plan.state(state).is_region {
+            true => environment.producers.get(plan.len() + state.0 as usize),
+            false => environment.producer(state),
+        };
+        match end.map(|producer| (producer, self.produced(producer))) {
+            Some((_, Some(outputs))) if outputs.contains_key(port) => Given::Written,
+            Some((producer, None)) if self.is_awaited(producer) => Given::NotYetKnown,
+            _ if self.sight.program.state(state).defaults.contains_key(port) => Given::Default,
+            _ => Given::Missing,
         }
-        environment.producer(state).is_some() || self.sight.program.state(state).defaults.contains_key(port)
     }
 
     fn fact(&self, pattern: &FactPattern) -> Lookup<'_> {
@@ -350,8 +360,8 @@ impl Names for View<'_> {
         Scope::port(self, state, port)
     }
 
-    fn is_given(&self, state: StateId, port: &str) -> bool {
-        Scope::is_given(self, state, port)
+    fn given(&self, state: StateId, port: &str) -> Given {
+        Scope::given(self, state, port)
     }
 }
 

@@ -57,6 +57,7 @@ struct FrameForm {
     iteration: Option<IterationForm>,
     variables: usize,
     fork: Option<InstanceId>,
+    earlier: Vec<StateId>,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -161,7 +162,7 @@ impl<'a> Known<'a> {
             at = frame.below.as_ref();
         }
         for frame in new.into_iter().rev() {
-            let Frame { below, owner, visit, path, visits, iteration, variables, fork } = &**frame;
+            let Frame { below, owner, visit, path, visits, iteration, variables, fork, earlier } = &**frame;
             let form = FrameForm {
                 below: below.as_ref().and_then(|below| self.frames.find(below)),
                 owner: *owner,
@@ -171,6 +172,7 @@ impl<'a> Known<'a> {
                 iteration: iteration.as_ref().map(|iteration| self.iteration(iteration)),
                 variables: *variables,
                 fork: *fork,
+                earlier: earlier.clone(),
             };
             self.frames.add(frame, form);
         }
@@ -217,10 +219,10 @@ impl Places<'_> {
         };
         let mut all_frames: Vec<Arc<Frame>> = Vec::with_capacity(frames.len());
         for form in frames {
-            let FrameForm { below, owner, visit, path, visits, iteration: of, variables, fork } = form;
+            let FrameForm { below, owner, visit, path, visits, iteration: of, variables, fork, earlier } = form;
             let below = below.map(|place| at(&all_frames, place, "a frame that stands before its own")).transpose()?;
             let iteration = of.map(iteration).transpose()?;
-            all_frames.push(Arc::new(Frame { below, owner, visit, path, visits, iteration, variables, fork }));
+            all_frames.push(Arc::new(Frame { below, owner, visit, path, visits, iteration, variables, fork, earlier }));
         }
         let binding = |(name, form)| {
             let binding = match form {
