@@ -14,3 +14,31 @@ pub fn was_overtaken(program: &Program, writer: &str, changes: &[Change], key: &
     let mut looked_up = effects.flat_map(|effects| EffectExpr::fact_expressions(effects));
     changes.iter().any(|change| change.pattern().matches(key)) || looked_up.any(|fact| fact.predicate == key.predicate)
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+    use super::*;
+    use ratn_model::catalogue::Catalogue;
+    use ratn_model::value::Value;
+
+    #[test]
+    fn what_changes_overwrite_and_what_they_are_made_of_overtakes_them_and_nothing_else_does() {
+        let text = "
+task: count
+world: [tools = 1, boxes = 2, cups = 3]
+states:
+  - part:
+      states:
+        - count: { action: gripper/release, pia: true, effects: [tools = boxes + 1], resources: [{ block: Gripper }] }
+        - other: { action: gripper/release, pia: true, effects: [tools = cups], resources: [{ block: Gripper }] }
+";
+        let program = ratn_model::load::load(text, "count.yaml", &Catalogue::standard()).unwrap().program;
+        let fact = |name: &str| FactKey { predicate: name.to_owned(), arguments: Vec::new() };
+        let changes = [Change::Set { fact: fact("tools"), value: Value::Int(3) }];
+        let overtaken = |name: &str| was_overtaken(&program, "part#2/count", &changes, &fact(name));
+        assert!(overtaken("tools") && overtaken("boxes"));
+        assert!(!overtaken("cups") && !overtaken("hand_empty"));
+    }
+}

@@ -9,14 +9,16 @@
 use crate::cloud::Cloud;
 use crate::frame::compose;
 use crate::joint_vector::JointVector;
+use crate::keep::Region;
 use crate::levers::Levers;
 use crate::mechanism::Mechanism;
+use crate::request::kept_out;
 use crate::robot::{Body, Configuration, Geometry, Robot, to_f32};
 use parry3d::math::{Pose as Pose32, Vector};
 use parry3d::query;
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
-use ratn_world::scene::{Placement, Scene};
+use ratn_world::scene::{Placement, Scene, Shape};
 use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
@@ -59,8 +61,18 @@ struct Obstacle {
     pose: Pose32,
     centre: Vector,
     radius: f32,
-    /// Where contact is allowed the fingers may be in it, however deep.
-    open: bool,
+    touch: Touch,
+}
+
+/// What may touch an obstacle where contact is allowed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Touch {
+    /// The fingers and what they hold, not deeper than may be pressed.
+    Pressed,
+    /// The fingers may be in it, however deep.
+    Open,
+    /// Nothing ever: fingers and what they hold may only be nearer than other things.
+    Never,
 }
 
 #[derive(Clone)]
@@ -151,8 +163,20 @@ impl<'a> Checker<'a> {
     /// The same, but where contact is allowed the fingers may be in these objects: hollow ones, whose shapes are filled.
     pub fn reaching_into(mut self, objects: &[String]) -> Checker<'a> {
         for obstacle in &mut self.obstacles {
-            obstacle.open = obstacle.link.is_none() && objects.contains(&obstacle.name);
+            if obstacle.link.is_none() && objects.contains(&obstacle.name) {
+                obstacle.touch = Touch::Open;
+            }
         }
+        self
+    }
+
+    /// The same, but nothing that moves may ever be in these boxes of the world.
+    pub fn keeping_out_of(mut self, regions: &[Region]) -> Checker<'a> {
+        for (i, Region { pose, size }) in regions.iter().enumerate() {
+            self.add_obstacle(kept_out(i), None, *pose, &Geometry::from(&Shape::Box { size: *size }), Touch::Never);
+        }
+        let all = 0..self.obstacles.len();
+        self.moving.iter_mut().for_each(|moving| moving.obstacles.extend(all.clone().skip(all.len() - regions.len())));
         self
     }
 
@@ -177,7 +201,7 @@ impl<'a> Checker<'a> {
                     Some((name, frame, role)) => self.add_moving(name.clone(), [i, *frame], *role, body),
                     None => {
                         let pose = self.poses[i].compose(&body.pose);
-                        self.add_obstacle(format!("link {}", link.name), Some(i), pose, &body.geometry);
+                        self.add_obstacle(format!("link {}", link.name), Some(i), pose, &body.geometry, Touch::Pressed);
                     }
                 }
             }
@@ -191,7 +215,7 @@ impl<'a> Checker<'a> {
             if let Placement::World(pose) = &object.placement {
                 let geometry = Geometry::from(&object.shape);
                 let body = geometry.at(*pose);
-                self.add_obstacle(object.name.clone(), None, body.pose, &geometry);
+                self.add_obstacle(object.name.clone(), None, body.pose, &geometry, Touch::Pressed);
             }
         }
     }
@@ -214,7 +238,7 @@ impl<'a> Checker<'a> {
         self.centres.push(Vector::ZERO);
     }
 
-    fn add_obstacle(&mut self, name: String, link: Option<usize>, pose: Pose, geometry: &Geometry) {
+    fn add_obstacle(&mut self, name: String, link: Option<usize>, pose: Pose, geometry: &Geometry, touch: Touch) {
         let pose = to_f32(&pose);
         self.obstacles.push(Obstacle {
             name,
@@ -223,7 +247,7 @@ impl<'a> Checker<'a> {
             pose,
             centre: pose.translation,
             radius: geometry.radius() as f32,
-            open: false,
+            touch,
         });
     }
 
@@ -325,7 +349,7 @@ impl<'a> Checker<'a> {
             room = room.min(self.room_between(i, Other::Moving(j), contact, room));
         }
         for i in 0..self.moving.len() {
-            let may_press = self.may_press(i, contact);
+            let may_press = self.may_press(i, Other::Cloud, contact);
             room = room.min((self.gap_to_cloud(i, room - may_press) + may_press).max(0.0));
         }
         Ok(room)
@@ -347,10 +371,10 @@ impl<'a> Checker<'a> {
             return up_to;
         }
         let tolerance = match (contact, other) {
-            (Contact::Gripper(_), Other::Obstacle(o)) if moving.role == Role::Finger && self.obstacles[o].open => {
+            (Contact::Gripper(_), _) if moving.role == Role::Finger && self.touch(other) == Touch::Open => {
                 return up_to;
             }
-            _ => self.may_press(i, contact),
+            _ => self.may_press(i, other, contact),
         };
         match query::contact(&self.placed[i], &*moving.shape, pose, &**shape, up_to as f32) {
             Ok(None) => up_to,
@@ -426,12 +450,19 @@ impl<'a> Checker<'a> {
 
     fn allowed(&self, i: usize, other: Other, contact: Contact) -> bool {
         let Contact::Gripper(tolerance) = contact else { return false };
-        if let (Role::Finger, Other::Obstacle(o)) = (self.moving[i].role, other)
-            && self.obstacles[o].open
-        {
+        if self.touch(other) == Touch::Open && self.moving[i].role == Role::Finger {
             return true;
         }
-        self.can_press(i) && self.depth(i, other).is_some_and(|depth| depth <= tolerance)
+        let deepest = if self.touch(other) == Touch::Never { tolerance.min(0.0) } else { tolerance };
+        self.can_press(i) && self.depth(i, other).is_some_and(|depth| depth <= deepest)
+    }
+
+    /// What may touch this where contact is allowed.
+    fn touch(&self, other: Other) -> Touch {
+        match other {
+            Other::Obstacle(o) => self.obstacles[o].touch,
+            Other::Moving(_) | Other::Cloud => Touch::Pressed,
+        }
     }
 
     /// Whether a moving shape may touch something at all.
@@ -439,9 +470,10 @@ impl<'a> Checker<'a> {
         matches!(self.moving[i].role, Role::Finger | Role::Held)
     }
 
-    /// How deep a moving shape may be in what it touches, in metres.
-    fn may_press(&self, i: usize, contact: Contact) -> f64 {
+    /// How deep a moving shape may be in this, in metres.
+    fn may_press(&self, i: usize, other: Other, contact: Contact) -> f64 {
         match contact {
+            Contact::Gripper(press) if self.can_press(i) && self.touch(other) == Touch::Never => press.min(0.0),
             Contact::Gripper(press) if self.can_press(i) => press,
             _ => 0.0,
         }

@@ -6,6 +6,7 @@
 
 use crate::connect::{Budget, ConnectError, connect};
 use crate::geometry::Body;
+use crate::hands::holder;
 use crate::mechanism::Mechanism;
 use crate::pace::Control;
 use crate::pairs::Checks;
@@ -61,13 +62,13 @@ impl Vehicle {
         for object in &scene.objects {
             let geometry = Geometry::from(&object.shape);
             match object.placement {
-                // `hands` says where that is.
-                Placement::Hand { .. } => {}
-                Placement::Gripper(pose) => bodies.push(placed(&poses[robot.tool], &geometry.at(pose))),
                 Placement::World(pose) if riding.contains(&object.name) => {
                     bodies.push(geometry.at(base.compose(&pose)));
                 }
                 Placement::World(pose) => obstacles.push(Obstacle { name: object.name.clone(), pose, geometry }),
+                _ => bodies.extend(
+                    holder(robot, &object.placement).map(|(link, pose)| placed(&poses[link], &geometry.at(pose))),
+                ),
             }
         }
         (Vehicle { bodies, area, heading, padding_m }, obstacles)

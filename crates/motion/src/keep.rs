@@ -1,4 +1,5 @@
-//! What the tool keeps on its way: an axis of it near a direction of the world, its place inside a box.
+//! What the tool keeps on its way: an axis of it near a direction of the world, its place inside a box. And boxes that everything that moves keeps
+//! out of.
 //!
 //! The free path is searched among postures that keep it (`constrained`). What was timed is looked at once more: the executed curve keeps it
 //! between all samples (`along`), or corners are followed more closely until it does.
@@ -38,7 +39,7 @@ pub struct KeptAxis {
     pub tolerance_rad: f64,
 }
 
-/// A box that the origin of the tool frame stays in.
+/// A box in the world: the origin of the tool frame stays in it, or everything that moves stays out of it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Region {
     /// Its middle and its axes, in the world.
@@ -54,6 +55,24 @@ pub struct Keep {
     pub axis: Option<KeptAxis>,
     /// Its place.
     pub inside: Option<Region>,
+}
+
+impl Region {
+    /// Refuses what makes no sense.
+    pub(crate) fn check(&self, input: &str) -> Result<(), PlanError> {
+        let malformed = |part: &str, value: String, expected: String| {
+            Err(PlanError::Malformed { what: format!("the {part} of `{input}`"), value, expected })
+        };
+        let Region { pose, size } = self;
+        if !pose.position.iter().chain(&pose.quaternion_xyzw).all(|c| c.is_finite()) {
+            return malformed("pose", format!("{pose:?}"), "finite numbers".to_owned());
+        }
+        if !size.iter().all(|edge| (2.0 * LEAST_TOLERANCE..=MAX_SIZE_M).contains(edge)) {
+            let expected = format!("edges of {} to {MAX_SIZE_M} m", 2.0 * LEAST_TOLERANCE);
+            return malformed("size", format!("{size:?}"), expected);
+        }
+        Ok(())
+    }
 }
 
 impl Keep {
@@ -74,16 +93,7 @@ impl Keep {
                 return malformed("keep_rad", tolerance_rad.to_string(), expected);
             }
         }
-        if let Some(Region { pose, size }) = self.inside {
-            if !pose.position.iter().chain(&pose.quaternion_xyzw).all(|c| c.is_finite()) {
-                return malformed("the pose of `inside`", format!("{pose:?}"), "finite numbers".to_owned());
-            }
-            if !size.iter().all(|edge| (2.0 * LEAST_TOLERANCE..=MAX_SIZE_M).contains(edge)) {
-                let expected = format!("edges of {} to {MAX_SIZE_M} m", 2.0 * LEAST_TOLERANCE);
-                return malformed("the size of `inside`", format!("{size:?}"), expected);
-            }
-        }
-        Ok(())
+        self.inside.iter().try_for_each(|region| region.check("inside"))
     }
 
     /// As a constraint of the frame of a link, from where that frame is at the start, in the frame of the root, which is at `base`.

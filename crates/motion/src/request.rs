@@ -3,7 +3,7 @@
 use crate::cloud::MAX_RADIUS_M;
 use crate::constrained::LEAST_TOLERANCE;
 use crate::joint_vector::JointVector;
-use crate::keep::Keep;
+use crate::keep::{Keep, Region};
 use crate::plan::PlanError;
 use crate::robot::{Configuration, Joint, Robot, on_floor};
 use crate::seen::Seen;
@@ -13,6 +13,9 @@ use crate::way_points::WayPoints;
 use ratn_model::pose::Pose;
 use ratn_world::scene::Scene;
 use std::f64::consts::FRAC_PI_2;
+
+/// The most boxes to keep out of.
+const MAX_KEPT_OUT: usize = 64;
 
 /// The most alternatives of one goal.
 pub const MAX_GOALS: usize = 64;
@@ -42,6 +45,9 @@ pub struct Request {
     pub upright_rad: Option<f64>,
     /// Further constraints on the tool, for the whole motion.
     pub keep: Keep,
+    /// Boxes into which nothing comes that moves: no link, no finger, nothing that is held; not on the straight parts either, where fingers and
+    /// what they hold may touch things. Nothing stands there, so they hide nothing that a camera saw.
+    pub keep_out: Vec<Region>,
     /// Names, in the scene, of hollow objects that the fingers may reach into on the straight parts, although their shapes are filled.
     pub reaches_into: Vec<String>,
     /// What a depth camera saw beside the scene.
@@ -56,6 +62,11 @@ pub struct Request {
     pub seed: u64,
     /// Iterations of improvement after the first path and its shortcutting; time may be up before.
     pub improvement_iterations: usize,
+}
+
+/// What messages call one of the boxes to keep out of.
+pub(crate) fn kept_out(index: usize) -> String {
+    format!("keep_out[{index}]")
 }
 
 /// A goal of a motion.
@@ -78,6 +89,7 @@ impl Request {
             straight: None,
             upright_rad: None,
             keep: Keep::default(),
+            keep_out: Vec::new(),
             reaches_into: Vec::new(),
             seen: None,
             speed: 1.0,
@@ -149,6 +161,11 @@ impl Request {
             return malformed("cloud_known_within_m", within.to_string(), &format!("0 to {MAX_RADIUS_M} m"));
         }
         self.keep.check()?;
+        if self.keep_out.len() > MAX_KEPT_OUT {
+            let expected = format!("{MAX_KEPT_OUT} at the most");
+            return malformed("the number of boxes of `keep_out`", self.keep_out.len().to_string(), &expected);
+        }
+        self.keep_out.iter().enumerate().try_for_each(|(i, region)| region.check(&kept_out(i)))?;
         self.tool_speed.check()?;
         for (what, scales) in ["velocity_scale", "acceleration_scale", "jerk_scale"].iter().zip(&self.scales) {
             if let Some(scale) = scales.iter().find(|scale| !(MIN_SPEED..=1.0).contains(*scale)) {

@@ -5,6 +5,7 @@
 
 use crate::cloud::{Cloud, CloudError};
 use crate::frame::compose;
+use crate::hands::holder;
 use crate::robot::{Body, Configuration, Geometry, Robot, to_f32};
 use ratn_world::scene::{Placement, Scene};
 use std::sync::Arc;
@@ -36,9 +37,7 @@ impl Seen {
             let geometry = Geometry::from(&object.shape);
             match &object.placement {
                 Placement::World(pose) => Some(geometry.at(*pose)),
-                Placement::Gripper(pose) => Some(on_robot(&geometry.at(*pose), robot.tool)),
-                // `hands` says where that is.
-                Placement::Hand { .. } => None,
+                held => holder(robot, held).map(|(link, pose)| on_robot(&geometry.at(pose), link)),
             }
         }));
         let mut is_known = vec![false; self.cloud.points().len()];

@@ -11,6 +11,7 @@ use common::{Cell, request};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
+use ratn_motion::aimm;
 use ratn_motion::arm;
 use ratn_motion::connect::Budget;
 use ratn_motion::constrained;
@@ -26,6 +27,7 @@ use ratn_motion::timing::{Section, Speed, timed, timed_while};
 use ratn_motion::tool_speed::ToolSpeed;
 use ratn_motion::trajectory::{Curve, Knot};
 use ratn_motion::way_points::WayPoints;
+use ratn_world::scene::{Placement, SceneObject, Shape};
 use robots::Arm;
 use std::f64::consts::PI;
 
@@ -379,4 +381,35 @@ fn limits_of_one_motion_hold_for_each_joint_and_for_the_tool() {
     ] {
         assert_eq!(cell.plan(&request).unwrap_err().to_string(), expected);
     }
+}
+
+#[test]
+fn no_finger_presses_into_a_box_to_keep_out_of_though_it_may_into_a_thing() {
+    let cell = Cell::with_boxes(1, 5);
+    let usual = cell.approach("box_1");
+    // A slab that covers the table, up to a height in millimetres.
+    let slab = |top_mm: i32| {
+        let ([length, width, _], [x, y, _]) = (aimm::TABLE_SIZE, aimm::TABLE_CENTRE);
+        Region { pose: Pose::at(x, y, f64::from(top_mm) / 1000.0 - 0.01), size: [length, width, 0.02] }
+    };
+    let as_a_thing = |top_mm: i32| {
+        let Region { pose, size } = slab(top_mm);
+        let mut cell = Cell { scene: cell.scene.clone(), ..Cell::with_boxes(1, 5) };
+        let placement = Placement::World(pose);
+        cell.scene.objects.push(SceneObject { name: "slab".to_owned(), shape: Shape::Box { size }, placement });
+        cell.plan(&usual).is_ok()
+    };
+    let kept_out = |top_mm: i32| cell.plan(&Request { keep_out: vec![slab(top_mm)], ..usual.clone() });
+    // The table's top is at 700 mm, and the fingertips come to somewhere beside the box.
+    let deepest = (690..900).take_while(|top_mm| as_a_thing(*top_mm)).last().unwrap();
+    let refused = kept_out(deepest).map(|plan| plan.iterations).unwrap_err().to_string();
+    assert!(refused.contains("keep_out[0]"), "{refused}");
+    let highest = (690..900).take_while(|top_mm| kept_out(*top_mm).is_ok()).last().unwrap();
+    assert!(highest + 3 < deepest, "up to {highest} mm, as a thing up to {deepest} mm");
+    let opened =
+        Request { reaches_into: vec!["keep_out[0]".to_owned()], keep_out: vec![slab(deepest)], ..usual.clone() };
+    assert!(cell.plan(&opened).is_err());
+    let flat = Request { keep_out: vec![Region { size: [1.0, 0.0, 1.0], ..slab(700) }], ..usual };
+    let flat = cell.plan(&flat).map(|plan| plan.iterations).unwrap_err().to_string();
+    assert!(flat.starts_with("the size of `keep_out[0]` is [1.0, 0.0, 1.0]: expected edges of"), "{flat}");
 }

@@ -8,6 +8,7 @@ use common::Cell;
 use ratn_model::pose::Pose;
 use ratn_motion::cloud::Cloud;
 use ratn_motion::collision::{CONTACT_TOLERANCE_M, Contact};
+use ratn_motion::keep::Region;
 use ratn_motion::plan::{Plan, PlanError, Request};
 use ratn_motion::seen::{KNOWN_WITHIN_M, Seen};
 use ratn_motion::trajectory::Curve;
@@ -83,6 +84,10 @@ fn a_motion_keeps_away_from_what_was_seen_and_touches_what_is_known() {
         }
         let careful = cell.plan(&Request { seen: seen(&points, KNOWN_WITHIN_M), ..blind.clone() }).unwrap();
         validated(&cell, &careful, std::slice::from_ref(&obstacle)).unwrap();
+        // A box to keep out of hides nothing that was seen of a thing that sticks out of it.
+        let core = Region { pose, size: SIZE.map(|edge| edge - 2.0 * KNOWN_WITHIN_M) };
+        let both = Request { seen: seen(&points, KNOWN_WITHIN_M), keep_out: vec![core], ..blind.clone() };
+        validated(&cell, &cell.plan(&both).unwrap(), std::slice::from_ref(&obstacle)).unwrap();
         let carried = {
             let mut cell = Cell { scene: cell.scene.clone(), ..Cell::with_boxes(3, 5) };
             cell.follow(&careful);

@@ -158,11 +158,8 @@ states:
         "loops[2]/note_2 {value: [[[0, 1], 2], 3]}",
     ];
     assert_eq!(noted(text, &[]), expected);
-    assert_eq!(
-        noted(&text.replace("do:", "outputs: { all: { each: x.x } }\n      do:").replace("loops:", "loops:"), &[])
-            .len(),
-        6
-    );
+    // One that collects forgets nothing else.
+    assert_eq!(noted(&text.replace("do:", "outputs: { all: { each: x.x } }\n      do:"), &[]), expected);
     let while_it_gives = "
 states:
   - loops:
@@ -269,16 +266,9 @@ states:
       do: [{ x: { THINK } }]
   - note: { NOTE, in: { value: 'loops.all[0] + loops.all[299] + [len(loops.all)]' } }
 ";
-    let text = text
-        .replace("300", &std::env::var("MEASURE").unwrap_or("300".into()))
-        .replace("'[$n]'", &std::env::var("EACH").unwrap_or("'[$n]'".into()));
     for mode in MODES {
-        let begun = std::time::Instant::now();
-        let (run, acts) = run_with(&text, mode, &NoFiles, &[]);
-        println!("{mode:?}: {:?}", begun.elapsed());
+        let (run, acts) = run_with(text, mode, &NoFiles, &[]);
         assert_eq!(run.outcome, "success");
-        if std::env::var("MEASURE").is_err() {
-            assert_eq!(acts, ["note {value: [0, 299, 300]}"], "{mode:?}");
-        }
+        assert_eq!(acts, ["note {value: [0, 299, 300]}"], "{mode:?}");
     }
 }

@@ -74,7 +74,7 @@ impl Action for PlanAction {
         let (asked, budget_s) = goal::asked(&goal, &robot)?;
         // Whatever the task declared that this plan depends on, and no more.
         let scene = goal.unless_cancelled(goal.scene(&self.scenes)).await??;
-        let scene = bounds::with_kept_out(&goal, arms::in_hands(&robot, scene)?)?;
+        let scene = arms::in_hands(&robot, scene)?;
         let request = asked.in_scene(&robot, &scene);
 
         let goal = Arc::new(goal);

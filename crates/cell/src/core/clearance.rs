@@ -166,9 +166,9 @@ fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahea
     let levers = ours.levers(robot);
     let between = ours.between_courses(robot);
     let (mut distances, mut configuration) = (MAX_DISTANCES, *here);
-    // How near each pair may come, once it is known how near it is at the start; and whether that is nearer than it should be.
-    let mut allowed: Vec<Option<(f32, bool)>> = vec![None; bodies.len() * others.len()];
     for course in &ours.courses {
+        // How near each pair may come, once it is known how near it is at the start; and whether that is nearer than it should be.
+        let mut allowed: Vec<Option<(f32, bool)>> = vec![None; bodies.len() * others.len()];
         let mut looked_at: Option<(&ArmPosition, f32)> = None;
         for (i, at) in course.iter().enumerate() {
             let beside = [i.checked_sub(1), Some(i + 1)].map(|next| next.and_then(|next| course.get(next)));
@@ -187,14 +187,16 @@ fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahea
                         continue;
                     }
                     let known = &mut allowed[body * others.len() + other];
-                    let up_to = known.map_or(f32::INFINITY, |(least, _)| room.max(leg) + least);
-                    let distance = a.nearest(&place, b, up_to, &mut distances)?;
                     let sure = BESIDE_M as f32 + b.missed();
-                    let (least, is_near) = *known.get_or_insert(if distance < sure + leg {
-                        (distance.min(BESIDE_M as f32) - ROUNDED_M, true)
-                    } else {
-                        (sure, false)
-                    });
+                    let up_to = known.map_or(f32::INFINITY, |(least, _)| (room.max(leg) + least).max(sure + leg));
+                    let distance = a.nearest(&place, b, up_to, &mut distances)?;
+                    let (least, is_near) = match *known {
+                        // Once it has been far enough away it comes back as any other.
+                        _ if distance >= sure + leg => (sure, false),
+                        Some(known) => known,
+                        None => (distance.min(BESIDE_M as f32) - ROUNDED_M, true),
+                    };
+                    *known = Some((least, is_near));
                     if distance < least + if is_near { between(a.link) } else { leg } {
                         return Err(Crossing::of(robot, a, b));
                     }

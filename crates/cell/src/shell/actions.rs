@@ -177,11 +177,12 @@ impl Action for ModuleAction {
         let performer = self.performer(goal.inputs.get("arm"), goal.lease.as_ref())?;
         let arm = performer.arm;
         let hand = goal.port("hand").optional().map(|port| port.string()).transpose()?.map(str::to_owned);
-        if let (Some(hand), Some(arm)) = (&hand, &performer.arm_name)
-            && hand != arm
+        let of_arm = performer.arm_name.as_deref().unwrap_or(self.handle.robot().arm_name());
+        if let Some(hand) = &hand
+            && hand != of_arm
         {
             let why = format!(
-                "input `hand` is `{hand}`, and the goal is for the arm `{arm}`: what it takes is in its own hand"
+                "input `hand` is `{hand}`, and the goal is for the arm `{of_arm}`: what it takes is in its own hand"
             );
             return Err(ActionFailure::Aborted(why));
         }

@@ -134,7 +134,10 @@ impl Link {
     }
 
     fn middle(&self) -> Resource {
-        Resource::new(format!("middle@{}", self.config.host), ResourceClass::System, MIDDLE).on_host(&self.config.host)
+        // Whose run is gone may have an arm there that still brakes.
+        Resource::new(format!("middle@{}", self.config.host), ResourceClass::System, MIDDLE)
+            .with_standstill(self.config.standstill())
+            .on_host(&self.config.host)
     }
 
     fn battery(&self, level: f64) -> Resource {

@@ -3,9 +3,9 @@
 //! Instances whose outputs or effects may be otherwise are marked, and looked at oldest first: each once, however many ways lead
 //! to it, and without recursion. PIAs are never made again: they begin when everything older is real.
 
-use super::Window;
 use super::graph::instance::{Instance, Role};
 use super::memory::{Deviation, Difference, Purpose, Source, User};
+use super::{Wait, Window};
 use crate::context::Context;
 use crate::protocol::Note;
 use ratn_model::id::InstanceId;
@@ -48,9 +48,10 @@ impl Window {
         is_known_now: bool,
     ) {
         for user in users.iter().filter(|user| user.of == Source::World && user.purpose == Purpose::Result) {
-            // Whoever waits for the environment to look as it does at its place looks again.
-            let waits = self.graph.get(user.id).is_some_and(|user| user.is_sensing() && !user.is_under_way());
-            if waits {
+            // Whoever waits for the environment to look as it does at its place looks again; and whoever waits for what another instance
+            // computes of the same, which what is tolerated makes another result.
+            let waits = |user: &Instance| user.is_sensing() || matches!(user.waiting.wait(), Wait::Twin(_));
+            if self.graph.get(user.id).is_some_and(|user| waits(user) && !user.is_under_way()) {
                 self.waits.enqueue(&mut self.graph, user.id);
             }
         }

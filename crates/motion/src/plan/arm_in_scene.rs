@@ -18,10 +18,10 @@ use crate::mechanism::Mechanism;
 use crate::pace::{Pace, Stop};
 use crate::reach::{Postures, Reach, Target};
 use crate::refine::{End, Measure, Refinement};
-use crate::request::Request;
-use crate::robot::{Configuration, Robot};
+use crate::request::{Request, kept_out};
+use crate::robot::{Configuration, Geometry, Robot};
 use crate::simplify::shortened;
-use crate::space::{Space, State, state};
+use crate::space::{Obstacle, Space, State, state};
 use crate::straight::Straight;
 use crate::surroundings::Surroundings;
 use crate::timing::rough::Rough;
@@ -31,7 +31,7 @@ use crate::way_points::{Followed, Follower, WayPoints};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
-use ratn_world::scene::Scene;
+use ratn_world::scene::{Scene, Shape};
 use std::sync::Arc;
 
 /// The padding, in metres, where the start is too close to something for the usual padding. A free path keeps at least this distance. A
@@ -54,7 +54,10 @@ fn checker<'a>(
     seen: Option<&Arc<Cloud>>,
     padding_m: f64,
 ) -> Checker<'a> {
-    Checker::new(robot, scene, here, padding_m).reaching_into(&request.reaches_into).beside(seen.cloned())
+    Checker::new(robot, scene, here, padding_m)
+        .reaching_into(&request.reaches_into)
+        .keeping_out_of(&request.keep_out)
+        .beside(seen.cloned())
 }
 
 /// The arm of a request in its scene.
@@ -80,8 +83,13 @@ pub(super) struct ArmInScene<'a> {
 impl<'a> ArmInScene<'a> {
     pub(super) fn new(robot: &'a Robot, scene: &'a Scene, request: &'a Request) -> Result<ArmInScene<'a>, PlanError> {
         let here = request.start.with_base(&scene.base);
-        let (mechanism, obstacles) = arm::in_scene(robot, scene, &here);
+        let (mechanism, mut obstacles) = arm::in_scene(robot, scene, &here);
         let base = arm::on_floor(robot, &scene.base);
+        obstacles.extend(request.keep_out.iter().enumerate().map(|(i, region)| Obstacle {
+            name: kept_out(i),
+            pose: base.inverse().compose(&region.pose),
+            geometry: Geometry::from(&Shape::Box { size: region.size }),
+        }));
         let seen = request.seen.as_ref().map(|seen| seen.unknown(robot, scene, &here)).transpose()?;
         let clouds = seen.as_ref().map(|cloud| cloud.moved(&base.inverse())).transpose()?;
         let surroundings = Surroundings { obstacles: &obstacles, clouds: clouds.as_slice(), meshes: &[] };

@@ -15,8 +15,10 @@ use crate::shell::Place;
 use anyhow::bail;
 use futures::{StreamExt, stream};
 use ratn_executive::protocol::Event;
+use ratn_executive::was_overtaken;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{LeaseId, Revision};
+use ratn_model::program::Program;
 use ratn_proto::types::{Resource, WorldUpdate};
 use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{Channels, WorldClient};
@@ -82,9 +84,14 @@ impl Performer {
     ///
     /// # Errors
     /// Where the run cannot go on.
-    pub(crate) async fn take_up(&mut self, mut ledger: Ledger, mirror: &World) -> anyhow::Result<Option<Event>> {
+    pub(crate) async fn take_up(
+        &mut self,
+        program: &Program,
+        mut ledger: Ledger,
+        mirror: &World,
+    ) -> anyhow::Result<Option<Event>> {
         (self.acquires, self.operations, self.resumptions) = (ledger.acquires, ledger.operations, ledger.resumptions);
-        let changed = self.commit_again(&ledger, mirror).await?;
+        let changed = self.commit_again(program, &ledger, mirror).await?;
         let commit = ledger.commits.last().map(|decided| decided.revision).unwrap_or_default();
         // All of it is in the root that was read.
         self.decided = commit;
@@ -121,11 +128,16 @@ impl Performer {
 
     /// Makes every commit that the world pool does not have, and compares the two worlds: what is otherwise in the pool was changed
     /// from outside.
-    async fn commit_again(&mut self, ledger: &Ledger, mirror: &World) -> anyhow::Result<Option<Event>> {
+    async fn commit_again(
+        &mut self,
+        program: &Program,
+        ledger: &Ledger,
+        mirror: &World,
+    ) -> anyhow::Result<Option<Event>> {
         let (mut root, _) = retry_unanswered(|| self.world.root()).await?;
         let there = self.commits_there(ledger, root).await?;
         if !self.session.state().borrow().found {
-            self.refuse_what_came_between(ledger, there, root).await?;
+            self.refuse_what_came_between(program, ledger, there, root).await?;
         }
         for decided in &ledger.commits[there..] {
             let commit = decided.clone().commit(&self.run);
@@ -140,8 +152,14 @@ impl Performer {
         Ok((!facts.is_empty()).then_some(Event::WorldChanged { revision, facts }))
     }
 
-    /// The run had lost what it held: where others have changed since what it has yet to commit, that is not true any more.
-    async fn refuse_what_came_between(&self, ledger: &Ledger, there: usize, root: Revision) -> anyhow::Result<()> {
+    /// The run had lost what it held: where others have changed since what it has yet to commit, or what that is made of, it is not true any more.
+    async fn refuse_what_came_between(
+        &self,
+        program: &Program,
+        ledger: &Ledger,
+        there: usize,
+        root: Revision,
+    ) -> anyhow::Result<()> {
         let missing = &ledger.commits[there..];
         if missing.is_empty() {
             return Ok(());
@@ -159,11 +177,11 @@ impl Performer {
             if is_behind {
                 let written = change.written.iter().map(|fact| &fact.key);
                 for key in written.chain(&change.gone) {
-                    let is_meant = |decided: &&Decided| decided.changes.iter().any(|one| one.pattern().matches(key));
+                    let is_meant = |decided: &&Decided| was_overtaken(program, &decided.writer, &decided.changes, key);
                     if let Some(decided) = missing.iter().find(is_meant) {
                         bail!(
-                            "{} had changed {key}, which is not in the world yet, and others have changed it since the run lost its \
-                             resources: run the task again, or begin it in the middle (`--from`)",
+                            "what {} has changed is not in the world yet, and others have changed {key}, which it changes or is made of, \
+                             since the run lost its resources: run the task again, or begin it in the middle (`--from`)",
                             decided.writer
                         );
                     }

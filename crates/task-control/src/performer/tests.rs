@@ -3,6 +3,7 @@
 use super::*;
 use crate::Endpoints;
 use crate::ledger::Ledger;
+use crate::task_for_tests::{FETCH_BOXES, program};
 use anyhow::Context;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
@@ -485,7 +486,7 @@ async fn who_comes_back_leaves_word_with_what_the_run_was_about_to_give_back() -
     let mut bench = bench.comes_back(true).await?;
     let mut mirror = World::default();
     mirror.apply(&done())?;
-    bench.performer.take_up(ledger, &mirror).await?;
+    bench.performer.take_up(&program(FETCH_BOXES), ledger, &mirror).await?;
     assert!(!bench.performer.order.returning.is_empty(), "it does not wait for that");
     let channels = Channels::new(&ClientTls::none());
     let next = Session::open(&channels, &bench.endpoints.resource_manager, "next", DEFAULT_TTL);
@@ -693,7 +694,7 @@ async fn who_comes_back_tells_a_goal_to_stop_that_may_not_have_been_told() -> an
     let catalogue = bench.performer.catalogue.clone();
     let mut bench = bench.comes_back(true).await?;
     bench.performer.catalogue = catalogue;
-    bench.performer.take_up(ledger, &World::default()).await?;
+    bench.performer.take_up(&program(FETCH_BOXES), ledger, &World::default()).await?;
     // The next goal of that arm leaves when it stands still.
     bench.performer.perform(start(InstanceId(3), 1, "work", lease, &endpoint))?;
     let event = bench.event().await;
@@ -896,7 +897,7 @@ async fn a_projection_that_was_named_and_not_asked_for_before_the_kill_is_asked_
     let mut ledger = ledger(&bench.performer.run, &[projection(instance, 2, false)]);
     ledger.event(Timestamp(0), &Event::Projected { instance, attempt: 2, projection: named });
     let mut bench = bench.comes_back(true).await?;
-    bench.performer.take_up(ledger, &World::default()).await?;
+    bench.performer.take_up(&program(FETCH_BOXES), ledger, &World::default()).await?;
     let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
     assert!(world.query(Some(named), &[]).await?.is_empty());
     bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
@@ -983,7 +984,7 @@ async fn who_comes_back_to_a_living_session_does_nothing_twice() -> anyhow::Resu
     let mut mirror = World::default();
     mirror.apply(&done())?;
     let ledger = ledger(&run, &[commit, operate, waiting]);
-    bench.performer.take_up(ledger, &mirror).await?;
+    bench.performer.take_up(&program(FETCH_BOXES), ledger, &mirror).await?;
     // It is asked for anew, and what nobody knew to have is free for it.
     bench.granted(InstanceId(2)).await?;
     assert_eq!(bench.units("Box").await?, 2);
@@ -999,7 +1000,7 @@ async fn who_comes_back_too_late_makes_anew_what_went_with_the_session() -> anyh
     while bench.units("Box").await? == 0 {}
     let mut bench = bench.comes_back(false).await?;
     assert_eq!(bench.units("Box").await?, 0);
-    bench.performer.take_up(ledger(&run, &[operate]), &World::default()).await?;
+    bench.performer.take_up(&program(FETCH_BOXES), ledger(&run, &[operate]), &World::default()).await?;
     assert_eq!(bench.units("Box").await?, 2);
     bench.performer.close().await
 }
@@ -1020,7 +1021,7 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     let mut mirror = World::default();
     mirror.apply(&done())?;
     check_world(&place_of(&bench.endpoints), &open).await?;
-    assert_eq!(bench.performer.take_up(open.clone(), &mirror).await?, None);
+    assert_eq!(bench.performer.take_up(&program(FETCH_BOXES), open.clone(), &mirror).await?, None);
     let (revision, facts) = bench.performer.root().await?;
     assert_eq!((revision, facts.len()), (Revision(1), 1));
 
@@ -1029,7 +1030,7 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     let changes = vec![Change::Set { fact: fact.clone(), value: Value::Int(1) }];
     bench.performer.world.commit("other/1/2", changes, None).await?;
     check_world(&place_of(&bench.endpoints), &open).await?;
-    let changed = bench.performer.take_up(open.clone(), &mirror).await?;
+    let changed = bench.performer.take_up(&program(FETCH_BOXES), open.clone(), &mirror).await?;
     let facts = vec![(fact, Some(Value::Int(1)))];
     assert_eq!(changed, Some(Event::WorldChanged { revision: Revision(2), facts }));
     // A pool that began anew.
@@ -1058,14 +1059,14 @@ async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() ->
     assert!(!remembers(&place_of(&bench.endpoints), &short).await?);
     let mut mirror = World::default();
     mirror.apply(&done())?;
-    let refused = bench.performer.take_up(short.clone(), &mirror).await;
+    let refused = bench.performer.take_up(&program(FETCH_BOXES), short.clone(), &mirror).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("resume the run again")));
     assert_eq!(bench.performer.root().await?.0, Revision(0));
     // With the whole log it has both, and the checkpoint is enough from then on.
-    assert_eq!(bench.performer.take_up(whole, &mirror).await?, None);
+    assert_eq!(bench.performer.take_up(&program(FETCH_BOXES), whole, &mirror).await?, None);
     assert_eq!(bench.performer.confirmed().commit, Revision(2));
     assert!(remembers(&place_of(&bench.endpoints), &short).await?);
-    assert_eq!(bench.performer.take_up(short, &mirror).await?, None);
+    assert_eq!(bench.performer.take_up(&program(FETCH_BOXES), short, &mirror).await?, None);
     assert_eq!(bench.performer.root().await?.0, Revision(2));
     bench.performer.close().await
 }

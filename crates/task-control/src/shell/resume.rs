@@ -132,7 +132,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         shell.log.make_durable()?;
         ledger.event(now, &Event::Resumed);
         shell.performer.know(shell.progress.paths());
-        let changed = shell.performer.take_up(ledger, &mirror).await?;
+        let changed = shell.performer.take_up(&Arc::clone(&shell.program), ledger, &mirror).await?;
         // Commits are there by now.
         let missing = missing.into_iter().filter(|command| !matches!(command, Command::Commit { .. }));
         let ended = shell.perform(now, missing.chain(commands), None)?;

@@ -50,9 +50,22 @@ fn wrong(port: &str, fault: RobotFault) -> ActionFailure {
 
 /// The scene with what the arms hold in their hands: what the arm holds that moves, and what the others hold where they stand.
 pub(super) fn in_hands(robot: &Robot, scene: Arc<Scene>) -> Result<Arc<Scene>, ActionFailure> {
+    with_hands(robot, scene, hands::seen_from)
+}
+
+/// The same where the base drives: what they all hold moves along.
+pub(super) fn carried(robot: &Robot, scene: Arc<Scene>) -> Result<Arc<Scene>, ActionFailure> {
+    with_hands(robot, scene, hands::carried_by)
+}
+
+fn with_hands(
+    robot: &Robot,
+    scene: Arc<Scene>,
+    seen: impl FnOnce(&Robot, Scene) -> Result<Scene, RobotFault>,
+) -> Result<Arc<Scene>, ActionFailure> {
     if !scene.objects.iter().any(|object| matches!(object.placement, Placement::Hand { .. })) {
         return Ok(scene);
     }
-    let seen = hands::seen_from(robot, Scene::clone(&scene)).map(Arc::new);
+    let seen = seen(robot, Scene::clone(&scene)).map(Arc::new);
     seen.map_err(|fault| ActionFailure::aborted(format!("a fact `in_gripper`: {fault}")))
 }

@@ -1,17 +1,12 @@
 //! What bounds a motion, read from the input ports of a goal: `keep_axis`, `keep_direction`, `keep_rad` and `inside` (what the tool keeps);
 //! `velocity_scale`, `acceleration_scale`, `jerk_scale` (fractions of the joints' limits: a number for all, or one for each joint);
-//! `tool_speed_m_s`, `tool_turning_rad_s`; `keep_out` (boxes into which nothing of the arm may come, though there is nothing).
+//! `tool_speed_m_s`, `tool_turning_rad_s`; `keep_out` (boxes into which nothing comes that moves, though there is nothing).
 
 use ratn_model::value::Value;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::keep::{Keep, KeptAxis, Region};
 use ratn_motion::tool_speed::ToolSpeed;
-use ratn_worker::action::{ActionFailure, GoalContext};
-use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
-use std::sync::Arc;
-
-/// The most boxes to keep out of.
-const MAX_KEPT_OUT: usize = 64;
+use ratn_worker::action::{ActionFailure, GoalContext, Port};
 
 /// What the tool keeps.
 pub(super) fn keep(goal: &GoalContext) -> Result<Keep, ActionFailure> {
@@ -27,36 +22,18 @@ pub(super) fn keep(goal: &GoalContext) -> Result<Keep, ActionFailure> {
             ));
         }
     };
-    let region = |port: ratn_worker::action::Port<'_>| -> Result<Region, ActionFailure> {
-        Ok(Region { pose: port.field("pose").pose()?, size: port.field("size").vector3()? })
-    };
-    let inside = goal.port("inside").optional().map(region).transpose()?;
+    let inside = goal.port("inside").optional().as_ref().map(region).transpose()?;
     Ok(Keep { axis, inside })
 }
 
-/// The scene with what the arm, and what it holds, keep out of as obstacles: the input `keep_out`, a list of boxes `{pose, size}`.
-pub(super) fn with_kept_out(goal: &GoalContext, scene: Arc<Scene>) -> Result<Arc<Scene>, ActionFailure> {
-    let Some(port) = goal.port("keep_out").optional() else { return Ok(scene) };
-    let boxes = port.list()?;
-    if boxes.len() > MAX_KEPT_OUT {
-        let found = boxes.len();
-        return Err(ActionFailure::aborted(format!(
-            "input `keep_out` has {found} boxes: expected {MAX_KEPT_OUT} at the most"
-        )));
-    }
-    let mut scene = Scene::clone(&scene);
-    for (i, one) in boxes.iter().enumerate() {
-        let (pose, size) = (one.field("pose").pose()?, one.field("size").vector3()?);
-        if size.iter().any(|edge| !edge.is_finite() || *edge <= 0.0) {
-            return Err(ActionFailure::aborted(format!(
-                "input `keep_out[{i}].size` is {size:?}: expected edges above 0"
-            )));
-        }
-        // A name that no fact has.
-        let name = format!("keep_out[{i}]");
-        scene.objects.push(SceneObject { name, shape: Shape::Box { size }, placement: Placement::World(pose) });
-    }
-    Ok(Arc::new(scene))
+/// The boxes `{pose, size}` of `keep_out`.
+pub(super) fn kept_out(goal: &GoalContext) -> Result<Vec<Region>, ActionFailure> {
+    let Some(port) = goal.port("keep_out").optional() else { return Ok(Vec::new()) };
+    port.list()?.iter().map(region).collect()
+}
+
+fn region(port: &Port<'_>) -> Result<Region, ActionFailure> {
+    Ok(Region { pose: port.field("pose").pose()?, size: port.field("size").vector3()? })
 }
 
 /// For so many joints: fractions of the limits of velocity, acceleration and jerk.

@@ -45,7 +45,7 @@ impl Action for DriveAction {
         let begin = Instant::now();
         let robot = arms::standing(&self.robot, &goal)?;
         let scene = goal.unless_cancelled(goal.scene(&self.scenes)).await??;
-        let scene = arms::in_hands(&robot, scene)?;
+        let scene = arms::carried(&robot, scene)?;
         let request = request(&goal, &robot, &scene)?;
         let goal = Arc::new(goal);
         let asking = Arc::clone(&goal);

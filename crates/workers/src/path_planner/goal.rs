@@ -96,6 +96,7 @@ pub(super) fn asked(goal: &GoalContext, robot: &Robot) -> Result<(Asked, Option<
         straight: way_points(goal)?,
         upright_rad: goal.optional_float("upright_rad")?,
         keep: bounds::keep(goal)?,
+        keep_out: bounds::kept_out(goal)?,
         scales: bounds::scales(goal, robot.arm_joints().len())?,
         tool_speed: bounds::tool_speed(goal)?,
         reaches_into: names(goal)?,

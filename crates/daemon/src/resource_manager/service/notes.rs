@@ -47,7 +47,10 @@ struct Note {
 
 /// What was done for a lease that is to be given back: the note that was left, where it was, and the notes whose place it took there.
 #[derive(Debug, Default)]
-pub(super) struct Left(Option<(Note, Vec<(String, Vec<Note>)>)>);
+pub(super) struct Left(Option<(Note, Vec<Replaced>)>);
+
+/// A resource, and the notes that were there.
+type Replaced = (String, Vec<Note>);
 
 impl Notes {
     /// A lease was granted to a session, for which this caller speaks: what is to be told of its resources, each note once.
