@@ -198,7 +198,7 @@ pub(super) async fn on_system<T>(
 ) -> anyhow::Result<(Ended, T)> {
     let place = Place { alone, urgency, ..system.place() };
     let ended = tokio::select! {
-        ended = shell::run(run, &place, interrupt) => ended,
+        ended = Box::pin(shell::run(run, &place, interrupt)) => ended,
         error = system.one_ended() => Err(error.context("a part of the system ended during the run")),
     };
     let answer = match ended {
