@@ -1,17 +1,21 @@
 //! How a call is made that has been decided: what it says has happened or is over (a commit, an operation, a lease that goes back, a withdrawal), so nobody
-//! can do without it. It is made again while it is not answered or is refused for load, and only while the run's session has what it had: what a run has
+//! can do without it. It is made again while it is not answered, for 30 s while it is refused for load, and only while the run's session has what it had: what a run has
 //! lost others may have got and changed. That is asked before every try, as a try may hang for longer than a session lives.
 
 use crate::record::said;
 use ratn_worker::client::CallError;
 use ratn_worker::session::Trust;
 use std::fmt;
+use std::time::{Duration, Instant};
 
 /// Tries of a call whose server is not there, where the run does not wait for that one as long as it waits for the resource manager: the pauses come
 /// to 4 s.
 const TRIES: u32 = 16;
 
-/// How long a server is waited for that does not answer. One that answers that it has too much to do is waited for as long as the session is kept.
+/// How long it is asked for what a server refuses for load. A bound may stay reached: the resources that a run has made itself nobody takes away.
+const REFUSED_PATIENCE: Duration = Duration::from_secs(30);
+
+/// How long a server is waited for that does not answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Unanswered {
     /// For 16 tries.
@@ -71,8 +75,20 @@ pub(super) async fn insist<T, F>(
 where
     F: Future<Output = Result<T, CallError>>,
 {
+    insist_for(REFUSED_PATIENCE, keeps, unanswered, &mut call).await
+}
+
+async fn insist_for<T, F>(
+    patience: Duration,
+    keeps: &impl Keeps,
+    unanswered: Unanswered,
+    call: &mut impl FnMut() -> F,
+) -> Result<T, Undone>
+where
+    F: Future<Output = Result<T, CallError>>,
+{
     let mut keeps = keeps.clone();
-    let mut tries = 0;
+    let (mut tries, mut refused): (u32, Option<Instant>) = (0, None);
     loop {
         if !keeps.is_kept().await {
             return Err(Undone::Lost);
@@ -86,9 +102,17 @@ where
             Ok(done) => return Ok(done),
             Err(error) => error,
         };
-        tries += u32::from(error.is_crash() && unanswered == Unanswered::GivenUp);
+        let goes_on = match &error {
+            CallError::Malformed { .. } => false,
+            CallError::Refused { .. } => refused.get_or_insert_with(Instant::now).elapsed() < patience,
+            _ => {
+                refused = None;
+                tries += u32::from(unanswered == Unanswered::GivenUp);
+                tries < TRIES
+            }
+        };
         match error.again_after() {
-            Some(pause) if tries < TRIES => tokio::time::sleep(pause).await,
+            Some(pause) if goes_on => tokio::time::sleep(pause).await,
             _ => return Err(Undone::Failed(error)),
         }
     }
@@ -100,7 +124,6 @@ mod tests {
     use ratn_worker::endpoint::Endpoint;
     use std::cell::{Cell, RefCell};
     use std::rc::Rc;
-    use std::time::Duration;
     use tonic::{Code, Status};
     use tonic_types::{ErrorDetails, StatusExt};
 
@@ -161,6 +184,11 @@ mod tests {
         let mut long: Vec<_> = (0..2 * TRIES).map(|_| Err(busy())).collect();
         long.push(Ok(7));
         assert!(matches!(insisted(Unanswered::GivenUp, long).await, Ok(7)));
+        // A bound that stays reached is named, also where the server was not there meanwhile.
+        let short = Duration::from_millis(100);
+        let full = &mut || std::future::ready(Err::<(), _>(busy()));
+        let refused = insist_for(short, &Kept::default(), Unanswered::Waits, full).await;
+        assert!(matches!(&refused, Err(Undone::Failed(error)) if error.to_string() == "busy"), "{refused:?}");
         let wrong = Err(failed(&Status::failed_precondition("another root")));
         let refused = insisted(Unanswered::Waits, vec![Err(busy()), wrong]).await;
         assert!(matches!(&refused, Err(Undone::Failed(error)) if error.to_string() == "another root"), "{refused:?}");

@@ -174,6 +174,12 @@ impl Recorder {
                     self.project(instance, asked, named, None);
                     None
                 }
+                // Nothing is made behind what was not: the world is that of a prefix of what was decided.
+                Record::Commit { decided: Decided { instance, .. }, .. } | Record::Operate { instance, .. }
+                    if let Err(reason) = &recorded =>
+                {
+                    Some(Event::RetirementFailed { instance, reason: format!("not done behind what failed: {reason}") })
+                }
                 Record::Commit { decided, safe } => {
                     let over = CancellationToken::new();
                     let (instance, under_way) = (decided.instance, UnderWay { id: decided.id(&self.run), over });

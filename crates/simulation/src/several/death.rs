@@ -143,8 +143,8 @@ impl System<'_> {
         Ok(())
     }
 
-    /// The first fact that another run has changed meanwhile, and that a commit that is not made yet changes or is made of. Task control
-    /// (`performer/resume.rs`) refuses only what is overwritten.
+    /// The first fact that another run has changed meanwhile, and that a commit that is not made yet changes or is made of: as task control
+    /// (`performer/resume.rs`) refuses it.
     fn overtaken(&self, run: usize, commits: &[Command], since: usize) -> Option<FactKey> {
         let by_others = self.commits[since..].iter().filter(|(by, _)| *by != run).flat_map(|(_, keys)| keys);
         let is_meant = |key: &&FactKey| {

@@ -9,6 +9,9 @@ use crate::record::Order;
 use crate::safe_on_disk::Mark;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
+/// From so many on, those that have their answer are forgotten.
+const FORGETS_FROM: usize = 64;
+
 /// Calls of one kind that have no answer yet.
 #[derive(Debug, Default)]
 pub(super) struct OnTheWay(Vec<CancellationToken>);
@@ -17,12 +20,16 @@ impl OnTheWay {
     /// One more, until what is returned is dropped.
     pub(super) fn begin(&mut self) -> DropGuard {
         let over = CancellationToken::new();
-        self.0.push(over.clone());
+        self.add(over.clone());
         over.drop_guard()
     }
 
     /// What this token stands for is one of them, until it is cancelled.
     pub(super) fn add(&mut self, over: CancellationToken) {
+        // Now and then: nobody may ever ask for all of them.
+        if self.0.len() >= FORGETS_FROM && self.0.len().is_power_of_two() {
+            self.0.retain(|over| !over.is_cancelled());
+        }
         self.0.push(over);
     }
 

@@ -104,6 +104,8 @@ impl Performer {
         for (instance, (attempt, goal)) in std::mem::take(&mut ledger.goals) {
             self.start(instance, attempt, goal, Given::Before, None);
         }
+        // Operations wait for that.
+        self.withdraw_again(std::mem::take(&mut ledger.withdrawn));
         if self.session.state().borrow().found {
             self.sweep(&ledger).await?;
             for (number, instance, operations) in &ledger.operated {
@@ -113,7 +115,6 @@ impl Performer {
             self.make_anew(&ledger).await?;
             self.confirm(Confirmed { commit, operation: ledger.operations });
         }
-        self.withdraw_again(std::mem::take(&mut ledger.withdrawn));
         for (instance, asked) in ledger.projecting {
             let named = asked.named.map(|id| Named { id, made: self.making.begin(id), again: true });
             self.record(Record::Project { instance, asked, named })?;

@@ -23,8 +23,8 @@ const AGAIN: Duration = Duration::from_millis(500);
 /// What is not known after this time never will be.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// A commit of a run that is under way which a pool that answers has not got after so long is not waited for: it will not come, or it was never
-/// made. Longer than a run lives that is not heard ([`ratn_worker::session::DEFAULT_TTL`]).
-const PENDING_PATIENCE: Duration = Duration::from_secs(5);
+/// made. Longer than what is in front of it in its run is tried ([`crate::decided`]).
+const PENDING_PATIENCE: Duration = Duration::from_secs(45);
 /// Of so many other runs it is known what was heard; then the one is forgotten of which nothing was heard for longest: who has to know of it asks.
 const MOST_RUNS: usize = 1024;
 
@@ -170,6 +170,10 @@ impl Told {
     /// # Errors
     /// Where the pool, or the resource manager, has not said after [`PATIENCE`] what there is: the resources are not to be used.
     pub(super) async fn until(&self, notes: &[HolderNote], ask: &impl Ask) -> Result<(), String> {
+        self.until_claimed(notes, ask, PENDING_PATIENCE).await
+    }
+
+    async fn until_claimed(&self, notes: &[HolderNote], ask: &impl Ask, claimed: Duration) -> Result<(), String> {
         let others = notes.iter().filter(|note| *note.session_id != *self.run);
         let mut others: Vec<(&str, Left)> =
             others.filter_map(|note| Some((note.session_id.as_str(), note.note.parse().ok()?))).collect();
@@ -186,7 +190,7 @@ impl Told {
                 if left.pending == Revision::default() || self.has_heard(run, left.pending) {
                     continue;
                 }
-                let is_claim = pool_answers.is_some_and(|since| since.elapsed() >= PENDING_PATIENCE);
+                let is_claim = pool_answers.is_some_and(|since| since.elapsed() >= claimed);
                 if (is_claim || ask.is_under_way(run).await == Some(false))
                     && let Some(root) = ask.root().await
                 {
@@ -310,16 +314,17 @@ mod tests {
         told.root(Revision(5));
         let note = |pending: u64| HolderNote { session_id: "liar".to_owned(), note: format!("0 {pending}") };
         let (began, known) = (Instant::now(), Known(Some(5), true));
-        assert_eq!(told.until(&[note(u64::MAX)], &known).await, Ok(()));
+        let patience = Duration::from_secs(2);
+        assert_eq!(told.until_claimed(&[note(u64::MAX)], &known, patience).await, Ok(()));
         let took = began.elapsed();
-        assert!(PENDING_PATIENCE <= took && took < PENDING_PATIENCE + Duration::from_secs(3), "{took:?}");
+        assert!(patience <= took && took < patience + Duration::from_secs(3), "{took:?}");
         // Nor is it believed again.
         assert!(!waits_knowing(&told, "liar", "0 7", Known(Some(5), true)).await);
         // A pool that does not answer does not say that it has not got it.
         let told = Told::new("run-a");
         let (notes, silent) = ([note(7)], Known(None, true));
-        let silent = told.until(&notes, &silent);
-        assert!(tokio::time::timeout(PENDING_PATIENCE + Duration::from_secs(2), silent).await.is_err());
+        let silent = told.until_claimed(&notes, &silent, patience);
+        assert!(tokio::time::timeout(patience + Duration::from_secs(2), silent).await.is_err());
     }
 
     #[tokio::test]
