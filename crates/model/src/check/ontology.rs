@@ -7,7 +7,7 @@ use crate::expression::scope::NothingKnown;
 use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::fact::{FactKey, FactPattern};
 use crate::ontology::{Ontology, Violation};
-use crate::program::{Location, Origin, Program, State};
+use crate::program::{Location, Program, State};
 use crate::value::Value;
 
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
@@ -35,13 +35,7 @@ fn of_state(subject: &Subject<'_>, ontology: &Ontology, state: &State, findings:
     for (part, facts) in [("reads", annotations.reads.as_deref().unwrap_or_default()), ("senses", annotations.senses())]
     {
         let mut said = Said { ontology, at: at(part), path: &state.path, findings };
-        // An action speaks for every task: of what this ontology does not have there is nothing to be looked at.
-        let is_of_action = annotations.origin.get(part) == Some(&Origin::Action);
-        let is_there = |fact: &&FactExpr| {
-            let takes = ontology.predicate(&fact.predicate).map(|predicate| predicate.domain.len());
-            !is_of_action || takes == Some(fact.arguments.len())
-        };
-        facts.iter().filter(is_there).for_each(|fact| said.fact(fact));
+        facts.iter().for_each(|fact| said.fact(fact));
     }
     for (outcome, effects) in &annotations.effects {
         let mut said = Said { ontology, at: at(&format!("effects.{outcome}")), path: &state.path, findings };

@@ -1,4 +1,5 @@
-//! What a task's ontology has no predicate for is left out of what an action says: a fact that cannot be named can neither be read nor change.
+//! What a task's ontology has no predicate for, or one of fewer or more arguments, is left out of what an action says: a fact that cannot be named
+//! can neither be read nor change.
 
 use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::ontology::Ontology;
@@ -47,5 +48,5 @@ fn retain(ontology: &Ontology, effects: &mut Vec<EffectExpr>) {
 }
 
 fn can_be(ontology: &Ontology, fact: &FactExpr) -> bool {
-    ontology.predicate(&fact.predicate).is_some()
+    ontology.predicate(&fact.predicate).is_some_and(|predicate| predicate.domain.len() == fact.arguments.len())
 }
