@@ -21,21 +21,22 @@ mod tests {
 
     use super::*;
     use ratn_model::catalogue::Catalogue;
+    use ratn_model::fact::Term;
     use ratn_model::value::Value;
 
     #[test]
     fn what_changes_overwrite_and_what_they_are_made_of_overtakes_them_and_nothing_else_does() {
-        let text = "
+        let text = r#"
 task: count
-world: [tools = 1, boxes = 2, cups = 3]
+world: ["tools(rack) = 1", "boxes(rack) = 2", "cups(rack) = 3"]
 states:
   - part:
       states:
-        - count: { action: gripper/release, pia: true, effects: [tools = boxes + 1], resources: [{ block: Gripper }] }
-        - other: { action: gripper/release, pia: true, effects: [tools = cups], resources: [{ block: Gripper }] }
-";
+        - count: { action: gripper/release, pia: true, effects: ["tools(rack) = boxes(rack) + 1"], resources: [{ block: Gripper }] }
+        - other: { action: gripper/release, pia: true, effects: ["tools(rack) = cups(rack)"], resources: [{ block: Gripper }] }
+"#;
         let program = ratn_model::load::load(text, "count.yaml", &Catalogue::standard()).unwrap().program;
-        let fact = |name: &str| FactKey { predicate: name.to_owned(), arguments: Vec::new() };
+        let fact = |name: &str| FactKey { predicate: name.to_owned(), arguments: vec![Term::Name("rack".to_owned())] };
         let changes = [Change::Set { fact: fact("tools"), value: Value::Int(3) }];
         let overtaken = |name: &str| was_overtaken(&program, "part#2/count", &changes, &fact(name));
         assert!(overtaken("tools") && overtaken("boxes"));
