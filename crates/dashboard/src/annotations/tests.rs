@@ -77,7 +77,7 @@ states:
       - open:
           action: gripper/release
           reads: [in_gripper($box)]
-          effects: [\"in_gripper($box, $arm) = pose(0, 0, 0)\", { for: b in [cup], do: [\"not on($b, table)\"] }]
+          effects: [\"in_gripper($box, $arm) = pose(0, 0, 0)\", { for: \"b in [cup]\", do: [\"not on($b, table)\"] }]
 ";
     let [of_one, of_two] = ["in_gripper(?)", "in_gripper(?, ?)"].map(|predicate| offered(task, predicate));
     assert_eq!(of_one.len(), 1);
