@@ -71,12 +71,17 @@ pub struct Limits {
     pub timeout_s: Option<f64>,
 }
 
+/// Whether a variable was made here or for an output: no file can say its name.
+pub fn is_made(variable: &str) -> bool {
+    variable.contains(' ')
+}
+
 /// What is put behind the list that a variable is, where that is its new value: what an iteration gives that is collected. So the list need not be
 /// copied.
 pub fn appended<'e>(variable: &str, value: &'e Expr) -> Option<&'e Expr> {
     let Expr::Binary(BinaryOperator::Add, list, more) = value else { return None };
     match (&**list, &**more) {
-        (Expr::Variable(name), Expr::List(items)) if name == variable && name.contains(' ') => match items.as_slice() {
+        (Expr::Variable(name), Expr::List(items)) if name == variable && is_made(name) => match items.as_slice() {
             [one] => Some(one),
             _ => None,
         },

@@ -61,12 +61,12 @@ struct Obstacle {
     pose: Pose32,
     centre: Vector,
     radius: f32,
-    touch: Touch,
+    entry: Entry,
 }
 
-/// What may touch an obstacle where contact is allowed.
+/// What may be in an obstacle where contact is allowed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Touch {
+enum Entry {
     /// The fingers and what they hold, not deeper than may be pressed.
     Pressed,
     /// The fingers may be in it, however deep.
@@ -164,7 +164,7 @@ impl<'a> Checker<'a> {
     pub fn reaching_into(mut self, objects: &[String]) -> Checker<'a> {
         for obstacle in &mut self.obstacles {
             if obstacle.link.is_none() && objects.contains(&obstacle.name) {
-                obstacle.touch = Touch::Open;
+                obstacle.entry = Entry::Open;
             }
         }
         self
@@ -173,7 +173,7 @@ impl<'a> Checker<'a> {
     /// The same, but nothing that moves may ever be in these boxes of the world.
     pub fn keeping_out_of(mut self, regions: &[Region]) -> Checker<'a> {
         for (i, Region { pose, size }) in regions.iter().enumerate() {
-            self.add_obstacle(kept_out(i), None, *pose, &Geometry::from(&Shape::Box { size: *size }), Touch::Never);
+            self.add_obstacle(kept_out(i), None, *pose, &Geometry::from(&Shape::Box { size: *size }), Entry::Never);
         }
         let all = 0..self.obstacles.len();
         self.moving.iter_mut().for_each(|moving| moving.obstacles.extend(all.clone().skip(all.len() - regions.len())));
@@ -201,7 +201,7 @@ impl<'a> Checker<'a> {
                     Some((name, frame, role)) => self.add_moving(name.clone(), [i, *frame], *role, body),
                     None => {
                         let pose = self.poses[i].compose(&body.pose);
-                        self.add_obstacle(format!("link {}", link.name), Some(i), pose, &body.geometry, Touch::Pressed);
+                        self.add_obstacle(format!("link {}", link.name), Some(i), pose, &body.geometry, Entry::Pressed);
                     }
                 }
             }
@@ -215,7 +215,7 @@ impl<'a> Checker<'a> {
             if let Placement::World(pose) = &object.placement {
                 let geometry = Geometry::from(&object.shape);
                 let body = geometry.at(*pose);
-                self.add_obstacle(object.name.clone(), None, body.pose, &geometry, Touch::Pressed);
+                self.add_obstacle(object.name.clone(), None, body.pose, &geometry, Entry::Pressed);
             }
         }
     }
@@ -238,7 +238,7 @@ impl<'a> Checker<'a> {
         self.centres.push(Vector::ZERO);
     }
 
-    fn add_obstacle(&mut self, name: String, link: Option<usize>, pose: Pose, geometry: &Geometry, touch: Touch) {
+    fn add_obstacle(&mut self, name: String, link: Option<usize>, pose: Pose, geometry: &Geometry, entry: Entry) {
         let pose = to_f32(&pose);
         self.obstacles.push(Obstacle {
             name,
@@ -247,7 +247,7 @@ impl<'a> Checker<'a> {
             pose,
             centre: pose.translation,
             radius: geometry.radius() as f32,
-            touch,
+            entry,
         });
     }
 
@@ -371,7 +371,7 @@ impl<'a> Checker<'a> {
             return up_to;
         }
         let tolerance = match (contact, other) {
-            (Contact::Gripper(_), _) if moving.role == Role::Finger && self.touch(other) == Touch::Open => {
+            (Contact::Gripper(_), _) if moving.role == Role::Finger && self.entry(other) == Entry::Open => {
                 return up_to;
             }
             _ => self.may_press(i, other, contact),
@@ -450,18 +450,18 @@ impl<'a> Checker<'a> {
 
     fn allowed(&self, i: usize, other: Other, contact: Contact) -> bool {
         let Contact::Gripper(tolerance) = contact else { return false };
-        if self.touch(other) == Touch::Open && self.moving[i].role == Role::Finger {
+        if self.entry(other) == Entry::Open && self.moving[i].role == Role::Finger {
             return true;
         }
-        let deepest = if self.touch(other) == Touch::Never { tolerance.min(0.0) } else { tolerance };
+        let deepest = if self.entry(other) == Entry::Never { tolerance.min(0.0) } else { tolerance };
         self.can_press(i) && self.depth(i, other).is_some_and(|depth| depth <= deepest)
     }
 
-    /// What may touch this where contact is allowed.
-    fn touch(&self, other: Other) -> Touch {
+    /// What may be in this where contact is allowed.
+    fn entry(&self, other: Other) -> Entry {
         match other {
-            Other::Obstacle(o) => self.obstacles[o].touch,
-            Other::Moving(_) | Other::Cloud => Touch::Pressed,
+            Other::Obstacle(o) => self.obstacles[o].entry,
+            Other::Moving(_) | Other::Cloud => Entry::Pressed,
         }
     }
 
@@ -473,7 +473,7 @@ impl<'a> Checker<'a> {
     /// How deep a moving shape may be in this, in metres.
     fn may_press(&self, i: usize, other: Other, contact: Contact) -> f64 {
         match contact {
-            Contact::Gripper(press) if self.can_press(i) && self.touch(other) == Touch::Never => press.min(0.0),
+            Contact::Gripper(press) if self.can_press(i) && self.entry(other) == Entry::Never => press.min(0.0),
             Contact::Gripper(press) if self.can_press(i) => press,
             _ => 0.0,
         }

@@ -3,17 +3,17 @@
 //! lost others may have got and changed. That is asked before every try, as a try may hang for longer than a session lives.
 
 use crate::record::said;
-use ratn_worker::client::CallError;
+use ratn_worker::client::{CallError, LoadPatience};
 use ratn_worker::session::Trust;
 use std::fmt;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// Tries of a call whose server is not there, where the run does not wait for that one as long as it waits for the resource manager: the pauses come
 /// to 4 s.
 const TRIES: u32 = 16;
 
-/// How long it is asked for what a server refuses for load. A bound may stay reached: the resources that a run has made itself nobody takes away.
-const REFUSED_PATIENCE: Duration = Duration::from_secs(30);
+/// How long a run asks for what a server refuses for load. A bound may stay reached: the resources that a run has made itself nobody takes away.
+pub(super) const REFUSED_PATIENCE: Duration = Duration::from_secs(30);
 
 /// How long a server is waited for that does not answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -88,7 +88,7 @@ where
     F: Future<Output = Result<T, CallError>>,
 {
     let mut keeps = keeps.clone();
-    let (mut tries, mut refused): (u32, Option<Instant>) = (0, None);
+    let (mut tries, mut patience) = (0, LoadPatience::new(patience));
     loop {
         if !keeps.is_kept().await {
             return Err(Undone::Lost);
@@ -102,17 +102,9 @@ where
             Ok(done) => return Ok(done),
             Err(error) => error,
         };
-        let goes_on = match &error {
-            CallError::Malformed { .. } => false,
-            CallError::Refused { .. } => refused.get_or_insert_with(Instant::now).elapsed() < patience,
-            _ => {
-                refused = None;
-                tries += u32::from(unanswered == Unanswered::GivenUp);
-                tries < TRIES
-            }
-        };
-        match error.again_after() {
-            Some(pause) if goes_on => tokio::time::sleep(pause).await,
+        tries += u32::from(error.is_crash() && unanswered == Unanswered::GivenUp);
+        match patience.again_after(&error) {
+            Some(pause) if tries < TRIES => tokio::time::sleep(pause).await,
             _ => return Err(Undone::Failed(error)),
         }
     }
@@ -184,7 +176,7 @@ mod tests {
         let mut long: Vec<_> = (0..2 * TRIES).map(|_| Err(busy())).collect();
         long.push(Ok(7));
         assert!(matches!(insisted(Unanswered::GivenUp, long).await, Ok(7)));
-        // A bound that stays reached is named, also where the server was not there meanwhile.
+        // A bound that stays reached is named.
         let short = Duration::from_millis(100);
         let full = &mut || std::future::ready(Err::<(), _>(busy()));
         let refused = insist_for(short, &Kept::default(), Unanswered::Waits, full).await;

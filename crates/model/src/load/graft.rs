@@ -5,6 +5,7 @@
 //! library may be used twice.
 
 use crate::expression::{EffectExpr, Expr};
+use crate::guard::is_made;
 use crate::id::StateId;
 use crate::program::{Exceptions, Program, State, StateKind, Target};
 use std::collections::{BTreeMap, BTreeSet};
@@ -12,7 +13,6 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Puts the states of a library below the state at this place, which is its root from then on; `in_sight` are the variables there.
 pub(crate) fn graft(states: &mut Vec<State>, at: StateId, library: &Program, in_sight: &BTreeSet<String>) {
     let (path, location) = (states[at.0 as usize].path.clone(), states[at.0 as usize].location);
-    let is_made = |name: &str| name.contains(' ');
     let taken = bound(library).into_iter().filter(|name| in_sight.contains(*name) || is_made(name));
     let renamed = taken.map(|name| (name.to_owned(), format!("{path}/{name}"))).collect();
     // The root becomes the state itself; the others come behind all there are.

@@ -2,7 +2,7 @@
 //! of the lease that another node of the run has handed over meanwhile.
 
 use super::{Answer, LONG_BESIDE_OTHERS, OVERDUE, Whom, Withdrawal};
-use crate::decided::{Unanswered, insist};
+use crate::decided::{REFUSED_PATIENCE, Unanswered, insist};
 use crate::performer::told::Told;
 use crate::record::said;
 use ratn_executive::protocol::{CERTAIN, Event};
@@ -20,9 +20,6 @@ use std::time::{Duration, Instant};
 use tokio::sync::mpsc::error::SendError;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::{CancellationToken, DropGuard};
-
-/// A resource manager that refuses an acquire for load, as some bound is reached, is asked again for so long.
-const LOAD_PATIENCE: Duration = Duration::from_secs(30);
 
 /// An acquire under way.
 #[derive(Debug)]
@@ -223,7 +220,7 @@ impl Acquiring {
                 Ok(lease) = &mut self.handed, if !self.handed.is_terminated() => return Got::Handed(lease),
                 () = self.withdrawn.cancelled() => return Got::Nothing,
                 // A manager that does not answer is waited for until the run gives its session up ([`super::Performer::lost`]).
-                answer = retry_until_answered(LOAD_PATIENCE, ask) => return Got::Answer(answer),
+                answer = retry_until_answered(REFUSED_PATIENCE, ask) => return Got::Answer(answer),
                 // Others are not let pass any more.
                 () = self.told.others_after(late), if may_be_late => {}
             }
@@ -276,7 +273,7 @@ fn refused(error: &CallError) -> String {
     let reason = said(error);
     match (error.is_crash(), error.again_after()) {
         (false, Some(_)) => {
-            format!("{reason} ({}; it was asked again for {} s)", error.reason(), LOAD_PATIENCE.as_secs())
+            format!("{reason} ({}; it was asked again for {} s)", error.reason(), REFUSED_PATIENCE.as_secs())
         }
         _ => reason,
     }

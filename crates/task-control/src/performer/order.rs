@@ -60,3 +60,21 @@ impl Operations {
         Order { safe, after: self.returning.all(), _ends: self.operating.begin() }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn calls_that_are_over_are_forgotten_though_nobody_asks_for_all_of_them() {
+        let mut calls = OnTheWay::default();
+        let open = calls.begin();
+        for _ in 0..10 * FORGETS_FROM {
+            drop(calls.begin());
+        }
+        assert!(calls.0.len() <= FORGETS_FROM && !calls.is_empty(), "{}", calls.0.len());
+        assert_eq!(calls.all().len(), 1);
+        drop(open);
+        assert!(calls.is_empty());
+    }
+}

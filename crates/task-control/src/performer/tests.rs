@@ -342,6 +342,26 @@ async fn an_operation_at_the_end_of_a_run_waits_for_a_manager_that_is_away_and_f
 }
 
 #[tokio::test]
+async fn behind_an_operation_that_was_refused_nothing_is_committed() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let gone = Requirement::new(ResourceOperation::Delete, "Nothing");
+    bench.performer.perform(Command::Operate { instance: InstanceId(1), operations: vec![gone] })?;
+    let commit = Command::Commit {
+        instance: InstanceId(2),
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(1),
+    };
+    bench.performer.perform(commit)?;
+    let refused = bench.performer.close().await.map_err(|error| error.to_string());
+    assert!(refused.is_err_and(|reason| reason.contains("Nothing")));
+    let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
+    assert_eq!(world.root().await?.0, Revision(0));
+    Ok(())
+}
+
+#[tokio::test]
 async fn a_commit_that_is_not_answered_is_not_made_when_the_session_is_gone() -> anyhow::Result<()> {
     let mut bench = Bench::new().await?;
     let place = tempfile::tempdir()?;

@@ -73,10 +73,11 @@ impl CallError {
     }
 
     /// After how long the call may be made again: one that was not answered, or that the server refused for load (RESOURCE_EXHAUSTED with when to
-    /// ask again). `None` for every other refusal, which is an answer.
+    /// ask again). `None` for every other refusal, and for an answer that cannot be read.
     pub fn again_after(&self) -> Option<Duration> {
         match self {
             CallError::Refused { retry_after, .. } => *retry_after,
+            CallError::Malformed { .. } => None,
             _ => Some(PAUSE),
         }
     }

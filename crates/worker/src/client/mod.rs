@@ -17,7 +17,7 @@ pub use health::{Health, NOT_SERVING, wait_until_serving};
 pub use pattern::{fact, pattern};
 pub use process::{LogPieces, ProcessClient, WorkerWatch};
 pub use resource::{AcquireOptions, DemandWatch, ResourceClient, ResourceWatch};
-pub use retry::{PAUSE, retry_unanswered, retry_until_answered};
+pub use retry::{LoadPatience, PAUSE, retry_unanswered, retry_until_answered};
 pub use world::{Commit, Early, Projection, ProjectionWatch, WorldClient, WorldWatch};
 
 use crate::endpoint::{Endpoint, Watched, connect_lazily_as};

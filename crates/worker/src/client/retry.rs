@@ -38,18 +38,37 @@ pub async fn retry_until_answered<T, F>(patience: Duration, mut call: impl FnMut
 where
     F: Future<Output = Result<T, CallError>>,
 {
-    let mut refused_since: Option<Instant> = None;
+    let mut patience = LoadPatience::new(patience);
     loop {
-        let asked = Instant::now();
-        let answer = call().await;
-        let Err(error) = &answer else { return answer };
-        let Some(pause) = error.again_after() else { return answer };
-        if error.is_crash() {
-            refused_since = None;
-        } else if refused_since.get_or_insert(asked).elapsed() >= patience {
-            return answer;
+        match call().await {
+            Err(error) if let Some(pause) = patience.again_after(&error) => tokio::time::sleep(pause).await,
+            answer => return answer,
         }
-        tokio::time::sleep(pause).await;
+    }
+}
+
+/// How long a call is made again that is refused for load, counted anew after every try that was not: a bound may stay reached.
+#[derive(Debug)]
+pub struct LoadPatience {
+    patience: Duration,
+    refused_since: Option<Instant>,
+}
+
+impl LoadPatience {
+    /// For so long.
+    pub fn new(patience: Duration) -> LoadPatience {
+        LoadPatience { patience, refused_since: None }
+    }
+
+    /// As [`CallError::again_after`]; `None` as well where the time is over.
+    pub fn again_after(&mut self, error: &CallError) -> Option<Duration> {
+        let pause = error.again_after()?;
+        if error.is_crash() {
+            self.refused_since = None;
+            return Some(pause);
+        }
+        let is_over = self.refused_since.get_or_insert_with(Instant::now).elapsed() >= self.patience;
+        (!is_over).then_some(pause)
     }
 }
 
