@@ -35,6 +35,7 @@ impl Interpreter {
             attempt: 1,
             tries: 1,
             crashes: 0,
+            has_died: false,
             phase: Phase::Held,
             timeout: None,
             lease: None,
@@ -317,7 +318,11 @@ impl Interpreter {
         if matches!(self.target, Target::Actual) {
             context.note(Note::Retired { instance });
         }
-        let reason = if outcome == SUCCESS { String::new() } else { format!("{}: {reason}", current.path) };
+        let reason = match outcome.as_str() {
+            SUCCESS => String::new(),
+            _ if reason.is_empty() => current.path,
+            _ => format!("{}: {reason}", current.path),
+        };
         self.ended(thread, id, outcome, reason);
     }
 
