@@ -295,6 +295,10 @@ impl Performing {
                 Err(broken @ CallError::Broken { .. }) if !broken.is_unreadable() => {
                     return self.lost(endpoint, &broken).await;
                 }
+                // It never came to its provider behind what broke the stream.
+                Err(unknown) if unknown.code() == Some(tonic::Code::NotFound) => {
+                    return self.lost(endpoint, unreadable).await;
+                }
                 _ => {}
             }
         }
