@@ -318,11 +318,7 @@ impl Interpreter {
         if matches!(self.target, Target::Actual) {
             context.note(Note::Retired { instance });
         }
-        let reason = match outcome.as_str() {
-            SUCCESS => String::new(),
-            _ if reason.is_empty() => current.path,
-            _ => format!("{}: {reason}", current.path),
-        };
+        let reason = if outcome == SUCCESS { String::new() } else { format!("{}: {reason}", current.path) };
         self.ended(thread, id, outcome, reason);
     }
 

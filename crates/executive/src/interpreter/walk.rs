@@ -359,10 +359,7 @@ impl Interpreter {
             // A region ends as its state does.
             return self.set(id, Todo::Done { outcome, reason });
         }
-        // An outcome of an action's own is a result; of what contains others it may be what is made of a failure.
-        let has_failed = is_failure(&outcome) || !matches!(context.program.state(state).kind, StateKind::Action { .. });
-        if has_failed
-            && outcome != SUCCESS
+        if is_failure(&outcome)
             && !reason.is_empty()
             && let Some(frame) = self.threads.get_mut(&id).and_then(|thread| thread.frames.last_mut())
         {
@@ -390,7 +387,7 @@ impl Interpreter {
             return String::new();
         }
         let frame = self.threads.get(&id).and_then(|thread| thread.frames.last());
-        match frame.filter(|_| reason.is_empty()) {
+        match frame.filter(|_| is_failure(outcome) && reason.is_empty()) {
             Some(frame) => frame.because.clone(),
             None => reason,
         }
