@@ -42,7 +42,7 @@ pub fn main() -> ExitCode {
     match command::run(arguments.command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            output::progress(&failure);
+            output::failure(&failure);
             failure.exit_code()
         }
     }

@@ -29,6 +29,12 @@ pub(crate) fn progress(line: impl Display) {
     }
 }
 
+/// Why the command did not do what was asked: said also where nothing is said of progress.
+pub(crate) fn failure(failure: &Failure) {
+    let mut progress = PROGRESS.lock().unwrap_or_else(PoisonError::into_inner);
+    let _ = io::stderr().write_all(format!("{}{failure}\n", progress.cleared()).as_bytes());
+}
+
 /// From now on nothing is said of progress.
 pub(crate) fn be_quiet() {
     PROGRESS.lock().unwrap_or_else(PoisonError::into_inner).is_quiet = true;

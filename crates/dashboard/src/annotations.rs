@@ -401,6 +401,7 @@ fn said(told: &InForce) -> Vec<wire::InForceLine> {
         Some(Origin::State) => "this state".to_owned(),
         Some(Origin::Action) => format!("the catalogue, of {}", told.action),
         Some(Origin::Both) => format!("this state and the catalogue, of {}", told.action),
+        Some(Origin::Reads) => "for what it reads".to_owned(),
         None => "default: nobody says otherwise".to_owned(),
     };
     let line = |line: &ratn_model::in_force::Line| wire::InForceLine {

@@ -3,7 +3,7 @@
 
 use crate::check::{name_state, named};
 use crate::expression::{EffectExpr, Expr, FactExpr};
-use crate::program::{Annotations, Nature, Origin, Program, ResourceExpr, SUCCESS, StateKind};
+use crate::program::{Annotations, Nature, Origin, Program, ResourceExpr, SUCCESS, StateKind, WORLD_MODEL};
 use crate::resource::Quantity;
 use serde::Serialize;
 use std::fmt::Display;
@@ -55,6 +55,10 @@ fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
     let mut effects = vec![said.effects.get(SUCCESS).map_or_else(everything, |effects| changed(effects))];
     let others = said.effects.iter().filter(|(outcome, effects)| *outcome != SUCCESS && !effects.is_empty());
     effects.extend(others.map(|(outcome, effects)| format!("{outcome}: {}", changed(effects))));
+    // A projection that nobody asks for is told for itself.
+    let implied = said.origin.get(WORLD_MODEL).copied();
+    let (room, own): (Vec<ResourceExpr>, Vec<ResourceExpr>) =
+        said.resources.iter().cloned().partition(|line| implied.is_some() && line.kind == WORLD_MODEL);
     let mut all = vec![
         match &said.nature {
             Nature::Computes => line("computes", "true".to_owned()),
@@ -64,12 +68,12 @@ fn lines(program: &Program, said: &Annotations) -> Vec<Line> {
         line("reads", said.reads.as_ref().map_or_else(everything, |read| facts(read))),
         line("requires", listed(&said.requires, name)),
         line("effects", effects.join("; ")),
-        line(
-            "resources",
-            if said.resources.is_empty() { "nothing".to_owned() } else { resources(program, &said.resources) },
-        ),
+        line("resources", if own.is_empty() { "nothing".to_owned() } else { resources(program, &own) }),
         line("duration", said.duration_s.as_ref().map_or_else(unknown, |duration| named(program, duration))),
     ];
+    if implied.is_some() {
+        all.push(Line { key: "resources", text: resources(program, &room), from: implied });
+    }
     if said.anytime {
         all.push(line("anytime", "true".to_owned()));
     }
@@ -129,6 +133,58 @@ states:
             of("effects").is_some_and(|effects| effects.contains("at(box, \"pos1.\") = plan.end_pose")),
             "{told:?}"
         );
+    }
+
+    #[test]
+    fn who_reads_facts_ahead_of_its_place_has_a_projection_whether_or_not_it_is_said() {
+        let catalogue = r#"
+[resources]
+Brain = { class = "process", count = 2 }
+WorldModel = { class = "world", count = 8 }
+[providers.brain]
+resource = "Brain"
+actions.think = {}
+actions.plan.annotations = { computes = true, reads = ["at(?)"], resources = ["Brain"] }
+"#;
+        let task = r#"
+task: t
+states:
+  - says_it: { action: brain/think, computes: true, reads: ['at(?)'], resources: [Brain, world_model] }
+  - reads: { action: brain/think, computes: true, reads: ['at(?)'], resources: [Brain] }
+  - by_its_action: { action: brain/plan }
+  - everything: { action: brain/think, computes: true, resources: [Brain] }
+  - looks: { action: brain/think, senses: ['light()'], reads: ['at(?)'], effects: [], resources: [Brain] }
+  - nothing: { action: brain/think, computes: true, reads: [], in: {}, resources: [Brain] }
+  - only_senses: { action: brain/think, senses: ['light()'], effects: [], resources: [Brain] }
+  - acts: { action: brain/think, pia: true, reads: ['at(?)'], effects: [], resources: [Brain] }
+  - around:
+      reads: ['at(?)']
+      states:
+        - inside: { action: brain/think, computes: true, reads: [], resources: [Brain] }
+"#;
+        let catalogue = Catalogue::from_toml(catalogue).unwrap_or_else(|error| panic!("{error}"));
+        let program = load(task, "t.yaml", &catalogue).map(|loaded| loaded.program);
+        let told = in_force(&program.unwrap_or_else(|found| panic!("{found:?}")));
+        let lines = told.iter().flat_map(|state| {
+            let resources = state.lines.iter().filter(|line| line.key == "resources");
+            resources.map(|line| format!("{}: {} ({:?})", state.state, line.text, line.from))
+        });
+        insta::assert_snapshot!(lines.collect::<Vec<_>>().join("\n"), @r"
+        says_it: block Brain; block WorldModel (Some(State))
+        reads: block Brain (Some(State))
+        reads: block WorldModel (Some(Reads))
+        by_its_action: block Brain (Some(Action))
+        by_its_action: block WorldModel (Some(Reads))
+        everything: block Brain (Some(State))
+        everything: block WorldModel (Some(Reads))
+        looks: block Brain (Some(State))
+        looks: block WorldModel (Some(Reads))
+        nothing: block Brain (Some(State))
+        only_senses: block Brain (Some(State))
+        acts: block Brain (Some(State))
+        around/inside: block Brain (Some(State))
+        around/inside: block WorldModel (Some(Reads))
+        ");
     }
 
     #[test]

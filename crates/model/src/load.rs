@@ -30,6 +30,7 @@ mod library;
 mod names;
 mod outline;
 mod outputs;
+mod projected;
 mod resources;
 mod state;
 mod tolerance;
@@ -252,6 +253,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
         graft::graft(&mut states, *id, library, &task.in_sight(*id));
         out.libraries.push(task.outline.step(*id).path.clone());
     }
+    projected::imply(&mut states);
     let digest = hasher.finalize().to_hex().to_string();
     let mut program = Program {
         name,

@@ -243,7 +243,7 @@ pub struct Annotations {
     pub anytime: bool,
     /// On a region: facts that other regions may touch too. The programmer answers for their order.
     pub shared: Vec<FactExpr>,
-    /// Who says what is in force, by key; keys that nobody says are left out.
+    /// Who says what is in force, by key; keys that nobody says are left out. The block of a projection that nobody says is under [`WORLD_MODEL`].
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub origin: BTreeMap<String, Origin>,
     /// That a sequence was made of a state that is tried again ([`crate::guard`]).
@@ -262,6 +262,8 @@ pub enum Origin {
     Action,
     /// Both: effects add up.
     Both,
+    /// Neither: what reads facts ahead of its place needs a projection.
+    Reads,
 }
 
 /// What a state became that is tried again. It is said once more what its transitions and variables come to.

@@ -1,6 +1,7 @@
 //! The critical path: walked backwards from the end of a run, at each moment what everything was waiting for.
 //!
-//! An instance that ran had waited for the result that let it begin, or for a resource that somebody gave back; there the path goes on.
+//! An instance that ran had waited for the result that let it begin, or for a resource that somebody gave back; there the path goes on. A state that waits
+//! for a condition, a time, a signal or an answer is on it for as long as it waited.
 //! The links lie behind each other in time, and what is between two of them is what the parts of the system took.
 
 use super::timeline::{Behind, Cause, Instance, Phase, Stage, Timeline};
@@ -71,7 +72,9 @@ fn step<'r>(
             }
             other => {
                 let came_from = earlier.or_else(|| last_phase(run, instance.expanded_by.instance()?, phase.from_s));
-                ((phase.to_s > phase.from_s).then(|| link(other.awaited())), came_from)
+                let itself = instance.awaited_itself.as_ref().filter(|(since_s, _)| phase.from_s >= *since_s);
+                let waited_for = itself.map_or_else(|| other.awaited(), |(_, what)| what.clone());
+                ((phase.to_s > phase.from_s).then(|| link(waited_for)), came_from)
             }
         },
         Stage::Asking => {

@@ -168,6 +168,39 @@ mod tests {
         }
     }
 
+    /// `move`, then `ready`, which waits until somebody else changes the world, then `turn`, then `rest`, which waits for its time. All are in the window
+    /// from the beginning.
+    const WAITS: &str = r#"{"at":0,"event":"started","task":"t","digest":"d","mode":"cdtn","parameters":{},"seed":7,"world":[],"revision":1,"capacity":{},"origin":{"run":"r","natures":{"computes":[],"actuating":["Arm"]}}}
+{"at":0,"command":"note","note":"expanded","instance":1,"state":1,"path":"move","speculative":false}
+{"at":0,"command":"note","note":"expanded","instance":2,"state":2,"path":"ready","speculative":false}
+{"at":0,"command":"note","note":"expanded","instance":3,"state":3,"path":"turn","speculative":false}
+{"at":0,"command":"note","note":"expanded","instance":4,"state":4,"path":"rest","speculative":false}
+{"at":0,"command":"start","instance":1,"attempt":1,"goal":{"provider":"arm","action":"move","inputs":{},"seed":1,"lease":{"id":1,"token":1,"resources":[{"id":"arm@sim","kind":"Arm","endpoint":""}]},"projection":null,"expected_s":null}}
+{"at":2000000000,"event":"finished","instance":1,"attempt":1,"outcome":"success","outputs":{},"measured":[],"reason":""}
+{"at":2000000000,"command":"note","note":"finished","instance":1,"outcome":"success"}
+{"at":2000000000,"command":"note","note":"awaiting","instance":2,"awaits":"condition","condition":"open(door)"}
+{"at":5000000000,"event":"world_changed","revision":7,"facts":[]}
+{"at":5000000000,"command":"note","note":"finished","instance":2,"outcome":"success"}
+{"at":5000000000,"command":"start","instance":3,"attempt":1,"goal":{"provider":"arm","action":"turn","inputs":{},"seed":1,"lease":{"id":2,"token":2,"resources":[{"id":"arm@sim","kind":"Arm","endpoint":""}]},"projection":null,"expected_s":null}}
+{"at":6000000000,"event":"finished","instance":3,"attempt":1,"outcome":"success","outputs":{},"measured":[],"reason":""}
+{"at":6000000000,"command":"note","note":"finished","instance":3,"outcome":"success"}
+{"at":6000000000,"command":"note","note":"awaiting","instance":4,"awaits":"time","until":8500000000}
+{"at":8500000000,"event":"woken"}
+{"at":8500000000,"command":"note","note":"finished","instance":4,"outcome":"success"}
+{"at":8500000000,"command":"end","outcome":"success","outputs":{},"reason":""}"#;
+
+    #[test]
+    fn the_critical_path_goes_through_what_waits_for_a_condition_or_a_time() {
+        insta::assert_snapshot!(critical::table(&critical::path(&told(WAITS))), @r"
+        critical path             from s    to s  length  was          began on
+          move                       0.0     2.0     2.0  running      the start
+          ready                      2.0     5.0     3.0  waiting      `open(door)`
+          turn                       5.0     6.0     1.0  running      ready
+          rest                       6.0     8.5     2.5  waiting      its time
+          8.5 s in 4 links, 0 of them shorter than 0.05 s and not shown
+        ");
+    }
+
     #[test]
     fn what_was_waited_for_is_told_by_cause() {
         insta::assert_snapshot!(waiting::table(&waiting::by_cause(&told(CHAIN))), @r"

@@ -24,6 +24,7 @@ mod outside;
 mod performer;
 pub mod progress;
 mod promises;
+mod readable;
 mod record;
 mod replay;
 mod safe_on_disk;

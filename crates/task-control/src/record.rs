@@ -24,7 +24,7 @@ use std::pin::pin;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 /// How far the world pool may be behind before the run is given up.
@@ -113,8 +113,8 @@ impl Decided {
 /// Attempts whose projection nobody waits for any more.
 pub(super) type Cancelled = Arc<Mutex<BTreeSet<(InstanceId, u32)>>>;
 
-/// How far the recorder is.
-pub(super) type Recorded = Arc<Mutex<Confirmed>>;
+/// How far the recorder is. Goals that look at the root wait for that.
+pub(super) type Recorded = Arc<watch::Sender<Confirmed>>;
 
 /// The task that does it.
 pub(super) struct Recorder {
@@ -232,9 +232,12 @@ impl Recorder {
     }
 
     fn confirm(&self, confirmed: Confirmed) {
-        let mut done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
-        done.commit = done.commit.max(confirmed.commit);
-        done.operation = done.operation.max(confirmed.operation);
+        self.done.send_if_modified(|done| {
+            let before = *done;
+            done.commit = done.commit.max(confirmed.commit);
+            done.operation = done.operation.max(confirmed.operation);
+            *done != before
+        });
     }
 
     /// Begins to have a projection made.

@@ -82,9 +82,9 @@ impl Syncer {
 }
 
 impl Mark {
-    /// One that is not safe as long as what is returned with it lives.
+    /// One that is not safe before its number, 1, is sent.
     #[cfg(test)]
-    pub(super) fn not_yet() -> (impl Sized, Mark) {
+    pub(super) fn not_yet() -> (watch::Sender<u64>, Mark) {
         let (told, safe) = watch::channel(0);
         (told, Mark { number: 1, safe })
     }

@@ -106,7 +106,7 @@ pub(crate) struct RunArguments {
     /// Write a checkpoint beside the event log after so many events, for a quick `--resume`; 0: none
     #[arg(long, value_name = "EVENTS", default_value_t = EVERY_EVENTS)]
     pub(crate) checkpoint_every: u64,
-    /// Say nothing but the result
+    /// Say nothing but the result, or why there is none
     #[arg(short, long)]
     pub(crate) quiet: bool,
     /// Print JSON on standard output: one document at the end, with `--json=lines` the event log as it grows before it, all of it a line each

@@ -225,7 +225,7 @@ fn read(path: &Path) -> Result<String, Failure> {
     input::read(path).map_err(|error| Failure::Refused(format!("{}: cannot be read: {error}", path.display())))
 }
 
-fn refused(findings: &[Diagnostic]) -> Failure {
+pub(super) fn refused(findings: &[Diagnostic]) -> Failure {
     let lines: Vec<String> = findings.iter().map(Diagnostic::to_string).collect();
     Failure::Refused(lines.join("\n"))
 }
@@ -234,6 +234,16 @@ fn refused(findings: &[Diagnostic]) -> Failure {
 pub(crate) fn load(path: &Path, from: Option<&str>, catalogue: &Catalogue) -> Result<Program, Failure> {
     let (text, file) = (read(path)?, path.display().to_string());
     accepted(ratn_model::load::load_beginning(&text, &file, catalogue, &input::Libraries, from))
+}
+
+/// As [`load`], with the findings where it is refused.
+pub(super) fn found(
+    path: &Path,
+    from: Option<&str>,
+    catalogue: &Catalogue,
+) -> Result<Result<Program, Vec<Diagnostic>>, Failure> {
+    let (text, file) = (read(path)?, path.display().to_string());
+    Ok(ratn_model::load::load_beginning(&text, &file, catalogue, &input::Libraries, from).map(told))
 }
 
 /// The program of a task file's text, with libraries from elsewhere; `file` is its name in messages.
@@ -248,10 +258,13 @@ pub(super) fn load_from(
 
 fn accepted(loaded: Result<Loaded, Vec<Diagnostic>>) -> Result<Program, Failure> {
     match loaded {
-        Ok(loaded) => {
-            loaded.warnings.iter().for_each(output::progress);
-            Ok(loaded.program)
-        }
+        Ok(loaded) => Ok(told(loaded)),
         Err(findings) => Err(refused(&findings)),
     }
+}
+
+/// Warnings go to standard error.
+fn told(loaded: Loaded) -> Program {
+    loaded.warnings.iter().for_each(output::progress);
+    loaded.program
 }

@@ -1,5 +1,6 @@
 //! `ratn run TASK`: on the system that runs here, or on one started for it; `ratn run --resume LOG`.
 
+mod described;
 mod resume;
 
 use super::{blocking_here, check};
@@ -64,7 +65,7 @@ async fn begin(
     let robot = arguments.robot.as_deref();
     let given = arguments.config.as_deref().map(|file| SystemConfig::load_for(Some(file), robot)).transpose()?;
     let tls = &given.as_ref().map_or_else(|| Ok(tls.clone()), |config| config.client_tls(tls))?;
-    let found = System::find(directory, given.clone(), tls).await?;
+    let mut found = System::find(directory, given.clone(), tls).await?;
     if found.is_none() && arguments.runtime_dir.is_some() {
         let place = directory.display();
         return Err(Failure::Refused(format!(
@@ -81,7 +82,11 @@ async fn begin(
     if let Some(system) = &found {
         system.mismatches.iter().for_each(|what| output::progress(format_args!("warning: {what}")));
     }
-    let program = check::load(task, arguments.from.as_deref(), &config.catalogue)?;
+    let from = arguments.from.as_deref();
+    let program = match &mut found {
+        Some(system) => Box::pin(described::program(task, from, system, interrupt)).await?,
+        None => check::load(task, from, &config.catalogue)?,
+    };
     let parameters = program
         .bind_parameters(&arguments.set)
         .map_err(|error| Failure::Refused(format!("{}: error[invalid-parameter]: {error}", task.display())))?;

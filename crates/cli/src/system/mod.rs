@@ -147,6 +147,13 @@ impl System {
         }))
     }
 
+    /// Asks once more what there is: workers may have come since.
+    pub(crate) async fn ask_again(&mut self) {
+        self.offered = Box::pin(Offered::known(&self.tls, &self.endpoints.resource_manager)).await;
+        self.mismatches = self.offered.mismatches(&self.config.catalogue);
+        self.offered.extend(&mut self.config.catalogue);
+    }
+
     /// Where a run finds what it needs of it. From here on the run sends its spans where the daemons send theirs.
     pub(crate) fn place(&self) -> Place {
         let resource = vec![("service.name", "ratn".to_owned())];

@@ -5,7 +5,7 @@ use ratn_daemon::process_manager::HOST_KIND;
 use ratn_model::catalogue::{Catalogue, WorkerDescription};
 use ratn_model::program::Program;
 use ratn_model::resource::{Quantity, ResourceClass, ResourceOperation};
-use ratn_proto::types::Resource;
+use ratn_proto::types::{PoolStatus, Resource};
 use ratn_worker::client::{ActionClient, CallError, Channels, DescribeError, ProcessClient, ResourceClient};
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::tls::ClientTls;
@@ -28,6 +28,8 @@ pub(crate) struct Offered {
     pub(crate) kinds: BTreeMap<String, Quantity>,
     /// Kinds of which a process manager can start workers.
     pub(crate) startable: BTreeSet<String>,
+    /// Kinds of which there are workers, or shall be.
+    pub(crate) kept: BTreeSet<String>,
 }
 
 /// A worker with what it says of itself.
@@ -67,8 +69,17 @@ impl Offered {
         });
         let (workers, hosts) = tokio::join!(futures::future::join_all(asked), futures::future::join_all(hosts));
         let pools = hosts.into_iter().filter_map(|answer| answer.ok()?.ok()).flat_map(|host| host.pools);
-        let startable = pools.filter(|pool| pool.max > 0).map(|pool| pool.kind).collect();
-        Ok(Offered { workers, kinds, startable })
+        let pools: Vec<PoolStatus> = pools.filter(|pool| pool.max > 0).collect();
+        let keeps = |pool: &&PoolStatus| pool.min > 0 || pool.spares > 0 || !pool.workers.is_empty();
+        let kept = pools.iter().filter(keeps).map(|pool| pool.kind.clone()).collect();
+        let startable = pools.into_iter().map(|pool| pool.kind).collect();
+        Ok(Offered { workers, kinds, startable, kept })
+    }
+
+    /// Kinds of which there are workers, or shall be, and none is offered: they are being started, perhaps once more.
+    pub(crate) fn away(&self) -> Vec<&str> {
+        let is_there = |kind: &str| self.workers.iter().any(|worker| worker.kind == kind);
+        self.kept.iter().map(String::as_str).filter(|kind| !is_there(kind)).collect()
     }
 
     /// Where workers and the catalogue say something else, and descriptions that are not believed, each in a sentence with whose it is.
@@ -153,6 +164,21 @@ mod tests {
         );
         offered.startable.insert("Detector".to_owned());
         assert_eq!(offered.lacking(&program()), Vec::<String>::new());
+    }
+
+    #[test]
+    fn workers_that_shall_be_there_and_are_not_are_away() {
+        let there = Described {
+            id: "planner-1@compute".to_owned(),
+            kind: "PathPlanner".to_owned(),
+            // It is there, and has nothing to say.
+            description: Err(DescribeError::Unanswered(String::new())),
+        };
+        let kinds = |all: &[&str]| all.iter().map(|kind| (*kind).to_owned()).collect();
+        let kept = kinds(&["Inspector", "PathPlanner"]);
+        let startable = kinds(&["Inspector", "PathPlanner", "Welder"]);
+        let offered = Offered { workers: vec![there], startable, kept, ..Offered::default() };
+        assert_eq!(offered.away(), ["Inspector"]);
     }
 
     #[test]

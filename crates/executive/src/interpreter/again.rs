@@ -19,7 +19,7 @@ impl Interpreter {
             let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { continue };
             let (instance, attempt) = (current.instance, current.attempt);
             match current.phase {
-                Phase::Backoff(until) if until <= context.now => self.try_now(context, thread),
+                Phase::Backoff(until) if until <= context.now => self.next_try(context, thread),
                 Phase::Running if current.timeout.is_some_and(|at| at <= context.now) => {
                     if context.program.state(current.state).is_pause() {
                         // What has ended already goes on first: who has lost a race by that takes no signal any more.
@@ -34,7 +34,7 @@ impl Interpreter {
                     }
                     let limit = context.program.state(current.state).annotations.timeout_s.unwrap_or_default();
                     context.commands.push(Command::Cancel { instance, attempt });
-                    if !self.is_tried_again(context, thread) {
+                    if !self.is_tried_again(context, thread, false) {
                         self.end_node(context, thread, format!("it took longer than {limit} s"));
                     }
                 }
@@ -46,13 +46,13 @@ impl Interpreter {
 
     /// A goal has ended: that is the result, unless it is tried again.
     pub(super) fn goal_ended(&mut self, context: &mut Context<'_>, thread: u64, end: GoalEnd) {
-        if end.outcome != ABORTED || !self.is_tried_again(context, thread) {
+        if end.outcome != ABORTED || !self.is_tried_again(context, thread, false) {
             self.finish(context, thread, end);
         }
     }
 
-    /// After a try that ended `aborted`: whether there is another one, which begins after its pause.
-    fn is_tried_again(&mut self, context: &mut Context<'_>, thread: u64) -> bool {
+    /// After a try that ended `aborted`, or whose worker died: whether there is another one, which begins after its pause.
+    fn is_tried_again(&mut self, context: &mut Context<'_>, thread: u64, has_died: bool) -> bool {
         let Some(current) = self.current(thread) else { return false };
         let retry = context.program.state(current.state).annotations.retry;
         let Some(retry) = retry.filter(|retry| current.tries <= retry.count) else { return false };
@@ -62,37 +62,60 @@ impl Interpreter {
         current.tries += 1;
         current.attempt += 1;
         current.phase = Phase::Backoff(until);
+        current.has_died = has_died;
         self.give_back(context, &given);
         if pause.is_zero() {
-            self.try_now(context, thread);
+            self.next_try(context, thread);
         } else {
             context.commands.push(Command::Wake { at: until });
         }
         true
     }
 
-    /// An attempt ended without an answer: a computing or sensing node is tried again, up to its limit.
+    /// The pause before a try is over.
+    fn next_try(&mut self, context: &mut Context<'_>, thread: u64) {
+        let Some(current) = self.current(thread) else { return };
+        if std::mem::take(&mut current.has_died) {
+            self.try_anew(context, thread)
+        } else {
+            self.try_now(context, thread)
+        }
+    }
+
+    /// An attempt ended without an answer: a computing or sensing node is tried again, up to its limit. What is behind that limit, and any PIA, counts as
+    /// one that ended `aborted`.
     pub(super) fn crashed(&mut self, context: &mut Context<'_>, thread: u64, reason: &str) {
         let Some(current) = self.current(thread) else { return };
-        let (attempt, id, phase) = (current.attempt, current.state, current.phase);
-        match phase {
-            Phase::Held | Phase::Projecting | Phase::Running | Phase::Acquiring => {}
+        let (attempt, id) = (current.attempt, current.state);
+        match current.phase {
+            Phase::Projecting | Phase::Running | Phase::Acquiring => {}
             Phase::Backoff(_) | Phase::Stalled | Phase::Queued(_) => return,
+            Phase::Held => {
+                // It had not begun: what it held is gone, and it asks again when it may.
+                let given = current.take_held();
+                current.attempt += 1;
+                return self.give_back(context, &given);
+            }
+        }
+        current.crashes += 1;
+        let limit = context.program.state(id).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
+        if context.plan.state(id).nature == NodeNature::Irreversible || current.crashes >= limit {
+            if !self.is_tried_again(context, thread, true) {
+                self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));
+            }
+            return;
         }
         let given = current.take_held();
         current.attempt += 1;
-        if phase == Phase::Held {
-            // It had not begun: what it held is gone, and it asks again when it may.
-            return self.give_back(context, &given);
-        }
-        current.crashes += 1;
-        current.phase = Phase::Stalled;
-        let crashes = current.crashes;
         self.give_back(context, &given);
-        let limit = context.program.state(id).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
-        if context.plan.state(id).nature == NodeNature::Irreversible || crashes >= limit {
-            return self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));
-        }
+        self.try_anew(context, thread);
+    }
+
+    /// Its worker died: it begins again with other resources, in a routine when that has all of its own anew.
+    fn try_anew(&mut self, context: &mut Context<'_>, thread: u64) {
+        let Some(current) = self.current(thread) else { return };
+        let id = current.state;
+        current.phase = Phase::Stalled;
         match self.threads.get(&thread).and_then(|thread| thread.routine) {
             Some(_) if !self.may_try(context, thread) => {}
             // In a race who waits loses: the others keep the lease, and what is left of it has to do.
@@ -124,16 +147,27 @@ impl Interpreter {
         let Some(thread) = self.stalled(routine).first().copied().or_else(|| queued.next()) else { return };
         drop(queued);
         let Some(instance) = self.current(thread).map(|current| current.instance) else { return };
-        let Some(routine) = self.routines.get_mut(&routine) else { return };
-        if let Some(lease) = routine.lease.take() {
+        let Some(one) = self.routines.get_mut(&routine) else { return };
+        if let Some(lease) = one.lease.take() {
             context.commands.push(Command::Release { instance, lease: Some(lease.id), projection: None });
         }
-        let requirements = routine.requirements.clone();
+        let requirements = one.requirements.clone();
+        self.know_of_new_lease(routine);
         if requirements.is_empty() {
             return self.go_on_under_new_lease(context, thread);
         }
         self.set_phase(thread, Phase::Acquiring);
         context.commands.push(Command::Acquire { instance, requirements, priority: i64::MAX });
+    }
+
+    /// Whoever pauses before its next try finds other resources than those with which its worker died.
+    fn know_of_new_lease(&mut self, routine: u64) {
+        let threads: Vec<u64> = self.threads_of(routine).collect();
+        for thread in threads {
+            if let Some(current) = self.current(thread) {
+                current.has_died = false;
+            }
+        }
     }
 
     /// Who has asked for the routine goes on, and whoever waited with it, unless what they require has been changed meanwhile.

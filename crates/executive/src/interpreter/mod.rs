@@ -182,6 +182,9 @@ struct Current {
     attempt: u32,
     tries: u32,
     crashes: u32,
+    /// In a pause before its next try: its worker died, and the lease of its routine is still that one's.
+    #[serde(default)]
+    has_died: bool,
     phase: Phase,
     /// When its goal has had its time.
     timeout: Option<Timestamp>,

@@ -35,6 +35,7 @@ impl Interpreter {
             attempt: 1,
             tries: 1,
             crashes: 0,
+            has_died: false,
             phase: Phase::Held,
             timeout: None,
             lease: None,

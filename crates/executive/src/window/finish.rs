@@ -182,17 +182,15 @@ impl Window {
         let limit = context.program.state(instance.state).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
         let (is_pia, attempt) = (instance.is_pia(), node.attempt);
         let is_held = is_pia && matches!(node.status, Status::Granted(_));
+        // One that had not begun asks again when it may: only what it held is gone.
+        if !is_held {
+            let crashes = self.graph.count_crash(id);
+            if is_pia || crashes >= limit {
+                return self.goal_ended(context, id, Ended::aborted(format!("crashed in attempt {attempt}: {reason}")));
+            }
+        }
         self.give_back(context, id);
         self.rest(id);
-        if is_held {
-            // It had not begun: what it held is gone, and it asks again when it may.
-            self.graph.begin_again(id);
-            return self.waits.enqueue(&mut self.graph, id);
-        }
-        let crashes = self.graph.count_crash(id);
-        if is_pia || crashes >= limit {
-            return self.finish(context, id, Ended::aborted(format!("crashed in attempt {attempt}: {reason}")));
-        }
         self.graph.begin_again(id);
         self.waits.enqueue(&mut self.graph, id);
     }

@@ -313,13 +313,20 @@ impl Timeline {
                 self.paused.get_or_insert(at);
                 self.stopped_at = Some(id);
             }
-            Note::Awaiting { awaited, .. } => self.known(id, at).awaits = Some(awaited.to_string()),
+            Note::Awaiting { awaited, .. } => {
+                let cause = self.cause.clone();
+                self.known(id, at).begins_to_await(at, awaited.to_string(), &cause);
+            }
             Note::Finished { outcome, .. } => {
                 let instance = self.known(id, at);
-                instance.awaits = None;
+                let has_awaited = instance.awaits.take().is_some();
                 (instance.finished, instance.outcome) = (true, Some(outcome.clone()));
                 self.enter(id, Stage::Finished, at);
                 self.open.remove(&id);
+                // Whatever ended a wait: what goes on now has waited for that.
+                if has_awaited {
+                    self.cause = Cause::Result(id, self.known(id, at).path.clone());
+                }
             }
             Note::Retired { .. } => {
                 self.improvements.is_real(id);

@@ -160,6 +160,8 @@ pub struct Instance {
     pub squashed: bool,
     /// What it waits for by itself: a condition, a time, a signal, an answer.
     pub awaits: Option<String>,
+    /// Since when it has waited so, or had until its end, and for what.
+    pub awaited_itself: Option<(f64, String)>,
     /// Its result was taken from an equal one.
     pub reused: bool,
     /// Why its result, or what it was at, did not count; once for each time.
@@ -186,6 +188,7 @@ impl Instance {
             retired: false,
             squashed: false,
             awaits: None,
+            awaited_itself: None,
             reused: false,
             invalidations: Vec::new(),
         }
@@ -201,6 +204,17 @@ impl Instance {
             self.phases.push(Phase { stage: self.stage, from_s, to_s, ended_by: cause.clone() });
         }
         (self.stage, self.since_s) = (stage, at_s);
+    }
+
+    /// What it waits for by itself is not there yet. It had waited for its turn before.
+    pub(super) fn begins_to_await(&mut self, at_s: f64, awaited: String, cause: &Cause) {
+        if self.stage == Stage::Waiting && self.awaits.is_none() {
+            let now_s = at_s.max(self.since_s);
+            let from_s = std::mem::replace(&mut self.since_s, now_s);
+            self.phases.push(Phase { stage: self.stage, from_s, to_s: self.since_s, ended_by: cause.clone() });
+            self.awaited_itself = Some((self.since_s, awaited.clone()));
+        }
+        self.awaits = Some(awaited);
     }
 
     /// Nothing of it is still to come, except that an equal one takes its result.

@@ -2,11 +2,13 @@
 
 use super::Answer;
 use super::told::Told;
+use crate::ledger::Confirmed;
+use crate::readable::readable;
 use crate::record::said;
 use crate::safe_on_disk::Mark;
 use ratn_executive::protocol::Event;
 use ratn_model::fact::FactKey;
-use ratn_model::id::{InstanceId, LeaseId};
+use ratn_model::id::{InstanceId, LeaseId, Revision};
 use ratn_model::measurement::Measurement;
 use ratn_model::program::{ABORTED, PREEMPTED};
 use ratn_model::value::Value;
@@ -18,8 +20,8 @@ use ratn_worker::session::DEFAULT_TTL;
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
-use tokio::sync::mpsc;
 use tokio::sync::mpsc::error::TrySendError;
+use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
 /// A provider that was told to stop and does not is left alone after this long.
@@ -105,6 +107,8 @@ pub(super) struct Performing {
     pub(super) outputs: Vec<String>,
     /// What has to be safe before it begins.
     pub(super) safe: Option<Mark>,
+    /// Without a projection: the root world, which has to have this commit of the run before it begins.
+    pub(super) sees: Option<(watch::Receiver<Confirmed>, Revision)>,
     /// The run is over: nothing begins any more.
     pub(super) over: CancellationToken,
     pub(super) told: Told,
@@ -135,6 +139,16 @@ impl Performing {
                 () = self.stop.cancelled() => return,
                 () = self.over.cancelled() => return,
                 () = before.cancelled() => {}
+            }
+        }
+        if let Some((mut confirmed, decided)) = self.sees.take() {
+            let is_there = async { confirmed.wait_for(|confirmed| confirmed.commit >= decided).await.is_ok() };
+            tokio::select! {
+                biased;
+                () = self.stop.cancelled() => return,
+                () = self.over.cancelled() => return,
+                // Where it never is the run ends.
+                is_there = is_there => if !is_there { return },
             }
         }
         if given != Given::ToStop && self.stop.is_cancelled() || self.over.is_cancelled() {
@@ -212,6 +226,7 @@ impl Performing {
                 self.crashed(format!("it was stopped while task control was gone: {}", fate.outcome.reason))
             }
             Ok(fate) => self.finished(fate.outcome),
+            Err(error) if error.is_unreadable() => self.unreadable(endpoint, &error).await,
             // Task control was killed when it had written down that it gives the goal, and before it did.
             Err(error)
                 if error.code() == Some(tonic::Code::NotFound)
@@ -233,6 +248,8 @@ impl Performing {
             Ok(outcome) => self.finished(outcome),
             // What was wrong with the goal is wrong with it the next time, too.
             Err(error) if error.code() == Some(tonic::Code::InvalidArgument) => self.aborted(said(&error)),
+            // Nor is what it has answered better the next time.
+            Err(error) if error.is_unreadable() => self.unreadable(endpoint, &error).await,
             // Only the connection may have broken; the goal is still there then.
             Err(error @ CallError::Broken { .. }) => self.attached(endpoint, &error).await,
             Err(error) => self.lost(endpoint, &error).await,
@@ -268,9 +285,30 @@ impl Performing {
         Some((lease.id, resource.id.clone()))
     }
 
+    /// What the provider answered cannot be read. Where that is no message at all it may be the answer to another goal of the same stream: over a
+    /// stream of its own this one hears its own.
+    async fn unreadable(&self, endpoint: &Endpoint, unreadable: &CallError) -> Event {
+        if !matches!(unreadable, CallError::Malformed { .. }) {
+            let attached = self.actions.attach_alone(endpoint, self.goal.clone(), |said| self.said(said));
+            match Box::pin(attached).await {
+                Ok(fate) if !fate.orphaned => return self.finished(fate.outcome),
+                Err(broken @ CallError::Broken { .. }) if !broken.is_unreadable() => {
+                    return self.lost(endpoint, &broken).await;
+                }
+                // It never came to its provider behind what broke the stream.
+                Err(unknown) if unknown.code() == Some(tonic::Code::NotFound) => {
+                    return self.lost(endpoint, unreadable).await;
+                }
+                _ => {}
+            }
+        }
+        self.aborted(format!("its worker answered what cannot be read: {}", said(unreadable)))
+    }
+
     async fn attached(&self, endpoint: &Endpoint, broken: &CallError) -> Event {
         match self.actions.attach_hearing(endpoint, self.goal.clone(), |said| self.said(said)).await {
             Ok(fate) if !fate.orphaned => self.finished(fate.outcome),
+            Err(error) if error.is_unreadable() => self.unreadable(endpoint, &error).await,
             _ => self.lost(endpoint, broken).await,
         }
     }
@@ -339,7 +377,7 @@ impl Performing {
     fn said(&self, said: Said) {
         let (instance, attempt) = (self.instance, self.attempt);
         let event = match said {
-            Said::Progress { message, .. } => Event::Progressed { instance, attempt, message },
+            Said::Progress { message, .. } => Event::Progressed { instance, attempt, message: readable(&message) },
             // What it comes to when it was told to stop nobody waits for.
             Said::Improved(_) if self.stop.is_cancelled() => return,
             // What is not whole is no result.
@@ -381,7 +419,7 @@ impl Performing {
             outcome: done.outcome,
             outputs: done.outputs,
             measured: done.measured,
-            reason: done.reason,
+            reason: readable(&done.reason),
         }
     }
 
@@ -391,7 +429,7 @@ impl Performing {
     }
 
     fn crashed(&self, reason: String) -> Event {
-        Event::Crashed { instance: self.instance, attempt: self.attempt, reason }
+        Event::Crashed { instance: self.instance, attempt: self.attempt, reason: readable(&reason) }
     }
 }
 
@@ -399,10 +437,11 @@ impl Performing {
 mod tests {
     use super::*;
     use futures::Stream;
+    use ratn_proto::v1;
     use ratn_proto::v1::action_service_server::{ActionService, ActionServiceServer};
     use ratn_proto::v1::{
-        CancelRequest, CancelResponse, DescribeRequest, DescribeResponse, ExecuteRequest, ExecuteResponse,
-        PerformRequest, PerformResponse,
+        CancelRequest, CancelResponse, DescribeRequest, DescribeResponse, ExecuteRequest, ExecuteResponse, GoalResult,
+        PerformRequest, PerformResponse, execute_response,
     };
     use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
     use ratn_worker::server::{Services, bind};
@@ -488,6 +527,7 @@ mod tests {
                 results: Mutex::default(),
                 outputs: Vec::new(),
                 safe: None,
+                sees: None,
                 over: CancellationToken::new(),
                 told: Told::new("run"),
                 goal: Goal {
@@ -665,6 +705,64 @@ mod tests {
         let late = told_to_stop_at_once(1).await?;
         tokio::time::sleep(Duration::from_millis(500)).await;
         assert_eq!(late.begun.load(Ordering::SeqCst), 0);
+        Ok(())
+    }
+
+    /// A provider that was made elsewhere: this is its answer to every goal.
+    struct Elsewhere(GoalResult);
+
+    #[tonic::async_trait]
+    impl ActionService for Elsewhere {
+        type ExecuteStream = Answers<ExecuteResponse>;
+        type PerformStream = Answers<PerformResponse>;
+
+        async fn execute(&self, _: Request<ExecuteRequest>) -> Result<Response<Self::ExecuteStream>, Status> {
+            let answer = ExecuteResponse { kind: Some(execute_response::Kind::Result(self.0.clone())) };
+            Ok(Response::new(Box::pin(futures::stream::iter([Ok(answer)]))))
+        }
+
+        async fn perform(
+            &self,
+            _: Request<Streaming<PerformRequest>>,
+        ) -> Result<Response<Self::PerformStream>, Status> {
+            Err(Status::unimplemented(""))
+        }
+
+        async fn cancel(&self, _: Request<CancelRequest>) -> Result<Response<CancelResponse>, Status> {
+            Ok(Response::new(CancelResponse { under_way: false }))
+        }
+
+        async fn describe(&self, _: Request<DescribeRequest>) -> Result<Response<DescribeResponse>, Status> {
+            Err(Status::unimplemented(""))
+        }
+    }
+
+    #[tokio::test]
+    async fn an_answer_that_means_nothing_ends_its_goal_and_is_no_crash() -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        let number = |x: f64| BTreeMap::from([("x".to_owned(), v1::Value::from(Value::Float(x)))]);
+        let success = || GoalResult { outcome: "success".into(), ..GoalResult::default() };
+        let answers = [
+            (GoalResult { outputs: number(f64::NAN), ..success() }, "outputs[x].number: is NaN"),
+            (GoalResult { outputs: number(f64::INFINITY), ..success() }, "outputs[x].number: is inf"),
+            (GoalResult { outcome: "\u{1b}[2J".into(), ..success() }, "outcome: holds control characters"),
+            (
+                GoalResult { outcome: ABORTED.into(), reason: "no \u{1b}[2J".repeat(9_999), ..success() },
+                "no \\u{1b}[2Jno ",
+            ),
+        ];
+        for (number, (answer, expected)) in answers.into_iter().enumerate() {
+            let bound = bind(&Endpoint::Unix(bench._place.path().join(format!("elsewhere-{number}.sock")))).await?;
+            let mut performing = bench.performing("work", None, 0);
+            performing.endpoint = Ok(bound.endpoint().clone());
+            let services = Services::new().with(ActionServiceServer::new(Elsewhere(answer)));
+            tokio::spawn(bound.serve(services, CancellationToken::new()));
+            performing.perform(Given::Now).await;
+            let event = bench.event().await;
+            let Some(Event::Finished { outcome, reason, .. }) = event else { anyhow::bail!("{expected}: {event:?}") };
+            assert!(outcome == ABORTED && reason.contains(expected), "{outcome}: {reason}");
+            assert!(reason.len() < 40_000 && !reason.contains('\u{1b}'), "{reason}");
+        }
         Ok(())
     }
 

@@ -339,11 +339,11 @@ impl Performer {
 
     /// How far what was decided is done.
     pub(super) fn confirmed(&self) -> Confirmed {
-        *self.recorded.lock().unwrap_or_else(PoisonError::into_inner)
+        *self.recorded.borrow()
     }
 
     fn confirm(&self, confirmed: Confirmed) {
-        *self.recorded.lock().unwrap_or_else(PoisonError::into_inner) = confirmed;
+        self.recorded.send_replace(confirmed);
     }
 
     /// Resolves when the session with the resource manager, and with it every lease, is gone. A manager that is not heard is waited for,
@@ -654,6 +654,9 @@ impl Performer {
         };
         let (resource, over) = (source.clone(), CancellationToken::new());
         let before = if given == Given::Now { self.stopping.before(&source) } else { Vec::new() };
+        // What has no projection looks at the root, in which everything that was decided before has to be.
+        let looks_at_root = given == Given::Now && goal.projection.is_none();
+        let sees = looks_at_root.then(|| (self.recorded.subscribe(), self.decided));
         let performing = Performing {
             instance,
             attempt,
@@ -670,6 +673,7 @@ impl Performer {
             results: Mutex::default(),
             outputs: self.outputs_of(&goal),
             safe,
+            sees,
             over: self.over.clone(),
             told: self.told.clone(),
             goal: types::Goal {

@@ -1209,3 +1209,41 @@ async fn a_goal_waits_for_one_of_the_same_resource_that_was_told_to_stop() -> an
     }
     bench.performer.close().await
 }
+
+#[tokio::test]
+async fn a_goal_without_a_projection_begins_when_what_was_decided_before_it_is_in_the_root() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let [first, second, third] = [1, 2, 3].map(InstanceId);
+    bench.ask(first)?;
+    let lease = bench.granted(first).await?;
+    let (_arm, endpoint) = serve_arm(&mut bench).await?;
+    let work = |instance| start(instance, 1, "work", lease, &endpoint);
+    let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
+    // The commit is on its way for long.
+    let (disk, slow) = Mark::not_yet();
+    let commit = Command::Commit {
+        instance: first,
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(1),
+    };
+    bench.performer.perform_when(Some(slow), commit)?;
+    bench.performer.perform(work(first))?;
+    // One that is told to stop meanwhile is never given; one with a projection waits for nothing.
+    bench.performer.perform(work(second))?;
+    bench.performer.perform(Command::Cancel { instance: second, attempt: 1 })?;
+    let Command::Start { instance, attempt, mut goal } = work(third) else { bail!("it is a start") };
+    goal.projection = Some(ProjectionId(999));
+    bench.performer.perform(Command::Start { instance, attempt, goal })?;
+    let event = bench.event().await;
+    assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == third), "{event:?}");
+    let early = tokio::time::timeout(Duration::from_millis(200), bench.event()).await;
+    assert!(early.is_err(), "{early:?}");
+    assert_eq!(world.root().await?.0, Revision(0));
+    disk.send_replace(1);
+    let event = bench.event().await;
+    assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == first), "{event:?}");
+    assert_eq!(world.root().await?.1.len(), 1);
+    bench.performer.close().await
+}

@@ -111,13 +111,15 @@ impl Reference<'_> {
                 Some(limit) if performance.duration_s > limit => None,
                 _ => Some(performance.answer),
             };
+            let mut why = "it took too long";
             let ended = match answer {
                 Some(Answer::Crashed | Answer::LeaseLost) => {
                     crashes += 1;
-                    if is_irreversible(state) || crashes >= annotations.attempts.unwrap_or(ATTEMPTS) {
-                        return Err(Fail::Wrong("its worker died".to_owned()));
+                    if !is_irreversible(state) && crashes < annotations.attempts.unwrap_or(ATTEMPTS) {
+                        continue;
                     }
-                    continue;
+                    why = "its worker died";
+                    None
                 }
                 Some(Answer::Finished { outcome, outputs, measured }) => {
                     Some(Ended { outcome, outputs, measured, has_begun: true })
@@ -129,7 +131,7 @@ impl Reference<'_> {
                 tries += 1;
                 continue;
             }
-            return ended.ok_or_else(|| Fail::Wrong("it took too long".to_owned()));
+            return ended.ok_or_else(|| Fail::Wrong(why.to_owned()));
         }
     }
 

@@ -159,11 +159,34 @@ impl ActionClient {
         self.listen(endpoint, v1::ExecuteRequest { goal: Some(goal.into()), known_only: true }, on_said).await
     }
 
+    /// As [`ActionClient::attach_hearing`], over a stream that no other goal shares: what others answer does not break it.
+    ///
+    /// # Errors
+    /// As [`ActionClient::attach`].
+    pub async fn attach_alone(
+        &self,
+        endpoint: &Endpoint,
+        goal: Goal,
+        on_said: impl FnMut(Said),
+    ) -> Result<Fate, CallError> {
+        self.listen_on(endpoint, v1::ExecuteRequest { goal: Some(goal.into()), known_only: true }, on_said, true).await
+    }
+
     async fn listen(
         &self,
         endpoint: &Endpoint,
         question: v1::ExecuteRequest,
+        on_said: impl FnMut(Said),
+    ) -> Result<Fate, CallError> {
+        self.listen_on(endpoint, question, on_said, false).await
+    }
+
+    async fn listen_on(
+        &self,
+        endpoint: &Endpoint,
+        question: v1::ExecuteRequest,
         mut on_said: impl FnMut(Said),
+        alone: bool,
     ) -> Result<Fate, CallError> {
         let malformed = |m: Malformed| CallError::malformed(endpoint, m);
         let mut nonsense = None;
@@ -181,14 +204,19 @@ impl ActionClient {
                 Err(error) => nonsense = Some(error),
             }
         };
-        let mut client = self.client(endpoint)?;
-        let open = |questions| async move { client.perform(questions).await };
-        let stream = self.channels.goals(endpoint);
-        let answer = stream.call_with_progress(open, Asked::Execute(question.clone()), &mut heard).await;
-        let answer = match answer {
-            // Its author has implemented only what is needed for one goal.
-            Err(status) if status.code() == Code::Unimplemented => self.execute_alone(endpoint, question, heard).await,
-            answer => answer,
+        let answer = if alone {
+            self.execute_alone(endpoint, question, heard).await
+        } else {
+            let mut client = self.client(endpoint)?;
+            let open = |questions| async move { client.perform(questions).await };
+            let stream = self.channels.goals(endpoint);
+            match stream.call_with_progress(open, Asked::Execute(question.clone()), &mut heard).await {
+                // Its author has implemented only what is needed for one goal.
+                Err(status) if status.code() == Code::Unimplemented => {
+                    self.execute_alone(endpoint, question, heard).await
+                }
+                answer => answer,
+            }
         };
         let answer = answer.map_err(|status| CallError::from_status(endpoint, &status))?;
         let Heard::Result(result) = answer else {

@@ -14,6 +14,9 @@ const SOONEST: Duration = Duration::from_millis(10);
 /// at the most this long.
 const LATEST: Duration = Duration::from_secs(5);
 
+/// What the error of prost begins with.
+const NO_MESSAGE: &str = "failed to decode Protobuf message";
+
 /// Why a call failed.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum CallError {
@@ -54,6 +57,15 @@ impl CallError {
     /// Whether the call was not answered: a crash or a broken connection, not a refusal.
     pub fn is_crash(&self) -> bool {
         !matches!(self, CallError::Refused { .. })
+    }
+
+    /// Whether something came that cannot be read: it is no message, too long, or means nothing. The next time it would be the same.
+    pub fn is_unreadable(&self) -> bool {
+        match self {
+            CallError::Malformed { .. } => true,
+            CallError::Refused { code, .. } => *code == Code::OutOfRange,
+            CallError::Broken { reason, .. } => reason.starts_with(NO_MESSAGE),
+        }
     }
 
     /// The gRPC status code of a refusal; `None` for other errors.
@@ -145,6 +157,15 @@ fn about_tls(endpoint: &Endpoint, reason: &str) -> &'static str {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+
+    #[test]
+    fn what_cannot_be_decoded_or_is_too_long_is_unreadable_and_silence_is_not() {
+        let endpoint = "http://a:1".parse().unwrap();
+        let is_unreadable = |status: Status| CallError::from_status(&endpoint, &status).is_unreadable();
+        assert!(is_unreadable(Status::internal("failed to decode Protobuf message: invalid varint")));
+        assert!(is_unreadable(Status::out_of_range("Error, decoded message length too large")));
+        assert!(!is_unreadable(Status::internal("no")) && !is_unreadable(Status::unavailable("nobody")));
+    }
 
     #[test]
     fn an_error_of_tls_says_which_file_is_missing() {

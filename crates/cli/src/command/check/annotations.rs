@@ -25,6 +25,7 @@ fn shown(state: &InForce) -> String {
             Some(Origin::State) => "this state".to_owned(),
             Some(Origin::Action) => state.action.clone(),
             Some(Origin::Both) => format!("this state, and {}", state.action),
+            Some(Origin::Reads) => "for what it reads".to_owned(),
             None => "nobody says otherwise".to_owned(),
         };
         format!("  {:<10} {}  ({from})", line.key, line.text)

@@ -1,8 +1,7 @@
 //! `ratn run --resume LOG`: what can be said against it before anything of the run is touched, then the run.
 
-use super::conclude;
+use super::{conclude, described};
 use crate::arguments::RunArguments;
-use crate::command::check;
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
 use crate::output;
@@ -43,7 +42,7 @@ pub(super) async fn run(
             "no system runs in {place}: a run goes on where it was, on a system that outlives it (`ratn up`)"
         )));
     };
-    let program = check::load(&task, history.from().as_deref(), &system.config.catalogue)?;
+    let program = Box::pin(described::program(&task, history.from().as_deref(), &mut system, interrupt)).await?;
     let resumption = Resumption::new(program, history, writer, arguments.checkpoint_every)
         .map_err(|error| refused(&format_args!("{:#}", anyhow::Error::from(error))))?;
     output::progress(format_args!("on the system in {}", directory.display()));
