@@ -136,7 +136,7 @@ fn an_arm_that_carries_the_other_one_is_refused_and_so_are_names_that_are_no_par
         .replace("home = [0.0, 0.4", "home = [1.5, 0.0, 0.4");
     let reason = refused_robot(&carries);
     assert!(
-        reason.contains("the arm `right` of the robot `gantry` cannot be in a cell: the link `right_1`"),
+        reason.contains("the robot `gantry` cannot stand in a cell: `joints` of the arm `right`: the link `right_1`"),
         "{reason}"
     );
     assert!(reason.contains("by those of the arm `left`"), "{reason}");

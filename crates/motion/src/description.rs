@@ -208,10 +208,19 @@ impl Robot {
         let folder = file.parent().unwrap_or(Path::new("."));
         let urdf_file = folder.join(&description.urdf);
         let urdf = read_text(&urdf_file)?;
-        let srdf = description.srdf.as_ref().map(|srdf| read_text(&folder.join(srdf))).transpose()?;
+        let srdf_file = description.srdf.as_ref().map(|srdf| folder.join(srdf));
+        let srdf = srdf_file.as_deref().map(read_text).transpose()?;
         let packages = description.packages.iter().map(|package| folder.join(package)).collect();
         let meshes = MeshFiles { beside: urdf_file.parent().unwrap_or(folder).to_owned(), packages };
-        let fault = |fault| DescriptionError::Fault { file: file.to_owned(), fault: Box::new(fault) };
+        let fault = |fault| {
+            // A line is one of the file that has it.
+            let file = match &fault {
+                RobotFault::Model(MechanismError::Robot(RobotError::Fault(_) | RobotError::Urdf(_))) => &urdf_file,
+                RobotFault::Model(MechanismError::Srdf(_)) => srdf_file.as_deref().unwrap_or(file),
+                _ => file,
+            };
+            DescriptionError::Fault { file: file.to_owned(), fault: Box::new(fault) }
+        };
         Robot::of(description, &urdf, srdf.as_deref(), &mut |name| meshes.read(name)).map_err(fault)
     }
 }

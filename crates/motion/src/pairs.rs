@@ -8,7 +8,8 @@
 //! - pairs that meet in every posture: nothing is there to be kept apart, and a check would forbid all postures.
 //!
 //! The search sees spheres. Where they meet so often though the shapes do not that it could not move, the exact check of the finished path alone
-//! sees the pair ([`Checks::by_shapes`]).
+//! sees the pair ([`Checks::by_shapes`]). With an SRDF that is so where the spheres meet in every posture that was looked at: they would forbid
+//! all that the SRDF leaves to be planned.
 
 use crate::exact::Exact;
 use crate::mechanism::Mechanism;
@@ -72,6 +73,17 @@ pub struct Checks {
     pub by_shapes: BTreeSet<Pair>,
 }
 
+/// What postures are looked at for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Look {
+    /// The kind of every pair.
+    All,
+    /// What to check.
+    Checks,
+    /// Whether spheres say anything: one posture in which they are apart says so.
+    Undecided,
+}
+
 /// How often two links were seen, and seen to meet.
 #[derive(Debug, Clone, Copy, Default)]
 struct Tally {
@@ -96,15 +108,19 @@ impl Tally {
     }
 
     /// Whether one more posture tells something.
-    fn is_open(&self, looks_at_all: bool) -> bool {
-        looks_at_all || self.postures < SAMPLES || self.met == self.postures
+    fn is_open(&self, look: Look) -> bool {
+        match look {
+            Look::All => true,
+            Look::Checks => self.postures < SAMPLES || self.met == self.postures,
+            Look::Undecided => self.met + self.mistaken == self.postures,
+        }
     }
 }
 
 /// What to check of a robot whose SRDF says nothing.
 pub(crate) fn checks(model: &RobotModel) -> Checks {
     let mut checks = Checks::default();
-    for (pair, tally) in tallies(model, false) {
+    for (pair, tally) in tallies(model, Checks::default(), Look::Checks) {
         match tally.kind() {
             Kind::Neighbours | Kind::Always => drop(checks.excepted.insert(pair)),
             _ if tally.mistaken as f64 > MISTAKEN * tally.postures as f64 => drop(checks.by_shapes.insert(pair)),
@@ -114,19 +130,28 @@ pub(crate) fn checks(model: &RobotModel) -> Checks {
     checks
 }
 
+/// Of the pairs that an SRDF does not except, those whose spheres meet in every posture though their shapes are apart in some, and whether the
+/// shapes met in any.
+pub(crate) fn undecided(model: &RobotModel, excepted: &BTreeSet<Pair>) -> BTreeMap<Pair, bool> {
+    let checks = Checks { excepted: excepted.clone(), ..Checks::default() };
+    let tallies = tallies(model, checks, Look::Undecided).into_iter();
+    let undecided = tallies.filter(|(_, tally)| tally.is_open(Look::Undecided) && tally.mistaken > 0);
+    undecided.map(|(pair, tally)| (pair, tally.met > 0)).collect()
+}
+
 /// All pairs that some joint moves against each other, by kind, from a thousand postures.
 pub fn kinds(model: &RobotModel) -> BTreeMap<Kind, Vec<Pair>> {
     let mut kinds: BTreeMap<Kind, Vec<Pair>> = BTreeMap::new();
-    for (pair, tally) in tallies(model, true) {
+    for (pair, tally) in tallies(model, Checks::default(), Look::All) {
         kinds.entry(tally.kind()).or_default().push(pair);
     }
     kinds
 }
 
-fn tallies(model: &RobotModel, looks_at_all: bool) -> BTreeMap<Pair, Tally> {
+fn tallies(model: &RobotModel, checks: Checks, look: Look) -> BTreeMap<Pair, Tally> {
     let all: Vec<usize> = (0..model.joints.len()).collect();
     let neutral = RobotState::neutral(model);
-    let mechanism = model.moved_by(&all, neutral.positions(), Checks::default());
+    let mechanism = model.moved_by(&all, neutral.positions(), checks);
     let mut tallies: BTreeMap<Pair, Tally> =
         mechanism.pairs().into_iter().map(|pair| (pair, Tally::default())).collect();
     for (pair, tally) in &mut tallies {
@@ -142,7 +167,7 @@ fn tallies(model: &RobotModel, looks_at_all: bool) -> BTreeMap<Pair, Tally> {
         };
         let poses = mechanism.poses(&positions);
         let mut is_one_open = false;
-        for (&(a, b), tally) in tallies.iter_mut().filter(|(_, tally)| tally.is_open(looks_at_all)) {
+        for (&(a, b), tally) in tallies.iter_mut().filter(|(_, tally)| tally.is_open(look)) {
             is_one_open = true;
             let spheres = spheres_meet(&mechanism, &around, &poses, (a, b));
             let met = spheres && exact.do_meet(&poses, a, b);

@@ -10,6 +10,7 @@ mod identity;
 mod parts;
 
 use crate::description::RobotDescription;
+use crate::exact::{Exact, Touch};
 pub use crate::geometry::{Body, Geometry};
 use crate::joint_vector::JointVector;
 use crate::levers::Chain;
@@ -17,6 +18,7 @@ use crate::mechanism::{MAX_JOINTS, Mechanism, MechanismError};
 use crate::mesh::MeshError;
 pub use crate::robot_model::{Drive, Joint, Link, RobotModel};
 use crate::robot_state::RobotState;
+use crate::space::Obstacle;
 pub use crate::urdf::RobotError;
 pub use crate::urdf_faults::UrdfFault;
 use crate::workplace::Workplace;
@@ -26,6 +28,7 @@ pub use fingers::FingerPart;
 pub use identity::RobotIdentity;
 use parry3d::math::{Pose as Pose32, Rotation, Vector};
 use parry3d::shape::SharedShape;
+use ratn_model::load::suggestion;
 use ratn_model::pose::Pose;
 
 /// A robot with an arm.
@@ -94,6 +97,16 @@ pub enum RobotFault {
     ArmJoints {
         /// How many.
         count: usize,
+    },
+    /// A part names a link that the URDF does not have.
+    #[error("`{key}`: the robot description has no link `{link}`; {help}")]
+    NoLink {
+        /// Where the description names it.
+        key: &'static str,
+        /// The name.
+        link: String,
+        /// What it may be instead.
+        help: String,
     },
     /// A joint of the arm does not move the tool.
     #[error("the joint `{joint}` of the arm does not move its tool, the link `{tool}`")]
@@ -294,24 +307,28 @@ impl Robot {
 
     /// Holds a description against a robot without meshes.
     fn on(description: RobotDescription, model: RobotModel) -> Result<Robot, RobotFault> {
-        let link = |name: &str| {
-            let missing = || RobotError::Missing { what: "link", name: name.to_owned() };
-            model.link(name).ok_or_else(missing).map_err(MechanismError::Robot)
+        let link = |key: &'static str, name: &str| {
+            let known = model.links.iter().map(|link| link.name.as_str());
+            let missing = || {
+                let help = suggestion(name, known, "", "name one of the URDF");
+                RobotFault::NoLink { key, link: name.to_owned(), help }
+            };
+            model.link(name).ok_or_else(missing)
         };
         let RobotDescription { arm, gripper, base, head, camera, postures, .. } = &description;
         if !(1..=MAX_JOINTS).contains(&arm.joints.len()) {
             return Err(RobotFault::ArmJoints { count: arm.joints.len() });
         }
         description.check_shared()?;
-        let tool = link(&arm.tool)?;
+        let tool = link("arm.tool", &arm.tool)?;
         let arm_part = Part::of(&model, &arm.joints)?;
         let base_part = base.as_ref().map(|base| Part::base(&model, base)).transpose()?;
         let head_part = head.as_ref().map(|head| Part::head(&model, head)).transpose()?;
         let finger = gripper.as_ref().map(|gripper| Part::gripper(&model, gripper)).transpose()?;
-        let camera = camera.as_ref().map(|camera| link(&camera.link)).transpose()?;
-        let body = base.as_ref().map(|base| link(&base.body)).transpose()?;
+        let camera = camera.as_ref().map(|camera| link("camera.link", &camera.link)).transpose()?;
+        let body = base.as_ref().map(|base| link("base.body", &base.body)).transpose()?;
         let gripper = match gripper {
-            Some(gripper) => Some([link(&gripper.hand)?, link(&gripper.finger)?]),
+            Some(gripper) => Some([link("gripper.hand", &gripper.hand)?, link("gripper.finger", &gripper.finger)?]),
             None => None,
         };
         let arm_joint_links = arm_part.links_to(&model, tool)?;
@@ -526,6 +543,13 @@ impl Robot {
             looking.tilt = (looking.tilt + tilt_step).clamp(tilt.lower, tilt.upper);
         }
         (looking.pan, looking.tilt)
+    }
+
+    /// All that touches by the exact shapes, the deepest first: what stands there and any link, and links of the robot of which the arm moves one
+    /// against the other.
+    pub fn touches(&self, configuration: &Configuration, standing: &[Obstacle]) -> Vec<Touch> {
+        let mechanism = self.arm(configuration);
+        Exact::new(&mechanism, standing).touches(&configuration.arm)
     }
 
     /// Every collision shape with its place in the world and the index of its link, for rendering.

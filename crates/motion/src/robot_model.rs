@@ -35,6 +35,8 @@ pub struct RobotModel {
     pub links: Vec<Link>,
     /// The names of the joints that mimic others.
     pub(crate) mimics: BTreeSet<String>,
+    /// The names of the joints that turn without end: after a whole turn everything is where it was.
+    pub(crate) endless: BTreeSet<String>,
     /// What the SRDF says of pairs of links, or, without one, what follows from how they meet ([`pairs`]).
     pub(crate) checks: Checks,
 }
@@ -179,6 +181,11 @@ impl RobotModel {
         load: &mut Loader<'_>,
     ) -> Result<RobotModel, MechanismError> {
         let mut description = urdf::read(urdf, load)?;
+        let has_meshes = description.links.iter().any(|link| !link.meshes.is_empty());
+        let exact = match srdf {
+            Some(_) if has_meshes => Some(RobotModel::of(description.clone(), srdf)?),
+            _ => None,
+        };
         for link in &mut description.links {
             let spheres = link.meshes.drain(..).flat_map(|mesh| mesh.cover(0.0));
             link.bodies.extend(spheres.map(|Sphere { centre: [x, y, z], radius }| Body {
@@ -186,15 +193,22 @@ impl RobotModel {
                 geometry: Geometry::Sphere { radius },
             }));
         }
-        RobotModel::of(description, srdf)
+        let mut model = RobotModel::of(description, srdf)?;
+        // Spheres that stand for meshes say nothing where they always meet: what the meshes never do is no collision.
+        let apart = exact.iter().flat_map(|exact| pairs::undecided(exact, &exact.checks.excepted));
+        model.checks.excepted.extend(apart.filter(|(_, met)| !met).map(|(pair, _)| pair));
+        Ok(model)
     }
 
     fn of(description: Description, srdf: Option<&str>) -> Result<RobotModel, MechanismError> {
-        let Description { name, joints, links, mimics } = description;
+        let Description { name, joints, links, mimics, endless } = description;
         let excepted = srdf.map(|text| srdf::excepted(text, &links)).transpose()?;
-        let mut model = RobotModel { name, joints, links, mimics, checks: Checks::default() };
+        let mut model = RobotModel { name, joints, links, mimics, endless, checks: Checks::default() };
         model.checks = match excepted {
-            Some(excepted) => Checks { excepted, ..Checks::default() },
+            Some(excepted) => {
+                let by_shapes = pairs::undecided(&model, &excepted).into_keys().collect();
+                Checks { excepted, by_shapes }
+            }
             None => pairs::checks(&model),
         };
         Ok(model)
@@ -268,8 +282,10 @@ impl RobotModel {
             let (origin, drive) = link.moved_by(planned, positions);
             Link { origin, drive, ..link.clone() }
         };
-        let joints = planned.iter().map(|joint| self.joints[*joint].clone()).collect();
-        Mechanism::new(&self.name, joints, self.links.iter().map(held).collect(), checks)
+        let joints: Vec<Joint> = planned.iter().map(|joint| self.joints[*joint].clone()).collect();
+        let endless = joints.iter().map(|joint| self.endless.contains(&joint.name)).collect();
+        let mechanism = Mechanism::new(&self.name, joints, self.links.iter().map(held).collect(), checks);
+        Mechanism { endless, ..mechanism }
     }
 
     /// The index of a joint that can be planned for.

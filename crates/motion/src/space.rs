@@ -31,7 +31,7 @@ pub fn state(positions: &[f64]) -> State {
 }
 
 /// Grown by this, the spheres hide the rounding of `f32`, in metres.
-const ROUNDING_M: f64 = 2e-5;
+pub(crate) const ROUNDING_M: f64 = 2e-5;
 
 /// Bounding spheres are larger by this, in metres: what a sphere meets in single precision, its bounding sphere meets, too.
 const COARSE_ROUNDING_M: f32 = 1e-5;

@@ -1,11 +1,12 @@
 //! One planning problem solved as a user of the crate would, timed by the caller's clock and checked by the exact shapes.
 
 use crate::connect::{Budget, ConnectError, Route, connect};
+use crate::diagnosis::diagnosis;
+use crate::endless::{Unwound, unwound};
 use crate::exact::{Exact, Touch};
 use crate::mechanism::Mechanism;
 use crate::pace::Control;
 use crate::problems::Problem;
-use crate::robot::Joint;
 use crate::simplify::{path_length, simplify};
 use crate::space::{Isa, Space, State, state};
 
@@ -70,18 +71,21 @@ pub fn run_with_isa(
         problem
     });
     let problem = filtered.as_ref().unwrap_or(problem);
+    let unwound = unwound(mechanism, &problem.start, &problem.goal);
+    let mechanism = &unwound.mechanism;
     let mut space = Space::with_isa(mechanism, problem.surroundings(), isa);
-    let ends = [("start", &problem.start), ("goal", &problem.goal)].map(|(which, positions)| {
+    let ends = [("start", &unwound.start), ("goal", &unwound.goals[0])].map(|(which, positions)| {
         let (positions, beyond) = mechanism.clamped(positions);
         (positions, beyond.iter().map(|b| format!("{which} state: {b}")).collect::<Vec<_>>())
     });
-    let (start, goal) = (state(&ends[0].0), state(&ends[1].0));
+    let start = state(&ends[0].0);
+    let goals: Vec<State> = unwound.goals.iter().map(|goal| state(&mechanism.clamped(goal).0)).collect();
     let mut go_on = |_: usize| Control::Continue;
     let (mut plan_time, mut simplify_time) = (f64::INFINITY, f64::INFINITY);
     let mut outcome = Err(ConnectError::Cancelled);
     for _ in 0..settings.repetitions.max(1) {
         let begin = clock();
-        let route = connect(&mut space, &start, &[goal], settings.budget, &mut go_on);
+        let route = connect(&mut space, &start, &goals, settings.budget, &mut go_on);
         let between = clock();
         let paths = route.and_then(|route| {
             let path = simplify(&mut space, &route.path, settings.budget, &mut go_on)?;
@@ -90,36 +94,29 @@ pub fn run_with_isa(
         let end = clock();
         plan_time = plan_time.min(between - begin);
         simplify_time = simplify_time.min(end - between);
-        outcome = paths;
+        outcome = paths.map_err(|error| match error {
+            // The same one, turned to by other ways.
+            ConnectError::Goal { .. } => ConnectError::Goal { goals: 1 },
+            error => error,
+        });
     }
     let clamped = ends.iter().flat_map(|(_, clamped)| clamped.clone()).collect();
-    let outcome = outcome.map(|(route, path)| Found { clamped, ..found(mechanism, problem, &route, &path) });
+    let outcome = outcome.map(|(route, path)| Found { clamped, ..found(&unwound, problem, &route, &path) });
     let diagnosis = match &outcome {
-        Err(ConnectError::Start) => diagnose(mechanism, problem, &ends[0].0, "start state"),
-        Err(ConnectError::Goal { .. }) => diagnose(mechanism, problem, &ends[1].0, "goal state"),
+        Err(ConnectError::Start) => diagnosis(mechanism, problem, &ends[0].0, "start state"),
+        Err(ConnectError::Goal { .. }) => diagnosis(mechanism, problem, &ends[1].0, "goal state"),
         _ => Vec::new(),
     };
     Trial { plan: plan_time, simplify: simplify_time, outcome, diagnosis }
 }
 
-/// What a posture breaks: limits, and what touches what, how deep.
-fn diagnose(mechanism: &Mechanism, problem: &Problem, positions: &[f64], which: &str) -> Vec<String> {
-    let beyond = mechanism.joints.iter().zip(positions).filter(|(j, q)| !(j.lower..=j.upper).contains(*q));
-    let limits = beyond.map(|(joint, position)| {
-        let by = (position - position.clamp(joint.lower, joint.upper)).abs();
-        let Joint { name, lower, upper, .. } = joint;
-        format!("{which}: {name} is at {position}, outside {lower} to {upper} by {by:.2e}")
-    });
-    let touches = Exact::new(mechanism, problem.surroundings()).touches(positions);
-    limits.chain(touches.iter().map(|touch| format!("{which}: {touch}"))).collect()
-}
-
-fn found(mechanism: &Mechanism, problem: &Problem, route: &Route, path: &[State]) -> Found {
+fn found(unwound: &Unwound, problem: &Problem, route: &Route, path: &[State]) -> Found {
+    let mechanism = &unwound.mechanism;
     let joints = mechanism.joints.len();
     let postures: Vec<Vec<f64>> = path.iter().map(|s| s[..joints].iter().map(|q| f64::from(*q)).collect()).collect();
     let touch = Exact::new(mechanism, problem.surroundings()).touch_along(&postures, EXACT_PER_RADIAN);
     Found {
-        path: postures,
+        path: postures.iter().map(|posture| unwound.wound(posture)).collect(),
         length_rad: path_length(path),
         first_length_rad: path_length(&route.path),
         iterations: route.iterations,

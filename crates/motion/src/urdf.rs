@@ -16,9 +16,9 @@ pub enum RobotError {
     /// Not a URDF, and where.
     #[error("the robot description is not valid URDF: {0}")]
     Fault(#[from] UrdfFault),
-    /// Not a URDF for another reason.
-    #[error("the robot description is not valid URDF")]
-    Urdf(#[from] urdf_rs::UrdfError),
+    /// Not a URDF for another reason, without a place.
+    #[error("the robot description is not valid URDF: {0}")]
+    Urdf(String),
     /// A joint or link that must be there is not.
     #[error("the robot description has no {what} `{name}`")]
     Missing {
@@ -79,10 +79,11 @@ pub enum RobotError {
 /// [`RobotError::Fault`] names the line.
 fn parse(text: &str) -> Result<urdf_rs::Robot, RobotError> {
     urdf_faults::check(text)?;
-    Ok(urdf_rs::read_from_string(text)?)
+    urdf_rs::read_from_string(text).map_err(|error| RobotError::Urdf(error.to_string()))
 }
 
 /// What a URDF describes.
+#[derive(Clone)]
 pub(crate) struct Description {
     pub(crate) name: String,
     /// Those with a position of their own.
@@ -91,6 +92,8 @@ pub(crate) struct Description {
     pub(crate) links: Vec<Link>,
     /// The names of the joints that mimic others.
     pub(crate) mimics: BTreeSet<String>,
+    /// The names of those that turn without end, and that no other joint mimics.
+    pub(crate) endless: BTreeSet<String>,
 }
 
 /// Limits of a joint that has none, in radians: a whole turn.
@@ -121,7 +124,12 @@ pub(crate) fn read(text: &str, load: &mut Loader<'_>) -> Result<Description, Rob
     let joints: Vec<Joint> = driving.iter().map(|(name, limits)| limits.joint(name)).collect();
     let links = links(&urdf, &joints, load)?;
     let mimics = urdf.joints.iter().filter(|j| j.mimic.is_some()).map(|j| j.name.clone()).collect();
-    Ok(Description { name: urdf.name, joints, links, mimics })
+    // What mimics may not be where it was after a whole turn of what it follows.
+    let followed: BTreeSet<&str> = urdf.joints.iter().filter_map(|j| Some(j.mimic.as_ref()?.joint.as_str())).collect();
+    let is_endless = |j: &&urdf_rs::Joint| j.joint_type == urdf_rs::JointType::Continuous && j.mimic.is_none();
+    let endless = urdf.joints.iter().filter(is_endless).map(|j| j.name.clone());
+    let endless = endless.filter(|name| !followed.contains(name.as_str())).collect();
+    Ok(Description { name: urdf.name, joints, links, mimics, endless })
 }
 
 /// What a description says of how a joint may move.

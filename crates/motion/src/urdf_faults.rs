@@ -1,5 +1,5 @@
 //! What is wrong with the text of a URDF, and where: the line of an element that is not closed, an attribute that is missing, a number that is
-//! none, limits that contradict themselves, links that are not one tree (`urdf_tree`). The reader of the whole description ([`urdf_rs`])
+//! none or that no robot can have, limits that contradict themselves, links that are not one tree (`urdf_tree`). The reader of the whole description ([`urdf_rs`])
 //! loses the lines.
 
 use crate::urdf_tree::{Place, Tree};
@@ -19,15 +19,31 @@ pub struct UrdfFault {
     pub reason: String,
 }
 
-/// What the value of an attribute must be.
+/// What the value of an attribute must be. So many numbers are separated by blanks.
 #[derive(Debug, Clone, Copy)]
 enum Value {
     Text,
-    /// So many numbers, separated by blanks.
+    /// Lengths, angles and parts of directions.
     Numbers(usize),
+    /// Sizes, in metres.
+    Sizes(usize),
+    /// Factors along x, y and z.
+    Scale,
+    /// How large or how fast at the most, infinite where it is not limited; 0 where it is not known.
+    Most,
+    /// A position.
+    Limit,
+    /// A number that is held against no other: it is read, and nothing here is computed from it.
+    Unused,
 }
 
-use Value::{Numbers, Text};
+use Value::{Limit, Most, Numbers, Scale, Sizes, Text, Unused};
+
+/// Places and sizes beyond this are not in metres. Shapes are computed in single precision, which has no room for much more.
+const FARTHEST: f64 = 1e6;
+
+/// An axis shorter than this points nowhere.
+const SHORTEST_AXIS: f64 = 1e-9;
 
 /// Attributes of the elements that are read, the element that holds them, and whether they must be there.
 const ATTRIBUTES: &[(&str, &str, &str, Value, bool)] = &[
@@ -40,25 +56,39 @@ const ATTRIBUTES: &[(&str, &str, &str, Value, bool)] = &[
     ("joint", "axis", "xyz", Numbers(3), true),
     ("joint", "origin", "xyz", Numbers(3), false),
     ("joint", "origin", "rpy", Numbers(3), false),
-    ("joint", "limit", "lower", Numbers(1), false),
-    ("joint", "limit", "upper", Numbers(1), false),
-    ("joint", "limit", "velocity", Numbers(1), true),
-    ("joint", "limit", "effort", Numbers(1), false),
+    ("joint", "limit", "lower", Limit, false),
+    ("joint", "limit", "upper", Limit, false),
+    ("joint", "limit", "velocity", Most, true),
+    ("joint", "limit", "acceleration", Most, false),
+    ("joint", "limit", "deceleration", Most, false),
+    ("joint", "limit", "jerk", Most, false),
+    ("joint", "limit", "effort", Limit, false),
+    ("joint", "dynamics", "damping", Unused, false),
+    ("joint", "dynamics", "friction", Unused, false),
     ("joint", "mimic", "joint", Text, true),
     ("joint", "mimic", "multiplier", Numbers(1), false),
     ("joint", "mimic", "offset", Numbers(1), false),
+    ("inertial", "origin", "xyz", Numbers(3), false),
+    ("inertial", "origin", "rpy", Numbers(3), false),
+    ("inertial", "mass", "value", Most, true),
+    ("inertial", "inertia", "ixx", Unused, true),
+    ("inertial", "inertia", "ixy", Unused, true),
+    ("inertial", "inertia", "ixz", Unused, true),
+    ("inertial", "inertia", "iyy", Unused, true),
+    ("inertial", "inertia", "iyz", Unused, true),
+    ("inertial", "inertia", "izz", Unused, true),
     ("collision", "origin", "xyz", Numbers(3), false),
     ("collision", "origin", "rpy", Numbers(3), false),
     ("visual", "origin", "xyz", Numbers(3), false),
     ("visual", "origin", "rpy", Numbers(3), false),
-    ("geometry", "box", "size", Numbers(3), true),
-    ("geometry", "sphere", "radius", Numbers(1), true),
-    ("geometry", "cylinder", "radius", Numbers(1), true),
-    ("geometry", "cylinder", "length", Numbers(1), true),
-    ("geometry", "capsule", "radius", Numbers(1), true),
-    ("geometry", "capsule", "length", Numbers(1), true),
+    ("geometry", "box", "size", Sizes(3), true),
+    ("geometry", "sphere", "radius", Sizes(1), true),
+    ("geometry", "cylinder", "radius", Sizes(1), true),
+    ("geometry", "cylinder", "length", Sizes(1), true),
+    ("geometry", "capsule", "radius", Sizes(1), true),
+    ("geometry", "capsule", "length", Sizes(1), true),
     ("geometry", "mesh", "filename", Text, true),
-    ("geometry", "mesh", "scale", Numbers(3), false),
+    ("geometry", "mesh", "scale", Scale, false),
 ];
 
 /// The types of joints that there are.
@@ -71,6 +101,8 @@ const TYPES: [&str; 7] = ["revolute", "continuous", "prismatic", "fixed", "float
 pub(crate) fn check(text: &str) -> Result<(), UrdfFault> {
     let mut reader = xml_text::reader(text.as_bytes());
     let (mut open, mut tree, mut has_limits): (Vec<String>, _, _) = (Vec::new(), Tree::default(), false);
+    // Of the link or joint that is being read, its name, and of a joint whether it moves.
+    let (mut named, mut moves) = (String::new(), false);
     loop {
         let event = reader.next();
         let at = reader.position();
@@ -93,12 +125,17 @@ pub(crate) fn check(text: &str) -> Result<(), UrdfFault> {
                 let value_of = |key: &str| {
                     attributes.iter().find(|a| a.name.local_name == key).map(|attribute| attribute.value.as_str())
                 };
+                let text = |key: &str| value_of(key).unwrap_or_default();
+                if open.len() == 1 {
+                    named = format!(" (in the {element} `{}`)", text("name"));
+                }
+                let place = if open.len() > 1 { named.as_str() } else { "" };
                 for (_, _, key, value, needed) in
                     ATTRIBUTES.iter().filter(|row| (row.0, row.1) == (parent, &element[..]))
                 {
-                    wrong(&element, key, value_of(key), *value, *needed).map_or(Ok(()), |reason| Err(fault(reason)))?;
+                    let wrong = wrong(&element, key, value_of(key), *value, *needed);
+                    wrong.map_or(Ok(()), |reason| Err(fault(reason + place)))?;
                 }
-                let text = |key: &str| value_of(key).unwrap_or_default();
                 match (parent, &element[..]) {
                     ("robot", "link") => tree.link(text("name"), at)?,
                     ("robot", "joint") => {
@@ -107,9 +144,17 @@ pub(crate) fn check(text: &str) -> Result<(), UrdfFault> {
                             return Err(fault(format!("a joint of type `{kind}`: there is {}", TYPES.join(", "))));
                         }
                         has_limits = ["revolute", "prismatic"].contains(&kind);
+                        moves = has_limits || kind == "continuous";
                         tree.joint(text("name"), at)?;
                     }
                     ("joint", "parent" | "child") if open.len() == 2 => tree.end(&element, text("link"), at),
+                    ("joint", "axis") if moves && !points(text("xyz")) => {
+                        let xyz = text("xyz");
+                        return Err(fault(format!(
+                            "the joint `{}`: its axis `{xyz}` has no length; write the direction that it slides along or turns about, as `0 0 1`",
+                            tree.last_joint()
+                        )));
+                    }
                     ("joint", "limit") if has_limits => {
                         contradiction(text("lower"), text("upper")).map_or(Ok(()), |reason| {
                             Err(fault(format!("the joint `{}`: {reason}", tree.last_joint())))
@@ -128,20 +173,46 @@ pub(crate) fn check(text: &str) -> Result<(), UrdfFault> {
     }
 }
 
-/// What is wrong with an attribute.
+/// What is wrong with an attribute, and what to write instead.
 fn wrong(element: &str, key: &str, found: Option<&str>, value: Value, needed: bool) -> Option<String> {
-    match (found, value) {
-        (None, _) => needed.then(|| format!("`{element}` has no attribute `{key}`")),
-        (Some(_), Text) => None,
-        (Some(text), Numbers(count)) => {
-            let numbers: Option<Vec<f64>> = text.split_whitespace().map(|word| word.parse().ok()).collect();
-            // A limit that is omitted may be written as infinite.
-            let good = |n: &f64| n.is_finite() || (element == "limit" && !n.is_nan());
-            let good = numbers.is_some_and(|numbers| numbers.len() == count && numbers.iter().all(good));
-            let plural = if count == 1 { "a number".to_owned() } else { format!("{count} numbers") };
-            (!good).then(|| format!("`{key}` of `{element}` is `{text}` instead of {plural}"))
+    let Some(text) = found else { return needed.then(|| format!("`{element}` has no attribute `{key}`")) };
+    let count = match value {
+        Text => return None,
+        Numbers(count) | Sizes(count) => count,
+        Scale => 3,
+        Most | Limit | Unused => 1,
+    };
+    let is = format!("`{key}` of `{element}` is `{text}`");
+    let numbers: Option<Vec<f64>> = text.split_whitespace().map(|word| word.parse().ok()).collect();
+    let Some(numbers) = numbers.filter(|numbers| numbers.len() == count && !numbers.iter().any(|n| n.is_nan())) else {
+        let plural = if count == 1 { "a number".to_owned() } else { format!("{count} numbers") };
+        return Some(format!("{is} instead of {plural}"));
+    };
+    let any = |is_wrong: fn(f64) -> bool| numbers.iter().any(|n| is_wrong(*n));
+    let far = match value {
+        Text | Limit => return None,
+        Most => {
+            return any(|n| n < 0.0)
+                .then(|| format!("{is}: that is never below 0; leave out the sign, or write 0 where it is not known"));
         }
-    }
+        Unused => return any(f64::is_infinite).then(|| format!("{is}: write a finite number")),
+        Scale if any(|n| n == 0.0) => {
+            return Some(format!(
+                "{is}: a factor of 0 leaves nothing of the mesh; write by what its numbers become metres"
+            ));
+        }
+        Sizes(_) if any(|n| n < 0.0) => {
+            return Some(format!("{is}: no size is below 0; write it in metres, without a sign"));
+        }
+        Numbers(_) | Sizes(_) | Scale => any(|n| n.abs() > FARTHEST),
+    };
+    far.then(|| format!("{is}: write finite numbers of at most {FARTHEST:e}, in metres and radians"))
+}
+
+/// Whether an axis has a direction.
+fn points(xyz: &str) -> bool {
+    let square: f64 = xyz.split_whitespace().filter_map(|word| word.parse::<f64>().ok()).map(|c| c * c).sum();
+    square.sqrt() > SHORTEST_AXIS
 }
 
 /// What is wrong with a range; where one end is not given it is 0.
@@ -168,9 +239,9 @@ mod tests {
         };
         assert_eq!(check(&joint("<axis xyz='0 0 1'/>")), Ok(()));
         let said = fault(&joint("<axis xyz='0 0'/>"));
-        assert_eq!(said, "line 3, column 1: `xyz` of `axis` is `0 0` instead of 3 numbers");
+        assert_eq!(said, "line 3, column 1: `xyz` of `axis` is `0 0` instead of 3 numbers (in the joint `j`)");
         let said = fault(&joint("<limit lower='low' velocity='1'/>"));
-        assert_eq!(said, "line 3, column 1: `lower` of `limit` is `low` instead of a number");
+        assert_eq!(said, "line 3, column 1: `lower` of `limit` is `low` instead of a number (in the joint `j`)");
         assert!(
             fault("<robot name='r'>\n<joint name='j' type='hinge'/></robot>")
                 .contains("line 2, column 1: a joint of type `hinge`")

@@ -188,3 +188,74 @@ fn what_is_fixed_to_the_tool_may_overlap_it_and_what_is_held_is_kept_from_the_li
     let collision = checker.collision(&home, Contact::None).unwrap();
     assert_eq!((&collision.moving[..], &collision.other[..]), ("link wrist", "held thing"));
 }
+
+/// A plate that turns about z, 4 mm above one that stands.
+fn plates(geometry: &str) -> String {
+    let plate = format!("<collision><geometry>{geometry}</geometry></collision>");
+    format!(
+        "<robot name='plates'><link name='low'>{plate}</link><link name='turned'/><link name='high'>{plate}</link>\
+         <joint name='turn' type='revolute'><parent link='low'/><child link='turned'/><origin xyz='0 0 0.044'/><axis xyz='0 0 1'/>\
+         <limit lower='-3' upper='3' velocity='1' effort='1'/></joint>\
+         <joint name='mount' type='fixed'><parent link='turned'/><child link='high'/></joint></robot>"
+    )
+}
+
+#[test]
+fn with_an_srdf_too_pairs_whose_spheres_always_meet_are_decided_by_their_shapes() {
+    let urdf = plates("<box size='0.4 0.4 0.04'/>");
+    let model = RobotModel::read(&urdf, Some("<robot name='plates'/>")).unwrap();
+    assert_eq!(model.checks().by_shapes, [pair(&model, "low", "high")].into());
+    let mechanism = Mechanism::read(&urdf, Some("<robot name='plates'/>"), &[]).unwrap();
+    assert!(Space::new(&mechanism, &[]).is_free(&[0.0; MAX_JOINTS]));
+    assert_eq!(Exact::new(&mechanism, &[]).touch(&[0.0]), None);
+    // Where they do meet, the shapes say so.
+    let lower = urdf.replace("0 0 0.044", "0 0 0.039");
+    let mechanism = Mechanism::read(&lower, Some("<robot name='plates'/>"), &[]).unwrap();
+    assert!(mechanism.by_shapes.is_empty() && !Space::new(&mechanism, &[]).is_free(&[0.0; MAX_JOINTS]));
+    // Of our robot the spheres of one pair that its SRDF leaves meet in every posture: no posture was free.
+    let joints: Vec<String> = (1..=7).map(|i| format!("arm_joint_{i}")).collect();
+    let arm = Mechanism::read(AIMM, Some(AIMM_SRDF), &joints).unwrap();
+    let names = |(a, b): &Pair| [&arm.links[*a].name[..], &arm.links[*b].name[..]];
+    let doubtful: Vec<_> = arm.by_shapes.iter().filter(|(a, b)| arm.is_checked(*a, *b)).map(names).collect();
+    assert_eq!(doubtful, [["base", "arm_1"]]);
+    let (mut space, mut random) = (Space::new(&arm, &[]), ChaCha8Rng::seed_from_u64(3));
+    let mut drawn =
+        || std::array::from_fn(|j| arm.joints.get(j).map_or(0.0, |q| random.random_range(q.lower..q.upper) as f32));
+    let free = (0..300).filter(|_| space.is_free(&drawn())).count();
+    assert!(free > 30, "{free} of 300");
+}
+
+#[test]
+fn meshes_that_are_always_apart_do_not_collide_for_the_spheres_that_stand_for_them() {
+    let corner = |i: usize| {
+        [0.2, 0.2, 0.02]
+            .map(f64::from)
+            .iter()
+            .enumerate()
+            .map(|(k, h)| if i >> k & 1 == 1 { *h } else { -h })
+            .collect::<Vec<f64>>()
+    };
+    let faces = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+    let mut stl = "solid plate\n".to_owned();
+    for [a, b, c, d] in faces {
+        for triangle in [[a, b, c], [a, c, d]] {
+            stl += "facet normal 0 0 0\nouter loop\n";
+            for i in triangle {
+                let at = corner(i);
+                stl += &format!("vertex {} {} {}\n", at[0], at[1], at[2]);
+            }
+            stl += "endloop\nendfacet\n";
+        }
+    }
+    stl += "endsolid plate\n";
+    let robot = |height: &str| {
+        let urdf = plates("<mesh filename='plate.stl'/>").replace("0 0 0.044", height);
+        let toml = "name = 'plates'\nurdf = 'plates.urdf'\n[arm]\njoints = ['turn']\ntool = 'high'\n";
+        let description = RobotDescription::read(toml).unwrap();
+        Robot::of(description, &urdf, Some("<robot name='plates'/>"), &mut |_| Ok(stl.clone().into_bytes())).unwrap()
+    };
+    let touches = |robot: &Robot| robot.touches(&robot.at_zero(), &[]);
+    assert_eq!(touches(&robot("0 0 0.044")), []);
+    // Meshes that meet do.
+    assert!(!touches(&robot("0 0 0.039")).is_empty());
+}

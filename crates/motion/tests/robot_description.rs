@@ -63,7 +63,10 @@ fn what_does_not_fit_is_refused_by_its_name() {
     let refused = |from: &str, to: &str| read(&TOML.replace(from, to)).unwrap_err().to_string();
     assert_eq!(refused(r#""b"]"#, r#""c"]"#), "the robot description has no joint `c`");
     assert_eq!(refused(r#""b"]"#, r#""a"]"#), "the joint `a` is named twice among those to be planned for");
-    assert_eq!(refused(r#"tool = "tool""#, r#"tool = "hand""#), "the robot description has no link `hand`");
+    assert_eq!(
+        refused(r#"tool = "tool""#, r#"tool = "hand""#),
+        "`arm.tool`: the robot description has no link `hand`; there is `foot`, `lid`, `lower`, `tool`, `upper`"
+    );
     assert_eq!(
         refused(r#"tool = "tool""#, r#"tool = "upper""#),
         "the joint `b` of the arm does not move its tool, the link `upper`"

@@ -207,3 +207,81 @@ fn joints_beside_the_chain_stay_where_they_are_in_closed_form() {
     }
     assert!(elsewhere > 50, "{elsewhere}: where the others stand in the way, no posture is found");
 }
+
+/// A robot whose link `foot` has this shape, on line 3.
+fn shaped(geometry: &str) -> String {
+    let foot = format!("<link name='foot'>\n<collision><geometry>{geometry}</geometry></collision></link>\n");
+    robot(&[foot, link("tool"), joint("turn", "foot", "tool")])
+}
+
+#[test]
+fn a_size_below_zero_or_without_an_end_is_refused_with_line_element_and_link() {
+    for (geometry, attribute) in [
+        ("<box size='0.1 -0.1 0.1'/>", "`size` of `box`"),
+        ("<sphere radius='-0.1'/>", "`radius` of `sphere`"),
+        ("<cylinder radius='-0.1' length='0.2'/>", "`radius` of `cylinder`"),
+        ("<cylinder radius='0.1' length='-0.2'/>", "`length` of `cylinder`"),
+        ("<capsule radius='-0.1' length='0.2'/>", "`radius` of `capsule`"),
+        ("<capsule radius='0.1' length='-0.2'/>", "`length` of `capsule`"),
+    ] {
+        says(&shaped(geometry), &["line 3", attribute, "below 0", "in metres", "link `foot`"]);
+        for number in ["NaN", "inf", "1e300"] {
+            let geometry = geometry.replacen("-0.1", number, 1).replacen("-0.2", number, 1);
+            says(&shaped(&geometry), &["line 3", attribute, number, "link `foot`"]);
+        }
+    }
+    for scale in ["1 0 1", "1 inf 1", "1 NaN 1"] {
+        let mesh = format!("<mesh filename='foot.stl' scale='{scale}'/>");
+        says(&shaped(&mesh), &["line 3", "`scale` of `mesh`", scale, "link `foot`"]);
+    }
+    // A mesh that is mirrored is one; here only its file is missing.
+    let mirrored = refusal(&shaped("<mesh filename='foot.stl' scale='1 -1 1'/>"));
+    assert!(mirrored.contains("`foot.stl`") && !mirrored.contains("scale"), "{mirrored}");
+}
+
+#[test]
+fn a_flat_shape_and_a_point_are_shapes() {
+    for geometry in
+        ["<box size='0.2 0.2 0'/>", "<box size='0 0 0'/>", "<sphere radius='0'/>", "<cylinder radius='0' length='0'/>"]
+    {
+        let mechanism = Mechanism::read(&shaped(geometry), None, &[]).unwrap();
+        let ball = |z: f64| {
+            let geometry = Geometry::Sphere { radius: 0.05 };
+            [Obstacle { name: "ball".into(), pose: Pose::at(0.0, 0.0, z), geometry }]
+        };
+        let state: State = [0.0; MAX_JOINTS];
+        assert!(Space::new(&mechanism, &ball(0.5)[..]).is_free(&state), "{geometry}");
+        assert!(!Space::new(&mechanism, &ball(0.01)[..]).is_free(&state), "{geometry}");
+    }
+}
+
+#[test]
+fn numbers_that_no_robot_can_have_are_refused_where_they_stand() {
+    let limited = |limit: &str| robot(&[link("a"), link("b"), with("turn", "a", "b", &format!("\n<limit {limit}/>"))]);
+    for (limit, parts) in [
+        ("lower='-1' upper='1' velocity='-1' effort='1'", ["`velocity` of `limit`", "below 0"]),
+        ("lower='-1' upper='1' velocity='NaN' effort='1'", ["`velocity` of `limit`", "NaN"]),
+        ("lower='NaN' upper='1' velocity='1' effort='1'", ["`lower` of `limit`", "NaN"]),
+        ("lower='-1' upper='1' velocity='1' effort='1' acceleration='-2'", ["`acceleration` of `limit`", "below 0"]),
+        ("lower='-1' upper='1' velocity='1' effort='1' jerk='fast'", ["`jerk` of `limit`", "a number"]),
+    ] {
+        says(&limited(limit), &[&parts[..], &["line 5", "joint `turn`"]].concat());
+    }
+    let axis = |xyz: &str| {
+        let joint = with("turn", "a", "b", "").replace("<axis xyz='0 0 1'/>", &format!("\n<axis xyz='{xyz}'/>"));
+        robot(&[link("a"), link("b"), joint])
+    };
+    says(&axis("0 0 0"), &["line 5", "`turn`", "no length", "`0 0 1`"]);
+    says(&axis("0 1e300 0"), &["line 5", "`xyz` of `axis`", "joint `turn`"]);
+    // What is fixed has no axis that counts.
+    assert!(RobotModel::read(&axis("0 0 0").replace("revolute", "fixed"), None).is_ok());
+    let heavy = |inertial: &str| robot(&[format!("<link name='a'>\n<inertial>{inertial}</inertial></link>\n")]);
+    let inertia = "<inertia ixx='1' ixy='0' ixz='0' iyy='1' iyz='0' izz='1'/>";
+    assert!(RobotModel::read(&heavy(&format!("<mass value='1'/>{inertia}")), None).is_ok());
+    says(&heavy(&format!("<mass value='-1'/>{inertia}")), &["line 3", "`value` of `mass`", "below 0", "link `a`"]);
+    says(&heavy(&format!("<mass value='NaN'/>{inertia}")), &["line 3", "`value` of `mass`", "NaN", "link `a`"]);
+    let far = heavy(&format!("<origin xyz='1e9 0 0'/><mass value='1'/>{inertia}"));
+    says(&far, &["line 3", "`xyz` of `origin`", "1e9", "link `a`"]);
+    let broken = inertia.replace("izz='1'", "izz='inf'");
+    says(&heavy(&format!("<mass value='1'/>{broken}")), &["line 3", "`izz` of `inertia`", "inf", "link `a`"]);
+}

@@ -313,6 +313,66 @@ fn sections_with_loose_ends_never_take_longer_than_with_stops_and_keep_within_al
     assert!(quicker >= 8, "{quicker} of 12");
 }
 
+/// How far a joint is beyond its range at the most, in radians, looked at a hundred times between any two knots.
+fn beyond(joints: &[Joint], curve: &Curve) -> f64 {
+    let mut most = f64::NEG_INFINITY;
+    for pair in curve.knots().windows(2) {
+        let h = pair[1].time_s - pair[0].time_s;
+        for (j, joint) in joints.iter().enumerate() {
+            let (acceleration, jerk) = cubic(&pair[0], &pair[1], j);
+            for i in 0..=100 {
+                let t = h * f64::from(i) / 100.0;
+                let at = pair[0].positions[j] + t * (pair[0].velocities[j] + t * (acceleration / 2.0 + t * jerk / 6.0));
+                most = most.max(at - joint.upper).max(joint.lower - at);
+            }
+        }
+    }
+    most
+}
+
+/// The same with a range for each joint that goes just as far as the postures do.
+fn ranged(joints: &[Joint], sections: &[Section]) -> Vec<Joint> {
+    let of = |(j, joint): (usize, &Joint)| {
+        let positions = || sections.iter().flat_map(|section| section.path().iter().map(move |posture| posture[j]));
+        let (lower, upper) = (positions().fold(f64::INFINITY, f64::min), positions().fold(f64::NEG_INFINITY, f64::max));
+        Joint { lower, upper, ..joint.clone() }
+    };
+    joints.iter().enumerate().map(of).collect()
+}
+
+#[test]
+fn no_joint_leaves_its_range_between_the_postures_of_a_rounded_path() {
+    // Rounding.
+    const ROUNDED: f64 = 2e-6;
+    let mut quicker = 0;
+    for seed in 0..40 {
+        let mut random = ChaCha8Rng::seed_from_u64(300 + seed);
+        let postures = random.random_range(4..8);
+        let (joints, path) = random_path::<3>(&mut random, postures);
+        let last = path.len() - 1;
+        let sections = |share: f64| {
+            [
+                Section::Loose(dense(&path[0], &path[1]), [0.0, share]),
+                Section::Blended(path[1..last].to_vec()),
+                Section::Loose(dense(&path[last - 1], &path[last]), [share, 0.0]),
+            ]
+        };
+        let share = random.random_range(0.1..=1.0);
+        let joints = ranged(&joints, &sections(share));
+        let stops = timed(&joints, &sections(0.0), 1.0, &mut |_, _| true);
+        let curve = timed(&joints, &sections(share), 1.0, &mut |_, _| true);
+        let blended = [Section::Blended(path.clone())];
+        let narrow = ranged(&joints, &blended);
+        let free = timed(&narrow, &blended, 1.0, &mut |_, _| true);
+        assert_within(&joints, &curve, 1.0);
+        let most = [beyond(&joints, &curve), beyond(&narrow, &free)];
+        assert!(most.iter().all(|most| *most <= ROUNDED), "seed {seed}: {most:?}");
+        quicker += i32::from(curve.duration_s() < 0.99 * stops.duration_s());
+    }
+    // Where there is room, corners are rounded as before.
+    assert!(quicker >= 20, "{quicker} of 40");
+}
+
 #[test]
 fn the_rough_duration_of_a_path_is_about_the_exact_one() {
     let (mut ratios, mut sums) = (Vec::new(), [0.0; 2]);

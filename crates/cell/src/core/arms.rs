@@ -6,7 +6,6 @@
 use super::grasping::Pads;
 use super::holding::Held;
 use super::parting::{Around, Closed};
-use super::placement::PlacementError;
 use crate::config::CellConfig;
 use ratn_model::pose::Pose;
 use ratn_motion::robot::{ArmPosition, Configuration, Robot};
@@ -14,9 +13,6 @@ use ratn_motion::workplace::HOME;
 
 /// The number of the arm that is meant where none is named.
 pub const FIRST: usize = 0;
-
-/// The most characters of the name of an arm.
-const MAX_NAME: usize = 64;
 
 /// The arms of one robot.
 #[derive(Debug, Clone)]
@@ -37,44 +33,18 @@ struct Arm {
 }
 
 impl Arms {
-    /// The arms of a robot that can stand in a cell; `pads` are those of the first one.
-    ///
-    /// # Errors
-    /// [`PlacementError`] where an arm cannot be in a cell.
-    pub(super) fn of(robot: &Robot, pads: Pads, config: &CellConfig) -> Result<Arms, PlacementError> {
+    /// The arms of a robot that meets the [demands](super::demands) of a cell; `pads` are those of the first one.
+    pub(super) fn of(robot: &Robot, pads: Pads, config: &CellConfig) -> Arms {
         let mut arms: Vec<Arm> = Vec::new();
-        let several = robot.arm_names().count() > 1;
         for (number, name) in robot.arm_names().enumerate() {
-            let unfit =
-                |reason| PlacementError::UnfitArm { arm: name.to_owned(), robot: robot.name().to_owned(), reason };
-            let named = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
-            // The only arm of a robot is `arm@sim` whatever it is called.
-            if several && !((1..=MAX_NAME).contains(&name.len()) && name.chars().all(named)) {
-                return Err(unfit(format!(
-                    "its name becomes part of a resource's id: use 1 to {MAX_NAME} letters, digits, `_`, `-` and `.`"
-                )));
-            }
-            let links = robot.links_of(number);
-            for (other, arm) in arms.iter().enumerate() {
-                let of_both = robot.links_of(other).into_iter().find(|link| links.contains(link));
-                if let Some(link) = of_both {
-                    return Err(unfit(format!(
-                        "the link `{}` is moved by its joints and by those of the arm `{}`, so that a lease of one arm would move the other; leave                          the joints that carry several arms out of `joints` of every arm",
-                        robot.model.links[link].name, arm.name
-                    )));
-                }
-            }
-            // A name that the robot has itself told is one of its arms.
-            let view = if number == FIRST {
-                robot.clone()
-            } else {
-                robot.with_arm(name).map_err(|fault| unfit(fault.to_string()))?
+            let view = match number {
+                FIRST => robot.clone(),
+                _ => match robot.with_arm(name) {
+                    Ok(view) => view,
+                    Err(fault) => unreachable!("a name that the robot has itself told is one of its arms: {fault}"),
+                },
             };
             let pads = if number == FIRST { Some(pads) } else { Pads::of(&view) };
-            if pads.is_none() && view.finger().is_some() {
-                let reason = "the finger of its gripper is no box in the URDF that lies along the tool's axes";
-                return Err(unfit(reason.to_owned()));
-            }
             let most = view.open_finger_m();
             let open_finger_m = config.gripper.opening_m.map_or(most, |opening_m| match number {
                 FIRST => opening_m / 2.0,
@@ -82,7 +52,7 @@ impl Arms {
             });
             arms.push(Arm { name: name.to_owned(), view, pads, open_finger_m, closed: Closed::NEVER, held: None });
         }
-        Ok(Arms(arms))
+        Arms(arms)
     }
 
     /// How many there are.

@@ -81,7 +81,7 @@ impl Cell {
         let robot = Robot::named_or_file(&config.robot)?;
         let pads = placement::fit(&robot, &config)?;
         let objects = placement::objects(&robot, config.scene, config.goods(), config.seed)?;
-        let arms = Arms::of(&robot, pads, &config)?;
+        let arms = Arms::of(&robot, pads, &config);
         let resting = arms.first_posture();
         let errors = Errors::new(config.errors, &joint_counts(&robot), config.seed, 0);
         let (environment, ids) = environment(&robot, &errors.truth(&resting), config.scene, &objects);

@@ -4,6 +4,7 @@ pub mod arms;
 pub mod braking;
 pub mod cell;
 pub mod contacts;
+pub mod demands;
 pub mod environment;
 mod errors;
 pub mod faults;

@@ -1,6 +1,7 @@
 //! Lays a random scene in which the task can be done: objects stand apart from each other and within reach, and each can be grasped from above
 //! while all others still stand there. The same seed gives the same scene.
 
+use super::demands::{self, Unmet};
 use super::environment::{Furniture, Kind, Model};
 use super::grasping::Pads;
 use super::objects::Placed;
@@ -58,22 +59,12 @@ pub enum PlacementError {
         reason: String,
     },
     /// A robot that cannot do what a cell is for.
-    #[error("the robot `{robot}` cannot stand in a cell: {reason}")]
+    #[error("the robot `{robot}` cannot stand in a cell: {}", unmet.iter().map(Unmet::to_string).collect::<Vec<_>>().join("; and "))]
     Unfit {
         /// Which robot.
         robot: String,
-        /// What it lacks, and what next.
-        reason: &'static str,
-    },
-    /// An arm that cannot do what a cell is for.
-    #[error("the arm `{arm}` of the robot `{robot}` cannot be in a cell: {reason}")]
-    UnfitArm {
-        /// Which arm.
-        arm: String,
-        /// Of which robot.
-        robot: String,
-        /// What is wrong with it, and what next.
-        reason: String,
+        /// All that it lacks, and what next.
+        unmet: Vec<Unmet>,
     },
 }
 
@@ -156,21 +147,11 @@ pub fn workplace(robot: &Robot) -> &Workplace {
 /// # Errors
 /// [`PlacementError::Unfit`] says what it lacks, [`PlacementError::Opening`] how its gripper opens.
 pub fn fit(robot: &Robot, config: &CellConfig) -> Result<Pads, PlacementError> {
-    let pads = Pads::of(robot);
-    let lacks = if robot.workplace().is_none() {
-        "its robot.toml has no [workplace], so nobody knows where the table and the boxes are: add one (docs/robots.md)"
-    } else if robot.camera_pose(&robot.at_zero()).is_none() {
-        "its robot.toml has no [camera]"
-    } else if config.scene == Setting::Table && robot.workplace().is_some_and(|place| place.tableware.is_none()) {
-        "its robot.toml has no [workplace.tableware], so nobody knows where the rack and the places are: add it (docs/robots.md), or use \
-         the scene `boxes`"
-    } else if let Some(pads) = pads {
-        check_opening(robot, config)?;
-        return Ok(pads);
-    } else {
-        "it needs a [gripper] whose finger is a box in the URDF that lies along the tool's axes"
-    };
-    Err(PlacementError::Unfit { robot: robot.name().to_owned(), reason: lacks })
+    let unmet = demands::unmet(robot, config.scene);
+    match Pads::of(robot).filter(|_| unmet.is_empty()) {
+        Some(pads) => check_opening(robot, config).map(|()| pads),
+        None => Err(PlacementError::Unfit { robot: robot.name().to_owned(), unmet }),
+    }
 }
 
 /// Checks that the gripper can open as far as the config says, and that every box fits in between then.

@@ -1,10 +1,13 @@
-//! `ratn robot check`: reads the description of a robot and says what it has, how far it reaches, and what of it collides.
+//! `ratn robot check`: reads the description of a robot and says what it has, how far it reaches, what of it collides, and what the
+//! simulated cell misses.
 
 use crate::arguments::{RobotArguments, RobotCommand};
 use crate::failure::Failure;
 use crate::output;
+use ratn_cell::config::Setting;
+use ratn_cell::core::demands;
 use ratn_motion::robot::Robot;
-use ratn_motion::survey::survey;
+use ratn_motion::survey::{Survey, survey};
 
 /// Runs the command.
 pub(crate) fn run(arguments: &RobotArguments) -> Result<(), Failure> {
@@ -13,12 +16,33 @@ pub(crate) fn run(arguments: &RobotArguments) -> Result<(), Failure> {
         true => Failure::Refused(format!("ratn: {error}")),
         false => Failure::Failed(error.into()),
     })?;
-    let survey = survey(&robot);
-    output::result(survey.lines.join("\n"))?;
-    if survey.faults.is_empty() {
+    let Survey { mut lines, mut faults } = survey(&robot);
+    let unmet = unmet(&robot);
+    if robot.workplace().is_some() {
+        lines.push(format!("cell      {}", if unmet.is_empty() { "it can stand there" } else { "CANNOT STAND THERE" }));
+    }
+    output::result(lines.join("\n"))?;
+    faults.extend(unmet.into_iter().map(|unmet| format!("for the cell: {unmet}")));
+    if faults.is_empty() {
         return Ok(());
     }
-    Err(anyhow::anyhow!("{}: {}", robot.name(), survey.faults.join("; ")).into())
+    Err(anyhow::anyhow!("{}: {}", robot.name(), faults.join("; ")).into())
+}
+
+/// What a cell would refuse in a scene that the robot has a workplace for. Without any workplace the robot is for planning alone.
+fn unmet(robot: &Robot) -> Vec<String> {
+    let Some(workplace) = robot.workplace() else { return Vec::new() };
+    let table = workplace.tableware.as_ref().map(|_| Setting::Table);
+    let mut unmet: Vec<String> = Vec::new();
+    for setting in [Setting::Boxes].into_iter().chain(table) {
+        for demand in demands::unmet(robot, setting) {
+            let said = demand.to_string();
+            if !unmet.contains(&said) {
+                unmet.push(said);
+            }
+        }
+    }
+    unmet
 }
 
 #[cfg(test)]
@@ -49,5 +73,30 @@ mod tests {
         assert!(matches!(check(), Err(Failure::Failed(_))), "{:?}", check());
         std::fs::write(folder.path().join("r.urdf"), shape("<box size='0.1 0.1 0.1'/>")).unwrap();
         assert!(check().is_ok());
+    }
+
+    #[test]
+    fn a_line_is_said_of_the_file_that_has_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+        let refusal =
+            || Robot::from_file(&folder.path().join("robot.toml")).map(drop).map_err(|error| error.to_string());
+        let urdf = |radius: &str| {
+            format!(
+                "<robot name='r'><link name='foot'>\n<collision><geometry><sphere radius='{radius}'/></geometry></collision></link>\
+                 <link name='tool'/><joint name='turn' type='revolute'><parent link='foot'/><child link='tool'/><axis xyz='0 0 1'/>\
+                 <limit lower='-1' upper='1' velocity='1' effort='1'/></joint></robot>"
+            )
+        };
+        write("robot.toml", "name = 'r'\nurdf = 'r.urdf'\nsrdf = 'r.srdf'\n[arm]\njoints = ['turn']\ntool = 'tool'\n");
+        write("r.srdf", "<robot name='r'/>");
+        write("r.urdf", &urdf("-1"));
+        let said = refusal().unwrap_err();
+        assert!(said.contains("r.urdf: ") && said.contains("line 2") && said.contains("`foot`"), "{said}");
+        write("r.urdf", &urdf("1"));
+        assert_eq!(refusal(), Ok(()));
+        write("r.srdf", "<robot");
+        let said = refusal().unwrap_err();
+        assert!(said.contains("r.srdf: "), "{said}");
     }
 }

@@ -32,6 +32,21 @@ impl Robot {
         bodies.iter().map(|body| part(&in_tool.compose(&body.pose), &body.geometry)).collect()
     }
 
+    /// Each link that the gripper's joint moves, and how far it goes in the tool's frame from where the joint is at zero to where it is at its
+    /// upper limit; none of a robot without a gripper.
+    pub fn finger_ways(&self) -> Vec<(usize, [f64; 3])> {
+        let Some(joint) = self.finger.as_ref() else { return Vec::new() };
+        let places = [0.0, joint.joints[0].upper].map(|position| {
+            let mut positions = self.neutral.clone();
+            positions[joint.indices[0]] = position;
+            let poses = self.model.poses(&positions);
+            let tool = poses[self.tool].inverse();
+            poses.iter().map(|link| tool.compose(link).position).collect::<Vec<_>>()
+        });
+        let way = |link: usize| std::array::from_fn(|i| places[1][link][i] - places[0][link][i]);
+        self.finger_links().into_iter().map(|link| (link, way(link))).collect()
+    }
+
     /// The poses of a link and of the tool in the frame of the last link that carries both. The links before that one are left out: they move
     /// both alike, and would only add rounding errors.
     fn in_shared_link(&self, link: usize, positions: &[f64]) -> (Pose, Pose) {

@@ -2,6 +2,7 @@
 //! and the obstacles leave room for; without room the path is cut there, for the arm to stop.
 
 use super::path::{Path, Segment, between};
+use super::room::Room;
 use super::{SAGITTA_RAD, STRAIGHT_RAD};
 use crate::collision::distance;
 
@@ -21,6 +22,7 @@ const CONTROLS: [f64; 3] = [0.0, 0.4, 0.8];
 /// The path with rounded corners, cut where the arm has to stop.
 pub(crate) fn rounded<const N: usize>(
     path: &[[f64; N]],
+    room: &Room<N>,
     is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
 ) -> Vec<Path<N>> {
     let mut pieces = Vec::new();
@@ -42,7 +44,7 @@ pub(crate) fn rounded<const N: usize>(
             }
             let (from, to) = (between(&corner, &before, width / near), between(&corner, &after, width / far));
             let blend = bezier(&from, &corner, &to, width);
-            if is_free_along(&blend, is_free) {
+            if is_free_along(&blend, room, is_free) {
                 curve = Some((from, blend, to));
                 break;
             }
@@ -91,10 +93,11 @@ fn bezier<const N: usize>(from: &[f64; N], corner: &[f64; N], to: &[f64; N], wid
     Segment::bezier(&[before[0], before[1], before[2], after[2], after[1], after[0]], 2.0 * width)
 }
 
-/// Whether the chords are free that are close enough to a segment.
+/// Whether the chords are free that are close enough to a segment, and no joint leaves its range.
 pub(crate) fn is_free_along<const N: usize>(
     segment: &Segment<N>,
+    room: &Room<N>,
     is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
 ) -> bool {
-    segment.points(SAGITTA_RAD).windows(2).all(|pair| is_free(&pair[0], &pair[1]))
+    room.holds(segment) && segment.points(SAGITTA_RAD).windows(2).all(|pair| is_free(&pair[0], &pair[1]))
 }

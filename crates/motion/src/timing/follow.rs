@@ -23,6 +23,9 @@ pub(crate) struct Bounds<const N: usize> {
     pub(crate) velocities: [f64; N],
     pub(crate) accelerations: [f64; N],
     pub(crate) jerks: [f64; N],
+    /// Least and greatest positions.
+    pub(crate) lower: [f64; N],
+    pub(crate) upper: [f64; N],
     tool: Option<Tool>,
     /// How many of the `N` joints the robot has.
     joints: usize,
@@ -72,6 +75,8 @@ impl<const N: usize> Bounds<N> {
             velocities: std::array::from_fn(|j| joint(j).velocity * speed),
             accelerations: std::array::from_fn(|j| joint(j).acceleration * speed),
             jerks: std::array::from_fn(|j| joint(j).jerk),
+            lower: std::array::from_fn(|j| joints.get(j).map_or(0.0, |joint| joint.lower)),
+            upper: std::array::from_fn(|j| joints.get(j).map_or(0.0, |joint| joint.upper)),
             tool,
             joints: joints.len(),
         }

@@ -11,6 +11,7 @@ mod double_s;
 mod follow;
 mod path;
 mod reachability;
+mod room;
 pub mod rough;
 mod seam;
 mod spline;
@@ -26,6 +27,7 @@ use blend::rounded;
 use follow::{Bounds, estimate, follow};
 use path::{Path, Segment};
 use ratn_model::value::Trajectory;
+use room::Room;
 use seam::{Loose, joined};
 use spline::{Sides, smoothed, through};
 
@@ -133,7 +135,7 @@ impl<P: Copy> Section<P> {
 }
 
 /// The trajectory along the sections at a fraction `speed` of the velocity and acceleration limits; those of jerk hold as they are.
-/// Corners are rounded where `is_free` finds the straight motions from point to point of the curve free.
+/// Corners are rounded where `is_free` finds the straight motions from point to point of the curve free, and where no joint leaves its range.
 pub fn parameterise(
     robot: &Robot,
     sections: &[Section],
@@ -255,7 +257,10 @@ fn passing<const N: usize>(
         way.pieces.iter().map(of).collect()
     };
     let pieces: Vec<Vec<Loose<N>>> = sections.iter().zip(ways).map(loose).collect();
-    followed(&joined(&pieces, bounds, is_free, goes_on)?, bounds, goes_on)
+    let postures = sections.iter().flat_map(|section| section.path());
+    let room = ways.iter().fold(Room::new(bounds, postures), |room, way| room.with(&way.knots));
+    let pieces = joined(&pieces, bounds, &room, is_free, goes_on)?;
+    followed(&pieces, bounds, goes_on).filter(|knots| room.holds_motion(knots))
 }
 
 /// Along postures as they are, or with a stop at each of them if there is no time for more.
@@ -285,16 +290,17 @@ fn free<const N: usize>(
     if path.len() == 2 {
         return best;
     }
-    let mut candidates = vec![rounded(path, is_free)];
+    let room = Room::new(bounds, path);
+    let mut candidates = vec![rounded(path, &room, is_free)];
     for spacing in SPACINGS_RAD {
-        candidates.extend(smoothed(path, Sides::Free, spacing, is_free));
+        candidates.extend(smoothed(path, Sides::Free, spacing, &room, is_free));
     }
     let length: f64 = path.windows(2).map(|pair| distance(&pair[0], &pair[1])).sum();
     if length / (path.len() as f64) < DENSE_RAD {
         for stride in STRIDES.into_iter().filter(|stride| path.len() > 2 * stride) {
             let kept = path.iter().step_by(stride).chain(path.last());
             let polygon = without_repeats(&kept.copied().collect::<Vec<_>>());
-            candidates.extend(smoothed(&polygon, Sides::Unknown, SPACINGS_RAD[0], is_free));
+            candidates.extend(smoothed(&polygon, Sides::Unknown, SPACINGS_RAD[0], &room, is_free));
         }
     }
     let rough = |pieces: &Vec<Path<N>>| pieces.iter().map(|piece| estimate(piece, bounds)).sum::<f64>();
@@ -302,7 +308,8 @@ fn free<const N: usize>(
     ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
     let quickest = ranked[0].0;
     for (_, pieces) in ranked.into_iter().filter(|(rough_s, _)| *rough_s < quickest * CLOSE).take(FOLLOWED) {
-        let Some(knots) = followed(&pieces, bounds, goes_on) else { continue };
+        let motion = followed(&pieces, bounds, goes_on).filter(|knots| room.holds_motion(knots));
+        let Some(knots) = motion else { continue };
         if lasts_s(&knots) < lasts_s(&best.knots) {
             best = Way { pieces, knots };
         }

@@ -107,6 +107,35 @@ impl<const N: usize> Segment<N> {
         }
     }
 
+    /// A range that joint `j` does not leave: that of the points of its Bézier form.
+    pub(crate) fn hull(&self, j: usize) -> [f64; 2] {
+        const CHOOSE: [[f64; COEFFICIENTS]; COEFFICIENTS] = [
+            [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+            [1.0, 1.0, 0.0, 0.0, 0.0, 0.0],
+            [1.0, 2.0, 1.0, 0.0, 0.0, 0.0],
+            [1.0, 3.0, 3.0, 1.0, 0.0, 0.0],
+            [1.0, 4.0, 6.0, 4.0, 1.0, 0.0],
+            [1.0, 5.0, 10.0, 10.0, 5.0, 1.0],
+        ];
+        let mut power = 1.0;
+        let scaled: [f64; COEFFICIENTS] = std::array::from_fn(|k| {
+            let scaled = self.coefficients[k][j] * power / CHOOSE[COEFFICIENTS - 1][k];
+            power *= self.length;
+            scaled
+        });
+        let point = |i: usize| (0..=i).map(|k| CHOOSE[i][k] * scaled[k]).sum::<f64>();
+        let points = (0..COEFFICIENTS).map(point);
+        points.fold([f64::INFINITY, f64::NEG_INFINITY], |[least, greatest], p| [least.min(p), greatest.max(p)])
+    }
+
+    /// The least and the greatest position of joint `j`.
+    pub(crate) fn range(&self, j: usize) -> [f64; 2] {
+        let positions = self.coefficients.map(|c| c[j]);
+        let extremes = zeros(&slope(&positions), self.length).into_iter().chain([0.0, self.length]);
+        let positions = extremes.map(|s| value(&positions, s));
+        positions.fold([f64::INFINITY, f64::NEG_INFINITY], |[least, greatest], p| [least.min(p), greatest.max(p)])
+    }
+
     fn is_straight(&self) -> bool {
         self.coefficients[2..].iter().all(|c| c.iter().all(|v| *v == 0.0))
     }
@@ -123,6 +152,41 @@ impl<const N: usize> Segment<N> {
         let count = (self.length * (self.sharpest() / (8.0 * sagitta)).sqrt()).ceil().clamp(1.0, 64.0);
         (0..=count as usize).map(|i| self.at(self.length * i as f64 / count).position).collect()
     }
+}
+
+/// What a polynomial is at s.
+fn value(coefficients: &[f64], s: f64) -> f64 {
+    coefficients.iter().rev().fold(0.0, |sum, c| sum * s + c)
+}
+
+/// Its derivative.
+fn slope(coefficients: &[f64]) -> Vec<f64> {
+    coefficients.iter().enumerate().skip(1).map(|(k, c)| k as f64 * c).collect()
+}
+
+/// Where it changes its sign from 0 to `to`: between any two neighbouring extremes, which are where its derivative does, it does so once at most.
+fn zeros(coefficients: &[f64], to: f64) -> Vec<f64> {
+    /// By so many halves a place is exact to the last bits.
+    const HALVINGS: usize = 52;
+    if coefficients.len() < 2 {
+        return Vec::new();
+    }
+    let mut ends = vec![0.0];
+    ends.extend(zeros(&slope(coefficients), to));
+    ends.push(to);
+    let between = |pair: &[f64]| {
+        let (mut low, mut high) = (pair[0], pair[1]);
+        let rises = value(coefficients, high) > 0.0;
+        if (value(coefficients, low) > 0.0) == rises {
+            return None;
+        }
+        for _ in 0..HALVINGS {
+            let middle = (low + high) / 2.0;
+            if (value(coefficients, middle) > 0.0) == rises { high = middle } else { low = middle }
+        }
+        Some((low + high) / 2.0)
+    };
+    ends.windows(2).filter_map(between).collect()
 }
 
 /// The point a share of the way from one to another.
@@ -183,5 +247,36 @@ impl<const N: usize> Path<N> {
     /// Whether it is one straight line.
     pub(crate) fn is_line(&self) -> bool {
         self.segments.len() == 1 && self.segments[0].is_straight()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_range_of_a_curve_is_that_of_its_places_and_within_its_hull() {
+        let curves = [
+            [0.0, 1.0, -2.0, 3.0, -1.0, 0.5],
+            [0.3, 0.3, 0.3, 0.3, 0.3, 0.3],
+            [0.0, 0.2, 0.4, 0.6, 0.8, 1.0],
+            [1.0, -1.0, 1.0, -1.0, 1.0, -1.0],
+            [0.0, 2.0, 2.0, -2.0, -2.0, 0.0],
+        ];
+        for controls in curves {
+            for length in [0.01, 0.7, 3.0] {
+                let curve = Segment::bezier(&controls.map(|c| [c]), length);
+                let places = (0..=10_000).map(|i| curve.at(length * f64::from(i) / 10_000.0).position[0]);
+                let (least, greatest) =
+                    places.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), p| (a.min(p), b.max(p)));
+                let ([low, high], [under, over]) = (curve.range(0), curve.hull(0));
+                assert!((low - least).abs() < 1e-7 && (high - greatest).abs() < 1e-7, "{controls:?}: {low} to {high}");
+                let [first, last] = [f64::min, f64::max].map(|of| controls.into_iter().reduce(of).unwrap_or(0.0));
+                assert!(
+                    (under - first).abs() < 1e-12 && (over - last).abs() < 1e-12,
+                    "{controls:?}: {under} to {over}"
+                );
+            }
+        }
     }
 }

@@ -4,6 +4,7 @@
 use super::blend::{LEAST_RAD, SHARPEST_RAD, is_free_along};
 use super::follow::{Bounds, estimate};
 use super::path::{Path, Segment, norm};
+use super::room::Room;
 
 /// How often what is cut off is halved before the arm stops at the seam instead.
 const HALVINGS: usize = 4;
@@ -22,6 +23,7 @@ pub(crate) struct Loose<const N: usize> {
 pub(crate) fn joined<const N: usize>(
     sections: &[Vec<Loose<N>>],
     bounds: &Bounds<N>,
+    room: &Room<N>,
     is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
     goes_on: &mut dyn FnMut() -> bool,
 ) -> Option<Vec<Path<N>>> {
@@ -30,7 +32,7 @@ pub(crate) fn joined<const N: usize>(
     for section in sections.iter().filter(|section| !section.is_empty()) {
         let mut rest = section.iter().cloned();
         if let (Some(last), Some(first)) = (pieces.last(), section.first())
-            && let Some(whole) = across(last, first, bounds, is_free, goes_on)
+            && let Some(whole) = across(last, first, bounds, room, is_free, goes_on)
         {
             (joins, _) = (true, rest.next());
             pieces.pop();
@@ -46,6 +48,7 @@ fn across<const N: usize>(
     before: &Loose<N>,
     after: &Loose<N>,
     bounds: &Bounds<N>,
+    room: &Room<N>,
     is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
     goes_on: &mut dyn FnMut() -> bool,
 ) -> Option<Loose<N>> {
@@ -57,7 +60,7 @@ fn across<const N: usize>(
             break;
         }
         let (cut, seam, goes_on_at) = seam(&before.path, &after.path, width)?;
-        if is_free_along(&seam, is_free) {
+        if is_free_along(&seam, room, is_free) {
             let mut path = before.path.part(0.0, cut);
             path.push(seam);
             path.append(after.path.part(goes_on_at, after.path.length()));

@@ -8,6 +8,7 @@
 use super::STRAIGHT_RAD;
 use super::blend::{bend_rad, is_free_along};
 use super::path::{Path, Segment, between};
+use super::room::Room;
 use crate::collision::distance;
 use std::collections::BTreeSet;
 
@@ -35,13 +36,14 @@ pub(crate) fn smoothed<const N: usize>(
     path: &[[f64; N]],
     sides: Sides,
     spacing: f64,
+    room: &Room<N>,
     is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
 ) -> Option<Vec<Path<N>>> {
     let mut polygons = vec![divided(path, spacing)];
     let mut known = BTreeSet::new();
     let mut pieces = Vec::new();
     while let Some(polygon) = polygons.pop() {
-        match curved(polygon, sides, &mut known, is_free)? {
+        match curved(polygon, sides, &mut known, room, is_free)? {
             Curved::Whole(piece) => pieces.push(piece),
             // The first of the two is next: it is taken from the end.
             Curved::Cut([before, after]) => polygons.extend([after, before]),
@@ -60,6 +62,7 @@ fn curved<const N: usize>(
     mut polygon: Vec<[f64; N]>,
     sides: Sides,
     known: &mut BTreeSet<Vec<u64>>,
+    room: &Room<N>,
     is_free: &mut dyn FnMut(&[f64; N], &[f64; N]) -> bool,
 ) -> Option<Curved<N>> {
     let whole = polygon.clone();
@@ -75,7 +78,7 @@ fn curved<const N: usize>(
             }
             let ends = [span.at(0.0), span.at(span.length / 2.0), span.at(span.length)];
             let key: Vec<u64> = ends.iter().flat_map(|e| e.position.map(f64::to_bits)).collect();
-            known.contains(&key) || is_free_along(span, is_free) && known.insert(key)
+            known.contains(&key) || is_free_along(span, room, is_free) && known.insert(key)
         };
         let blocked: Vec<usize> = (0..last).filter(|i| !is_span_free(*i)).collect();
         let Some(first) = blocked.first() else {

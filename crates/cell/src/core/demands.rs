@@ -1,0 +1,260 @@
+//! What a simulated cell demands of a robot: a workplace, a camera, arms that can be told apart, grippers that can hold the boxes, and room to
+//! stand. The start of a cell refuses a robot that leaves one of them unmet; `ratn robot check` tells all of them before.
+//!
+//! What a description must be for any use (its names, its limits, the kinds of its joints) is checked where it is read. Whether each place of
+//! the workplace can be reached is surveyed (`ratn_motion::survey`); the cell lays objects where they can be.
+
+use super::arms::FIRST;
+use super::environment::Furniture;
+use super::grasping::{NotGrasped, Pads};
+use super::placement::furniture;
+use crate::config::Setting;
+use ratn_model::pose::Pose;
+use ratn_motion::exact::Touch;
+use ratn_motion::geometry::Geometry;
+use ratn_motion::robot::{Configuration, Robot};
+use ratn_motion::space::Obstacle;
+use ratn_motion::top_grasp::grasp_poses;
+use ratn_motion::workplace::{Boxes, HOME, Workplace};
+use std::fmt;
+
+/// A demand that a robot does not meet.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Unmet {
+    /// Where to look: a part of the robot.toml, and of which arm.
+    pub place: String,
+    /// What is not as it must be.
+    pub what: String,
+    /// What the cell needs it for.
+    pub why: &'static str,
+    /// What to do.
+    pub next: String,
+}
+
+impl fmt::Display for Unmet {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Unmet { place, what, why, next } = self;
+        write!(f, "{place}: {what}; {why}; {next}")
+    }
+}
+
+/// The most characters of the name of an arm.
+const MAX_NAME: usize = 64;
+
+/// A finger may be so far from where it is said to be, in metres: as far as pads give way.
+const FINGER_OFF_M: f64 = 0.002;
+
+/// What stands on something may be so deep in it, in metres: people round.
+const STANDS_IN_M: f64 = 0.001;
+
+/// The demands that a robot does not meet in a scene.
+pub fn unmet(robot: &Robot, setting: Setting) -> Vec<Unmet> {
+    let mut unmet = Vec::new();
+    let Some(workplace) = robot.workplace() else {
+        return vec![Unmet {
+            place: "[workplace]".to_owned(),
+            what: "there is none".to_owned(),
+            why: "nobody knows where the table and the boxes are",
+            next: "add one to the robot.toml (docs/robots.md)".to_owned(),
+        }];
+    };
+    if robot.camera_pose(&robot.at_zero()).is_none() {
+        unmet.push(Unmet {
+            place: "[camera]".to_owned(),
+            what: "there is none".to_owned(),
+            why: "the cell's pictures are taken from it",
+            next: "name the link of its optical frame (z forward, x right, y down) as `link`".to_owned(),
+        });
+    }
+    if setting == Setting::Table && workplace.tableware.is_none() {
+        unmet.push(Unmet {
+            place: "[workplace.tableware]".to_owned(),
+            what: "there is none".to_owned(),
+            why: "nobody knows where the rack and the places are",
+            next: "add it (docs/robots.md), or use the scene `boxes`".to_owned(),
+        });
+    }
+    let (names, standing): (Vec<&str>, _) = (robot.arm_names().collect(), standing(robot, setting));
+    for (number, name) in names.iter().enumerate() {
+        // A name that the robot has itself told is one of its arms.
+        let Ok(view) = robot.with_arm(name) else { continue };
+        let of_arm = if names.len() > 1 { format!(" of the arm `{name}`") } else { String::new() };
+        if names.len() > 1 {
+            unmet.extend(named(name));
+        }
+        unmet.extend((0..number).find_map(|other| shared(robot, [other, number], [names[other], name])));
+        unmet.extend(ungrasping(&view, number == FIRST, share(workplace, number, name), &of_arm));
+        unmet.extend(in_the_way(&view, &standing, &of_arm, &unmet));
+    }
+    unmet
+}
+
+/// The boxes of an arm: of the first one those of the workplace.
+fn share<'w>(workplace: &'w Workplace, number: usize, name: &str) -> Option<&'w Boxes> {
+    match number {
+        FIRST => Some(&workplace.boxes),
+        _ => workplace.others.iter().find(|share| share.arm == name).map(|share| &share.boxes),
+    }
+}
+
+/// The only arm of a robot is `arm@sim` whatever it is called; this is asked of several.
+fn named(name: &str) -> Option<Unmet> {
+    let part_of_id = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
+    let is_good = (1..=MAX_NAME).contains(&name.len()) && name.chars().all(part_of_id);
+    (!is_good).then(|| Unmet {
+        place: format!("`name` of the arm `{name}`"),
+        what: "it is no part of an id".to_owned(),
+        why: "it becomes part of the id of the arm's resource",
+        next: format!("use 1 to {MAX_NAME} letters, digits, `_`, `-` and `.`"),
+    })
+}
+
+/// A link that two arms move.
+fn shared(robot: &Robot, [other, arm]: [usize; 2], [other_name, name]: [&str; 2]) -> Option<Unmet> {
+    let links = robot.links_of(arm);
+    let link = robot.links_of(other).into_iter().find(|link| links.contains(link))?;
+    let link = &robot.model.links[link].name;
+    Some(Unmet {
+        place: format!("`joints` of the arm `{name}`"),
+        what: format!("the link `{link}` is moved by them and by those of the arm `{other_name}`"),
+        why: "a lease of one arm would move the other",
+        next: "leave the joints that carry several arms out of `joints` of every arm".to_owned(),
+    })
+}
+
+/// Why the gripper of an arm cannot hold what the cell has for it. An arm that has no boxes needs no gripper.
+fn ungrasping(view: &Robot, is_first: bool, boxes: Option<&Boxes>, of_arm: &str) -> Option<Unmet> {
+    let unmet = |what: String, why: &'static str, next: &str| {
+        Some(Unmet { place: format!("[gripper]{of_arm}"), what, why, next: next.to_owned() })
+    };
+    let (Some(joint), Some(finger)) = (view.finger(), view.finger_link()) else {
+        let needs_one = is_first || boxes.is_some();
+        return needs_one
+            .then(|| unmet("there is none".to_owned(), "the boxes are taken with it", "add one (docs/robots.md)"))?;
+    };
+    let name = &view.model.links[finger].name;
+    let Some(part) = Pads::part(view) else {
+        return unmet(
+            format!("none of the shapes of its finger `{name}` is a box that lies along the axes of the tool's frame"),
+            "the pad that holds is found on such a box",
+            "give the finger one, or turn the tool's frame so that y is the way the fingers close",
+        );
+    };
+    if !view.arm_links.contains(&finger) {
+        return unmet(
+            format!("its finger `{name}` is not carried by the arm"),
+            "what is grasped is carried by the arm",
+            "hang the fingers on a link behind the arm's last joint",
+        );
+    }
+    let outward = if part.middle[1] < 0.0 { -1.0 } else { 1.0 };
+    let (opens, ways) = (joint.upper, view.finger_ways());
+    let goes = |way: [f64; 3], y: f64| (way[1] - y).abs().max(way[0].abs()).max(way[2].abs()) <= FINGER_OFF_M;
+    let way = ways.iter().find(|(link, _)| *link == finger).map_or([0.0; 3], |(_, way)| *way);
+    if !goes(way, outward * opens) {
+        // Adding zero takes the sign from a zero.
+        let [x, y, z] = way.map(|c| (1e3 * c).round() + 0.0);
+        return unmet(
+            format!(
+                "when its joint `{}` goes from 0 to {:.0} mm, its finger `{name}` goes by ({x:.0}, {y:.0}, {z:.0}) mm in the tool's frame",
+                joint.name,
+                1e3 * opens
+            ),
+            "the position of the joint is how far each finger is from the middle, along the tool's y",
+            "let the joint slide the finger along y of the tool's frame, away from the middle, with 0 where the fingers meet",
+        );
+    }
+    if !ways.iter().any(|(_, way)| goes(*way, -outward * opens)) {
+        return unmet(
+            format!("no link goes the other way when its finger `{name}` opens"),
+            "a box is held between two fingers",
+            "add the other finger, with a joint that mimics the first one",
+        );
+    }
+    let from_middle = part.middle[1].abs() - part.half[1];
+    if from_middle.abs() > FINGER_OFF_M {
+        return unmet(
+            format!(
+                "with its joint at 0 the pad of its finger `{name}` is {:.1} mm from the middle",
+                1e3 * from_middle
+            ),
+            "0 is where the fingers meet",
+            "move the finger's joint or the tool's frame by that much",
+        );
+    }
+    let boxes = boxes?;
+    if joint.lower > boxes.least[1] / 2.0 {
+        let [closed, narrow] = [2.0 * joint.lower, boxes.least[1]].map(|m| 1e3 * m);
+        return unmet(
+            format!("its fingers close to {closed:.0} mm, and the narrowest boxes are {narrow:.0} mm wide"),
+            "the fingers close until they hold",
+            "lower the lower limit of its joint, or make `boxes.least` wider",
+        );
+    }
+    let pads = Pads::of(view)?;
+    let held =
+        [boxes.least, boxes.greatest].into_iter().find_map(|size| Some((size, holds(&pads, opens, size).err()?)));
+    let ([long, wide, high], error) = held?;
+    unmet(
+        format!("its fingers do not hold a box of {long} by {wide} by {high} m that is taken from above: {error}"),
+        "the boxes are taken so",
+        "let the pads be about the tool's frame, as large as they are, or change the boxes of [workplace]",
+    )
+}
+
+/// Whether fingers that are this far open hold a box of this size.
+fn holds(pads: &Pads, finger: f64, size: [f64; 3]) -> Result<(), NotGrasped> {
+    let standing = Pose::at(0.0, 0.0, size[2] / 2.0);
+    let cuboids = [("it".to_owned(), standing, size)];
+    let [first, second] = grasp_poses(&standing, size).map(|tool| pads.close(&tool, finger, &cuboids).map(drop));
+    first.or(second)
+}
+
+/// All furniture.
+fn standing(robot: &Robot, setting: Setting) -> Vec<Obstacle> {
+    let parts = |piece: Furniture| piece.parts.into_iter().map(move |part| (piece.name.clone(), part));
+    let solid = |(name, (pose, size)): (String, (Pose, [f64; 3]))| Obstacle {
+        name,
+        pose,
+        geometry: Geometry::Box { half: size.map(|edge| edge / 2.0) },
+    };
+    furniture(robot, setting).into_iter().flat_map(parts).map(solid).collect()
+}
+
+/// What the robot stands in, or is in itself, when the cell begins, if that was not said of another arm.
+fn in_the_way(view: &Robot, standing: &[Obstacle], of_arm: &str, said: &[Unmet]) -> Vec<Unmet> {
+    let touches = view.touches(&first_posture(view), standing);
+    let deep = touches.into_iter().filter(|touch| touch.depth_m > STANDS_IN_M);
+    let unmet = |touch: Touch| {
+        let is_furniture = standing.iter().any(|obstacle| obstacle.name == touch.other);
+        let is_carried = view.link(&touch.link).is_some_and(|link| view.arm_links.contains(&link));
+        let (place, next) = match (is_furniture, is_carried) {
+            (true, false) => {
+                ("[workplace]".to_owned(), format!("move the {} of [workplace], or the link in the URDF", touch.other))
+            }
+            (true, true) => (
+                format!("[postures] `{HOME}`{of_arm}"),
+                format!("change the posture, or move the {} of [workplace]", touch.other),
+            ),
+            (false, _) => (
+                format!("[postures] `{HOME}`{of_arm}"),
+                "change the posture, or except the pair in the SRDF where the links are made to touch".to_owned(),
+            ),
+        };
+        Unmet { place, what: format!("the link {touch}"), why: "the cell begins so", next }
+    };
+    deep.map(unmet).filter(|unmet| !said.iter().any(|other| other.what == unmet.what)).collect()
+}
+
+/// Every arm in its posture `home` with open fingers, as the robot seen from an arm has it.
+fn first_posture(view: &Robot) -> Configuration {
+    let mut first = view.with_all_arms(&view.at_zero());
+    for (number, name) in view.arm_names().enumerate() {
+        let Ok(arm) = view.with_arm(name) else { continue };
+        first.set_finger(number, arm.open_finger_m());
+        if let Some(home) = arm.posture(HOME) {
+            first.set_joints(number, home);
+        }
+    }
+    first
+}
