@@ -365,7 +365,6 @@ fn a_motion_is_free_between_its_postures_just_where_a_look_at_everything_finds_i
         read(&turning, &folding(6), &names),
         read(&sliding, &folding(6), &names),
         read(include_str!("../robots/panda.urdf"), include_str!("../robots/panda.srdf"), &seven),
-        arm(),
     ];
     let mut random = ChaCha8Rng::seed_from_u64(31);
     for (robot, mechanism) in robots.iter().enumerate() {
@@ -391,7 +390,7 @@ fn a_motion_is_free_between_its_postures_just_where_a_look_at_everything_finds_i
                 }
             }
         }
-        assert!(answers.iter().all(|count| *count > 20), "{robot}: {answers:?}");
+        assert!(answers.iter().all(|count| *count > 30), "{robot}: {answers:?}");
     }
 }
 
