@@ -2,7 +2,8 @@
 //!
 //! Two ways to check a motion. [`Space::is_free_motion`] looks at [`Space::RESOLUTION`] postures per radian, as the search
 //! does. [`Space::is_swept_free`] leaves nothing between the postures: each sphere is grown by how far it can move until the
-//! next one, and the parts where that is too much are cut finer, down to postures so close that what is between is noise.
+//! next one, and the parts where that is too much are cut finer, down to postures so close that what is between is noise. Finer parts are looked at
+//! beside what the coarser ones were near to, and nothing else.
 //! How far it can move is half of its step to the next posture, and what the curvature of its way allows beside that.
 
 use crate::branches;
@@ -11,7 +12,7 @@ use crate::geometry::Geometry;
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 use crate::occupied::{self, Reached};
 pub use crate::simd::Isa;
-use crate::simd::{self, Block, Compiled, Edge, Frame, Group, Rigid, Row, Scratch, SelfPair};
+use crate::simd::{self, Among, Block, Compiled, Edge, Frame, Group, Rigid, Row, Scratch, SelfPair, Spans};
 use crate::surroundings::Surroundings;
 use ratn_model::pose::Pose;
 use std::cmp::Reverse;
@@ -36,9 +37,13 @@ pub(crate) const ROUNDING_M: f64 = 2e-5;
 /// Bounding spheres are larger by this, in metres: what a sphere meets in single precision, its bounding sphere meets, too.
 const COARSE_ROUNDING_M: f32 = 1e-5;
 
-/// How much finer each level of a swept check is than the one before, and how many levels there are.
+/// How much finer each level of a swept check is than the one before, and how many levels there are. The second is as close as the postures of
+/// [`Space::is_free_motion`].
 const FINER: usize = 4;
-const LEVELS: usize = 3;
+const LEVELS: usize = simd::DEPTH;
+
+/// For a look at everything.
+const ALL: Among = Among { depth: 0, lanes: 0 };
 
 /// Points of a cloud that is joined with others at the most.
 const SMALL_CLOUD: usize = 1_000;
@@ -63,10 +68,6 @@ pub struct Space {
     compiled: Compiled,
     scratch: Scratch,
     isa: Isa,
-    spans: Spans,
-    /// Per rigid part, then per group: how far it turns in half a step, and how much larger its spheres are taken to be.
-    turned: Vec<f32>,
-    inflate: Vec<f32>,
     lower: State,
     upper: State,
     /// How many times as closely motions of each joint are looked at ([`Mechanism::fineness`]).
@@ -75,17 +76,6 @@ pub struct Space {
     /// A part that no joint moves stands in an obstacle.
     blocked: bool,
     swept: bool,
-}
-
-/// How spheres move with each joint: of each joint a list over the rigid parts, then the groups, so that many are added up at once.
-#[derive(Debug, Clone)]
-struct Spans {
-    /// How far they turn for one radian; zero for joints that slide.
-    turns: Vec<Vec<f32>>,
-    /// How far a point of them moves at most for one radian; for one metre of a joint that slides, twice that.
-    ways: Vec<Vec<f32>>,
-    /// Of each rigid part and group, the radius of its bounding sphere.
-    radii: Vec<f32>,
 }
 
 impl Space {
@@ -135,7 +125,7 @@ impl Space {
         compiled.obstacles = compiled_obstacles;
         blocked |= add_clouds(&mut compiled, mechanism, &surroundings, &shells, &links, isa);
         compiled.pairs = pairs(mechanism, &compiled, &links);
-        let spans = spans(&compiled);
+        compiled.spans = spans(&compiled);
         let (mut lower, mut upper) = ([0.0; MAX_JOINTS], [0.0; MAX_JOINTS]);
         for (j, joint) in mechanism.joints.iter().enumerate() {
             (lower[j], upper[j]) = (joint.lower as f32, joint.upper as f32);
@@ -145,22 +135,8 @@ impl Space {
             *fine = fineness as f32;
         }
         let scratch = Scratch::new(&compiled);
-        let (turned, inflate) = (vec![0.0; spans.radii.len()], vec![0.0; spans.radii.len()]);
         let branches = branches::branches(&parents(&compiled));
-        Space {
-            compiled,
-            scratch,
-            isa,
-            spans,
-            turned,
-            inflate,
-            lower,
-            upper,
-            fineness,
-            branches,
-            blocked,
-            swept: false,
-        }
+        Space { compiled, scratch, isa, lower, upper, fineness, branches, blocked, swept: false }
     }
 
     /// How many joints there are.
@@ -200,7 +176,7 @@ impl Space {
 
     /// Whether a posture touches nothing.
     pub fn is_free(&mut self, state: &State) -> bool {
-        !self.blocked && self.check(state, &[0.0; MAX_JOINTS], 1)
+        !self.blocked && self.check(state, &[0.0; MAX_JOINTS], 1, ALL)
     }
 
     /// Whether a straight motion touches nothing; `from` itself is not looked at.
@@ -211,7 +187,7 @@ impl Space {
         }
         let delta = difference(to, from);
         let batches = self.batches(&delta);
-        !self.blocked && self.check(from, &delta, batches)
+        !self.blocked && self.check(from, &delta, batches, ALL)
     }
 
     /// Whether a straight motion touches nothing, also between the postures.
@@ -219,30 +195,35 @@ impl Space {
         let delta = difference(to, from);
         // What is wrong at all is mostly found by the coarse look.
         let batches = self.batches(&delta);
-        !self.blocked && self.check(from, &delta, batches) && self.sweep(from, &delta, batches, LEVELS)
+        !self.blocked && self.check(from, &delta, batches, ALL) && self.sweep(from, &delta)
     }
 
     /// One batch of postures along a motion; what the measurements time.
     pub fn check_batch(&mut self, from: &State, delta: &State) -> bool {
-        self.check(from, delta, 1)
+        self.check(from, delta, 1, ALL)
     }
 
     /// As [`Space::is_swept_free`], for a motion whose postures were looked at before.
     pub(crate) fn is_swept_free_too(&mut self, from: &State, to: &State) -> bool {
-        let delta = difference(to, from);
-        let batches = self.batches(&delta);
-        !self.blocked && self.sweep(from, &delta, batches, LEVELS)
+        !self.blocked && self.sweep(from, &difference(to, from))
     }
 
-    fn sweep(&mut self, from: &State, delta: &State, pieces: usize, levels: usize) -> bool {
-        if levels == 0 {
-            return self.check(from, delta, pieces);
+    fn sweep(&mut self, from: &State, delta: &State) -> bool {
+        let pieces = self.batches(delta).div_ceil(FINER);
+        self.sweep_among(from, delta, pieces, ALL)
+    }
+
+    /// Whether a part of a motion is free, cut into so many batches, beside what was near in the coarser look.
+    fn sweep_among(&mut self, from: &State, delta: &State, pieces: usize, among: Among) -> bool {
+        if among.depth == LEVELS {
+            return self.check(from, delta, pieces, among);
         }
         let width = self.isa.width();
         let piece: State = std::array::from_fn(|j| delta[j] / pieces as f32);
         for i in 0..pieces {
             let start: State = std::array::from_fn(|j| from[j] + piece[j] * i as f32);
-            let mut doubtful = self.touching_grown(&start, &piece);
+            let edge = Edge { compiled: &self.compiled, start: &start, delta: &piece, batches: 1, among };
+            let mut doubtful = self.isa.near(&edge, &mut self.scratch);
             // Runs of steps, each cut finer as a motion of its own.
             while doubtful != 0 {
                 let first = doubtful.trailing_zeros();
@@ -250,10 +231,12 @@ impl Space {
                 let fraction = |steps: u32| steps as f32 / width as f32;
                 let run: State = std::array::from_fn(|j| piece[j] * fraction(steps));
                 let at: State = std::array::from_fn(|j| start[j] + piece[j] * fraction(first));
-                if !self.sweep(&at, &run, (steps as usize * FINER).div_ceil(width), levels - 1) {
+                let lanes = ((1_u32 << steps) - 1) << first;
+                let finer = Among { depth: among.depth + 1, lanes };
+                if !self.sweep_among(&at, &run, (steps as usize * FINER).div_ceil(width), finer) {
                     return false;
                 }
-                doubtful &= !(((1_u32 << steps) - 1) << first);
+                doubtful &= !lanes;
             }
         }
         true
@@ -267,36 +250,9 @@ impl Space {
     }
 
     #[inline]
-    fn check(&mut self, start: &State, delta: &State, batches: usize) -> bool {
-        self.isa.is_free(&Edge { compiled: &self.compiled, start, delta, batches, inflate: &[] }, &mut self.scratch)
-    }
-
-    /// Which of a batch's steps may touch something, a bit per step.
-    fn touching_grown(&mut self, start: &State, delta: &State) -> u32 {
-        // Each posture stands for the step that it is in the middle of: nothing is further than half a step from one.
-        let step = 0.5 / self.isa.width() as f32;
-        self.turned.fill(0.0);
-        self.inflate.fill(0.0);
-        let Spans { turns, ways, radii } = &self.spans;
-        for (joint, (turns, ways)) in turns.iter().zip(ways).enumerate() {
-            let by = delta[joint].abs() * step;
-            for (turned, turns) in self.turned.iter_mut().zip(turns) {
-                *turned += turns * by;
-            }
-            for (moved, way) in self.inflate.iter_mut().zip(ways) {
-                *moved += way * by;
-            }
-        }
-        for ((inflate, turned), radius) in self.inflate.iter_mut().zip(&self.turned).zip(radii) {
-            // The second derivative by two joints that turn is no longer than the lever of the later one. The mean speed of a
-            // step differs from that anywhere in it and half a step beyond by what it changes in one step at most.
-            let bend = 2.0 * turned * *inflate;
-            // Points beside the centre of the bounding sphere turn about it.
-            *inflate = bend + turned * radius;
-        }
-        let start: State = std::array::from_fn(|j| start[j] - delta[j] * step);
-        let edge = Edge { compiled: &self.compiled, start: &start, delta, batches: 1, inflate: &self.inflate };
-        self.isa.touching(&edge, &mut self.scratch)
+    fn check(&mut self, start: &State, delta: &State, batches: usize, among: Among) -> bool {
+        let edge = Edge { compiled: &self.compiled, start, delta, batches, among };
+        self.isa.is_free(&edge, &mut self.scratch)
     }
 }
 

@@ -351,6 +351,49 @@ fn a_motion_free_between_its_postures_is_free_wherever_one_looks() {
     assert!(free[0] > 5 && free[1] > 5, "{free:?}");
 }
 
+/// What a check that looks again only at what was near answers is compared with a look at everything in postures as close as its finest.
+#[test]
+fn a_motion_is_free_between_its_postures_just_where_a_look_at_everything_finds_it_free() {
+    // Between the finest postures of either nothing moves further.
+    const BETWEEN_M: f64 = 5e-4;
+    const PER_RADIAN: f32 = 2048.0;
+    let (turning, names) = chain(6);
+    let sliding = turning.replacen("revolute", "prismatic", 2);
+    let read = |urdf: &str, srdf: &str, names: &[String]| Mechanism::read(urdf, Some(srdf), names).unwrap();
+    let seven: Vec<String> = (1..=7).map(|i| format!("arm_joint_{i}")).collect();
+    let robots = [
+        read(&turning, &folding(6), &names),
+        read(&sliding, &folding(6), &names),
+        read(include_str!("../robots/panda.urdf"), include_str!("../robots/panda.srdf"), &seven),
+    ];
+    let mut random = ChaCha8Rng::seed_from_u64(31);
+    for (robot, mechanism) in robots.iter().enumerate() {
+        let mut answers = [0; 2];
+        let (less, more) = (grown(mechanism, -BETWEEN_M), grown(mechanism, BETWEEN_M));
+        for isa in Isa::available() {
+            for count in [4, 20, 4, 20] {
+                let obstacles = clutter(&mut random, count, 1.4);
+                let mut spaces = [mechanism, &less, &more].map(|robot| Space::with_isa(robot, &obstacles, isa));
+                for _ in 0..30 {
+                    let [space, less, more] = &mut spaces;
+                    let from = posture(&mut random, mechanism);
+                    let to = between(&from, &posture(&mut random, mechanism), random.random_range(0.05..0.4));
+                    let is_free = space.is_swept_free(&from, &to);
+                    let steps = (ratn_motion::space::distance(&from, &to) * PER_RADIAN).ceil() as usize;
+                    let at = |i: usize| between(&from, &to, i as f32 / steps as f32);
+                    answers[usize::from(is_free)] += 1;
+                    if is_free {
+                        assert!((1..=steps).all(|i| less.is_free(&at(i))), "{robot}: {from:?} {to:?}");
+                    } else {
+                        assert!((0..=steps).any(|i| !more.is_free(&at(i))), "{robot}: {from:?} {to:?}");
+                    }
+                }
+            }
+        }
+        assert!(answers.iter().all(|count| *count > 30), "{robot}: {answers:?}");
+    }
+}
+
 #[test]
 fn a_way_that_slips_through_a_thin_plate_is_mended_or_refused() {
     let (urdf, names) = chain(4);

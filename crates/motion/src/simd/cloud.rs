@@ -219,7 +219,7 @@ impl Cloud {
 
     /// Whether one sphere touches a ball.
     pub(crate) fn touches_sphere(&self, centre: [f32; 3], radius: f32) -> bool {
-        self.touching::<[f32; 8], true>(centre.map(|c| [c; 8]), radius + self.radius, 1) != 0
+        self.touching::<[f32; 8]>(centre.map(|c| [c; 8]), radius + self.radius, 1, true) != 0
     }
 
     /// Whether a ball is about within a distance of a place, in metres.
@@ -270,9 +270,9 @@ impl Cloud {
         lanes & gap.mul_add(gap, out).below(V::splat(radius * radius))
     }
 
-    /// Which lanes' spheres touch a ball; `lanes` are looked at.
+    /// Which lanes' spheres touch a ball, or one of them where not all are asked for; `lanes` are looked at.
     #[inline(always)]
-    pub(super) fn touching<V: Lanes, const ALL: bool>(&self, centre: [V; 3], radius: f32, lanes: u32) -> u32 {
+    pub(super) fn touching<V: Lanes>(&self, centre: [V; 3], radius: f32, lanes: u32, all: bool) -> u32 {
         let mut cells = Block([0.0; 16]);
         let mut doubtful = self.may_touch(centre, radius, lanes, &mut cells);
         if doubtful == 0 {
@@ -289,7 +289,7 @@ impl Cloud {
             let cell = slot_of(cells.0[lane]);
             if self.touches::<V>([at[0].0[lane], at[1].0[lane], at[2].0[lane]], radius, cell) {
                 found |= 1 << lane;
-                if !ALL {
+                if !all {
                     return found;
                 }
             }

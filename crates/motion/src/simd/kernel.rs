@@ -1,16 +1,16 @@
-//! Whether postures along an edge touch anything, for as many postures at once as there are lanes.
+//! Where postures along an edge touch something, for as many postures at once as there are lanes: kinematics, and one walk over all that may
+//! touch, whose [`Visitor`] says what becomes of that. [`sweep`](super::sweep) has the motions that are checked so.
 //!
-//! The postures of one batch are spread over the whole edge, later batches fill the gaps, so that the first batch most likely
-//! finds what is in the way (Thomason, Kingston, Kavraki: *Motions in Microseconds via Vectorized Sampling-Based Planning*, ICRA
-//! 2024). Kinematics first; then, for all links that are fixed to one frame together, the hand before the shoulder, the box that holds their
+//! The walk (Thomason, Kingston, Kavraki: *Motions in Microseconds via Vectorized Sampling-Based Planning*, ICRA 2024): for all links that are fixed to one frame together, the hand before the shoulder, the box that holds their
 //! bounding sphere in all lanes against those of the obstacles that it can reach at all, as many at once as there are lanes; the sphere
 //! against what is in there, nearest to the shoulder first; then the bounding sphere of each link and its fine spheres, only against
-//! obstacles that the larger sphere meets. Then clouds of points and pairs, in the same manner. Any touching lane ends it.
+//! obstacles that the larger sphere meets. Then clouds of points and pairs, in the same manner. [`walk_among`] does the same for what was noted before.
 //!
 //! There are no closures over vectors here: a closure that is not inlined is compiled without the instructions of its caller.
 
 use super::cloud::Cloud;
 use super::lanes::{Block, Lanes};
+use super::sweep::{Growth, Near, Spans};
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -105,27 +105,57 @@ pub(crate) struct Compiled {
     pub(crate) obstacles: Vec<Obstacle>,
     pub(crate) clouds: Vec<Arc<Cloud>>,
     pub(crate) slots: usize,
+    /// How its rigid parts, then its groups, move.
+    pub(crate) spans: Spans,
 }
 
-/// A sphere and what it touched: an obstacle, or a sphere of another link.
+/// What the spheres of a group may touch, by its index.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Contact {
-    /// The sphere's group, and which of its fine spheres it is.
-    sphere: (u32, u32),
-    with: With,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum With {
+pub(super) enum Other {
     Obstacle(u32),
-    Sphere(u32, u32),
+    Group(u32),
+    Cloud(u32),
 }
+
+/// A sphere of a group and what it touched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Contact {
+    pub(super) group: u32,
+    pub(super) other: Other,
+    /// Which of the fine spheres of the group, and which of the other group's.
+    spheres: (u32, u32),
+}
+
+/// What is done with what a walk finds.
+pub(super) trait Visitor {
+    /// Whether it asks for all lanes in which a group touches something, and not for one of them.
+    const ALL: bool;
+    /// A sphere touches something in these lanes. Whether the walk goes on.
+    fn touch(&mut self, contact: Contact, lanes: u32) -> bool;
+}
+
+/// Ends the walk at the first contact.
+#[derive(Default)]
+pub(super) struct First(Option<Contact>);
+
+impl Visitor for First {
+    const ALL: bool = false;
+
+    #[inline(always)]
+    fn touch(&mut self, contact: Contact, _: u32) -> bool {
+        self.0 = Some(contact);
+        false
+    }
+}
+
+/// Lists of what is near, one for each level of a swept check.
+pub(crate) const DEPTH: usize = 4;
 
 /// Contacts that are remembered: what was in the way of a motion is often in the way of the next one, too.
 const CONTACTS: usize = 4;
 
 /// Room for one batch.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub(crate) struct Scratch {
     /// What was touched last, the latest first.
     contacts: Vec<Contact>,
@@ -139,6 +169,9 @@ pub(crate) struct Scratch {
     coarse_stamps: Vec<u64>,
     fine_stamps: Vec<u64>,
     batch: u64,
+    pub(super) growth: Growth,
+    /// What is near: in each list, of a stretch within that of the list before.
+    pub(super) near: [Vec<Near>; DEPTH],
 }
 
 impl Scratch {
@@ -157,11 +190,14 @@ impl Scratch {
             coarse_stamps: vec![0; compiled.groups.len()],
             fine_stamps: vec![0; compiled.groups.len()],
             batch: 0,
+            growth: Growth::new(&compiled.spans),
+            near: std::array::from_fn(|_| Vec::new()),
         }
     }
 
-    /// Puts a contact before all others.
-    fn remember(&mut self, contact: Contact) {
+    /// Puts what ended a walk before all other contacts.
+    pub(super) fn remember(&mut self, First(found): First) {
+        let Some(contact) = found.filter(|contact| !matches!(contact.other, Other::Cloud(_))) else { return };
         let last = self.contacts.iter().position(|known| *known == contact).unwrap_or_else(|| {
             if self.contacts.len() == CONTACTS {
                 self.contacts[CONTACTS - 1] = contact;
@@ -182,25 +218,21 @@ pub(crate) struct Edge<'a> {
     pub(crate) delta: &'a [f32; LENGTH],
     /// How many batches; the end is checked, the start is not.
     pub(crate) batches: usize,
-    /// For the check that leaves nothing between postures: what the spheres of each rigid part, then of each group, grow by, beside half of
-    /// the greatest step of their bounding sphere. Empty for a check of the postures alone.
-    pub(crate) inflate: &'a [f32],
+    /// What is looked at.
+    pub(crate) among: Among,
 }
 
-/// Whether no posture touches anything.
-#[inline(always)]
-pub(super) fn is_free<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
-    for batch in 0..edge.batches {
-        if touching::<V, false>(edge, batch, scratch) != 0 {
-            return false;
-        }
-    }
-    true
+/// Everything (depth 0), or what the list before this depth has as near in one of these lanes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Among {
+    pub(crate) depth: usize,
+    pub(crate) lanes: u32,
 }
 
-/// Which postures of a batch touch something, a bit per lane; without `ALL` some of them, if there are any.
+/// Places the robot's frames in the postures of a batch. Those of one batch are spread over the whole edge, later batches fill the gaps, so
+/// that the first most likely finds what is in the way.
 #[inline(always)]
-pub(super) fn touching<V: Lanes, const ALL: bool>(edge: &Edge<'_>, batch: usize, scratch: &mut Scratch) -> u32 {
+pub(super) fn pose<V: Lanes>(edge: &Edge<'_>, batch: usize, scratch: &mut Scratch) {
     let mut fractions = Block([0.0; 16]);
     for lane in 0..V::WIDTH {
         fractions.0[lane] = (lane + 1) as f32 / V::WIDTH as f32;
@@ -209,28 +241,50 @@ pub(super) fn touching<V: Lanes, const ALL: bool>(edge: &Edge<'_>, batch: usize,
     let at = V::load(&fractions).sub(V::splat(batch as f32 * back));
     scratch.batch += 1;
     kinematics(edge, at, scratch);
-    if !ALL && batch == 0 && touches_again::<V>(edge, scratch) {
-        return V::ALL;
+}
+
+/// Shows a visitor all contacts in the postures of the batch, and says whether it went on to the end.
+#[inline(always)]
+pub(super) fn walk<V: Lanes, F: Visitor>(edge: &Edge<'_>, scratch: &mut Scratch, visitor: &mut F) -> bool {
+    in_obstacles::<V, F>(edge, scratch, visitor) && in_itself::<V, F>(edge, scratch, visitor)
+}
+
+/// As [`walk`], where only what was near in some of these lanes is looked at.
+#[inline(always)]
+pub(super) fn walk_among<V: Lanes, F: Visitor>(
+    edge: &Edge<'_>,
+    (near, lanes): (&[Near], u32),
+    scratch: &mut Scratch,
+    visitor: &mut F,
+) -> bool {
+    for Near { group, other, .. } in near.iter().filter(|near| near.lanes & lanes != 0) {
+        let group = *group as usize;
+        let goes_on = match other {
+            Other::Obstacle(number) => group_in_obstacle::<V, F>(edge, group, *number, V::ALL, scratch, visitor),
+            Other::Group(second) => groups_meet::<V, F>(edge, (group, *second as usize), scratch, visitor),
+            Other::Cloud(number) => group_in_cloud::<V, F>(edge, group, *number, V::ALL, scratch, visitor),
+        };
+        if !goes_on {
+            return false;
+        }
     }
-    let found = in_obstacles::<V, ALL>(edge, scratch);
-    if found != 0 && (!ALL || found == V::ALL) {
-        return found;
-    }
-    in_itself::<V, ALL>(edge, found, scratch)
+    true
 }
 
 /// Whether one of the remembered contacts is there again. It decides nothing that the whole check would not find.
 #[inline(always)]
-fn touches_again<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
+pub(super) fn touches_again<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
     for i in 0..scratch.contacts.len() {
-        let Contact { sphere, with } = scratch.contacts[i];
-        let (at, radius) = fine_sphere::<V>(edge, sphere, scratch);
-        let found = match with {
-            With::Obstacle(obstacle) => meets(at, radius, &edge.compiled.obstacles[obstacle as usize]),
-            With::Sphere(group, which) => {
-                let (other, more) = fine_sphere::<V>(edge, (group, which), scratch);
+        let Contact { group, other, spheres } = scratch.contacts[i];
+        let (at, radius) = fine_sphere::<V>(edge, (group, spheres.0), scratch);
+        let found = match other {
+            Other::Obstacle(obstacle) => meets(at, radius, &edge.compiled.obstacles[obstacle as usize]),
+            Other::Group(other) => {
+                let (other, more) = fine_sphere::<V>(edge, (other, spheres.1), scratch);
                 meet(at, other, radius + more)
             }
+            // None is remembered.
+            Other::Cloud(_) => 0,
         };
         if found != 0 {
             scratch.contacts[..=i].rotate_right(1);
@@ -358,19 +412,6 @@ fn fetch<V: Lanes>(from: &[Block; 3]) -> [V; 3] {
     [V::load(&from[0]), V::load(&from[1]), V::load(&from[2])]
 }
 
-/// How far a point goes from one lane to the next at most.
-#[inline(always)]
-fn greatest_step(point: &[Block; 3], width: usize) -> f32 {
-    let mut squares = [0.0_f32; 15];
-    for Block(along) in point {
-        for (i, square) in squares.iter_mut().enumerate() {
-            let step = along[i + 1] - along[i];
-            *square += step * step;
-        }
-    }
-    squares[..width - 1].iter().fold(0.0, |most: f32, square| if *square > most { *square } else { most }).sqrt()
-}
-
 /// Fills in the centre of a group's bounding sphere, once per batch.
 #[inline(always)]
 fn approach<V: Lanes>(edge: &Edge<'_>, index: usize, scratch: &mut Scratch) {
@@ -379,16 +420,7 @@ fn approach<V: Lanes>(edge: &Edge<'_>, index: usize, scratch: &mut Scratch) {
         let group = &edge.compiled.groups[index];
         let (at, grown) = &mut scratch.coarse[index];
         store(place::<V>(&scratch.frames[group.frame], &group.coarse), at);
-        *grown = grow::<V>(edge, edge.compiled.rigids.len() + index, at);
-    }
-}
-
-/// How much larger the spheres about a centre are in this batch.
-#[inline(always)]
-fn grow<V: Lanes>(edge: &Edge<'_>, index: usize, centre: &[Block; 3]) -> f32 {
-    match edge.inflate.get(index) {
-        Some(more) => more + 0.5 * greatest_step(centre, V::WIDTH),
-        None => 0.0,
+        *grown = scratch.growth.of::<V>(edge.compiled.rigids.len() + index, at);
     }
 }
 
@@ -405,14 +437,13 @@ fn refine<V: Lanes>(group: &Group, index: usize, scratch: &mut Scratch) {
 }
 
 #[inline(always)]
-fn in_obstacles<V: Lanes, const ALL: bool>(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
-    let mut found = 0;
+fn in_obstacles<V: Lanes, F: Visitor>(edge: &Edge<'_>, scratch: &mut Scratch, visitor: &mut F) -> bool {
     let compiled = edge.compiled;
     for (index, rigid) in compiled.rigids.iter().enumerate() {
         let centre = place::<V>(&scratch.frames[rigid.frame], &rigid.coarse);
         let (at, grown) = &mut scratch.rigid[index];
         store(centre, at);
-        *grown = grow::<V>(edge, index, at);
+        *grown = scratch.growth.of::<V>(index, at);
         if rigid.near.is_empty() && rigid.clouds.is_empty() {
             continue;
         }
@@ -423,101 +454,115 @@ fn in_obstacles<V: Lanes, const ALL: bool>(edge: &Edge<'_>, scratch: &mut Scratc
             while hits != 0 {
                 let number = row.obstacles[hits.trailing_zeros() as usize];
                 hits &= hits - 1;
-                let about = meets(centre, radius, &compiled.obstacles[number as usize]) & !found;
+                let about = meets(centre, radius, &compiled.obstacles[number as usize]);
                 if about == 0 {
                     continue;
                 }
                 for group in rigid.groups.clone() {
                     let about = if rigid.groups.len() == 1 { about } else { V::ALL };
-                    found |= group_in_obstacle::<V, ALL>(edge, group, number, about, found, scratch);
-                    if found != 0 && (!ALL || found == V::ALL) {
-                        return found;
+                    if !group_in_obstacle::<V, F>(edge, group, number, about, scratch, visitor) {
+                        return false;
                     }
                 }
             }
         }
-        for cloud in &rigid.clouds {
-            let cloud = &*compiled.clouds[*cloud as usize];
+        for number in &rigid.clouds {
+            let cloud = &*compiled.clouds[*number as usize];
             if cloud.is_beside(&bounds) {
                 continue;
             }
             let mut cells = Block([0.0; 16]);
-            let about = cloud.may_touch(centre, radius + cloud.radius, V::ALL & !found, &mut cells);
+            let about = cloud.may_touch(centre, radius + cloud.radius, V::ALL, &mut cells);
             if about == 0 {
                 continue;
             }
             for group in rigid.groups.clone() {
-                found |= group_in_cloud::<V, ALL>(edge, group, cloud, about & !found, scratch);
-                if found != 0 && (!ALL || found == V::ALL) {
-                    return found;
+                if !group_in_cloud::<V, F>(edge, group, *number, about, scratch, visitor) {
+                    return false;
                 }
             }
         }
     }
-    found
+    true
 }
 
-/// Where a group meets an obstacle, beside what was found; `about` says where its bounding sphere does, if that is known, and else all lanes.
+/// Where a group meets an obstacle; `about` says where its bounding sphere does, if that is known, and else all lanes.
 #[inline(always)]
-fn group_in_obstacle<V: Lanes, const ALL: bool>(
+fn group_in_obstacle<V: Lanes, F: Visitor>(
     edge: &Edge<'_>,
     index: usize,
     number: u32,
     mut about: u32,
-    mut found: u32,
     scratch: &mut Scratch,
-) -> u32 {
+    visitor: &mut F,
+) -> bool {
     let group = &edge.compiled.groups[index];
     let obstacle = &edge.compiled.obstacles[number as usize];
     approach::<V>(edge, index, scratch);
     let (at, grown) = &scratch.coarse[index];
     let grown = *grown;
     if about == V::ALL {
-        about = meets::<V>(fetch(at), group.coarse[3] + grown, obstacle) & !found;
+        about = meets::<V>(fetch(at), group.coarse[3] + grown, obstacle);
     }
-    if about == 0 || (ALL && group.fine.len() == 1) {
-        return about;
+    if about == 0 {
+        return true;
+    }
+    let contact = |which| Contact { group: index as u32, other: Other::Obstacle(number), spheres: (which, 0) };
+    if group.fine.len() == 1 {
+        return visitor.touch(contact(0), about);
     }
     refine::<V>(group, index, scratch);
     for (which, sphere) in group.fine.iter().enumerate() {
-        found |= meets::<V>(fetch(&scratch.fine[group.slot + which]), sphere[3] + grown, obstacle);
-        if found != 0 && (!ALL || found == V::ALL) {
-            if !ALL {
-                scratch.remember(Contact { sphere: (index as u32, which as u32), with: With::Obstacle(number) });
+        let lanes = meets::<V>(fetch(&scratch.fine[group.slot + which]), sphere[3] + grown, obstacle);
+        if lanes != 0 {
+            if !visitor.touch(contact(which as u32), lanes) {
+                return false;
             }
-            return found;
+            about &= !lanes;
+            if about == 0 {
+                break;
+            }
         }
     }
-    found
+    true
 }
 
-/// Which of some lanes of a group touch a cloud.
+/// Where a group touches a cloud, in some lanes.
 #[inline(always)]
-fn group_in_cloud<V: Lanes, const ALL: bool>(
+fn group_in_cloud<V: Lanes, F: Visitor>(
     edge: &Edge<'_>,
     index: usize,
-    cloud: &Cloud,
+    number: u32,
     mut about: u32,
     scratch: &mut Scratch,
-) -> u32 {
+    visitor: &mut F,
+) -> bool {
     let group = &edge.compiled.groups[index];
+    let cloud = &*edge.compiled.clouds[number as usize];
     approach::<V>(edge, index, scratch);
     let (at, grown) = &scratch.coarse[index];
     let grown = *grown + cloud.radius;
     let mut cells = Block([0.0; 16]);
     about = cloud.may_touch::<V>(fetch(at), group.coarse[3] + grown, about, &mut cells);
     if about == 0 {
-        return 0;
+        return true;
     }
     refine::<V>(group, index, scratch);
-    let mut found = 0;
-    for (sphere, at) in group.fine.iter().zip(&scratch.fine[group.slot..]) {
-        found |= cloud.touching::<V, ALL>(fetch(at), sphere[3] + grown, about & !found);
-        if found != 0 && (!ALL || found == about) {
-            return found;
+    for (which, sphere) in group.fine.iter().enumerate() {
+        let at = fetch(&scratch.fine[group.slot + which]);
+        let lanes = cloud.touching::<V>(at, sphere[3] + grown, about, F::ALL);
+        if lanes != 0 {
+            let spheres = (which as u32, 0);
+            if !visitor.touch(Contact { group: index as u32, other: Other::Cloud(number), spheres }, lanes) {
+                return false;
+            }
+            about &= !lanes;
+            if about == 0 {
+                break;
+            }
         }
     }
-    found
+    true
 }
 
 /// Greatest and least coordinates of spheres in all lanes, the least with the sign changed.
@@ -604,60 +649,64 @@ fn meet<V: Lanes>(a: [V; 3], b: [V; 3], reach: f32) -> u32 {
     squared(minus(a, b)).below(V::splat(reach * reach))
 }
 
-/// Adds to what was found where two links touch.
+/// Where links touch each other; the places of the rigid parts are known.
 #[inline(always)]
-fn in_itself<V: Lanes, const ALL: bool>(edge: &Edge<'_>, mut found: u32, scratch: &mut Scratch) -> u32 {
+fn in_itself<V: Lanes, F: Visitor>(edge: &Edge<'_>, scratch: &mut Scratch, visitor: &mut F) -> bool {
     for pair in &edge.compiled.pairs {
         let (i, j) = (pair.first as usize, pair.second as usize);
         let ((at_a, more_a), (at_b, more_b)) = (&scratch.rigid[i], &scratch.rigid[j]);
         let (a, b) = (&edge.compiled.rigids[i], &edge.compiled.rigids[j]);
         let reach = a.coarse[3] + b.coarse[3] + (more_a + more_b);
-        if meet::<V>(fetch(at_a), fetch(at_b), reach) & !found == 0 {
+        if meet::<V>(fetch(at_a), fetch(at_b), reach) == 0 {
             continue;
         }
         for (i, j) in &pair.groups {
-            found = groups_meet::<V, ALL>(edge, (*i as usize, *j as usize), found, scratch);
-            if found != 0 && (!ALL || found == V::ALL) {
-                return found;
+            if !groups_meet::<V, F>(edge, (*i as usize, *j as usize), scratch, visitor) {
+                return false;
             }
         }
     }
-    found
+    true
 }
 
-/// Adds to what was found where two groups touch.
+/// Where two groups touch.
 #[inline(always)]
-fn groups_meet<V: Lanes, const ALL: bool>(
+fn groups_meet<V: Lanes, F: Visitor>(
     edge: &Edge<'_>,
     (i, j): (usize, usize),
-    mut found: u32,
     scratch: &mut Scratch,
-) -> u32 {
+    visitor: &mut F,
+) -> bool {
     approach::<V>(edge, i, scratch);
     approach::<V>(edge, j, scratch);
     let (a, b) = (&edge.compiled.groups[i], &edge.compiled.groups[j]);
     let more = scratch.coarse[i].1 + scratch.coarse[j].1;
     let (at_a, at_b) = (fetch::<V>(&scratch.coarse[i].0), fetch::<V>(&scratch.coarse[j].0));
-    if meet(at_a, at_b, a.coarse[3] + b.coarse[3] + more) & !found == 0 {
-        return found;
+    // Where their bounding spheres meet and no others were found to.
+    let mut left = meet(at_a, at_b, a.coarse[3] + b.coarse[3] + more);
+    if left == 0 {
+        return true;
     }
     refine::<V>(a, i, scratch);
     for (p, sphere) in a.fine.iter().enumerate() {
         let at = fetch::<V>(&scratch.fine[a.slot + p]);
-        if meet(at, at_b, sphere[3] + b.coarse[3] + more) & !found == 0 {
+        if meet(at, at_b, sphere[3] + b.coarse[3] + more) & left == 0 {
             continue;
         }
         refine::<V>(b, j, scratch);
         for (q, other) in b.fine.iter().enumerate() {
-            found |= meet(at, fetch::<V>(&scratch.fine[b.slot + q]), sphere[3] + other[3] + more);
-            if found != 0 && (!ALL || found == V::ALL) {
-                if !ALL {
-                    let with = With::Sphere(j as u32, q as u32);
-                    scratch.remember(Contact { sphere: (i as u32, p as u32), with });
+            let lanes = meet(at, fetch::<V>(&scratch.fine[b.slot + q]), sphere[3] + other[3] + more);
+            if lanes != 0 {
+                let spheres = (p as u32, q as u32);
+                if !visitor.touch(Contact { group: i as u32, other: Other::Group(j as u32), spheres }, lanes) {
+                    return false;
                 }
-                return found;
+                left &= !lanes;
+                if left == 0 {
+                    return true;
+                }
             }
         }
     }
-    found
+    true
 }

@@ -8,8 +8,8 @@
 #![allow(unsafe_code, reason = "vector intrinsics behind a detected instruction set, see above")]
 
 use super::cloud::{self, Cloud};
-use super::kernel::{self, Edge, Scratch};
-use super::nearest;
+use super::kernel::{Edge, Scratch};
+use super::{nearest, sweep};
 
 /// Sixteen numbers on one cache line; narrower lanes use the first of them.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -97,7 +97,7 @@ impl Isa {
         }
     }
 
-    /// See [`kernel::is_free`].
+    /// See [`sweep::is_free`].
     #[inline]
     pub(crate) fn is_free(self, edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
         match self.0 {
@@ -110,24 +110,24 @@ impl Isa {
             // SAFETY: as above.
             #[cfg(target_arch = "aarch64")]
             Kind::Neon => unsafe { is_free_neon(edge, scratch) },
-            Kind::Plain => kernel::is_free::<[f32; 8]>(edge, scratch),
+            Kind::Plain => sweep::is_free::<[f32; 8]>(edge, scratch),
         }
     }
 
-    /// See [`kernel::touching`].
+    /// See [`sweep::near`].
     #[inline]
-    pub(crate) fn touching(self, edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
+    pub(crate) fn near(self, edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
         match self.0 {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx512 => unsafe { touching_avx512(edge, scratch) },
+            Kind::Avx512 => unsafe { near_avx512(edge, scratch) },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx2 => unsafe { touching_avx2(edge, scratch) },
+            Kind::Avx2 => unsafe { near_avx2(edge, scratch) },
             // SAFETY: as above.
             #[cfg(target_arch = "aarch64")]
-            Kind::Neon => unsafe { touching_neon(edge, scratch) },
-            Kind::Plain => kernel::touching::<[f32; 8], true>(edge, 0, scratch),
+            Kind::Neon => unsafe { near_neon(edge, scratch) },
+            Kind::Plain => sweep::near::<[f32; 8]>(edge, scratch),
         }
     }
 
@@ -165,25 +165,25 @@ impl Isa {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx2,fma")]
 fn is_free_avx512(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
-    kernel::is_free::<x86::Wide16>(edge, scratch)
+    sweep::is_free::<x86::Wide16>(edge, scratch)
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 fn is_free_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
-    kernel::is_free::<x86::Wide8>(edge, scratch)
+    sweep::is_free::<x86::Wide8>(edge, scratch)
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx2,fma")]
-fn touching_avx512(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
-    kernel::touching::<x86::Wide16, true>(edge, 0, scratch)
+fn near_avx512(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
+    sweep::near::<x86::Wide16>(edge, scratch)
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
-fn touching_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
-    kernel::touching::<x86::Wide8, true>(edge, 0, scratch)
+fn near_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
+    sweep::near::<x86::Wide8>(edge, scratch)
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -219,13 +219,13 @@ fn nearest_avx2(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16
 #[cfg(target_arch = "aarch64")]
 #[target_feature(enable = "neon")]
 fn is_free_neon(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
-    kernel::is_free::<arm::Pair>(edge, scratch)
+    sweep::is_free::<arm::Pair>(edge, scratch)
 }
 
 #[cfg(target_arch = "aarch64")]
 #[target_feature(enable = "neon")]
-fn touching_neon(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
-    kernel::touching::<arm::Pair, true>(edge, 0, scratch)
+fn near_neon(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
+    sweep::near::<arm::Pair>(edge, scratch)
 }
 
 impl Lanes for [f32; 8] {
