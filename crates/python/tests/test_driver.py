@@ -56,7 +56,7 @@ def test_a_hold_pauses_a_motion_which_then_goes_on(mover: Place) -> None:
     run, log = begun(mover, 150, "held")
     told = safety(mover, "hold")
     assert told.returncode == 0, told.stderr
-    until(lambda: "brakes: held" in mover.logs(), mover)
+    until(lambda: "brakes: held by the user" in mover.logs(), mover)
     steps = log.read_text().count('"message":"moving"')
     time.sleep(0.4)
     # One more may have been under way to the log.
@@ -80,6 +80,38 @@ def test_an_emergency_stop_ends_the_goal_and_outlasts_the_driver(mover: Place) -
     assert not (mover.folder / "stop.json").exists()
     ended = mover.run(mover.write("after.yaml", TASK.replace("STEPS", "2")))
     assert ended["outcome"] == "success" and ended["outputs"]["steps"] == 2, ended
+
+
+def test_the_brakes_of_a_pooled_driver_are_told_at_its_start(mover: Place) -> None:
+    log = mover.logs()
+    begun, let_go = log.find("brakes: held the driver has started"), log.find("brakes: ready")
+    assert 0 <= begun < let_go, log
+    assert log.find("brakes: held by the user") in (-1, *range(let_go, len(log)))
+
+
+def test_an_older_call_of_the_brakes_does_not_undo_a_stop(place: Place) -> None:
+    shutil.copy(TESTS / "workers" / "slow_brakes.py", place.folder)
+    pool = template("slow_brakes", "SlowBrakes", python="slow_brakes.py", interpreter=PYTHON, min=1, max=1, standstill_ms=2000)
+
+    def said(line: str) -> int:
+        return place.logs().count(line)
+
+    with place.up(place.write("system.toml", CONFIG + pool), "--speed", "1"):
+        before = said("brakes: ready begins")
+        (place.folder / "slow").touch()
+        assert safety(place, "hold").returncode == 0
+        command = [program(), "go-on", "--runtime-dir", str(place.runtime)]
+        going_on = subprocess.Popen(command, env=place.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        until(lambda: said("brakes: ready begins") == before + 1, place)
+        told = safety(place, "stop")
+        assert said("brakes: stopped done") >= 1, "the stop has not waited for the older call"
+        assert told.returncode != 0, f"confirmed while the brakes may let go: {told.stdout}"
+        (place.folder / "let_go").touch()
+        going_on.wait(30)
+        until(lambda: said("brakes: ready done") == before + 1, place)
+        told = safety(place, "stop")
+        assert told.returncode == 0, told.stdout + told.stderr
+        assert (place.folder / "motor").read_text() == "stopped"
 
 
 def test_a_driver_without_brakes_or_without_leases_does_not_start() -> None:

@@ -10,6 +10,7 @@ import asyncio
 import json
 import os
 import pathlib
+import secrets
 import shutil
 import signal
 import subprocess
@@ -17,14 +18,15 @@ import sys
 import tempfile
 import threading
 import time
+import weakref
 from collections.abc import AsyncIterator, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from ratn import _ratn, _views
-from ratn._expression import written
+from ratn._expression import expression
 from ratn._ratn import Error, Fact, Lease, Projected, WorldWatch
-from ratn._step import Step, refuse_while_read
+from ratn._step import kind_of, refuse_while_read
 from ratn._task import Task
 
 _READY = "the system is ready"
@@ -41,6 +43,22 @@ def _program() -> str:
     if found is None:
         raise Error("there is no program `ratn` in PATH: install it, or set RATN to its path")
     return found
+
+
+def _told(words: list[str]) -> subprocess.CompletedProcess[str]:
+    """What the program says."""
+    return subprocess.run([_program(), *words], capture_output=True, text=True, encoding="utf-8", errors="replace")
+
+
+def _text_of(file: pathlib.Path) -> str:
+    """What a process has written, as far as that is text."""
+    return file.read_text(encoding="utf-8", errors="replace")
+
+
+def _remove(folder: str, maker: int, processes: list[subprocess.Popen[Any]]) -> None:
+    """Removes a folder, unless a process still writes into it. A fork of the process that made it leaves it alone."""
+    if os.getpid() == maker and all(process.poll() is not None for process in processes):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _default_directory() -> pathlib.Path:
@@ -83,7 +101,8 @@ class System:
     ) -> None:
         refuse_while_read("it would start a system")
         self._process: subprocess.Popen[str] | None = None
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._clean: weakref.finalize[..., System] | None = None
+        self._maker = os.getpid()
         directory = pathlib.Path(runtime_dir) if runtime_dir is not None else _default_directory()
         if config is None and not options and (directory / "resource-manager.endpoint").exists():
             self.runtime_dir = directory
@@ -96,8 +115,9 @@ class System:
             raise
 
     def _start(self, config: object, runtime_dir: object, options: dict[str, object]) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="ratn-")
-        folder = pathlib.Path(self._folder.name)
+        folder = pathlib.Path(tempfile.mkdtemp(prefix="ratn-"))
+        # Without `close()` the system ends with this object, and writes there no more that anybody could ask for.
+        self._clean = weakref.finalize(self, _remove, str(folder), self._maker, [])
         self.runtime_dir = pathlib.Path(str(runtime_dir)) if runtime_dir is not None else folder / "run"
         command = [_program(), "up", "--exit-with-parent", "--runtime-dir", str(self.runtime_dir)]
         command += ["--config", str(config)] if config is not None else []
@@ -112,11 +132,11 @@ class System:
             )
         until = time.monotonic() + _READY_WITHIN_S
         try:
-            while _READY not in said.read_text():
+            while _READY not in _text_of(said):
                 if self._process.poll() is not None:
-                    raise Error(f"`ratn up` has ended: {said.read_text().strip()}")
+                    raise Error(f"`ratn up` has ended: {_text_of(said).strip()}")
                 if time.monotonic() > until:
-                    raise Error(f"the system was not ready within {_READY_WITHIN_S:.0f} s: {said.read_text().strip()}")
+                    raise Error(f"the system was not ready within {_READY_WITHIN_S:.0f} s: {_text_of(said).strip()}")
                 time.sleep(_LOOK_S)
         except BaseException:
             self._end()
@@ -132,11 +152,15 @@ class System:
         return f"<System at {self.runtime_dir}{'' if self._process is None else ', started here'}>"
 
     def close(self) -> None:
-        """Gives back what is held, and ends the system if it was started here."""
-        self._client.close()
-        self._end()
+        """Gives back what is held, and ends the system if it was started here. A fork of the process that opened it ends nothing."""
+        try:
+            self._client.close()
+        finally:
+            self._end()
 
     def _end(self) -> None:
+        if os.getpid() != self._maker:
+            return
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
             try:
@@ -147,9 +171,9 @@ class System:
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()
         self._process = None
-        if self._folder is not None:
-            self._folder.cleanup()
-            self._folder = None
+        if self._clean is not None:
+            self._clean()
+            self._clean = None
 
     def run(
         self,
@@ -165,7 +189,7 @@ class System:
     ) -> Run:
         """Begins a run of a task, or of a task file; its parameters are keyword arguments. ``mode`` is ``cdtn`` or ``hsm``.
 
-        It goes beside other runs of the system, unless it or one of them is to be ``alone``; ``urgency`` (``low``, ``normal``, ``high``) says whose needs come first. The steps of a task (``@ratn.step``) are performed by workers that live as long as the run: ``step_workers`` processes for each file.
+        It goes beside other runs of the system, unless it or one of them is to be ``alone``; ``urgency`` (``low``, ``normal``, ``high``) says whose needs come first. The steps of a task (``@ratn.step``) are performed by workers that are the run's own and live as long as it: ``step_workers`` processes for each file. The run's log is in a temporary folder unless ``log`` says where; that goes with the ``Run``, unless the run is under way then.
         """
         return Run(self, task, mode, seed, log, parameters, step_workers, alone, urgency)
 
@@ -184,7 +208,7 @@ class System:
 
     def pools(self) -> list[dict[str, Any]]:
         """The pools of worker processes of all hosts, as ``ratn ps --json`` has them."""
-        told = subprocess.run([_program(), "ps", "--json", "--runtime-dir", str(self.runtime_dir)], capture_output=True, text=True)
+        told = _told(["ps", "--json", "--runtime-dir", str(self.runtime_dir)])
         if not told.stdout.strip():
             raise Error(told.stderr.strip() or f"`ratn ps` has ended with code {told.returncode}")
         said = json.loads(told.stdout)
@@ -226,15 +250,20 @@ class Run:
         urgency: str = "normal",
     ) -> None:
         self._system = system
-        self._folder = tempfile.TemporaryDirectory(prefix="ratn-run-")
-        folder = pathlib.Path(self._folder.name)
+        folder = pathlib.Path(tempfile.mkdtemp(prefix="ratn-run-"))
+        self._processes: list[subprocess.Popen[Any]] = []
+        weakref.finalize(self, _remove, str(folder), os.getpid(), self._processes)
         #: The event log, which ``ratn report`` reads.
         self.log = pathlib.Path(log) if log is not None else folder / "run.jsonl"
         self._workers: list[subprocess.Popen[bytes]] = []
+        steps: dict[str, str] = {}
         if isinstance(task, Task):
+            # Steps are done by workers of this run alone: another one may have other workers of the same file.
+            token = secrets.token_hex(4)
+            providers = {provider: f"{provider}_{token}" for provider in task._step_files()}
+            steps = {providers[provider]: file for provider, file in task._step_files().items()}
             file = folder / f"{task.name or 'task'}.yaml"
-            file.write_text(task.standing_alone())
-            self._start_steps(list(task._steps.values()), step_workers, folder)
+            file.write_text((task._with_providers(providers) if providers else task).standing_alone(), encoding="utf-8")
             task = file
         command = [_program(), "run", os.fspath(task), "--json", "--mode", mode]
         command += ["--runtime-dir", str(system.runtime_dir), "--log", str(self.log)]
@@ -242,23 +271,32 @@ class Run:
         command += ["--urgency", urgency, *(["--alone"] if alone else [])]
         for name, value in parameters.items():
             # Texts are taken as they are.
-            command += ["--set", f"{name}={value if isinstance(value, str) else written(value)}"]
+            command += ["--set", f"{name}={value if isinstance(value, str) else expression(value)}"]
         self._said, self._told = folder / "result.json", folder / "messages"
-        with self._said.open("w") as output, self._told.open("w") as messages:
-            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=messages, start_new_session=True)
+        self._start_steps(steps, step_workers, folder)
+        try:
+            with self._said.open("w") as output, self._told.open("w") as messages:
+                self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=messages, start_new_session=True)
+        except BaseException:
+            self._end_steps()
+            raise
+        self._processes.append(self._process)
         if self._workers:
             # They end with the run, also where nobody asks for its result.
             threading.Thread(target=self._end_with_run, daemon=True).start()
 
-    def _start_steps(self, steps: list[Step], each: int, folder: pathlib.Path) -> None:
-        """Workers for the steps, one or more for each file, which offer themselves to the system."""
-        kinds = {step.file: step.kind for step in steps}
-        manager = (self._system.runtime_dir / "resource-manager.endpoint").read_text().strip() if kinds else ""
-        logs, ids = [], set()
-        for number, (file, kind) in enumerate((one for one in kinds.items() for _ in range(each)), 1):
-            name = f"{kind.lower()}-{os.getpid()}-{id(self) % 1_000_000}-{number}"
+    def _start_steps(self, steps: dict[str, str], each: int, folder: pathlib.Path) -> None:
+        """Workers for the steps, one or more for each provider with its file, which offer themselves to the system."""
+        if not steps:
+            return
+        if each < 1:
+            raise ValueError(f"step_workers is {each}: the steps of a task need a worker")
+        manager = (self._system.runtime_dir / "resource-manager.endpoint").read_text(encoding="utf-8").strip()
+        logs, ids, kinds = [], set(), {kind_of(provider) for provider in steps}
+        for number, (provider, file) in enumerate((one for one in steps.items() for _ in range(each)), 1):
+            name = f"{provider.replace('_', '-')}-{number}"
             said = folder / f"{name}.log"
-            command = [sys.executable, "-m", "ratn._step", file, "--id", name, "--kind", kind, "--resource-manager", manager]
+            command = [sys.executable, "-m", "ratn._step", file, provider, "--id", name, "--kind", kind_of(provider), "--resource-manager", manager]
             with said.open("wb") as output:
                 self._workers.append(
                     subprocess.Popen(
@@ -269,12 +307,12 @@ class Run:
             ids.add(name)
         until = time.monotonic() + _READY_WITHIN_S
         try:
-            while not ids <= {resource["id"] for resource in self._system.resources(*set(kinds.values()))}:
+            while not ids <= {resource["id"] for resource in self._system.resources(*kinds)}:
                 for worker, said in zip(self._workers, logs):
                     if worker.poll() is not None:
-                        raise Error(f"the worker of the steps has ended: {said.read_text().strip()}")
+                        raise Error(f"the worker of the steps has ended: {_text_of(said).strip()}")
                 if time.monotonic() > until:
-                    raise Error(f"the worker of the steps was not ready within {_READY_WITHIN_S:.0f} s: {logs[0].read_text().strip()}")
+                    raise Error(f"the worker of the steps was not ready within {_READY_WITHIN_S:.0f} s: {_text_of(logs[0]).strip()}")
                 time.sleep(_LOOK_S)
         except BaseException:
             self._end_steps()
@@ -306,7 +344,7 @@ class Run:
 
     def messages(self) -> str:
         """What the run has told people so far."""
-        return self._told.read_text()
+        return _text_of(self._told)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for events in self._pieces():
@@ -345,10 +383,11 @@ class Run:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             raise TimeoutError(f"the run has not ended within {timeout_s} s") from None
-        text = self._said.read_text().strip()
-        if not text:
-            raise Error(self.messages().strip() or f"the run has ended with code {self._process.returncode}")
-        said = json.loads(text)
+        try:
+            said = json.loads(_text_of(self._said))
+        except ValueError:
+            # It could not begin, or was killed.
+            raise Error(self.messages().strip() or f"the run has ended with code {self._process.returncode}") from None
         return Result(said["outcome"], said.get("outputs", {}), said.get("reason", ""), said.get("makespan_s", 0.0))
 
     @property
@@ -362,15 +401,14 @@ class Run:
         return self._tell(["control", *words, "--run", self.id])
 
     def _tell(self, words: list[str]) -> str:
-        command = [_program(), *words, "--runtime-dir", str(self._system.runtime_dir)]
-        told = subprocess.run(command, capture_output=True, text=True)
+        told = _told([*words, "--runtime-dir", str(self._system.runtime_dir)])
         if told.returncode != 0:
             raise Error(told.stderr.strip() or f"`ratn {words[0]}` has ended with code {told.returncode}")
         return told.stdout.strip()
 
     def signal(self, name: str, value: Any = None) -> None:
         """Sends a signal, which a state of the task waits for (``ratn.wait(signal="order")``), with a value. It is kept until one does."""
-        self._tell(["signal", self.id, name, *([] if value is None else [str(written(value))])])
+        self._tell(["signal", self.id, name, *([] if value is None else [expression(value)])])
 
     def answer(self, choice: str, *, state: str | None = None) -> None:
         """Answers the question of a state (``ratn.ask``); where several ask, of that of this path."""
@@ -436,7 +474,7 @@ class Run:
 
     def network(self) -> _views.Network:
         """What each instance of a state waited for, as a graph."""
-        told = subprocess.run([_program(), "export", "mermaid", str(self.log)], capture_output=True, text=True)
+        told = _told(["export", "mermaid", str(self.log)])
         if told.returncode != 0:
             raise Error(told.stderr.strip())
         return _views.Network(told.stdout.strip())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import contextvars
 import inspect
 import logging
@@ -12,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from ratn import _ports, _ratn
-from ratn._ratn import Cancelled, Goal
+from ratn._ratn import Aborted, Cancelled, Goal, Lost
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -67,6 +68,8 @@ class Worker:
         """
 
         def known(function: _Function) -> _Function:
+            if inspect.isgeneratorfunction(function) or inspect.isasyncgenfunction(function):
+                raise TypeError(f"{_ports.where(function)}: an action returns its outputs once, without `yield`; `goal.progress` tells how far it is")
             senses_, effects_ = list(senses), None if effects is None else list(effects)
             inputs, arrays = _ports.inputs_of(function)
             action = _ports.Action(
@@ -149,9 +152,10 @@ class Driver(Worker):
         """Makes a function the brakes: ``@d.brakes`` above ``def brake(state, reason): …``.
 
         It is called with ``"held"``, ``"stopped"`` or ``"ready"`` and with whoever asked for it and why, from another thread than the goals.
-        For the first two it returns when nothing moves; where it raises, the stop is in force and not confirmed. It is called for ``"stopped"`` at the
-        start, too, because the process before may have begun a motion, and may be called for a state that it has carried out already; an
-        emergency stop does not wait for an earlier call to return.
+        For the first two it returns when nothing moves; where it raises, the stop is in force and not confirmed. At the start it is called for
+        ``"held"`` (``"stopped"``, where a stop is kept) and then for ``"ready"``, because the process before may have begun a motion: no goal begins before
+        it has returned. It may be called for a state that it has carried out already. An emergency stop does not wait for an earlier call to return; it is
+        confirmed when that one has, and the brakes have been told once more, so that the newest state counts.
         """
         self._brakes = function
         return function
@@ -190,20 +194,42 @@ def _performed(
     for port in action.arrays & given.keys():
         import numpy
 
-        given[port] = numpy.asarray(given[port], dtype=float)
+        if given[port] is not None:
+            given[port] = numpy.asarray(given[port], dtype=float)
     # What a goal sets there is its own: its thread performs others after it.
-    ended = contextvars.copy_context().run(function, goal, **given)
-    if inspect.isawaitable(ended):
-        import asyncio
+    context = contextvars.copy_context()
+    try:
+        ended = context.run(function, goal, **given)
+        if inspect.isawaitable(ended):
+            import asyncio
 
-        ended = asyncio.run(_until_cancelled(goal, ended))
-    if isinstance(ended, Outcome):
-        return ended.name, ended.outputs, ended.reason
-    ended = {} if ended is None else ended
-    if not isinstance(ended, dict):
-        raise TypeError(f"{_ports.where(function)} returned a {type(ended).__name__}: expected a dict of outputs, or an Outcome")
+            ended = context.run(asyncio.run, _until_cancelled(goal, ended))
+    except BaseException as raised:
+        meant = _meant(raised)
+        if meant is raised:
+            raise
+        raise meant from None
+    name, outputs, reason = (ended.name, ended.outputs, ended.reason) if isinstance(ended, Outcome) else ("success", ended, "")
+    outputs = {} if outputs is None else outputs
+    if not isinstance(outputs, dict):
+        raise TypeError(f"{_ports.where(function)} returned a {type(outputs).__name__}: expected a dict of outputs, or an Outcome")
     kinds = dict(action.outputs)
-    return "success", {port: _ports.fitting(value, kinds.get(port, "any")) for port, value in ended.items()}, ""
+    return name, {port: _ports.fitting(value, kinds.get(port, "any")) for port, value in outputs.items()}, str(reason)
+
+
+def _meant(raised: BaseException) -> BaseException:
+    """What tasks of asyncio that belong together (`asyncio.TaskGroup`) have raised of what ends a goal as its action wants; else what was raised."""
+    group = getattr(builtins, "BaseExceptionGroup", ())
+    each, waiting = [], [raised]
+    while waiting:
+        one = waiting.pop(0)
+        if isinstance(one, group):
+            waiting += one.exceptions  # type: ignore[attr-defined]
+        else:
+            each.append(one)
+    kinds = (Cancelled, Lost, Aborted)
+    wanted = [one for kind in kinds for one in each if isinstance(one, kind)]
+    return wanted[0] if len(wanted) == len(each) else raised
 
 
 async def _until_cancelled(goal: Goal, work: Any) -> Any:

@@ -4,7 +4,9 @@ import asyncio
 import contextvars
 import logging
 import os
+import sys
 import time
+import weakref
 from typing import Annotated, Any, TypedDict
 
 import numpy as np
@@ -106,6 +108,71 @@ def spin(goal: ratn.Goal, rounds: int) -> dict:
 @w.action(senses=["at(?)"])
 def look(goal: ratn.Goal) -> None:
     goal.measured("at(ball)", ratn.Pose(1, 2, 3), covariance=np.eye(6) * 0.25, source="eye")
+
+
+@w.action(computes=True, reads=[])
+def leave(goal: ratn.Goal, how: str) -> dict:
+    if how == "interrupt":
+        raise KeyboardInterrupt("by the action")
+    sys.exit("no more of this")
+    return {}
+
+
+@w.action(computes=True, reads=[])
+async def leave_later(goal: ratn.Goal) -> dict:
+    await asyncio.sleep(0)
+    sys.exit("no more of that")
+    return {}
+
+
+@w.action(outputs={"refused": str}, computes=True, reads=[])
+def tell(goal: ratn.Goal, length: int) -> dict:
+    try:
+        goal.progress("x" * length, picture=b"x" * length)
+    except ValueError as refused:
+        return {"refused": str(refused)}
+    return {"refused": ""}
+
+
+@w.action(outputs={"heard": str}, computes=True, reads=[])
+def ask(goal: ratn.Goal) -> dict:
+    try:
+        goal.call("Nearest", "nearest", begin=ratn.Pose())
+    except ratn.Aborted as refused:
+        return {"heard": str(refused)}
+    return {"heard": ""}
+
+
+@w.action(computes=True, reads=[])
+async def together(goal: ratn.Goal) -> dict:
+    async def fail() -> None:
+        raise ratn.Aborted("apart")
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(fail())
+    return {}
+
+
+class Heard:
+    def __call__(self) -> None: ...
+
+
+watching: weakref.WeakSet = weakref.WeakSet()
+
+
+@w.action(outputs={"watching": int}, computes=True, reads=[])
+def watched(goal: ratn.Goal) -> dict:
+    """Zählt, was auf frühere Ziele noch hört 🤖."""
+    before = len(watching)
+    heard = Heard()
+    watching.add(heard)
+    goal.on_cancel(heard)
+    return {"watching": before}
+
+
+@w.action(outputs={"joints": ratn.Joints, "given": bool}, computes=True, reads=[])
+def odd(goal: ratn.Goal, numbers: np.ndarray | None = None) -> ratn.Outcome:
+    return ratn.Outcome("success", {"joints": [1, 2.5], "given": isinstance(numbers, np.ndarray)})
 
 
 w.run()
