@@ -105,7 +105,7 @@ impl Goal {
     }
 
     /// Says how far it is, to whoever listens and to the event log; figures as keyword arguments. The message and the figures have at most 16 KiB together
-    /// (`ValueError`).
+    /// (`ValueError`); what comes more than 100 times a second is not told.
     #[pyo3(signature = (message, /, **figures))]
     fn progress(&self, message: String, figures: Option<&Bound<'_, PyDict>>) -> PyResult<()> {
         let figures = figures.map(fields_from_python).transpose()?.unwrap_or_default();

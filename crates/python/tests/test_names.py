@@ -309,9 +309,13 @@ def test_descriptions_survive_a_catalogue_and_stubs(text: str) -> None:
 
     said = {"computes": True, "reads": ["at(?)", 'at("ö")'], "effects": [], "duration": "0.5", "anytime": True}
     actions = [{"action": "eye/look", "resource": "Eye", "inputs": {"at": "pose"}, "description": text, "annotations": said, "defaults": {}}]
+    # Names that are none of Python are no stubs.
+    actions += [{**actions[0], "action": name} for name in ("eye/3d_scan", "eye/a.b-c", "eye/class", "odd-one/look")]
     catalogue = _stubs.toml(actions)
     known = json.loads(_ratn.catalogue([catalogue]))["providers"]["eye"]["actions"]["look"]
     assert known["description"] == text and known["annotations"] == said
-    compile(_stubs.stubs(catalogue, "a test"), "stubs.pyi", "exec")
+    stubs = _stubs.stubs(catalogue, "a test")
+    compile(stubs, "stubs.pyi", "exec")
+    assert "def look(" in stubs and "3d_scan" not in stubs and "odd" not in stubs.partition("class _Odometry")[0]
 
 

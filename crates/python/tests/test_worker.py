@@ -177,6 +177,8 @@ def test_an_action_that_would_leave_the_process_is_aborted_and_the_worker_goes_o
 
 def test_what_an_action_tells_of_its_progress_has_a_bound(tester: Place) -> None:
     assert performed(tester, "tells_little", "tell", "{ length: 4096 }", "refused") == ""
+    ended = tester.run(tester.write("tells_often.yaml", task("tells_often", state("it", "tester/tell_often", "Tester", "{ times: 2000 }"))))
+    assert ended["outcome"] == "success" and 0 < ended["log"].count('"message":"once more"') < 600, "100 at once, and 100 in a second"
     assert "at most 16384" in str(performed(tester, "tells_much", "tell", "{ length: 12000 }", "refused"))
 
 

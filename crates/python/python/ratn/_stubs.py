@@ -51,14 +51,15 @@ def stubs(catalogue: str | None, what: str) -> str:
     """The text of a ``.pyi`` with a class for each provider."""
     providers: dict[str, Any] = json.loads(_ratn.catalogue([] if catalogue is None else [catalogue]))["providers"]
     parts = [_HEAD.format(what=what)]
-    for name, provider in sorted(providers.items()):
+    for name, provider in sorted(item for item in providers.items() if _is_name(item[0])):
         parts.append(_provider(name, provider))
     return "".join(parts).rstrip() + "\n"
 
 
 def _provider(name: str, provider: dict[str, Any]) -> str:
     states, methods = [], []
-    for action, signature in sorted(provider["actions"].items()):
+    # What is no name of Python is performed by `ratn.action("provider/3d-scan", …)`.
+    for action, signature in sorted(item for item in provider["actions"].items() if _is_name(item[0])):
         state = "".join(part.capitalize() for part in f"{name}_{action}".split("_"))
         outputs = [port for port in sorted(signature.get("outputs", {})) if _is_name(port)]
         states.append(f"class _{state}(ratn.State):\n" + ("".join(f"    {port}: Value\n" for port in outputs) or "    ...\n"))
@@ -68,7 +69,7 @@ def _provider(name: str, provider: dict[str, Any]) -> str:
         star = "        *,\n" if given else ""
         methods.append(f"    def {action}(\n        self,\n{star}{given}        **annotations: Unpack[Annotations],\n    ) -> _{state}:{_document(signature)}\n")
     title = "".join(part.capitalize() for part in name.split("_"))
-    return "".join(f"{state}\n" for state in states) + f"class _{title}:\n{''.join(methods)}\n{name}: _{title}\n\n"
+    return "".join(f"{state}\n" for state in states) + f"class _{title}:\n{''.join(methods) or '    ...\n'}\n{name}: _{title}\n\n"
 
 
 def _document(signature: dict[str, Any]) -> str:

@@ -10,6 +10,7 @@ import asyncio
 import json
 import os
 import pathlib
+import re
 import secrets
 import shutil
 import signal
@@ -33,6 +34,8 @@ _READY = "the system is ready"
 _READY_WITHIN_S = 60.0
 _ENDED_WITHIN_S = 20.0
 _LOOK_S = 0.02
+#: What a process manager tells the workers of its pools. A worker of steps is in none, also where the program that runs the task is.
+_OF_POOLED = ("RATN_PROVIDER_SESSION", "RATN_RESOURCE_MANAGER", "RATN_STANDSTILL_MS", "RATN_WORKER_LISTEN")
 
 
 def _program() -> str:
@@ -262,7 +265,7 @@ class Run:
             token = secrets.token_hex(4)
             providers = {provider: f"{provider}_{token}" for provider in task._step_files()}
             steps = {providers[provider]: file for provider, file in task._step_files().items()}
-            file = folder / f"{task.name or 'task'}.yaml"
+            file = folder / f"{re.sub(r'[^A-Za-z0-9_]', '_', task.name) or 'task'}.yaml"
             file.write_text((task._with_providers(providers) if providers else task).standing_alone(), encoding="utf-8")
             task = file
         command = [_program(), "run", os.fspath(task), "--json", "--mode", mode]
@@ -292,6 +295,7 @@ class Run:
         if each < 1:
             raise ValueError(f"step_workers is {each}: the steps of a task need a worker")
         manager = (self._system.runtime_dir / "resource-manager.endpoint").read_text(encoding="utf-8").strip()
+        environment = {name: value for name, value in os.environ.items() if name not in _OF_POOLED}
         logs, ids, kinds = [], set(), {kind_of(provider) for provider in steps}
         for number, (provider, file) in enumerate((one for one in steps.items() for _ in range(each)), 1):
             name = f"{provider.replace('_', '-')}-{number}"
@@ -300,7 +304,8 @@ class Run:
             with said.open("wb") as output:
                 self._workers.append(
                     subprocess.Popen(
-                        [*command, "--exit-with-parent"], stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+                        [*command, "--exit-with-parent"], stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
+                        env=environment,
                     )
                 )
             logs.append(said)

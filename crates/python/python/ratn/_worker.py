@@ -224,7 +224,7 @@ def _meant(raised: BaseException) -> BaseException:
     while waiting:
         one = waiting.pop(0)
         if isinstance(one, group):
-            waiting += one.exceptions  # type: ignore[attr-defined]
+            waiting += one.exceptions
         else:
             each.append(one)
     kinds = (Cancelled, Lost, Aborted)

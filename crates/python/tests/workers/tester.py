@@ -134,6 +134,16 @@ def tell(goal: ratn.Goal, length: int) -> dict:
     return {"refused": ""}
 
 
+@w.action(computes=True, reads=[])
+def tell_often(goal: ratn.Goal, times: int) -> dict:
+    for number in range(times):
+        goal.progress("once more", number=number)
+        if number % 50 == 0:
+            # Whoever listens keeps up.
+            time.sleep(0.01)
+    return {"times": times}
+
+
 @w.action(outputs={"heard": str}, computes=True, reads=[])
 def ask(goal: ratn.Goal) -> dict:
     try:

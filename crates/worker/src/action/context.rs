@@ -5,6 +5,7 @@ use super::goal::GoalEntry;
 use crate::client::{ActionClient, CallError, Channels, WorldClient, retry_unanswered};
 use crate::endpoint::{Endpoint, EndpointError};
 use crate::safety::{Safety, SafetyState};
+use crate::token_bucket::TokenBucket;
 use ratn_model::fact::{Change, FactPattern};
 use ratn_model::id::ProjectionId;
 use ratn_model::program::{PREEMPTED, STOPPED};
@@ -17,8 +18,9 @@ use ratn_proto::v1;
 use ratn_world::scene::delta::DeltaError;
 use ratn_world::world::{ChangeError, World};
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
@@ -26,6 +28,10 @@ use tonic::Code;
 /// What an action says of its progress at once, the message and the named values together, has at most so many bytes. Of a goal the last 64 are
 /// kept for a listener that is slow, so that it never keeps more than a mebibyte of them.
 pub const MAX_PROGRESS_BYTES: usize = 16 * 1024;
+
+/// A goal tells of its progress at most so often in a second, and so often at once. What comes beyond that is not told, so that the sum of what it
+/// tells in a second is bounded, too.
+pub const MAX_PROGRESS_PER_S: u32 = 100;
 
 /// Bytes of a message that are told where the whole is too long.
 const SHORTENED_PROGRESS_BYTES: usize = 1024;
@@ -55,6 +61,7 @@ pub struct GoalContext {
     pub(super) safety: Safety,
     entry: Arc<GoalEntry>,
     calls: AtomicU32,
+    progress_left: Mutex<TokenBucket>,
 }
 
 /// Why the world cannot be read.
@@ -171,6 +178,7 @@ impl GoalContext {
             safety,
             entry,
             calls: AtomicU32::new(0),
+            progress_left: Mutex::new(TokenBucket::full(MAX_PROGRESS_PER_S, Instant::now())),
         }
     }
 
@@ -180,8 +188,13 @@ impl GoalContext {
     }
 
     /// As [`GoalContext::progress`], with named values beside the message. Of what has more than [`MAX_PROGRESS_BYTES`] only the beginning of the message is
-    /// told.
+    /// told, and what comes more often than [`MAX_PROGRESS_PER_S`] is not told.
     pub fn progress_with(&self, message: impl Into<String>, values: BTreeMap<String, Value>) {
+        let mut left = self.progress_left.lock().unwrap_or_else(PoisonError::into_inner);
+        if !left.take(MAX_PROGRESS_PER_S, MAX_PROGRESS_PER_S, Instant::now()) {
+            return;
+        }
+        drop(left);
         // Nobody may be listening.
         let _ = self.entry.progress.send(bounded(message.into(), values));
     }
