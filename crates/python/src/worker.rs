@@ -25,7 +25,7 @@ use tracing_subscriber::EnvFilter;
 
 /// Threads of goals that have not ended are left alone after this long.
 const LAST_THREADS: Duration = Duration::from_secs(1);
-/// No more of a traceback goes into a run's reason.
+/// No more of a traceback, or of what else an action says, goes into a run's reason.
 const MAX_TRACEBACK_BYTES: usize = 8 * 1024;
 
 /// An action as Python describes it.
@@ -313,7 +313,7 @@ fn perform(py: Python<'_>, context: &Arc<GoalContext>, function: &Py<PyAny>, run
         let ended = function.bind(py).call1((&goal, inputs));
         goal.get().is_over();
         let (outcome, outputs, reason): (String, Bound<'_, PyDict>, String) = ended?.extract()?;
-        let outputs = fields_from_python(&outputs)?;
+        let (outputs, reason) = (fields_from_python(&outputs)?, shortened(reason));
         Ok(goal.get().with_measured(GoalOutcome { outputs, reason, ..GoalOutcome::named(&outcome) }))
     };
     given().map_err(|error| failure(py, context, &error))
@@ -332,10 +332,10 @@ fn failure(py: Python<'_>, context: &GoalContext, error: &PyErr) -> ActionFailur
         }
     }
     if error.is_instance_of::<Lost>(py) {
-        return ActionFailure::Lost(message());
+        return ActionFailure::Lost(shortened(message()));
     }
     if error.is_instance_of::<Aborted>(py) {
-        return ActionFailure::Aborted(message());
+        return ActionFailure::Aborted(shortened(message()));
     }
     let traceback = error.traceback(py).and_then(|traceback| traceback.format().ok()).unwrap_or_default();
     // Not `print`, which would end the process for a `SystemExit`.

@@ -122,6 +122,26 @@ def test_a_driver_without_brakes_or_without_leases_does_not_start() -> None:
     with pytest.raises(ValueError, match="only for whoever holds it"):
         driver.run([], without_leases=True)
 
+    async def later(state: str, reason: str) -> None: ...
+
+    # Called, it would have done nothing.
+    with pytest.raises(TypeError, match="the brakes are a plain function"):
+        driver.brakes(later)
+
+
+def test_brakes_that_have_done_nothing_confirm_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    driver = ratn.Driver("mover")
+    driver.action(lambda goal: {}, name="move", outputs={})
+
+    async def later() -> None: ...
+
+    driver.brakes(lambda state, reason: later())
+    served: list[object] = []
+    monkeypatch.setattr(ratn._ratn, "serve", lambda *given: served.append(given[-1]))
+    driver.run([])
+    with pytest.raises(TypeError, match="the brakes returned a coroutine"):
+        served[0].brakes("stopped", "a test")  # type: ignore[attr-defined]
+
 
 def test_a_pool_without_a_bound_for_standstill_refuses_the_driver(place: Place) -> None:
     shutil.copy(TESTS / "workers" / "mover.py", place.folder)

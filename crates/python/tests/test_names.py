@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import json
 import pathlib
 from collections.abc import Callable
@@ -271,6 +272,24 @@ def test_an_f_string_that_is_no_annotation_is_refused() -> None:
 
     text = annotated.to_yaml()
     assert "pose($n, 0, 0)" in text and "at($n) = $n + 1" in text and '"$n > 1"' in text and "i in range($n)" in text and "\u2063" not in text, text
+
+
+def test_a_member_of_an_enumeration_is_its_value() -> None:
+    class Colour(str, enum.Enum):
+        RED = "red"
+
+    class Size(enum.IntEnum):
+        LARGE = 3
+
+    @ratn.task
+    def enumerations(colour: str = Colour.RED, size: int = Size.LARGE) -> dict:  # type: ignore[type-arg]
+        ratn.action("printer/say", {"colour": Colour.RED, "size": Size.LARGE, "both": [Size.LARGE, {"colour": Colour.RED}]}, resources=["Printer"])
+        return {"more": fn.len([Size.LARGE, Colour.RED]) + Size.LARGE}
+
+    text = enumerations.to_yaml()
+    for part in ("in: { colour: red, size: 3, both: [3, { colour: red }] }", 'more: "len([3, red]) + 3"', "default: red", "default: 3"):
+        assert part in text, text
+    assert "Colour" not in text and "LARGE" not in text
 
 
 def test_a_state_is_no_value() -> None:

@@ -20,18 +20,19 @@ NO_CATALOGUE = 'catalogues = ["built-in"]\n[process-manager]\nhost = "compute"\n
 
 @pytest.fixture(scope="module")
 def tester(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
-    """A system with the two workers of these tests, of which its catalogue knows nothing."""
+    """A system with the workers of these tests, of which its catalogue knows nothing."""
     import tempfile
 
     with tempfile.TemporaryDirectory(prefix="ratn-py-") as folder:
         place = Place(pathlib.Path(folder))
-        for name in ("tester.py", "nearest.py"):
+        for name in ("tester.py", "nearest.py", "lingerer.py"):
             shutil.copy(TESTS / "workers" / name, folder)
         config = place.write(
             "system.toml",
             NO_CATALOGUE
             + template("tester", "Tester", python="tester.py", interpreter=PYTHON, max=2, min=1)
-            + template("nearest", "Nearest", python="nearest.py", interpreter=PYTHON),
+            + template("nearest", "Nearest", python="nearest.py", interpreter=PYTHON)
+            + template("lingerer", "Lingerer", python="lingerer.py", interpreter=PYTHON),
         )
         with place.up(config, "--speed", "1"):
             yield place
@@ -175,6 +176,19 @@ def test_an_action_that_would_leave_the_process_is_aborted_and_the_worker_goes_o
         assert performed(tester, f"after_{name}_{number}", "echo", "{ value: 3 }", "echo") == 3
 
 
+@pytest.mark.parametrize(("how", "reason"), [("long", "ää\n…\nää"), ("unprintable", "Unprintable: "), ("group", "several (2 sub-exceptions)")])
+def test_an_unusual_exception_is_a_reason_like_others(tester: Place, how: str, reason: str) -> None:
+    if how == "group" and sys.version_info < (3, 11):
+        pytest.skip("there are no groups of exceptions")
+    ended = tester.run(tester.write(f"unusual_{how}.yaml", task(f"unusual_{how}", state("it", "tester/unusual", "Tester", f"{{ how: {how} }}"))))
+    assert ended["outcome"] == "aborted" and reason in ended["reason"] and len(ended["reason"]) < 20_000, ended["reason"][:2_000]
+    assert performed(tester, f"after_unusual_{how}", "echo", "{ value: 3 }", "echo") == 3
+
+
+def test_a_process_that_an_action_forks_leaves_the_goal_to_it(tester: Place) -> None:
+    assert performed(tester, "forks", "forks", "{}", "codes") == [7, 0, 1]
+
+
 def test_what_an_action_tells_of_its_progress_has_a_bound(tester: Place) -> None:
     assert performed(tester, "tells_little", "tell", "{ length: 4096 }", "refused") == ""
     ended = tester.run(tester.write("tells_often.yaml", task("tells_often", state("it", "tester/tell_often", "Tester", "{ times: 2000 }"))))
@@ -187,6 +201,13 @@ def test_an_input_that_an_action_does_not_have_is_refused_with_those_that_it_has
     ended = tester.run(tester.write("asks.yaml", text))
     assert ended["outcome"] == "success", ended
     assert "`begin`" in ended["outputs"]["out"] and "start, within_m" in ended["outputs"]["out"], ended
+
+
+def test_a_call_of_another_provider_is_given_up_with_its_goal(tester: Place) -> None:
+    text = task("through", state("it", "tester/through", "Tester, Lingerer", "{ seconds: 60 }", "computes: true, reads: [], timeout: 1"))
+    ended = tester.run(tester.write("through.yaml", text), timeout=50)
+    assert ended["outcome"] != "success" and ended["log"].count('"message":"calls"') == 1, ended
+    assert "INFO tester: the call was given up" in tester.logs()
 
 
 def test_what_a_group_of_tasks_raises_is_what_the_action_means(tester: Place) -> None:

@@ -51,8 +51,10 @@ _KEYS = {name: key for key, name in _source.RENAMED.items()}
 
 def entry(value: object) -> Any:
     """A value of Python where a task file has an expression."""
-    if value is None or isinstance(value, (bool, int, float)) and not hasattr(value, "tolist"):
+    if value is None or isinstance(value, bool):
         return value
+    if isinstance(value, (int, float)) and not hasattr(value, "tolist"):
+        return int(value) if isinstance(value, int) else float(value)
     if isinstance(value, dict):
         return {literal(str(name), "a name"): entry(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):

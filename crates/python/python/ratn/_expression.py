@@ -438,7 +438,8 @@ def written(value: object) -> object:
     if getattr(type(value), "_is_state", False):
         refuse("a state is no value", "name one of its outputs, `look.boxes`")
     if isinstance(value, str):
-        literal(value)
+        # What an enumeration says of itself is another text than its value.
+        value = str.__str__(literal(value))
         return value if _WORD.match(value) and value not in _KEYWORDS else json.dumps(value, ensure_ascii=False)
     if isinstance(value, range) and value.step == 1:
         return f"range({value.start}, {value.stop})" if value.start else f"range({value.stop})"
@@ -457,7 +458,7 @@ def written(value: object) -> object:
     if isinstance(value, (int, float)) and not hasattr(value, "tolist"):
         if not math.isfinite(value):
             refuse(f"{value} is no number of a task", "use finite numbers")
-        return repr(value)
+        return int.__repr__(value) if isinstance(value, int) else float.__repr__(value)
     if hasattr(value, "tolist"):
         return written(value.tolist())
     refuse(f"a {type(value).__name__} is no value of a task", "use numbers, texts, lists, dicts, ratn.Pose, ratn.Joints, or values of the task")

@@ -6,11 +6,12 @@ import builtins
 import contextvars
 import inspect
 import logging
+import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from ratn import _ports, _ratn
 from ratn._ratn import Aborted, Cancelled, Goal, Lost
@@ -157,6 +158,8 @@ class Driver(Worker):
         it has returned. It may be called for a state that it has carried out already. An emergency stop does not wait for an earlier call to return; it is
         confirmed when that one has, and the brakes have been told once more, so that the newest state counts.
         """
+        if any(kind(function) for kind in (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.isasyncgenfunction)):
+            raise TypeError(f"{_ports.where(function)}: the brakes are a plain function, without `async` and `yield`: nothing moves when it has returned")
         self._brakes = function
         return function
 
@@ -167,7 +170,15 @@ class Driver(Worker):
         if self._brakes is None:
             raise ValueError("the driver has no brakes: decorate a function with `@driver.brakes`, which returns when nothing moves")
         arguments = sys.argv[1:] if arguments is None else arguments
-        self._serve(_at_a_socket(arguments), False, Driven(self._brakes, self._stop_file, self._standstill_s))
+        brakes = self._brakes
+
+        def apply(state: str, reason: str) -> None:
+            said = brakes(state, reason)
+            if inspect.isawaitable(said) or inspect.isgenerator(said):
+                getattr(said, "close", lambda: None)()
+                raise TypeError(f"the brakes returned a {type(said).__name__}, so they have not done anything: nothing moves when they have returned")
+
+        self._serve(_at_a_socket(arguments), False, Driven(apply, self._stop_file, self._standstill_s))
 
 
 def _at_a_socket(arguments: list[str]) -> list[str]:
@@ -197,14 +208,18 @@ def _performed(
         if given[port] is not None:
             given[port] = numpy.asarray(given[port], dtype=float)
     # What a goal sets there is its own: its thread performs others after it.
-    context = contextvars.copy_context()
+    context, process = contextvars.copy_context(), os.getpid()
     try:
         ended = context.run(function, goal, **given)
         if inspect.isawaitable(ended):
             import asyncio
 
             ended = context.run(asyncio.run, _until_cancelled(goal, ended))
+        if os.getpid() != process:
+            _leave_fork(None)
     except BaseException as raised:
+        if os.getpid() != process:
+            _leave_fork(raised)
         meant = _meant(raised)
         if meant is raised:
             raise
@@ -215,6 +230,18 @@ def _performed(
         raise TypeError(f"{_ports.where(function)} returned a {type(outputs).__name__}: expected a dict of outputs, or an Outcome")
     kinds = dict(action.outputs)
     return name, {port: _ports.fitting(value, kinds.get(port, "any")) for port, value in outputs.items()}, str(reason)
+
+
+def _leave_fork(raised: BaseException | None) -> NoReturn:
+    """Ends a process that an action has forked and that has come back here: the goal is that of the process before it."""
+    code = 0 if raised is None else 1
+    if isinstance(raised, SystemExit):
+        code = raised.code if isinstance(raised.code, int) else 0 if raised.code is None else 1
+    elif raised is not None:
+        sys.excepthook(type(raised), raised, raised.__traceback__)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code & 0xFF)
 
 
 def _meant(raised: BaseException) -> BaseException:

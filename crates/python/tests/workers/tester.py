@@ -118,6 +118,37 @@ def leave(goal: ratn.Goal, how: str) -> dict:
     return {}
 
 
+@w.action(outputs={"codes": list[int]}, computes=True, reads=[])
+def forks(goal: ratn.Goal) -> dict:
+    """Its children leave by what an action may leave by, too."""
+    codes = []
+    for ending in ("exit", "return", "raise"):
+        child = os.fork()
+        if child == 0:
+            if ending == "exit":
+                sys.exit(7)
+            if ending == "raise":
+                raise ValueError("of the child")
+            return {"codes": []}
+        codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+    return {"codes": codes}
+
+
+class Unprintable(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("has no text")
+
+
+@w.action(computes=True, reads=[])
+def unusual(goal: ratn.Goal, how: str) -> dict:
+    if how == "long":
+        raise ratn.Aborted("ä" * 20_000_000)
+    if how == "group":
+        raise BaseExceptionGroup("several", [ratn.Aborted("one"), SystemExit(3)])
+    raise Unprintable
+    return {}
+
+
 @w.action(computes=True, reads=[])
 async def leave_later(goal: ratn.Goal) -> dict:
     await asyncio.sleep(0)
@@ -151,6 +182,17 @@ def ask(goal: ratn.Goal) -> dict:
     except ratn.Aborted as refused:
         return {"heard": str(refused)}
     return {"heard": ""}
+
+
+@w.action(computes=True, reads=[])
+def through(goal: ratn.Goal, seconds: float) -> dict:
+    goal.progress("calls")
+    try:
+        goal.call("Lingerer", "linger", seconds=seconds)
+    except ratn.Cancelled:
+        log.info("the call was given up")
+        raise
+    return {}
 
 
 @w.action(computes=True, reads=[])
