@@ -214,6 +214,23 @@ def test_the_steps_of_a_run_are_done_by_its_own_workers(system: ratn.System, tmp
         assert {*result.outputs["files"]} == {str(script)} and result.outputs["other"] == str(tmp_path / "other" / "whose.py")
 
 
+def test_a_worker_of_steps_that_dies_is_replaced_and_not_for_ever(system: ratn.System, tmp_path: pathlib.Path) -> None:
+    import runpy
+
+    script = tmp_path / "dying.py"
+    script.write_text(
+        "import os, pathlib, ratn\n\n@ratn.step\ndef die(times: int) -> dict:\n    died = pathlib.Path(__file__).with_suffix(f'.{times}')\n"
+        "    before = len(died.read_text()) if died.exists() else 0\n    if before < times:\n        died.write_text('x' * (before + 1))\n        os._exit(3)\n"
+        "    return {'before': before}\n\n"
+        "@ratn.task\ndef dying(times: int = 1) -> dict:\n    it = die(times=times)\n    return {'before': it.before}\n"
+    )
+    task = runpy.run_path(str(script), run_name="dying")["dying"]
+    result = system.run(task, times=1).result(60)
+    assert result.is_success and result.outputs == {"before": 1}, result
+    result = system.run(task, times=100).result(60)
+    assert not result.is_success, result
+
+
 def test_a_step_whose_file_does_not_load_is_told(system: ratn.System, tmp_path: pathlib.Path) -> None:
     script = tmp_path / "odd.py"
     good = "import ratn\n\n@ratn.step\ndef one() -> dict:\n    return {'a': 1}\n\n@ratn.task\ndef odd() -> None:\n    one()\n"

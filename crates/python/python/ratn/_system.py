@@ -34,6 +34,9 @@ _READY = "the system is ready"
 _READY_WITHIN_S = 60.0
 _ENDED_WITHIN_S = 20.0
 _LOOK_S = 0.02
+#: How often it is looked whether the workers of steps are there, and how many take the place of others in a run.
+_LOOK_AT_WORKERS_S = 0.2
+_WORKERS_AGAIN = 3
 #: What a process manager tells the workers of its pools. A worker of steps is in none, also where the program that runs the task is.
 _OF_POOLED = ("RATN_PROVIDER_SESSION", "RATN_RESOURCE_MANAGER", "RATN_STANDSTILL_MS", "RATN_WORKER_LISTEN")
 
@@ -237,6 +240,16 @@ class System:
         return self._client.watch(*patterns)
 
 
+@dataclass(frozen=True)
+class _OfSteps:
+    """A worker of steps."""
+
+    id: str
+    provider: str
+    file: str
+    said: pathlib.Path
+
+
 class Run:
     """A run under way. Iterating over it (``for`` or ``async for``) gives the events of its log as dicts, until it has ended."""
 
@@ -259,6 +272,8 @@ class Run:
         #: The event log, which ``ratn report`` reads.
         self.log = pathlib.Path(log) if log is not None else folder / "run.jsonl"
         self._workers: list[subprocess.Popen[bytes]] = []
+        self._of_steps: list[_OfSteps] = []
+        self._begun, self._lost = 0, ""
         steps: dict[str, str] = {}
         if isinstance(task, Task):
             # Steps are done by workers of this run alone: another one may have other workers of the same file.
@@ -286,7 +301,7 @@ class Run:
         self._processes.append(self._process)
         if self._workers:
             # They end with the run, also where nobody asks for its result.
-            threading.Thread(target=self._end_with_run, daemon=True).start()
+            threading.Thread(target=self._end_with_run, args=[folder], daemon=True).start()
 
     def _start_steps(self, steps: dict[str, str], each: int, folder: pathlib.Path) -> None:
         """Workers for the steps, one or more for each provider with its file, which offer themselves to the system."""
@@ -294,38 +309,69 @@ class Run:
             return
         if each < 1:
             raise ValueError(f"step_workers is {each}: the steps of a task need a worker")
-        manager = (self._system.runtime_dir / "resource-manager.endpoint").read_text(encoding="utf-8").strip()
-        environment = {name: value for name, value in os.environ.items() if name not in _OF_POOLED}
-        logs, ids, kinds = [], set(), {kind_of(provider) for provider in steps}
-        for number, (provider, file) in enumerate((one for one in steps.items() for _ in range(each)), 1):
-            name = f"{provider.replace('_', '-')}-{number}"
-            said = folder / f"{name}.log"
-            command = [sys.executable, "-m", "ratn._step", file, provider, "--id", name, "--kind", kind_of(provider), "--resource-manager", manager]
-            with said.open("wb") as output:
-                self._workers.append(
-                    subprocess.Popen(
-                        [*command, "--exit-with-parent"], stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
-                        env=environment,
-                    )
-                )
-            logs.append(said)
-            ids.add(name)
+        kinds, each_of = {kind_of(provider) for provider in steps}, [one for one in steps.items() for _ in range(each)]
         until = time.monotonic() + _READY_WITHIN_S
         try:
-            while not ids <= {resource["id"] for resource in self._system.resources(*kinds)}:
-                for worker, said in zip(self._workers, logs):
+            for provider, file in each_of:
+                self._start_worker(provider, file, folder)
+            while not {step.id for step in self._of_steps} <= {resource["id"] for resource in self._system.resources(*kinds)}:
+                for worker, step in zip(self._workers, self._of_steps):
                     if worker.poll() is not None:
-                        raise Error(f"the worker of the steps has ended: {_text_of(said).strip()}")
+                        raise Error(f"the worker of the steps has ended: {_text_of(step.said).strip()}")
                 if time.monotonic() > until:
-                    raise Error(f"the worker of the steps was not ready within {_READY_WITHIN_S:.0f} s: {_text_of(logs[0]).strip()}")
+                    said = _text_of(self._of_steps[0].said).strip()
+                    raise Error(f"the worker of the steps was not ready within {_READY_WITHIN_S:.0f} s: {said}")
                 time.sleep(_LOOK_S)
         except BaseException:
             self._end_steps()
             raise
 
-    def _end_with_run(self) -> None:
-        self._process.wait()
+    def _start_worker(self, provider: str, file: str, folder: pathlib.Path, place: int | None = None) -> None:
+        """Starts a worker of steps, in the place of one that has ended where that is said."""
+        self._begun += 1
+        name = f"{provider.replace('_', '-')}-{self._begun}"
+        said = folder / f"{name}.log"
+        manager = (self._system.runtime_dir / "resource-manager.endpoint").read_text(encoding="utf-8").strip()
+        command = [sys.executable, "-m", "ratn._step", file, provider, "--id", name, "--kind", kind_of(provider), "--resource-manager", manager]
+        command.append("--exit-with-parent")
+        environment = {name: value for name, value in os.environ.items() if name not in _OF_POOLED}
+        with said.open("wb") as output:
+            worker = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True, env=environment
+            )
+        step = _OfSteps(name, provider, file, said)
+        if place is None:
+            self._workers.append(worker)
+            self._of_steps.append(step)
+        else:
+            self._workers[place], self._of_steps[place] = worker, step
+
+    def _end_with_run(self, folder: pathlib.Path) -> None:
+        """Has others take the place of workers that end before the run does; without any it would wait for ever."""
+        left = _WORKERS_AGAIN
+        while True:
+            try:
+                self._process.wait(_LOOK_AT_WORKERS_S)
+                break
+            except subprocess.TimeoutExpired:
+                pass
+            for place, (worker, step) in enumerate(zip(self._workers, self._of_steps)):
+                if worker.poll() is None or self._lost:
+                    continue
+                if left == 0:
+                    self._lost = f"a worker of the steps in {step.file} has ended, and {_WORKERS_AGAIN} others before it: {_text_of(step.said).strip()}"
+                    self._abort_without_steps()
+                else:
+                    left -= 1
+                    self._start_worker(step.provider, step.file, folder, place)
         self._end_steps()
+
+    def _abort_without_steps(self) -> None:
+        try:
+            self.abort()
+        except (Error, OSError):
+            # It is ending, or does not listen: its process is told.
+            self._process.terminate()
 
     def _end_steps(self) -> None:
         for worker in self._workers:
@@ -393,7 +439,8 @@ class Run:
         except ValueError:
             # It could not begin, or was killed.
             raise Error(self.messages().strip() or f"the run has ended with code {self._process.returncode}") from None
-        return Result(said["outcome"], said.get("outputs", {}), said.get("reason", ""), said.get("makespan_s", 0.0))
+        reason = "; ".join(part for part in (said.get("reason", ""), self._lost) if part)
+        return Result(said["outcome"], said.get("outputs", {}), reason, said.get("makespan_s", 0.0))
 
     @property
     def id(self) -> str:
