@@ -69,7 +69,8 @@ def _provider(name: str, provider: dict[str, Any]) -> str:
         star = "        *,\n" if given else ""
         methods.append(f"    def {action}(\n        self,\n{star}{given}        **annotations: Unpack[Annotations],\n    ) -> _{state}:{_document(signature)}\n")
     title = "".join(part.capitalize() for part in name.split("_"))
-    return "".join(f"{state}\n" for state in states) + f"class _{title}:\n{''.join(methods) or '    ...\n'}\n{name}: _{title}\n\n"
+    inside = "".join(methods) or "    ...\n"
+    return "".join(f"{state}\n" for state in states) + f"class _{title}:\n{inside}\n{name}: _{title}\n\n"
 
 
 def _document(signature: dict[str, Any]) -> str:
