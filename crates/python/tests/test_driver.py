@@ -89,6 +89,19 @@ def test_the_brakes_of_a_pooled_driver_are_told_at_its_start(mover: Place) -> No
     assert log.find("brakes: held by the user") in (-1, *range(let_go, len(log)))
 
 
+def test_a_pooled_driver_that_starts_while_it_is_stopped_is_told(place: Place) -> None:
+    shutil.copy(TESTS / "workers" / "mover.py", place.folder)
+    place.write("stop.json", "a test")
+    pool = template("mover", "Mover", python="mover.py", interpreter=PYTHON, min=1, max=1, standstill_ms=2000)
+    with place.up(place.write("system.toml", CONFIG + pool), "--speed", "1"):
+        ended = place.run(place.write("stopped.yaml", TASK.replace("STEPS", "2")))
+        assert ended["outcome"] != "success" and "a test" in ended["reason"], ended
+        assert "brakes: stopped a test" in place.logs() and "brakes: ready" not in place.logs(), place.logs()
+        assert safety(place, "stop", "--clear").returncode == 0
+        until(lambda: "brakes: ready" in place.logs(), place)
+        assert place.run(place.write("cleared.yaml", TASK.replace("STEPS", "2")))["outcome"] == "success"
+
+
 def test_an_older_call_of_the_brakes_does_not_undo_a_stop(place: Place) -> None:
     shutil.copy(TESTS / "workers" / "slow_brakes.py", place.folder)
     pool = template("slow_brakes", "SlowBrakes", python="slow_brakes.py", interpreter=PYTHON, min=1, max=1, standstill_ms=2000)
