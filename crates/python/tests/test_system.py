@@ -88,6 +88,15 @@ def test_a_resource_is_held_for_a_block_and_nobody_else_gets_it(system: ratn.Sys
     assert lease.release() is False
 
 
+def test_what_a_block_raises_is_not_hidden_by_what_cannot_be_given_back(system: ratn.System) -> None:
+    assert system.resources("Camera")
+    with ratn.System(boxes=1, speed=50) as own:
+        with pytest.raises(KeyError):
+            with own.acquire("Camera"):
+                own._end()
+                raise KeyError("inside")
+
+
 def test_python_goes_on_while_a_thread_waits_for_a_resource(system: ratn.System) -> None:
     with system.acquire("Camera"):
         got: list[ratn.Lease] = []
