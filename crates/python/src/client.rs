@@ -190,7 +190,8 @@ impl Client {
         let requirements = kinds.iter().map(|kind| Requirement::new(ResourceOperation::Block, kind)).collect();
         let options = AcquireOptions { request: fresh_id("python"), priority, deadline, holder: holder.to_owned() };
         let granted = wait_for(py, &self.runtime, held.client.acquire(requirements, options))?;
-        Ok(Lease { granted, held, runtime: Arc::clone(&self.runtime) })
+        let generation = held.session.state().borrow().generation;
+        Ok(Lease { granted, held, generation, runtime: Arc::clone(&self.runtime) })
     }
 
     /// The resources, each as a dict; of these kinds, where any is given.
@@ -303,6 +304,8 @@ impl Client {
 pub(crate) struct Lease {
     granted: ratn_model::resource::Lease,
     held: Arc<Held>,
+    /// Which of the sessions of this id, of which a manager that was started anew makes another one.
+    generation: u64,
     runtime: Arc<OwnRuntime>,
 }
 
@@ -326,10 +329,11 @@ impl Lease {
         each.map(|held| (held.id.clone(), held.kind.clone(), held.endpoint.clone())).collect()
     }
 
-    /// Whether the session in whose name it is held still lives, as far as is known here.
+    /// Whether the session in whose name it is held still lives, as far as is known here. One that the manager has made anew holds nothing of before.
     #[getter]
     fn alive(&self) -> bool {
-        self.held.session.state().borrow().alive
+        let state = *self.held.session.state().borrow();
+        state.alive && state.generation == self.generation
     }
 
     /// Gives the resources back; false where the lease had ended before.

@@ -97,6 +97,26 @@ def test_what_a_block_raises_is_not_hidden_by_what_cannot_be_given_back(system: 
                 raise KeyError("inside")
 
 
+def test_a_lease_of_a_manager_that_was_started_anew_is_not_alive(place: Place) -> None:
+    config = place.write("system.toml", 'catalogues = ["built-in"]\n[process-manager]\nhost = "compute"\n')
+    with place.up(config):
+        system = ratn.System(runtime_dir=place.runtime)
+        watch = system.watch("at(nothing)")
+        lease = system.acquire("Camera", timeout_s=20)
+        assert lease.alive and next(watch)["written"] == []
+    with pytest.raises(ratn.Unavailable):
+        system.query()
+    with place.up(config):
+        # The same object goes on with the new one.
+        with system.acquire("Camera", timeout_s=20) as again:
+            assert again.alive and not lease.alive and again.token > lease.token
+        assert system.query("at(nothing)") == []
+        assert lease.release() is False
+        with pytest.raises(ratn.Unavailable):
+            next(watch)
+        system.close()
+
+
 def test_python_goes_on_while_a_thread_waits_for_a_resource(system: ratn.System) -> None:
     with system.acquire("Camera"):
         got: list[ratn.Lease] = []
