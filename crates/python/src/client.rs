@@ -2,9 +2,9 @@
 
 use crate::error::{Error, Unavailable, line, of_call};
 use crate::value::{Fact, from_python};
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyKeyboardInterrupt, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyDict, PyTuple};
 use ratn_model::fact::{Change, FactPattern, Footprint};
 use ratn_model::id::ProjectionId;
 use ratn_model::resource::{Requirement, ResourceOperation};
@@ -14,13 +14,13 @@ use ratn_worker::client::{
 };
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
-use ratn_worker::session::{DEFAULT_TTL, Session};
+use ratn_worker::session::{DEFAULT_TTL, Session, SessionError};
 use ratn_worker::tls::ClientTls;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::runtime::{Builder, Runtime};
-use tokio::sync::mpsc;
+use tokio::sync::{Mutex as AsyncMutex, mpsc};
 
 /// A resource manager that opens no session for so long is not there.
 const SESSION_PATIENCE: Duration = Duration::from_secs(5);
@@ -35,11 +35,45 @@ const MAX_UPDATES: usize = 64;
 /// What speaks to the system whose endpoint files are in a directory.
 #[pyclass(frozen, module = "ratn")]
 pub(crate) struct Client {
-    runtime: Arc<Runtime>,
+    runtime: Arc<OwnRuntime>,
     channels: Channels,
     resource_manager: Endpoint,
     world: WorldClient,
-    session: Mutex<Option<Arc<Held>>>,
+    /// Waited for only without Python's lock: whoever has it waits for Python's lock.
+    session: AsyncMutex<Option<Arc<Held>>>,
+}
+
+/// A runtime, which works in the process that made it only: the threads are not there in a fork of that.
+struct OwnRuntime {
+    /// Until this is dropped.
+    runtime: Option<Runtime>,
+    process: u32,
+}
+
+impl OwnRuntime {
+    fn is_here(&self) -> bool {
+        self.process == std::process::id()
+    }
+
+    fn here(&self) -> PyResult<&Runtime> {
+        if let Some(runtime) = self.runtime.as_ref().filter(|_| self.is_here()) {
+            return Ok(runtime);
+        }
+        Err(Error::new_err(format!(
+            "this system was opened by process {}, of which this one ({}) is a fork: open it here, `ratn.System(runtime_dir=system.runtime_dir)`",
+            self.process,
+            std::process::id()
+        )))
+    }
+}
+
+impl Drop for OwnRuntime {
+    fn drop(&mut self) {
+        if !self.is_here() {
+            // A fork would wait for threads that it does not have.
+            std::mem::forget(self.runtime.take());
+        }
+    }
 }
 
 /// A session, and what asks in its name.
@@ -48,35 +82,64 @@ struct Held {
     client: ResourceClient,
 }
 
+/// Why there is no session.
+enum NoSession {
+    Silent(SessionError),
+    Refused(CallError),
+}
+
 impl Client {
+    /// The session of the process, which the first who asks for it opens; whoever asks meanwhile waits.
     fn held(&self, py: Python<'_>) -> PyResult<Arc<Held>> {
-        let mut kept = self.session.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(held) = kept.as_ref() {
-            return Ok(Arc::clone(held));
-        }
-        let _within = self.runtime.enter();
-        let session = Session::open(&self.channels, &self.resource_manager, "python", DEFAULT_TTL);
-        let alive = py.detach(|| self.runtime.block_on(session.alive(SESSION_PATIENCE)));
-        alive.map_err(|error| Unavailable::new_err(line(&error)))?;
-        let client = ResourceClient::new(&self.channels, &self.resource_manager, session.id());
-        let client = client.map_err(|error| of_call(&error))?;
-        Ok(Arc::clone(kept.insert(Arc::new(Held { session, client }))))
+        let opened = async {
+            let mut kept = self.session.lock().await;
+            // One whose id is another caller's comes to nothing any more.
+            if let Some(held) = kept.as_ref().filter(|held| !held.session.state().borrow().taken) {
+                return Ok(Arc::clone(held));
+            }
+            let session = Session::open(&self.channels, &self.resource_manager, "python", DEFAULT_TTL);
+            session.alive(SESSION_PATIENCE).await.map_err(NoSession::Silent)?;
+            let client = ResourceClient::new(&self.channels, &self.resource_manager, session.id());
+            let client = client.map_err(NoSession::Refused)?;
+            Ok(Arc::clone(kept.insert(Arc::new(Held { session, client }))))
+        };
+        wait(py, &self.runtime, opened)?.map_err(|error| match error {
+            NoSession::Silent(error) => Unavailable::new_err(line(&error)),
+            NoSession::Refused(error) => of_call(&error),
+        })
     }
 }
 
 /// Waits without Python's lock, and hears Ctrl-C meanwhile.
 fn wait_for<T: Send>(
     py: Python<'_>,
-    runtime: &Runtime,
+    runtime: &OwnRuntime,
     work: impl Future<Output = Result<T, CallError>> + Send,
 ) -> PyResult<T> {
+    wait(py, runtime, work)?.map_err(|error| of_call(&error))
+}
+
+/// As [`wait_for`], for anything.
+fn wait<T: Send>(py: Python<'_>, runtime: &OwnRuntime, work: impl Future<Output = T> + Send) -> PyResult<T> {
+    let runtime = runtime.here()?;
+    // What is given up may have something to say in the runtime.
+    let _within = runtime.enter();
     let mut work = Box::pin(work);
     loop {
         let waited = py.detach(|| runtime.block_on(async { tokio::time::timeout(SIGNALS, &mut work).await }));
         match waited {
-            Ok(ended) => return ended.map_err(|error| of_call(&error)),
+            Ok(ended) => return Ok(ended),
             Err(_) => py.check_signals()?,
         }
+    }
+}
+
+/// The end of a `with` block: where something was raised inside, that is what counts.
+fn left(released: PyResult<bool>, exception: &Bound<'_, PyTuple>) -> PyResult<bool> {
+    let has_raised = exception.get_item(0).is_ok_and(|kind| !kind.is_none());
+    match released {
+        Err(error) if !has_raised || error.is_instance_of::<PyKeyboardInterrupt>(exception.py()) => Err(error),
+        _ => Ok(false),
     }
 }
 
@@ -107,7 +170,8 @@ impl Client {
         let channels = Channels::new(&tls);
         let world = py.detach(|| runtime.block_on(async { WorldClient::new(&channels, &world_pool) }));
         let world = world.map_err(|error| of_call(&error))?;
-        Ok(Client { runtime: Arc::new(runtime), channels, resource_manager, world, session: Mutex::default() })
+        let runtime = Arc::new(OwnRuntime { runtime: Some(runtime), process: std::process::id() });
+        Ok(Client { runtime, channels, resource_manager, world, session: AsyncMutex::default() })
     }
 
     /// Waits until one of each of the kinds is free, and takes them under one lease.
@@ -126,15 +190,17 @@ impl Client {
         let requirements = kinds.iter().map(|kind| Requirement::new(ResourceOperation::Block, kind)).collect();
         let options = AcquireOptions { request: fresh_id("python"), priority, deadline, holder: holder.to_owned() };
         let granted = wait_for(py, &self.runtime, held.client.acquire(requirements, options))?;
-        Ok(Lease { granted, held, runtime: Arc::clone(&self.runtime) })
+        let generation = held.session.state().borrow().generation;
+        Ok(Lease { granted, held, generation, runtime: Arc::clone(&self.runtime) })
     }
 
     /// The resources, each as a dict; of these kinds, where any is given.
     #[pyo3(signature = (*kinds))]
     fn resources<'py>(&self, py: Python<'py>, kinds: Vec<String>) -> PyResult<Vec<Bound<'py, PyDict>>> {
-        let _within = self.runtime.enter();
-        let client =
-            ResourceClient::new(&self.channels, &self.resource_manager, "").map_err(|error| of_call(&error))?;
+        let client = {
+            let _within = self.runtime.here()?.enter();
+            ResourceClient::new(&self.channels, &self.resource_manager, "").map_err(|error| of_call(&error))?
+        };
         let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();
         let found = wait_for(py, &self.runtime, client.list(&kinds))?;
         let shown = found.iter().map(|resource| {
@@ -191,7 +257,8 @@ impl Client {
         match made() {
             Ok((base, id)) => Ok(Projected { base: base.0, id, lease, world: self.world.clone() }),
             Err(error) => {
-                lease.release(py)?;
+                // What went wrong first is what counts; the lease ends with the session otherwise.
+                let _ = lease.release(py);
                 Err(error)
             }
         }
@@ -203,8 +270,14 @@ impl Client {
         let patterns = patterns_of(&patterns)?;
         let mut watch = wait_for(py, &self.runtime, self.world.watch(None, &patterns))?;
         let (tell, updates) = mpsc::channel(MAX_UPDATES);
-        self.runtime.spawn(async move {
-            while let Some(update) = watch.next().await.transpose() {
+        self.runtime.here()?.spawn(async move {
+            loop {
+                let update = tokio::select! {
+                    // Nobody iterates over it any more, and it may be long until the next change.
+                    () = tell.closed() => return,
+                    update = watch.next() => update,
+                };
+                let Some(update) = update.transpose() else { return };
                 if tell.send(update).await.is_err() {
                     return;
                 }
@@ -213,13 +286,16 @@ impl Client {
         Ok(WorldWatch { runtime: Arc::clone(&self.runtime), updates: Mutex::new(updates) })
     }
 
-    /// Ends the session, with all that it holds.
+    /// Ends the session, with all that it holds. A fork of the process that opened it ends nothing.
     fn close(&self, py: Python<'_>) {
-        let kept = self.session.lock().unwrap_or_else(PoisonError::into_inner).take();
-        // Where a lease is still in use, its last user ends it.
-        if let Some(held) = kept.and_then(Arc::into_inner) {
-            py.detach(|| self.runtime.block_on(held.session.close()));
-        }
+        let Ok(runtime) = self.runtime.here() else { return };
+        let closed = async {
+            // Where a lease is still in use, its last user ends it.
+            if let Some(held) = self.session.lock().await.take().and_then(Arc::into_inner) {
+                held.session.close().await;
+            }
+        };
+        py.detach(|| runtime.block_on(closed));
     }
 }
 
@@ -228,7 +304,9 @@ impl Client {
 pub(crate) struct Lease {
     granted: ratn_model::resource::Lease,
     held: Arc<Held>,
-    runtime: Arc<Runtime>,
+    /// Which of the sessions of this id, of which a manager that was started anew makes another one.
+    generation: u64,
+    runtime: Arc<OwnRuntime>,
 }
 
 #[pymethods]
@@ -251,10 +329,11 @@ impl Lease {
         each.map(|held| (held.id.clone(), held.kind.clone(), held.endpoint.clone())).collect()
     }
 
-    /// Whether the session in whose name it is held still lives, as far as is known here.
+    /// Whether the session in whose name it is held still lives, as far as is known here. One that the manager has made anew holds nothing of before.
     #[getter]
     fn alive(&self) -> bool {
-        self.held.session.state().borrow().alive
+        let state = *self.held.session.state().borrow();
+        state.alive && state.generation == self.generation
     }
 
     /// Gives the resources back; false where the lease had ended before.
@@ -267,9 +346,8 @@ impl Lease {
     }
 
     #[pyo3(signature = (*_exception))]
-    fn __exit__(&self, py: Python<'_>, _exception: &Bound<'_, pyo3::types::PyTuple>) -> PyResult<bool> {
-        self.release(py)?;
-        Ok(false)
+    fn __exit__(&self, py: Python<'_>, _exception: &Bound<'_, PyTuple>) -> PyResult<bool> {
+        left(self.release(py), _exception)
     }
 
     fn __repr__(&self) -> String {
@@ -314,9 +392,8 @@ impl Projected {
     }
 
     #[pyo3(signature = (*_exception))]
-    fn __exit__(&self, py: Python<'_>, _exception: &Bound<'_, pyo3::types::PyTuple>) -> PyResult<bool> {
-        self.release(py)?;
-        Ok(false)
+    fn __exit__(&self, py: Python<'_>, _exception: &Bound<'_, PyTuple>) -> PyResult<bool> {
+        left(self.release(py), _exception)
     }
 
     fn __repr__(&self) -> String {
@@ -327,7 +404,7 @@ impl Projected {
 /// What holds, then each revision of the root world, as dicts with `revision`, `written` (facts) and `gone` (texts).
 #[pyclass(frozen, module = "ratn")]
 pub(crate) struct WorldWatch {
-    runtime: Arc<Runtime>,
+    runtime: Arc<OwnRuntime>,
     updates: Mutex<mpsc::Receiver<Result<WorldUpdate, CallError>>>,
 }
 
@@ -338,9 +415,10 @@ impl WorldWatch {
     }
 
     fn __next__<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
+        let runtime = self.runtime.here()?;
         let next = || {
             let mut updates = self.updates.lock().unwrap_or_else(PoisonError::into_inner);
-            self.runtime.block_on(async { tokio::time::timeout(SIGNALS, updates.recv()).await })
+            runtime.block_on(async { tokio::time::timeout(SIGNALS, updates.recv()).await })
         };
         let update = loop {
             match py.detach(next) {

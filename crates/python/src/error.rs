@@ -1,8 +1,9 @@
 //! The exceptions of the package. Each has the words of whoever refused, which say what to do next.
 
 use pyo3::create_exception;
-use pyo3::exceptions::PyException;
+use pyo3::exceptions::{PyBaseException, PyException};
 use pyo3::prelude::*;
+use ratn_model::program::{PREEMPTED, STOPPED};
 use ratn_worker::action::{ActionFailure, WorldFailure};
 use ratn_worker::client::CallError;
 use std::error::Error as StdError;
@@ -118,7 +119,28 @@ pub(crate) fn of_world(failure: WorldFailure) -> PyErr {
 pub(crate) fn of_failure(failure: ActionFailure) -> PyErr {
     match failure {
         ActionFailure::Aborted(reason) => Aborted::new_err(reason),
-        ActionFailure::Preempted(reason) | ActionFailure::Stopped(reason) => Cancelled::new_err(reason),
+        ActionFailure::Preempted(reason) => cancelled(PREEMPTED, reason),
+        ActionFailure::Stopped(reason) => cancelled(STOPPED, reason),
         ActionFailure::Lost(reason) => Lost::new_err(reason),
+    }
+}
+
+/// With the outcome that it comes to where it is let through.
+fn cancelled(outcome: &str, reason: String) -> PyErr {
+    let raised = Cancelled::new_err(reason);
+    Python::attach(|py| {
+        // An exception takes any attribute.
+        let _ = raised.value(py).setattr("outcome", outcome);
+    });
+    raised
+}
+
+/// What a `Cancelled` makes of a goal that nobody has told to stop, where it came of another one that was.
+pub(crate) fn stopped_elsewhere(raised: &Bound<'_, PyBaseException>, reason: String) -> Option<ActionFailure> {
+    let outcome: String = raised.getattr("outcome").ok()?.extract().ok()?;
+    match outcome.as_str() {
+        PREEMPTED => Some(ActionFailure::Preempted(reason)),
+        STOPPED => Some(ActionFailure::Stopped(reason)),
+        _ => None,
     }
 }

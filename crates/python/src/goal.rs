@@ -8,12 +8,14 @@ use pyo3::types::PyDict;
 use ratn_model::fact::FactKey;
 use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::value::Value;
+use ratn_proto::convert::{ports_bytes, wire_ports};
 use ratn_proto::types::GoalOutcome;
-use ratn_worker::action::{ActionFailure, GoalContext};
+use ratn_worker::action::{ActionFailure, CallFailure, GoalContext, MAX_PROGRESS_BYTES};
 use ratn_worker::client::{fact, pattern};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::runtime::Handle;
+use tokio::task::AbortHandle;
 
 /// A goal under way: what is to be done, and what may be done with it.
 #[pyclass(frozen, module = "ratn")]
@@ -21,11 +23,19 @@ pub(crate) struct Goal {
     pub(crate) context: Arc<GoalContext>,
     pub(crate) runtime: Handle,
     measured: Mutex<Vec<(FactKey, Value, Measurement)>>,
+    /// What waits for the goal being told to stop; nothing where it is over.
+    watching: Mutex<Option<Vec<AbortHandle>>>,
 }
 
 impl Goal {
     pub(crate) fn new(context: Arc<GoalContext>, runtime: Handle) -> Goal {
-        Goal { context, runtime, measured: Mutex::default() }
+        Goal { context, runtime, measured: Mutex::default(), watching: Mutex::new(Some(Vec::new())) }
+    }
+
+    /// Nothing is called any more when it shall stop.
+    pub(crate) fn is_over(&self) {
+        let watching = self.watching.lock().unwrap_or_else(PoisonError::into_inner).take();
+        watching.iter().flatten().for_each(AbortHandle::abort);
     }
 
     /// The outcome with what was measured.
@@ -94,10 +104,18 @@ impl Goal {
         Ok(Fact::all(facts.map_err(of_world)?))
     }
 
-    /// Says how far it is, to whoever listens and to the event log; figures as keyword arguments.
-    #[pyo3(signature = (message, **figures))]
+    /// Says how far it is, to whoever listens and to the event log; figures as keyword arguments. The message and the figures have at most 16 KiB together
+    /// (`ValueError`); what comes more than 100 times a second is not told.
+    #[pyo3(signature = (message, /, **figures))]
     fn progress(&self, message: String, figures: Option<&Bound<'_, PyDict>>) -> PyResult<()> {
         let figures = figures.map(fields_from_python).transpose()?.unwrap_or_default();
+        let bytes = message.len() + ports_bytes(&wire_ports(figures.clone()));
+        if bytes > MAX_PROGRESS_BYTES {
+            let said = format!(
+                "progress: the message and its figures have {bytes} bytes, at most {MAX_PROGRESS_BYTES} are told; what is large is an output"
+            );
+            return Err(PyValueError::new_err(said));
+        }
         self.context.progress_with(message, figures);
         Ok(())
     }
@@ -142,7 +160,7 @@ impl Goal {
     }
 
     /// Has another provider of this goal's lease do something, `goal.call("Camera", "capture", exposure_s=0.01)`; its outputs.
-    #[pyo3(signature = (kind, action, **inputs))]
+    #[pyo3(signature = (kind, action, /, **inputs))]
     fn call<'py>(
         &self,
         py: Python<'py>,
@@ -152,19 +170,26 @@ impl Goal {
     ) -> PyResult<Bound<'py, PyDict>> {
         let inputs = inputs.map(fields_from_python).transpose()?.unwrap_or_default();
         let called = py.detach(|| self.runtime.block_on(self.context.call(kind, action, inputs)));
-        fields_to_python(py, &called.map_err(|error| of_failure(ActionFailure::from(error)))?)
+        let failure = |error| match error {
+            CallFailure::Cancelled { .. } => self.context.stopped(),
+            error => ActionFailure::from(error),
+        };
+        fields_to_python(py, &called.map_err(|error| of_failure(failure(error)))?)
     }
 
-    /// Calls `back` without arguments, in another thread, when the goal shall stop.
+    /// Calls `back` without arguments, in another thread, when the goal shall stop. After the goal's end it is not called any more.
     fn on_cancel(&self, back: Py<PyAny>) {
         let cancelled = self.context.cancelled.clone();
-        self.runtime.spawn(async move {
+        let mut watching = self.watching.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(watching) = watching.as_mut() else { return };
+        let task = self.runtime.spawn(async move {
             cancelled.cancelled().await;
             let called = tokio::task::spawn_blocking(move || Python::attach(|py| back.call0(py).map(drop)));
             if let Ok(Err(error)) = called.await {
                 tracing::warn!(error = %line(&error), "what was to be called when the goal shall stop has failed");
             }
         });
+        watching.push(task.abort_handle());
     }
 
     fn __repr__(&self) -> String {

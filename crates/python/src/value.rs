@@ -126,8 +126,8 @@ impl Joints {
     }
 
     fn __getitem__(&self, index: isize) -> PyResult<f64> {
-        let from_end = |index: isize| usize::try_from(index).ok().and_then(|back| self.0.len().checked_sub(back));
-        let place = if index < 0 { from_end(-index) } else { usize::try_from(index).ok() };
+        let from_end = |back: usize| self.0.len().checked_sub(back);
+        let place = if index < 0 { from_end(index.unsigned_abs()) } else { usize::try_from(index).ok() };
         let found = place.and_then(|place| self.0.get(place)).copied();
         found.ok_or_else(|| pyo3::exceptions::PyIndexError::new_err("there is no such joint"))
     }

@@ -15,15 +15,17 @@ use ratn_worker::arguments::Arguments;
 use ratn_worker::prelude::async_trait;
 use ratn_worker::safety::{Brakes, Safety, SafetyState};
 use ratn_worker::worker::WorkerError;
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::runtime::{Builder, Handle};
+use tokio::sync::watch;
 use tracing_subscriber::EnvFilter;
 
 /// Threads of goals that have not ended are left alone after this long.
 const LAST_THREADS: Duration = Duration::from_secs(1);
-/// No more of a traceback goes into a run's reason.
+/// No more of a traceback, or of what else an action says, goes into a run's reason.
 const MAX_TRACEBACK_BYTES: usize = 8 * 1024;
 
 /// An action as Python describes it.
@@ -114,16 +116,88 @@ pub(crate) fn serve(
 
 impl Driven {
     async fn safety(self) -> Result<Safety, WorkerError> {
-        let brakes = PythonBrakes { apply: Arc::new(self.brakes) };
+        let brakes = PythonBrakes::new(self.brakes);
         let Some(file) = self.stop_file else { return Ok(Safety::new(brakes)) };
         let what = format!("keep a stop in {}", file.display());
         Safety::kept_in(file, brakes).await.map_err(|source| WorkerError::System { what, source })
     }
 }
 
-/// Brakes that are a Python function. A stop does not wait for an earlier call: it is made in another thread then.
+/// Brakes that are a Python function. A stop does not wait for an earlier call: it is made in another thread then. A call of Python cannot be
+/// dropped, so the earlier one may still do what it was told, `ready` for one, after the newer one has returned. Hence the newer one is made once more
+/// when all earlier ones have returned, and only then confirmed.
 struct PythonBrakes {
     apply: Arc<Py<PyAny>>,
+    calls: watch::Sender<BrakeCalls>,
+}
+
+/// The calls of the brakes, by number, and the newest state that they were asked for, likewise.
+#[derive(Debug, Default)]
+struct BrakeCalls {
+    newest: u64,
+    last: u64,
+    under_way: BTreeSet<u64>,
+}
+
+/// A call that is under way until this is dropped.
+struct BrakeCall {
+    calls: watch::Sender<BrakeCalls>,
+    state: u64,
+    number: u64,
+    /// Earlier ones were under way when it began.
+    overlaps: bool,
+}
+
+impl BrakeCall {
+    fn begin(calls: &watch::Sender<BrakeCalls>, state: u64) -> BrakeCall {
+        let (mut number, mut overlaps) = (0, false);
+        calls.send_modify(|calls| {
+            overlaps = !calls.under_way.is_empty();
+            calls.last += 1;
+            number = calls.last;
+            calls.under_way.insert(number);
+        });
+        BrakeCall { calls: calls.clone(), state, number, overlaps }
+    }
+
+    /// Whether a newer state was asked for.
+    fn is_superseded(&self) -> bool {
+        self.calls.borrow().newest > self.state
+    }
+}
+
+impl Drop for BrakeCall {
+    fn drop(&mut self) {
+        self.calls.send_modify(|calls| {
+            calls.under_way.remove(&self.number);
+        });
+    }
+}
+
+impl PythonBrakes {
+    fn new(apply: Py<PyAny>) -> PythonBrakes {
+        PythonBrakes { apply: Arc::new(apply), calls: watch::Sender::default() }
+    }
+
+    /// Calls the function; whether an earlier call may have undone what it did.
+    async fn call(&self, state: u64, word: &'static str, reason: String) -> Result<bool, String> {
+        let (apply, call) = (Arc::clone(&self.apply), BrakeCall::begin(&self.calls, state));
+        let overlaps = call.overlaps;
+        let called = move || {
+            Python::attach(|py| {
+                if call.is_superseded() {
+                    return Err("a newer state came before they were asked".to_owned());
+                }
+                let failed = |error: PyErr| {
+                    error.display(py);
+                    format!("the brakes raised {error}")
+                };
+                apply.call1(py, (word, reason)).map(drop).map_err(failed)
+            })
+        };
+        tokio::task::spawn_blocking(called).await.unwrap_or_else(|error| Err(line(&error)))?;
+        Ok(overlaps)
+    }
 }
 
 #[async_trait]
@@ -134,17 +208,16 @@ impl Brakes for PythonBrakes {
             SafetyState::Held { reason } => ("held", reason.clone()),
             SafetyState::Stopped { reason } => ("stopped", reason.clone()),
         };
-        let apply = Arc::clone(&self.apply);
-        let called = move || {
-            Python::attach(|py| {
-                let failed = |error: PyErr| {
-                    error.print(py);
-                    format!("the brakes raised {error}")
-                };
-                apply.call1(py, (word, reason)).map(drop).map_err(failed)
-            })
-        };
-        tokio::task::spawn_blocking(called).await.unwrap_or_else(|error| Err(line(&error)))
+        let mut asked = 0;
+        self.calls.send_modify(|calls| {
+            calls.newest += 1;
+            asked = calls.newest;
+        });
+        while self.call(asked, word, reason.clone()).await? {
+            // The sender is in `self`.
+            let _ = self.calls.subscribe().wait_for(|calls| calls.under_way.is_empty()).await;
+        }
+        Ok(())
     }
 }
 
@@ -237,9 +310,10 @@ fn perform(py: Python<'_>, context: &Arc<GoalContext>, function: &Py<PyAny>, run
     let given = || -> PyResult<GoalOutcome> {
         let goal = Bound::new(py, Goal::new(Arc::clone(context), runtime))?;
         let inputs = fields_to_python(py, &context.inputs)?;
-        let ended = function.bind(py).call1((&goal, inputs))?;
-        let (outcome, outputs, reason): (String, Bound<'_, PyDict>, String) = ended.extract()?;
-        let outputs = fields_from_python(&outputs)?;
+        let ended = function.bind(py).call1((&goal, inputs));
+        goal.get().is_over();
+        let (outcome, outputs, reason): (String, Bound<'_, PyDict>, String) = ended?.extract()?;
+        let (outputs, reason) = (fields_from_python(&outputs)?, shortened(reason));
         Ok(goal.get().with_measured(GoalOutcome { outputs, reason, ..GoalOutcome::named(&outcome) }))
     };
     given().map_err(|error| failure(py, context, &error))
@@ -248,17 +322,24 @@ fn perform(py: Python<'_>, context: &Arc<GoalContext>, function: &Py<PyAny>, run
 /// What an exception makes of the goal. One that is nobody's plan is in the worker's log and in the goal's reason, with its traceback.
 fn failure(py: Python<'_>, context: &GoalContext, error: &PyErr) -> ActionFailure {
     let message = || error.value(py).to_string();
-    if error.is_instance_of::<Cancelled>(py) && context.cancelled.is_cancelled() {
-        return context.stopped();
+    if error.is_instance_of::<Cancelled>(py) {
+        if context.cancelled.is_cancelled() {
+            return context.stopped();
+        }
+        // Another provider's goal that it waited for was told to stop.
+        if let Some(failure) = crate::error::stopped_elsewhere(error.value(py), message()) {
+            return failure;
+        }
     }
     if error.is_instance_of::<Lost>(py) {
-        return ActionFailure::Lost(message());
+        return ActionFailure::Lost(shortened(message()));
     }
     if error.is_instance_of::<Aborted>(py) {
-        return ActionFailure::Aborted(message());
+        return ActionFailure::Aborted(shortened(message()));
     }
     let traceback = error.traceback(py).and_then(|traceback| traceback.format().ok()).unwrap_or_default();
-    error.print(py);
+    // Not `print`, which would end the process for a `SystemExit`.
+    error.display(py);
     ActionFailure::Aborted(shortened(format!("{error}\n{traceback}")))
 }
 

@@ -56,7 +56,7 @@ def test_a_hold_pauses_a_motion_which_then_goes_on(mover: Place) -> None:
     run, log = begun(mover, 150, "held")
     told = safety(mover, "hold")
     assert told.returncode == 0, told.stderr
-    until(lambda: "brakes: held" in mover.logs(), mover)
+    until(lambda: "brakes: held by the user" in mover.logs(), mover)
     steps = log.read_text().count('"message":"moving"')
     time.sleep(0.4)
     # One more may have been under way to the log.
@@ -82,6 +82,51 @@ def test_an_emergency_stop_ends_the_goal_and_outlasts_the_driver(mover: Place) -
     assert ended["outcome"] == "success" and ended["outputs"]["steps"] == 2, ended
 
 
+def test_the_brakes_of_a_pooled_driver_are_told_at_its_start(mover: Place) -> None:
+    log = mover.logs()
+    begun, let_go = log.find("brakes: held the driver has started"), log.find("brakes: ready")
+    assert 0 <= begun < let_go, log
+    assert log.find("brakes: held by the user") in (-1, *range(let_go, len(log)))
+
+
+def test_a_pooled_driver_that_starts_while_it_is_stopped_is_told(place: Place) -> None:
+    shutil.copy(TESTS / "workers" / "mover.py", place.folder)
+    place.write("stop.json", "a test")
+    pool = template("mover", "Mover", python="mover.py", interpreter=PYTHON, min=1, max=1, standstill_ms=2000)
+    with place.up(place.write("system.toml", CONFIG + pool), "--speed", "1"):
+        ended = place.run(place.write("stopped.yaml", TASK.replace("STEPS", "2")))
+        assert ended["outcome"] != "success" and "a test" in ended["reason"], ended
+        assert "brakes: stopped a test" in place.logs() and "brakes: ready" not in place.logs(), place.logs()
+        assert safety(place, "stop", "--clear").returncode == 0
+        until(lambda: "brakes: ready" in place.logs(), place)
+        assert place.run(place.write("cleared.yaml", TASK.replace("STEPS", "2")))["outcome"] == "success"
+
+
+def test_an_older_call_of_the_brakes_does_not_undo_a_stop(place: Place) -> None:
+    shutil.copy(TESTS / "workers" / "slow_brakes.py", place.folder)
+    pool = template("slow_brakes", "SlowBrakes", python="slow_brakes.py", interpreter=PYTHON, min=1, max=1, standstill_ms=2000)
+
+    def said(line: str) -> int:
+        return place.logs().count(line)
+
+    with place.up(place.write("system.toml", CONFIG + pool), "--speed", "1"):
+        before = said("brakes: ready begins")
+        (place.folder / "slow").touch()
+        assert safety(place, "hold").returncode == 0
+        command = [program(), "go-on", "--runtime-dir", str(place.runtime)]
+        going_on = subprocess.Popen(command, env=place.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        until(lambda: said("brakes: ready begins") == before + 1, place)
+        told = safety(place, "stop")
+        assert said("brakes: stopped done") >= 1, "the stop has not waited for the older call"
+        assert told.returncode != 0, f"confirmed while the brakes may let go: {told.stdout}"
+        (place.folder / "let_go").touch()
+        going_on.wait(30)
+        until(lambda: said("brakes: ready done") == before + 1, place)
+        told = safety(place, "stop")
+        assert told.returncode == 0, told.stdout + told.stderr
+        assert (place.folder / "motor").read_text() == "stopped"
+
+
 def test_a_driver_without_brakes_or_without_leases_does_not_start() -> None:
     driver = ratn.Driver("mover")
     driver.action(lambda goal: {}, name="move", outputs={})
@@ -89,6 +134,26 @@ def test_a_driver_without_brakes_or_without_leases_does_not_start() -> None:
         driver.run([])
     with pytest.raises(ValueError, match="only for whoever holds it"):
         driver.run([], without_leases=True)
+
+    async def later(state: str, reason: str) -> None: ...
+
+    # Called, it would have done nothing.
+    with pytest.raises(TypeError, match="the brakes are a plain function"):
+        driver.brakes(later)
+
+
+def test_brakes_that_have_done_nothing_confirm_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    driver = ratn.Driver("mover")
+    driver.action(lambda goal: {}, name="move", outputs={})
+
+    async def later() -> None: ...
+
+    driver.brakes(lambda state, reason: later())
+    served: list[object] = []
+    monkeypatch.setattr(ratn._ratn, "serve", lambda *given: served.append(given[-1]))
+    driver.run([])
+    with pytest.raises(TypeError, match="the brakes returned a coroutine"):
+        served[0].brakes("stopped", "a test")  # type: ignore[attr-defined]
 
 
 def test_a_pool_without_a_bound_for_standstill_refuses_the_driver(place: Place) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import pathlib
+import shutil
 import subprocess
 import sys
 import threading
@@ -86,6 +88,35 @@ def test_a_resource_is_held_for_a_block_and_nobody_else_gets_it(system: ratn.Sys
     assert lease.release() is False
 
 
+def test_what_a_block_raises_is_not_hidden_by_what_cannot_be_given_back(system: ratn.System) -> None:
+    assert system.resources("Camera")
+    with ratn.System(boxes=1, speed=50) as own:
+        with pytest.raises(KeyError):
+            with own.acquire("Camera"):
+                own._end()
+                raise KeyError("inside")
+
+
+def test_a_lease_of_a_manager_that_was_started_anew_is_not_alive(place: Place) -> None:
+    config = place.write("system.toml", 'catalogues = ["built-in"]\n[process-manager]\nhost = "compute"\n')
+    with place.up(config):
+        system = ratn.System(runtime_dir=place.runtime)
+        watch = system.watch("at(nothing)")
+        lease = system.acquire("Camera", timeout_s=20)
+        assert lease.alive and next(watch)["written"] == []
+    with pytest.raises(ratn.Unavailable):
+        system.query()
+    with place.up(config):
+        # The same object goes on with the new one.
+        with system.acquire("Camera", timeout_s=20) as again:
+            assert again.alive and not lease.alive and again.token > lease.token
+        assert system.query("at(nothing)") == []
+        assert lease.release() is False
+        with pytest.raises(ratn.Unavailable):
+            next(watch)
+        system.close()
+
+
 def test_python_goes_on_while_a_thread_waits_for_a_resource(system: ratn.System) -> None:
     with system.acquire("Camera"):
         got: list[ratn.Lease] = []
@@ -95,6 +126,83 @@ def test_python_goes_on_while_a_thread_waits_for_a_resource(system: ratn.System)
         assert not got
     waiting.join(30)
     assert got and got[0].release()
+
+
+TWO_THREADS = """
+import sys, threading, ratn
+
+for _ in range(8):
+    with ratn.System(runtime_dir=sys.argv[1]) as system:
+        both = threading.Barrier(2)
+
+        def hold(kind):
+            both.wait()
+            with system.acquire(kind, timeout_s=30):
+                pass
+
+        threads = [threading.Thread(target=hold, args=[kind]) for kind in ("Camera", "PanTilt")]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+print("both")
+"""
+
+
+def test_two_threads_open_the_session_of_a_system_together(system: ratn.System) -> None:
+    told = subprocess.run([sys.executable, "-c", TWO_THREADS, str(system.runtime_dir)], capture_output=True, text=True, timeout=60)
+    assert told.stdout == "both\n", told.stderr
+
+
+FORK = """
+import os, signal, sys, ratn
+
+with ratn.System(runtime_dir=sys.argv[1]) as system:
+    lease = system.acquire("Camera")
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)
+        for ask in (system.query, lambda: system.acquire("PanTilt"), lease.release):
+            try:
+                ask()
+                os._exit(1)
+            except ratn.Error as refused:
+                if "is a fork" not in str(refused):
+                    os._exit(2)
+        system.close()
+        del system, lease, ask
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert lease.alive and lease.release() and system.query() is not None
+"""
+
+
+def test_a_fork_of_a_process_neither_waits_for_its_threads_nor_ends_what_it_has(system: ratn.System) -> None:
+    told = subprocess.run([sys.executable, "-c", FORK, str(system.runtime_dir)], capture_output=True, text=True, timeout=60)
+    assert told.returncode == 0, told.stderr
+
+
+def test_the_log_of_a_run_under_way_outlives_its_object(system: ratn.System) -> None:
+    run = system.run(EXAMPLE, boxes=1)
+    log, id = run.log, run.id
+    process = run._process
+    del run
+    gc.collect()
+    assert process.poll() is None and log.exists(), "the run writes into it"
+    system_words = ["--runtime-dir", str(system.runtime_dir)]
+    assert subprocess.run([program(), "control", "abort", "--run", id, *system_words]).returncode == 0
+    process.wait(60)
+    assert '"event":"ended"' in log.read_text() or log.read_text().count("\n") > 1
+    shutil.rmtree(log.parent)
+    # That of one that has ended goes with it.
+    run = system.run(EXAMPLE, boxes=1)
+    run.abort()
+    run.result(60)
+    log = run.log
+    assert log.exists()
+    del run
+    gc.collect()
+    assert not log.parent.exists()
 
 
 def test_the_world_is_read_written_and_watched(system: ratn.System) -> None:

@@ -184,9 +184,51 @@ def test_steps_of_python_are_states_of_a_run(system: ratn.System, tmp_path: path
     assert result.outputs["heights"] == pytest.approx([0.5, 0.6, 0.7]) and result.outputs["found"] >= 1
     # The workers end with the run.
     end = time.monotonic() + 30
-    while system.resources("ChoosingSteps"):
+    while any(resource["kind"].startswith("ChoosingSteps") for resource in system.resources()):
         assert time.monotonic() < end
         time.sleep(0.05)
+
+
+def test_the_steps_of_a_run_are_done_by_its_own_workers(system: ratn.System, tmp_path: pathlib.Path) -> None:
+    import runpy
+
+    (tmp_path / "other").mkdir()
+    step = "import os\nimport ratn\n\n@ratn.step\ndef who(of: int = 0) -> dict:\n    return {'pid': os.getpid(), 'file': __file__}\n"
+    (tmp_path / "other" / "whose.py").write_text(step)
+    script = tmp_path / "whose.py"
+    script.write_text(
+        step + "\nimport importlib.util\nspec = importlib.util.spec_from_file_location('whose_other', os.path.join(os.path.dirname(__file__), 'other', 'whose.py'))\n"
+        "other = importlib.util.module_from_spec(spec)\nspec.loader.exec_module(other)\n\n"
+        "@ratn.task\ndef whose() -> dict:\n"
+        "    for i in ratn.each(ratn.fn.range(12)):\n        one = who(of=i)\n        pids = ratn.collect(one.pid)\n        files = ratn.collect(one.file)\n"
+        "    second = other.who(of=1)\n    return {'pids': pids, 'files': files, 'other': second.file, 'other_pid': second.pid}\n"
+    )
+    task = runpy.run_path(str(script), run_name="whose")["whose"]
+    assert task.check() == []
+    runs = [system.run(task) for _ in range(2)]
+    for run in runs:
+        result = run.result(90)
+        assert result.is_success, f"{result}\n{run.messages()}"
+        own = [worker.pid for worker in run._workers]
+        assert {*result.outputs["pids"], result.outputs["other_pid"]} == {*own}, f"{result.outputs} of workers {own}"
+        assert {*result.outputs["files"]} == {str(script)} and result.outputs["other"] == str(tmp_path / "other" / "whose.py")
+
+
+def test_a_worker_of_steps_that_dies_is_replaced_and_not_for_ever(system: ratn.System, tmp_path: pathlib.Path) -> None:
+    import runpy
+
+    script = tmp_path / "dying.py"
+    script.write_text(
+        "import os, pathlib, ratn\n\n@ratn.step\ndef die(times: int) -> dict:\n    died = pathlib.Path(__file__).with_suffix(f'.{times}')\n"
+        "    before = len(died.read_text()) if died.exists() else 0\n    if before < times:\n        died.write_text('x' * (before + 1))\n        os._exit(3)\n"
+        "    return {'before': before}\n\n"
+        "@ratn.task\ndef dying(times: int = 1) -> dict:\n    it = die(times=times)\n    return {'before': it.before}\n"
+    )
+    task = runpy.run_path(str(script), run_name="dying")["dying"]
+    result = system.run(task, times=1).result(60)
+    assert result.is_success and result.outputs == {"before": 1}, result
+    result = system.run(task, times=100).result(60)
+    assert not result.is_success, result
 
 
 def test_a_step_whose_file_does_not_load_is_told(system: ratn.System, tmp_path: pathlib.Path) -> None:

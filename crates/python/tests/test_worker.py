@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pathlib
 import shutil
 import subprocess
@@ -19,18 +20,19 @@ NO_CATALOGUE = 'catalogues = ["built-in"]\n[process-manager]\nhost = "compute"\n
 
 @pytest.fixture(scope="module")
 def tester(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
-    """A system with the two workers of these tests, of which its catalogue knows nothing."""
+    """A system with the workers of these tests, of which its catalogue knows nothing."""
     import tempfile
 
     with tempfile.TemporaryDirectory(prefix="ratn-py-") as folder:
         place = Place(pathlib.Path(folder))
-        for name in ("tester.py", "nearest.py"):
+        for name in ("tester.py", "nearest.py", "lingerer.py"):
             shutil.copy(TESTS / "workers" / name, folder)
         config = place.write(
             "system.toml",
             NO_CATALOGUE
             + template("tester", "Tester", python="tester.py", interpreter=PYTHON, max=2, min=1)
-            + template("nearest", "Nearest", python="nearest.py", interpreter=PYTHON),
+            + template("nearest", "Nearest", python="nearest.py", interpreter=PYTHON)
+            + template("lingerer", "Lingerer", python="lingerer.py", interpreter=PYTHON),
         )
         with place.up(config, "--speed", "1"):
             yield place
@@ -157,6 +159,75 @@ def test_a_goal_that_is_told_to_stop_ends_at_once(tester: Place, action: str, wo
     assert f"INFO tester: {word}" in tester.logs()
 
 
+@pytest.mark.parametrize(
+    ("action", "inputs", "reason"),
+    [
+        ("leave", "{ how: exit }", "SystemExit: no more of this"),
+        ("leave", "{ how: interrupt }", "KeyboardInterrupt: by the action"),
+        ("leave_later", "{}", "SystemExit: no more of that"),
+    ],
+)
+def test_an_action_that_would_leave_the_process_is_aborted_and_the_worker_goes_on(tester: Place, action: str, inputs: str, reason: str) -> None:
+    name = f"{action}_{len(inputs)}"
+    ended = tester.run(tester.write(f"{name}.yaml", task(name, state("it", f"tester/{action}", "Tester", inputs))))
+    assert ended["outcome"] == "aborted" and reason in ended["reason"], ended
+    # Both processes of the pool, the one after the other.
+    for number in range(4):
+        assert performed(tester, f"after_{name}_{number}", "echo", "{ value: 3 }", "echo") == 3
+
+
+@pytest.mark.parametrize(("how", "reason"), [("long", "ää\n…\nää"), ("unprintable", "Unprintable: "), ("group", "several (2 sub-exceptions)")])
+def test_an_unusual_exception_is_a_reason_like_others(tester: Place, how: str, reason: str) -> None:
+    if how == "group" and sys.version_info < (3, 11):
+        pytest.skip("there are no groups of exceptions")
+    ended = tester.run(tester.write(f"unusual_{how}.yaml", task(f"unusual_{how}", state("it", "tester/unusual", "Tester", f"{{ how: {how} }}"))))
+    assert ended["outcome"] == "aborted" and reason in ended["reason"] and len(ended["reason"]) < 20_000, ended["reason"][:2_000]
+    assert performed(tester, f"after_unusual_{how}", "echo", "{ value: 3 }", "echo") == 3
+
+
+def test_a_process_that_an_action_forks_leaves_the_goal_to_it(tester: Place) -> None:
+    assert performed(tester, "forks", "forks", "{}", "codes") == [7, 0, 1]
+
+
+def test_what_an_action_tells_of_its_progress_has_a_bound(tester: Place) -> None:
+    assert performed(tester, "tells_little", "tell", "{ length: 4096 }", "refused") == ""
+    ended = tester.run(tester.write("tells_often.yaml", task("tells_often", state("it", "tester/tell_often", "Tester", "{ times: 2000 }"))))
+    assert ended["outcome"] == "success" and 0 < ended["log"].count('"message":"once more"') < 600, "100 at once, and 100 in a second"
+    assert "at most 16384" in str(performed(tester, "tells_much", "tell", "{ length: 12000 }", "refused"))
+
+
+def test_an_input_that_an_action_does_not_have_is_refused_with_those_that_it_has(tester: Place) -> None:
+    text = task("asks", state("it", "tester/ask", "Tester, Nearest"), "outputs:\n  out: { type: any, value: it.heard }\n")
+    ended = tester.run(tester.write("asks.yaml", text))
+    assert ended["outcome"] == "success", ended
+    assert "`begin`" in ended["outputs"]["out"] and "start, within_m" in ended["outputs"]["out"], ended
+
+
+def test_a_call_of_another_provider_is_given_up_with_its_goal(tester: Place) -> None:
+    text = task("through", state("it", "tester/through", "Tester, Lingerer", "{ seconds: 60 }", "computes: true, reads: [], timeout: 1"))
+    ended = tester.run(tester.write("through.yaml", text), timeout=50)
+    assert ended["outcome"] != "success" and ended["log"].count('"message":"calls"') == 1, ended
+    assert "INFO tester: the call was given up" in tester.logs()
+
+
+def test_what_a_group_of_tasks_raises_is_what_the_action_means(tester: Place) -> None:
+    if sys.version_info < (3, 11):
+        pytest.skip("there is no asyncio.TaskGroup")
+    ended = tester.run(tester.write("together.yaml", task("together", state("it", "tester/together", "Tester"))))
+    assert ended["outcome"] == "aborted" and "apart" in ended["reason"] and "Traceback" not in ended["reason"], ended["reason"]
+
+
+def test_what_listens_to_a_goal_goes_with_it(tester: Place) -> None:
+    seen = [performed(tester, f"watched_{number}", "watched", "{}", "watching", "int") for number in range(6)]
+    assert max(seen) <= 1, f"{seen} are kept of goals that are over"
+
+
+def test_outputs_of_an_outcome_and_arrays_that_may_be_left_out(tester: Place) -> None:
+    assert performed(tester, "odd_joints", "odd", "{}", "joints", "joints") == [1.0, 2.5]
+    assert performed(tester, "odd_none", "odd", "{}", "given", "bool") is False
+    assert performed(tester, "odd_array", "odd", "{ numbers: '[1, 2]' }", "given", "bool") is True
+
+
 def test_async_def_performs_goals_and_tells_how_far_it_is(tester: Place) -> None:
     assert performed(tester, "slept", "nap", "{ seconds: 0.05 }", "slept") == 0.05
 
@@ -199,14 +270,12 @@ import sys, ratn
 w = ratn.Worker("bench")
 
 @w.action
-def add(goal: ratn.Goal, value: int) -> dict:
-    return {}
+def add(goal: ratn.Goal, value: int) -> None: ...
 
 print(*(module for module in ("asyncio", "numpy", "socket", "ssl", "subprocess", "tempfile", "ratn._system", "ratn._task") if module in sys.modules))
 
 @w.action
-async def wait(goal: ratn.Goal) -> dict:
-    return {}
+async def wait(goal: ratn.Goal) -> None: ...
 
 assert "asyncio" in sys.modules, "what its goals need is read before the first"
 """
@@ -239,7 +308,10 @@ def test_what_is_no_port_is_refused_with_the_line_of_the_function() -> None:
     def many(goal: ratn.Goal, *numbers: int) -> dict:
         return {}
 
-    for function, part in [(complex_, "parameter `z`"), (no_goal, "is its goal"), (unseen, "outputs={"), (many, "`*numbers")]:
+    def pieces(goal: ratn.Goal):
+        yield {"piece": 1}
+
+    for function, part in [(pieces, "without `yield`"), (complex_, "parameter `z`"), (no_goal, "is its goal"), (unseen, "outputs={"), (many, "`*numbers")]:
         said = broken(function)
         assert part in said and f"{__file__}:" in said, said
 
@@ -298,14 +370,22 @@ def test_a_task_is_checked_against_what_workers_say_of_themselves(tester: Place)
 
 def test_actions_of_a_running_system_are_a_module(tester: Place) -> None:
     import runpy
-    import sys
+
+    import ratn._stubs
 
     robot = tester.folder / "robot.py"
+    # Whatever the locale is.
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     told = subprocess.run(
-        [sys.executable, "-m", "ratn", "stubs", "--runtime-dir", str(tester.runtime), str(robot)], capture_output=True, text=True
+        [sys.executable, "-m", "ratn", "stubs", "--runtime-dir", str(tester.runtime), str(robot)], capture_output=True, text=True, env=environment
     )
     assert told.returncode == 0, told.stderr
     module = runpy.run_path(str(robot))
+    known = json.loads(ratn._ratn.catalogue([ratn._stubs.catalogue_of_system(tester.runtime)]))["providers"]["tester"]["actions"]
+    assert known["watched"]["description"] == "Zählt, was auf frühere Ziele noch hört 🤖."
+    assert known["watched"]["annotations"] == {"computes": True, "reads": []}, "what a worker says of its actions is known to tasks"
+    assert known["look"]["annotations"] == {"computes": False, "senses": ["at(?)"]}, known["look"]
+    assert known["add"]["defaults"] == {"factor": "2"}, known["add"]
     worker, arm = module["__getattr__"]("tester"), module["__getattr__"]("arm")
 
     @ratn.task
@@ -318,4 +398,4 @@ def test_actions_of_a_running_system_are_a_module(tester: Place) -> None:
     with ratn.System(runtime_dir=tester.runtime) as system:
         result = system.run(halves, number=10).result(60)
         assert result.is_success and result.outputs == {"half": 5}, result
-    assert "def halve(" in robot.with_suffix(".pyi").read_text()
+    assert "def halve(" in robot.with_suffix(".pyi").read_text(encoding="utf-8")

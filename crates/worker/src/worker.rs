@@ -337,9 +337,15 @@ impl Worker {
         if let Some(safety) = &safety {
             actions = actions.safety(safety.clone());
         }
-        // A pooled worker is offered by its process manager.
-        let _resting = options.resource_manager.is_some().then(|| {
-            let resting = bring_to_rest(leases.clone(), safety.clone(), standstill);
+        // A pooled worker is offered by its process manager once it serves, which waits until another one that was killed stands still. Its brakes
+        // know that earlier.
+        let stands_alone = options.resource_manager.is_some();
+        let rests = stands_alone || (confirms && safety.is_some());
+        if rests {
+            leases.begin_at_rest();
+        }
+        let _resting = rests.then(|| {
+            let resting = bring_to_rest(leases.clone(), safety.clone(), standstill.filter(|_| stands_alone));
             AbortOnDropHandle::new(tokio::spawn(exit_on_panic("what brings the worker to rest", resting)))
         });
         let server = actions.channels(channels.clone()).build();
@@ -349,7 +355,7 @@ impl Worker {
         };
         crate::otlp::start(options.access.as_deref(), &options.id);
         let vitals = Vitals::default();
-        let _hearing = confirms.then(|| serve_once_heard(&leases, &vitals));
+        let _hearing = confirms.then(|| serve_once_heard(&leases, &vitals, rests && !stands_alone));
         let serving = Serving { gate: Arc::new(RoleGate::new(access)), vitals, ..Serving::default() };
         let bound = bind_as(&options.listen, &options.exposure).await?;
         let endpoint = bound.endpoint().clone();
@@ -447,13 +453,18 @@ async fn bring_to_rest(leases: LeaseWatch, safety: Option<Safety>, standstill: O
     leases.brought_to_rest();
 }
 
-/// Nobody is offered a worker that refuses every goal because it has never heard the resource manager.
-fn serve_once_heard(leases: &LeaseWatch, vitals: &Vitals) -> AbortOnDropHandle<()> {
+/// Nobody is offered a worker that refuses every goal because it has never heard the resource manager, or, where it `rests` first, whose
+/// brakes have not said that nothing moves.
+fn serve_once_heard(leases: &LeaseWatch, vitals: &Vitals, rests: bool) -> AbortOnDropHandle<()> {
     vitals.unwell("the resource manager has not been heard yet: every goal is refused");
     let (mut heard, leases, vitals) = (leases.heard(), leases.clone(), vitals.clone());
     let hear = async move {
         // The sender is in the watch.
         while !leases.is_heard() && heard.changed().await.is_ok() {}
+        if rests {
+            vitals.unwell("its brakes have not said yet that nothing moves: every goal is refused");
+            leases.rested().await;
+        }
         vitals.well();
     };
     AbortOnDropHandle::new(tokio::spawn(exit_on_panic(LEASES, hear)))

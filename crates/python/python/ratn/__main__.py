@@ -28,9 +28,9 @@ def main() -> None:
     python.add_argument("task", type=pathlib.Path, metavar="TASK")
     given = parser.parse_args()
     if given.command == "python":
-        sys.stdout.write(Task.from_yaml(given.task).to_python())
+        _write(Task.from_yaml(given.task).to_python())
         return
-    catalogue = given.catalogue.read_text() if given.catalogue else None
+    catalogue = given.catalogue.read_text(encoding="utf-8") if given.catalogue else None
     if given.runtime_dir is not None:
         if catalogue is not None:
             parser.error("--catalogue or --runtime-dir, not both")
@@ -39,10 +39,16 @@ def main() -> None:
     what = f"the built-in catalogue and {given.catalogue.name}" if given.catalogue else "the built-in catalogue"
     text = _stubs.stubs(catalogue, what)
     if given.module is None:
-        sys.stdout.write(text)
+        _write(text)
         return
-    given.module.write_text(_MODULE.format(what=what, catalogue=catalogue))
-    given.module.with_suffix(".pyi").write_text(text)
+    given.module.write_text(_MODULE.format(what=what, catalogue=catalogue), encoding="utf-8")
+    given.module.with_suffix(".pyi").write_text(text, encoding="utf-8")
+
+
+def _write(text: str) -> None:
+    """Source text is UTF-8, whatever the terminal's locale is."""
+    sys.stdout.buffer.write(text.encode())
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ratn import _source
-from ratn._expression import Value, written
+from ratn._expression import Value, expression, literal, plain, words
 from ratn._trace import State
 
 
@@ -51,28 +51,32 @@ _KEYS = {name: key for key, name in _source.RENAMED.items()}
 
 def entry(value: object) -> Any:
     """A value of Python where a task file has an expression."""
-    if value is None or isinstance(value, (bool, int, float)) and not hasattr(value, "tolist"):
+    if value is None or isinstance(value, bool):
         return value
+    if isinstance(value, (int, float)) and not hasattr(value, "tolist"):
+        return int(value) if isinstance(value, int) else float(value)
     if isinstance(value, dict):
-        return {str(name): entry(item) for name, item in value.items()}
+        return {literal(str(name), "a name"): entry(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [entry(item) for item in value]
-    return str(written(value))
+    return expression(value)
 
 
 def raw(value: object) -> Any:
     """What is in a task file's own words: texts as they are, values as their expressions, states as their names."""
     if isinstance(value, State):
-        return value._node.name
+        return value._node.named()
     if isinstance(value, Value):
-        return str(value)
+        return plain(value)
     if isinstance(value, dict):
         return {str(raw(name)): raw(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [raw(item) for item in value]
-    if value is None or isinstance(value, (bool, int, float, str)):
+    if isinstance(value, str):
+        return words(value)
+    if value is None or isinstance(value, (bool, int, float)):
         return value
-    return str(written(value))
+    return expression(value)
 
 
 def annotate(body: dict[str, Any], said: dict[str, Any]) -> None:

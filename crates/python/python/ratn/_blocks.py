@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from ratn._annotations import annotate, entry, output, outputs_said
-from ratn._expression import Value, refuse, statements_at_work, user_line, written
+from ratn._expression import Value, Variable, expression, literal, refuse, statements_at_work, user_line, words
 from ratn._trace import AnyState, Node, Port, Trace, assigned_name, calls
 
 
@@ -21,7 +21,7 @@ class Block(AnyState):
     def __init__(self, function: str, name: str | None, annotations: dict[str, Any], head: dict[str, Any], default: str) -> None:
         at = user_line()
         trace = Trace.now(f"`ratn.{function}`")
-        node = trace.add(name or assigned_name(function, at), default, at)
+        node = trace.add(name, default, at, assigned_name(function, at))
         node.body.update(head)
         annotate(node.body, annotations)
         node.branches[self._FORM] = []
@@ -110,6 +110,10 @@ class Condition(Block):
     _FORM = "then"
 
 
+#: What a loop binds beside its element.
+_NUMBER = "number of the iteration"
+
+
 class Loop(Block):
     """What is done again and again."""
 
@@ -120,14 +124,15 @@ class Loop(Block):
 
     def test(self, condition: object) -> None:
         """The condition, said inside: it may speak of the states in the loop."""
-        self._node.body[self._key] = condition if isinstance(condition, str) else entry(condition)
+        self._node.body[self._key] = _condition(condition)
 
     @property
     def index(self) -> Value:
         """The number of the iteration, from 0."""
         if self._index is None:
-            self._index = str(self._node.body.setdefault("index", "iteration"))
-        return Value(f"${self._index}")
+            self._index = self._trace.free(self._node, "iteration")
+            self._node.body["index"] = self._index
+        return Variable(self._trace.bind(self._node, self._index, _NUMBER, self._node.line))
 
     def __exit__(self, kind: object, *exception: object) -> None:
         super().__exit__(kind, *exception)
@@ -169,7 +174,7 @@ def retry(
 
 
 def _condition(condition: object) -> Any:
-    return condition if isinstance(condition, str) else entry(condition)
+    return words(condition) if isinstance(condition, str) else entry(condition)
 
 
 def when(condition: object, *, name: str | None = None, **annotations: Any) -> Condition:
@@ -227,14 +232,14 @@ class Each(Iterator[Any]):
         self._trace = Trace.now("`ratn.each`")
         targets = self._targets(at)
         if index is True:
-            self._index: str | None = targets[0] if len(targets) == 2 else "index"
+            self._index: str | None = targets[0] if len(targets) == 2 else self._trace.free(None, "index")
         else:
             self._index = index or None
         if variable is None and not targets and statements_at_work(*at):
             refuse("`ratn.each` outside of a `for`", "write `for x in ratn.each(list):`; of a list of values make another with `fn.map(list, lambda x: …)`", at)
-        self._variable = variable or (targets[-1] if targets else "element")
+        self._variable = variable or (targets[-1] if targets else self._trace.free(None, "element"))
         node = self._trace.add(name, f"for_{self._variable}", at)
-        text = elements if isinstance(elements, str) else str(written(elements))
+        text = words(elements) if isinstance(elements, str) else expression(elements)
         node.body["for"] = f"{self._variable} in {text}"
         if self._index:
             node.body["index"] = self._index
@@ -261,8 +266,10 @@ class Each(Iterator[Any]):
             raise StopIteration
         self._has_begun = True
         self._trace.enter(self._node, "do")
-        element = Value(f"${self._variable}")
-        return (Value(f"${self._index}"), element) if self._gives_index else element
+        trace, node = self._trace, self._node
+        element = Variable(trace.bind(node, self._variable, "element of the loop", node.line))
+        number = None if self._index is None else Variable(trace.bind(node, self._index, _NUMBER, node.line))
+        return (number, element) if self._gives_index else element
 
 
 def each(elements: object, *, variable: str | None = None, index: str | bool | None = None, name: str | None = None, **annotations: Any) -> Each:
@@ -278,7 +285,7 @@ def collect(value: object, *, name: str | None = None, type: str | None = None) 
     at = user_line()
     trace = Trace.now("`ratn.collect`")
     place = trace.collects()
-    name = name or assigned_name("collect", at) or "all"
+    name = literal(name, "a name") if name else assigned_name("collect", at) or "all"
     innermost, trace.open[place + 1 :] = trace.open[place + 1 :], []
     try:
         said = output(each=value, type=type).entry()
@@ -296,6 +303,8 @@ def _loop(key: str, function: str, condition: object, index: str | None, name: s
     head = {} if condition is None else {key: _condition(condition)}
     loop = Loop(function, name, annotations, {**head, **({"index": index} if index else {})}, function.rstrip("_"))
     loop._key, loop._index = key, index
+    if index is not None:
+        loop._trace.bind(loop._node, index, _NUMBER, loop._node.line)
     return loop
 
 

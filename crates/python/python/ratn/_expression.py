@@ -8,6 +8,8 @@ refused with the line of the user's file and with what to write instead.
 from __future__ import annotations
 
 import ast
+import contextlib
+import contextvars
 import json
 import linecache
 import math
@@ -24,6 +26,8 @@ from ratn._ratn import Error, Joints, Pose
 _PACKAGE = os.path.dirname(os.path.abspath(__file__)) + os.sep
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _KEYWORDS = {"or", "and", "not", "in", "exists", "true", "false", "null"}
+#: Begins the text of a value in an f-string: where a text is no expression it is refused. It is not seen where it is printed.
+_MARK = "\u2063"
 
 
 class Untraceable(Error):
@@ -126,10 +130,37 @@ def _truth_wanted() -> NoReturn:
     refuse(what, instead, (file, line))
 
 
+def plain(part: object) -> str:
+    """A part of an expression as it is written at the place that is being traced."""
+    text: str = part if isinstance(part, str) else part._text()  # type: ignore[attr-defined]
+    return text
+
+
+def expression(value: object) -> str:
+    """A value of Python as the text of an expression."""
+    return plain(written(value))
+
+
+def words(text: str) -> str:
+    """A text that is in the words of task files: an f-string in it names values."""
+    return text.replace(_MARK, "")
+
+
+def literal(text: str, what: str = "a text") -> str:
+    """A text that is what it says, and no expression."""
+    if _MARK in text:
+        refuse(
+            f"{what} with a value in it that is known only while the task runs, `{words(text)}`",
+            'write `fn.concat("…", value)`; an f-string names values only in annotations, conditions and `ratn.expr`',
+        )
+    return text
+
+
 class Value:
     """A value that is known only while the task runs: an expression. ``+ - * /``, comparisons, ``& | ~``, ``.field`` and ``[i]`` make others.
 
-    In an f-string it is its text: ``effects=[f"at({box.id}) = {box.pose}"]``.
+    In an f-string of an annotation it is its text: ``effects=[f"at({box.id}) = {box.pose}"]``. Elsewhere a text is what it says, and such an f-string is
+    refused: ``fn.concat("Box ", box.id)`` makes a text of values.
     """
 
     __slots__ = ("_parts", "_is_atom")
@@ -140,8 +171,11 @@ class Value:
         object.__setattr__(self, "_parts", parts)
         object.__setattr__(self, "_is_atom", is_atom)
 
+    def _text(self) -> str:
+        return "".join(map(plain, self._parts))
+
     def __str__(self) -> str:
-        return "".join(part if isinstance(part, str) else str(part) for part in self._parts)
+        return _MARK + self._text()
 
     def __format__(self, form: str) -> str:
         if form:
@@ -150,7 +184,7 @@ class Value:
 
     def __repr__(self) -> str:
         try:
-            return f"<Value {self}>"
+            return f"<Value {self._text()}>"
         except Untraceable:
             return "<Value of a task that is not being traced>"
 
@@ -285,6 +319,108 @@ class Value:
         refuse("the number is known only while the task runs", "write `fn.range(n)` for a range, `list[i]` of a value of the task")
 
 
+class Binding:
+    """A variable of a task file: who binds it. Written down where another one of its name hides it, it is refused."""
+
+    def __init__(self, name: str, kind: str, line: tuple[str, int]) -> None:
+        self.name, self.kind, self.line = name, kind, line
+
+    def __str__(self) -> str:
+        return f"the {self.kind} `${self.name}` of {self.line[0]}:{self.line[1]}"
+
+    def _text(self) -> str:
+        for inner in reversed(_bound.get()):
+            if inner is self:
+                return f"${self.name}"
+            if isinstance(inner, TaskFunctionScope):
+                refuse(f"`{inner.name}` sees its parameters and facts only, and uses {self}", "give it that as another parameter")
+            if inner.name == self.name:
+                self.hidden_by(str(inner))
+        if self.kind == "element":
+            refuse(f"{self} is known only inside of its `lambda`", "use it there")
+        from ratn._trace import Trace
+
+        Trace.now(f"`${self.name}`").sees(self)
+        return f"${self.name}"
+
+    def hidden_by(self, other: str) -> NoReturn:
+        how = "`variable=`" if self.kind == "element of the loop" else "`index=`" if self.kind == "number of the iteration" else "another name"
+        refuse(f"{self} is hidden here by {other}", f"give one of the two another name ({how})" if how.startswith("`") else "give one of the two another name")
+
+
+class TaskFunctionScope:
+    """Around the body of a function of the task: it sees nothing of what is around."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+
+#: What is bound by functions of elements and of the task that are being written down, the innermost last.
+_bound: contextvars.ContextVar[tuple[Binding | TaskFunctionScope, ...]] = contextvars.ContextVar("ratn_bound", default=())
+
+
+@contextlib.contextmanager
+def binding(*inner: Binding | TaskFunctionScope) -> Iterator[None]:
+    token = _bound.set((*_bound.get(), *inner))
+    try:
+        yield
+    finally:
+        _bound.reset(token)
+
+
+def scope_of_function() -> str | None:
+    """The function of the task whose body is being written down."""
+    return next((inner.name for inner in reversed(_bound.get()) if isinstance(inner, TaskFunctionScope)), None)
+
+
+class Within:
+    """An expression of an element, where that is bound."""
+
+    def __init__(self, element: Binding, value: object) -> None:
+        self.element, self.value = element, value
+
+    def _text(self) -> str:
+        with binding(self.element):
+            return plain(self.value)
+
+
+class Variable(Value):
+    """A parameter, a scoped variable, or what a loop binds: ``$name``."""
+
+    __slots__ = ()
+
+    def _in_place(self, sign: str, other: object) -> NoReturn:
+        (bound,) = self._parts
+        assert isinstance(bound, Binding)
+        name = bound.name
+        what = f"`{name} {sign}= …` would leave the {bound.kind} as it is, and make another value"
+        more = f"give that a name of its own, `more = {name} {sign} …`"
+        if bound.kind == "variable":
+            refuse(what, f"say `assign={{\"{name}\": {name} {sign} …}}` at a state that changes it, or {more}")
+        refuse(what, f"{more}, or count in a `ratn.variable(0)` that states `assign`")
+
+    def __iadd__(self, other: object) -> NoReturn:
+        self._in_place("+", other)
+
+    def __isub__(self, other: object) -> NoReturn:
+        self._in_place("-", other)
+
+    def __imul__(self, other: object) -> NoReturn:
+        self._in_place("*", other)
+
+    def __itruediv__(self, other: object) -> NoReturn:
+        self._in_place("/", other)
+
+    def __imatmul__(self, other: object) -> NoReturn:
+        self._in_place("@", other)
+
+    def __iand__(self, other: object) -> NoReturn:
+        self._in_place("&", other)
+
+    def __ior__(self, other: object) -> NoReturn:
+        self._in_place("|", other)
+
+
 def within(part: object) -> object:
     """An operand, in parentheses where it has to be."""
     if isinstance(part, Value) and part._is_atom:
@@ -299,14 +435,18 @@ def written(value: object) -> object:
     """A value of Python as a part of an expression."""
     if isinstance(value, Value):
         return value
+    if getattr(type(value), "_is_state", False):
+        refuse("a state is no value", "name one of its outputs, `look.boxes`")
     if isinstance(value, str):
+        # What an enumeration says of itself is another text than its value.
+        value = str.__str__(literal(value))
         return value if _WORD.match(value) and value not in _KEYWORDS else json.dumps(value, ensure_ascii=False)
     if isinstance(value, range) and value.step == 1:
         return f"range({value.start}, {value.stop})" if value.start else f"range({value.stop})"
     if isinstance(value, (list, tuple)):
         return Value("[", *_joined(written(item) for item in value), "]")
     if isinstance(value, dict):
-        pairs = (Value(f"{name}: ", written(item)) for name, item in value.items())
+        pairs = (Value(f"{literal(str(name))}: ", written(item)) for name, item in value.items())
         return Value("{", *_joined(pairs), "}")
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
@@ -318,7 +458,7 @@ def written(value: object) -> object:
     if isinstance(value, (int, float)) and not hasattr(value, "tolist"):
         if not math.isfinite(value):
             refuse(f"{value} is no number of a task", "use finite numbers")
-        return repr(value)
+        return int.__repr__(value) if isinstance(value, int) else float.__repr__(value)
     if hasattr(value, "tolist"):
         return written(value.tolist())
     refuse(f"a {type(value).__name__} is no value of a task", "use numbers, texts, lists, dicts, ratn.Pose, ratn.Joints, or values of the task")
@@ -354,18 +494,19 @@ def call(function: str, *arguments: object) -> Value:
 
 def expr(text: str) -> Value:
     """An expression as task files have it: ``ratn.expr("grasp_pose($box)")``. An f-string may name values: ``ratn.expr(f"{box}.id")``."""
+    text = words(text)
     return Value(text, is_atom=bool(_WORD.match(text.lstrip("$"))))
 
 
 def fact(predicate: str, *arguments: object) -> Value:
     """What the world says at the state's place: ``ratn.fact("at", "cup")`` is the pose; ``"?"`` stands for any argument."""
     said = ("?" if isinstance(argument, str) and argument == "?" else written(argument) for argument in arguments)
-    return Value(f"{predicate}(", *_joined(said), ")")
+    return Value(f"{words(predicate)}(", *_joined(said), ")")
 
 
 def exists(what: Value | str) -> Value:
     """Whether a fact is there, whatever it says, ``ratn.exists(ratn.fact("in_gripper", "cup"))``; or a query with variables, as text."""
-    return Value("exists ", what if isinstance(what, Value) else f"({what})", is_atom=False)
+    return Value("exists ", what if isinstance(what, Value) else f"({words(what)})", is_atom=False)
 
 
 def isin(item: object, of: object) -> Value:
@@ -403,8 +544,9 @@ def _applied(name: str, arguments: tuple[object, ...]) -> Value:
     if len(arguments) != 2 or not callable(arguments[1]):
         raise TypeError(f"`fn.{name}` takes a list and a function of an element: `fn.{name}(list, lambda x: …)`")
     function: Any = arguments[1]
-    variable = function.__code__.co_varnames[0]
-    return Value(f"{name}(${variable} in ", written(arguments[0]), ", ", written(function(Value(f"${variable}"))), ")")
+    code = function.__code__
+    element = Binding(code.co_varnames[0], "element", (code.co_filename, code.co_firstlineno))
+    return Value(f"{name}(${element.name} in ", written(arguments[0]), ", ", Within(element, written(function(Variable(element)))), ")")
 
 
 def _functions() -> set[str]:

@@ -74,8 +74,11 @@ def is_array(annotation: Any) -> bool:
     """Whether numpy's arrays are meant; numpy is not imported for it."""
     numpy = sys.modules.get("numpy")
     origin = typing.get_origin(annotation) or annotation
-    if origin is typing.Annotated:
+    if origin is typing.Annotated or hasattr(annotation, "__metadata__"):
         return is_array(typing.get_args(annotation)[0])
+    if origin in (typing.Union, types.UnionType):
+        present = [kind for kind in typing.get_args(annotation) if kind is not type(None)]
+        return len(present) == 1 and is_array(present[0])
     return numpy is not None and isinstance(origin, type) and issubclass(origin, numpy.ndarray)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from ratn._annotations import ANNOTATIONS, annotate, entry
-from ratn._expression import Value, call, refuse, user_line, written
+from ratn._expression import Binding, TaskFunctionScope, Value, Variable, binding, call, expression, literal, plain, refuse, user_line, words
 from ratn._trace import AnyState, State, Trace, assigned_name
 
 
@@ -21,7 +21,7 @@ def perform(
     at = user_line()
     trace = Trace.now(f"`{action}`")
     function = action.rpartition("/")[2]
-    node = trace.add(name or assigned_name(function, at) or function, function, at)
+    node = trace.add(name, function, at, assigned_name(function, at) or function)
     node.body["action"] = action
     if inputs:
         node.body["in"] = {port: entry(value) for port, value in inputs.items()}
@@ -81,8 +81,8 @@ def library(file: str | os.PathLike[str], *, name: str | None = None, **given: A
     """Another task file as a state; what is no annotation is a parameter: ``ratn.library("fetch_boxes.yaml", boxes=2)``."""
     at = user_line()
     trace = Trace.now("`ratn.library`")
-    node = trace.add(name or assigned_name("library", at) or pathlib.Path(file).stem, "library", at)
-    node.body["library"] = os.fspath(file)
+    node = trace.add(name, "library", at, assigned_name("library", at) or pathlib.Path(file).stem)
+    node.body["library"] = literal(os.fspath(file), "a path")
     parameters = {**given.pop("parameters", {}), **{key: given.pop(key) for key in list(given) if key not in ANNOTATIONS}}
     if parameters:
         node.body["with"] = {key: entry(value) for key, value in parameters.items()}
@@ -93,7 +93,7 @@ def library(file: str | os.PathLike[str], *, name: str | None = None, **given: A
 def leave(outcome: str, *, name: str | None = None) -> State:
     """A step out of the block around by one of its outcomes."""
     trace = Trace.now("`ratn.leave`")
-    node = trace.add(name or f"leave_{outcome}", "leave")
+    node = trace.add(name, "leave", None, f"leave_{literal(outcome, 'an outcome')}")
     node.body.update({"states": [], "transitions": {"success": outcome}})
     return State(node)
 
@@ -119,7 +119,7 @@ def wait(
     if len(said) != 1:
         refuse("a state waits for one thing", "say a condition, `seconds=`, `until=` or `signal=`")
     ((key, value),) = said.items()
-    body = {key: value if isinstance(value, str) else entry(value)}
+    body = {key: entry(value) if not isinstance(value, str) else literal(value, "a signal") if key == "signal" else words(value)}
     if timeout is not None:
         body["timeout"] = timeout
     return _own("wait", name, f"wait_{'condition' if key == 'for' else key}", body, annotations)
@@ -133,7 +133,7 @@ def ask(
     ``go_on.answer`` is the choice. One that ``transitions`` name is an outcome. After ``timeout`` seconds the answer is ``default``, or the outcome
     ``timeout`` without one.
     """
-    text = str(question)
+    text = plain(question) if isinstance(question, Value) else literal(str(question), "a question")
     if isinstance(question, Value) and not text.startswith(("'", '"', "$", "concat(")):
         text = f"concat({text})"
     elif not isinstance(question, Value) and text.startswith(("'", '"', "$", "concat(")):
@@ -151,7 +151,7 @@ def _own(function: str, name: str | None, default: str, body: dict[str, Any], an
     """A state that task control executes itself."""
     at = user_line()
     trace = Trace.now(f"`ratn.{function}`")
-    node = trace.add(name or assigned_name(function, at) or default, default, at)
+    node = trace.add(name, default, at, assigned_name(function, at) or default)
     node.body[function] = body
     annotate(node.body, annotations)
     return AnyState(node)
@@ -177,7 +177,10 @@ class TaskFunction:
                 refuse(f"there are two functions `{self._name}`", "give one another name")
             self._is_traced = True
             try:
-                body = str(written(self._function(*(Value(f"${parameter}") for parameter in self._parameters))))
+                at = (self._function.__code__.co_filename, self._function.__code__.co_firstlineno)
+                own = [Binding(parameter, "parameter", at) for parameter in self._parameters]
+                with binding(TaskFunctionScope(self._name), *own):
+                    body = expression(self._function(*map(Variable, own)))
             finally:
                 self._is_traced = False
             head = f"{self._name}({', '.join(f'${parameter}' for parameter in self._parameters)})"
@@ -190,7 +193,7 @@ def function(function: Callable[..., Any]) -> TaskFunction:
     return TaskFunction(function)
 
 
-def variable(value: object, *, name: str | None = None) -> Value:
+def variable(value: object, *, name: str | None = None) -> Variable:
     """A scoped variable of the task or block around: ``tries = ratn.variable(0)``. States give it new values with ``assign``."""
     at = user_line()
     trace = Trace.now("`ratn.variable`")
@@ -200,6 +203,8 @@ def variable(value: object, *, name: str | None = None) -> Value:
     owner = trace.open[-1][1]
     if owner is not None and "states" not in owner.branches:
         refuse("variables belong to the task or to a `ratn.sequence`", "say it before the block, or in a `with ratn.sequence():` inside of it")
+    begins = entry(value)
+    bound = trace.declare(owner, literal(called, "a name"), at)
     variables = trace.variables if owner is None else owner.body.setdefault("variables", {})
-    variables[called] = entry(value)
-    return Value(f"${called}")
+    variables[called] = begins
+    return Variable(bound)

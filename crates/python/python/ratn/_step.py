@@ -1,6 +1,6 @@
 """Steps: functions of Python as states of a task. They run in a worker that lives as long as the run.
 
-A step is an action of a worker, made of its function as ``Worker.action`` makes one. ``python -m ratn._step FILE`` is that worker: it runs the file in
+A step is an action of a worker, made of its function as ``Worker.action`` makes one. ``python -m ratn._step FILE PROVIDER`` is that worker: it runs the file in
 which the steps stand (with another ``__name__`` than ``__main__``) and serves them.
 """
 
@@ -18,8 +18,8 @@ from typing import Any
 from ratn import _annotations, _expression, _ports, _states, _stubs, _trace, _worker
 from ratn._ratn import Error, Goal
 
-#: The steps of this process, by file.
-_STEPS: dict[str, list[Step]] = {}
+#: The steps of this process, by file and name.
+_STEPS: dict[str, dict[str, Step]] = {}
 #: The file that a worker is reading its steps from.
 _being_read: str | None = None
 
@@ -32,6 +32,11 @@ def refuse_while_read(what: str) -> None:
         )
 
 
+def kind_of(provider: str) -> str:
+    """The kind of resource that a provider of steps is."""
+    return "".join(part.capitalize() for part in provider.split("_"))
+
+
 class Step:
     """A function as a state. In a task a call adds the state; elsewhere it calls the function, without a goal if it takes none."""
 
@@ -42,12 +47,17 @@ class Step:
         stem = "".join(letter if letter.isalnum() else "_" for letter in pathlib.Path(self.file).stem).lower().strip("_")
         #: What tasks call the worker, and the kind of resource that it is.
         self.provider = f"{stem or 'steps'}_steps"
-        self.kind = "".join(part.capitalize() for part in self.provider.split("_"))
+        self.kind = kind_of(self.provider)
         parameters = list(inspect.signature(function).parameters)
         hints = typing.get_type_hints(function, include_extras=True)
         self.takes_goal = bool(parameters) and (hints.get(parameters[0]) is Goal or parameters[0] == "goal")
+        of_file = _STEPS.setdefault(self.file, {})
+        before = of_file.get(self.name)
+        # A file may be read twice: as the worker does it, and by a module of it that imports it.
+        if _being_read == self.file and before is not None and before.function.__code__.co_firstlineno != function.__code__.co_firstlineno:
+            raise ValueError(f"{_ports.where(function)}: there is a step `{self.name}` in this file already")
+        of_file[self.name] = self
         # Refused here and now, with the line of the function.
-        _STEPS.setdefault(self.file, []).append(self)
         self.action = self._known_to(_worker.Worker(self.provider, kind=self.kind))
 
     def _known_to(self, worker: _worker.Worker) -> _ports.Action:
@@ -65,7 +75,8 @@ class Step:
             _expression.refuse(f"the step `{self.name}` stands in no file", "its worker runs the file: write it into a module and import it")
         if positional:
             raise TypeError(f"the step `{self.name}` takes its inputs by name: `{self.name}(port=value)`")
-        trace.steps[f"{self.provider}/{self.name}"] = self
+        provider = trace.provider_of_steps(self.provider, self.file)
+        trace.steps[f"{provider}/{self.name}"] = self
         ports = {port for port, *_ in self.action.inputs}
         name = given.pop("name", None) if "name" not in ports else None
         inputs = {key: given.pop(key) for key in list(given) if key in ports}
@@ -75,15 +86,15 @@ class Step:
         # What it says of itself holds for the state, unless the state says otherwise.
         said = {"computes": self.action.computes or None, "reads": self.action.reads or ([] if self.action.computes else None)}
         said |= {key: getattr(self.action, key) or None for key in ("senses", "requires", "effects")}
-        return _states.perform(f"{self.provider}/{self.name}", inputs, {**said, **given}, name=name, kind=self.kind)
+        return _states.perform(f"{provider}/{self.name}", inputs, {**said, **given}, name=name, kind=kind_of(provider))
 
-    def catalogue(self) -> str:
-        """What it offers, as a catalogue has it."""
+    def catalogue(self, provider: str) -> str:
+        """What it offers as a step of this provider, as a catalogue has it."""
         ports: dict[str, dict[str, str]] = {"inputs": {}, "optional": {}, "outputs": dict(self.action.outputs)}
         for port, kind, is_required, _ in self.action.inputs:
             ports["inputs" if is_required else "optional"][port] = kind
-        name = f"{self.provider}/{self.name}"
-        return _stubs.toml([{"action": name, "resource": self.kind, **ports, "outcomes": self.action.outcomes, "description": self.action.description}])
+        name = f"{provider}/{self.name}"
+        return _stubs.toml([{"action": name, "resource": kind_of(provider), **ports, "outcomes": self.action.outcomes, "description": self.action.description}])
 
 
 def _without_goal(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -121,14 +132,15 @@ def step(
     It is as ``Worker.action``, but for the goal, which it may do without. Its file is run by the worker: what shall happen only in the
     program that starts the run stands below ``if __name__ == "__main__":``.
     """
-    senses, effects = list(senses), list(effects)
+    # They are read twice: here, and by the worker.
+    outcomes, reads, senses, requires, effects = (list(said) for said in (outcomes, reads, senses, requires, effects))
     computes = not (senses or effects) if computes is None else computes
     said = {"outputs": outputs, "outcomes": outcomes, "computes": computes, "reads": reads, "senses": senses, "requires": requires, "effects": effects}
     return (lambda function: Step(function, name, said)) if function is None else Step(function, name, said)
 
 
-def serve(file: str, arguments: list[str]) -> None:
-    """Serves the steps of a file."""
+def serve(file: str, provider: str, arguments: list[str]) -> None:
+    """Serves the steps of a file, as this provider."""
     path = os.path.abspath(file)
     sys.path.insert(0, os.path.dirname(path))
     global _being_read
@@ -137,10 +149,10 @@ def serve(file: str, arguments: list[str]) -> None:
         runpy.run_path(path, run_name="__ratn_steps__")
     finally:
         _being_read = None
-    steps = _STEPS.get(path, [])
+    steps = list(_STEPS.get(path, {}).values())
     if not steps:
         raise SystemExit(f"{file} has no steps: decorate a function with `@ratn.step`")
-    worker = _worker.Worker(steps[0].provider, kind=steps[0].kind)
+    worker = _worker.Worker(provider, kind=kind_of(provider))
     for one in steps:
         one._known_to(worker)
     worker.run(arguments)
@@ -150,4 +162,4 @@ if __name__ == "__main__":
     # The package's own module, not this one that is called `__main__`.
     from ratn import _step
 
-    _step.serve(sys.argv[1], sys.argv[2:])
+    _step.serve(sys.argv[1], sys.argv[2], sys.argv[3:])

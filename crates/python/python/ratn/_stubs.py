@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import keyword
 import os
-import subprocess
+import re
 from typing import Any
 
 from ratn import _ratn
@@ -36,6 +36,9 @@ _KINDS = {
 }
 
 
+_BARE = re.compile(r"[A-Za-z0-9_-]+\Z")
+
+
 def _python(kind: str) -> str:
     if kind in _KINDS:
         return _KINDS[kind]
@@ -48,14 +51,15 @@ def stubs(catalogue: str | None, what: str) -> str:
     """The text of a ``.pyi`` with a class for each provider."""
     providers: dict[str, Any] = json.loads(_ratn.catalogue([] if catalogue is None else [catalogue]))["providers"]
     parts = [_HEAD.format(what=what)]
-    for name, provider in sorted(providers.items()):
+    for name, provider in sorted(item for item in providers.items() if _is_name(item[0])):
         parts.append(_provider(name, provider))
     return "".join(parts).rstrip() + "\n"
 
 
 def _provider(name: str, provider: dict[str, Any]) -> str:
     states, methods = [], []
-    for action, signature in sorted(provider["actions"].items()):
+    # What is no name of Python is performed by `ratn.action("provider/3d-scan", …)`.
+    for action, signature in sorted(item for item in provider["actions"].items() if _is_name(item[0])):
         state = "".join(part.capitalize() for part in f"{name}_{action}".split("_"))
         outputs = [port for port in sorted(signature.get("outputs", {})) if _is_name(port)]
         states.append(f"class _{state}(ratn.State):\n" + ("".join(f"    {port}: Value\n" for port in outputs) or "    ...\n"))
@@ -65,11 +69,13 @@ def _provider(name: str, provider: dict[str, Any]) -> str:
         star = "        *,\n" if given else ""
         methods.append(f"    def {action}(\n        self,\n{star}{given}        **annotations: Unpack[Annotations],\n    ) -> _{state}:{_document(signature)}\n")
     title = "".join(part.capitalize() for part in name.split("_"))
-    return "".join(f"{state}\n" for state in states) + f"class _{title}:\n{''.join(methods)}\n{name}: _{title}\n\n"
+    inside = "".join(methods) or "    ...\n"
+    return "".join(f"{state}\n" for state in states) + f"class _{title}:\n{inside}\n{name}: _{title}\n\n"
 
 
 def _document(signature: dict[str, Any]) -> str:
     text = str(signature.get("description", "")).replace("\\", "\\\\").replace('"""', "'''")
+    text = f'{text[:-1]}\\"' if text.endswith('"') else text
     return f'\n        """{text}"""\n' if text else " ..."
 
 
@@ -84,9 +90,9 @@ def _is_port(port: str) -> bool:
 
 def catalogue_of_system(runtime_dir: str | os.PathLike[str]) -> str:
     """What a running system offers beside the built-in catalogue, as a catalogue in TOML: what its config and its workers say."""
-    from ratn._system import _program
+    from ratn._system import _told
 
-    told = subprocess.run([_program(), "actions", "--json", "--runtime-dir", os.fspath(runtime_dir)], capture_output=True, text=True)
+    told = _told(["actions", "--json", "--runtime-dir", os.fspath(runtime_dir)])
     if told.returncode != 0:
         raise Error(told.stderr.strip())
     return toml([action for action in json.loads(told.stdout) if action["from"] != "built in"])
@@ -96,15 +102,28 @@ def toml(actions: list[dict[str, Any]]) -> str:
     """A catalogue with these actions: each with ``action`` (``provider/action``), ``resource``, and its signature."""
     known = json.loads(_ratn.catalogue([]))
     kinds = sorted({action["resource"] for action in actions} - known["resources"].keys())
-    lines = [line for kind in kinds for line in (f"[resources.{kind}]", 'class = "process"', "count = 64", "")]
+    lines = [line for kind in kinds for line in (f"[resources.{_key(kind)}]", 'class = "process"', "count = 64", "")]
     for provider, resource in sorted({(action["action"].partition("/")[0], action["resource"]) for action in actions}):
-        lines += [f"[providers.{provider}]", f"resource = {json.dumps(resource)}", ""]
+        lines += [f"[providers.{_key(provider)}]", f"resource = {_value(resource)}", ""]
     for action in actions:
         provider, _, name = action["action"].partition("/")
-        lines.append(f"[providers.{provider}.actions.{name}]")
-        for key in ("inputs", "optional", "outputs"):
-            ports = ", ".join(f"{json.dumps(port)} = {json.dumps(kind)}" for port, kind in (action.get(key) or {}).items())
-            lines.append(f"{key} = {{ {ports} }}")
-        lines.append(f"outcomes = {json.dumps(action.get('outcomes') or [])}")
-        lines += [f"description = {json.dumps(action.get('description', ''))}", ""]
+        lines.append(f"[providers.{_key(provider)}.actions.{_key(name)}]")
+        lines += [f"{key} = {_value(action.get(key) or {})}" for key in ("inputs", "optional", "outputs", "defaults")]
+        lines += [f"outcomes = {_value(action.get('outcomes') or [])}", f"description = {_value(action.get('description', ''))}"]
+        said = {key: value for key, value in (action.get("annotations") or {}).items() if value is not None}
+        lines += [*([f"annotations = {_value(said)}"] if said else []), ""]
     return "\n".join(lines)
+
+
+def _key(name: str) -> str:
+    return name if _BARE.match(name) else _value(name)
+
+
+def _value(value: Any) -> str:
+    """A text, a truth, a list or a table of them, as TOML has it."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_key(str(key))} = {_value(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    # A text of JSON is one of TOML, but for what that escapes in two halves, and for DEL.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -10,6 +10,8 @@ import asyncio
 import json
 import os
 import pathlib
+import re
+import secrets
 import shutil
 import signal
 import subprocess
@@ -17,20 +19,26 @@ import sys
 import tempfile
 import threading
 import time
+import weakref
 from collections.abc import AsyncIterator, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from ratn import _ratn, _views
-from ratn._expression import written
+from ratn._expression import expression
 from ratn._ratn import Error, Fact, Lease, Projected, WorldWatch
-from ratn._step import Step, refuse_while_read
+from ratn._step import kind_of, refuse_while_read
 from ratn._task import Task
 
 _READY = "the system is ready"
 _READY_WITHIN_S = 60.0
 _ENDED_WITHIN_S = 20.0
 _LOOK_S = 0.02
+#: How often it is looked whether the workers of steps are there, and how many take the place of others in a run.
+_LOOK_AT_WORKERS_S = 0.2
+_WORKERS_AGAIN = 3
+#: What a process manager tells the workers of its pools. A worker of steps is in none, also where the program that runs the task is.
+_OF_POOLED = ("RATN_PROVIDER_SESSION", "RATN_RESOURCE_MANAGER", "RATN_STANDSTILL_MS", "RATN_WORKER_LISTEN")
 
 
 def _program() -> str:
@@ -41,6 +49,22 @@ def _program() -> str:
     if found is None:
         raise Error("there is no program `ratn` in PATH: install it, or set RATN to its path")
     return found
+
+
+def _told(words: list[str]) -> subprocess.CompletedProcess[str]:
+    """What the program says."""
+    return subprocess.run([_program(), *words], capture_output=True, text=True, encoding="utf-8", errors="replace")
+
+
+def _text_of(file: pathlib.Path) -> str:
+    """What a process has written, as far as that is text."""
+    return file.read_text(encoding="utf-8", errors="replace")
+
+
+def _remove(folder: str, maker: int, processes: list[subprocess.Popen[Any]]) -> None:
+    """Removes a folder, unless a process still writes into it. A fork of the process that made it leaves it alone."""
+    if os.getpid() == maker and all(process.poll() is not None for process in processes):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _default_directory() -> pathlib.Path:
@@ -83,7 +107,8 @@ class System:
     ) -> None:
         refuse_while_read("it would start a system")
         self._process: subprocess.Popen[str] | None = None
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._clean: weakref.finalize[..., System] | None = None
+        self._maker = os.getpid()
         directory = pathlib.Path(runtime_dir) if runtime_dir is not None else _default_directory()
         if config is None and not options and (directory / "resource-manager.endpoint").exists():
             self.runtime_dir = directory
@@ -96,8 +121,9 @@ class System:
             raise
 
     def _start(self, config: object, runtime_dir: object, options: dict[str, object]) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="ratn-")
-        folder = pathlib.Path(self._folder.name)
+        folder = pathlib.Path(tempfile.mkdtemp(prefix="ratn-"))
+        # Without `close()` the system ends with this object, and writes there no more that anybody could ask for.
+        self._clean = weakref.finalize(self, _remove, str(folder), self._maker, [])
         self.runtime_dir = pathlib.Path(str(runtime_dir)) if runtime_dir is not None else folder / "run"
         command = [_program(), "up", "--exit-with-parent", "--runtime-dir", str(self.runtime_dir)]
         command += ["--config", str(config)] if config is not None else []
@@ -112,11 +138,11 @@ class System:
             )
         until = time.monotonic() + _READY_WITHIN_S
         try:
-            while _READY not in said.read_text():
+            while _READY not in _text_of(said):
                 if self._process.poll() is not None:
-                    raise Error(f"`ratn up` has ended: {said.read_text().strip()}")
+                    raise Error(f"`ratn up` has ended: {_text_of(said).strip()}")
                 if time.monotonic() > until:
-                    raise Error(f"the system was not ready within {_READY_WITHIN_S:.0f} s: {said.read_text().strip()}")
+                    raise Error(f"the system was not ready within {_READY_WITHIN_S:.0f} s: {_text_of(said).strip()}")
                 time.sleep(_LOOK_S)
         except BaseException:
             self._end()
@@ -132,11 +158,15 @@ class System:
         return f"<System at {self.runtime_dir}{'' if self._process is None else ', started here'}>"
 
     def close(self) -> None:
-        """Gives back what is held, and ends the system if it was started here."""
-        self._client.close()
-        self._end()
+        """Gives back what is held, and ends the system if it was started here. A fork of the process that opened it ends nothing."""
+        try:
+            self._client.close()
+        finally:
+            self._end()
 
     def _end(self) -> None:
+        if os.getpid() != self._maker:
+            return
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
             try:
@@ -147,9 +177,9 @@ class System:
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()
         self._process = None
-        if self._folder is not None:
-            self._folder.cleanup()
-            self._folder = None
+        if self._clean is not None:
+            self._clean()
+            self._clean = None
 
     def run(
         self,
@@ -165,7 +195,7 @@ class System:
     ) -> Run:
         """Begins a run of a task, or of a task file; its parameters are keyword arguments. ``mode`` is ``cdtn`` or ``hsm``.
 
-        It goes beside other runs of the system, unless it or one of them is to be ``alone``; ``urgency`` (``low``, ``normal``, ``high``) says whose needs come first. The steps of a task (``@ratn.step``) are performed by workers that live as long as the run: ``step_workers`` processes for each file.
+        It goes beside other runs of the system, unless it or one of them is to be ``alone``; ``urgency`` (``low``, ``normal``, ``high``) says whose needs come first. The steps of a task (``@ratn.step``) are performed by workers that are the run's own and live as long as it: ``step_workers`` processes for each file. The run's log is in a temporary folder unless ``log`` says where; that goes with the ``Run``, unless the run is under way then.
         """
         return Run(self, task, mode, seed, log, parameters, step_workers, alone, urgency)
 
@@ -184,7 +214,7 @@ class System:
 
     def pools(self) -> list[dict[str, Any]]:
         """The pools of worker processes of all hosts, as ``ratn ps --json`` has them."""
-        told = subprocess.run([_program(), "ps", "--json", "--runtime-dir", str(self.runtime_dir)], capture_output=True, text=True)
+        told = _told(["ps", "--json", "--runtime-dir", str(self.runtime_dir)])
         if not told.stdout.strip():
             raise Error(told.stderr.strip() or f"`ratn ps` has ended with code {told.returncode}")
         said = json.loads(told.stdout)
@@ -210,6 +240,16 @@ class System:
         return self._client.watch(*patterns)
 
 
+@dataclass(frozen=True)
+class _OfSteps:
+    """A worker of steps."""
+
+    id: str
+    provider: str
+    file: str
+    said: pathlib.Path
+
+
 class Run:
     """A run under way. Iterating over it (``for`` or ``async for``) gives the events of its log as dicts, until it has ended."""
 
@@ -226,15 +266,22 @@ class Run:
         urgency: str = "normal",
     ) -> None:
         self._system = system
-        self._folder = tempfile.TemporaryDirectory(prefix="ratn-run-")
-        folder = pathlib.Path(self._folder.name)
+        folder = pathlib.Path(tempfile.mkdtemp(prefix="ratn-run-"))
+        self._processes: list[subprocess.Popen[Any]] = []
+        weakref.finalize(self, _remove, str(folder), os.getpid(), self._processes)
         #: The event log, which ``ratn report`` reads.
         self.log = pathlib.Path(log) if log is not None else folder / "run.jsonl"
         self._workers: list[subprocess.Popen[bytes]] = []
+        self._of_steps: list[_OfSteps] = []
+        self._begun, self._lost = 0, ""
+        steps: dict[str, str] = {}
         if isinstance(task, Task):
-            file = folder / f"{task.name or 'task'}.yaml"
-            file.write_text(task.standing_alone())
-            self._start_steps(list(task._steps.values()), step_workers, folder)
+            # Steps are done by workers of this run alone: another one may have other workers of the same file.
+            token = secrets.token_hex(4)
+            providers = {provider: f"{provider}_{token}" for provider in task._step_files()}
+            steps = {providers[provider]: file for provider, file in task._step_files().items()}
+            file = folder / f"{re.sub(r'[^A-Za-z0-9_]', '_', task.name) or 'task'}.yaml"
+            file.write_text((task._with_providers(providers) if providers else task).standing_alone(), encoding="utf-8")
             task = file
         command = [_program(), "run", os.fspath(task), "--json", "--mode", mode]
         command += ["--runtime-dir", str(system.runtime_dir), "--log", str(self.log)]
@@ -242,47 +289,89 @@ class Run:
         command += ["--urgency", urgency, *(["--alone"] if alone else [])]
         for name, value in parameters.items():
             # Texts are taken as they are.
-            command += ["--set", f"{name}={value if isinstance(value, str) else written(value)}"]
+            command += ["--set", f"{name}={value if isinstance(value, str) else expression(value)}"]
         self._said, self._told = folder / "result.json", folder / "messages"
-        with self._said.open("w") as output, self._told.open("w") as messages:
-            self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=messages, start_new_session=True)
+        self._start_steps(steps, step_workers, folder)
+        try:
+            with self._said.open("w") as output, self._told.open("w") as messages:
+                self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=messages, start_new_session=True)
+        except BaseException:
+            self._end_steps()
+            raise
+        self._processes.append(self._process)
         if self._workers:
             # They end with the run, also where nobody asks for its result.
-            threading.Thread(target=self._end_with_run, daemon=True).start()
+            threading.Thread(target=self._end_with_run, args=[folder], daemon=True).start()
 
-    def _start_steps(self, steps: list[Step], each: int, folder: pathlib.Path) -> None:
-        """Workers for the steps, one or more for each file, which offer themselves to the system."""
-        kinds = {step.file: step.kind for step in steps}
-        manager = (self._system.runtime_dir / "resource-manager.endpoint").read_text().strip() if kinds else ""
-        logs, ids = [], set()
-        for number, (file, kind) in enumerate((one for one in kinds.items() for _ in range(each)), 1):
-            name = f"{kind.lower()}-{os.getpid()}-{id(self) % 1_000_000}-{number}"
-            said = folder / f"{name}.log"
-            command = [sys.executable, "-m", "ratn._step", file, "--id", name, "--kind", kind, "--resource-manager", manager]
-            with said.open("wb") as output:
-                self._workers.append(
-                    subprocess.Popen(
-                        [*command, "--exit-with-parent"], stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
-                    )
-                )
-            logs.append(said)
-            ids.add(name)
+    def _start_steps(self, steps: dict[str, str], each: int, folder: pathlib.Path) -> None:
+        """Workers for the steps, one or more for each provider with its file, which offer themselves to the system."""
+        if not steps:
+            return
+        if each < 1:
+            raise ValueError(f"step_workers is {each}: the steps of a task need a worker")
+        kinds, each_of = {kind_of(provider) for provider in steps}, [one for one in steps.items() for _ in range(each)]
         until = time.monotonic() + _READY_WITHIN_S
         try:
-            while not ids <= {resource["id"] for resource in self._system.resources(*set(kinds.values()))}:
-                for worker, said in zip(self._workers, logs):
+            for provider, file in each_of:
+                self._start_worker(provider, file, folder)
+            while not {step.id for step in self._of_steps} <= {resource["id"] for resource in self._system.resources(*kinds)}:
+                for worker, step in zip(self._workers, self._of_steps):
                     if worker.poll() is not None:
-                        raise Error(f"the worker of the steps has ended: {said.read_text().strip()}")
+                        raise Error(f"the worker of the steps has ended: {_text_of(step.said).strip()}")
                 if time.monotonic() > until:
-                    raise Error(f"the worker of the steps was not ready within {_READY_WITHIN_S:.0f} s: {logs[0].read_text().strip()}")
+                    said = _text_of(self._of_steps[0].said).strip()
+                    raise Error(f"the worker of the steps was not ready within {_READY_WITHIN_S:.0f} s: {said}")
                 time.sleep(_LOOK_S)
         except BaseException:
             self._end_steps()
             raise
 
-    def _end_with_run(self) -> None:
-        self._process.wait()
+    def _start_worker(self, provider: str, file: str, folder: pathlib.Path, place: int | None = None) -> None:
+        """Starts a worker of steps, in the place of one that has ended where that is said."""
+        self._begun += 1
+        name = f"{provider.replace('_', '-')}-{self._begun}"
+        said = folder / f"{name}.log"
+        manager = (self._system.runtime_dir / "resource-manager.endpoint").read_text(encoding="utf-8").strip()
+        command = [sys.executable, "-m", "ratn._step", file, provider, "--id", name, "--kind", kind_of(provider), "--resource-manager", manager]
+        command.append("--exit-with-parent")
+        environment = {name: value for name, value in os.environ.items() if name not in _OF_POOLED}
+        with said.open("wb") as output:
+            worker = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, start_new_session=True, env=environment
+            )
+        step = _OfSteps(name, provider, file, said)
+        if place is None:
+            self._workers.append(worker)
+            self._of_steps.append(step)
+        else:
+            self._workers[place], self._of_steps[place] = worker, step
+
+    def _end_with_run(self, folder: pathlib.Path) -> None:
+        """Has others take the place of workers that end before the run does; without any it would wait for ever."""
+        left = _WORKERS_AGAIN
+        while True:
+            try:
+                self._process.wait(_LOOK_AT_WORKERS_S)
+                break
+            except subprocess.TimeoutExpired:
+                pass
+            for place, (worker, step) in enumerate(zip(self._workers, self._of_steps)):
+                if worker.poll() is None or self._lost:
+                    continue
+                if left == 0:
+                    self._lost = f"a worker of the steps in {step.file} has ended, and {_WORKERS_AGAIN} others before it: {_text_of(step.said).strip()}"
+                    self._abort_without_steps()
+                else:
+                    left -= 1
+                    self._start_worker(step.provider, step.file, folder, place)
         self._end_steps()
+
+    def _abort_without_steps(self) -> None:
+        try:
+            self.abort()
+        except (Error, OSError):
+            # It is ending, or does not listen: its process is told.
+            self._process.terminate()
 
     def _end_steps(self) -> None:
         for worker in self._workers:
@@ -306,7 +395,7 @@ class Run:
 
     def messages(self) -> str:
         """What the run has told people so far."""
-        return self._told.read_text()
+        return _text_of(self._told)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for events in self._pieces():
@@ -345,11 +434,13 @@ class Run:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             raise TimeoutError(f"the run has not ended within {timeout_s} s") from None
-        text = self._said.read_text().strip()
-        if not text:
-            raise Error(self.messages().strip() or f"the run has ended with code {self._process.returncode}")
-        said = json.loads(text)
-        return Result(said["outcome"], said.get("outputs", {}), said.get("reason", ""), said.get("makespan_s", 0.0))
+        try:
+            said = json.loads(_text_of(self._said))
+        except ValueError:
+            # It could not begin, or was killed.
+            raise Error(self.messages().strip() or f"the run has ended with code {self._process.returncode}") from None
+        reason = "; ".join(part for part in (said.get("reason", ""), self._lost) if part)
+        return Result(said["outcome"], said.get("outputs", {}), reason, said.get("makespan_s", 0.0))
 
     @property
     def id(self) -> str:
@@ -362,15 +453,14 @@ class Run:
         return self._tell(["control", *words, "--run", self.id])
 
     def _tell(self, words: list[str]) -> str:
-        command = [_program(), *words, "--runtime-dir", str(self._system.runtime_dir)]
-        told = subprocess.run(command, capture_output=True, text=True)
+        told = _told([*words, "--runtime-dir", str(self._system.runtime_dir)])
         if told.returncode != 0:
             raise Error(told.stderr.strip() or f"`ratn {words[0]}` has ended with code {told.returncode}")
         return told.stdout.strip()
 
     def signal(self, name: str, value: Any = None) -> None:
         """Sends a signal, which a state of the task waits for (``ratn.wait(signal="order")``), with a value. It is kept until one does."""
-        self._tell(["signal", self.id, name, *([] if value is None else [str(written(value))])])
+        self._tell(["signal", self.id, name, *([] if value is None else [expression(value)])])
 
     def answer(self, choice: str, *, state: str | None = None) -> None:
         """Answers the question of a state (``ratn.ask``); where several ask, of that of this path."""
@@ -436,7 +526,7 @@ class Run:
 
     def network(self) -> _views.Network:
         """What each instance of a state waited for, as a graph."""
-        told = subprocess.run([_program(), "export", "mermaid", str(self.log)], capture_output=True, text=True)
+        told = _told(["export", "mermaid", str(self.log)])
         if told.returncode != 0:
             raise Error(told.stderr.strip())
         return _views.Network(told.stdout.strip())

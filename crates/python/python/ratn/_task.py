@@ -11,7 +11,6 @@ import inspect
 import json
 import os
 import pathlib
-import subprocess
 import tempfile
 import types
 import typing
@@ -21,8 +20,9 @@ from typing import Any
 
 from ratn import _ports, _ratn, _source, _yaml
 from ratn._annotations import VALUES, Output, entry, outputs_said, raw
-from ratn._expression import Untraceable, Value, refuse, user_frame
+from ratn._expression import Binding, Untraceable, Value, Variable, literal, refuse, user_frame
 from ratn._ratn import Error, InvalidTask
+from ratn._step import kind_of
 from ratn._trace import Trace, tracing
 from ratn._yaml import Body
 
@@ -88,7 +88,7 @@ class Task:
             text, file, folder = source, "<text>", pathlib.Path.cwd()
         else:
             path = pathlib.Path(source)
-            text, file, folder = path.read_text(), str(path), path.resolve().parent
+            text, file, folder = path.read_text(encoding="utf-8"), str(path), path.resolve().parent
         document = _ratn.read_yaml(text, file)
         if not isinstance(document, dict):
             raise InvalidTask(f"{file}:1: a task file is a mapping: begin it with `task: name`")
@@ -102,7 +102,7 @@ class Task:
         """
         text = "\n".join(_yaml.write(self.document).text) + "\n"
         if path is not None:
-            pathlib.Path(path).write_text(text)
+            pathlib.Path(path).write_text(text, encoding="utf-8")
         return text
 
     def to_python(self) -> str:
@@ -121,6 +121,32 @@ class Task:
         """The text with paths that are valid everywhere."""
         return "\n".join(self._standing_alone().text) + "\n"
 
+    def _step_files(self) -> dict[str, str]:
+        """The files of its steps, by the provider that they are in it."""
+        return {name.rpartition("/")[0]: step.file for name, step in self._steps.items()}
+
+    def _with_providers(self, providers: dict[str, str]) -> Task:
+        """The same, whose steps are done by other providers."""
+        actions = {name: f"{providers[name.rpartition('/')[0]]}/{step.name}" for name, step in self._steps.items()}
+        kinds = {kind_of(provider): kind_of(own) for provider, own in providers.items()}
+
+        def renamed(value: Any) -> Any:
+            if isinstance(value, list):
+                return [renamed(item) for item in value]
+            if not isinstance(value, dict):
+                return value
+            whole = Body({key: item if key in ("in", "with", *VALUES) else renamed(item) for key, item in value.items()})
+            whole.line = getattr(value, "line", None)
+            if isinstance(value.get("action"), str):
+                whole["action"] = actions.get(value["action"], value["action"])
+            if isinstance(value.get("resources"), list):
+                whole["resources"] = [_of_kind(one, kinds) for one in value["resources"]]
+            return whole if whole.line is not None else dict(whole)
+
+        document = {**self.document, "states": renamed(self.document.get("states") or [])}
+        steps = {actions[name]: step for name, step in self._steps.items()}
+        return Task(document, folder=self.folder, file=self._file, catalogues=self._catalogues, steps=steps)
+
     def _standing_alone(self) -> _yaml.Lines:
         document = dict(self.document)
         if isinstance(document.get("ontology"), str):
@@ -138,9 +164,12 @@ class Task:
             return rooted if rooted.line is not None else dict(rooted)
         return [self._rooted(item) for item in value] if isinstance(value, list) else value
 
+    def _all_catalogues(self) -> list[str]:
+        return [*self._catalogues, *(step.catalogue(name.rpartition("/")[0]) for name, step in self._steps.items())]
+
     def _read(self) -> tuple[list[Finding], dict[str, Any] | None]:
         lines = self._lines()
-        catalogues = [*self._catalogues, *(step.catalogue() for step in self._steps.values())]
+        catalogues = self._all_catalogues()
         said, model = _ratn.check_task("\n".join(lines.text) + "\n", str(self.folder / pathlib.Path(self._file).name), catalogues)
         findings = [self._finding(one, lines) for one, _ in json.loads(said)]
         return findings, None if model is None else json.loads(model)
@@ -166,25 +195,25 @@ class Task:
 
     def _check_with(self, system: object, config: str | os.PathLike[str] | None) -> list[Finding]:
         """As ``ratn check`` does it, which knows what a system is."""
-        from ratn._system import _program
+        from ratn._system import _told
 
         lines = self._standing_alone()
         with tempfile.TemporaryDirectory(prefix="ratn-check-") as folder:
             file = pathlib.Path(folder) / pathlib.Path(self._file).with_suffix(".yaml").name
-            file.write_text("\n".join(lines.text) + "\n")
-            command = [_program(), "check", str(file), "--no-simulation", "--json"]
-            for number, catalogue in enumerate([*self._catalogues, *(step.catalogue() for step in self._steps.values())]):
-                (pathlib.Path(folder) / f"{number}.toml").write_text(catalogue)
+            file.write_text("\n".join(lines.text) + "\n", encoding="utf-8")
+            command = ["check", str(file), "--no-simulation", "--json"]
+            for number, catalogue in enumerate(self._all_catalogues()):
+                (pathlib.Path(folder) / f"{number}.toml").write_text(catalogue, encoding="utf-8")
                 command += ["--catalogue", str(pathlib.Path(folder) / f"{number}.toml")]
             command += ["--config", os.fspath(config)] if config is not None else []
             command += ["--runtime-dir", str(getattr(system, "runtime_dir", system))] if system is not None else []
-            told = subprocess.run(command, capture_output=True, text=True)
+            told = _told(command)
         if not told.stdout.strip():
             raise Error(told.stderr.strip() or f"`ratn check` has ended with code {told.returncode}")
         said = json.loads(told.stdout)
         findings = [self._finding(one, lines, file.name) for one in said["findings"]]
         # Whoever performs steps comes with the run.
-        kinds = [f"`{step.kind}`" for step in self._steps.values()]
+        kinds = [f"`{kind_of(provider)}`" for provider in self._step_files()]
         workers = [what for what in said["workers"] if not any(kind in what for kind in kinds)]
         findings += [Finding("worker", "warning", self._file, 1, "", what, "") for what in workers]
         if said["task"] is None:
@@ -200,6 +229,13 @@ class Task:
         for state in model["states"]:
             state.pop("location")
         return model
+
+
+def _of_kind(resource: Any, kinds: dict[str, str]) -> Any:
+    """An entry of `resources`, of the kind that is in the place of another one."""
+    if isinstance(resource, dict):
+        return {key: kinds.get(kind, kind) if key in ("block", "consume") and isinstance(kind, str) else kind for key, kind in resource.items()}
+    return kinds.get(resource, resource) if isinstance(resource, str) else resource
 
 
 def invalid(findings: list[Finding]) -> InvalidTask:
@@ -246,7 +282,7 @@ def _traced(function: Callable[..., Any], name: str, said: dict[str, Any]) -> Ta
         document["description"] = description
     # Annotations may be texts, and name what stands beside the function within another one.
     hints = typing.get_type_hints(function, localns={**user_frame().f_locals}, include_extras=True)
-    parameters, given = _parameters(function, hints)
+    parameters, given = _parameters(function, hints, trace)
     token = tracing.set(trace)
     try:
         returned = function(**given)
@@ -263,11 +299,25 @@ def _traced(function: Callable[..., Any], name: str, said: dict[str, Any]) -> Ta
         if outputs:
             document["outputs"] = outputs
         document["states"] = [node.item() for node in trace.top]
+        _whole(document)
     finally:
         tracing.reset(token)
     path = pathlib.Path(file)
     folder = path.resolve().parent if path.exists() else pathlib.Path.cwd()
     return Task(document, folder=folder, file=file, catalogues=trace.catalogues, steps=trace.steps)
+
+
+def _whole(value: Any) -> None:
+    """Refuses a text that is no expression and has a value in it, wherever it has come to."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _whole(key)
+            _whole(item)
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            _whole(item)
+    elif isinstance(value, str):
+        literal(value)
 
 
 def _said(key: str, value: Any) -> Any:
@@ -303,7 +353,7 @@ class Doc:
     text: str
 
 
-def _parameters(function: Callable[..., Any], hints: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Value]]:
+def _parameters(function: Callable[..., Any], hints: dict[str, Any], trace: Trace) -> tuple[dict[str, Any], dict[str, Value]]:
     parameters: dict[str, Any] = {}
     given: dict[str, Value] = {}
     place = _ports.where(function)
@@ -311,7 +361,9 @@ def _parameters(function: Callable[..., Any], hints: dict[str, Any]) -> tuple[di
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD, parameter.POSITIONAL_ONLY):
             raise TypeError(f"{place}: `{parameter}` is no parameter of a task: it has a name and a type")
         hint, has_default = hints.get(parameter.name), parameter.default is not parameter.empty
-        given[parameter.name] = Value(f"${parameter.name}")
+        bound = Binding(parameter.name, "parameter", (function.__code__.co_filename, function.__code__.co_firstlineno))
+        trace.bindings[parameter.name] = bound
+        given[parameter.name] = Variable(bound)
         if hint is None and has_default:
             parameters[parameter.name] = entry(parameter.default)
             continue

@@ -8,7 +8,7 @@ import typing
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from ratn._expression import Value, refuse, statements_at_work, user_line, written
+from ratn._expression import Binding, Value, Within, expression, literal, refuse, scope_of_function, statements_at_work, user_line
 from ratn._yaml import Body
 
 if typing.TYPE_CHECKING:
@@ -20,28 +20,45 @@ tracing: contextvars.ContextVar[Trace | None] = contextvars.ContextVar("ratn_tra
 class Node:
     """A state in the making: its body, and the lists of states inside."""
 
-    def __init__(self, siblings: list[Node], owner: Node | None, name: str | None, line: tuple[str, int], default: str) -> None:
+    def __init__(
+        self, siblings: list[Node], owner: Node | None, name: str | None, line: tuple[str, int], default: str, implied: str | None = None
+    ) -> None:
         self.siblings, self.owner, self.default, self.line = siblings, owner, default, line
         self.body = Body()
         self.body.line = line
         self.branches: dict[str, list[Node]] = {}
         self.before: list[Node] | None = None
         self.is_open = False
-        self.name = None if name is None else self._unique(name)
+        #: The variables that it binds, for what is inside of it.
+        self.bindings: dict[str, Binding] = {}
+        #: Variables of what is around that were named inside of it.
+        self.spoken: dict[str, Binding] = {}
+        beside = {other.name for other in siblings}
+        if name is not None:
+            self.name: str | None = _free(name, beside)
+        else:
+            # Where nobody has said a name it hides none of what is around.
+            self.name = None if implied is None else _free(implied, beside | self._around())
         siblings.append(self)
 
-    def _unique(self, name: str) -> str:
-        taken = {other.name for other in self.siblings}
-        number = 2
-        unique = name
-        while unique in taken:
-            unique, number = f"{name}_{number}", number + 1
-        return unique
+    def _around(self) -> set[str | None]:
+        """The names of the states beside those that it is inside of."""
+        names, node = set[str | None](), self.owner
+        while node is not None:
+            names |= {other.name for other in node.siblings}
+            node = node.owner
+        return names
+
+    def _below(self) -> set[str | None]:
+        """The names of all states inside of it."""
+        lists = [*self.branches.values(), *([self.before] if self.before else [])]
+        return {name for states in lists for node in states for name in (node.name, *node._below())}
 
     def named(self) -> str:
         """Its name; one that had none gets one, because somebody speaks of it."""
         if self.name is None:
-            self.name = self._unique(self.default)
+            taken = {name for other in self.siblings for name in (other.name, *other._below())}
+            self.name = _free(self.default, taken | self._around())
         return self.name
 
     def put_out(self, text: str, *names: str) -> str:
@@ -68,6 +85,14 @@ class Node:
         return item
 
 
+def _free(name: str, taken: typing.Collection[str | None]) -> str:
+    """The name, with a number where it is taken."""
+    number, free = 2, name
+    while free in taken:
+        free, number = f"{name}_{number}", number + 1
+    return free
+
+
 class Trace:
     """What is being traced: the lists of states that are open, the innermost last."""
 
@@ -78,7 +103,13 @@ class Trace:
         self.variables: dict[str, Any] = {}
         self.catalogues: list[str] = []
         self.steps: dict[str, Any] = {}
+        #: The files of steps, by the provider that each of them is here.
+        self.step_files: dict[str, str] = {}
         self.functions: dict[str, tuple[TaskFunction, str, str]] = {}
+        #: The parameters and variables of the task.
+        self.bindings: dict[str, Binding] = {}
+        #: The states that were named from inside of a list and stand outside of it, by that list.
+        self.spoken: dict[int, dict[str, Node]] = {}
 
     @staticmethod
     def now(what: str) -> Trace:
@@ -88,9 +119,67 @@ class Trace:
             refuse(f"{what} belongs into a task", "call it in a function with `@ratn.task`")
         return trace
 
-    def add(self, name: str | None, default: str, at: tuple[str, int] | None = None) -> Node:
+    def add(self, name: str | None, default: str, at: tuple[str, int] | None = None, implied: str | None = None) -> Node:
+        """A further state; `implied` is what it is called where nobody has said a name."""
         siblings, owner = self.open[-1]
-        return Node(siblings, owner, name, at or user_line(), default)
+        at = at or user_line()
+        if name is not None:
+            outside = self.spoken.get(id(siblings), {}).get(literal(name, "a name"))
+            if outside is not None:
+                self._hidden(outside, at)
+        return Node(siblings, owner, name, at, default, implied)
+
+    def provider_of_steps(self, provider: str, file: str) -> str:
+        """What the steps of a file are called here: two files of one name are two providers."""
+        number, name = 2, provider
+        while self.step_files.setdefault(name, file) != file:
+            number, name = number + 1, f"{provider}_{number}"
+        return name
+
+    def free(self, node: Node | None, name: str) -> str:
+        """The name of a variable that hides none; of one that `node` binds, unless that is still to come."""
+        taken = set(self.bindings)
+        for _, owner in self.open:
+            if owner is not None:
+                taken |= {*owner.bindings, *owner.body.get("variables", {})}
+        return _free(name, taken if node is None else {*taken, *node.spoken})
+
+    def bind(self, node: Node, name: str, kind: str, at: tuple[str, int]) -> Binding:
+        """The variable of this name that a block binds."""
+        return node.bindings.setdefault(name, Binding(name, kind, at))
+
+    def declare(self, owner: Node | None, name: str, at: tuple[str, int]) -> Binding:
+        """A scoped variable of a block, or of the task."""
+        known = self.bindings if owner is None else owner.bindings
+        before = known.get(name) or (None if owner is None else owner.spoken.get(name))
+        if before is not None or name in (self.variables if owner is None else owner.body.get("variables", {})):
+            refuse(f"there is {before or f'a variable `${name}`'} already", "give one of the two another name")
+        known[name] = Binding(name, "variable", at)
+        return known[name]
+
+    def sees(self, bound: Binding) -> None:
+        """Refuses a variable that is not what its name stands for at this place."""
+        passed: list[Node] = []
+        for _, owner in reversed(self.open):
+            if owner is None:
+                continue
+            if owner.bindings.get(bound.name) is bound:
+                break
+            if bound.name in owner.bindings or bound.name in owner.body.get("variables", {}):
+                bound.hidden_by(str(owner.bindings.get(bound.name) or f"the variable `${bound.name}` of {owner.line[0]}:{owner.line[1]}"))
+            passed.append(owner)
+        else:
+            if self.bindings.get(bound.name) is not bound:
+                refuse(f"{bound} is not known here", "it is known inside of what binds it: use it there, or put it out, `ratn.collect(value)`")
+        for owner in passed:
+            owner.spoken[bound.name] = bound
+
+    def _hidden(self, node: Node, at: tuple[str, int] | None = None) -> NoReturn:
+        refuse(
+            f"the state `{node.named()}` of {node.line[0]}:{node.line[1]} is hidden here by another one of its name",
+            "give one of the two another name (`name=`)",
+            at,
+        )
 
     def enter(self, node: Node, branch: str) -> None:
         node.is_open = True
@@ -109,9 +198,21 @@ class Trace:
 
     def seen(self, node: Node, port: str) -> str:
         """What an output of a state is called here."""
+        inside = scope_of_function()
+        if inside is not None:
+            refuse(f"`{inside}` sees its parameters and facts only, and uses the state `{node.named()}`", "give it that as another parameter")
         lists = [siblings for siblings, _ in self.open]
         if any(siblings is node.siblings for siblings in lists):
-            return f"{node.named()}.{port}"
+            name = node.named()
+            for siblings, around in reversed(self.open):
+                if siblings is node.siblings:
+                    break
+                # Other branches of its own block hide nothing.
+                if around is not node.owner:
+                    if any(other.name == name for other in siblings):
+                        self._hidden(node)
+                    self.spoken.setdefault(id(siblings), {})[name] = node
+            return f"{name}.{port}"
         owner = node.owner
         if owner is None:
             refuse(f"`{node.named()}` is a state of another task", "states see those of their own task only")
@@ -131,7 +232,7 @@ class Trace:
         around = [self._hides(way) for way in ways]
         hidden = {id(block): block for block in around if block is not None}
         if len(hidden) != 1:
-            return f"either({', '.join(str(written(way)) for way in ways)})"
+            return f"either({', '.join(map(expression, ways))})"
         (block,) = hidden.values()
         behind = [at for at, way in enumerate(ways) if around[at] is None and self._is_behind(way, block)]
         first = behind[-1] + 1 if behind else 0
@@ -144,14 +245,14 @@ class Trace:
         depth = len(self.open)
         self.open += [(states, block) for states in block.branches.values()]
         try:
-            text = self.first_of(within) if len(within) > 1 else str(written(within[0]))
+            text = self.first_of(within) if len(within) > 1 else expression(within[0])
         finally:
             del self.open[depth:]
         (port, *_) = _ports(next(way for way, hides in zip(ways, around, strict=True) if hides is not None))
         seen = f"{block.named()}.{block.put_out(text, port.port, f'either_{port.port}')}"
         # The block may have failed, and that been handled: then the others are looked through beside it.
         others = [way for at, way in enumerate(ways) if at >= first and around[at] is None]
-        all_ways = [*(str(written(way)) for way in beside), seen, *(str(written(way)) for way in others)]
+        all_ways = [*map(expression, beside), seen, *map(expression, others)]
         return f"either({', '.join(all_ways)})" if len(all_ways) > 1 else seen
 
     def _is_behind(self, way: object, block: Node) -> bool:
@@ -183,7 +284,7 @@ class Port:
     def __init__(self, node: Node, port: str) -> None:
         self.node, self.port = node, port
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
         return Trace.now(f"`{self.node.named()}.{self.port}`").seen(self.node, self.port)
 
 
@@ -193,7 +294,7 @@ class Either:
     def __init__(self, ways: Sequence[object]) -> None:
         self.ways = ways
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
         return Trace.now("`fn.either`").first_of(self.ways)
 
 
@@ -205,6 +306,8 @@ def _ports(value: object) -> list[Port]:
         return [port for way in value.ways for port in _ports(way)]
     if isinstance(value, dict):
         return _ports(list(value.values()))
+    if isinstance(value, Within):
+        return _ports(value.value)
     parts = value._parts if isinstance(value, Value) else value if isinstance(value, (list, tuple)) else ()
     return [port for part in parts for port in _ports(part)]
 
@@ -213,6 +316,7 @@ class State:
     """A state of a task. Its outputs are its attributes, ``look.boxes``; in ``transitions`` it stands for itself."""
 
     __slots__ = ("_node",)
+    _is_state = True
     #: How it ended, as the ``decide`` of a concurrency sees it of its regions.
     outcome: Value
 

@@ -103,7 +103,7 @@ class Chart:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes it into a file, ``run.svg``."""
-        pathlib.Path(path).write_text(self.svg)
+        pathlib.Path(path).write_text(self.svg, encoding="utf-8")
 
 
 class Network:

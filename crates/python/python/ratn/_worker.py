@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import builtins
 import contextvars
 import inspect
 import logging
+import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from ratn import _ports, _ratn
-from ratn._ratn import Cancelled, Goal
+from ratn._ratn import Aborted, Cancelled, Goal, Lost
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -67,6 +69,8 @@ class Worker:
         """
 
         def known(function: _Function) -> _Function:
+            if inspect.isgeneratorfunction(function) or inspect.isasyncgenfunction(function):
+                raise TypeError(f"{_ports.where(function)}: an action returns its outputs once, without `yield`; `goal.progress` tells how far it is")
             senses_, effects_ = list(senses), None if effects is None else list(effects)
             inputs, arrays = _ports.inputs_of(function)
             action = _ports.Action(
@@ -149,10 +153,13 @@ class Driver(Worker):
         """Makes a function the brakes: ``@d.brakes`` above ``def brake(state, reason): …``.
 
         It is called with ``"held"``, ``"stopped"`` or ``"ready"`` and with whoever asked for it and why, from another thread than the goals.
-        For the first two it returns when nothing moves; where it raises, the stop is in force and not confirmed. It is called for ``"stopped"`` at the
-        start, too, because the process before may have begun a motion, and may be called for a state that it has carried out already; an
-        emergency stop does not wait for an earlier call to return.
+        For the first two it returns when nothing moves; where it raises, the stop is in force and not confirmed. At the start it is called for
+        ``"held"`` (``"stopped"``, where a stop is kept) and then for ``"ready"``, because the process before may have begun a motion: no goal begins before
+        it has returned. It may be called for a state that it has carried out already. An emergency stop does not wait for an earlier call to return; it is
+        confirmed when that one has, and the brakes have been told once more, so that the newest state counts.
         """
+        if any(kind(function) for kind in (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.isasyncgenfunction)):
+            raise TypeError(f"{_ports.where(function)}: the brakes are a plain function, without `async` and `yield`: nothing moves when it has returned")
         self._brakes = function
         return function
 
@@ -163,7 +170,15 @@ class Driver(Worker):
         if self._brakes is None:
             raise ValueError("the driver has no brakes: decorate a function with `@driver.brakes`, which returns when nothing moves")
         arguments = sys.argv[1:] if arguments is None else arguments
-        self._serve(_at_a_socket(arguments), False, Driven(self._brakes, self._stop_file, self._standstill_s))
+        brakes = self._brakes
+
+        def apply(state: str, reason: str) -> None:
+            said = brakes(state, reason)
+            if inspect.isawaitable(said) or inspect.isgenerator(said):
+                getattr(said, "close", lambda: None)()
+                raise TypeError(f"the brakes returned a {type(said).__name__}, so they have not done anything: nothing moves when they have returned")
+
+        self._serve(_at_a_socket(arguments), False, Driven(apply, self._stop_file, self._standstill_s))
 
 
 def _at_a_socket(arguments: list[str]) -> list[str]:
@@ -190,20 +205,58 @@ def _performed(
     for port in action.arrays & given.keys():
         import numpy
 
-        given[port] = numpy.asarray(given[port], dtype=float)
+        if given[port] is not None:
+            given[port] = numpy.asarray(given[port], dtype=float)
     # What a goal sets there is its own: its thread performs others after it.
-    ended = contextvars.copy_context().run(function, goal, **given)
-    if inspect.isawaitable(ended):
-        import asyncio
+    context, process = contextvars.copy_context(), os.getpid()
+    try:
+        ended = context.run(function, goal, **given)
+        if inspect.isawaitable(ended):
+            import asyncio
 
-        ended = asyncio.run(_until_cancelled(goal, ended))
-    if isinstance(ended, Outcome):
-        return ended.name, ended.outputs, ended.reason
-    ended = {} if ended is None else ended
-    if not isinstance(ended, dict):
-        raise TypeError(f"{_ports.where(function)} returned a {type(ended).__name__}: expected a dict of outputs, or an Outcome")
+            ended = context.run(asyncio.run, _until_cancelled(goal, ended))
+        if os.getpid() != process:
+            _leave_fork(None)
+    except BaseException as raised:
+        if os.getpid() != process:
+            _leave_fork(raised)
+        meant = _meant(raised)
+        if meant is raised:
+            raise
+        raise meant from None
+    name, outputs, reason = (ended.name, ended.outputs, ended.reason) if isinstance(ended, Outcome) else ("success", ended, "")
+    outputs = {} if outputs is None else outputs
+    if not isinstance(outputs, dict):
+        raise TypeError(f"{_ports.where(function)} returned a {type(outputs).__name__}: expected a dict of outputs, or an Outcome")
     kinds = dict(action.outputs)
-    return "success", {port: _ports.fitting(value, kinds.get(port, "any")) for port, value in ended.items()}, ""
+    return name, {port: _ports.fitting(value, kinds.get(port, "any")) for port, value in outputs.items()}, str(reason)
+
+
+def _leave_fork(raised: BaseException | None) -> NoReturn:
+    """Ends a process that an action has forked and that has come back here: the goal is that of the process before it."""
+    code = 0 if raised is None else 1
+    if isinstance(raised, SystemExit):
+        code = raised.code if isinstance(raised.code, int) else 0 if raised.code is None else 1
+    elif raised is not None:
+        sys.excepthook(type(raised), raised, raised.__traceback__)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code & 0xFF)
+
+
+def _meant(raised: BaseException) -> BaseException:
+    """What tasks of asyncio that belong together (`asyncio.TaskGroup`) have raised of what ends a goal as its action wants; else what was raised."""
+    group = getattr(builtins, "BaseExceptionGroup", ())
+    each, waiting = [], [raised]
+    while waiting:
+        one = waiting.pop(0)
+        if isinstance(one, group):
+            waiting += one.exceptions
+        else:
+            each.append(one)
+    kinds = (Cancelled, Lost, Aborted)
+    wanted = [one for kind in kinds for one in each if isinstance(one, kind)]
+    return wanted[0] if len(wanted) == len(each) else raised
 
 
 async def _until_cancelled(goal: Goal, work: Any) -> Any:

@@ -4,7 +4,9 @@ import asyncio
 import contextvars
 import logging
 import os
+import sys
 import time
+import weakref
 from typing import Annotated, Any, TypedDict
 
 import numpy as np
@@ -106,6 +108,123 @@ def spin(goal: ratn.Goal, rounds: int) -> dict:
 @w.action(senses=["at(?)"])
 def look(goal: ratn.Goal) -> None:
     goal.measured("at(ball)", ratn.Pose(1, 2, 3), covariance=np.eye(6) * 0.25, source="eye")
+
+
+@w.action(computes=True, reads=[])
+def leave(goal: ratn.Goal, how: str) -> dict:
+    if how == "interrupt":
+        raise KeyboardInterrupt("by the action")
+    sys.exit("no more of this")
+    return {}
+
+
+@w.action(outputs={"codes": list[int]}, computes=True, reads=[])
+def forks(goal: ratn.Goal) -> dict:
+    """Its children leave by what an action may leave by, too."""
+    codes = []
+    for ending in ("exit", "return", "raise"):
+        child = os.fork()
+        if child == 0:
+            if ending == "exit":
+                sys.exit(7)
+            if ending == "raise":
+                raise ValueError("of the child")
+            return {"codes": []}
+        codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+    return {"codes": codes}
+
+
+class Unprintable(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("has no text")
+
+
+@w.action(computes=True, reads=[])
+def unusual(goal: ratn.Goal, how: str) -> dict:
+    if how == "long":
+        raise ratn.Aborted("ä" * 20_000_000)
+    if how == "group":
+        raise BaseExceptionGroup("several", [ratn.Aborted("one"), SystemExit(3)])
+    raise Unprintable
+    return {}
+
+
+@w.action(computes=True, reads=[])
+async def leave_later(goal: ratn.Goal) -> dict:
+    await asyncio.sleep(0)
+    sys.exit("no more of that")
+    return {}
+
+
+@w.action(outputs={"refused": str}, computes=True, reads=[])
+def tell(goal: ratn.Goal, length: int) -> dict:
+    try:
+        goal.progress("x" * length, picture=b"x" * length)
+    except ValueError as refused:
+        return {"refused": str(refused)}
+    return {"refused": ""}
+
+
+@w.action(computes=True, reads=[])
+def tell_often(goal: ratn.Goal, times: int) -> dict:
+    for number in range(times):
+        goal.progress("once more", number=number)
+        if number % 50 == 0:
+            # Whoever listens keeps up.
+            time.sleep(0.01)
+    return {"times": times}
+
+
+@w.action(outputs={"heard": str}, computes=True, reads=[])
+def ask(goal: ratn.Goal) -> dict:
+    try:
+        goal.call("Nearest", "nearest", begin=ratn.Pose())
+    except ratn.Aborted as refused:
+        return {"heard": str(refused)}
+    return {"heard": ""}
+
+
+@w.action(computes=True, reads=[])
+def through(goal: ratn.Goal, seconds: float) -> dict:
+    goal.progress("calls")
+    try:
+        goal.call("Lingerer", "linger", seconds=seconds)
+    except ratn.Cancelled:
+        log.info("the call was given up")
+        raise
+    return {}
+
+
+@w.action(computes=True, reads=[])
+async def together(goal: ratn.Goal) -> dict:
+    async def fail() -> None:
+        raise ratn.Aborted("apart")
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(fail())
+    return {}
+
+
+class Heard:
+    def __call__(self) -> None: ...
+
+
+watching: weakref.WeakSet = weakref.WeakSet()
+
+
+@w.action(outputs={"watching": int}, computes=True, reads=[])
+def watched(goal: ratn.Goal) -> dict:
+    """Zählt, was auf frühere Ziele noch hört 🤖."""
+    before = len(watching)
+    heard = Heard()
+    watching.add(heard)
+    goal.on_cancel(heard)
+    return {"watching": before}
+
+
+@w.action(outputs={"joints": ratn.Joints, "given": bool}, computes=True, reads=[])
+def odd(goal: ratn.Goal, numbers: np.ndarray | None = None) -> ratn.Outcome:
+    return ratn.Outcome("success", {"joints": [1, 2.5], "given": isinstance(numbers, np.ndarray)})
 
 
 w.run()

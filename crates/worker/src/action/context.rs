@@ -5,6 +5,7 @@ use super::goal::GoalEntry;
 use crate::client::{ActionClient, CallError, Channels, WorldClient, retry_unanswered};
 use crate::endpoint::{Endpoint, EndpointError};
 use crate::safety::{Safety, SafetyState};
+use crate::token_bucket::TokenBucket;
 use ratn_model::fact::{Change, FactPattern};
 use ratn_model::id::ProjectionId;
 use ratn_model::program::{PREEMPTED, STOPPED};
@@ -17,11 +18,23 @@ use ratn_proto::v1;
 use ratn_world::scene::delta::DeltaError;
 use ratn_world::world::{ChangeError, World};
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
+
+/// What an action says of its progress at once, the message and the named values together, has at most so many bytes. Of a goal the last 64 are
+/// kept for a listener that is slow, so that it never keeps more than a mebibyte of them.
+pub const MAX_PROGRESS_BYTES: usize = 16 * 1024;
+
+/// A goal tells of its progress at most so often in a second, and so often at once. What comes beyond that is not told, so that the sum of what it
+/// tells in a second is bounded, too.
+pub const MAX_PROGRESS_PER_S: u32 = 100;
+
+/// Bytes of a message that are told where the whole is too long.
+const SHORTENED_PROGRESS_BYTES: usize = 1024;
 
 /// A goal that an action performs.
 #[derive(Debug)]
@@ -48,6 +61,7 @@ pub struct GoalContext {
     pub(super) safety: Safety,
     entry: Arc<GoalEntry>,
     calls: AtomicU32,
+    progress_left: Mutex<TokenBucket>,
 }
 
 /// Why the world cannot be read.
@@ -136,6 +150,17 @@ impl WorldFailure {
     }
 }
 
+fn bounded(mut message: String, values: BTreeMap<String, Value>) -> v1::GoalProgress {
+    let values = wire_ports(values);
+    let bytes = message.len() + ports_bytes(&values);
+    if bytes <= MAX_PROGRESS_BYTES {
+        return v1::GoalProgress { message, values };
+    }
+    message.truncate(message.floor_char_boundary(SHORTENED_PROGRESS_BYTES));
+    message.push_str(&format!("… (shortened: {bytes} bytes with its values, at most {MAX_PROGRESS_BYTES} are told)"));
+    v1::GoalProgress { message, ..v1::GoalProgress::default() }
+}
+
 impl GoalContext {
     pub(crate) fn new(goal: Goal, entry: Arc<GoalEntry>, channels: Channels, safety: Safety) -> GoalContext {
         GoalContext {
@@ -153,6 +178,7 @@ impl GoalContext {
             safety,
             entry,
             calls: AtomicU32::new(0),
+            progress_left: Mutex::new(TokenBucket::full(MAX_PROGRESS_PER_S, Instant::now())),
         }
     }
 
@@ -161,11 +187,16 @@ impl GoalContext {
         self.progress_with(message, BTreeMap::new());
     }
 
-    /// As [`GoalContext::progress`], with named values beside the message.
+    /// As [`GoalContext::progress`], with named values beside the message. Of what has more than [`MAX_PROGRESS_BYTES`] only the beginning of the message is
+    /// told, and what comes more often than [`MAX_PROGRESS_PER_S`] is not told.
     pub fn progress_with(&self, message: impl Into<String>, values: BTreeMap<String, Value>) {
-        let progress = v1::GoalProgress { message: message.into(), values: wire_ports(values) };
+        let mut left = self.progress_left.lock().unwrap_or_else(PoisonError::into_inner);
+        if !left.take(MAX_PROGRESS_PER_S, MAX_PROGRESS_PER_S, Instant::now()) {
+            return;
+        }
+        drop(left);
         // Nobody may be listening.
-        let _ = self.entry.progress.send(progress);
+        let _ = self.entry.progress.send(bounded(message.into(), values));
     }
 
     /// Whether the goal may give a result, go on and give better ones ([`GoalContext::improved`]), and if so which outputs stay as they
@@ -324,6 +355,26 @@ impl GoalContext {
             Ok(outcome.outputs)
         } else {
             Err(CallFailure::Outcome { action: name, outcome: outcome.outcome, reason: outcome.reason })
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn progress_has_a_bound_for_the_message_and_the_values_together() {
+        let of = |bytes: usize| BTreeMap::from([("picture".to_owned(), Value::Bytes(vec![7; bytes]))]);
+        let told = bounded("half".to_owned(), of(MAX_PROGRESS_BYTES / 2));
+        assert_eq!((told.message.as_str(), told.values.len()), ("half", 1));
+        for (message, values) in [
+            ("ä".repeat(MAX_PROGRESS_BYTES), BTreeMap::new()),
+            ("x".repeat(MAX_PROGRESS_BYTES / 2), of(MAX_PROGRESS_BYTES / 2)),
+        ] {
+            let told = bounded(message, values);
+            assert!(told.message.contains("shortened") && told.message.len() < 2 * SHORTENED_PROGRESS_BYTES);
+            assert!(told.values.is_empty());
         }
     }
 }

@@ -27,7 +27,7 @@ mod stream;
 
 pub(crate) use admission::TOO_MANY_WAITING;
 pub(crate) use authority::{MANAGER_UNHEARD, NOT_AT_REST};
-pub use context::{CallFailure, GoalContext, WorldFailure};
+pub use context::{CallFailure, GoalContext, MAX_PROGRESS_BYTES, MAX_PROGRESS_PER_S, WorldFailure};
 pub use port::{InputError, Port};
 pub use ratn_proto::types::{Goal, GoalOutcome};
 pub use run::STOP_GRACE;

@@ -23,6 +23,9 @@ use tracing::Instrument;
 /// Of a goal that was told to stop and does not the result is told after this long; it keeps its resource until it has ended.
 pub const STOP_GRACE: Duration = Duration::from_secs(3);
 
+/// A reason is for people; of a longer one the beginning is told.
+const MAX_REASON_BYTES: usize = 64 * 1024;
+
 /// Runs a goal to its end, whatever its action does.
 pub(super) async fn run(
     server: Arc<Inner>,
@@ -114,8 +117,13 @@ async fn perform(action: &dyn Action, mut context: GoalContext) -> ActionResult 
     Ok(outcome)
 }
 
-/// An outcome whose outputs fit into a message; a failure that says what does not, otherwise.
-fn bounded(outcome: GoalOutcome) -> GoalOutcome {
+/// An outcome whose outputs fit into a message, with a reason that does; a failure that says what does not, otherwise.
+fn bounded(mut outcome: GoalOutcome) -> GoalOutcome {
+    if outcome.reason.len() > MAX_REASON_BYTES {
+        let bytes = outcome.reason.len();
+        outcome.reason.truncate(outcome.reason.floor_char_boundary(MAX_REASON_BYTES));
+        outcome.reason.push_str(&format!("… (shortened: {bytes} bytes)"));
+    }
     let outputs = wire_ports(outcome.outputs.clone());
     let bytes = ports_bytes(&outputs);
     if bytes <= MAX_PORTS_BYTES {
@@ -142,5 +150,18 @@ fn panic_message(panic: &(dyn std::any::Any + Send)) -> &str {
         (Some(text), _) => text,
         (_, Some(text)) => text,
         _ => "no message",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_reason_that_is_too_long_to_be_sent_is_told_without_its_end() {
+        let told = bounded(GoalOutcome::aborted("ä".repeat(20_000_000)));
+        assert!(told.reason.ends_with("… (shortened: 40000000 bytes)") && told.reason.len() < MAX_REASON_BYTES + 64);
+        assert_eq!(told.outcome, "aborted");
+        assert_eq!(bounded(GoalOutcome::aborted("short")).reason, "short");
     }
 }

@@ -179,6 +179,17 @@ impl LeaseWatch {
         self.shared.heard.send_modify(|heard| *heard += 1);
     }
 
+    /// From now on no goal begins before [`LeaseWatch::brought_to_rest`].
+    pub(crate) fn begin_at_rest(&self) {
+        self.shared.begins_at_rest.store(true, Ordering::SeqCst);
+    }
+
+    /// Returns once the driver has said [`LeaseWatch::brought_to_rest`].
+    pub(crate) async fn rested(&self) {
+        // The sender is in `self`.
+        let _ = self.shared.is_brought_to_rest.subscribe().wait_for(|said| *said).await;
+    }
+
     /// Whether the driver has said [`LeaseWatch::brought_to_rest`], and no goal runs at a resource, also none that was told to stop.
     pub fn is_at_rest(&self, resource: &str) -> bool {
         *self.shared.is_brought_to_rest.borrow()
@@ -202,7 +213,7 @@ impl LeaseWatch {
         let confirming = self.clone().confirm_standstill(client.clone());
         let (state, belief, id) = (session.state(), session.belief(), session.id().to_owned());
         let source = Source::Session { client: Box::new(client), state, belief, id };
-        self.shared.begins_at_rest.store(true, Ordering::SeqCst);
+        self.begin_at_rest();
         let following = self.clone().follow(source, patience);
         Ok(async move {
             tokio::select! {

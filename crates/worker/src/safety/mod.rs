@@ -64,6 +64,9 @@ pub trait Brakes: Send + Sync + 'static {
     /// caller who asked still waits. A stop or a hold does not wait for an earlier call: the earlier future is dropped at the point where it
     /// waits, and the two may overlap until it gets there. What the newer call did is then done once more.
     ///
+    /// Work that goes on after the future was dropped (`spawn_blocking`, a thread, another process) is unknown to who calls: it could release what a newer
+    /// call has stopped. Where there is such work, a newer call must not confirm before that is over, and do its own once more then.
+    ///
     /// # Errors
     /// Why the state is not carried out, or may not be.
     async fn apply(&self, state: &SafetyState) -> Result<(), String>;
