@@ -1001,7 +1001,7 @@ fn ledger(run: &str, commands: &[Command]) -> Ledger {
 }
 
 /// What is told of the world.
-fn changes(told: Vec<Event>) -> Vec<Event> {
+fn of_the_world(told: Vec<Event>) -> Vec<Event> {
     told.into_iter().filter(|event| matches!(event, Event::WorldChanged { .. })).collect()
 }
 
@@ -1260,7 +1260,7 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     let mut mirror = World::default();
     mirror.apply(&done())?;
     check_world(&place_of(&bench.endpoints), &open).await?;
-    assert_eq!(changes(bench.performer.take_up(&program(FETCH_BOXES), open.clone(), &mirror).await?), []);
+    assert_eq!(of_the_world(bench.performer.take_up(&program(FETCH_BOXES), open.clone(), &mirror).await?), []);
     let (revision, facts) = bench.performer.root().await?;
     assert_eq!((revision, facts.len()), (Revision(1), 1));
 
@@ -1271,7 +1271,7 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     check_world(&place_of(&bench.endpoints), &open).await?;
     let changed = bench.performer.take_up(&program(FETCH_BOXES), open.clone(), &mirror).await?;
     let facts = vec![(fact, Some(Value::Int(1)))];
-    assert_eq!(changes(changed), [Event::WorldChanged { revision: Revision(2), facts }]);
+    assert_eq!(of_the_world(changed), [Event::WorldChanged { revision: Revision(2), facts }]);
     // A pool that began anew.
     let later = Ledger { first_revision: Revision(9), ..open };
     let refused = check_world(&place_of(&bench.endpoints), &later).await;
@@ -1302,10 +1302,10 @@ async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() ->
     assert!(refused.is_err_and(|error| error.to_string().contains("resume the run again")));
     assert_eq!(bench.performer.root().await?.0, Revision(0));
     // With the whole log it has both, and the checkpoint is enough from then on.
-    assert_eq!(changes(bench.performer.take_up(&program(FETCH_BOXES), whole, &mirror).await?), []);
+    assert_eq!(of_the_world(bench.performer.take_up(&program(FETCH_BOXES), whole, &mirror).await?), []);
     assert_eq!(bench.performer.confirmed().commit, Revision(2));
     assert!(remembers(&place_of(&bench.endpoints), &short).await?);
-    assert_eq!(changes(bench.performer.take_up(&program(FETCH_BOXES), short, &mirror).await?), []);
+    assert_eq!(of_the_world(bench.performer.take_up(&program(FETCH_BOXES), short, &mirror).await?), []);
     assert_eq!(bench.performer.root().await?.0, Revision(2));
     bench.performer.close().await
 }
