@@ -7,6 +7,7 @@ use serde_json::Value;
 use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::Path;
+use support::host::Host;
 use support::motions::{begun_in, lines, motions, starts};
 use support::{Place, Started, repository, texts, wait_for};
 
@@ -177,4 +178,115 @@ fn a_run_is_paused_and_stepped_from_outside() -> anyhow::Result<()> {
     ensure!(learned.is_some_and(|seconds| seconds > 0.1), "{}", lines[0]["learned"]);
     ensure!(lines.last().is_some_and(|line| line["outcome"] == "preempted"), "{:?}", lines.last());
     Ok(())
+}
+
+/// Two things are noted, and between them something is waited for.
+const NOTE: &str = r#"
+task: note
+states:
+  - first: { resources: [{ create: Note, class: task }], states: [{ moment: { wait: { seconds: 0.1 } } }] }
+  - second:
+      effects: [noted(desk)]
+      resources: [{ create: Note, class: task }]
+      states: [{ go: { wait: { signal: go } } }]
+"#;
+
+/// Runs that on a host until it waits.
+fn waits_to_note(host: &Host, log: &Path) -> anyhow::Result<Started> {
+    let task = host.place.path().join("note.yaml");
+    std::fs::write(&task, NOTE)?;
+    let arguments = ["run", task.to_str().context("a path")?, &host.config(), "--log", log.to_str().context("a path")?];
+    let run = host.place.start_as("run", &arguments)?;
+    wait_for_line(log, "the wait", |line| line["awaits"] == "signal").with_context(|| run.said())?;
+    Ok(run)
+}
+
+/// How many notes there are.
+fn notes(host: &Host) -> usize {
+    let there = host.json(&["resource", "list", "--json"]);
+    let there = there.as_ref().and_then(Value::as_array).map(Vec::as_slice).unwrap_or_default();
+    there.iter().filter(|resource| resource["kind"] == "Note").count()
+}
+
+fn goes_on(host: &Host) -> anyhow::Result<()> {
+    let output = host.place.ratn(&["signal", "note", "go"]).output()?;
+    ensure!(output.status.success(), "{}", texts(&output).1);
+    Ok(())
+}
+
+#[test]
+fn a_run_that_was_killed_behind_its_end_does_what_it_had_decided_when_it_is_resumed() -> anyhow::Result<()> {
+    let mut host = Host::start()?;
+    let log = host.place.path().join("log.jsonl");
+    let file = log.to_str().context("a path")?.to_owned();
+    let mut run = waits_to_note(&host, &log)?;
+    host.kill("world-pool")?;
+    goes_on(&host)?;
+    wait_for_line(&log, "the end", |line| line["command"] == "end").with_context(|| run.said())?;
+    run.process()?.kill()?;
+    let status = run.child.wait()?;
+    ensure!(status.code().is_none(), "it was to be killed: {}", run.said());
+    host.start_role("world-pool")?;
+    let noted = || host.json(&["world", "facts", "--json"]).map(|facts| facts.to_string().contains("noted"));
+    ensure!(!wait_for("the world pool", || Ok(noted()))?, "it was committed before");
+
+    let resume = || host.place.ratn(&["run", "--resume", &file, &host.config()]).output();
+    let (output, before) = (resume()?, lines(&log)?.len());
+    let (out, err) = texts(&output);
+    ensure!(
+        output.status.success() && err.contains("the run had ended with success, and was killed before"),
+        "{out}{err}"
+    );
+    ensure!(noted() == Some(true), "{out}{err}");
+    // It is done, and nothing of it is left.
+    let output = resume()?;
+    let err = texts(&output).1;
+    ensure!(
+        output.status.code() == Some(2) && err.contains("has ended with success: there is nothing to resume"),
+        "{err}"
+    );
+    ensure!(lines(&log)?.len() == before && notes(&host) == 0);
+    host.is_whole()
+}
+
+#[test]
+fn what_was_created_before_the_kill_is_there_once_whether_its_session_lives_or_not() -> anyhow::Result<()> {
+    // A manager that forgets at once what it was asked for.
+    let host = Host::start_with("\n[resource-manager.limits]\nremembered_requests = 1\n")?;
+    let log = host.place.path().join("log.jsonl");
+    let file = log.to_str().context("a path")?.to_owned();
+    let run = waits_to_note(&host, &log)?;
+    let recorded = wait_for_line(&log, "word of the note", |line| line["event"] == "recorded")?;
+    let origin = &lines(&log)?[0]["origin"];
+    ensure!(recorded["operation"] == 1 && recorded["session"] == origin["session"], "{recorded} {origin}");
+    ensure!(notes(&host) == 1);
+    run.process()?.kill()?;
+    drop(run);
+    let resumed = |name: &str, times: usize| {
+        let run = host.place.start_as(name, &["run", "--resume", &file, &host.config()])?;
+        wait_for("task control to go on", || {
+            let resumed = lines(&log).unwrap_or_default().iter().filter(|line| line["event"] == "resumed").count();
+            Ok((resumed == times && run.said().contains("task control goes on")).then_some(()))
+        })
+        .with_context(|| run.said())?;
+        anyhow::Ok(run)
+    };
+    // Within its time to live.
+    let again = resumed("again", 1)?;
+    std::thread::sleep(std::time::Duration::from_millis(500));
+    ensure!(notes(&host) == 1, "{}", again.said());
+    again.process()?.kill()?;
+    drop(again);
+    wait_for("its session to end", || Ok((notes(&host) == 0).then_some(())))?;
+    // And after it: then it is made anew, and the log names the new session.
+    let mut last = resumed("last", 2)?;
+    wait_for("the note", || Ok((notes(&host) == 1).then_some(()))).with_context(|| last.said())?;
+    goes_on(&host)?;
+    let (code, out, err) = last.finish()?;
+    ensure!(code == Some(0), "{out}{err}");
+    let lines = lines(&log)?;
+    let recorded = lines.iter().filter(|line| line["event"] == "recorded");
+    let recorded: Vec<_> = recorded.map(|line| (line["operation"].as_u64(), line["session"].as_u64())).collect();
+    ensure!(recorded.len() >= 2 && recorded[0].1 != recorded[1].1 && recorded[1].0 == Some(1), "{recorded:?}");
+    host.is_whole()
 }

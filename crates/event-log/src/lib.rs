@@ -17,8 +17,8 @@ use std::path::{Path, PathBuf};
 
 /// A longer line is not written by any task; whoever wrote it is not `ratn`.
 const MAX_LINE_BYTES: usize = 16 << 20;
-/// Room that is kept for the next line, however long one was.
-const USUAL_LINE_BYTES: usize = 64 << 10;
+/// Room that is kept for the next lines, however long the last ones were.
+const USUAL_BYTES: usize = 64 << 10;
 /// A run whose log grows beyond this is ended rather than filling the disk.
 const MAX_LOG_BYTES: u64 = 4 << 30;
 
@@ -52,6 +52,20 @@ pub enum LogError {
     TooLong {
         /// The log.
         path: PathBuf,
+    },
+    /// A line would be longer than a reader takes.
+    #[error(
+        "the {what} has {bytes} bytes as a line of the event log {}, and at most {MAX_LINE_BYTES} can be read again; the run ends here, and \
+         nothing is done that follows from it",
+        path.display()
+    )]
+    LineTooLong {
+        /// The log.
+        path: PathBuf,
+        /// Which event or command, as it is named there.
+        what: String,
+        /// How long it is.
+        bytes: usize,
     },
     /// A line does not read.
     #[error("{}:{line}: not a line of an event log: {reason}", path.display())]
@@ -93,7 +107,7 @@ pub struct LogWriter {
     on_disk: bool,
     /// What was behind the last whole line is away.
     is_cut: bool,
-    /// Room for the next line.
+    /// Room for the next lines.
     text: Vec<u8>,
 }
 
@@ -183,18 +197,24 @@ impl LogWriter {
         Ok(())
     }
 
-    /// Writes what happened and what was decided then, and hands it to the operating system.
+    /// Writes what happened and what was decided then, and hands it to the operating system. Where it cannot be written so that it reads
+    /// again, nothing of it is written.
     pub fn append(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Result<(), LogError> {
-        self.write(&Written { at, entry: event })?;
-        self.append_commands(at, commands)
+        self.begin();
+        self.add(&Written { at, entry: event })?;
+        self.add_commands(at, commands)?;
+        self.write(1 + commands.len())
     }
 
-    /// Writes what was decided on the last event.
+    /// Writes what was decided on the last event, as [`LogWriter::append`] does.
     pub fn append_commands(&mut self, at: Timestamp, commands: &[Command]) -> Result<(), LogError> {
-        for command in commands {
-            self.write(&Written { at, entry: command })?;
-        }
-        self.file.flush().map_err(|source| self.io(source))
+        self.begin();
+        self.add_commands(at, commands)?;
+        self.write(commands.len())
+    }
+
+    fn add_commands(&mut self, at: Timestamp, commands: &[Command]) -> Result<(), LogError> {
+        commands.iter().try_for_each(|command| self.add(&Written { at, entry: command }))
     }
 
     /// The file, to make safe what was written while more is written; `None` where it is on no disk.
@@ -214,18 +234,32 @@ impl LogWriter {
         Ok(())
     }
 
-    fn write(&mut self, line: &Written<impl Serialize>) -> Result<(), LogError> {
+    fn begin(&mut self) {
         self.text.clear();
-        self.text.shrink_to(USUAL_LINE_BYTES);
+        self.text.shrink_to(USUAL_BYTES);
+    }
+
+    fn add(&mut self, line: &Written<impl Serialize>) -> Result<(), LogError> {
+        let begins = self.text.len();
         serde_json::to_writer(&mut self.text, line).map_err(|source| self.io(source.into()))?;
+        let bytes = self.text.len() - begins;
+        if bytes > MAX_LINE_BYTES {
+            return Err(LogError::LineTooLong { path: self.path.clone(), what: named(&self.text[begins..]), bytes });
+        }
         self.text.push(b'\n');
-        self.cut()?;
-        self.written += self.text.len() as u64;
-        self.lines += 1;
-        if self.written > MAX_LOG_BYTES {
+        Ok(())
+    }
+
+    /// Writes the lines that were added.
+    fn write(&mut self, lines: usize) -> Result<(), LogError> {
+        if self.written + self.text.len() as u64 > MAX_LOG_BYTES {
             return Err(LogError::TooLong { path: self.path.clone() });
         }
-        self.file.write_all(&self.text).map_err(|source| self.io(source))
+        self.cut()?;
+        self.written += self.text.len() as u64;
+        self.lines += lines;
+        let written = self.file.write_all(&self.text).and_then(|()| self.file.flush());
+        written.map_err(|source| self.io(source))
     }
 
     fn io(&self, source: std::io::Error) -> LogError {
@@ -413,6 +447,16 @@ pub fn without_visits(path: &str) -> String {
         .collect()
 }
 
+/// What a line calls itself, `event finished`: this stands at its beginning.
+fn named(line: &[u8]) -> String {
+    let beginning = String::from_utf8_lossy(&line[..line.len().min(100)]);
+    let named = ["event", "command"].iter().find_map(|what| {
+        let (_, name) = beginning.split_once(&format!("\"{what}\":\""))?;
+        Some(format!("{what} {}", name.split_once('"')?.0))
+    });
+    named.unwrap_or_else(|| "line".to_owned())
+}
+
 /// serde's message for an untagged enum says nothing; this one says what the line claims to be.
 fn explain(text: &[u8], error: &serde_json::Error) -> String {
     let Ok(value) = serde_json::from_slice::<serde_json::Value>(text) else {
@@ -529,6 +573,32 @@ mod tests {
         let log = read(file.path()).unwrap();
         assert_eq!((log.lines.len(), log.torn), (2, None));
         assert!(refusal(&first).contains("has no whole line"));
+    }
+
+    #[test]
+    fn a_line_that_no_reader_takes_is_refused_when_it_is_written_with_all_of_its_event() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let mut log = LogWriter::create(file.path()).unwrap();
+        log.append(Timestamp(0), &started(), &[]).unwrap();
+        let says =
+            |length: usize| Event::Signalled { signal: "x".repeat(length), value: ratn_model::value::Value::Null };
+        let around = serde_json::to_string(&Written { at: Timestamp(1), entry: &says(0) }).unwrap().len();
+        log.append(Timestamp(1), &says(MAX_LINE_BYTES - around), &[]).unwrap();
+        assert_eq!(read(file.path()).unwrap().lines.len(), 2);
+        let (bytes, lines) = (log.written(), log.lines());
+        let refused = log.append(Timestamp(1), &says(MAX_LINE_BYTES - around + 1), &[]).unwrap_err();
+        assert!(refused.to_string().starts_with("the event signalled has 16777217 bytes"), "{refused}");
+        // Nor is an event there without what was decided on it.
+        let end = Command::End {
+            outcome: "aborted".to_owned(),
+            outputs: Default::default(),
+            reason: "y".repeat(MAX_LINE_BYTES),
+        };
+        let refused = log.append(Timestamp(1), &Event::Woken, &[Command::Wake { at: Timestamp(2) }, end]).unwrap_err();
+        assert!(matches!(&refused, LogError::LineTooLong { what, .. } if what == "command end"), "{refused}");
+        assert_eq!((log.written(), log.lines()), (bytes, lines));
+        log.append(Timestamp(2), &Event::Resumed, &[]).unwrap();
+        assert_eq!(read(file.path()).unwrap().lines.len(), 3);
     }
 
     #[test]

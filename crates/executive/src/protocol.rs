@@ -40,6 +40,10 @@ pub struct Origin {
     /// can resume it.
     #[serde(default)]
     pub run: String,
+    /// The number of the session with which it began, as the resource manager numbers sessions: one that is made anew under the same id has
+    /// another. 0 in logs of earlier versions.
+    #[serde(default)]
+    pub session: u64,
     /// The version of the program that runs it.
     #[serde(default)]
     pub version: String,
@@ -113,6 +117,13 @@ pub enum Event {
     },
     /// Task control was gone and goes on from its log. Logged; changes nothing.
     Resumed,
+    /// What the run has created, deleted and used up is so at the resource manager. Logged; changes nothing.
+    Recorded {
+        /// Up to this one of its [`Command::Operate`]s, which are numbered from 1.
+        operation: u64,
+        /// In the session of this number: the run's from now on, where it had another before.
+        session: u64,
+    },
     /// The moment of a [`Command::Wake`] has come. Logged, as every event.
     Woken,
     /// A client sends a signal: the state that waits for one of this name goes on, or the next one that will.

@@ -65,7 +65,7 @@ impl History {
     /// Where the run stands: by its newest checkpoint and what is behind it, else by the whole log.
     ///
     /// # Errors
-    /// Where the log is not of this program and this version, or the run has ended.
+    /// Where the log is not of this program and this version.
     pub(crate) fn replay(&self, program: &Arc<Program>) -> Result<(Replayed, Log), HistoryError> {
         replay::check(program, &self.first)?;
         let Some(checkpoint) = self.checkpoint()? else {
@@ -79,7 +79,6 @@ impl History {
                     .say(format_args!("{path}: a checkpoint after {before} lines, and {read} lines behind it"));
                 Ok((replayed, behind))
             }
-            Err(error @ ReplayError::Ended { .. }) => Err(error.into()),
             Err(error) => {
                 self.say(&error);
                 self.replay_whole(program)

@@ -11,8 +11,8 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// A checkpoint keeps so many commits and operations although the daemons have confirmed them: a daemon that was killed without
-/// durable storage may have lost the last of them, and they are then repeated.
+/// A checkpoint keeps so many commits and operations although the daemons have confirmed them: a world pool that was killed without
+/// durable storage may have lost the last commits, and they are then repeated.
 const KEPT: usize = 256;
 /// A checkpoint keeps so many of the last withdrawn requests. An older one was answered long ago: the resource manager lets no
 /// session wait for more at a time (`waiters_per_session`).
@@ -30,6 +30,13 @@ pub(super) struct Ledger {
     pub(super) origin: Origin,
     /// The root's revision when the run began.
     pub(super) first_revision: Revision,
+    /// The root's revision of which the run has heard last: what others had made up to it is in its world.
+    pub(super) knows: Revision,
+    /// The number of the run's session: what it has made and holds is in that one. A session of its id that has another number was opened by
+    /// a resumption that died before it had made anything so again.
+    pub(super) session: u64,
+    /// The last operation that is done in that session, by its number.
+    pub(super) recorded: u64,
     /// When the last event came.
     pub(super) last: Timestamp,
     /// How often task control has come back so far.
@@ -120,8 +127,14 @@ impl Ledger {
         match event {
             Event::Started { origin, revision, .. } => {
                 self.origin = (**origin).clone();
-                self.first_revision = *revision;
+                self.session = origin.session;
+                (self.first_revision, self.knows) = (*revision, *revision);
             }
+            Event::Recorded { operation, session } => {
+                self.session = *session;
+                self.recorded = self.recorded.max(*operation);
+            }
+            Event::WorldChanged { revision, .. } => self.knows = self.knows.max(*revision),
             Event::Resumed => {
                 self.resumptions += 1;
                 for (instance, asked) in &mut self.waiting {
@@ -200,7 +213,8 @@ impl Ledger {
             Command::Commit { instance, writer, changes, evidence, revision } => {
                 let (instance, revision, writer) = (*instance, *revision, writer.clone());
                 let (changes, evidence) = (changes.clone(), evidence.clone());
-                self.commits.push(Decided { instance, writer, changes, evidence, revision });
+                let knows = self.knows;
+                self.commits.push(Decided { instance, writer, changes, evidence, revision, knows });
             }
             Command::Operate { instance, operations } => {
                 self.operations += 1;
@@ -212,6 +226,11 @@ impl Ledger {
             Command::End { outcome, .. } => self.ended = Some(outcome.clone()),
             Command::Note(_) => {}
         }
+    }
+
+    /// The operations that may not be done in the run's session, in order.
+    pub(super) fn open_operations(&self) -> impl Iterator<Item = &(u64, InstanceId, Vec<Requirement>)> {
+        self.operated.iter().filter(|(number, ..)| *number > self.recorded)
     }
 
     /// A goal is told to stop.
@@ -258,6 +277,23 @@ impl Ledger {
         let operations = self.operated.iter().flat_map(|(_, _, operations)| operations);
         operations.for_each(|operation| create_or_delete(&mut left, operation));
         left
+    }
+
+    /// What may not be done of what takes away: deletions of what the run had not created itself, and consumptions; with the numbers of their
+    /// operations and their places in these. What others have made does not go with the session, nor does what is used up for good return with it.
+    pub(super) fn open_removals(&self) -> Vec<(u64, InstanceId, usize, &Requirement)> {
+        let (mut left, mut open) = (self.left.clone(), Vec::new());
+        for (number, instance, operations) in &self.operated {
+            for (index, operation) in operations.iter().enumerate() {
+                let before = (*number > self.recorded).then(|| left.clone());
+                create_or_delete(&mut left, operation);
+                let removes = matches!(operation.operation, ResourceOperation::Delete | ResourceOperation::Consume);
+                if removes && before.is_some_and(|before| before == left) {
+                    open.push((*number, *instance, index, operation));
+                }
+            }
+        }
+        open
     }
 
     /// What the run has used up, for the same reason.
@@ -388,6 +424,47 @@ mod tests {
         ];
         ledger.command(&Command::Operate { instance: InstanceId(1), operations });
         assert_eq!(ledger.created(), [requirement(Create, "Box", 1)]);
+    }
+
+    #[test]
+    fn an_operation_is_open_until_it_is_recorded_and_what_it_takes_from_others_also_in_another_session() {
+        use ResourceOperation::{Consume, Create, Delete};
+        let mut ledger = Ledger { session: 7, ..Ledger::default() };
+        for operation in [
+            requirement(Create, "Box", 1),
+            requirement(Delete, "Foreign", 1),
+            requirement(Delete, "Box", 1),
+            requirement(Delete, "Foreign", 2),
+            requirement(Consume, "Glue", 1),
+        ] {
+            ledger.command(&Command::Operate { instance: InstanceId(1), operations: vec![operation] });
+        }
+        let open = |ledger: &Ledger| ledger.open_operations().map(|(number, ..)| *number).collect::<Vec<_>>();
+        let removals = |ledger: &Ledger| ledger.open_removals().iter().map(|one| (one.0, one.2)).collect::<Vec<_>>();
+        assert_eq!((open(&ledger), removals(&ledger)), (vec![1, 2, 3, 4, 5], vec![(2, 0), (4, 0), (5, 0)]));
+        ledger.event(Timestamp(1), &Event::Recorded { operation: 2, session: 7 });
+        assert_eq!((open(&ledger), removals(&ledger)), (vec![3, 4, 5], vec![(4, 0), (5, 0)]));
+        // A resumption has made all of it so in a session of its own.
+        ledger.event(Timestamp(2), &Event::Recorded { operation: 5, session: 9 });
+        assert_eq!((open(&ledger), ledger.session), (vec![], 9));
+    }
+
+    #[test]
+    fn a_commit_is_made_of_what_others_had_made_until_it_was_decided() {
+        let mut ledger = Ledger::default();
+        let decides = |ledger: &mut Ledger, number: u64| {
+            ledger.command(&Command::Commit {
+                instance: InstanceId(number),
+                writer: String::new(),
+                changes: Vec::new(),
+                evidence: Vec::new(),
+                revision: Revision(number),
+            });
+        };
+        decides(&mut ledger, 1);
+        ledger.event(Timestamp(1), &Event::WorldChanged { revision: Revision(5), facts: Vec::new() });
+        decides(&mut ledger, 2);
+        assert_eq!(ledger.commits.iter().map(|decided| decided.knows).collect::<Vec<_>>(), [Revision(0), Revision(5)]);
     }
 
     #[test]

@@ -100,7 +100,8 @@ mod tests {
             self.commits += 1;
             let revision = self.mirror.apply(changes).unwrap_or_default();
             let (instance, writer) = (InstanceId(self.commits), String::new());
-            let decided = Decided { instance, writer, changes: changes.to_vec(), evidence: Vec::new(), revision };
+            let (changes_made, evidence, knows) = (changes.to_vec(), Vec::new(), Revision(0));
+            let decided = Decided { instance, writer, changes: changes_made, evidence, revision, knows };
             self.outside.decided("run", &decided);
             (decided.id("run"), changes.to_vec())
         }

@@ -243,6 +243,7 @@ impl Progress {
             | Event::Granted { .. }
             | Event::Projected { .. }
             | Event::Progressed { .. }
+            | Event::Recorded { .. }
             | Event::Woken
             | Event::WantedByOthers { .. }
             | Event::Advised { .. } => {}

@@ -94,6 +94,8 @@ pub(super) struct Decided {
     pub(super) evidence: Evidence,
     /// What the run's root becomes: the pool's, as long as nobody else writes into it.
     pub(super) revision: Revision,
+    /// The pool's revision that the run had heard of when it decided that: what others had made until then it knew.
+    pub(super) knows: Revision,
 }
 
 impl Decided {
@@ -126,6 +128,8 @@ pub(super) struct Recorder {
     pub(super) events: mpsc::Sender<Answer>,
     /// The run's session: what it no longer holds others may have changed since.
     pub(super) trust: Trust,
+    /// Its number.
+    pub(super) session: u64,
     /// The run's place in its trace.
     pub(super) trace: TraceContext,
     pub(super) root: Root,
@@ -201,9 +205,10 @@ impl Recorder {
                 }
                 Record::Operate { instance, number, operations, order } => {
                     let operating = self.operate(instance, number, operations, &order);
-                    let event = trace::within(self.of(instance), operating).await;
+                    let failed = trace::within(self.of(instance), operating).await;
                     behind = Some(order);
-                    event
+                    // Whoever resumes the run does not do it again.
+                    Some(failed.unwrap_or(Event::Recorded { operation: number, session: self.session }))
                 }
                 Record::Flush(done) => {
                     let _ = done.send(recorded.clone());

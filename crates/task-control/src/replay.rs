@@ -4,6 +4,7 @@
 
 use super::checkpoint::{Checkpoint, ReplayedState};
 use super::ledger::Ledger;
+use super::shell::Ended;
 use ratn_executive::executive::Executive;
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine, Note};
 use ratn_model::id::{InstanceId, StateId};
@@ -41,7 +42,7 @@ pub enum ReplayError {
         "the task file has changed since the run began: put the old one back, or run the new one from its beginning"
     )]
     Digest,
-    /// Nothing is left to do.
+    /// It has ended, and all that it did is recorded, or cannot be any more.
     #[error("the run has ended with {outcome}: there is nothing to resume")]
     Ended {
         /// The outcome of the run.
@@ -75,6 +76,8 @@ pub(super) struct Replayed {
     /// Commands of the last event that are not in the log: its writer was killed among them, and has performed none of them.
     /// They are to be performed.
     pub(super) missing: Vec<Command>,
+    /// How it has ended, where it has: what it had decided by then may not all be done.
+    pub(super) ended: Option<Ended>,
     /// How many events were replayed.
     pub(super) events: u64,
 }
@@ -135,7 +138,7 @@ fn go_on(
     lines: &[LogLine],
 ) -> Result<Replayed, ReplayError> {
     let ReplayedState { ledger, states, progress } = &mut standing;
-    let mut missing = Vec::new();
+    let (mut missing, mut ended) = (Vec::new(), None);
     let (mut next, mut events) = (0, 0);
     while let Some(LogLine { at, entry }) = lines.get(next) {
         let event = match entry {
@@ -163,8 +166,8 @@ fn go_on(
             return Err(otherwise(before + next + logged.len() + 1, None, missing.get(logged.len())));
         }
         missing.iter().for_each(|command| follow(states, command));
-        if let Some(Command::End { outcome, .. }) = logged.last() {
-            return Err(ReplayError::Ended { outcome: outcome.clone() });
+        if let Some(end @ Command::End { .. }) = logged.last().copied() {
+            ended = Ended::of(end.clone(), *at);
         }
         logged.iter().for_each(|command| ledger.command(command));
         progress.catch_up(*at, event, missing.iter());
@@ -174,7 +177,7 @@ fn go_on(
         commits.for_each(|command| ledger.command(command));
         next += logged.len();
     }
-    Ok(Replayed { executive, standing, missing, events })
+    Ok(Replayed { executive, standing, missing, ended, events })
 }
 
 /// Keeps in mind which state an instance is of, as long as it matters.
@@ -287,8 +290,11 @@ pub(super) mod tests {
                 }
                 assert!(executive.has_ended());
             }
-            let ended = ReplayError::Ended { outcome: "success".into() };
-            assert_eq!(replay(&program, &lines).err(), Some(ended));
+            // Of one that has ended it is known what it had decided.
+            let whole = replay(&program, &lines).unwrap();
+            assert_eq!(whole.ended.map(|ended| ended.outcome).as_deref(), Some("success"));
+            let decided = lines.iter().filter(|line| matches!(line.entry, LogEntry::Command(Command::Commit { .. })));
+            assert_eq!(whole.standing.ledger.commits.len(), decided.count());
         }
     }
 
@@ -342,8 +348,8 @@ pub(super) mod tests {
             let behind = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place..cut]).unwrap();
             assert_eq!((&behind.standing, &behind.missing), (&whole.standing, &whole.missing));
             // The end is found, too; and a line that does not follow is refused with its number in the whole log.
-            let ended = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place..]).err();
-            assert_eq!(ended, Some(ReplayError::Ended { outcome: "success".into() }));
+            let ended = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place..]).unwrap().ended;
+            assert_eq!(ended.map(|ended| ended.outcome).as_deref(), Some("success"));
             let refused = replay_behind(&program, checkpoint(&program, &lines[..place]), &lines[place - 1..]).err();
             if matches!(lines[place - 1].entry, LogEntry::Command(_)) {
                 assert!(

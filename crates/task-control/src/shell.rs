@@ -115,7 +115,7 @@ pub enum Urgency {
 }
 
 /// How a run ended.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Ended {
     /// The outcome of the task.
     pub outcome: String,
@@ -137,7 +137,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
     let id = fresh_id("run");
     let began_unix_ms = unix_ms();
     let trace = trace_of(&id, &run.program.name, run.seed, began_unix_ms);
-    let performer = Performer::connect(place, &id, &run.program.name, trace, events).await;
+    let performer = Performer::connect(place, &id, &run.program.name, None, trace, events).await;
     let performer = performer.context("cannot begin the run")?;
     // A run that is refused leaves no log.
     let log = LogWriter::create(&run.log)?;
@@ -183,6 +183,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
             breakpoints: run.breakpoints.into_boxed_slice(),
             origin: Box::new(Origin {
                 run: id,
+                session: shell.performer.session(),
                 version: VERSION.to_owned(),
                 file: run.file,
                 from: run.from,
@@ -368,7 +369,7 @@ impl Shell {
         for command in commands {
             match command {
                 Command::Wake { at } => drop(self.timers.insert(at)),
-                Command::End { .. } => return Ok(ended(command, now)),
+                Command::End { .. } => return Ok(Ended::of(command, now)),
                 command => {
                     let waits = replay::must_be_durable(&self.program, &self.states, std::slice::from_ref(&command));
                     let safe = match &command {
@@ -645,12 +646,15 @@ struct Asks {
     for_lost_leases: bool,
 }
 
-fn ended(command: Command, now: Timestamp) -> Option<Ended> {
-    match command {
-        Command::End { outcome, outputs, reason } => {
-            Some(Ended { outcome, outputs, reason, makespan_s: now.seconds() })
+impl Ended {
+    /// By the command that ended it, at this moment; nothing by another one.
+    pub(crate) fn of(command: Command, now: Timestamp) -> Option<Ended> {
+        match command {
+            Command::End { outcome, outputs, reason } => {
+                Some(Ended { outcome, outputs, reason, makespan_s: now.seconds() })
+            }
+            _ => None,
         }
-        _ => None,
     }
 }
 

@@ -65,6 +65,9 @@ pub struct SessionState {
     pub unheard_since: Option<Instant>,
     /// The manager knew it from before when it was pinged for the first time: it goes on with what it has there.
     pub found: bool,
+    /// Its number at the manager: one that is made anew under the same id has another. 0 until it was alive, and where the manager does not
+    /// number its sessions.
+    pub number: u64,
     /// The manager has said last that the id is another caller's, who has a session of it or had the last one ([`Session::taken`]).
     pub taken: bool,
 }
@@ -404,6 +407,7 @@ impl SessionTask {
                 let before = *state;
                 // One that was not alive here was not there: the answer that said so may have been lost with its stream.
                 state.found |= before.generation == 0 && !answer.created;
+                state.number = answer.number;
                 state.generation += u64::from(answer.created || is_another || before.generation == 0);
                 state.alive |= holds;
                 state.taken = false;

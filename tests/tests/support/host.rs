@@ -21,12 +21,17 @@ pub(crate) struct Host {
 
 impl Host {
     pub(crate) fn start() -> anyhow::Result<Host> {
+        Host::start_with("")
+    }
+
+    /// As [`Host::start`], with more in its config.
+    pub(crate) fn start_with(more: &str) -> anyhow::Result<Host> {
         let place = Place::new()?;
         let config = place.path().join("ratn.toml");
         let shipped = std::fs::read_to_string(repository("deploy/ratn.toml"))?;
         std::fs::write(
             &config,
-            shipped.replace("\nspeed = 1.0", "\nspeed = 8.0").replace("\nboxes = 3", "\nboxes = 1"),
+            shipped.replace("\nspeed = 1.0", "\nspeed = 8.0").replace("\nboxes = 3", "\nboxes = 1") + more,
         )?;
         let mut host = Host { place, config, running: BTreeMap::new(), starts: 0 };
         for role in ROLES {

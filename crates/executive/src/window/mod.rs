@@ -189,7 +189,11 @@ impl Window {
             Event::WantedByOthers { holders } => self.give_way_to_others(context, &holders),
             Event::Signalled { .. } => self.may_end_waits = true,
             Event::Woken => self.wake_routines(context),
-            Event::Answered { .. } | Event::Started { .. } | Event::Progressed { .. } | Event::Resumed => {}
+            Event::Answered { .. }
+            | Event::Started { .. }
+            | Event::Progressed { .. }
+            | Event::Recorded { .. }
+            | Event::Resumed => {}
         }
         self.go_on(context)
     }

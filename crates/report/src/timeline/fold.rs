@@ -166,7 +166,7 @@ impl Timeline {
             | Event::AbortRequested { .. } => Cause::Operator,
             Event::Signalled { signal, .. } => Cause::Signal(signal.as_str().into()),
             // It changes nothing.
-            Event::Progressed { .. } => return,
+            Event::Progressed { .. } | Event::Recorded { .. } => return,
         };
         match event {
             Event::Started { task, mode, parameters, seed, capacity, breakpoints, origin, .. } => {
@@ -218,6 +218,7 @@ impl Timeline {
             Event::BreakpointsSet { states } => self.breakpoints.clone_from(states),
             Event::Projected { .. }
             | Event::Progressed { .. }
+            | Event::Recorded { .. }
             | Event::WorldChanged { .. }
             | Event::RetirementFailed { .. }
             | Event::AbortRequested { .. }
@@ -472,6 +473,7 @@ fn instance_of(event: &Event) -> Option<InstanceId> {
         | Event::RetirementFailed { instance, .. } => Some(*instance),
         Event::Started { .. }
         | Event::Resumed
+        | Event::Recorded { .. }
         | Event::Woken
         | Event::PauseRequested
         | Event::ResumeRequested

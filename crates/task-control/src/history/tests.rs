@@ -132,7 +132,7 @@ fn a_checkpoint_that_is_torn_or_damaged_anywhere_is_not_used() {
     // Of an older or newer format.
     std::fs::write(bench.checkpoint(), &whole).unwrap();
     rewrite(&bench.checkpoint(), |bytes| bytes[16] += 1);
-    assert!(find().unwrap_err().to_string().contains("of format 5"));
+    assert!(find().unwrap_err().to_string().contains("of format 6"));
     assert_eq!(bench.resumes_behind(), 0);
 }
 
@@ -200,7 +200,7 @@ fn a_state_that_does_not_fit_the_lines_behind_it_is_not_used() {
 fn a_run_that_has_ended_leaves_no_checkpoint() {
     let bench = Bench::new(Mode::Hsm);
     bench.run(bench.events(), 100, usize::MAX);
-    assert!(matches!(bench.resume().err().unwrap(), HistoryError::Replay(ReplayError::Ended { .. })));
+    assert!(bench.resume().unwrap().0.ended.is_some());
     std::fs::remove_file(bench.log()).unwrap();
     let writer = LogWriter::create(&bench.log()).unwrap();
     Checkpointer::start(&writer, &bench.program.digest, 1, Ledger::default(), 0).unwrap().end();

@@ -14,7 +14,7 @@ mod told;
 mod wanted;
 mod watch;
 
-pub(super) use resume::{check_world, remembers};
+pub(super) use resume::{check_world, missing_commits, remembers};
 
 use super::decided::{Unanswered, insist};
 use super::ledger::{Confirmed, Projecting, acquire_request};
@@ -44,7 +44,7 @@ use ratn_otlp::ids;
 use ratn_proto::types::{self, ENDPOINT_ATTRIBUTE, WorldChange};
 use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
-use ratn_worker::session::{DEFAULT_TTL, Session, Trust};
+use ratn_worker::session::{DEFAULT_TTL, Session, SessionState, Trust};
 use ratn_worker::trace::{self, TraceContext};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
@@ -93,6 +93,14 @@ async fn end_projection(world: &WorldClient, trust: &Trust, instance: InstanceId
     if let Err(undone) = insist(trust, Unanswered::GivenUp, || world.release(projection)).await {
         tracing::warn!(%instance, "a projection was not given back: {undone}");
     }
+}
+
+/// Whether a session was opened by a resumption that died before the run was in it what it had been: nothing in it is the run's. `before` is the
+/// number of the run's own, 0 where that is not known.
+fn is_of_a_resumption(session: &Session, before: Option<u64>) -> bool {
+    let state = session.state();
+    let SessionState { found, number, .. } = *state.borrow();
+    found && before.is_some_and(|before| before != 0 && number != 0 && before != number)
 }
 
 /// Who is asked where something is not told in time.
@@ -164,6 +172,10 @@ pub(super) struct Performer {
     channels: Channels,
     world: WorldClient,
     session: Session,
+    /// Its number at the manager.
+    number: u64,
+    /// Whether who comes back has found it, with all that the run has in it.
+    is_own: bool,
     /// Whether the run has what it had.
     trust: Trust,
     /// Where the session is kept alive, whatever this thread does.
@@ -224,11 +236,12 @@ struct Job {
 
 impl Performer {
     /// Opens the run's session and begins to listen to commands. The session has the run's id, so that whoever resumes the run
-    /// goes on with it. `trace` is the place of the run in its trace.
+    /// goes on with it; `before` is its number by the run's log. `trace` is the place of the run in its trace.
     pub(super) async fn connect(
         place: &Place,
         run: &str,
         task: &str,
+        before: Option<u64>,
         trace: TraceContext,
         events: mpsc::Sender<Answer>,
     ) -> anyhow::Result<Performer> {
@@ -238,8 +251,17 @@ impl Performer {
         let background = BackgroundRuntime::start("session").context("cannot keep a session alive")?;
         // Over a connection of its own.
         let open = || Session::open_as(&Channels::new(&place.tls), manager, run.clone(), "task-control", DEFAULT_TTL);
-        let session = background.enter(open);
+        let mut session = background.enter(open);
         session.alive(SESSION_DEADLINE).await?;
+        if is_of_a_resumption(&session, before) {
+            session.close().await;
+            session = background.enter(open);
+            session.alive(SESSION_DEADLINE).await?;
+            if is_of_a_resumption(&session, before) {
+                bail!("the session of a resumption that was killed has not ended yet: resume the run again");
+            }
+        }
+        let SessionState { found: is_own, number, .. } = *session.state().borrow();
         let resources = ResourceClient::new(&channels, manager, session.id())?;
         let told = Told::new(&run);
         let others = claim::look_for_others(resources.clone(), run.clone(), told.clone());
@@ -247,7 +269,7 @@ impl Performer {
         match claim(&resources, &run, task, place.alone).await {
             Ok(has_others) => told.beside_others(has_others),
             // What a run that comes back holds is still its own.
-            Err(refused) if session.state().borrow().found => {
+            Err(refused) if is_own => {
                 session.abandon().await;
                 return Err(refused);
             }
@@ -271,6 +293,7 @@ impl Performer {
             done: recorded.clone(),
             events: events.clone(),
             trust: trust.clone(),
+            session: number,
             trace,
             root: root.clone(),
             promises: promises.clone(),
@@ -289,6 +312,8 @@ impl Performer {
             channels,
             world,
             session,
+            number,
+            is_own,
             trust,
             _background: background,
             _others: [others, listening],
@@ -380,6 +405,11 @@ impl Performer {
         self.paths.extend(paths.iter().map(|(instance, path)| (*instance, path.clone())));
     }
 
+    /// The number of the run's session.
+    pub(super) fn session(&self) -> u64 {
+        self.number
+    }
+
     /// The id of the run.
     pub(super) fn run(&self) -> &str {
         &self.run
@@ -418,7 +448,8 @@ impl Performer {
                 self.release(instance, lease, projection, safe);
             }
             Command::Commit { instance, writer, changes, evidence, revision } => {
-                let decided = Decided { instance, writer, changes, evidence, revision };
+                let knows = self.told.revision();
+                let decided = Decided { instance, writer, changes, evidence, revision, knows };
                 self.outside.decided(&self.run, &decided);
                 self.decided = decided.revision;
                 self.record(Record::Commit { decided, safe })?;

@@ -1,16 +1,22 @@
 //! Coming back to a run whose task control was killed: what it had asked for is asked for again, and nothing twice.
 //!
 //! Leases live on with the run's session, if that still lives; what nobody knows to have goes back. Goals are looked for where
-//! they were given. Commits and operations are repeated under their ids. If the session has ended meanwhile, leases are gone
-//! with it (their goals end as the providers say), and what the run had created and used up is made so again.
+//! they were given. Commits that the world pool does not have, and operations that the log does not say to be done, are made under their ids.
+//!
+//! ```text
+//! the session that the log names is found ─► it is the run's, with all that is done in it
+//! another is found ─► a resumption opened it and died: it is ended ─┐
+//! none is found ────────────────────────────────────────────────────┴► a new one: leases are gone (their goals end as the providers
+//!           say), what the run had created and used up is made so again, and then the log names the new session
+//! ```
 
 use super::Performer;
 use super::acquiring::late_request;
 use super::goal::Given;
-use crate::decided::{Unanswered, insist};
-use crate::ledger::{Confirmed, Ledger};
+use crate::decided::{Unanswered, Undone, insist};
+use crate::ledger::{Confirmed, Ledger, operation_request};
 use crate::outside;
-use crate::record::{Decided, Named, Record, commit_next, operate_once};
+use crate::record::{Decided, Named, Record, commit_next, operate_once, said};
 use crate::shell::Place;
 use anyhow::bail;
 use futures::{StreamExt, stream};
@@ -19,12 +25,17 @@ use ratn_executive::was_overtaken;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::program::Program;
+use ratn_model::resource::{Requirement, ResourceOperation};
+use ratn_model::value::Value;
 use ratn_proto::types::{Resource, WorldUpdate};
 use ratn_worker::client::retry_unanswered;
-use ratn_worker::client::{Channels, WorldClient};
+use ratn_worker::client::{Channels, ResourceClient, WorldClient};
+use ratn_worker::session::Trust;
 use ratn_world::world::World;
+use std::borrow::Cow;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
+use tokio_util::sync::CancellationToken;
 
 /// So many withdrawals of before are under way at once.
 const WITHDRAWN_AT_ONCE: usize = 64;
@@ -51,6 +62,23 @@ pub(crate) async fn remembers(place: &Place, ledger: &Ledger) -> anyhow::Result<
     let world = WorldClient::new(&Channels::new(&place.tls), &place.endpoints.world_pool)?;
     let (root, _) = retry_unanswered(|| world.root()).await?;
     Ok(youngest_there(&world, ledger, root).await?.0.is_some())
+}
+
+/// How many of the ledger's commits the world pool lacks; `None` where it cannot be told any more.
+pub(crate) async fn missing_commits(place: &Place, ledger: &Ledger) -> anyhow::Result<Option<usize>> {
+    let world = WorldClient::new(&Channels::new(&place.tls), &place.endpoints.world_pool)?;
+    let (root, _) = retry_unanswered(|| world.root()).await?;
+    if root < ledger.first_revision {
+        return Ok(None);
+    }
+    let (there, oldest) = youngest_there(&world, ledger, root).await?;
+    let is_unknown = ledger.forgotten > 0 || is_before(ledger, oldest);
+    Ok(there.or((!is_unknown).then_some(0)).map(|there| ledger.commits.len() - there))
+}
+
+/// Whether commits of the run may be older than what the pool can tell of.
+fn is_before(ledger: &Ledger, oldest: Revision) -> bool {
+    oldest > ledger.first_revision && !ledger.commits.is_empty()
 }
 
 /// How many of the ledger's commits the pool has: they were made in order, so those up to the youngest that it tells of. `None`
@@ -80,7 +108,8 @@ async fn youngest_there(
 }
 
 impl Performer {
-    /// Takes up everything that is open, in the order in which it was decided; what has changed from outside meanwhile.
+    /// Takes up everything that is open, in the order in which it was decided. What the executive is to be told: that all of it is so in a new
+    /// session, and what has changed from outside meanwhile.
     ///
     /// # Errors
     /// Where the run cannot go on.
@@ -89,31 +118,26 @@ impl Performer {
         program: &Program,
         mut ledger: Ledger,
         mirror: &World,
-    ) -> anyhow::Result<Option<Event>> {
-        (self.acquires, self.operations, self.resumptions) = (ledger.acquires, ledger.operations, ledger.resumptions);
-        let changed = self.commit_again(program, &ledger, mirror).await?;
-        let commit = ledger.commits.last().map(|decided| decided.revision).unwrap_or_default();
-        // All of it is in the root that was read.
-        self.decided = commit;
-        self.told.committed(commit);
-        self.confirm(Confirmed { commit, ..Confirmed::default() });
-        for (instance, attempt, goal) in &ledger.stopped {
-            self.start(*instance, *attempt, goal.clone(), Given::ToStop, None);
-        }
+    ) -> anyhow::Result<Vec<Event>> {
+        let (_, revision, facts) = self.commit_again(program, &ledger).await?;
+        let facts = outside::differences(&World::from_facts(facts, revision), mirror);
+        let changed = (!facts.is_empty()).then_some(Event::WorldChanged { revision, facts });
+        self.stop_again(&ledger);
         // Before all that takes a while: whoever performs them waits for their run no longer than its grace.
         for (instance, (attempt, goal)) in std::mem::take(&mut ledger.goals) {
             self.start(instance, attempt, goal, Given::Before, None);
         }
         // Operations wait for that.
-        self.withdraw_again(std::mem::take(&mut ledger.withdrawn));
-        if self.session.state().borrow().found {
-            self.sweep(&ledger).await?;
-            for (number, instance, operations) in &ledger.operated {
-                self.operate(*instance, *number, operations.clone(), None)?;
-            }
+        let withdrawn = self.withdraw_again(std::mem::take(&mut ledger.withdrawn));
+        let mut recorded = None;
+        if self.is_own {
+            self.sweep(&ledger, withdrawn).await?;
+            self.operate_again(&ledger)?;
         } else {
             self.make_anew(&ledger).await?;
-            self.confirm(Confirmed { commit, operation: ledger.operations });
+            let operation = ledger.operations;
+            self.confirm(Confirmed { operation, ..self.confirmed() });
+            recorded = Some(Event::Recorded { operation, session: self.number });
         }
         for (instance, asked) in ledger.projecting {
             let named = asked.named.map(|id| Named { id, made: self.making.begin(id), again: true });
@@ -124,20 +148,35 @@ impl Performer {
         for (instance, asked) in waiting {
             self.acquire(instance, asked.number, asked.requirements, asked.priority);
         }
-        Ok(changed)
+        Ok(recorded.into_iter().chain(changed).collect())
     }
 
-    /// Makes every commit that the world pool does not have, and compares the two worlds: what is otherwise in the pool was changed
-    /// from outside.
+    /// Does what a run that has ended had decided and may not have done: its commits; and its operations, where its session still lives. What it
+    /// had created is gone with that otherwise. So many of each.
+    ///
+    /// # Errors
+    /// Where the commits cannot be made.
+    pub(crate) async fn finish(&mut self, program: &Program, mut ledger: Ledger) -> anyhow::Result<(usize, usize)> {
+        let (commits, ..) = self.commit_again(program, &ledger).await?;
+        if !self.is_own {
+            return Ok((commits, 0));
+        }
+        self.stop_again(&ledger);
+        let withdrawn = self.withdraw_again(std::mem::take(&mut ledger.withdrawn));
+        self.sweep(&ledger, withdrawn).await?;
+        Ok((commits, self.operate_again(&ledger)?))
+    }
+
+    /// Makes every commit that the world pool does not have. How many these were, and the root with all of them.
     async fn commit_again(
         &mut self,
         program: &Program,
         ledger: &Ledger,
-        mirror: &World,
-    ) -> anyhow::Result<Option<Event>> {
+    ) -> anyhow::Result<(usize, Revision, Vec<(FactKey, Value)>)> {
+        (self.acquires, self.operations, self.resumptions) = (ledger.acquires, ledger.operations, ledger.resumptions);
         let (mut root, _) = retry_unanswered(|| self.world.root()).await?;
         let there = self.commits_there(ledger, root).await?;
-        if !self.session.state().borrow().found {
+        if !self.is_own {
             self.refuse_what_came_between(program, ledger, there, root).await?;
         }
         for decided in &ledger.commits[there..] {
@@ -148,12 +187,32 @@ impl Performer {
             }
         }
         let (revision, facts) = self.root().await?;
-        let pool = World::from_facts(facts, revision);
-        let facts = outside::differences(&pool, mirror);
-        Ok((!facts.is_empty()).then_some(Event::WorldChanged { revision, facts }))
+        let commit = ledger.commits.last().map(|decided| decided.revision).unwrap_or_default();
+        // All of it is in the root that was read.
+        self.decided = commit;
+        self.told.committed(commit);
+        self.confirm(Confirmed { commit, operation: if self.is_own { ledger.recorded } else { 0 } });
+        Ok((ledger.commits.len() - there, revision, facts))
+    }
+
+    /// Tells goals to stop that may not have heard of it.
+    fn stop_again(&mut self, ledger: &Ledger) {
+        for (instance, attempt, goal) in &ledger.stopped {
+            self.start(*instance, *attempt, goal.clone(), Given::ToStop, None);
+        }
+    }
+
+    /// Does the operations that may not be done, in order, under their ids; how many.
+    fn operate_again(&mut self, ledger: &Ledger) -> anyhow::Result<usize> {
+        let open: Vec<_> = ledger.open_operations().collect();
+        for (number, instance, operations) in &open {
+            self.operate(*instance, *number, operations.clone(), None)?;
+        }
+        Ok(open.len())
     }
 
     /// The run had lost what it held: where others have changed since what it has yet to commit, or what that is made of, it is not true any more.
+    /// What it had heard of when it decided that is in it.
     async fn refuse_what_came_between(
         &self,
         program: &Program,
@@ -178,7 +237,9 @@ impl Performer {
             if is_behind {
                 let written = change.written.iter().map(|fact| &fact.key);
                 for key in written.chain(&change.gone) {
-                    let is_meant = |decided: &&Decided| was_overtaken(program, &decided.writer, &decided.changes, key);
+                    let is_meant = |decided: &&Decided| {
+                        decided.knows < told && was_overtaken(program, &decided.writer, &decided.changes, key)
+                    };
                     if let Some(decided) = missing.iter().find(is_meant) {
                         bail!(
                             "what {} has changed is not in the world yet, and others have changed {key}, which it changes or is made of, \
@@ -198,7 +259,7 @@ impl Performer {
             (None, _) if ledger.forgotten > 0 => {
                 bail!("the world pool has lost commits of the run since it was asked for them; resume the run again")
             }
-            (None, oldest) if oldest > ledger.first_revision && !ledger.commits.is_empty() => bail!(
+            (None, oldest) if is_before(ledger, oldest) => bail!(
                 "the world pool keeps no revision of this run any more (the oldest is {oldest}): what it has of the run's commits \
                    is not known; run the task again"
             ),
@@ -207,63 +268,143 @@ impl Performer {
     }
 
     /// Undoes what was withdrawn before, if that was not heard: what crossed with the end of task control goes back; a waiting one has left the queue
-    /// with its connection. Nothing waits for that but operations.
-    fn withdraw_again(&mut self, withdrawn: Vec<String>) {
+    /// with its connection. Nothing waits for that but operations, and leases that nobody knows of. What is returned is cancelled when all of it is done.
+    fn withdraw_again(&mut self, withdrawn: Vec<String>) -> CancellationToken {
+        let over = CancellationToken::new();
+        let ends = over.clone().drop_guard();
         if withdrawn.is_empty() {
-            return;
+            return over;
         }
         let (resources, trust, returns) = (self.resources.clone(), self.trust.clone(), self.order.returning.begin());
-        let requests = withdrawn.into_iter().flat_map(|request| [late_request(&request), request]);
         self.giving_back.spawn(async move {
-            let withdrawing = stream::iter(requests).map(move |request| {
+            let withdrawing = stream::iter(newest_first(withdrawn)).map(move |request| {
                 let (resources, trust) = (resources.clone(), trust.clone());
                 async move { insist(&trust, Unanswered::Waits, || resources.withdraw(&request)).await }
             });
             withdrawing.buffer_unordered(WITHDRAWN_AT_ONCE).for_each(|_| std::future::ready(())).await;
-            drop(returns);
+            drop((returns, ends));
         });
+        over
     }
 
-    /// Gives back what the session holds and the run does not: what it was about to give back, with word of what it has committed; and grants that
-    /// nobody heard of. What others left to be told of these stays there.
-    async fn sweep(&mut self, ledger: &Ledger) -> anyhow::Result<()> {
-        for lease in self.living_leases().await?.difference(&ledger.held) {
-            let (lease, resources, trust) = (*lease, self.resources.clone(), self.trust.clone());
-            let is_known = ledger.returned.contains(&lease);
-            let note = if is_known { self.told.left(self.decided).to_string() } else { String::new() };
+    /// Gives back what the session holds and the run does not: what it was about to give back, with word of what it has committed; and, behind the
+    /// withdrawals, which give back as well what was used up, grants that nobody heard of. What others left to be told of these stays there.
+    async fn sweep(&mut self, ledger: &Ledger, withdrawn: CancellationToken) -> anyhow::Result<()> {
+        let living = living_leases(&self.resources, &self.run).await?;
+        let (known, unheard): (Vec<LeaseId>, BTreeSet<LeaseId>) = {
+            let is_known = |lease: &&LeaseId| ledger.returned.contains(lease);
+            let (known, unheard): (Vec<_>, Vec<_>) = living.difference(&ledger.held).partition(is_known);
+            (known.into_iter().copied().collect(), unheard.into_iter().copied().collect())
+        };
+        for lease in known {
+            let (resources, trust) = (self.resources.clone(), self.trust.clone());
+            let note = self.told.left(self.decided).to_string();
             let (idle, returns) = (self.stopping.under(lease), self.order.returning.begin());
             self.giving_back.spawn(async move {
                 for goal in idle {
                     goal.cancelled().await;
                 }
-                let release = || resources.release_with_note(lease, note.clone());
-                if let Err(undone) = insist(&trust, Unanswered::Waits, release).await {
-                    tracing::warn!("a lease that was left from before was not given back: {undone}");
-                }
+                release(&resources, &trust, lease, &note).await;
                 drop(returns);
             });
         }
+        if unheard.is_empty() {
+            return Ok(());
+        }
+        let (resources, trust, run) = (self.resources.clone(), self.trust.clone(), self.run.clone());
+        let returns = self.order.returning.begin();
+        self.giving_back.spawn(async move {
+            withdrawn.cancelled().await;
+            match living_leases(&resources, &run).await {
+                Ok(living) => {
+                    for lease in unheard.intersection(&living) {
+                        release(&resources, &trust, *lease, "").await;
+                    }
+                }
+                Err(error) => tracing::warn!("leases that nobody heard of were not given back: {error:#}"),
+            }
+            drop(returns);
+        });
         Ok(())
     }
 
-    async fn living_leases(&self) -> anyhow::Result<BTreeSet<LeaseId>> {
-        let resources = retry_unanswered(|| self.resources.list(&[])).await?;
-        let own = |resource: Resource| {
-            let holdings = resource.holdings.into_iter().filter(|holding| holding.session == self.run);
-            holdings.map(|holding| holding.lease).collect::<Vec<_>>()
-        };
-        Ok(resources.into_iter().flat_map(own).collect())
-    }
-
-    /// The old session is gone with what it had made and used up.
+    /// The old session is gone with what it had made and used up. What others had made and the run deleted is gone for good, and so is some of what
+    /// it used up: that is repeated only where it may not be done.
     async fn make_anew(&self, ledger: &Ledger) -> anyhow::Result<()> {
         let created = ledger.created();
-        for (index, operation) in created.iter().chain(ledger.used_up()).enumerate() {
+        for (number, instance, index, removal) in ledger.open_removals() {
+            if removal.operation == ResourceOperation::Consume && self.came_back(removal, &created).await? {
+                continue;
+            }
+            let request = operation_request(&self.run, instance, number, index);
+            match operate_once(&self.resources, &self.trust, &request, removal).await {
+                Ok(()) => {}
+                // It was done, and that is forgotten.
+                Err(Undone::Failed(error)) if !error.is_crash() => {
+                    tracing::warn!("`{removal}` was not repeated: {}", said(&error));
+                }
+                Err(undone) => bail!("`{removal}` may not be done and cannot be repeated: {undone}"),
+            }
+        }
+        let mut again: Vec<&Requirement> = created.iter().collect();
+        for consumption in ledger.used_up() {
+            if self.came_back(consumption, &created).await? {
+                again.push(consumption);
+            }
+        }
+        for (index, operation) in again.into_iter().enumerate() {
             let request = format!("{}/again-{}.{index}", self.run, self.resumptions);
             if let Err(undone) = operate_once(&self.resources, &self.trust, &request, operation).await {
                 bail!("`{operation}` was so before and cannot be made so again: {undone}");
             }
         }
         Ok(())
+    }
+
+    /// Whether what was used up came back with the end of the session: what is renewable did, and what the run creates itself is made anew.
+    async fn came_back(&self, consumption: &Requirement, created: &[Requirement]) -> anyhow::Result<bool> {
+        let fits =
+            |attributes: &BTreeMap<String, Value>| consumption.accepts(|name| attributes.get(name).map(Cow::Borrowed));
+        if created.iter().any(|one| one.kind == consumption.kind && fits(&one.attributes)) {
+            return Ok(true);
+        }
+        let kinds = [consumption.kind.as_str()];
+        let there = retry_unanswered(|| self.resources.list(&kinds)).await?;
+        let mut fitting = there.iter().filter(|resource| fits(&resource.attributes)).peekable();
+        Ok(fitting.peek().is_none() || fitting.any(|resource| resource.renewable))
+    }
+}
+
+/// The requests of withdrawn acquires: those of the last moments may have been granted meanwhile and keep others waiting; older ones were answered
+/// long ago.
+fn newest_first(withdrawn: Vec<String>) -> impl Iterator<Item = String> {
+    withdrawn.into_iter().rev().flat_map(|request| [late_request(&request), request])
+}
+
+async fn living_leases(resources: &ResourceClient, run: &str) -> anyhow::Result<BTreeSet<LeaseId>> {
+    let resources = retry_unanswered(|| resources.list(&[])).await?;
+    let own = |resource: Resource| {
+        let holdings = resource.holdings.into_iter().filter(|holding| holding.session == run);
+        holdings.map(|holding| holding.lease).collect::<Vec<_>>()
+    };
+    Ok(resources.into_iter().flat_map(own).collect())
+}
+
+async fn release(resources: &ResourceClient, trust: &Trust, lease: LeaseId, note: &str) {
+    let release = || resources.release_with_note(lease, note.to_owned());
+    if let Err(undone) = insist(trust, Unanswered::Waits, release).await {
+        tracing::warn!("a lease that was left from before was not given back: {undone}");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_withdrawn_last_is_withdrawn_first_also_where_it_was_asked_for_again_late() {
+        let withdrawn = ["r/1", "r/2", "r/3"].map(str::to_owned).to_vec();
+        let requests: Vec<String> = newest_first(withdrawn).collect();
+        assert_eq!(requests, ["r/3/late", "r/3", "r/2/late", "r/2", "r/1/late", "r/1"]);
     }
 }

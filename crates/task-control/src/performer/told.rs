@@ -343,7 +343,14 @@ mod tests {
     #[test]
     fn a_commit_says_whose_it_is() {
         let (instance, writer) = (InstanceId(7), String::new());
-        let decided = Decided { instance, writer, changes: Vec::new(), evidence: Vec::new(), revision: Revision(12) };
+        let decided = Decided {
+            instance,
+            writer,
+            changes: Vec::new(),
+            evidence: Vec::new(),
+            revision: Revision(12),
+            knows: Revision(0),
+        };
         assert_eq!(maker(&decided.id("run-1")), Some(("run-1".to_owned(), Revision(12))));
         assert_eq!(maker("by hand"), None);
     }

@@ -8,7 +8,7 @@ use crate::control::Control;
 use crate::history::{History, HistoryError};
 use crate::interrupt::Interrupt;
 use crate::performer::{self, Performer};
-use crate::replay::{self, Replayed};
+use crate::replay::{self, ReplayError, Replayed};
 use crate::shell::MAX_PENDING_EVENTS;
 use crate::spans::{Before, Spans, trace_of};
 use anyhow::Context;
@@ -34,7 +34,7 @@ impl Resumption {
     /// Replays what the log says. Touches nothing of the run.
     ///
     /// # Errors
-    /// Where the log is not of this program and this version, or the run has ended.
+    /// Where the log is not of this program and this version.
     pub fn new(
         program: Program,
         history: History,
@@ -70,20 +70,26 @@ impl Resumption {
     }
 }
 
-/// Goes on with a run whose task control was killed, on the system that it was on.
+/// Goes on with a run whose task control was killed, on the system that it was on. Of one that has ended it does what may not have been done when it
+/// was killed.
 ///
 /// # Errors
 /// As when a run begins; and where the run cannot go on: its log is of another program, its world is not there any more, it is under
-/// way.
+/// way. [`ReplayError::Ended`] where it has ended and nothing is left to do.
 pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Interrupt) -> anyhow::Result<Ended> {
     let ledger = &resumption.replayed.standing.ledger;
-    performer::check_world(place, ledger).await?;
+    if resumption.replayed.ended.is_none() {
+        performer::check_world(place, ledger).await?;
+    }
     if !performer::remembers(place, ledger).await? {
         resumption.history.say(&"the world pool has lost commits that are older");
         resumption = resumption.whole()?;
     }
+    if let Some(ended) = resumption.replayed.ended.take() {
+        return finish(resumption, ended, place).await;
+    }
     let Resumption { program, history, replayed, log, checkpoint_every } = resumption;
-    let Replayed { executive, standing, missing, events: replayed } = replayed;
+    let Replayed { executive, standing, missing, events: replayed, .. } = replayed;
     let ReplayedState { mut ledger, states, progress } = standing;
     let (mode, seed) = history.mode_and_seed();
     // It knows of what is missing before that is written: nothing is kept until it is.
@@ -96,7 +102,8 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
     let origin = &ledger.origin;
     // Of the same trace as before.
     let trace = trace_of(&origin.run, &program.name, seed, origin.began_unix_ms);
-    let performer = Performer::connect(place, &origin.run, &program.name, trace, events).await;
+    let before = Some(ledger.session);
+    let performer = Performer::connect(place, &origin.run, &program.name, before, trace, events).await;
     let performer = performer.context("cannot go on with the run")?;
     let shell = Shell {
         executive,
@@ -132,14 +139,51 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         shell.log.make_durable()?;
         ledger.event(now, &Event::Resumed);
         shell.performer.know(shell.progress.paths());
-        let changed = shell.performer.take_up(&Arc::clone(&shell.program), ledger, &mirror).await?;
+        let told = shell.performer.take_up(&Arc::clone(&shell.program), ledger, &mirror).await?;
         // Commits are there by now.
         let missing = missing.into_iter().filter(|command| !matches!(command, Command::Commit { .. }));
-        let ended = shell.perform(now, missing.chain(commands), None)?;
-        match changed {
-            Some(changed) if ended.is_none() => shell.step(changed),
-            _ => Ok(ended),
+        let mut ended = shell.perform(now, missing.chain(commands), None)?;
+        for event in told {
+            if ended.is_none() {
+                ended = shell.step(event)?;
+            }
         }
+        Ok(ended)
     };
     shell.run_to_its_end(begin, interrupt).await
+}
+
+/// Does what a run had decided that was killed behind its end.
+async fn finish(resumption: Resumption, ended: Ended, place: &Place) -> anyhow::Result<Ended> {
+    let Resumption { program, history, replayed, log, .. } = resumption;
+    let ledger = replayed.standing.ledger;
+    let nothing = || ReplayError::Ended { outcome: ended.outcome.clone() };
+    let say = |what: String| history.messages().say(format_args!("{}: {what}", log.path().display()));
+    let Some(missing) = performer::missing_commits(place, &ledger).await? else {
+        say("whether all that the run did is in the world is not known: the world pool does not go back so far"
+            .to_owned());
+        return Err(nothing().into());
+    };
+    if missing == 0 && ledger.open_operations().next().is_none() {
+        return Err(nothing().into());
+    }
+    let (origin, seed) = (&ledger.origin, history.mode_and_seed().1);
+    let trace = trace_of(&origin.run, &program.name, seed, origin.began_unix_ms);
+    // Nobody hears of anything any more.
+    let events = mpsc::channel(1).0;
+    let performer = Performer::connect(place, &origin.run, &program.name, Some(ledger.session), trace, events).await;
+    let mut performer = performer.context("cannot do what the run had decided")?;
+    let finished = performer.finish(&program, ledger).await;
+    let closed = performer.close().await;
+    let (commits, operations) = finished?;
+    closed?;
+    if (commits, operations) == (0, 0) {
+        return Err(nothing().into());
+    }
+    say(format!(
+        "the run had ended with {}, and was killed before all that it had decided was recorded; made now: commits {commits}, operations \
+         {operations}",
+        ended.outcome
+    ));
+    Ok(ended)
 }

@@ -257,6 +257,50 @@ states:
     Ok(())
 }
 
+async fn resumption_of(run: &Run) -> anyhow::Result<Resumption> {
+    // Threads of what was dropped hold the log a moment longer.
+    let log = loop {
+        match LogWriter::go_on(&run.log) {
+            Err(ratn_event_log::LogError::UnderWay { .. }) => tokio::task::yield_now().await,
+            opened => break opened?,
+        }
+    };
+    let history = crate::history::History::of(&log, Messages::nowhere())?;
+    Ok(Resumption::new((*run.program).clone(), history, log, 1)?)
+}
+
+#[tokio::test]
+async fn of_a_run_that_was_killed_behind_its_end_the_rest_is_done_once() -> anyhow::Result<()> {
+    const NOTED: &str = "
+task: note
+states:
+  - part: { effects: [noted(desk)], resources: [{ create: Note, class: task }], states: [{ moment: { wait: { seconds: 0.1 } } }] }
+";
+    let bench = Bench::new(|note| *note = program(NOTED)).await?;
+    let (place, (_asks, interrupt)) = (&bench.place, Interrupt::new());
+    let outcome = run(bench.run.clone(), place, &interrupt).await?.outcome;
+    assert_eq!(outcome, SUCCESS);
+    let nothing = resume(resumption_of(&bench.run).await?, place, &interrupt).await;
+    let ended = || replay::ReplayError::Ended { outcome: outcome.clone() };
+    assert_eq!(nothing.err().and_then(|error| error.downcast().ok()), Some(ended()));
+    // A world pool to which its last commit has not come.
+    let runtime = RuntimeDirectory::create(&bench.directory.path().join("other"))?;
+    let shutdown = CancellationToken::new();
+    tokio::spawn(world_pool::run(WorldPoolConfig::default(), runtime.clone(), shutdown.clone()));
+    let _shutdown = shutdown.drop_guard();
+    let world_pool = runtime.wait_for(world_pool::ROLE, READY).await?;
+    let place = &Place { endpoints: Endpoints { world_pool, ..place.endpoints.clone() }, ..place.clone() };
+    let finished = resume(resumption_of(&bench.run).await?, place, &interrupt).await?;
+    assert_eq!(finished.outcome, SUCCESS);
+    let channels = ratn_worker::client::Channels::new(&place.tls);
+    let world = ratn_worker::client::WorldClient::new(&channels, &place.endpoints.world_pool)?;
+    let (_, facts) = world.root().await?;
+    assert_eq!(facts.iter().map(|fact| fact.key.to_string()).collect::<Vec<_>>(), ["noted(desk)"]);
+    let nothing = resume(resumption_of(&bench.run).await?, place, &interrupt).await;
+    assert_eq!(nothing.err().and_then(|error| error.downcast().ok()), Some(ended()));
+    Ok(())
+}
+
 #[tokio::test]
 async fn a_run_that_waits_has_what_it_was_sent_also_after_it_was_killed() -> anyhow::Result<()> {
     let mut bench = Bench::new(|waiting| *waiting = program(WAITING)).await?;
@@ -279,15 +323,7 @@ async fn a_run_that_waits_has_what_it_was_sent_also_after_it_was_killed() -> any
         ended = run(bench.run.clone(), place, &interrupt) => panic!("it ended: {ended:?}"),
         () = killed => {}
     }
-    // Threads of what was dropped hold the log a moment longer.
-    let log = loop {
-        match LogWriter::go_on(&bench.run.log) {
-            Err(ratn_event_log::LogError::UnderWay { .. }) => tokio::task::yield_now().await,
-            opened => break opened?,
-        }
-    };
-    let history = crate::history::History::of(&log, Messages::nowhere())?;
-    let resumption = Resumption::new((*bench.run.program).clone(), history, log, 1)?;
+    let resumption = resumption_of(&bench.run).await?;
     let resumed = resume(resumption, place, &interrupt);
     let asked = async {
         waits(place, "really").await;

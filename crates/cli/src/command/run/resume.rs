@@ -8,7 +8,7 @@ use crate::output;
 use crate::system::System;
 use crate::system::config::SystemConfig;
 use ratn_event_log::LogWriter;
-use ratn_task_control::history::History;
+use ratn_task_control::history::{History, ReplayError};
 use ratn_task_control::shell::{self, Place, Resumption};
 use ratn_worker::tls::ClientTls;
 use std::path::Path;
@@ -51,5 +51,10 @@ pub(super) async fn run(
         ended = shell::resume(resumption, &place, interrupt) => ended,
         error = system.one_ended() => Err(error.context("a part of the system ended during the run")),
     };
-    conclude(&ended?, file, arguments)
+    let ended = match ended {
+        // It has ended, and there is nothing to do.
+        Err(error) if error.is::<ReplayError>() => return Err(refused(&error)),
+        ended => ended?,
+    };
+    conclude(&ended, file, arguments)
 }
