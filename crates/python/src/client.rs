@@ -124,7 +124,13 @@ impl Client {
             .map_err(|_| PyValueError::new_err("timeout_s: is no time to wait"))?;
         let held = self.held(py)?;
         let requirements = kinds.iter().map(|kind| Requirement::new(ResourceOperation::Block, kind)).collect();
-        let options = AcquireOptions { request: fresh_id("python"), priority, deadline, holder: holder.to_owned() };
+        let options = AcquireOptions {
+            request: fresh_id("python"),
+            priority,
+            deadline,
+            holder: holder.to_owned(),
+            ..AcquireOptions::default()
+        };
         let granted = wait_for(py, &self.runtime, held.client.acquire(requirements, options))?;
         Ok(Lease { granted, held, runtime: Arc::clone(&self.runtime) })
     }

@@ -48,6 +48,7 @@ fn place_of(endpoints: &Endpoints) -> Place {
         messages: Messages::nowhere(),
         alone: false,
         urgency: Urgency::Normal,
+        standing: Standing::default(),
     }
 }
 
