@@ -32,7 +32,12 @@ impl Holder {
         let mut resources = ResourceServiceClient::new(connect(manager, &ClientTls::none()).await?);
         let (pings, outgoing) = mpsc::channel(1);
         pings
-            .send(v1::KeepAliveRequest { session_id: "holder".into(), ttl_ms: TTL_MS, client: "holder".into() })
+            .send(v1::KeepAliveRequest {
+                session_id: "holder".into(),
+                ttl_ms: TTL_MS,
+                client: "holder".into(),
+                ..Default::default()
+            })
             .await?;
         resources
             .keep_alive(ReceiverStream::new(outgoing))

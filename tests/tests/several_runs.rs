@@ -84,3 +84,59 @@ fn a_run_that_was_suspended_for_too_long_changes_nothing_of_what_came_after_it()
     up.finish()?;
     place.wait_until_empty()
 }
+
+/// What is said on the command line of a run is what the resource manager counts with, and what `ratn status` shows.
+#[test]
+fn the_share_and_the_due_time_of_a_run_arrive_and_are_shown() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let mut up = place.start_as("up", &["up", "--speed", "10", "--boxes", "1"])?;
+    wait_for("the system", || Ok(up.said().contains("is ready").then_some(()))).with_context(|| up.said())?;
+    let file = place.path().join("waits.yaml");
+    std::fs::write(&file, "task: waits\nstates:\n  - go: { wait: { signal: go } }\n")?;
+    let file = file.to_str().context("a path")?;
+
+    for (wrong, why) in [
+        (["--share", "0"], "expected a number from 0.01 to 100; 1 is the usual share"),
+        (["--due", "soon"], "expected a time from the start as 90s, 15m or 2h"),
+        (["--due", "2001-01-01T00:00:00Z"], "--due: has passed"),
+    ] {
+        let output = place.ratn(&[["run", file].as_slice(), &wrong].concat()).output()?;
+        let (_, err) = texts(&output);
+        ensure!(output.status.code() == Some(2) && err.contains(why) && err.contains(wrong[0]), "{wrong:?}: {err}");
+    }
+
+    let mut run = place.start_as("run", &["run", file, "--share", "2.5", "--due", "30m"])?;
+    let mut usual = place.start_as("usual", &["run", file])?;
+    let shown = wait_for("both runs", || {
+        let (shown, _) = texts(&place.ratn(&["status"]).output()?);
+        Ok((shown.matches("share ").count() == 2).then_some(shown))
+    })
+    .with_context(|| run.said())?;
+    let due: Vec<&str> = shown.lines().filter_map(|line| line.strip_prefix("share 2.5, due in ")).collect();
+    let seconds = due.first().and_then(|due| due.strip_suffix(" s")).context("no due time")?.parse::<u32>()?;
+    ensure!((1_700..=1_800).contains(&seconds), "{shown}");
+    ensure!(shown.lines().any(|line| line == "share 1"), "{shown}");
+
+    let (sessions, err) = texts(&place.ratn(&["resource", "sessions", "--json"]).output()?);
+    let sessions: serde_json::Value = serde_json::from_str(&sessions).with_context(|| err)?;
+    let sessions = sessions.as_array().context("a list of sessions")?;
+    let told =
+        |share: f64| sessions.iter().filter(|one| one["client"] == "task-control" && one["share"] == share).count();
+    ensure!((told(2.5), told(1.0)) == (1, 1), "{sessions:?}");
+    let of_run = sessions.iter().find(|one| one["share"] == 2.5).context("its session")?;
+    ensure!(of_run["due_in_ms"].as_i64().is_some_and(|due| (1_700_000..=1_800_000).contains(&due)), "{of_run}");
+
+    let (runs, _) = texts(&place.ratn(&["status", "--json"]).output()?);
+    let runs: serde_json::Value = serde_json::from_str(&runs)?;
+    for id in runs["runs"].as_array().context("a list of runs")?.iter().filter_map(|run| run["run"].as_str()) {
+        let (said, err) = texts(&place.ratn(&["signal", id, "go"]).output()?);
+        ensure!(err.is_empty() || !said.is_empty(), "{said}{err}");
+    }
+    for one in [&mut run, &mut usual] {
+        let (code, _, said) = one.finish()?;
+        ensure!(code == Some(0), "{code:?}\n{said}");
+    }
+    up.signal(nix::sys::signal::Signal::SIGTERM)?;
+    up.finish()?;
+    place.wait_until_empty()
+}

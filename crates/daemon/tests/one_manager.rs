@@ -34,7 +34,12 @@ async fn ping(
     ttl: Duration,
 ) -> Option<v1::KeepAliveResponse> {
     let ttl_ms = u64::try_from(ttl.as_millis()).unwrap();
-    let request = v1::KeepAliveRequest { session_id: session.to_owned(), ttl_ms, client: session.to_owned() };
+    let request = v1::KeepAliveRequest {
+        session_id: session.to_owned(),
+        ttl_ms,
+        client: session.to_owned(),
+        ..Default::default()
+    };
     let answers = client.keep_alive(tokio_stream::once(request)).await.ok()?;
     answers.into_inner().message().await.ok()?
 }

@@ -44,7 +44,12 @@ fn refused(status: Status, says: &str) {
 
 /// The answer to one ping of a session of a day.
 async fn ping(client: &mut ResourceServiceClient<Channel>, session: &str) -> Result<(), Status> {
-    let ping = v1::KeepAliveRequest { session_id: session.to_owned(), ttl_ms: 86_400_000, client: String::new() };
+    let ping = v1::KeepAliveRequest {
+        session_id: session.to_owned(),
+        ttl_ms: 86_400_000,
+        client: String::new(),
+        ..Default::default()
+    };
     let answers = client.keep_alive(tokio_stream::iter([ping])).await?;
     in_time(answers.into_inner().message()).await.map(drop)
 }

@@ -167,7 +167,12 @@ async fn a_session_whose_pings_stay_away_expires() {
     let system = TestSystem::new();
     let manager = system.resource_manager().await;
     let mut raw = ResourceServiceClient::new(system.channels.get(&manager.endpoint).unwrap());
-    let ping = v1::KeepAliveRequest { session_id: "silent".into(), ttl_ms: 500, client: "silent".into() };
+    let ping = v1::KeepAliveRequest {
+        session_id: "silent".into(),
+        ttl_ms: 500,
+        client: "silent".into(),
+        ..Default::default()
+    };
     let answer = raw.keep_alive(tokio_stream::once(ping)).await.unwrap().into_inner().message().await.unwrap().unwrap();
     assert!(answer.created);
     let request =

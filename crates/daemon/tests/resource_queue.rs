@@ -12,10 +12,10 @@ use ratn_proto::v1::resource_service_client::ResourceServiceClient;
 use ratn_resources::Limits;
 use ratn_worker::client::{AcquireOptions, CallError, ResourceClient};
 use ratn_worker::server::Serving;
-use ratn_worker::session::Session;
+use ratn_worker::session::{Session, Standing};
 use ratn_worker::trace::Traced;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 use support::{Client, DEADLINE, Daemon, TestSystem, block, in_time};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -219,4 +219,101 @@ async fn a_limit_of_leases_that_changes_binds_in_a_running_manager_at_once() {
     in_time(waits).await.unwrap().unwrap();
     end.cancel();
     in_time(running).await.unwrap().unwrap();
+}
+
+/// A client whose session says what it is beside others.
+async fn client_beside(system: &TestSystem, manager: &Daemon, name: &str, standing: Standing) -> Client {
+    let ttl = Duration::from_secs(5);
+    let session = Session::open_beside(&system.channels, &manager.endpoint, name.to_owned(), name, ttl, standing);
+    session.alive(DEADLINE).await.unwrap();
+    let resources = ResourceClient::new(&system.channels, &manager.endpoint, session.id()).unwrap();
+    Client { session, resources }
+}
+
+fn due_in(seconds: u64) -> Standing {
+    Standing { due: Some(SystemTime::now() + Duration::from_secs(seconds)), ..Standing::default() }
+}
+
+#[tokio::test]
+async fn what_a_session_says_of_its_share_and_its_due_time_is_told_and_whose_task_is_due_first_is_served_first() {
+    let system = TestSystem::new();
+    let manager = manager_with(&system, Limits::default()).await;
+    let (a, held) = half_held(&system, &manager).await;
+    let other = a.resources.acquire(vec![block("Planner")], AcquireOptions::default()).await.unwrap();
+    let later = client_beside(&system, &manager, "later", Standing { share: 2.5, ..due_in(3_000) }).await;
+    let sooner = client_beside(&system, &manager, "sooner", due_in(1_000)).await;
+    let waits = [ask(&a, "a", 1).await, ask(&later, "later", 1).await, ask(&sooner, "sooner", 1).await];
+
+    let waiting = a.resources.explain("").await.unwrap();
+    let order: Vec<&str> = waiting.iter().map(|one| one.request.as_str()).collect();
+    assert_eq!(order, ["sooner", "later", "a"]);
+    let told: Vec<f64> = waiting.iter().map(|one| one.share).collect();
+    assert_eq!(told, [1.0, 2.5, 1.0]);
+    let is_due = |due: Option<i64>, seconds: i64| {
+        due.is_some_and(|due| (seconds * 1_000 - 60_000..=seconds * 1_000).contains(&due))
+    };
+    assert!(is_due(waiting[0].due_in_ms, 1_000) && is_due(waiting[1].due_in_ms, 3_000), "{waiting:?}");
+    assert_eq!(waiting[2].due_in_ms, None);
+    let sessions = a.resources.sessions().await.unwrap();
+    let of = |id: &str| sessions.iter().find(|session| session.id == id).unwrap();
+    assert_eq!((of("later").share, of("sooner").share, of(a.session.id()).share), (2.5, 1.0, 1.0));
+    assert!(is_due(of("later").due_in_ms, 3_000));
+
+    let [first, second, third] = [2, 1, 0];
+    let mut waits = waits.map(Some);
+    a.resources.release(held.id).await.unwrap();
+    let lease = in_time(waits[first].take().unwrap()).await.unwrap().unwrap();
+    a.resources.release(other.id).await.unwrap();
+    in_time(waits[second].take().unwrap()).await.unwrap().unwrap();
+    sooner.resources.release(lease.id).await.unwrap();
+    in_time(waits[third].take().unwrap()).await.unwrap().unwrap();
+}
+
+#[tokio::test]
+async fn a_share_beyond_the_bounds_is_refused_with_what_it_may_be() {
+    let system = TestSystem::new();
+    let manager = manager_with(&system, Limits::default()).await;
+    let mut raw = raw(&system, &manager);
+    for share in [-1.0, 0.001, 100.5, f64::NAN, f64::INFINITY] {
+        let ping = v1::KeepAliveRequest { session_id: "greedy".into(), ttl_ms: 5_000, share, ..Default::default() };
+        let mut answers = in_time(raw.keep_alive(tokio_stream::once(ping))).await.unwrap().into_inner();
+        let refused = in_time(answers.message()).await.unwrap_err();
+        assert_eq!(refused.code(), Code::InvalidArgument);
+        let words = "a share is a number from 0.01 to 100";
+        assert!(refused.message().starts_with("share: is ") && refused.message().contains(words), "{refused}");
+    }
+    // Any due time is one.
+    for due_in_ms in [i64::MIN, i64::MAX, 0] {
+        let ping = v1::KeepAliveRequest {
+            session_id: "odd".into(),
+            ttl_ms: 5_000,
+            due_in_ms: Some(due_in_ms),
+            ..Default::default()
+        };
+        let mut answers = in_time(raw.keep_alive(tokio_stream::once(ping))).await.unwrap().into_inner();
+        in_time(answers.message()).await.unwrap().unwrap();
+    }
+}
+
+#[tokio::test]
+async fn an_acquire_that_takes_the_place_of_another_keeps_its_time_and_the_other_call_ends() {
+    let system = TestSystem::new();
+    let manager = manager_with(&system, Limits::default()).await;
+    let (a, held) = half_held(&system, &manager).await;
+    let rest = a.resources.acquire(vec![block("Planner")], AcquireOptions::default()).await.unwrap();
+    let options = AcquireOptions { request: "in-case".into(), speculative: true, ..Default::default() };
+    let resources = a.resources.clone();
+    let in_case = tokio::spawn(async move { resources.acquire(vec![block("Planner")], options).await });
+    until_waiting(&a, 1).await;
+    assert!(a.resources.explain("in-case").await.unwrap()[0].speculative);
+    let options =
+        AcquireOptions { request: "certain".into(), instead_of: "in-case".into(), ..AcquireOptions::default() };
+    let resources = a.resources.clone();
+    let certain = tokio::spawn(async move { resources.acquire(vec![block("Planner")], options).await });
+    in_time(in_case).await.unwrap().unwrap_err();
+    assert_eq!(waiting(&a).await, 1);
+    assert!(!a.resources.explain("certain").await.unwrap()[0].speculative);
+    a.resources.release(held.id).await.unwrap();
+    in_time(certain).await.unwrap().unwrap();
+    a.resources.release(rest.id).await.unwrap();
 }

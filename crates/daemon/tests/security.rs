@@ -36,7 +36,7 @@ fn create(session: &str, class: v1::ResourceClass) -> v1::CreateRequest {
 }
 
 async fn ping(client: &mut Raw, session: &str, ttl_ms: u64) -> Result<v1::KeepAliveResponse, tonic::Status> {
-    let ping = v1::KeepAliveRequest { session_id: session.into(), ttl_ms, client: "test".into() };
+    let ping = v1::KeepAliveRequest { session_id: session.into(), ttl_ms, client: "test".into(), ..Default::default() };
     let mut answers = client.keep_alive(tokio_stream::once(ping)).await?.into_inner();
     answers.message().await.map(|answer| answer.unwrap())
 }

@@ -31,7 +31,12 @@ impl Line {
     async fn open(system: &TestSystem, manager: &support::Daemon, session: &str) -> Line {
         let channel = system.channels.get(&manager.endpoint).unwrap();
         let (questions, outgoing) = mpsc::channel(64);
-        let ping = v1::KeepAliveRequest { session_id: session.to_owned(), ttl_ms: 60_000, client: session.to_owned() };
+        let ping = v1::KeepAliveRequest {
+            session_id: session.to_owned(),
+            ttl_ms: 60_000,
+            client: session.to_owned(),
+            ..Default::default()
+        };
         questions
             .send(SessionRequest { id: 1, kind: Some(Asked::KeepAlive(ping)), ..Default::default() })
             .await

@@ -501,6 +501,8 @@ async fn breakpoints_are_told_as_a_run_has_them_and_set_and_cleared_in_it() {
         mode: Mode::Cdtn,
         log: log.clone(),
         at_s: 4.0,
+        share: 1.0,
+        due_in_s: None,
         paused: true,
         ended: 0,
         under_way: Vec::new(),

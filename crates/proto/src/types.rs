@@ -184,7 +184,7 @@ impl Resource {
 }
 
 /// An acquire in the queue.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct WaitingAcquire {
     /// Its request id; may be empty.
     pub request: String,
@@ -200,10 +200,18 @@ pub struct WaitingAcquire {
     pub obstacles: Vec<String>,
     /// The leases that hold what it lacks.
     pub held_by: Vec<LeaseId>,
+    /// The share of its session.
+    pub share: f64,
+    /// In how many milliseconds the task of its session is due, if it is.
+    pub due_in_ms: Option<i64>,
+    /// It may turn out not to be needed.
+    pub speculative: bool,
+    /// For how long it has waited, with what it took the place of.
+    pub waiting_ms: u64,
 }
 
 /// A session as the resource manager lists it.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct SessionStatus {
     /// Its id.
     pub id: String,
@@ -221,6 +229,10 @@ pub struct SessionStatus {
     pub resources: Vec<String>,
     /// Who opened it, as the connection proved it: nobody else speaks for it, except an operator. Empty where nobody knows.
     pub opened_by: String,
+    /// Its share of what several want.
+    pub share: f64,
+    /// In how many milliseconds its task is due, if it is.
+    pub due_in_ms: Option<i64>,
 }
 
 /// Which resources a list is of; the default is all of them.

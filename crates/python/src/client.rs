@@ -188,7 +188,13 @@ impl Client {
             .map_err(|_| PyValueError::new_err("timeout_s: is no time to wait"))?;
         let held = self.held(py)?;
         let requirements = kinds.iter().map(|kind| Requirement::new(ResourceOperation::Block, kind)).collect();
-        let options = AcquireOptions { request: fresh_id("python"), priority, deadline, holder: holder.to_owned() };
+        let options = AcquireOptions {
+            request: fresh_id("python"),
+            priority,
+            deadline,
+            holder: holder.to_owned(),
+            ..AcquireOptions::default()
+        };
         let granted = wait_for(py, &self.runtime, held.client.acquire(requirements, options))?;
         let generation = held.session.state().borrow().generation;
         Ok(Lease { granted, held, generation, runtime: Arc::clone(&self.runtime) })

@@ -10,15 +10,15 @@ use crate::id::{SessionId, WaiterId};
 use crate::lease::LeaseRecord;
 use crate::memory::{Recalled, Remembered, RequestId};
 use crate::pool::Pool;
-use crate::queue::{AcquireRequest, Waiter};
+use crate::queue::{AcquireRequest, Place, Waiter};
 use crate::record::Effect;
+use crate::replaced::Earlier;
 use crate::resource::{Resource, Units};
 use crate::session::Session;
 use crate::session::Speaker;
 use ratn_model::id::{FencingToken, LeaseId};
 use ratn_model::resource::{Lease, ResourceOperation};
 use ratn_model::time::Timestamp;
-use std::cmp::Reverse;
 
 impl Pool {
     /// Asks for several resources, all or nothing. How it ends comes as a [`Notice`], at once where it can be granted.
@@ -171,7 +171,7 @@ impl Pool {
         fingerprint: Fingerprint,
     ) -> Result<WaiterId, PoolError> {
         use ResourceOperation::{Block, Consume, Exists};
-        let full = self.no_room(&request.session)?;
+        self.session(&request.session)?;
         if request.requirements.is_empty() {
             return Err(malformed("requirements of an acquire", "at least one: what needs nothing needs no lease"));
         }
@@ -182,15 +182,18 @@ impl Pool {
         if request.deadline.is_some_and(|deadline| deadline <= self.now) {
             return Err(malformed("deadline", "it lies in the future"));
         }
+        let asked = self.asked_at(&request, &request_id);
+        let full = self.no_room(&request.session)?;
         self.next_waiter += 1;
         let id = WaiterId(self.next_waiter);
-        let place = (Reverse(request.priority), id);
+        let turn = self.turn_of(&request, asked);
+        let place = (turn, id);
         let known = self.session(&request.session)?;
         self.check_leases(known)?;
         if self.may_grant_to(known)
             && let Some(taken) = self.at_once(place, &request.requirements)
         {
-            self.give(id, request, request_id, fingerprint, taken);
+            self.give(place, request, request_id, fingerprint, taken);
             self.schedule();
             return Ok(id);
         }
@@ -212,10 +215,21 @@ impl Pool {
         }
         let reserved = vec![Units::new(); request.requirements.len()];
         let (hopeful, hopeful_since, lacks, overtaken, missing) = Default::default();
-        self.join(
-            id,
-            Waiter { request, request_id, groups, hopeful, hopeful_since, reserved, lacks, overtaken, missing },
-        );
+        self.count_waiting(&request, turn, true);
+        let waiter = Waiter {
+            request,
+            turn,
+            asked,
+            request_id,
+            groups,
+            hopeful,
+            hopeful_since,
+            reserved,
+            lacks,
+            overtaken,
+            missing,
+        };
+        self.join(id, waiter);
         self.schedule();
         match full {
             Some(full) if self.queue.get(id).is_some() => {
@@ -281,18 +295,18 @@ impl Pool {
     /// Gives a waiter what was found for it.
     pub(crate) fn grant(&mut self, id: WaiterId, taken: Vec<Units>) {
         let Some((waiter, fingerprint)) = self.leave(id, true) else { return };
-        self.give(id, waiter.request, waiter.request_id, fingerprint, taken);
+        self.give(waiter.place(id), waiter.request, waiter.request_id, fingerprint, taken);
     }
 
     fn give(
         &mut self,
-        id: WaiterId,
+        place: Place,
         request: AcquireRequest,
         request_id: RequestId,
         fingerprint: Fingerprint,
         taken: Vec<Units>,
     ) {
-        self.overtake((Reverse(request.priority), id), &taken);
+        self.overtake(place, &taken);
         let (mut held, mut consumed) = (Vec::new(), Vec::new());
         for (requirement, taken) in request.requirements.iter().zip(taken) {
             if requirement.operation == ResourceOperation::Consume {
@@ -317,7 +331,7 @@ impl Pool {
         self.commit(Effect::LeaseGranted { lease, granted });
         self.remember(request_id, fingerprint, Remembered::Granted(lease));
         if let Some(lease) = self.lease(lease) {
-            self.notices.push(Notice::Granted { waiter: id, lease });
+            self.notices.push(Notice::Granted { waiter: place.1, lease });
         }
     }
 
@@ -360,8 +374,11 @@ impl Pool {
             session.waiters.remove(&id);
             self.callers.waits_no_more(&session.opened_by, &waiter.groups);
         }
+        self.count_waiting(&waiter.request, waiter.turn, false);
         let fingerprint = self.memory.waited(&waiter.request_id).unwrap_or_default();
         if !granted {
+            let (asked, speculative, groups) = (waiter.asked, waiter.request.speculative, waiter.groups.clone());
+            self.left.leaves(self.now, waiter.request_id.clone(), Earlier { asked, speculative, groups });
             self.withdrawals.heard_of(self.now, &self.limits, waiter.request_id.clone());
         }
         Some((waiter, fingerprint))

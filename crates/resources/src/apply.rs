@@ -3,6 +3,7 @@
 //! [`Pool::commit`] applies and writes down; restoring applies alone. So what is restored cannot differ from what was.
 //! Each effect also tells the watchers, which makes the revision a function of the records.
 
+use crate::accounts::{Accounts, Within};
 use crate::event::EndReason;
 use crate::event::{Change, Notice, WatchEvent};
 use crate::expiry::Timer;
@@ -79,6 +80,7 @@ impl Pool {
                 let known = self.sessions.remove(session).ok_or_else(|| format!("{session} is not there"))?;
                 self.stop_timer(known.expires, Timer::Session(session.clone()));
                 self.resources.closed(session);
+                self.accounts.forget(session);
                 self.callers.closed(&known.opened_by);
                 self.kept_ids.keep(session, &known.opened_by, self.now, &self.limits);
                 Ok(())
@@ -135,8 +137,11 @@ impl Pool {
                         continue;
                     }
                     let record = self.leases.get_mut(&lease).ok_or_else(|| format!("{lease} is not there"))?;
+                    let lost = record.held.iter().filter(|(held, _)| held == slot).map(|(_, amount)| *amount).sum();
                     record.held.retain(|(held, _)| held != slot);
                     let (token, session) = (record.token, record.session.clone());
+                    let kind = &resource.description.kind;
+                    self.in_account(&session, kind, |accounts, within| accounts.holds_no_more(within, lost));
                     self.publish(Change::ResourceLost { lease, token, session, resource: view.clone() });
                 }
                 self.publish(Change::ResourceDeleted { resource: view, reason: *reason });
@@ -186,6 +191,7 @@ impl Pool {
                     self.stop_timer(expires, Timer::Lease(*lease));
                 }
                 let slots = record.slots();
+                self.count_held(&record.session, &record.held, Accounts::holds_no_more);
                 for slot in &slots {
                     if !self.begin_standstill(*lease, &record, *slot, *reason) {
                         self.change(*slot, |resource| remove_from(&mut resource.holders, lease));
@@ -276,6 +282,7 @@ impl Pool {
         let opened_by = session.opened_by.clone();
         self.callers.holds(&opened_by);
         let slots = granted.slots();
+        self.count_held(&granted.session, &granted.held, Accounts::holds);
         self.leases.insert(lease, LeaseRecord { expires, opened_by, ..granted.clone() });
         self.undoable(lease, &granted.consumed);
         slots.iter().for_each(|slot| self.held_otherwise(*slot, lease));
@@ -317,6 +324,21 @@ impl Pool {
         }
         self.stop_timer(until, Timer::Standstill(lease, slot));
         true
+    }
+
+    /// Puts what a lease holds, or has held, to the account of its session.
+    fn count_held(
+        &mut self,
+        session: &SessionId,
+        held: &[(Slot, Quantity)],
+        count: fn(&mut Accounts, &Within<'_>, Quantity),
+    ) {
+        for (slot, amount) in held {
+            let Some(description) = self.resources.get(*slot).map(|resource| resource.description.clone()) else {
+                continue;
+            };
+            self.in_account(session, &description.kind, |accounts, within| count(accounts, within, *amount));
+        }
     }
 
     fn opened(&mut self, id: &SessionId, session: Session) -> Result<(), Misfit> {

@@ -13,6 +13,7 @@ use crate::id::{Slot, WaiterId};
 use crate::pool::Pool;
 use crate::queue::{Place, Queue, Waiter};
 use crate::resources::Resources;
+use crate::turn::Turn;
 use ratn_model::resource::Quantity;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Bound;
@@ -32,7 +33,7 @@ type Noted = (Slot, Option<Seen>);
 type Change = (Slot, Option<Seen>, Option<Seen>);
 
 /// Behind every place.
-const LAST: Place = (std::cmp::Reverse(i64::MIN), WaiterId(u64::MAX));
+const LAST: Place = (Turn::LAST, WaiterId(u64::MAX));
 
 impl Touched {
     pub(crate) fn is_empty(&self) -> bool {

@@ -5,8 +5,10 @@ use crate::id::{SessionId, WaiterId};
 use crate::pool::Pool;
 use crate::queue::Waiter;
 use crate::resource::Units;
+use crate::turn::Standing;
 use ratn_model::id::LeaseId;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
+use ratn_model::time::Timestamp;
 use std::fmt;
 use std::time::Duration;
 
@@ -20,6 +22,10 @@ pub struct Explanation {
     pub waiter: WaiterId,
     /// How many are served before it.
     pub ahead: usize,
+    /// Since when it waits, or what it has taken the place of.
+    pub asked: Timestamp,
+    /// What its session is beside others.
+    pub standing: Standing,
     /// What is in the way, in the order of its requirements.
     pub obstacles: Vec<Obstacle>,
 }
@@ -108,7 +114,8 @@ impl Pool {
                 self.obstacle(id, requirement, !without_queue.is_zero())
             })
             .collect();
-        Some((Explanation { waiter: id, ahead, obstacles }, looked_at))
+        let (asked, standing) = (waiter.asked, self.standing(&waiter.request.session));
+        Some((Explanation { waiter: id, ahead, asked, standing, obstacles }, looked_at))
     }
 
     fn obstacle(&self, id: WaiterId, requirement: &Requirement, held: bool) -> Obstacle {

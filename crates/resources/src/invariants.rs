@@ -114,6 +114,7 @@ impl Pool {
         ensure(self.timers.is_subset(&expected) && timers == named, || {
             "the timers do not agree with what they are for".to_owned()
         })?;
+        self.accounts_agree()?;
         self.memory.check(&self.limits)?;
         let waiting = self.queue.iter().filter(|(_, waiter)| !waiter.request_id.is_empty()).count();
         ensure(self.memory.waiting() == waiting, || "a request id waits without a waiter".to_owned())

@@ -17,7 +17,7 @@
 //! Pure: time comes in as an argument, whatever happens besides the direct answer comes out of [`Pool::take_notices`], and
 //! what has to survive of it out of [`Pool::take_records`]. What is free is computed from the live leases of a resource;
 //! nothing is counted beside them. Grants are made in
-//! strict order of priority, then arrival: a waiter that cannot be served yet reserves every free unit it can use, so a
+//! strict order of turns (`turn.rs`: certain before speculative, then by time and share, urgency, due time, priority and arrival): a waiter that cannot be served yet reserves every free unit it can use, so a
 //! later one never takes a unit that it waits for, and waiters for other kinds pass. It deliberately knows no socket,
 //! no clock, no file and no process. Starting missing workers is the task of the providers.
 //!
@@ -32,6 +32,7 @@
 //! | restart | | 0.15 s from a snapshot, 0.17 s from records | |
 //! | memory | | 716 bytes a resource with three attributes, 274 its lease | 957 bytes a waiter |
 
+mod accounts;
 mod acquisition;
 mod apply;
 mod assignment;
@@ -61,12 +62,15 @@ mod pace;
 mod pool;
 mod queue;
 mod record;
+mod replaced;
 mod request;
 mod resource;
 mod resources;
 mod schedule;
 mod session;
 mod snapshot;
+mod standing;
+mod turn;
 mod validation;
 mod withdrawals;
 
@@ -94,3 +98,4 @@ pub use resource::{
 };
 pub use session::{SessionView, Speaker};
 pub use snapshot::{RestoreError, Snapshot};
+pub use turn::{AHEAD, BOUND, LEAD, NoShare, Share, Standing};

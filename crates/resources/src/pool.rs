@@ -1,5 +1,6 @@
 //! The pool: its state, requests with their ids, and what can be seen of it.
 
+use crate::accounts::Accounts;
 use crate::caller::Callers;
 use crate::crowd::Crowds;
 use crate::error::PoolError;
@@ -16,6 +17,7 @@ use crate::memory::{Recalled, Remembered, RequestId, RequestMemory};
 use crate::pace::Pace;
 use crate::queue::{AcquireRequest, Queue};
 use crate::record::{Effect, Record};
+use crate::replaced::Left;
 use crate::request::{Reply, Request};
 use crate::resource::{Resource, ResourceView};
 use crate::resources::Resources;
@@ -54,6 +56,10 @@ pub struct Pool {
     pub(crate) history: History,
     // What is not.
     pub(crate) queue: Queue,
+    /// What each session has had beside others.
+    pub(crate) accounts: Accounts,
+    /// Requests whose place others may take.
+    pub(crate) left: Left,
     /// Request ids whose acquires may arrive after they were withdrawn.
     pub(crate) withdrawals: Withdrawals,
     /// What providers cannot provide, by kind, and why.
@@ -89,6 +95,7 @@ impl Pool {
     pub fn with_kinds(mut self, kinds: Kinds) -> Pool {
         debug_assert!(self.queue.len() == 0, "waiters are in families of the kinds of before");
         self.resources.set_kinds(kinds);
+        self.open_accounts();
         self
     }
 

@@ -1,4 +1,4 @@
-//! The queue of acquires: larger priority first, then first come, first served; and what each waiter has reserved.
+//! The queue of acquires, in the order of their turns; and what each waiter has reserved.
 
 use crate::changed::Touched;
 use crate::group::{Family, Group, Key};
@@ -6,10 +6,10 @@ use crate::growth::{Growth, Provided};
 use crate::id::{SessionId, Slot, WaiterId};
 use crate::memory::RequestId;
 use crate::resource::Units;
+use crate::turn::Turn;
 use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
 use serde::{Deserialize, Serialize};
-use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Bound;
 use std::sync::Arc;
@@ -22,7 +22,8 @@ pub struct AcquireRequest {
     pub session: SessionId,
     /// Blocks, consumes and exists.
     pub requirements: Vec<Requirement>,
-    /// Larger first.
+    /// Larger first, of what was asked at about the same time by sessions with about their shares: see `turn.rs`. The bits from 2^60 on are
+    /// the urgency, which comes before due times.
     pub priority: i64,
     /// When to give up; `None` waits as long as the session lives.
     pub deadline: Option<Timestamp>,
@@ -30,15 +31,28 @@ pub struct AcquireRequest {
     pub hold_for: Option<Duration>,
     /// Whom or what it is for, in explanations and events (a run's instance); may be empty.
     pub purpose: String,
+    /// It may turn out not to be needed: all that is needed for certain comes first.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub speculative: bool,
+    /// The id of an earlier request of the session for the same, whose place it takes; empty for none.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub instead_of: String,
+}
+
+fn is_false(value: &bool) -> bool {
+    !value
 }
 
 /// Where a waiter stands: it is served before those with a larger place.
-pub(crate) type Place = (Reverse<i64>, WaiterId);
+pub(crate) type Place = (Turn, WaiterId);
 
 /// A queued acquire.
 #[derive(Debug, Clone)]
 pub(crate) struct Waiter {
     pub(crate) request: AcquireRequest,
+    pub(crate) turn: Turn,
+    /// Since when it or what it replaces waits.
+    pub(crate) asked: Timestamp,
     /// Forgotten again when it leaves without a lease, so that the client can ask once more.
     pub(crate) request_id: RequestId,
     /// Per requirement, the group that it waits in.
@@ -95,7 +109,8 @@ pub(crate) struct Queue {
 impl AcquireRequest {
     /// Without priority, deadline or bound on holding.
     pub fn new(session: SessionId, requirements: Vec<Requirement>) -> AcquireRequest {
-        AcquireRequest { session, requirements, priority: 0, deadline: None, hold_for: None, purpose: String::new() }
+        let (priority, deadline, hold_for, purpose, speculative, instead_of) = Default::default();
+        AcquireRequest { session, requirements, priority, deadline, hold_for, purpose, speculative, instead_of }
     }
 
     /// With this priority.
@@ -115,7 +130,7 @@ impl AcquireRequest {
 
 impl Waiter {
     pub(crate) fn place(&self, id: WaiterId) -> Place {
-        (Reverse(self.request.priority), id)
+        (self.turn, id)
     }
 
     /// What was missing of a group when what exists would last not have done.

@@ -8,6 +8,7 @@ use crate::id::{SessionId, Slot, WaiterId};
 use crate::limits::Limits;
 use crate::pool::Pool;
 use crate::record::Effect;
+use crate::turn::Standing;
 use ratn_model::id::LeaseId;
 use ratn_model::resource::Quantity;
 use ratn_model::time::Timestamp;
@@ -42,6 +43,8 @@ pub(crate) struct Session {
     pub(crate) waiters: BTreeSet<WaiterId>,
     /// The resources of which it has consumed something that returns at its task's end.
     pub(crate) consumed: BTreeSet<Slot>,
+    /// What it is beside others, as it has said since the pool was made or restored.
+    pub(crate) standing: Standing,
 }
 
 /// A session as others see it.
@@ -63,6 +66,8 @@ pub struct SessionView {
     pub waiters: Vec<WaiterId>,
     /// Ids of the resources that it provides, in order.
     pub provides: Vec<String>,
+    /// What it is beside others.
+    pub standing: Standing,
 }
 
 /// Who speaks for sessions, as the connection proves it.
@@ -98,6 +103,7 @@ impl Session {
             leases: BTreeSet::new(),
             waiters: BTreeSet::new(),
             consumed: BTreeSet::new(),
+            standing: Standing::default(),
         }
     }
 
@@ -286,6 +292,7 @@ impl Pool {
             leases: session.leases.iter().take(named).copied().collect(),
             waiters: session.waiters.iter().copied().collect(),
             provides,
+            standing: session.standing,
         }
     }
 

@@ -217,6 +217,7 @@ impl Pool {
             }
             self.ending.insert(id, ending);
         }
+        self.open_accounts();
         self.gather_crowds();
         self.callers = Callers::of(&self.sessions, &self.ending, &self.queue);
         let mut answered = snapshot.answered.into_iter();

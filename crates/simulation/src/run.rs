@@ -11,7 +11,7 @@ use crate::dice::Dice;
 use busy::Busy;
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::{Lookout, Memory, Problem, Search};
-use ratn_executive::protocol::{Command, Event, Goal, LogEntry, LogLine, Mode};
+use ratn_executive::protocol::{CERTAIN, Command, Event, Goal, LogEntry, LogLine, Mode};
 use ratn_model::catalogue::ResourceOffer;
 use ratn_model::fact::{Change, FactKey, Footprint};
 use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
@@ -522,7 +522,9 @@ impl Simulation<'_> {
                 self.at(late, Event::Refused { instance, reason });
             }
             Command::Acquire { instance, requirements, priority } => {
-                let request = AcquireRequest::new(self.session.clone(), requirements).priority(priority);
+                let request = AcquireRequest::new(self.session.clone(), requirements)
+                    .priority(priority)
+                    .speculative(priority < CERTAIN);
                 let waiter = self.pool.acquire(self.now, request).map_err(|e| self.broken(e))?;
                 self.waiters.insert(instance, waiter);
                 self.answers();

@@ -359,7 +359,9 @@ impl System<'_> {
             Command::Note(_) | Command::Commit { .. } | Command::Operate { .. } => {}
             Command::Acquire { instance, requirements, priority } => {
                 self.runs[run].asked.insert(instance, (requirements.clone(), priority));
-                let request = AcquireRequest::new(self.runs[run].session.clone(), requirements).priority(priority);
+                let request = AcquireRequest::new(self.runs[run].session.clone(), requirements)
+                    .priority(priority)
+                    .speculative(priority < CERTAIN);
                 let waiter = self.pool.acquire(self.now, request).map_err(|error| self.broken(error))?;
                 self.runs[run].waiters.insert(instance, waiter);
                 self.answers();

@@ -58,6 +58,12 @@ pub struct RunStatus {
     pub log: PathBuf,
     /// The robot's seconds since it began.
     pub at_s: f64,
+    /// Its share of what several runs need.
+    #[serde(default = "usual_share")]
+    pub share: f64,
+    /// In how many seconds of wall time it is due, if it is; negative where that has passed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub due_in_s: Option<f64>,
     /// Whether the user has paused it.
     pub paused: bool,
     /// How many states have ended for good.
@@ -73,6 +79,10 @@ pub struct RunStatus {
     /// Before which states it pauses, by their paths without visits.
     #[serde(default)]
     pub breakpoints: Vec<String>,
+}
+
+fn usual_share() -> f64 {
+    1.0
 }
 
 /// A state that waits for a time, a condition, a signal or an answer.
@@ -439,6 +449,8 @@ mod tests {
             mode: Mode::Cdtn,
             log: PathBuf::from("log.jsonl"),
             at_s: 3.5,
+            share: 2.0,
+            due_in_s: Some(90.5),
             paused: true,
             ended: 2,
             under_way: vec![UnderWay {

@@ -37,6 +37,7 @@ use ratn_model::value::Value;
 use ratn_model::wait::Wait;
 use ratn_worker::client::fresh_id;
 use ratn_worker::robot_clock::RobotClock;
+use ratn_worker::session::Standing;
 use ratn_worker::tls::ClientTls;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -100,6 +101,8 @@ pub struct Place {
     pub alone: bool,
     /// What comes first of what several runs need.
     pub urgency: Urgency,
+    /// The run's share of it, and when the run is due.
+    pub standing: Standing,
 }
 
 /// How urgent a run is beside others. What is needed for certain comes before what is speculative, however urgent that is.
@@ -404,13 +407,15 @@ impl Shell {
 
     /// What the run is doing, for whoever asks.
     fn status(&self) -> RunStatus {
-        let now = self.clock.now();
+        let (now, standing) = (self.clock.now(), self.performer.standing());
         RunStatus {
             run: self.performer.run().to_owned(),
             task: self.program.name.clone(),
             mode: self.mode,
             log: std::path::absolute(self.log.path()).unwrap_or_else(|_| self.log.path().to_owned()),
             at_s: now.seconds(),
+            share: standing.share,
+            due_in_s: standing.due_in_ms(SystemTime::now()).map(|ms| ms as f64 / 1e3),
             paused: self.progress.is_paused(),
             ended: self.progress.retired(),
             under_way: self.progress.under_way(now, |instance| self.usually_s(instance)),

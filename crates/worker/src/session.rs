@@ -17,7 +17,8 @@ use crate::trace::Traced;
 use ratn_panic_point::panic_point;
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
-use std::time::Duration;
+use std::ops::RangeInclusive;
+use std::time::{Duration, SystemTime};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, timeout};
@@ -52,6 +53,32 @@ pub struct Session {
     belief: Belief,
     end: CancellationToken,
     task: Option<JoinHandle<()>>,
+}
+
+/// What the client of a session is beside others that want the same.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Standing {
+    /// How much of it the client is to have, beside the shares of the others: from 0.01 to 100, and 1 as usual.
+    pub share: f64,
+    /// When its task is due, if it is.
+    pub due: Option<SystemTime>,
+}
+
+impl Default for Standing {
+    fn default() -> Standing {
+        Standing { share: 1.0, due: None }
+    }
+}
+
+impl Standing {
+    /// The shares that there are.
+    pub const SHARES: RangeInclusive<f64> = 0.01..=100.0;
+
+    /// How many milliseconds are left until its task is due; negative where that has passed.
+    pub fn due_in_ms(&self, now: SystemTime) -> Option<i64> {
+        let whole = |time: Duration| i64::try_from(time.as_millis()).unwrap_or(i64::MAX);
+        self.due.map(|due| due.duration_since(now).map_or_else(|passed| -whole(passed.duration()), whole))
+    }
 }
 
 /// The state of a session.
@@ -116,12 +143,35 @@ impl Session {
         Session::open_by(BootClock::default(), channels, endpoint, id, client, ttl)
     }
 
+    /// As [`Session::open_as`], of a client that says what it is beside others.
+    pub fn open_beside(
+        channels: &Channels,
+        endpoint: &Endpoint,
+        id: String,
+        client: &str,
+        ttl: Duration,
+        standing: Standing,
+    ) -> Session {
+        Session::keep(BootClock::default(), channels, endpoint, (id, standing), client, ttl)
+    }
+
     /// As [`Session::open_as`], measured by this clock.
     pub fn open_by(
         clock: BootClock,
         channels: &Channels,
         endpoint: &Endpoint,
         id: String,
+        client: &str,
+        ttl: Duration,
+    ) -> Session {
+        Session::keep(clock, channels, endpoint, (id, Standing::default()), client, ttl)
+    }
+
+    fn keep(
+        clock: BootClock,
+        channels: &Channels,
+        endpoint: &Endpoint,
+        (id, standing): (String, Standing),
         client: &str,
         ttl: Duration,
     ) -> Session {
@@ -136,6 +186,7 @@ impl Session {
             endpoint: endpoint.clone(),
             id: id.clone(),
             client: client.to_owned(),
+            standing,
             ttl,
             expires,
             tell,
@@ -324,6 +375,7 @@ struct SessionTask {
     endpoint: Endpoint,
     id: String,
     client: String,
+    standing: Standing,
     ttl: Duration,
     clock: BootClock,
     expires: watch::Sender<BootInstant>,
@@ -453,7 +505,13 @@ impl SessionTask {
 
     fn ping(&self, ttl: Duration) -> v1::KeepAliveRequest {
         let ttl_ms = u64::try_from(ttl.as_millis()).unwrap_or(u64::MAX);
-        v1::KeepAliveRequest { session_id: self.id.clone(), ttl_ms, client: self.client.clone() }
+        v1::KeepAliveRequest {
+            session_id: self.id.clone(),
+            ttl_ms,
+            client: self.client.clone(),
+            share: self.standing.share,
+            due_in_ms: self.standing.due_in_ms(SystemTime::now()),
+        }
     }
 
     /// How long an answer may take: until the session is over, once it is, a time to live.

@@ -70,7 +70,12 @@ pub(crate) struct Line {
 impl Line {
     pub(crate) async fn open(channel: Channel, session: &str) -> Line {
         let (questions, outgoing) = mpsc::channel(256);
-        let ping = v1::KeepAliveRequest { session_id: session.to_owned(), ttl_ms: 60_000, client: "bench".to_owned() };
+        let ping = v1::KeepAliveRequest {
+            session_id: session.to_owned(),
+            ttl_ms: 60_000,
+            client: "bench".to_owned(),
+            ..Default::default()
+        };
         let first = SessionRequest { id: 0, kind: Some(Asked::KeepAlive(ping)), ..Default::default() };
         questions.send(first).await.unwrap();
         let mut client = ResourceServiceClient::new(channel);
@@ -103,6 +108,7 @@ impl Line {
             priority: 0,
             deadline_ms: 10_000,
             holder: HOLDER.to_owned(),
+            ..Default::default()
         };
         lease(self.ask(Asked::Acquire(question)).await)
     }

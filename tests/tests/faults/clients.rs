@@ -173,6 +173,7 @@ impl Client {
             priority: self.random.below(3) as i64,
             deadline_ms: 20 + self.random.below(300),
             holder: request.clone(),
+            ..Default::default()
         };
         let begin = now();
         let asked = Asked { session: self.number, begin, until: NEVER };
@@ -490,7 +491,8 @@ impl Client {
 
 async fn ping(rpc: &ResourceServiceClient<Channel>, number: Session, ttl: Duration, record: &Record) {
     let ttl_ms = u64::try_from(ttl.as_millis()).unwrap_or(u64::MAX);
-    let question = v1::KeepAliveRequest { session_id: session(number), ttl_ms, client: session(number) };
+    let question =
+        v1::KeepAliveRequest { session_id: session(number), ttl_ms, client: session(number), ..Default::default() };
     let begin = now();
     let mut rpc = rpc.clone();
     let asking = async {

@@ -1,6 +1,6 @@
 //! What is said of tasks: how they are checked, run, steered, reported and simulated, and of planning problems.
 
-use super::values::{at_least_one, chart, makespan, padding, setting, share, speed};
+use super::values::{Due, at_least_one, chart, due, makespan, padding, run_share, setting, share, speed};
 use clap::{Args, Subcommand, ValueEnum};
 use ratn_task_control::checkpoint::EVERY_EVENTS;
 use std::net::SocketAddr;
@@ -79,6 +79,13 @@ pub(crate) struct RunArguments {
     /// What comes first of what several runs on the system need
     #[arg(long, value_enum, value_name = "HOW", default_value = "normal")]
     pub(crate) urgency: UrgencyArgument,
+    /// How much the run is to have of what several runs need, beside the shares of the others, from 0.01 to 100
+    #[arg(long, value_name = "N", default_value_t = 1.0, value_parser = run_share)]
+    pub(crate) share: f64,
+    /// When the run is to have ended: a time from its start (90s, 15m, 2h), or an instant (2026-11-28T17:15:00Z). Of what several runs need
+    /// at about the same time, the run that is due first comes first
+    #[arg(long, value_name = "TIME", value_parser = due)]
+    pub(crate) due: Option<Due>,
     /// Give a parameter of the task a value, `boxes=3`; may be repeated
     #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
     pub(crate) set: Vec<(String, String)>,

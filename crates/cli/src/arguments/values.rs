@@ -1,7 +1,10 @@
 //! Words of the command line that have to be of a form.
 
 use ratn_cell::config::Setting;
+use ratn_worker::session::Standing;
 use std::path::PathBuf;
+use std::time::{Duration, SystemTime};
+use time::{Date, Month};
 
 const SLOWEST: f64 = 0.01;
 const FASTEST: f64 = 1000.0;
@@ -51,6 +54,84 @@ pub(super) fn share(text: &str) -> Result<f64, String> {
     }
 }
 
+/// A run's share of what several need.
+pub(super) fn run_share(text: &str) -> Result<f64, String> {
+    let (least, most) = (*Standing::SHARES.start(), *Standing::SHARES.end());
+    match text.parse::<f64>() {
+        Ok(share) if Standing::SHARES.contains(&share) => Ok(share),
+        _ => Err(format!("expected a number from {least} to {most}; 1 is the usual share")),
+    }
+}
+
+/// When something is due.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Due {
+    /// So long after it begins.
+    After(Duration),
+    At(SystemTime),
+}
+
+impl Due {
+    /// Of what begins now.
+    ///
+    /// # Errors
+    /// An instant that has passed.
+    pub(crate) fn from(self, now: SystemTime) -> Result<SystemTime, String> {
+        match self {
+            Due::After(time) => Ok(now + time),
+            Due::At(at) if at > now => Ok(at),
+            Due::At(_) => Err("--due: has passed; say a later time, or leave it out".to_owned()),
+        }
+    }
+}
+
+/// A run is due within so many seconds: a year.
+const LATEST_DUE_S: f64 = 31_536_000.0;
+
+pub(super) fn due(text: &str) -> Result<Due, String> {
+    let expected =
+        "expected a time from the start as 90s, 15m or 2h, of a year at most, or an instant as 2026-11-28T17:15:00Z";
+    let units = [("s", 1.0), ("m", 60.0), ("h", 3_600.0)];
+    let time = units.iter().find_map(|(unit, seconds)| Some(text.strip_suffix(unit)?.parse::<f64>().ok()? * seconds));
+    let time = time.filter(|seconds| *seconds > 0.0 && *seconds <= LATEST_DUE_S).map(Duration::from_secs_f64);
+    time.map(Due::After).or_else(|| instant(text).map(Due::At)).ok_or_else(|| expected.to_owned())
+}
+
+/// An instant in the form of RFC 3339.
+fn instant(text: &str) -> Option<SystemTime> {
+    let (date, rest) = text.split_once(['T', 't', ' '])?;
+    let (time, offset_s) = match rest.strip_suffix(['Z', 'z']) {
+        Some(time) => (time, 0),
+        None => {
+            let (time, offset) = rest.split_at(rest.rfind(['+', '-'])?);
+            let [hours, minutes] = numbers(&offset[1..], ':', [2, 2])?;
+            let offset = (hours < 24 && minutes < 60).then_some(i64::from(hours * 3_600 + minutes * 60))?;
+            (time, if offset.is_positive() && rest.contains('+') { offset } else { -offset })
+        }
+    };
+    let [year, month, day] = numbers(date, '-', [4, 2, 2])?;
+    let (whole, parts) = time.split_once('.').unwrap_or((time, "0"));
+    let [hour, minute, second] = numbers(whole, ':', [2, 2, 2])?;
+    let parts =
+        parts.bytes().all(|digit| digit.is_ascii_digit()).then(|| format!("0.{parts}").parse::<f64>().ok())??;
+    let small = |number: u32| u8::try_from(number).ok();
+    let month = Month::try_from(small(month)?).ok()?;
+    let date = Date::from_calendar_date(i32::try_from(year).ok()?, month, small(day)?).ok()?;
+    let at = date.with_hms(small(hour)?, small(minute)?, small(second)?).ok()?.assume_utc().unix_timestamp() - offset_s;
+    SystemTime::UNIX_EPOCH.checked_add(Duration::from_secs(u64::try_from(at).ok()?) + Duration::from_secs_f64(parts))
+}
+
+/// Numbers of so many digits with a separator between them.
+fn numbers<const N: usize>(text: &str, separator: char, digits: [usize; N]) -> Option<[u32; N]> {
+    let words: [&str; N] = text.split(separator).collect::<Vec<_>>().try_into().ok()?;
+    let number = |(word, digits): (&str, usize)| {
+        let is_number = word.len() == digits && word.bytes().all(|digit| digit.is_ascii_digit());
+        is_number.then(|| word.parse().ok()).flatten()
+    };
+    let numbers: Option<Vec<u32>> = words.into_iter().zip(digits).map(number).collect();
+    numbers?.try_into().ok()
+}
+
 pub(super) fn chart(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     let known = path.extension().is_some_and(|end| ["svg", "html"].iter().any(|known| end.eq_ignore_ascii_case(known)));
@@ -60,4 +141,48 @@ pub(super) fn chart(text: &str) -> Result<PathBuf, String> {
 pub(super) fn setting(text: &str) -> Result<(String, String), String> {
     let pair = text.split_once('=').map(|(name, value)| (name.to_owned(), value.to_owned()));
     pair.ok_or_else(|| "expected NAME=VALUE".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_due_time_is_a_time_from_the_start_or_an_instant() {
+        let after = |seconds: f64| Ok(Due::After(Duration::from_secs_f64(seconds)));
+        assert_eq!([due("90s"), due("1.5m"), due("2h")], [after(90.0), after(90.0), after(7_200.0)]);
+        let at = |seconds: f64| Ok(Due::At(SystemTime::UNIX_EPOCH + Duration::from_secs_f64(seconds)));
+        assert_eq!(due("2026-11-28T17:15:00Z"), at(1_795_886_100.0));
+        assert_eq!(due("2026-11-28T18:45:00.5+01:30"), at(1_795_886_100.5));
+        assert_eq!(due("2026-11-28t12:15:00-05:00"), at(1_795_886_100.0));
+        for text in [
+            "",
+            "90",
+            "0s",
+            "-5s",
+            "infs",
+            "9000h",
+            "2026-11-28",
+            "2026-02-30T00:00:00Z",
+            "2026-11-28T17:15:00",
+            "2026-11-28T25:00:00Z",
+            "2026-11-28T17:15:00.xZ",
+            "+026-11-28T17:15:00Z",
+            "2026-11-28T17:15:00+1:00",
+            "ä",
+        ] {
+            assert!(due(text).is_err_and(|why| why.starts_with("expected a time")), "{text}");
+        }
+        let now = SystemTime::UNIX_EPOCH + Duration::from_secs(100);
+        assert_eq!(Due::After(Duration::from_secs(5)).from(now), Ok(now + Duration::from_secs(5)));
+        assert!(Due::At(now).from(now).is_err_and(|why| why.contains("--due: has passed")));
+    }
+
+    #[test]
+    fn a_share_is_a_number_within_its_bounds() {
+        assert_eq!((run_share("0.01"), run_share("100")), (Ok(0.01), Ok(100.0)));
+        for text in ["0", "-1", "100.1", "inf", "NaN", "much"] {
+            assert_eq!(run_share(text), Err("expected a number from 0.01 to 100; 1 is the usual share".to_owned()));
+        }
+    }
 }

@@ -73,6 +73,8 @@ mod tests {
             mode: Mode::Hsm,
             log: "l".into(),
             at_s: 1.0,
+            share: 1.0,
+            due_in_s: None,
             paused: true,
             ended: 0,
             under_way: vec![UnderWay {

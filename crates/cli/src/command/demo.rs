@@ -6,7 +6,7 @@ mod pair;
 mod result;
 mod table_task;
 
-use super::run::{on_system, starting};
+use super::run::{Beside, on_system, starting};
 use super::{blocking_here, check};
 use crate::arguments::{Budget, DemoArguments, GoodsArguments, SystemArguments};
 use crate::failure::Failure;
@@ -24,7 +24,7 @@ use ratn_motion::robot::Robot;
 use ratn_proto::v1::UnintendedContact;
 use ratn_report::gantt;
 use ratn_report::timeline::Timeline;
-use ratn_task_control::shell::{Run, Urgency};
+use ratn_task_control::shell::Run;
 use ratn_worker::tls::ClientTls;
 use result::{Demonstration, Outcome, Plan, Work};
 use std::borrow::Cow;
@@ -271,8 +271,7 @@ impl Setup<'_> {
         };
         let system = starting(Box::pin(System::start_private(config, tls)), interrupt).await?;
         let (ended, judgement) =
-            on_system(run, system, (false, Urgency::Normal), interrupt, async |system| system.judgement().await)
-                .await?;
+            on_system(run, system, Beside::default(), interrupt, async |system| system.judgement().await).await?;
         let Judgement { delivered, greatest_tilt_rad, unintended_contacts } = judgement;
         let timeline = Timeline::of(&log::read(&log_file)?.lines);
         if timeline.outcome.as_deref() != Some(ended.outcome.as_str()) {

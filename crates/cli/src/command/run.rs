@@ -23,10 +23,12 @@ use ratn_report::statistics::Statistics;
 use ratn_report::timeline::Timeline;
 use ratn_task_control::learn;
 use ratn_task_control::shell::{self, Ended, Place, Run, Urgency};
+use ratn_worker::session::Standing;
 use ratn_worker::tls::ClientTls;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::SystemTime;
 
 impl From<ModeArgument> for Mode {
     fn from(mode: ModeArgument) -> Mode {
@@ -110,6 +112,7 @@ async fn begin(
     if let Some(chart) = &arguments.gantt {
         output::check_writable(chart)?;
     }
+    Beside::of(arguments)?;
     let learned = learn::from_files(&arguments.learn, &program.name, &output::messages())?;
     let log = arguments.log.clone().map_or_else(|| log_file(&program.name), Ok)?;
 
@@ -146,7 +149,7 @@ async fn begin(
         checkpoint_every: arguments.checkpoint_every,
     };
     let live = way.map(|way| Live::follow(&log, way, system.place().speed, system.directory().path()));
-    let ended = on_system(run, system, (arguments.alone, arguments.urgency.into()), interrupt, async |_| Ok(())).await;
+    let ended = on_system(run, system, Beside::of(arguments)?, interrupt, async |_| Ok(())).await;
     drop(live);
     output::progress(format_args!("event log: {}", log.display()));
     let (ended, ()) = ended?;
@@ -192,16 +195,39 @@ pub(super) async fn starting<T>(
     }
 }
 
+/// What a run is beside others on its system.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Beside {
+    alone: bool,
+    urgency: Urgency,
+    standing: Standing,
+}
+
+impl Beside {
+    /// Of a run that begins now.
+    fn of(arguments: &RunArguments) -> Result<Beside, Failure> {
+        let due = arguments.due.map(|due| due.from(SystemTime::now())).transpose();
+        let due = due.map_err(|why| Failure::Refused(format!("ratn: {why}")))?;
+        let standing = Standing { share: arguments.share, due };
+        Ok(Beside { alone: arguments.alone, urgency: arguments.urgency.into(), standing })
+    }
+
+    fn on(self, place: Place) -> Place {
+        let Beside { alone, urgency, standing } = self;
+        Place { alone, urgency, standing, ..place }
+    }
+}
+
 /// Runs a task, alone on its system or beside others and as urgent as is said. Asks `afterwards` what has become of the system, and ends the
 /// system if it was started for this.
 pub(super) async fn on_system<T>(
     run: Run,
     mut system: System,
-    (alone, urgency): (bool, Urgency),
+    beside: Beside,
     interrupt: &Interrupt,
     afterwards: impl AsyncFnOnce(&System) -> anyhow::Result<T>,
 ) -> anyhow::Result<(Ended, T)> {
-    let place = Place { alone, urgency, ..system.place() };
+    let place = beside.on(system.place());
     let ended = tokio::select! {
         ended = Box::pin(shell::run(run, &place, interrupt)) => ended,
         error = system.one_ended() => Err(error.context("a part of the system ended during the run")),

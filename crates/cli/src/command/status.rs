@@ -128,6 +128,7 @@ impl Status {
             if self.runs.len() > 1 {
                 lines.push(format!("run: {}", run.run));
             }
+            lines.extend(beside(run, self.runs.len() + self.elsewhere.len()));
             lines.push(format!("event log: {}", log.display()));
             let rows = run.under_way.iter().map(|one| [one.path.clone(), one.text()]);
             section(&mut lines, &colours.green("under way"), rows.collect());
@@ -153,6 +154,15 @@ impl Status {
         }
         lines.join("\n")
     }
+}
+
+/// What a run is beside others, where it is not as usual or there are several.
+fn beside(run: &RunStatus, runs: usize) -> Option<String> {
+    let due = run.due_in_s.map(|due| match due {
+        due if due >= 0.0 => format!(", due in {due:.0} s"),
+        due => format!(", was due {:.0} s ago", -due),
+    });
+    (runs > 1 || run.share != 1.0 || due.is_some()).then(|| format!("share {}{}", run.share, due.unwrap_or_default()))
 }
 
 /// A head and a line each; nothing where there are none.
@@ -187,6 +197,8 @@ mod tests {
                 mode: Mode::Cdtn,
                 log: "log.jsonl".into(),
                 at_s: 12.34,
+                share: 2.5,
+                due_in_s: Some(90.2),
                 paused: true,
                 ended: 3,
                 under_way: vec![UnderWay {
@@ -214,6 +226,7 @@ mod tests {
         };
         assert_snapshot!(status.text(Path::new("/run/ratn"), Colours::default()), @r"
         sort_boxes in CDTN mode: 12.3 s, paused; 3 states have ended
+        share 2.5, due in 90 s
         event log: log.jsonl
         under way:
           place[2]/plan  for 1.5 s of about 4.0 s: 2 of 5 ways

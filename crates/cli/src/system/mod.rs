@@ -21,6 +21,7 @@ use ratn_task_control::shell::{Place, Urgency};
 use ratn_worker::client::{Channels, ResourceClient, WorldClient};
 use ratn_worker::endpoint::{self, Endpoint};
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::session::Standing;
 use ratn_worker::tls::ClientTls;
 use std::collections::BTreeMap;
 use std::os::unix::fs::MetadataExt;
@@ -171,6 +172,7 @@ impl System {
             messages: output::messages(),
             alone: false,
             urgency: Urgency::Normal,
+            standing: Standing::default(),
         }
     }
 

@@ -115,14 +115,22 @@ pub(super) fn session(view: SessionView, now: Timestamp) -> SessionStatus {
         waiting: u32::try_from(view.waiters.len()).unwrap_or(u32::MAX),
         resources: view.provides,
         opened_by: view.opened_by.to_string(),
+        share: view.standing.share.number(),
+        due_in_ms: view.standing.due.map(|due| due_in_ms(due, now)),
     }
+}
+
+/// Negative where it has passed.
+fn due_in_ms(due: Timestamp, now: Timestamp) -> i64 {
+    let whole = |time: Duration| i64::try_from(time.as_millis()).unwrap_or(i64::MAX);
+    whole(due.since(now)) - whole(now.since(due))
 }
 
 fn milliseconds(time: Duration) -> u64 {
     u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
-pub(super) fn waiting(request_id: &str, request: &AcquireRequest, why: &Explanation) -> WaitingAcquire {
+pub(super) fn waiting(request_id: &str, request: &AcquireRequest, why: &Explanation, now: Timestamp) -> WaitingAcquire {
     WaitingAcquire {
         request: request_id.to_owned(),
         session: request.session.as_str().to_owned(),
@@ -131,5 +139,9 @@ pub(super) fn waiting(request_id: &str, request: &AcquireRequest, why: &Explanat
         ahead: u32::try_from(why.ahead).unwrap_or(u32::MAX),
         obstacles: why.obstacles.iter().map(ToString::to_string).collect(),
         held_by: if why.is_hopeful() { why.held_by().collect() } else { Vec::new() },
+        share: why.standing.share.number(),
+        due_in_ms: why.standing.due.map(|due| due_in_ms(due, now)),
+        speculative: request.speculative,
+        waiting_ms: milliseconds(now.since(why.asked)),
     }
 }

@@ -10,10 +10,11 @@ use super::project::{Plan, Project};
 use super::schedule::Scheduler;
 use super::variation::{Direction, Variation};
 
-/// Of each population: as many as Hartmann's has for some thousand schedules.
-const SIZE: usize = 40;
-/// After so many schedules without anything better all but the best are drawn anew.
-const PATIENCE: usize = 75 * SIZE;
+/// How many each population has: of 30 or 60 tasks as many as Hartmann's has for some thousand schedules, of more two for each three of them up to
+/// the second number. Measured on PSPLIB with 3,000 to 30,000 schedules: a larger one is better only with more schedules (docs/performance.md).
+const SIZES: [usize; 2] = [40, 80];
+/// After so many schedules for each of a population without anything better all but the best are drawn anew.
+const PATIENCE: usize = 75;
 /// A list that is given is scheduled, and its schedule justified to the end and back.
 const SCHEDULES_OF_GIVEN: usize = 3;
 
@@ -32,6 +33,8 @@ pub(super) struct Population {
     project: Project,
     scheduler: Scheduler,
     variation: Variation,
+    /// How many are in each.
+    size: usize,
     /// Those that were scheduled forward.
     early: Vec<Individual>,
     /// Those that were scheduled backward.
@@ -57,14 +60,17 @@ impl Population {
     /// Begins with these lists, the best first.
     pub(super) fn new(project: Project, seed: u64, lists: Vec<Vec<u32>>) -> Population {
         let tasks = project.len();
+        let [least, most] = SIZES;
+        let size = (2 * tasks / 3).clamp(least, most);
         Population {
+            size,
             scheduler: Scheduler::new(&project),
             variation: Variation::new(tasks, seed),
-            early: Vec::with_capacity(SIZE),
-            late: Vec::with_capacity(SIZE),
+            early: Vec::with_capacity(size),
+            late: Vec::with_capacity(size),
             direction: Direction::Backward,
             mother: 0,
-            given: lists.into_iter().take(SIZE).rev().collect(),
+            given: lists.into_iter().take(size).rev().collect(),
             in_vain: 0,
             child: Vec::with_capacity(tasks),
             best: Vec::new(),
@@ -82,7 +88,7 @@ impl Population {
         // What is in the order of the ends, the last first, is backwards in an order in which it could begin.
         let early = early.into_iter().map(|individual| individual.list.iter().rev().copied().collect());
         let best = (!self.best_list.is_empty()).then(|| self.best_list.clone());
-        best.into_iter().chain(early).chain(self.given.iter().rev().cloned()).take(SIZE).collect()
+        best.into_iter().chain(early).chain(self.given.iter().rev().cloned()).take(self.size).collect()
     }
 
     /// The project that the lists are of.
@@ -94,12 +100,12 @@ impl Population {
     pub(super) fn step(&mut self, schedules: usize, bound: u64) -> Option<Plan> {
         let mut made = 0;
         while made < schedules && self.best_end > bound {
-            if self.in_vain >= PATIENCE {
+            if self.in_vain >= PATIENCE * self.size {
                 self.begin_anew();
             }
             let more = if let Some(list) = self.given.pop() {
                 self.take(list)
-            } else if self.early.len() < SIZE {
+            } else if self.early.len() < self.size {
                 self.draw()
             } else {
                 self.bear()

@@ -437,6 +437,10 @@ impl From<WaitingAcquire> for v1::WaitingAcquire {
             ahead: waiting.ahead,
             obstacles: waiting.obstacles,
             held_by_leases: waiting.held_by.into_iter().map(|lease| lease.0).collect(),
+            share: waiting.share,
+            due_in_ms: waiting.due_in_ms,
+            speculative: waiting.speculative,
+            waiting_ms: waiting.waiting_ms,
         }
     }
 }
@@ -453,6 +457,10 @@ impl TryFrom<v1::WaitingAcquire> for WaitingAcquire {
             ahead: waiting.ahead,
             obstacles: waiting.obstacles,
             held_by: waiting.held_by_leases.into_iter().map(LeaseId).collect(),
+            share: waiting.share,
+            due_in_ms: waiting.due_in_ms,
+            speculative: waiting.speculative,
+            waiting_ms: waiting.waiting_ms,
         })
     }
 }
@@ -468,6 +476,8 @@ impl From<SessionStatus> for v1::SessionStatus {
             waiting: session.waiting,
             resource_ids: session.resources,
             opened_by: session.opened_by,
+            share: session.share,
+            due_in_ms: session.due_in_ms,
         }
     }
 }
@@ -485,6 +495,8 @@ impl TryFrom<v1::SessionStatus> for SessionStatus {
             waiting: session.waiting,
             resources: session.resource_ids,
             opened_by: session.opened_by,
+            share: session.share,
+            due_in_ms: session.due_in_ms,
         })
     }
 }

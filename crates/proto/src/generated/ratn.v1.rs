@@ -724,7 +724,8 @@ pub struct AcquireRequest {
     /// Blocks, consumes and exists; at least one.
     #[prost(message, repeated, tag = "3")]
     pub requirements: ::prost::alloc::vec::Vec<Requirement>,
-    /// Larger first; among equals first come, first served.
+    /// Larger first, of what was asked within the same ten seconds by sessions that have had about their shares; among equals first come,
+    /// first served. The bits from 2^60 on are the urgency, which comes before due times.
     #[prost(int64, tag = "4")]
     pub priority: i64,
     /// How long to wait at the most, in milliseconds from the arrival of the call; at least 1.
@@ -733,6 +734,14 @@ pub struct AcquireRequest {
     /// What the holder is, for people.
     #[prost(string, tag = "6")]
     pub holder: ::prost::alloc::string::String,
+    /// It may turn out not to be needed. All that is needed for certain comes first.
+    #[prost(bool, tag = "7")]
+    pub speculative: bool,
+    /// The request id of an acquire of the session that wanted the same, whose place this takes: it keeps the time at which that one was asked,
+    /// where that one waits, or has left without a lease within the last ten seconds. Empty for none. One that was speculative leaves the last
+    /// ten seconds of its waiting to one that is not.
+    #[prost(string, tag = "8")]
+    pub instead_of: ::prost::alloc::string::String,
 }
 /// What was granted.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -882,7 +891,7 @@ pub struct ResourceEvent {
     pub part: u32,
 }
 /// One ping of a session.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct KeepAliveRequest {
     /// Chosen by the client, unique to it; the same id after a reconnect continues the session.
     #[prost(string, tag = "1")]
@@ -893,6 +902,14 @@ pub struct KeepAliveRequest {
     /// Who this is, for people: "process-manager@compute".
     #[prost(string, tag = "3")]
     pub client: ::prost::alloc::string::String,
+    /// How much the session is to have of what several want, beside the shares of the others: from 0.01 to 100; 0 is 1, the usual share. It
+    /// counts from this ping on.
+    #[prost(double, tag = "4")]
+    pub share: f64,
+    /// In how many milliseconds from the arrival of the ping its task is due; unset: it is never due. A due time that moves by less than a
+    /// second stays.
+    #[prost(int64, optional, tag = "5")]
+    pub due_in_ms: ::core::option::Option<i64>,
 }
 /// The answer to a ping.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1056,7 +1073,7 @@ pub struct ExplainResponse {
     pub total: u32,
 }
 /// An acquire in the queue.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct WaitingAcquire {
     /// Its request id; may be empty.
     #[prost(string, tag = "1")]
@@ -1079,6 +1096,18 @@ pub struct WaitingAcquire {
     /// The leases that hold what it lacks, at most 8 for each requirement; none where some of that is not there at all.
     #[prost(uint64, repeated, tag = "7")]
     pub held_by_leases: ::prost::alloc::vec::Vec<u64>,
+    /// The share of its session.
+    #[prost(double, tag = "8")]
+    pub share: f64,
+    /// In how many milliseconds the task of its session is due; negative where that has passed; unset where it is never due.
+    #[prost(int64, optional, tag = "9")]
+    pub due_in_ms: ::core::option::Option<i64>,
+    /// It may turn out not to be needed.
+    #[prost(bool, tag = "10")]
+    pub speculative: bool,
+    /// For how many milliseconds it has waited, and what it took the place of.
+    #[prost(uint64, tag = "11")]
+    pub waiting_ms: u64,
 }
 /// Asks who is there.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1101,7 +1130,7 @@ pub struct ListSessionsResponse {
     pub next_page_token: ::prost::alloc::string::String,
 }
 /// A session.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SessionStatus {
     /// Its id.
     #[prost(string, tag = "1")]
@@ -1128,6 +1157,12 @@ pub struct SessionStatus {
     /// operator. Empty where nobody knows.
     #[prost(string, tag = "8")]
     pub opened_by: ::prost::alloc::string::String,
+    /// Its share.
+    #[prost(double, tag = "9")]
+    pub share: f64,
+    /// In how many milliseconds its task is due; negative where that has passed; unset where it is never due.
+    #[prost(int64, optional, tag = "10")]
+    pub due_in_ms: ::core::option::Option<i64>,
 }
 /// Says that a task is over.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]

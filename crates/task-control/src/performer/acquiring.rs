@@ -232,7 +232,8 @@ impl Acquiring {
                 () = withdraw(&self.resources, &self.trust, &self.options.request) => {}
             }
             // Another request: a manager that was started again has not heard of the first, and refuses what was withdrawn before it came.
-            self.options.request = late_request(&self.options.request);
+            let late = late_request(&self.options.request);
+            self.options.instead_of = std::mem::replace(&mut self.options.request, late);
             self.options.priority = OVERDUE;
         }
     }

@@ -44,7 +44,7 @@ use ratn_otlp::ids;
 use ratn_proto::types::{self, ENDPOINT_ATTRIBUTE, WorldChange};
 use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
-use ratn_worker::session::{DEFAULT_TTL, Session, SessionState, Trust};
+use ratn_worker::session::{DEFAULT_TTL, Session, SessionState, Standing, Trust};
 use ratn_worker::trace::{self, TraceContext};
 use ratn_world::world::World;
 use std::collections::BTreeMap;
@@ -163,6 +163,7 @@ pub(super) struct Performer {
     run: String,
     task: String,
     urgency: Urgency,
+    standing: Standing,
     /// The robot's seconds per second.
     speed: f64,
     catalogue: Arc<Catalogue>,
@@ -202,8 +203,8 @@ pub(super) struct Performer {
     /// Nothing begins any more.
     over: CancellationToken,
     asking: Waiting,
-    /// Since when instances have waited that have not got what they need, however often they ask.
-    waiting_since: BTreeMap<InstanceId, Instant>,
+    /// Since when instances have waited that have not got what they need, however often they ask; and how they asked last.
+    waiting_since: BTreeMap<InstanceId, (Instant, LastAsked)>,
     leases: Leases,
     holds: HoldsSpeculatively,
     /// What the instances of the window are called, for whoever asks who holds something.
@@ -220,6 +221,21 @@ pub(super) struct Performer {
     resumptions: u32,
     /// Of the run.
     trace: TraceContext,
+}
+
+/// How an instance asked last.
+#[derive(Debug, Clone)]
+struct LastAsked {
+    request: String,
+    priority: i64,
+}
+
+impl LastAsked {
+    /// The id under which it is in the queue after so long: what is needed for certain and has waited for long asks once more.
+    fn in_queue(self, waited: Duration) -> String {
+        let is_late = self.priority >= CERTAIN && waited >= LONG_BESIDE_OTHERS;
+        if is_late { acquiring::late_request(&self.request) } else { self.request }
+    }
 }
 
 struct Job {
@@ -250,7 +266,11 @@ impl Performer {
         let manager = &place.endpoints.resource_manager;
         let background = BackgroundRuntime::start("session").context("cannot keep a session alive")?;
         // Over a connection of its own.
-        let open = || Session::open_as(&Channels::new(&place.tls), manager, run.clone(), "task-control", DEFAULT_TTL);
+        let standing = place.standing;
+        let open = || {
+            let channels = Channels::new(&place.tls);
+            Session::open_beside(&channels, manager, run.clone(), "task-control", DEFAULT_TTL, standing)
+        };
         let mut session = background.enter(open);
         session.alive(SESSION_DEADLINE).await?;
         if is_of_a_resumption(&session, before) {
@@ -304,6 +324,7 @@ impl Performer {
             run,
             task: task.to_owned(),
             urgency: place.urgency,
+            standing,
             speed: place.speed,
             catalogue: place.catalogue.clone(),
             messages: place.messages.clone(),
@@ -408,6 +429,11 @@ impl Performer {
     /// The number of the run's session.
     pub(super) fn session(&self) -> u64 {
         self.number
+    }
+
+    /// What the run is beside others.
+    pub(super) fn standing(&self) -> Standing {
+        self.standing
     }
 
     /// The id of the run.
@@ -549,10 +575,15 @@ impl Performer {
         let (hand, handed) = oneshot::channel();
         let request = acquire_request(&self.run, instance, number, self.resumptions);
         let since = Instant::now();
-        let waited = self.waiting_since.entry(instance).or_insert(since).elapsed();
+        let before = self.waiting_since.get(&instance).cloned();
+        let began = before.as_ref().map_or(since, |(began, _)| *began);
+        let waited = began.elapsed();
+        self.waiting_since.insert(instance, (began, LastAsked { request: request.clone(), priority }));
         let options = AcquireOptions {
             request: request.clone(),
             priority: beside_others(priority, self.urgency),
+            speculative: priority < CERTAIN,
+            instead_of: before.map_or_else(String::new, |(_, last)| last.in_queue(waited)),
             deadline: ACQUIRE_DEADLINE,
             holder: holder(&self.task, self.paths.get(&instance).map_or(&instance.to_string(), |path| path)),
         };

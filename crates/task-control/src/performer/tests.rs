@@ -49,6 +49,7 @@ fn place_of(endpoints: &Endpoints) -> Place {
         messages: Messages::nowhere(),
         alone: false,
         urgency: Urgency::Normal,
+        standing: Standing::default(),
     }
 }
 
@@ -797,6 +798,15 @@ fn what_is_certain_comes_first_then_the_urgent_run_then_the_own_order() {
     let ranks = order.map(|(priority, urgency)| beside_others(priority, urgency));
     assert!(ranks.is_sorted_by(|a, b| a > b), "{ranks:?}");
     assert!(ranks[0] < OVERDUE && ranks[4] >= CERTAIN && ranks[5] < CERTAIN);
+}
+
+#[test]
+fn an_instance_that_asks_again_names_the_request_under_which_it_is_in_the_queue() {
+    let after = |priority: i64, waited: Duration| LastAsked { request: "r".to_owned(), priority }.in_queue(waited);
+    let long = LONG_BESIDE_OTHERS;
+    assert_eq!(after(CERTAIN, Duration::ZERO), "r");
+    assert_eq!(after(CERTAIN, long), acquiring::late_request("r"), "it has asked once more");
+    assert_eq!(after(CERTAIN - 1, long), "r", "what is speculative does not");
 }
 
 #[tokio::test]

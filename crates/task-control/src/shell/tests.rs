@@ -55,6 +55,7 @@ impl Bench {
             messages: Messages::nowhere(),
             alone: false,
             urgency: Urgency::Normal,
+            standing: ratn_worker::session::Standing::default(),
         };
         Ok(Bench { place, run, directory, _shutdown: shutdown.drop_guard() })
     }

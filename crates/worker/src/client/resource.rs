@@ -37,8 +37,12 @@ pub struct ResourceClient {
 pub struct AcquireOptions {
     /// The request id, which makes a repetition harmless, for example `run/instance/attempt`. A fresh one where empty.
     pub request: String,
-    /// Larger priorities are served first; equal ones in the order in which they came.
+    /// Larger priorities are served first, of what was asked within the same ten seconds; equal ones in the order in which they came.
     pub priority: i64,
+    /// It may turn out not to be needed: all that is needed for certain comes first.
+    pub speculative: bool,
+    /// The request id of an earlier acquire of the session for the same, whose place this one takes; empty for none.
+    pub instead_of: String,
     /// The longest time to wait.
     pub deadline: Duration,
     /// A name of the holder for people: `sort_boxes: place[2]/plan`.
@@ -50,6 +54,8 @@ impl Default for AcquireOptions {
         AcquireOptions {
             request: String::new(),
             priority: 0,
+            speculative: false,
+            instead_of: String::new(),
             deadline: Duration::from_secs(600),
             holder: String::new(),
         }
@@ -208,6 +214,8 @@ impl ResourceClient {
             priority: options.priority,
             deadline_ms: milliseconds(options.deadline),
             holder: options.holder,
+            speculative: options.speculative,
+            instead_of: options.instead_of,
         };
         match self.ask_for_lease(&question.request_id.clone(), Asked::Acquire(question)).await? {
             Answered::Acquire(granted) => Ok((self.field(granted.lease, "lease")?, granted.notes)),

@@ -43,6 +43,7 @@ pub(super) async fn block(asking: &Asking, held: &HoldArguments) -> Result<(), F
         priority: held.priority,
         deadline: held.wait,
         holder: format!("ratn resource block, process {}", std::process::id()),
+        ..AcquireOptions::default()
     };
     let granted = tokio::select! {
         granted = granted(&session, &client, requirement, options) => granted.context("not blocked"),

@@ -78,10 +78,12 @@ pub(super) fn event(event: &ResourceEvent) -> String {
 pub(super) fn waiting(waiting: &[WaitingAcquire]) -> String {
     let rows = waiting.iter().map(|one| {
         let (request, holder, session) = (one.request.clone(), one.holder.clone(), one.session.clone());
-        [one.ahead.to_string(), one.priority.to_string(), request, holder, session]
+        let due = one.due_in_ms.map_or_else(|| "-".to_owned(), |due| format!("{:.0} s", due as f64 / 1e3));
+        [one.ahead.to_string(), one.priority.to_string(), one.share.to_string(), due, request, holder, session]
     });
-    let mut rows: Vec<[String; 5]> = rows.collect();
-    rows.insert(0, ["AHEAD", "PRIORITY", "REQUEST", "HOLDER", "SESSION"].map(str::to_owned));
+    let mut rows: Vec<[String; 7]> = rows.collect();
+    let heads = ["AHEAD", "PRIORITY", "SHARE", "DUE IN", "REQUEST", "HOLDER", "SESSION"];
+    rows.insert(0, heads.map(str::to_owned));
     let mut lines = aligned(&rows).into_iter();
     let mut shown: Vec<String> = lines.next().into_iter().collect();
     for (line, one) in lines.zip(waiting) {
@@ -93,9 +95,11 @@ pub(super) fn waiting(waiting: &[WaitingAcquire]) -> String {
 
 pub(super) fn waiting_json(waiting: &WaitingAcquire) -> serde_json::Value {
     let WaitingAcquire { request, session, holder, priority, ahead, obstacles, .. } = waiting;
+    let WaitingAcquire { share, due_in_ms, speculative, waiting_ms, .. } = waiting;
     json!({
         "request": request, "session": session, "holder": holder, "priority": priority, "ahead": ahead,
-        "obstacles": obstacles,
+        "obstacles": obstacles, "share": share, "due_in_ms": due_in_ms, "speculative": speculative,
+        "waiting_ms": waiting_ms,
     })
 }
 
@@ -116,11 +120,12 @@ pub(super) fn sessions(sessions: &[SessionStatus]) -> String {
 }
 
 pub(super) fn session_json(session: &SessionStatus) -> serde_json::Value {
-    let SessionStatus { id, client, ttl_ms, expires_in_ms, leases, waiting, resources, opened_by } = session;
+    let SessionStatus { id, client, ttl_ms, expires_in_ms, leases, waiting, resources, opened_by, .. } = session;
+    let SessionStatus { share, due_in_ms, .. } = session;
     let leases: Vec<u64> = leases.iter().map(|lease| lease.0).collect();
     json!({
         "session": id, "client": client, "ttl_ms": ttl_ms, "expires_in_ms": expires_in_ms, "leases": leases,
-        "waiting": waiting, "resources": resources, "opened_by": opened_by,
+        "waiting": waiting, "resources": resources, "opened_by": opened_by, "share": share, "due_in_ms": due_in_ms,
     })
 }
 
@@ -286,14 +291,22 @@ mod tests {
             priority: 5,
             ahead: 0,
             obstacles: vec!["`block Arm`: held by lease 7 of session t".to_owned()],
-            held_by: Vec::new(),
+            share: 2.0,
+            due_in_ms: Some(90_400),
+            ..WaitingAcquire::default()
         };
-        let other = WaitingAcquire { ahead: 1, request: "run/8/1".to_owned(), obstacles: Vec::new(), ..one.clone() };
+        let other = WaitingAcquire {
+            ahead: 1,
+            due_in_ms: None,
+            request: "run/8/1".to_owned(),
+            obstacles: Vec::new(),
+            ..one.clone()
+        };
         assert_snapshot!(waiting(&[one, other]), @r"
-        AHEAD  PRIORITY  REQUEST  HOLDER          SESSION
-        0      5         run/7/1  fetch/approach  s
+        AHEAD  PRIORITY  SHARE  DUE IN  REQUEST  HOLDER          SESSION
+        0      5         2      90 s    run/7/1  fetch/approach  s
           `block Arm`: held by lease 7 of session t
-        1      5         run/8/1  fetch/approach  s
+        1      5         2      -       run/8/1  fetch/approach  s
         ");
     }
 

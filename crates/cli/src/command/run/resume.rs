@@ -1,6 +1,6 @@
 //! `ratn run --resume LOG`: what can be said against it before anything of the run is touched, then the run.
 
-use super::{conclude, described};
+use super::{Beside, conclude, described};
 use crate::arguments::RunArguments;
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
@@ -9,7 +9,7 @@ use crate::system::System;
 use crate::system::config::SystemConfig;
 use ratn_event_log::LogWriter;
 use ratn_task_control::history::{History, ReplayError};
-use ratn_task_control::shell::{self, Place, Resumption};
+use ratn_task_control::shell::{self, Resumption};
 use ratn_worker::tls::ClientTls;
 use std::path::Path;
 
@@ -28,6 +28,7 @@ pub(super) async fn run(
     if let Some(chart) = &arguments.gantt {
         output::check_writable(chart)?;
     }
+    let beside = Beside::of(arguments)?;
     // From here on nobody else goes on with it.
     let log = |error| refused(&format_args!("{:#}", anyhow::Error::from(error)));
     let writer = LogWriter::go_on(file).map_err(log)?;
@@ -46,7 +47,7 @@ pub(super) async fn run(
     let resumption = Resumption::new(program, history, writer, arguments.checkpoint_every)
         .map_err(|error| refused(&format_args!("{:#}", anyhow::Error::from(error))))?;
     output::progress(format_args!("on the system in {}", directory.display()));
-    let place = Place { alone: arguments.alone, urgency: arguments.urgency.into(), ..system.place() };
+    let place = beside.on(system.place());
     let ended = tokio::select! {
         ended = shell::resume(resumption, &place, interrupt) => ended,
         error = system.one_ended() => Err(error.context("a part of the system ended during the run")),

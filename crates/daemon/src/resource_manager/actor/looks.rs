@@ -3,6 +3,7 @@
 use super::{ResourceCore, ResourceTurn};
 use crate::details::status as status_with;
 use crate::resource_manager::wire;
+use ratn_model::time::Timestamp;
 use ratn_proto::types::{SessionStatus, WaitingAcquire};
 use ratn_resources::{Explanation, WaiterId};
 use std::sync::Arc;
@@ -36,11 +37,11 @@ impl ResourceCore {
         Ok((waiters, self.pool.waiting()))
     }
 
-    pub(super) fn explain(&self, waiters: &[WaiterId]) -> (Vec<WaitingAcquire>, usize) {
+    pub(super) fn explain(&self, waiters: &[WaiterId], now: Timestamp) -> (Vec<WaitingAcquire>, usize) {
         let (explanations, done) = self.pool.explain_some(waiters, LOOKS);
         let explained = |why: &Explanation| {
             let (request_id, request) = self.pool.waiter(why.waiter)?;
-            Some(wire::waiting(request_id, request, why))
+            Some(wire::waiting(request_id, request, why, now))
         };
         (explanations.iter().filter_map(explained).collect(), done)
     }

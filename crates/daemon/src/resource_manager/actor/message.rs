@@ -6,8 +6,11 @@ use super::super::watch_message::WatchMessage;
 use super::ResourceCore;
 use crate::resource_manager::Granted;
 use ratn_model::id::{LeaseId, Revision};
+use ratn_model::time::Timestamp;
 use ratn_proto::types::{Demand, SessionStatus, WaitingAcquire, WatchPosition};
-use ratn_resources::{AcquireRequest, Reply, Request, ResourceView, Search, SessionId, Speaker, WaiterId};
+use ratn_resources::{
+    AcquireRequest, Reply, Request, ResourceView, Search, SessionId, Share, Speaker, Standing, WaiterId,
+};
 use std::cmp::Reverse;
 use std::sync::Arc;
 use std::time::Duration;
@@ -30,7 +33,26 @@ pub(in super::super) struct Ping {
     pub(super) session: SessionId,
     pub(super) client: String,
     pub(super) ttl: Duration,
+    pub(super) claim: Claim,
     pub(super) answer: Answer<KeptAlive>,
+}
+
+/// What a session says that it is beside others.
+#[derive(Debug, Clone, Copy, Default)]
+pub(in super::super) struct Claim {
+    pub(in super::super) share: Share,
+    /// When its task is due, from now on; negative where that has passed.
+    pub(in super::super) due_in_ms: Option<i64>,
+}
+
+impl Claim {
+    pub(super) fn at(self, now: Timestamp) -> Standing {
+        let due = |ms: i64| match Duration::from_millis(ms.unsigned_abs()) {
+            left if ms >= 0 => now + left,
+            passed => Timestamp(now.0.saturating_sub(u64::try_from(passed.as_nanos()).unwrap_or(u64::MAX))),
+        };
+        Standing { share: self.share, due: self.due_in_ms.map(due) }
+    }
 }
 
 /// What the service asks of the actor.
@@ -139,8 +161,9 @@ impl Handle {
         session: SessionId,
         client: String,
         ttl: Duration,
+        claim: Claim,
     ) -> Result<KeptAlive, Status> {
-        self.ask_urgently(|answer| Ping { speaker, session, client, ttl, answer }).await?
+        self.ask_urgently(|answer| Ping { speaker, session, client, ttl, claim, answer }).await?
     }
 }
 

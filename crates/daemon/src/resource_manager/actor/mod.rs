@@ -10,7 +10,7 @@ mod looks;
 mod message;
 mod watchers;
 
-pub(super) use message::{Answer, Handle, KeptAlive, Message};
+pub(super) use message::{Answer, Claim, Handle, KeptAlive, Message};
 
 use super::providers::Providers;
 use super::watch_message::WatchMessage;
@@ -137,7 +137,8 @@ impl Core for ResourceCore {
         self.pool.advance(context.now());
     }
 
-    fn receive_urgent(&mut self, Ping { speaker, session, client, ttl, answer }: Ping, context: &mut ResourceTurn) {
+    fn receive_urgent(&mut self, ping: Ping, context: &mut ResourceTurn) {
+        let Ping { speaker, session, client, ttl, claim, answer } = ping;
         let before = self.pool.session_ttl(&session);
         let kept = match context.stopped() {
             Some(stopped) => Err(stopped.status.clone()),
@@ -145,6 +146,10 @@ impl Core for ResourceCore {
                 .keep_alive(context.now(), &speaker, &session, &client, ttl)
                 .map_err(|error| status::of_error(&error)),
         };
+        if kept.is_ok() && !ttl.is_zero() {
+            // It was there a moment ago.
+            let _ = self.pool.set_standing(context.now(), &session, claim.at(context.now()));
+        }
         match kept {
             // Nothing has changed that would have to be on the disk: however slow that is, it ends no session.
             Ok(kept)
@@ -239,7 +244,7 @@ impl Core for ResourceCore {
                 let waiters = self.waiters(&caller, &request_id);
                 context.reply(answer, waiters);
             }
-            Message::Explain { waiters, answer } => context.tell(answer, self.explain(&waiters)),
+            Message::Explain { waiters, answer } => context.tell(answer, self.explain(&waiters, now)),
             Message::Watch { after, filter, answer } => {
                 let watch = self.watch(after, filter, context);
                 context.reply(answer, watch);

@@ -48,6 +48,8 @@ pub(super) async fn acquire(
     let acquire = AcquireRequest {
         priority: request.priority,
         purpose: request.holder,
+        speculative: request.speculative,
+        instead_of: request.instead_of,
         ..AcquireRequest::new(session(&request.session_id)?, requirements)
     };
     let lease = wait_for_grant(requests, tickets, caller, request.request_id, acquire, request.deadline_ms).await?;
@@ -83,6 +85,7 @@ async fn granted(
 ) -> Granted {
     label(&request_id, "request_id")?;
     label(&request.purpose, "holder")?;
+    label(&request.instead_of, "instead_of")?;
     if wait_ms == 0 {
         return Err(status(Code::InvalidArgument, "MALFORMED", "deadline_ms: is 0: it must be at least 1"));
     }

@@ -6,10 +6,10 @@ use crate::access::{Caller, speaker};
 use crate::audit::{self, Mutation};
 use crate::paging::{Filled, Page};
 use crate::quota::Quotas;
-use crate::resource_manager::actor::Message;
-use ratn_proto::convert::label;
+use crate::resource_manager::actor::{Claim, Message};
+use ratn_proto::convert::{Malformed, label};
 use ratn_proto::v1;
-use ratn_resources::Request;
+use ratn_resources::{Request, Share};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
@@ -27,10 +27,11 @@ pub(super) async fn kept_alive(
 ) -> Result<v1::KeepAliveResponse, Status> {
     let session = session(&ping.session_id)?;
     label(&ping.client, "client")?;
+    let claim = Claim { share: share(ping.share)?, due_in_ms: ping.due_in_ms };
     let client = if ping.client.is_empty() { ping.session_id.clone() } else { ping.client };
     let ttl = Duration::from_millis(ping.ttl_ms);
     let (named, id) = (client.clone(), ping.session_id.clone());
-    let kept = requests.actor().keep_alive(speaker(caller), session, client, ttl).await;
+    let kept = requests.actor().keep_alive(speaker(caller), session, client, ttl, claim).await;
     // Pings that change nothing are not written down.
     if ttl.is_zero() {
         audit::begin(caller, "", || Mutation::CloseSession { session: id }).ended(&kept);
@@ -46,6 +47,14 @@ pub(super) async fn kept_alive(
         revision: kept.revision.0,
         number: kept.number,
     })
+}
+
+/// The share that a session says; 0 is none that it says.
+fn share(said: f64) -> Result<Share, Malformed> {
+    if said == 0.0 {
+        return Ok(Share::ONE);
+    }
+    Share::new(said).map_err(|error| Malformed::new("share", format!("is {said}: {error}")))
 }
 
 /// Answers each ping of a stream, until the first refusal.
@@ -119,6 +128,7 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::super::test_actor;
     use crate::durable_actor::slow_disk::SlowDisk;
+    use crate::resource_manager::actor::Claim;
     use ratn_resources::{SessionId, Speaker};
     use std::time::Duration;
 
@@ -129,7 +139,8 @@ mod tests {
         let speaker = || Speaker::trusted();
         let ping = async |session: &str, ttl_s| {
             let ttl = Duration::from_secs(ttl_s);
-            actor.keep_alive(speaker(), SessionId::from(session), "a".to_owned(), ttl).await.unwrap()
+            let session = SessionId::from(session);
+            actor.keep_alive(speaker(), session, "a".to_owned(), ttl, Claim::default()).await.unwrap()
         };
         assert!(ping("a", 60).await.created && ping("c", 60).await.created);
         let hangs = disk.hang();

@@ -72,6 +72,7 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::super::test_actor;
     use super::*;
+    use crate::resource_manager::actor::Claim;
     use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
     use ratn_resources::{Request as PoolRequest, ResourceSpec, SessionId};
 
@@ -79,7 +80,10 @@ mod tests {
     async fn a_lease_that_two_calls_of_one_request_got_goes_back_when_both_are_dropped() {
         let (actor, _directory) = test_actor::started(|log| log);
         let session = SessionId::from("s");
-        actor.keep_alive(Speaker::trusted(), session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
+        actor
+            .keep_alive(Speaker::trusted(), session.clone(), "s".to_owned(), Duration::from_secs(60), Claim::default())
+            .await
+            .unwrap();
         let requirement = Requirement::new(ResourceOperation::Block, "Arm");
         let mut calls = Vec::new();
         for ticket in [1, 2] {
@@ -106,7 +110,10 @@ mod tests {
     async fn with_an_arm() -> (Handle, SessionId, tempfile::TempDir) {
         let (actor, directory) = test_actor::started(|log| log);
         let session = SessionId::from("s");
-        actor.keep_alive(Speaker::trusted(), session.clone(), "s".to_owned(), Duration::from_secs(60)).await.unwrap();
+        actor
+            .keep_alive(Speaker::trusted(), session.clone(), "s".to_owned(), Duration::from_secs(60), Claim::default())
+            .await
+            .unwrap();
         let create = PoolRequest::Create { session: None, spec: ResourceSpec::new(ResourceClass::Module, "Arm") };
         let request_id = String::new();
         actor

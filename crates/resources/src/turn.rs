@@ -1,0 +1,207 @@
+//! Turns: the order in which waiting requests are served, as a number that a request gets when it asks and keeps.
+//!
+//! What is needed for certain comes before what is speculative. Then, by time in steps of [`LEAD`]: when it was asked, or later, where its
+//! session has had more than its share (`accounts.rs`), by [`AHEAD`] at the most. Within a step, the most urgent (bits 60 and up of a
+//! priority), then the session whose task is due first, then the larger priority, then who came first.
+//!
+//! ```text
+//!   asked ≤ time of the turn ≤ asked + AHEAD       step = time of the turn / LEAD, rounded down
+//!
+//!   w asked at a:                     step(w) ≤ ⌊(a + AHEAD) / LEAD⌋
+//!   v asked at b, is served before w: step(v) ≤ step(w), and step(v) ≥ ⌊b / LEAD⌋, so b < a + AHEAD + LEAD
+//! ```
+//!
+//! So of what is needed for certain, nobody is passed by a request of another session that was asked `AHEAD + LEAD` later, whatever its
+//! priority, share or due time. A request may keep the time at which another one was asked that it replaces (`replaced.rs`); one that
+//! becomes certain so keeps [`LEAD`] of it at the most. It passes nobody who was there [`BOUND`] before it became certain.
+//!
+//! While nobody else waits for anything in the families of kinds that a request wants, it joins the last step of its own session there: it
+//! passes nobody by that, and a session alone is served by priority and arrival, for however long its requests wait.
+//!
+//! Where a turn comes from: VirtualClock (Zhang 1990), with a bound on how far a clock is ahead.
+
+use ratn_model::time::Timestamp;
+use serde::{Deserialize, Serialize};
+use std::cmp::Reverse;
+use std::fmt;
+use std::time::Duration;
+
+/// By so much a turn is later than its request at the most, for what its session has had.
+pub const AHEAD: Duration = Duration::from_secs(60);
+/// What is asked within such a step of time is served by urgency, due time and priority.
+pub const LEAD: Duration = Duration::from_secs(10);
+/// Nobody who needs something for certain is passed by a request of another session that became certain so much later.
+pub const BOUND: Duration = Duration::from_secs(AHEAD.as_secs() + 2 * LEAD.as_secs());
+/// The bits of a priority from this one on are its urgency.
+const URGENCY_BITS: u32 = 60;
+
+/// How much a session is to have of what several want, beside the shares of the others: thousandths of the usual share.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(try_from = "f64", into = "f64")]
+pub struct Share(u32);
+
+/// A share that is no number from [`Share::LEAST`] to [`Share::MOST`].
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[error("a share is a number from {} to {}, and 1 is the usual one", Share::LEAST, Share::MOST)]
+pub struct NoShare;
+
+impl Share {
+    /// The usual share.
+    pub const ONE: Share = Share(1_000);
+    /// The least.
+    pub const LEAST: Share = Share(10);
+    /// The largest.
+    pub const MOST: Share = Share(100_000);
+
+    /// The share of a number, in thousandths.
+    ///
+    /// # Errors
+    /// A number that is none, or outside of the bounds.
+    pub fn new(number: f64) -> Result<Share, NoShare> {
+        let thousandths = (number * 1_000.0).round();
+        if !(f64::from(Share::LEAST.0)..=f64::from(Share::MOST.0)).contains(&thousandths) {
+            return Err(NoShare);
+        }
+        Ok(Share(thousandths as u32))
+    }
+
+    /// As a number.
+    pub fn number(self) -> f64 {
+        f64::from(self.0) / 1_000.0
+    }
+
+    pub(crate) fn thousandths(self) -> u64 {
+        self.0.into()
+    }
+}
+
+impl Default for Share {
+    fn default() -> Share {
+        Share::ONE
+    }
+}
+
+impl TryFrom<f64> for Share {
+    type Error = NoShare;
+
+    fn try_from(number: f64) -> Result<Share, NoShare> {
+        Share::new(number)
+    }
+}
+
+impl From<Share> for f64 {
+    fn from(share: Share) -> f64 {
+        share.number()
+    }
+}
+
+impl fmt::Display for Share {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.number().fmt(f)
+    }
+}
+
+/// What a session says of itself beside others.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Standing {
+    /// Its share.
+    pub share: Share,
+    /// When its task is due.
+    pub due: Option<Timestamp>,
+}
+
+/// Where a request stands; the smaller one is served first. In the order of comparison.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct Turn {
+    speculative: bool,
+    step: u32,
+    urgency: Reverse<i8>,
+    /// Whole seconds; [`NEVER`] where nothing is due.
+    due: u32,
+    priority: Reverse<i64>,
+}
+
+const NEVER: u32 = u32::MAX;
+
+impl Turn {
+    /// Behind every turn.
+    pub(crate) const LAST: Turn =
+        Turn { speculative: true, step: u32::MAX, urgency: Reverse(i8::MIN), due: NEVER, priority: Reverse(i64::MIN) };
+
+    /// Of a request that was asked at `asked`, of a session whose clock is at `clock`.
+    pub(crate) fn of(speculative: bool, step: u32, due: Option<Timestamp>, priority: i64) -> Turn {
+        let due = due.map_or(NEVER, |due| seconds(due).min(NEVER - 1));
+        let urgency = Reverse((priority >> URGENCY_BITS) as i8);
+        Turn { speculative, step, urgency, due, priority: Reverse(priority) }
+    }
+
+    pub(crate) fn step(self) -> u32 {
+        self.step
+    }
+}
+
+/// The step of what was asked at `asked` by who has had what `clock` says.
+pub(crate) fn step(asked: Timestamp, clock: Timestamp) -> u32 {
+    seconds(clock.clamp(asked, asked + AHEAD)) / LEAD.as_secs() as u32
+}
+
+fn seconds(at: Timestamp) -> u32 {
+    u32::try_from(at.0 / 1_000_000_000).unwrap_or(u32::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    fn at(seconds: u64) -> Timestamp {
+        Timestamp(seconds * 1_000_000_000)
+    }
+
+    #[test]
+    fn certain_comes_first_then_the_step_then_urgency_then_what_is_due_then_priority() {
+        const URGENT: i64 = 1 << URGENCY_BITS;
+        let order = [
+            Turn::of(false, 1, None, 0),
+            Turn::of(false, 2, None, URGENT),
+            Turn::of(false, 2, Some(at(50)), 3),
+            Turn::of(false, 2, Some(at(60)), URGENT - 1),
+            Turn::of(false, 2, None, 7),
+            Turn::of(false, 2, None, 0),
+            Turn::of(false, 2, Some(at(50)), -1),
+            Turn::of(true, 0, Some(at(1)), i64::MAX),
+            Turn::LAST,
+        ];
+        assert!(order.is_sorted_by(|a, b| a < b), "{order:?}");
+        let priorities = [i64::MAX, URGENT, URGENT - 1, 1, 0, -1, i64::MIN].map(|p| Turn::of(false, 2, None, p));
+        assert!(priorities.is_sorted_by(|a, b| a < b), "without due times as the priorities say");
+    }
+
+    #[test]
+    fn a_turn_is_no_sooner_than_its_request_and_at_most_so_much_later() {
+        assert_eq!(step(at(25), at(0)), 2, "who has had nothing saves nothing up");
+        assert_eq!(step(at(25), at(38)), 3);
+        assert_eq!(step(at(25), at(1_000)), 8, "60 s later");
+        assert_eq!(step(Timestamp(u64::MAX), at(0)), u32::MAX / 10);
+    }
+
+    #[test]
+    fn a_request_passes_none_that_was_asked_ahead_and_lead_before_it() {
+        for asked in 0..200 {
+            let latest = step(at(asked), at(asked + 500));
+            let earliest = step(at(asked) + AHEAD + LEAD, at(0));
+            assert!(Turn::of(false, earliest, Some(at(0)), i64::MAX) > Turn::of(false, latest, None, i64::MIN));
+        }
+    }
+
+    #[test]
+    fn a_share_is_a_number_within_its_bounds() {
+        for (number, share) in [(1.0, Some("1")), (0.01, Some("0.01")), (2.5, Some("2.5")), (100.0, Some("100"))] {
+            assert_eq!(Share::new(number).ok().map(|share| share.to_string()).as_deref(), share);
+        }
+        for number in [0.0, -1.0, 0.009, 100.01, f64::NAN, f64::INFINITY] {
+            assert_eq!(Share::new(number), Err(NoShare), "{number}");
+        }
+        assert_eq!(NoShare.to_string(), "a share is a number from 0.01 to 100, and 1 is the usual one");
+    }
+}

@@ -1,0 +1,414 @@
+//! Turns: shares over a long time, due times, and the bound within which nobody is passed, over random requests from fixed seeds.
+//!
+//! The bound is looked at from outside, with nothing of the pool's own count: by who was granted what, and when each had asked.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use ratn_model::id::LeaseId;
+use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
+use ratn_model::time::Timestamp;
+use ratn_resources::{
+    AHEAD, AcquireRequest, BOUND, LEAD, Limits, Notice, Pool, Quantity, Reply, Request, ResourceSpec, SessionId, Share,
+    Standing, WaiterId,
+};
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+
+const HOUR: Duration = Duration::from_secs(3_600);
+const KINDS: [&str; 2] = ["Arm", "Camera"];
+
+/// SplitMix64.
+struct Dice(u64);
+
+impl Dice {
+    fn below(&mut self, bound: u64) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mixed = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        (mixed ^ (mixed >> 31)) % bound
+    }
+
+    fn between(&mut self, from: u64, to: u64) -> u64 {
+        from + self.below(to - from)
+    }
+}
+
+fn at(milliseconds: u64) -> Timestamp {
+    Timestamp(milliseconds * 1_000_000)
+}
+
+fn run(number: usize) -> SessionId {
+    SessionId::from(format!("run-{number}").as_str())
+}
+
+fn block(kind: &str, count: u32) -> Requirement {
+    Requirement { count: count.into(), ..Requirement::new(ResourceOperation::Block, kind) }
+}
+
+fn pool(runs: &[Standing], units: [u32; 2]) -> Pool {
+    let mut pool = Pool::new(Limits::default());
+    for (number, standing) in runs.iter().enumerate() {
+        pool.keep_alive(at(0), &run(number), "run", 100 * HOUR).unwrap();
+        pool.set_standing(at(0), &run(number), *standing).unwrap();
+    }
+    for (kind, units) in KINDS.iter().zip(units).filter(|(_, units)| *units > 0) {
+        pool.create(at(0), None, ResourceSpec::new(ResourceClass::Module, *kind).capacity(units)).unwrap();
+    }
+    pool
+}
+
+/// What a run that always wants more asks for, how many times at once, and for how long it holds that.
+#[derive(Clone)]
+struct Wants {
+    at_once: usize,
+    units: [u32; 2],
+    priority: i64,
+    hold_ms: (u64, u64),
+}
+
+impl Wants {
+    fn one_arm() -> Wants {
+        Wants { at_once: 1, units: [1, 0], priority: 0, hold_ms: (900, 1_100) }
+    }
+}
+
+/// How long each run held each kind, in unit-milliseconds, where all of them always want more.
+fn held(standings: &[Standing], wants: &[Wants], units: [u32; 2], length_ms: u64, seed: u64) -> Vec<[u64; 2]> {
+    let (mut pool, mut dice) = (pool(standings, units), Dice(seed));
+    let mut held = vec![[0; 2]; wants.len()];
+    let mut asked: BTreeMap<WaiterId, usize> = BTreeMap::new();
+    let mut ends: BTreeSet<(u64, LeaseId, usize)> = BTreeSet::new();
+    let mut now = 0;
+    let ask = |pool: &mut Pool, asked: &mut BTreeMap<WaiterId, usize>, number: usize, now: u64| {
+        let wanted = wants[number].units.iter().zip(KINDS).filter(|(units, _)| **units > 0);
+        let wanted = wanted.map(|(units, kind)| block(kind, *units)).collect();
+        let request = AcquireRequest::new(run(number), wanted).priority(wants[number].priority);
+        asked.insert(pool.acquire(at(now), request).unwrap(), number);
+    };
+    for (number, wants) in wants.iter().enumerate() {
+        (0..wants.at_once).for_each(|_| ask(&mut pool, &mut asked, number, now));
+    }
+    while now < length_ms {
+        for notice in pool.take_notices() {
+            let Notice::Granted { waiter, lease } = notice else { continue };
+            let number = asked.remove(&waiter).unwrap();
+            let time = dice.between(wants[number].hold_ms.0, wants[number].hold_ms.1);
+            (0..2).for_each(|kind| held[number][kind] += u64::from(wants[number].units[kind]) * time);
+            ends.insert((now + time, lease.id, number));
+        }
+        if now % 16 == 0 {
+            pool.check_invariants().unwrap();
+        }
+        let (end, lease, number) = ends.pop_first().unwrap();
+        now = end;
+        // It asks for the next before it gives this one back.
+        ask(&mut pool, &mut asked, number, now);
+        pool.release(at(now), Some(&run(number)), lease).unwrap();
+    }
+    held
+}
+
+fn shares(numbers: &[f64]) -> Vec<Standing> {
+    numbers.iter().map(|number| Standing::of(Share::new(*number).unwrap())).collect()
+}
+
+/// What each has of the first kind, in hundredths of all.
+fn percent(held: &[[u64; 2]]) -> Vec<u64> {
+    let all: u64 = held.iter().map(|held| held[0]).sum();
+    held.iter().map(|held| (100 * held[0] + all / 2) / all).collect()
+}
+
+fn about(is: &[u64], expected: &[u64], tolerance: u64) {
+    let near = is.iter().zip(expected).all(|(is, expected)| is.abs_diff(*expected) <= tolerance);
+    assert!(near, "{is:?} is not about {expected:?} %");
+}
+
+#[test]
+fn two_runs_have_an_arm_by_their_shares() {
+    for (shares_of, expected) in [([1.0, 1.0], [50, 50]), ([2.0, 1.0], [67, 33]), ([1.0, 4.0], [20, 80])] {
+        for seed in 0..3 {
+            let held = held(&shares(&shares_of), &[Wants::one_arm(), Wants::one_arm()], [1, 0], 3_600_000, seed);
+            about(&percent(&held), &expected, 5);
+        }
+    }
+}
+
+#[test]
+fn what_a_run_has_follows_from_its_share_and_not_from_its_priorities_or_how_long_it_holds() {
+    let urgent = Wants { priority: 1 << 59, ..Wants::one_arm() };
+    let long = Wants { hold_ms: (3_600, 4_400), ..Wants::one_arm() };
+    for seed in 0..3 {
+        let held = held(&shares(&[1.0, 1.0]), &[urgent.clone(), Wants::one_arm()], [1, 0], 3_600_000, seed);
+        about(&percent(&held), &[50, 50], 5);
+        let held = self::held(&shares(&[1.0, 1.0]), &[long.clone(), Wants::one_arm()], [1, 0], 3_600_000, seed);
+        about(&percent(&held), &[50, 50], 5);
+    }
+}
+
+#[test]
+fn three_runs_have_two_arms_by_their_shares() {
+    let wants = vec![Wants { at_once: 2, ..Wants::one_arm() }; 3];
+    for seed in 0..3 {
+        let held = held(&shares(&[2.0, 1.0, 1.0]), &wants, [2, 0], 3_600_000, seed);
+        about(&percent(&held), &[50, 25, 25], 5);
+    }
+}
+
+#[test]
+fn what_a_run_leaves_others_have() {
+    // The first one wants little, though its share is large.
+    let seldom = Wants { units: [0, 1], ..Wants::one_arm() };
+    let wants = [seldom, Wants::one_arm(), Wants::one_arm()];
+    let held = held(&shares(&[10.0, 1.0, 1.0]), &wants, [1, 1], 600_000, 1);
+    about(&percent(&held), &[0, 50, 50], 5);
+    assert!(held.iter().map(|held| held[0]).sum::<u64>() > 590_000, "the arm is never idle");
+}
+
+#[test]
+fn of_what_is_asked_at_about_the_same_time_what_is_due_first_comes_first() {
+    let due = |seconds: u64| Standing { due: Some(at(seconds * 1_000)), ..Standing::default() };
+    let mut pool = pool(&[Standing::default(), due(500), due(400), Standing::default()], [1, 0]);
+    let held = pool.acquire(at(0), AcquireRequest::new(run(3), vec![block("Arm", 1)])).unwrap();
+    let asked = [(0, 7), (1, 0), (2, 0), (0, 1 << 60)];
+    let asked = asked.map(|(number, priority)| {
+        pool.acquire(at(1), AcquireRequest::new(run(number), vec![block("Arm", 1)]).priority(priority)).unwrap()
+    });
+    let order: Vec<WaiterId> = pool.waiters().into_iter().map(|(id, _)| id).collect();
+    assert_eq!(order, [asked[3], asked[2], asked[1], asked[0]], "urgency, then due times, then priorities");
+    // Said again from another moment it is the same; and nobody is passed for it who asked so long before.
+    pool.set_standing(at(2), &run(1), Standing { due: Some(at(500_900)), ..Standing::default() }).unwrap();
+    assert_eq!(pool.explain(asked[1]).unwrap().standing.due, Some(at(500_000)));
+    pool.set_standing(at(2), &run(1), due(1)).unwrap();
+    let late = AcquireRequest::new(run(1), vec![block("Arm", 1)]).priority(i64::MAX);
+    let late = pool.acquire(at(10_000), late).unwrap();
+    assert_eq!(pool.waiters().last().unwrap().0, late);
+    assert!(pool.explain(held).is_none(), "it holds the arm");
+}
+
+#[test]
+fn a_session_alone_is_served_by_priority_however_long_its_requests_wait() {
+    let mut pool = pool(&shares(&[1.0, 1.0]), [1, 1]);
+    let ask = |pool: &mut Pool, now: u64, number: usize, kind: &str, priority: i64| {
+        pool.acquire(at(now), AcquireRequest::new(run(number), vec![block(kind, 1)]).priority(priority)).unwrap()
+    };
+    for (number, kind) in [(0, "Arm"), (1, "Camera"), (1, "Camera")] {
+        ask(&mut pool, 0, number, kind, 0);
+    }
+    let first = ask(&mut pool, 1_000, 0, "Arm", 1);
+    let second = ask(&mut pool, 900_000, 0, "Arm", 2);
+    let third = ask(&mut pool, 1_800_000, 0, "Arm", 0);
+    let arms = |pool: &Pool| -> Vec<WaiterId> {
+        let arm = |request: &AcquireRequest| request.requirements[0].kind == "Arm";
+        pool.waiters().into_iter().filter(|(_, request)| arm(request)).map(|(id, _)| id).collect()
+    };
+    assert_eq!(arms(&pool), [second, first, third], "the other one waits for something else");
+    let other = ask(&mut pool, 1_800_000, 1, "Arm", 9);
+    let last = ask(&mut pool, 1_900_000, 0, "Arm", 9);
+    assert_eq!(arms(&pool), [second, first, third, other, last]);
+}
+
+#[test]
+fn a_request_that_takes_the_place_of_another_keeps_its_time() {
+    let mut pool = pool(&shares(&[1.0, 1.0]), [1, 0]);
+    let ask = |pool: &mut Pool, now: u64, id: &str, request: AcquireRequest| match pool
+        .handle(at(now), id, Request::Acquire(request))
+        .unwrap()
+    {
+        Reply::Queued(waiter) => waiter,
+        reply => panic!("{reply:?}"),
+    };
+    let arm = |number: usize| AcquireRequest::new(run(number), vec![block("Arm", 1)]);
+    let order = |pool: &Pool| pool.waiters().into_iter().map(|(id, _)| id).collect::<Vec<_>>();
+    ask(&mut pool, 0, "held", arm(1));
+    let in_case = ask(&mut pool, 1_000, "in-case", arm(0).speculative(true));
+    let other = ask(&mut pool, 20_000, "other", arm(1));
+    assert_eq!(order(&pool), [other, in_case], "what is certain comes first");
+    // Of 39 s of speculative waiting it keeps 10.
+    let certain = ask(&mut pool, 40_000, "certain", arm(0).instead_of("in-case"));
+    let asked = pool.explain(certain).unwrap().asked;
+    assert_eq!((order(&pool), asked), (vec![other, certain], at(30_000)));
+    let refused = |notice: &Notice| matches!(notice, Notice::Refused { waiter, .. } if *waiter == in_case);
+    assert!(pool.take_notices().iter().any(refused), "whom it takes the place of leaves");
+    // Of certain waiting all, also under the same id after it had left.
+    let urgent = ask(&mut pool, 60_000, "urgent", arm(0).instead_of("certain").priority(5));
+    assert_eq!(pool.explain(urgent).unwrap().asked, at(30_000));
+    pool.cancel(at(61_000), urgent).unwrap();
+    let again = ask(&mut pool, 62_000, "urgent", arm(0).instead_of("certain").priority(5));
+    assert_eq!(pool.explain(again).unwrap().asked, at(30_000));
+    // Not twice, not of another session, not after a while.
+    let twice = ask(&mut pool, 63_000, "twice", arm(0).instead_of("certain"));
+    let anothers = ask(&mut pool, 63_000, "anothers", arm(1).instead_of("urgent"));
+    pool.cancel(at(64_000), again).unwrap();
+    let late = ask(&mut pool, 75_000, "late", arm(0).instead_of("urgent"));
+    let asked = [twice, anothers, late].map(|waiter| pool.explain(waiter).unwrap().asked);
+    assert_eq!(asked, [at(63_000), at(63_000), at(75_000)]);
+    pool.check_invariants().unwrap();
+}
+
+/// A request that waits, as the test knows it.
+struct Waits {
+    number: usize,
+    /// When it became certain; nothing while it is speculative.
+    certain_since: Option<u64>,
+    /// As far as that counts for who passes it: where it replaced another one, since when that was certain.
+    asked: u64,
+    units: [u32; 2],
+    id: String,
+}
+
+/// Random requests of so many runs for an hour; how many grants there were, and how many that passed somebody.
+fn random_hour(seed: u64) -> (usize, usize) {
+    let mut dice = Dice(seed);
+    let runs = dice.between(2, 7) as usize;
+    let mut standings = shares(&vec![1.0; runs]);
+    for standing in &mut standings {
+        standing.share = Share::new([0.01, 0.5, 1.0, 3.0, 100.0][dice.below(5) as usize]).unwrap();
+        standing.due = (dice.below(3) == 0).then(|| at(dice.below(3_600_000)));
+    }
+    let mut pool = pool(&standings, [2, 3]);
+    let mut waiting: BTreeMap<WaiterId, Waits> = BTreeMap::new();
+    let mut ends: BTreeSet<(u64, LeaseId)> = BTreeSet::new();
+    let (mut now, mut next, mut grants, mut passes) = (0, 0, 0, 0);
+    // Some seeds have long waits, some short ones.
+    let pause = [200, 2_000, 6_000][dice.below(3) as usize];
+    while now < 3_600_000 {
+        now += dice.between(1, pause);
+        while let Some((end, lease)) = ends.first().copied().filter(|(end, _)| *end <= now) {
+            ends.pop_first();
+            pool.release(at(end), None, lease).unwrap();
+            observe(&mut pool, end, &mut dice, &mut waiting, &mut ends, (&mut grants, &mut passes));
+        }
+        let known = waiting.keys().nth(dice.below(1 + waiting.len() as u64) as usize).copied();
+        match (dice.below(10), known) {
+            (0, Some(id)) => {
+                pool.cancel(at(now), id).unwrap();
+                waiting.remove(&id);
+            }
+            (1, Some(id)) => {
+                let before = waiting.remove(&id).unwrap();
+                next += 1;
+                let request = AcquireRequest::new(run(before.number), wanted(before.units)).instead_of(&before.id);
+                let request = request.priority(dice.below(1 << 62) as i64);
+                let waiter = queued(&mut pool, now, next, request);
+                let asked = if before.certain_since.is_some() { before.asked } else { now };
+                let certain_since = Some(before.certain_since.unwrap_or(now));
+                waiting.insert(waiter, Waits { id: next.to_string(), asked, certain_since, ..before });
+            }
+            _ if waiting.len() < 60 => {
+                next += 1;
+                let number = dice.below(runs as u64) as usize;
+                let units = [[1, 0], [2, 0], [0, 1], [0, 3], [1, 1], [2, 3]][dice.below(6) as usize];
+                let speculative = dice.below(4) == 0;
+                let priority = [0, 1, 1 << 60, 1 << 61, i64::MAX, i64::MIN][dice.below(6) as usize];
+                let request = AcquireRequest::new(run(number), wanted(units)).priority(priority);
+                let waiter = queued(&mut pool, now, next, request.speculative(speculative));
+                let certain_since = (!speculative).then_some(now);
+                let waits = Waits { number, certain_since, asked: now, units, id: next.to_string() };
+                waiting.insert(waiter, waits);
+            }
+            _ => {}
+        }
+        observe(&mut pool, now, &mut dice, &mut waiting, &mut ends, (&mut grants, &mut passes));
+    }
+    (grants, passes)
+}
+
+fn wanted(units: [u32; 2]) -> Vec<Requirement> {
+    KINDS.iter().zip(units).filter(|(_, units)| *units > 0).map(|(kind, units)| block(kind, units)).collect()
+}
+
+fn queued(pool: &mut Pool, now: u64, id: u64, request: AcquireRequest) -> WaiterId {
+    match pool.handle(at(now), &id.to_string(), Request::Acquire(request)).unwrap() {
+        Reply::Queued(waiter) => waiter,
+        reply => panic!("{reply:?}"),
+    }
+}
+
+/// Takes the grants, and looks whether anybody was passed who must not be.
+fn observe(
+    pool: &mut Pool,
+    now: u64,
+    dice: &mut Dice,
+    waiting: &mut BTreeMap<WaiterId, Waits>,
+    ends: &mut BTreeSet<(u64, LeaseId)>,
+    (grants, passes): (&mut usize, &mut usize),
+) {
+    if now % 64 == 0 {
+        pool.check_invariants().unwrap();
+    }
+    let granted = pool.take_notices().into_iter().filter_map(|notice| match notice {
+        Notice::Granted { waiter, lease } => Some((waiter, lease.id)),
+        _ => None,
+    });
+    let granted: Vec<(WaiterId, LeaseId)> = granted.collect();
+    let free =
+        KINDS.map(|kind| pool.list().iter().filter(|one| one.kind == kind).map(|one| one.free).sum::<Quantity>());
+    for (waiter, lease) in granted {
+        *grants += 1;
+        let served = waiting.remove(&waiter).unwrap();
+        ends.insert((now + dice.between(100, 20_000), lease));
+        for other in waiting.values().filter(|other| other.number != served.number) {
+            // What it had reserved is free still.
+            let took = (0..2).any(|kind| served.units[kind] > 0 && free[kind] < other.units[kind].into());
+            let Some(since) = other.certain_since.filter(|_| took) else { continue };
+            let asked_after = match served.certain_since {
+                Some(since) => since,
+                None => panic!("what is speculative was served before {} that is certain", other.id),
+            };
+            *passes += usize::from(asked_after > since);
+            let bound = other.asked.max(since) + BOUND.as_millis() as u64;
+            assert!(
+                asked_after < bound,
+                "{} asked at {since} and was passed by one that asked at {asked_after}",
+                other.id
+            );
+        }
+    }
+}
+
+#[test]
+fn nobody_is_passed_by_who_asked_later_than_the_bound() {
+    assert_eq!(BOUND, AHEAD + 2 * LEAD);
+    let (mut grants, mut passes) = (0, 0);
+    for seed in 0..24 {
+        let (granted, passed) = random_hour(seed);
+        (grants, passes) = (grants + granted, passes + passed);
+    }
+    assert!(grants > 10_000 && passes > 1_000, "{grants} grants, {passes} of which passed somebody");
+}
+
+#[test]
+fn a_large_request_is_kept_what_becomes_free_once_all_that_may_pass_it_is_served() {
+    let mut pool = pool(&shares(&[0.01, 100.0]), [2, 0]);
+    let mut ends = BTreeSet::new();
+    let (mut now, mut large) = (0, None);
+    // What the other run has had is far more than its share.
+    pool.acquire(at(0), AcquireRequest::new(run(0), vec![block("Arm", 2)])).unwrap();
+    // Small ones one after the other, of a run with a large share and a high priority, for ever.
+    let mut asked = 0;
+    loop {
+        for notice in pool.take_notices() {
+            let Notice::Granted { waiter, lease } = notice else { continue };
+            if large.is_some_and(|(large, _)| large == waiter) {
+                let since = large.map_or(0, |(_, since)| since);
+                let waited = Duration::from_millis(now - since);
+                assert!(AHEAD - LEAD <= waited && waited <= AHEAD + LEAD + Duration::from_secs(2), "{waited:?}");
+                return;
+            }
+            ends.insert((now + 1_000, lease.id));
+        }
+        while pool.waiters().len() < 3 {
+            let small = AcquireRequest::new(run(1), vec![block("Arm", 1)]).priority(i64::MAX);
+            pool.acquire(at(now), small).unwrap();
+            asked += 1;
+            if asked == 10 {
+                let both = AcquireRequest::new(run(0), vec![block("Arm", 2)]).priority(i64::MIN);
+                large = Some((pool.acquire(at(now), both).unwrap(), now));
+            }
+        }
+        if let Some((end, lease)) = ends.pop_first() {
+            now = now.max(end) + 1;
+            pool.release(at(now), None, lease).unwrap();
+        }
+        assert!(now < 600_000, "the large request is never served");
+    }
+}
