@@ -503,6 +503,7 @@ impl SessionTask {
         self.channels.get(&self.endpoint).ok().map(ResourceServiceClient::new)
     }
 
+    #[expect(clippy::disallowed_methods, reason = "a due time is a moment of the wall clock")]
     fn ping(&self, ttl: Duration) -> v1::KeepAliveRequest {
         let ttl_ms = u64::try_from(ttl.as_millis()).unwrap_or(u64::MAX);
         v1::KeepAliveRequest {
