@@ -235,13 +235,16 @@ def _performed(
 def _leave_fork(raised: BaseException | None) -> NoReturn:
     """Ends a process that an action has forked and that has come back here: the goal is that of the process before it."""
     code = 0 if raised is None else 1
-    if isinstance(raised, SystemExit):
-        code = raised.code if isinstance(raised.code, int) else 0 if raised.code is None else 1
-    elif raised is not None:
-        sys.excepthook(type(raised), raised, raised.__traceback__)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code & 0xFF)
+    try:
+        if isinstance(raised, SystemExit):
+            code = raised.code if isinstance(raised.code, int) else 0 if raised.code is None else 1
+        elif raised is not None:
+            sys.excepthook(type(raised), raised, raised.__traceback__)
+        sys.stdout.flush()
+        sys.stderr.flush()
+    finally:
+        # Whatever cannot be said any more: nothing else of this process goes on.
+        os._exit(code & 0xFF)
 
 
 def _meant(raised: BaseException) -> BaseException:
