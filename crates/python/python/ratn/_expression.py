@@ -26,10 +26,10 @@ from ratn._ratn import Error, Joints, Pose
 _PACKAGE = os.path.dirname(os.path.abspath(__file__)) + os.sep
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 KEYWORDS = {"or", "and", "not", "in", "exists", "true", "false", "null"}
-#: Stands around the number of a value in an f-string: the value is written down where the text is used, as it is seen there, and refused where a text is no
-#: expression. Without a number the text behind it is that of a value which is the same everywhere. It is not seen where it is printed.
+#: Stands around the number of a value in an f-string, and is not seen itself where it is printed: the value is written down where the text is used, as it is
+#: there, and refused where a text is no expression. Where nothing stands between two, the text behind them is that of a value that is the same everywhere.
 _MARK = "\u2063"
-_MARKED = re.compile(f"{_MARK}([0-9]*){_MARK}")
+_MARKED = re.compile(f"{_MARK}(?:<value_([0-9]+)>)?{_MARK}")
 
 
 class Untraceable(Error):
@@ -147,13 +147,15 @@ def parts_of(text: str) -> list[object]:
     """A text that is in the words of task files, as texts and the values that f-strings in it name."""
     parts: list[object] = []
     for index, part in enumerate(_MARKED.split(str.__str__(text))):
-        if index % 2 == 0 and _MARK in part:
-            refuse("a text of which an f-string with a value was taken apart", "write an f-string of the whole text")
-        if index % 2 == 1 and part:
+        if not part:
+            continue
+        if index % 2 == 1:
             from ratn._trace import Trace
 
             parts.append(Trace.now("a text with a value of a task in it").named_in_text(int(part)))
-        elif index % 2 == 0 and part:
+        elif _MARK in part:
+            refuse("a text of which an f-string with a value was taken apart", "write an f-string of the whole text")
+        else:
             parts.append(part)
     return parts
 
@@ -192,7 +194,7 @@ def key_of(name: object, what: str = "a name") -> str:
 class Value:
     """A value that is known only while the task runs: an expression. ``+ - * /``, comparisons, ``& | ~``, ``.field`` and ``[i]`` make others.
 
-    In an f-string of an annotation it is its text: ``effects=[f"at({box.id}) = {box.pose}"]``. Elsewhere a text is what it says, and such an f-string is
+    In an f-string of an annotation it is its text, as it is seen where the annotation stands: ``effects=[f"at({box.id}) = {box.pose}"]``. Elsewhere a text is what it says, and such an f-string is
     refused: ``fn.concat("Box ", box.id)`` makes a text of values.
     """
 
@@ -211,7 +213,7 @@ class Value:
         from ratn._trace import tracing
 
         trace = tracing.get()
-        return f"{_MARK}{_MARK}{self._text()}" if trace is None else f"{_MARK}{trace.name_in_text(self)}{_MARK}"
+        return f"{_MARK}{_MARK}{self._text()}" if trace is None else f"{_MARK}<value_{trace.name_in_text(self)}>{_MARK}"
 
     def __format__(self, form: str) -> str:
         if form:
