@@ -86,6 +86,7 @@ def test_the_brakes_of_a_pooled_driver_are_told_at_its_start(mover: Place) -> No
     log = mover.logs()
     begun, let_go = log.find("brakes: held the driver has started"), log.find("brakes: ready")
     assert 0 <= begun < let_go, log
+    assert 0 <= log.find("it is ready when its brakes have said that nothing moves"), "who waits for it reads why"
     assert log.find("brakes: held by the user") in (-1, *range(let_go, len(log)))
 
 

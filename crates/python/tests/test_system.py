@@ -102,16 +102,7 @@ def test_a_resource_is_held_for_a_block_and_nobody_else_gets_it(system: ratn.Sys
     assert lease.release() is False
 
 
-def test_what_a_block_raises_is_not_hidden_by_what_cannot_be_given_back(system: ratn.System) -> None:
-    assert system.resources("Camera")
-    with ratn.System(boxes=1, speed=50) as own:
-        with pytest.raises(KeyError):
-            with own.acquire("Camera"):
-                own._end()
-                raise KeyError("inside")
-
-
-def test_what_could_not_be_given_back_after_a_block_raised_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_block_raises_is_not_hidden_by_what_cannot_be_given_back_and_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
     monkeypatch.setattr(sys, "unraisablehook", lambda said: told.append(str(said.exc_value)))
     with ratn.System(boxes=1, speed=50) as own:
