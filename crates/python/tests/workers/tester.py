@@ -229,7 +229,7 @@ def deaf(goal: ratn.Goal) -> dict:
     ended: list[bool] = []
     goal.on_cancel(lambda: log.info("deaf: told when it was over" if ended else "deaf: told in time"))
     usual = sys.getswitchinterval()
-    again = threading.Timer(2, sys.setswitchinterval, [usual])
+    again = threading.Timer(1.2, sys.setswitchinterval, [usual])
     again.start()
     sys.setswitchinterval(60)
     while not goal.cancelled:
