@@ -138,9 +138,18 @@ fn wait<T: Send>(py: Python<'_>, runtime: &OwnRuntime, work: impl Future<Output 
 fn left(released: PyResult<bool>, exception: &Bound<'_, PyTuple>) -> PyResult<bool> {
     let has_raised = exception.get_item(0).is_ok_and(|kind| !kind.is_none());
     match released {
-        Err(error) if !has_raised || error.is_instance_of::<PyKeyboardInterrupt>(exception.py()) => Err(error),
-        _ => Ok(false),
+        Err(error) if has_raised => beside(exception.py(), error).map(|()| false),
+        released => released.map(|_| false),
     }
+}
+
+/// What went wrong after something that counts more: it is told where Python tells what nobody can be given. Ctrl-C is never beside something else.
+fn beside(py: Python<'_>, error: PyErr) -> PyResult<()> {
+    if error.is_instance_of::<PyKeyboardInterrupt>(py) {
+        return Err(error);
+    }
+    error.write_unraisable(py, None);
+    Ok(())
 }
 
 /// A fact with its value; without one it is gone.
@@ -264,7 +273,7 @@ impl Client {
             Ok((base, id)) => Ok(Projected { base: base.0, id, lease, world: self.world.clone() }),
             Err(error) => {
                 // What went wrong first is what counts; the lease ends with the session otherwise.
-                let _ = lease.release(py);
+                lease.release(py).map(drop).or_else(|lost| beside(py, lost))?;
                 Err(error)
             }
         }

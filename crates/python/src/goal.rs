@@ -12,6 +12,7 @@ use ratn_proto::convert::{ports_bytes, wire_ports};
 use ratn_proto::types::GoalOutcome;
 use ratn_worker::action::{ActionFailure, CallFailure, GoalContext, MAX_PROGRESS_BYTES};
 use ratn_worker::client::{fact, pattern};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::runtime::Handle;
@@ -25,15 +26,24 @@ pub(crate) struct Goal {
     measured: Mutex<Vec<(FactKey, Value, Measurement)>>,
     /// What waits for the goal being told to stop; nothing where it is over.
     watching: Mutex<Option<Vec<AbortHandle>>>,
+    /// Set while Python's lock is held: what has waited for that asks again.
+    over: Arc<AtomicBool>,
 }
 
 impl Goal {
     pub(crate) fn new(context: Arc<GoalContext>, runtime: Handle) -> Goal {
-        Goal { context, runtime, measured: Mutex::default(), watching: Mutex::new(Some(Vec::new())) }
+        Goal {
+            context,
+            runtime,
+            measured: Mutex::default(),
+            watching: Mutex::new(Some(Vec::new())),
+            over: Arc::default(),
+        }
     }
 
     /// Nothing is called any more when it shall stop.
-    pub(crate) fn is_over(&self) {
+    pub(crate) fn is_over(&self, _: Python<'_>) {
+        self.over.store(true, Ordering::Relaxed);
         let watching = self.watching.lock().unwrap_or_else(PoisonError::into_inner).take();
         watching.iter().flatten().for_each(AbortHandle::abort);
     }
@@ -182,9 +192,14 @@ impl Goal {
         let cancelled = self.context.cancelled.clone();
         let mut watching = self.watching.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(watching) = watching.as_mut() else { return };
+        let over = Arc::clone(&self.over);
         let task = self.runtime.spawn(async move {
             cancelled.cancelled().await;
-            let called = tokio::task::spawn_blocking(move || Python::attach(|py| back.call0(py).map(drop)));
+            let call = move |py: Python<'_>| match over.load(Ordering::Relaxed) {
+                true => Ok(()),
+                false => back.call0(py).map(drop),
+            };
+            let called = tokio::task::spawn_blocking(move || Python::attach(call));
             if let Ok(Err(error)) = called.await {
                 tracing::warn!(error = %line(&error), "what was to be called when the goal shall stop has failed");
             }

@@ -124,8 +124,8 @@ impl Driven {
 }
 
 /// Brakes that are a Python function. A stop does not wait for an earlier call: it is made in another thread then. A call of Python cannot be
-/// dropped, so the earlier one may still do what it was told, `ready` for one, after the newer one has returned. Hence the newer one is made once more
-/// when all earlier ones have returned, and only then confirmed.
+/// dropped, so the earlier one may still do what it was told, `ready` for one, after the newer one has returned; or keep the newer one from what they
+/// both need. Hence the newer one is made once more when all earlier ones have returned, whatever it gave, and only that one is the answer.
 struct PythonBrakes {
     apply: Arc<Py<PyAny>>,
     calls: watch::Sender<BrakeCalls>,
@@ -179,8 +179,8 @@ impl PythonBrakes {
         PythonBrakes { apply: Arc::new(apply), calls: watch::Sender::default() }
     }
 
-    /// Calls the function; whether an earlier call may have undone what it did.
-    async fn call(&self, state: u64, word: &'static str, reason: String) -> Result<bool, String> {
+    /// Calls the function: what it gave, and whether an earlier call may have undone that, or kept it from it.
+    async fn call(&self, state: u64, word: &'static str, reason: String) -> (Result<(), String>, bool) {
         let (apply, call) = (Arc::clone(&self.apply), BrakeCall::begin(&self.calls, state));
         let overlaps = call.overlaps;
         let called = move || {
@@ -195,8 +195,7 @@ impl PythonBrakes {
                 apply.call1(py, (word, reason)).map(drop).map_err(failed)
             })
         };
-        tokio::task::spawn_blocking(called).await.unwrap_or_else(|error| Err(line(&error)))?;
-        Ok(overlaps)
+        (tokio::task::spawn_blocking(called).await.unwrap_or_else(|error| Err(line(&error))), overlaps)
     }
 }
 
@@ -213,11 +212,14 @@ impl Brakes for PythonBrakes {
             calls.newest += 1;
             asked = calls.newest;
         });
-        while self.call(asked, word, reason.clone()).await? {
+        loop {
+            let (result, overlaps) = self.call(asked, word, reason.clone()).await;
+            if !overlaps {
+                return result;
+            }
             // The sender is in `self`.
             let _ = self.calls.subscribe().wait_for(|calls| calls.under_way.is_empty()).await;
         }
-        Ok(())
     }
 }
 
@@ -311,7 +313,7 @@ fn perform(py: Python<'_>, context: &Arc<GoalContext>, function: &Py<PyAny>, run
         let goal = Bound::new(py, Goal::new(Arc::clone(context), runtime))?;
         let inputs = fields_to_python(py, &context.inputs)?;
         let ended = function.bind(py).call1((&goal, inputs));
-        goal.get().is_over();
+        goal.get().is_over(py);
         let (outcome, outputs, reason): (String, Bound<'_, PyDict>, String) = ended?.extract()?;
         let (outputs, reason) = (fields_from_python(&outputs)?, shortened(reason));
         Ok(goal.get().with_measured(GoalOutcome { outputs, reason, ..GoalOutcome::named(&outcome) }))

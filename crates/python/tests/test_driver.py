@@ -86,6 +86,7 @@ def test_the_brakes_of_a_pooled_driver_are_told_at_its_start(mover: Place) -> No
     log = mover.logs()
     begun, let_go = log.find("brakes: held the driver has started"), log.find("brakes: ready")
     assert 0 <= begun < let_go, log
+    assert 0 <= log.find("it is ready when its brakes have said that nothing moves"), "who waits for it reads why"
     assert log.find("brakes: held by the user") in (-1, *range(let_go, len(log)))
 
 
@@ -125,6 +126,32 @@ def test_an_older_call_of_the_brakes_does_not_undo_a_stop(place: Place) -> None:
         told = safety(place, "stop")
         assert told.returncode == 0, told.stdout + told.stderr
         assert (place.folder / "motor").read_text() == "stopped"
+
+
+def test_brakes_that_an_older_call_keeps_from_stopping_stop_after_it(place: Place) -> None:
+    shutil.copy(TESTS / "workers" / "slow_brakes.py", place.folder)
+    (place.folder / "one_line").touch()
+    pool = template("slow_brakes", "SlowBrakes", python="slow_brakes.py", interpreter=PYTHON, min=1, max=1, standstill_ms=2000)
+
+    def said(line: str) -> int:
+        return place.logs().count(line)
+
+    with place.up(place.write("system.toml", CONFIG + pool), "--speed", "1"):
+        before = said("brakes: ready begins")
+        (place.folder / "slow").touch()
+        assert safety(place, "hold").returncode == 0
+        command = [program(), "go-on", "--runtime-dir", str(place.runtime)]
+        going_on = subprocess.Popen(command, env=place.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        until(lambda: said("brakes: ready begins") == before + 1, place)
+        told = safety(place, "stop")
+        assert told.returncode != 0 and said("the line is busy") >= 1, told.stdout
+        (place.folder / "let_go").touch()
+        going_on.wait(30)
+        # Nobody asks again.
+        until(lambda: said("brakes: ready done") == before + 1 and said("brakes: stopped done") >= 1, place)
+        assert (place.folder / "motor").read_text() == "stopped"
+        told = safety(place, "stop")
+        assert told.returncode == 0, told.stdout + told.stderr
 
 
 def test_a_driver_without_brakes_or_without_leases_does_not_start() -> None:

@@ -12,12 +12,26 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from typing import TypedDict
 
 import pytest
 import ratn
 from conftest import ROOT, Place, program
 
 EXAMPLE = ROOT / "examples" / "fetch_boxes.yaml"
+
+
+@ratn.step
+def measure(of: int = 0) -> TypedDict("Measured", {"value": float}):
+    return {"value": of + 0.5}
+
+
+@ratn.task
+def measures() -> dict:
+    duration = measure(of=1)
+    with ratn.sequence("decide"):
+        outputs = measure(of=2)
+    return {"values": [duration.value, outputs.value]}
 
 
 @pytest.fixture(scope="module")
@@ -88,13 +102,51 @@ def test_a_resource_is_held_for_a_block_and_nobody_else_gets_it(system: ratn.Sys
     assert lease.release() is False
 
 
-def test_what_a_block_raises_is_not_hidden_by_what_cannot_be_given_back(system: ratn.System) -> None:
-    assert system.resources("Camera")
+def test_what_a_block_raises_is_not_hidden_by_what_cannot_be_given_back_and_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda said: told.append(str(said.exc_value)))
     with ratn.System(boxes=1, speed=50) as own:
         with pytest.raises(KeyError):
             with own.acquire("Camera"):
                 own._end()
                 raise KeyError("inside")
+    assert len(told) == 1, told
+
+
+def test_a_step_may_be_called_as_what_is_said_of_states(system: ratn.System) -> None:
+    run = system.run(measures)
+    assert run.result(60).outputs == {"values": [1.5, 2.5]}, run.messages()
+
+
+def test_a_worker_of_steps_that_cannot_be_started_again_ends_the_run(tmp_path: pathlib.Path) -> None:
+    from ratn._system import Run, _OfSteps
+
+    def start(*_: object) -> None:
+        tries.append(time.monotonic())
+        raise FileNotFoundError("resource-manager.endpoint")
+
+    tries: list[float] = []
+    run = Run.__new__(Run)
+    run._process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    run._workers = [subprocess.Popen([sys.executable, "-c", ""], stdin=subprocess.PIPE) for _ in range(2)]
+    run._workers[1] = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    run._of_steps = [_OfSteps(f"one-{n}", "one", f"{n}.py", tmp_path / f"{n}.log") for n in range(2)]
+    run._lost, run._start_worker, run._abort_without_steps = "", start, run._process.terminate
+    run._end_with_run(tmp_path)
+    assert len(tries) == 3 and "resource-manager.endpoint" in run._lost, run._lost
+    assert run._workers[1].wait(10) is not None, "those of other steps end with the run"
+
+
+def test_a_run_whose_steps_have_a_worker_left_goes_on(tmp_path: pathlib.Path) -> None:
+    from ratn._system import Run, _OfSteps
+
+    run = Run.__new__(Run)
+    run._process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(2)"])
+    run._workers = [subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE) for code in ("", "input()")]
+    run._of_steps = [_OfSteps(f"one-{n}", "one", "one.py", tmp_path / f"{n}.log") for n in range(2)]
+    run._lost, run._start_worker, run._abort_without_steps = "", lambda *_: None, run._process.terminate
+    run._end_with_run(tmp_path)
+    assert not run._lost and run._process.wait(0) == 0
 
 
 def test_a_lease_of_a_manager_that_was_started_anew_is_not_alive(place: Place) -> None:

@@ -129,13 +129,13 @@ def test_what_different_ways_give_is_put_out_by_the_block_around_them() -> None:
     assert loop["for_box"]["for"] == "box in near.boxes"
     assert loop["for_box"]["outputs"] == {
         "trajectories": {"each": "plan.trajectory"},
-        "pans": {"each": "either(condition.pan, 0)", "type": "list<float>"},
+        "pans": {"each": "either(condition_2.pan, 0)", "type": "list<float>"},
         "length_m": "either(plan.length_m, 0)",
     }
-    assert loop["for_box"]["do"][1]["condition"]["outputs"] == {"pan": "either(one.pan, 0)"}
+    assert loop["for_box"]["do"][1]["condition_2"]["outputs"] == {"pan": "either(one.pan, 0)"}
     assert follow["for"] == "way in for_box.trajectories"
-    assert race["concurrency"]["outputs"] == {"pan": "either(head.pan, 0.5)"}
-    assert last["last"]["in"]["target"] == "pose(0.1, either(concurrency.pan, 0.5), near.panned)"
+    assert race["concurrently"]["outputs"] == {"pan": "either(head.pan, 0.5)"}
+    assert last["last"]["in"]["target"] == "pose(0.1, either(concurrently.pan, 0.5), near.panned)"
     assert ways.document["outputs"] == {"length_m": "either(for_box.length_m, 0)"}
     assert "ratn.output(each=expr('plan.trajectory'))" in ways.to_python()
     with pytest.raises(TypeError, match="an output has a value"):
@@ -154,15 +154,15 @@ def test_what_is_beside_a_block_and_inside_of_it_keeps_its_order() -> None:
         pan_tilt.look_at(target=fn.pose(fn.either(last.pan, again.pan, first.pan), 0, 1), name="behind")
 
     _, block, newest, oldest, _, behind = ways.document["states"]
-    assert block["condition"]["outputs"] == {
+    assert block["condition_2"]["outputs"] == {
         "pan": "either(again.pan, first.pan, 0)",
         "tilt": "either(first.tilt, again.tilt)",
         "either_pan": "either(again.pan, 1)",
         "either_pan_3": "either(again.pan, first.pan)",
     }
-    assert newest["newest"]["in"]["target"] == "pose(either(condition.pan, first.pan, 0), 0, 1)"
-    assert oldest["oldest"]["in"]["target"] == "pose(either(condition.tilt, first.tilt), 0, 1)"
-    assert behind["behind"]["in"]["target"] == "pose(either(last.pan, condition.either_pan_3, first.pan), 0, 1)"
+    assert newest["newest"]["in"]["target"] == "pose(either(condition_2.pan, first.pan, 0), 0, 1)"
+    assert oldest["oldest"]["in"]["target"] == "pose(either(condition_2.tilt, first.tilt), 0, 1)"
+    assert behind["behind"]["in"]["target"] == "pose(either(last.pan, condition_2.either_pan_3, first.pan), 0, 1)"
 
     def behind_the_block(n: int = 1) -> None:
         with ratn.when(n > 1):
@@ -441,7 +441,7 @@ def test_stubs_have_the_actions_of_the_catalogue_and_type_checkers_refuse_what_i
     (tmp_path / "wrong.py").write_text(wrong)
     command = [sys.executable, "-m", "mypy", "--cache-dir", str(tmp_path / "mypy"), "good.py", "wrong.py"]
     told = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    for part in ('wrong.py:6: error: Argument "at"', 'wrong.py:7: error: "_EyeLook" has no attribute "sean"', 'wrong.py:8: error: Unexpected keyword argument "thing"'):
+    for part in ('wrong.py:6: error: Argument "at"', 'wrong.py:7: error: "_Eye_Look" has no attribute "sean"', 'wrong.py:8: error: Unexpected keyword argument "thing"'):
         assert part in told.stdout, told.stdout
     assert "good.py" not in told.stdout, told.stdout
 

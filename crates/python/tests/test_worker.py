@@ -222,6 +222,17 @@ def test_what_listens_to_a_goal_goes_with_it(tester: Place) -> None:
     assert max(seen) <= 1, f"{seen} are kept of goals that are over"
 
 
+def test_what_listens_to_a_goal_is_not_called_after_its_end(tester: Place) -> None:
+    text = task("deaf", state("it", "tester/deaf", "Tester", more="computes: true, reads: [], timeout: 0.5"))
+    tester.run(tester.write("deaf.yaml", text))
+    until = time.monotonic() + 20
+    while "deaf: told to stop" not in tester.logs():
+        assert time.monotonic() < until, tester.logs()
+        time.sleep(0.05)
+    time.sleep(1.5)
+    assert "deaf: told when it was over" not in tester.logs(), tester.logs()
+
+
 def test_outputs_of_an_outcome_and_arrays_that_may_be_left_out(tester: Place) -> None:
     assert performed(tester, "odd_joints", "odd", "{}", "joints", "joints") == [1.0, 2.5]
     assert performed(tester, "odd_none", "odd", "{}", "given", "bool") is False

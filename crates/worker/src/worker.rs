@@ -463,6 +463,8 @@ fn serve_once_heard(leases: &LeaseWatch, vitals: &Vitals, rests: bool) -> AbortO
         while !leases.is_heard() && heard.changed().await.is_ok() {}
         if rests {
             vitals.unwell("its brakes have not said yet that nothing moves: every goal is refused");
+            // Whoever starts it waits only so long, and points to the log.
+            tracing::info!("it is ready when its brakes have said that nothing moves, and have let go");
             leases.rested().await;
         }
         vitals.well();

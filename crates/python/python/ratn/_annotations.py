@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ratn import _source
-from ratn._expression import Value, expression, literal, plain, words
-from ratn._trace import State
+from ratn._expression import Value, expression, key_of, plain, words
+from ratn._trace import State, Trace
 
 
 class Annotations(typing.TypedDict, total=False):
@@ -56,7 +56,7 @@ def entry(value: object) -> Any:
     if isinstance(value, (int, float)) and not hasattr(value, "tolist"):
         return int(value) if isinstance(value, int) else float(value)
     if isinstance(value, dict):
-        return {literal(str(name), "a name"): entry(item) for name, item in value.items()}
+        return {key_of(name): entry(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [entry(item) for item in value]
     return expression(value)
@@ -65,7 +65,7 @@ def entry(value: object) -> Any:
 def raw(value: object) -> Any:
     """What is in a task file's own words: texts as they are, values as their expressions, states as their names."""
     if isinstance(value, State):
-        return value._node.named()
+        return Trace.now("a state in `transitions`").leads_to(value._node)
     if isinstance(value, Value):
         return plain(value)
     if isinstance(value, dict):

@@ -17,11 +17,13 @@ class Block(AnyState):
 
     __slots__ = ("_branch", "_trace")
     _FORM: str = "states"
+    #: What it is called where nobody says so: there are forms that have a name.
+    _IMPLIED: str | None = None
 
     def __init__(self, function: str, name: str | None, annotations: dict[str, Any], head: dict[str, Any], default: str) -> None:
         at = user_line()
         trace = Trace.now(f"`ratn.{function}`")
-        node = trace.add(name, default, at, assigned_name(function, at))
+        node = trace.add(name, default, at, assigned_name(function, at) or self._IMPLIED)
         node.body.update(head)
         annotate(node.body, annotations)
         node.branches[self._FORM] = []
@@ -145,6 +147,7 @@ class Concurrency(Block):
 
     __slots__ = ()
     _FORM = "regions"
+    _IMPLIED = "concurrently"
 
     def decide(self, **outcomes: Any) -> None:
         """Its outcome is the first whose condition holds: ``both.decide(blind=head.outcome == "aborted")``."""
@@ -325,4 +328,4 @@ def until(condition: object = None, *, index: str | None = None, name: str | Non
 
 def concurrently(kind: str | int = "barrier", *, name: str | None = None, **annotations: Any) -> Concurrency:
     """Regions: each state inside is one. ``barrier`` waits for all, ``preemptive`` ends with the first, a number as soon as so many have succeeded."""
-    return Concurrency("concurrently", name, annotations, {"concurrency": kind}, "concurrency")
+    return Concurrency("concurrently", name, annotations, {"concurrency": kind}, "concurrently")

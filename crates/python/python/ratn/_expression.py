@@ -25,9 +25,11 @@ from ratn._ratn import Error, Joints, Pose
 
 _PACKAGE = os.path.dirname(os.path.abspath(__file__)) + os.sep
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
-_KEYWORDS = {"or", "and", "not", "in", "exists", "true", "false", "null"}
-#: Begins the text of a value in an f-string: where a text is no expression it is refused. It is not seen where it is printed.
+KEYWORDS = {"or", "and", "not", "in", "exists", "true", "false", "null"}
+#: Stands around the number of a value in an f-string, and is not seen itself where it is printed: the value is written down where the text is used, as it is
+#: there, and refused where a text is no expression. Where nothing stands between two, the text behind them is that of a value that is the same everywhere.
 _MARK = "\u2063"
+_MARKED = re.compile(f"{_MARK}(?:<value_([0-9]+)>)?{_MARK}")
 
 
 class Untraceable(Error):
@@ -141,25 +143,58 @@ def expression(value: object) -> str:
     return plain(written(value))
 
 
+def parts_of(text: str) -> list[object]:
+    """A text that is in the words of task files, as texts and the values that f-strings in it name."""
+    parts: list[object] = []
+    for index, part in enumerate(_MARKED.split(str.__str__(text))):
+        if not part:
+            continue
+        if index % 2 == 1:
+            from ratn._trace import Trace
+
+            parts.append(Trace.now("a text with a value of a task in it").named_in_text(int(part)))
+        elif _MARK in part:
+            refuse("a text of which an f-string with a value was taken apart", "write an f-string of the whole text")
+        else:
+            parts.append(part)
+    return parts
+
+
 def words(text: str) -> str:
-    """A text that is in the words of task files: an f-string in it names values."""
-    return text.replace(_MARK, "")
+    """A text that is in the words of task files, as it is written at the place that is being traced: an f-string in it names values."""
+    return "".join(map(plain, parts_of(text)))
+
+
+def _shown(text: str) -> str:
+    """A text for people."""
+    try:
+        return words(text)
+    except Untraceable:
+        return _MARKED.sub("…", text).replace(_MARK, "")
 
 
 def literal(text: str, what: str = "a text") -> str:
     """A text that is what it says, and no expression."""
     if _MARK in text:
         refuse(
-            f"{what} with a value in it that is known only while the task runs, `{words(text)}`",
+            f"{what} with a value in it that is known only while the task runs, `{_shown(text)}`",
             'write `fn.concat("…", value)`; an f-string names values only in annotations, conditions and `ratn.expr`',
         )
-    return text
+    # What a member of an enumeration says of itself is another text than its value.
+    return str.__str__(text)
+
+
+def key_of(name: object, what: str = "a name") -> str:
+    """A name in a map."""
+    if isinstance(name, int) and not isinstance(name, bool):
+        return int.__repr__(name)
+    return literal(name if isinstance(name, str) else str(name), what)
 
 
 class Value:
     """A value that is known only while the task runs: an expression. ``+ - * /``, comparisons, ``& | ~``, ``.field`` and ``[i]`` make others.
 
-    In an f-string of an annotation it is its text: ``effects=[f"at({box.id}) = {box.pose}"]``. Elsewhere a text is what it says, and such an f-string is
+    In an f-string of an annotation it is its text, as it is seen where the annotation stands: ``effects=[f"at({box.id}) = {box.pose}"]``. Elsewhere a text is what it says, and such an f-string is
     refused: ``fn.concat("Box ", box.id)`` makes a text of values.
     """
 
@@ -175,7 +210,10 @@ class Value:
         return "".join(map(plain, self._parts))
 
     def __str__(self) -> str:
-        return _MARK + self._text()
+        from ratn._trace import tracing
+
+        trace = tracing.get()
+        return f"{_MARK}{_MARK}{self._text()}" if trace is None else f"{_MARK}<value_{trace.name_in_text(self)}>{_MARK}"
 
     def __format__(self, form: str) -> str:
         if form:
@@ -438,15 +476,14 @@ def written(value: object) -> object:
     if getattr(type(value), "_is_state", False):
         refuse("a state is no value", "name one of its outputs, `look.boxes`")
     if isinstance(value, str):
-        # What an enumeration says of itself is another text than its value.
-        value = str.__str__(literal(value))
-        return value if _WORD.match(value) and value not in _KEYWORDS else json.dumps(value, ensure_ascii=False)
+        value = literal(value)
+        return value if _WORD.match(value) and value not in KEYWORDS else json.dumps(value, ensure_ascii=False)
     if isinstance(value, range) and value.step == 1:
         return f"range({value.start}, {value.stop})" if value.start else f"range({value.stop})"
     if isinstance(value, (list, tuple)):
         return Value("[", *_joined(written(item) for item in value), "]")
     if isinstance(value, dict):
-        pairs = (Value(f"{literal(str(name))}: ", written(item)) for name, item in value.items())
+        pairs = (Value(f"{key_of(name)}: ", written(item)) for name, item in value.items())
         return Value("{", *_joined(pairs), "}")
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
@@ -494,19 +531,22 @@ def call(function: str, *arguments: object) -> Value:
 
 def expr(text: str) -> Value:
     """An expression as task files have it: ``ratn.expr("grasp_pose($box)")``. An f-string may name values: ``ratn.expr(f"{box}.id")``."""
-    text = words(text)
-    return Value(text, is_atom=bool(_WORD.match(text.lstrip("$"))))
+    parts = parts_of(text)
+    (single,) = parts if len(parts) == 1 else (None,)
+    is_atom = single._is_atom if isinstance(single, Value) else isinstance(single, str) and bool(_WORD.match(single.lstrip("$")))
+    return Value(*parts, is_atom=is_atom)
 
 
 def fact(predicate: str, *arguments: object) -> Value:
     """What the world says at the state's place: ``ratn.fact("at", "cup")`` is the pose; ``"?"`` stands for any argument."""
     said = ("?" if isinstance(argument, str) and argument == "?" else written(argument) for argument in arguments)
-    return Value(f"{words(predicate)}(", *_joined(said), ")")
+    return Value(*parts_of(predicate), "(", *_joined(said), ")")
 
 
 def exists(what: Value | str) -> Value:
     """Whether a fact is there, whatever it says, ``ratn.exists(ratn.fact("in_gripper", "cup"))``; or a query with variables, as text."""
-    return Value("exists ", what if isinstance(what, Value) else f"({words(what)})", is_atom=False)
+    said = (what,) if isinstance(what, Value) else ("(", *parts_of(what), ")")
+    return Value("exists ", *said, is_atom=False)
 
 
 def isin(item: object, of: object) -> Value:

@@ -97,11 +97,7 @@ class _Source:
             self.depth -= 1
 
     def state(self, item: dict[str, Any]) -> None:
-        name, body = None, item
-        if len(item) == 1:
-            ((key, value),) = item.items()
-            if isinstance(value, dict) and not _is_form(key, value):
-                name, body = key, value
+        name, body = named(item)
         body = _written_out(body)
         lastly = body.get("finally")
         if lastly:
@@ -197,6 +193,17 @@ class _Source:
 
 
 _FORMS = ("fallback", "cases", "action", "for", "condition", "states", "while", "do_while", "until", "concurrency", "library", "wait", "ask")
+#: Words that say what a state is wherever they stand in a list of states: none is called so. (`wait` and `ask` are told apart by what is below them.)
+WORDS_OF_FORMS = frozenset({*_FORMS, "switch"} - {"cases", "wait", "ask"})
+
+
+def named(item: dict[str, Any]) -> tuple[str | None, dict[str, Any]]:
+    """The name of a state in a list, if it has one, and what is said of it."""
+    if len(item) == 1:
+        ((key, value),) = item.items()
+        if isinstance(value, dict) and not _is_form(key, value):
+            return key, value
+    return None, item
 
 
 def _is_form(key: str, value: dict[str, Any]) -> bool:

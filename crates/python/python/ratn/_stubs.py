@@ -60,7 +60,7 @@ def _provider(name: str, provider: dict[str, Any]) -> str:
     states, methods = [], []
     # What is no name of Python is performed by `ratn.action("provider/3d-scan", …)`.
     for action, signature in sorted(item for item in provider["actions"].items() if _is_name(item[0])):
-        state = "".join(part.capitalize() for part in f"{name}_{action}".split("_"))
+        state = f"{_title(name)}_{_title(action)}"
         outputs = [port for port in sorted(signature.get("outputs", {})) if _is_name(port)]
         states.append(f"class _{state}(ratn.State):\n" + ("".join(f"    {port}: Value\n" for port in outputs) or "    ...\n"))
         ports = [(port, kind, "") for port, kind in sorted(signature.get("inputs", {}).items())]
@@ -68,9 +68,14 @@ def _provider(name: str, provider: dict[str, Any]) -> str:
         given = "".join(f"        {port}: {_python(kind)}{default},\n" for port, kind, default in ports if _is_port(port))
         star = "        *,\n" if given else ""
         methods.append(f"    def {action}(\n        self,\n{star}{given}        **annotations: Unpack[Annotations],\n    ) -> _{state}:{_document(signature)}\n")
-    title = "".join(part.capitalize() for part in name.split("_"))
+    title = _title(name)
     inside = "".join(methods) or "    ...\n"
     return "".join(f"{state}\n" for state in states) + f"class _{title}:\n{inside}\n{name}: _{title}\n\n"
+
+
+def _title(name: str) -> str:
+    """The name of a class, which has no underscore: one stands between that of a provider and that of its action."""
+    return "".join(part.capitalize() for part in name.split("_"))
 
 
 def _document(signature: dict[str, Any]) -> str:
@@ -84,8 +89,8 @@ def _is_name(port: str) -> bool:
 
 
 def _is_port(port: str) -> bool:
-    # One with the name of an annotation is given by `inputs={…}`.
-    return _is_name(port) and port not in Annotations.__annotations__
+    # One with the name of an annotation, or of what a method has already, is given by `inputs={…}`.
+    return _is_name(port) and port not in {*Annotations.__annotations__, "self", "annotations"}
 
 
 def catalogue_of_system(runtime_dir: str | os.PathLike[str]) -> str:

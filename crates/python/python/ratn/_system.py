@@ -7,6 +7,7 @@ can be read by ``ratn report``. Resources and the world are asked for directly.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import pathlib
@@ -25,7 +26,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ratn import _ratn, _views
-from ratn._expression import expression
+from ratn._expression import expression, literal
 from ratn._ratn import Error, Fact, Lease, Projected, WorldWatch
 from ratn._step import kind_of, refuse_while_read
 from ratn._task import Task
@@ -289,7 +290,7 @@ class Run:
         command += ["--urgency", urgency, *(["--alone"] if alone else [])]
         for name, value in parameters.items():
             # Texts are taken as they are.
-            command += ["--set", f"{name}={value if isinstance(value, str) else expression(value)}"]
+            command += ["--set", f"{name}={literal(value) if isinstance(value, str) else expression(value)}"]
         self._said, self._told = folder / "result.json", folder / "messages"
         self._start_steps(steps, step_workers, folder)
         try:
@@ -349,22 +350,38 @@ class Run:
     def _end_with_run(self, folder: pathlib.Path) -> None:
         """Has others take the place of workers that end before the run does; without any it would wait for ever."""
         left = _WORKERS_AGAIN
-        while True:
-            try:
-                self._process.wait(_LOOK_AT_WORKERS_S)
-                break
-            except subprocess.TimeoutExpired:
-                pass
-            for place, (worker, step) in enumerate(zip(self._workers, self._of_steps)):
-                if worker.poll() is None or self._lost:
-                    continue
-                if left == 0:
-                    self._lost = f"a worker of the steps in {step.file} has ended, and {_WORKERS_AGAIN} others before it: {_text_of(step.said).strip()}"
-                    self._abort_without_steps()
-                else:
-                    left -= 1
-                    self._start_worker(step.provider, step.file, folder, place)
-        self._end_steps()
+        try:
+            while True:
+                try:
+                    self._process.wait(_LOOK_AT_WORKERS_S)
+                    break
+                except subprocess.TimeoutExpired:
+                    pass
+                for place, (worker, step) in enumerate(zip(self._workers, self._of_steps)):
+                    if worker.poll() is None or self._lost:
+                        continue
+                    if left > 0:
+                        left -= 1
+                        self._start_again(step, folder, place)
+                    elif not self._has_worker(step.file):
+                        said = _text_of(step.said).strip()
+                        self._lost = f"a worker of the steps in {step.file} has ended, and {_WORKERS_AGAIN} others before it: {said}"
+                        self._abort_without_steps()
+        finally:
+            self._end_steps()
+
+    def _start_again(self, step: _OfSteps, folder: pathlib.Path, place: int) -> None:
+        """Starts a worker in the place of one that has ended; one that cannot be started is looked after again in the next round."""
+        try:
+            self._start_worker(step.provider, step.file, folder, place)
+        except OSError as error:
+            # The manager is being started anew, or there is no room for a process.
+            with contextlib.suppress(OSError), step.said.open("a", encoding="utf-8") as said:
+                said.write(f"\nno other worker could be started in its place: {error}\n")
+
+    def _has_worker(self, file: str) -> bool:
+        """Whether a worker of the steps in a file is there still."""
+        return any(step.file == file and worker.poll() is None for worker, step in zip(self._workers, self._of_steps))
 
     def _abort_without_steps(self) -> None:
         try:

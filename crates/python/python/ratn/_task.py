@@ -130,20 +130,13 @@ class Task:
         actions = {name: f"{providers[name.rpartition('/')[0]]}/{step.name}" for name, step in self._steps.items()}
         kinds = {kind_of(provider): kind_of(own) for provider, own in providers.items()}
 
-        def renamed(value: Any) -> Any:
-            if isinstance(value, list):
-                return [renamed(item) for item in value]
-            if not isinstance(value, dict):
-                return value
-            whole = Body({key: item if key in ("in", "with", *VALUES) else renamed(item) for key, item in value.items()})
-            whole.line = getattr(value, "line", None)
-            if isinstance(value.get("action"), str):
-                whole["action"] = actions.get(value["action"], value["action"])
-            if isinstance(value.get("resources"), list):
-                whole["resources"] = [_of_kind(one, kinds) for one in value["resources"]]
-            return whole if whole.line is not None else dict(whole)
+        def renamed(body: dict[str, Any]) -> None:
+            if isinstance(body.get("action"), str):
+                body["action"] = actions.get(body["action"], body["action"])
+            if isinstance(body.get("resources"), list):
+                body["resources"] = [_of_kind(one, kinds) for one in body["resources"]]
 
-        document = {**self.document, "states": renamed(self.document.get("states") or [])}
+        document = {**self.document, "states": _changed(self.document.get("states") or [], renamed)}
         steps = {actions[name]: step for name, step in self._steps.items()}
         return Task(document, folder=self.folder, file=self._file, catalogues=self._catalogues, steps=steps)
 
@@ -151,18 +144,13 @@ class Task:
         document = dict(self.document)
         if isinstance(document.get("ontology"), str):
             document["ontology"] = str(self.folder / document["ontology"])
-        document["states"] = [self._rooted(state) for state in document.get("states") or []]
-        return _yaml.write(document)
 
-    def _rooted(self, value: Any) -> Any:
-        if isinstance(value, dict):
-            # What is an expression is no path.
-            rooted = Body({key: item if key in ("in", "with", *VALUES) else self._rooted(item) for key, item in value.items()})
-            rooted.line = getattr(value, "line", None)
-            if isinstance(value.get("library"), str):
-                rooted["library"] = str(self.folder / value["library"])
-            return rooted if rooted.line is not None else dict(rooted)
-        return [self._rooted(item) for item in value] if isinstance(value, list) else value
+        def rooted(body: dict[str, Any]) -> None:
+            if isinstance(body.get("library"), str):
+                body["library"] = str(self.folder / body["library"])
+
+        document["states"] = _changed(document.get("states") or [], rooted)
+        return _yaml.write(document)
 
     def _all_catalogues(self) -> list[str]:
         return [*self._catalogues, *(step.catalogue(name.rpartition("/")[0]) for name, step in self._steps.items())]
@@ -229,6 +217,33 @@ class Task:
         for state in model["states"]:
             state.pop("location")
         return model
+
+
+def _changed(value: Any, change: Callable[[dict[str, Any]], None]) -> Any:
+    """States, or what is said of one, after `change` of what is said of each, also of those inside."""
+    if isinstance(value, list):
+        return [_changed_state(item, change) for item in value]
+    if not isinstance(value, dict):
+        return value
+    # What is an expression, or has some within, says neither an action nor a file.
+    body = _like(value, {key: item if key in ("in", "with", *VALUES) else _changed(item, change) for key, item in value.items()})
+    change(body)
+    return body
+
+
+def _changed_state(item: Any, change: Callable[[dict[str, Any]], None]) -> Any:
+    """An item of a list: its name may be a word that is said of states, too."""
+    name, body = _source.named(item) if isinstance(item, dict) else (None, item)
+    return _changed(body, change) if name is None else _like(item, {name: _changed(body, change)})
+
+
+def _like(before: dict[str, Any], entries: dict[str, Any]) -> dict[str, Any]:
+    """A mapping in the place of another one, made in the same line."""
+    if getattr(before, "line", None) is None:
+        return entries
+    body = Body(entries)
+    body.line = before.line  # type: ignore[attr-defined]
+    return body
 
 
 def _of_kind(resource: Any, kinds: dict[str, str]) -> Any:
@@ -298,6 +313,7 @@ def _traced(function: Callable[..., Any], name: str, said: dict[str, Any]) -> Ta
             document["parameters"] = parameters
         if outputs:
             document["outputs"] = outputs
+        trace.check_leads()
         document["states"] = [node.item() for node in trace.top]
         _whole(document)
     finally:

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import ast
 import contextvars
+import itertools
 import typing
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from ratn._expression import Binding, Value, Within, expression, literal, refuse, scope_of_function, statements_at_work, user_line
+from ratn._expression import KEYWORDS, Binding, Value, Within, expression, literal, refuse, scope_of_function, statements_at_work, user_line
+from ratn._source import WORDS_OF_FORMS
 from ratn._yaml import Body
 
 if typing.TYPE_CHECKING:
     from ratn._states import TaskFunction
 
 tracing: contextvars.ContextVar[Trace | None] = contextvars.ContextVar("ratn_tracing", default=None)
+#: No state is called so: a task file means something else by them.
+_NO_NAMES = WORDS_OF_FORMS | KEYWORDS
+#: The numbers of values in texts. One of another task is none of this one.
+_numbers = itertools.count()
 
 
 class Node:
@@ -26,6 +32,7 @@ class Node:
         self.siblings, self.owner, self.default, self.line = siblings, owner, default, line
         self.body = Body()
         self.body.line = line
+        self.name: str | None = None
         self.branches: dict[str, list[Node]] = {}
         self.before: list[Node] | None = None
         self.is_open = False
@@ -33,13 +40,26 @@ class Node:
         self.bindings: dict[str, Binding] = {}
         #: Variables of what is around that were named inside of it.
         self.spoken: dict[str, Binding] = {}
-        beside = {other.name for other in siblings}
+        siblings.append(self)
+        beside = self._beside()
         if name is not None:
-            self.name: str | None = _free(name, beside)
+            self.name = _free(name, beside)
         else:
             # Where nobody has said a name it hides none of what is around.
-            self.name = None if implied is None else _free(implied, beside | self._around())
-        siblings.append(self)
+            self.name = None if implied is None else _free(implied, beside | self._around() | _NO_NAMES)
+
+    def _beside(self) -> set[str | None]:
+        """The names of the other states of its list, also those that states without one get where the file is read: one after the other."""
+        names = set[str | None]()
+        is_before = True
+        for other in self.siblings:
+            if other is self:
+                is_before = False
+            elif other.name is not None:
+                names.add(other.name)
+            elif is_before:
+                names.add(_free(other.default, names))
+        return names
 
     def _around(self) -> set[str | None]:
         """The names of the states beside those that it is inside of."""
@@ -57,8 +77,8 @@ class Node:
     def named(self) -> str:
         """Its name; one that had none gets one, because somebody speaks of it."""
         if self.name is None:
-            taken = {name for other in self.siblings for name in (other.name, *other._below())}
-            self.name = _free(self.default, taken | self._around())
+            below = {name for other in self.siblings for name in other._below()}
+            self.name = _free(self.default, below | self._beside() | self._around() | _NO_NAMES)
         return self.name
 
     def put_out(self, text: str, *names: str) -> str:
@@ -109,7 +129,11 @@ class Trace:
         #: The parameters and variables of the task.
         self.bindings: dict[str, Binding] = {}
         #: The states that were named from inside of a list and stand outside of it, by that list.
-        self.spoken: dict[int, dict[str, Node]] = {}
+        self._spoken: dict[int, tuple[list[Node], dict[str, Node]]] = {}
+        #: Values in texts, by their numbers.
+        self._in_texts: dict[int, Value] = {}
+        #: Transitions: the state that has one, that which it leads to, and the line.
+        self._leads: list[tuple[Node, Node, tuple[str, int]]] = []
 
     @staticmethod
     def now(what: str) -> Trace:
@@ -124,10 +148,45 @@ class Trace:
         siblings, owner = self.open[-1]
         at = at or user_line()
         if name is not None:
-            outside = self.spoken.get(id(siblings), {}).get(literal(name, "a name"))
+            name = literal(name, "a name")
+            if name in _NO_NAMES:
+                refuse(f"a state cannot be called `{name}`, which means something else in a task file", "give it another name", at)
+            outside = self._spoken_in(siblings).get(name)
             if outside is not None:
                 self._hidden(outside, at)
         return Node(siblings, owner, name, at, default, implied)
+
+    def _spoken_in(self, siblings: list[Node]) -> dict[str, Node]:
+        """The states that were named from inside of a list and stand outside of it."""
+        # The list stays: another one would get its address.
+        return self._spoken.setdefault(id(siblings), (siblings, {}))[1]
+
+    def name_in_text(self, value: Value) -> int:
+        """The number of a value that stands in a text."""
+        number = next(_numbers)
+        self._in_texts[number] = value
+        return number
+
+    def named_in_text(self, number: int) -> Value:
+        """The value with a number."""
+        value = self._in_texts.get(number)
+        if value is None:
+            refuse("a text with a value of another task in it", "make the text in the task that uses it")
+        return value
+
+    def leads_to(self, node: Node) -> str:
+        """What a state is called in a transition of the state that was added last."""
+        siblings, _ = self.open[-1]
+        if siblings:
+            self._leads.append((siblings[-1], node, user_line()))
+        return node.named()
+
+    def check_leads(self) -> None:
+        """Refuses transitions that do not lead to a state beside the one that has them."""
+        for node, target, at in self._leads:
+            if node.siblings is not target.siblings:
+                what = f"a transition leads to the state `{target.named()}` of {target.line[0]}:{target.line[1]}, which is not beside the one that has it"
+                refuse(what, "lead to a state beside it, or give the block around a transition (`ratn.leave(outcome)` leads out of it)", at)
 
     def provider_of_steps(self, provider: str, file: str) -> str:
         """What the steps of a file are called here: two files of one name are two providers."""
@@ -160,8 +219,9 @@ class Trace:
     def sees(self, bound: Binding) -> None:
         """Refuses a variable that is not what its name stands for at this place."""
         passed: list[Node] = []
-        for _, owner in reversed(self.open):
-            if owner is None:
+        for siblings, owner in reversed(self.open):
+            # What it binds is known in what it does, and in nothing that is done before or after that.
+            if owner is None or siblings is owner.before or siblings is owner.branches.get("finally"):
                 continue
             if owner.bindings.get(bound.name) is bound:
                 break
@@ -211,7 +271,7 @@ class Trace:
                 if around is not node.owner:
                     if any(other.name == name for other in siblings):
                         self._hidden(node)
-                    self.spoken.setdefault(id(siblings), {})[name] = node
+                    self._spoken_in(siblings)[name] = node
             return f"{name}.{port}"
         owner = node.owner
         if owner is None:

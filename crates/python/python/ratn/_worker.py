@@ -134,7 +134,8 @@ class Driver(Worker):
 
     ``brakes`` says how it comes to rest, and lets go again. ``standstill_s`` is the time within which everything stands still after a lease has ended: the
     next one is granted when the driver has confirmed that, or after it; a template needs a ``standstill_ms`` of at least that. A
-    ``stop_file`` keeps an emergency stop beyond the end of the process; it belongs into a state directory.
+    ``stop_file`` keeps an emergency stop beyond the end of the process; it belongs into a state directory. Without one a process that takes the place of one
+    that ended during a stop knows nothing of that stop, and has its brakes let go.
     """
 
     def __init__(
@@ -154,9 +155,10 @@ class Driver(Worker):
 
         It is called with ``"held"``, ``"stopped"`` or ``"ready"`` and with whoever asked for it and why, from another thread than the goals.
         For the first two it returns when nothing moves; where it raises, the stop is in force and not confirmed. At the start it is called for
-        ``"held"`` (``"stopped"``, where a stop is kept) and then for ``"ready"``, because the process before may have begun a motion: no goal begins before
-        it has returned. It may be called for a state that it has carried out already. An emergency stop does not wait for an earlier call to return; it is
-        confirmed when that one has, and the brakes have been told once more, so that the newest state counts.
+        ``"held"`` and then for ``"ready"``, because the process before may have begun a motion; where a stop is kept, for ``"stopped"``, and for ``"ready"`` only
+        when the stop is cleared. No goal begins before it has returned, and in a pool all of that is within the template's ``start_timeout_s``. It may be called for
+        a state that it has carried out already. An emergency stop does not wait for an earlier call to return, and may find a device that is still used by that;
+        it is confirmed when the earlier one has returned and the brakes have been told once more, whatever they raised before, so that the newest state counts.
         """
         if any(kind(function) for kind in (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.isasyncgenfunction)):
             raise TypeError(f"{_ports.where(function)}: the brakes are a plain function, without `async` and `yield`: nothing moves when it has returned")
@@ -235,13 +237,16 @@ def _performed(
 def _leave_fork(raised: BaseException | None) -> NoReturn:
     """Ends a process that an action has forked and that has come back here: the goal is that of the process before it."""
     code = 0 if raised is None else 1
-    if isinstance(raised, SystemExit):
-        code = raised.code if isinstance(raised.code, int) else 0 if raised.code is None else 1
-    elif raised is not None:
-        sys.excepthook(type(raised), raised, raised.__traceback__)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code & 0xFF)
+    try:
+        if isinstance(raised, SystemExit):
+            code = raised.code if isinstance(raised.code, int) else 0 if raised.code is None else 1
+        elif raised is not None:
+            sys.excepthook(type(raised), raised, raised.__traceback__)
+        sys.stdout.flush()
+        sys.stderr.flush()
+    finally:
+        # Whatever cannot be said any more: nothing else of this process goes on.
+        os._exit(code & 0xFF)
 
 
 def _meant(raised: BaseException) -> BaseException:

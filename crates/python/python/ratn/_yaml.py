@@ -41,12 +41,13 @@ def scalar(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int):
-        return str(value)
+        return int.__repr__(value)
     if isinstance(value, float):
-        text = repr(value)
+        text = float.__repr__(value)
         return {"inf": ".inf", "-inf": "-.inf", "nan": ".nan"}.get(text, text)
     if not isinstance(value, str):
         raise TypeError(f"{value!r} stands in no task file")
+    value = str.__str__(value)
     return value if _PLAIN.match(value) and value.lower() not in _SPECIAL else json.dumps(value, ensure_ascii=False)
 
 

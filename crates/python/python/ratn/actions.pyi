@@ -8,17 +8,17 @@ from typing_extensions import Unpack
 import ratn
 from ratn import Annotations, Value
 
-class _ArmFollow(ratn.State):
+class _Arm_Follow(ratn.State):
     end: Value
     tracking_max_rad: Value
     tracking_rms_rad: Value
 
-class _ArmMoveTo(ratn.State):
+class _Arm_MoveTo(ratn.State):
     end: Value
     tracking_max_rad: Value
     tracking_rms_rad: Value
 
-class _ArmWhere(ratn.State):
+class _Arm_Where(ratn.State):
     joints: Value
 
 class _Arm:
@@ -28,7 +28,7 @@ class _Arm:
         trajectory: ratn.Trajectory | Value,
         arm: str | Value = ...,
         **annotations: Unpack[Annotations],
-    ) -> _ArmFollow: ...
+    ) -> _Arm_Follow: ...
     def move_to(
         self,
         *,
@@ -36,24 +36,24 @@ class _Arm:
         arm: str | Value = ...,
         speed: float | Value = ...,
         **annotations: Unpack[Annotations],
-    ) -> _ArmMoveTo: ...
+    ) -> _Arm_MoveTo: ...
     def where(
         self,
         *,
         arm: str | Value = ...,
         **annotations: Unpack[Annotations],
-    ) -> _ArmWhere: ...
+    ) -> _Arm_Where: ...
 
 arm: _Arm
 
-class _BaseDrive(ratn.State):
+class _Base_Drive(ratn.State):
     end: Value
     tracking_max_m: Value
     tracking_max_rad: Value
     tracking_rms_m: Value
     tracking_rms_rad: Value
 
-class _BaseLocalise(ratn.State):
+class _Base_Localise(ratn.State):
     pose: Value
 
 class _Base:
@@ -62,15 +62,15 @@ class _Base:
         *,
         trajectory: ratn.Trajectory | Value,
         **annotations: Unpack[Annotations],
-    ) -> _BaseDrive: ...
+    ) -> _Base_Drive: ...
     def localise(
         self,
         **annotations: Unpack[Annotations],
-    ) -> _BaseLocalise: ...
+    ) -> _Base_Localise: ...
 
 base: _Base
 
-class _CameraCapture(ratn.State):
+class _Camera_Capture(ratn.State):
     camera: Value
     camera_covariance: Value
     cx: Value
@@ -88,17 +88,17 @@ class _Camera:
         *,
         frames: int | Value = ...,
         **annotations: Unpack[Annotations],
-    ) -> _CameraCapture: ...
+    ) -> _Camera_Capture: ...
 
 camera: _Camera
 
-class _DetectorLocate(ratn.State):
+class _Detector_Locate(ratn.State):
     confidence: Value
     covariance: Value
     pose: Value
     size: Value
 
-class _DetectorSegment(ratn.State):
+class _Detector_Segment(ratn.State):
     boxes: Value
 
 class _Detector:
@@ -111,7 +111,7 @@ class _Detector:
         measures: Sequence[Any] | Value = ...,
         surface_m: float | Value = ...,
         **annotations: Unpack[Annotations],
-    ) -> _DetectorLocate: ...
+    ) -> _Detector_Locate: ...
     def segment(
         self,
         *,
@@ -122,18 +122,18 @@ class _Detector:
         measures: Sequence[Any] | Value = ...,
         surface_m: float | Value = ...,
         **annotations: Unpack[Annotations],
-    ) -> _DetectorSegment: ...
+    ) -> _Detector_Segment: ...
 
 detector: _Detector
 
-class _GripperFeel(ratn.State):
+class _Gripper_Feel(ratn.State):
     holding: Value
     width_m: Value
 
-class _GripperGrasp(ratn.State):
+class _Gripper_Grasp(ratn.State):
     width_m: Value
 
-class _GripperRelease(ratn.State):
+class _Gripper_Release(ratn.State):
     ...
 
 class _Gripper:
@@ -142,7 +142,7 @@ class _Gripper:
         *,
         arm: str | Value = ...,
         **annotations: Unpack[Annotations],
-    ) -> _GripperFeel: ...
+    ) -> _Gripper_Feel: ...
     def grasp(
         self,
         *,
@@ -151,18 +151,18 @@ class _Gripper:
         expected: ratn.Pose | Value = ...,
         hand: str | Value = ...,
         **annotations: Unpack[Annotations],
-    ) -> _GripperGrasp: ...
+    ) -> _Gripper_Grasp: ...
     def release(
         self,
         *,
         arm: str | Value = ...,
         width_m: float | Value = ...,
         **annotations: Unpack[Annotations],
-    ) -> _GripperRelease: ...
+    ) -> _Gripper_Release: ...
 
 gripper: _Gripper
 
-class _PanTiltLookAt(ratn.State):
+class _PanTilt_LookAt(ratn.State):
     pan: Value
     tilt: Value
 
@@ -172,17 +172,17 @@ class _PanTilt:
         *,
         target: ratn.Pose | Value,
         **annotations: Unpack[Annotations],
-    ) -> _PanTiltLookAt: ...
+    ) -> _PanTilt_LookAt: ...
 
 pan_tilt: _PanTilt
 
-class _PathPlannerDrive(ratn.State):
+class _PathPlanner_Drive(ratn.State):
     end: Value
     length_m: Value
     planning_s: Value
     trajectory: Value
 
-class _PathPlannerPlan(ratn.State):
+class _PathPlanner_Plan(ratn.State):
     end: Value
     end_pose: Value
     first_length_rad: Value
@@ -210,7 +210,7 @@ class _PathPlanner:
         tilt: float | Value = ...,
         width_m: float | Value = ...,
         **annotations: Unpack[Annotations],
-    ) -> _PathPlannerDrive: ...
+    ) -> _PathPlanner_Drive: ...
     def plan(
         self,
         *,
@@ -248,6 +248,6 @@ class _PathPlanner:
         way_points: Sequence[Any] | Value = ...,
         width_m: float | Value = ...,
         **annotations: Unpack[Annotations],
-    ) -> _PathPlannerPlan: ...
+    ) -> _PathPlanner_Plan: ...
 
 path_planner: _PathPlanner

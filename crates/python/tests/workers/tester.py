@@ -5,6 +5,7 @@ import contextvars
 import logging
 import os
 import sys
+import threading
 import time
 import weakref
 from typing import Annotated, Any, TypedDict
@@ -220,6 +221,25 @@ def watched(goal: ratn.Goal) -> dict:
     watching.add(heard)
     goal.on_cancel(heard)
     return {"watching": before}
+
+
+@w.action(computes=True, reads=[])
+def deaf(goal: ratn.Goal) -> dict:
+    """Does not let go of Python's lock until it has returned, and for a while after it was told to stop."""
+    ended: list[bool] = []
+    goal.on_cancel(lambda: log.info("deaf: told when it was over" if ended else "deaf: told in time"))
+    usual = sys.getswitchinterval()
+    again = threading.Timer(1.2, sys.setswitchinterval, [usual])
+    again.start()
+    sys.setswitchinterval(60)
+    while not goal.cancelled:
+        pass
+    log.info("deaf: told to stop")
+    until = time.monotonic() + 0.3
+    while time.monotonic() < until:
+        pass
+    ended.append(True)
+    return {}
 
 
 @w.action(outputs={"joints": ratn.Joints, "given": bool}, computes=True, reads=[])
