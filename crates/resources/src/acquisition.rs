@@ -12,7 +12,7 @@ use crate::memory::{Recalled, Remembered, RequestId};
 use crate::pool::Pool;
 use crate::queue::{AcquireRequest, Place, Waiter};
 use crate::record::Effect;
-use crate::replaced::Earlier;
+use crate::replaced::{Earlier, Kept};
 use crate::resource::{Resource, Units};
 use crate::session::Session;
 use crate::session::Speaker;
@@ -182,12 +182,30 @@ impl Pool {
         if request.deadline.is_some_and(|deadline| deadline <= self.now) {
             return Err(malformed("deadline", "it lies in the future"));
         }
-        let asked = self.asked_at(&request, &request_id);
+        let replaced = self.replaced_by(&request, &request_id);
+        let groups: Vec<Key> = request.requirements.iter().map(key).collect();
+        let kept = replaced.as_ref().and_then(|(_, of)| of.kept_by(self.now, request.speculative, &groups));
+        let queued = self.enqueue_keeping(request, request_id, fingerprint, groups, kept);
+        if let (Err(_), Some((id, earlier))) = (&queued, replaced) {
+            // Who is refused may come back for what it had waited.
+            self.left.leaves(self.now, id, earlier);
+        }
+        queued
+    }
+
+    /// The same of a request that is in order, with what it keeps of the one that it replaces.
+    fn enqueue_keeping(
+        &mut self,
+        request: AcquireRequest,
+        request_id: RequestId,
+        fingerprint: Fingerprint,
+        groups: Vec<Key>,
+        kept: Option<Kept>,
+    ) -> Result<WaiterId, PoolError> {
         let full = self.no_room(&request.session)?;
         self.next_waiter += 1;
         let id = WaiterId(self.next_waiter);
-        let turn = self.turn_of(&request, asked);
-        let place = (turn, id);
+        let place = (self.turn_of(&request, kept, id), id);
         let known = self.session(&request.session)?;
         self.check_leases(known)?;
         if self.may_grant_to(known)
@@ -201,7 +219,6 @@ impl Pool {
         if let Some(full) = full.as_ref().filter(|_| !self.is_before_others(place, &request.requirements)) {
             return Err(full.clone());
         }
-        let groups: Vec<Key> = request.requirements.iter().map(key).collect();
         self.check_selectors(self.session(&request.session)?, &groups)?;
         if let Some(deadline) = request.deadline {
             self.timers.insert((deadline, Timer::Waiter(id)));
@@ -214,12 +231,15 @@ impl Pool {
             self.memory.wait(&request_id, fingerprint, id);
         }
         let reserved = vec![Units::new(); request.requirements.len()];
-        let (hopeful, hopeful_since, lacks, overtaken, missing) = Default::default();
-        self.count_waiting(&request, turn, true);
+        let (hopeful, first, hopeful_since, since, lacks, overtaken, missing) = Default::default();
+        let turn = self.turn_behind(&request);
         let waiter = Waiter {
             request,
             turn,
-            asked,
+            asked: kept.map_or(self.now, |kept| kept.since),
+            since,
+            kept,
+            first,
             request_id,
             groups,
             hopeful,
@@ -366,6 +386,7 @@ impl Pool {
 
     /// Takes a waiter from everywhere; with the fingerprint of its request.
     fn leave(&mut self, id: WaiterId, granted: bool) -> Option<(Waiter, Fingerprint)> {
+        let competed = self.queue.get(id)?.hopeful;
         let waiter = self.part(id, granted)?;
         if let Some(deadline) = waiter.request.deadline {
             self.timers.remove(&(deadline, Timer::Waiter(id)));
@@ -374,11 +395,15 @@ impl Pool {
             session.waiters.remove(&id);
             self.callers.waits_no_more(&session.opened_by, &waiter.groups);
         }
-        self.count_waiting(&waiter.request, waiter.turn, false);
+        if competed {
+            self.has_competed(&waiter.request, id, granted && waiter.first);
+        }
         let fingerprint = self.memory.waited(&waiter.request_id).unwrap_or_default();
         if !granted {
-            let (asked, speculative, groups) = (waiter.asked, waiter.request.speculative, waiter.groups.clone());
-            self.left.leaves(self.now, waiter.request_id.clone(), Earlier { asked, speculative, groups });
+            let had = Kept { since: waiter.since, step: waiter.turn.step() };
+            let kept = if competed { Some(had) } else { waiter.kept };
+            let (speculative, groups) = (waiter.request.speculative, waiter.groups.clone());
+            self.left.leaves(self.now, waiter.request_id.clone(), Earlier { kept, speculative, groups });
             self.withdrawals.heard_of(self.now, &self.limits, waiter.request_id.clone());
         }
         Some((waiter, fingerprint))

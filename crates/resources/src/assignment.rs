@@ -241,6 +241,6 @@ pub(crate) fn selects_the_same(one: &Requirement, other: &Requirement) -> bool {
 }
 
 /// Whole units, unless a part of one is asked for.
-fn grain(requirement: &Requirement) -> Quantity {
+pub(crate) fn grain(requirement: &Requirement) -> Quantity {
     if requirement.count.is_whole() { Quantity::ONE } else { Quantity::from_thousandths(1) }
 }

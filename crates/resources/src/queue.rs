@@ -1,10 +1,12 @@
 //! The queue of acquires, in the order of their turns; and what each waiter has reserved.
 
+use crate::assignment::grain;
 use crate::changed::Touched;
 use crate::group::{Family, Group, Key};
 use crate::growth::{Growth, Provided};
 use crate::id::{SessionId, Slot, WaiterId};
 use crate::memory::RequestId;
+use crate::replaced::Kept;
 use crate::resource::Units;
 use crate::turn::Turn;
 use ratn_model::resource::{Quantity, Requirement};
@@ -53,6 +55,12 @@ pub(crate) struct Waiter {
     pub(crate) turn: Turn,
     /// Since when it or what it replaces waits.
     pub(crate) asked: Timestamp,
+    /// The same, by the count of turns: only while what exists would do.
+    pub(crate) since: Timestamp,
+    /// What it has of the one that it replaces, as long as what exists would do.
+    pub(crate) kept: Option<Kept>,
+    /// Whether it is the first of its session in all families that it wants, of those for which what exists would do.
+    pub(crate) first: bool,
     /// Forgotten again when it leaves without a lease, so that the client can ask once more.
     pub(crate) request_id: RequestId,
     /// Per requirement, the group that it waits in.
@@ -138,11 +146,15 @@ impl Waiter {
         self.groups.iter().zip(&self.missing).filter(|(other, _)| *other == key).map(|(_, amount)| *amount).sum()
     }
 
-    /// What of a group it wants and has not reserved.
+    /// What of a group it wants and has not reserved. Parts of a unit are none of what is wanted in whole ones.
     pub(crate) fn lacks_of(&self, key: &Key) -> Quantity {
         let wanted = self.request.requirements.iter().zip(&self.reserved).zip(&self.groups);
         let of_group = wanted.filter(|(_, other)| *other == key).map(|(wanted, _)| wanted);
-        of_group.map(|(wanted, reserved)| wanted.count.saturating_sub(reserved.values().copied().sum())).sum()
+        let has = |wanted: &Requirement, amount: &Quantity| amount.floor_to(grain(wanted));
+        let lacks = |(wanted, reserved): (&Requirement, &Units)| {
+            wanted.count.saturating_sub(reserved.values().map(|amount| has(wanted, amount)).sum())
+        };
+        of_group.map(lacks).sum()
     }
 }
 
@@ -240,6 +252,41 @@ impl Queue {
     pub(crate) fn mark(&mut self, family: &Arc<str>, anew: bool) {
         *self.changed.entry(family.clone()).or_default() |= anew;
         self.shared_until.remove(family);
+    }
+
+    /// A waiter has another turn. What others had reserved may be its own now, or the other way.
+    pub(crate) fn move_to(&mut self, id: WaiterId, turn: Turn) {
+        let Some(waiter) = self.waiters.get_mut(&id) else { return };
+        let (from, to) = (waiter.place(id), (turn, id));
+        waiter.turn = turn;
+        let swap = |set: &mut BTreeSet<Place>| {
+            if set.remove(&from) {
+                set.insert(to);
+            }
+        };
+        [&mut self.order, &mut self.ready, &mut self.doubtful, &mut self.hopeless].into_iter().for_each(swap);
+        let mut families = BTreeSet::new();
+        for (requirement, key) in waiter.request.requirements.iter().zip(&waiter.groups) {
+            let Some(group) = self.groups.get_mut(key) else { continue };
+            if group.by_amount.remove(&(requirement.count, from)) {
+                group.by_amount.insert((requirement.count, to));
+            }
+            [&mut group.wanting, &mut group.several, &mut group.lacking].into_iter().for_each(swap);
+            families.insert(group.family.clone());
+        }
+        let between = (Bound::Excluded(from.min(to)), Bound::Excluded(from.max(to)));
+        let mut disturbed = Vec::new();
+        for name in families {
+            let Some(family) = self.families.get_mut(&name) else { continue };
+            let wants = |key: &Key| self.groups.get(key)?.wanting.range(between).next();
+            let disturbs = match to < from {
+                true => waiter.lacks.contains(&name) && family.reserving.range(between).next().is_some(),
+                false => family.reserving.contains(&from) && family.groups.iter().any(|key| wants(key).is_some()),
+            };
+            [&mut family.takers, &mut family.reserving, &mut family.strict].into_iter().for_each(swap);
+            disturbed.push((name, disturbs));
+        }
+        disturbed.iter().for_each(|(name, disturbs)| self.mark(name, *disturbs));
     }
 
     /// Whether the indices say the same as the waiters do.

@@ -22,8 +22,6 @@ pub(crate) struct Resources {
     vacant: BTreeSet<Slot>,
     by_id: BTreeMap<Box<str>, Slot>,
     by_kind: BTreeMap<Box<str>, OfKind>,
-    /// How much there is of each family, held or not.
-    by_family: BTreeMap<Box<str>, Quantity>,
 }
 
 /// A place among the resources of a kind and of those below it: which of the kinds, and which resource.
@@ -52,10 +50,6 @@ impl Resources {
 
     pub(crate) fn set_kinds(&mut self, kinds: Kinds) {
         self.kinds = kinds;
-        self.by_family.clear();
-        for (kind, of_kind) in &self.by_kind {
-            *self.by_family.entry(self.kinds.family(kind).into()).or_default() += of_kind.quantity;
-        }
     }
 
     pub(crate) fn set_max_holders(&mut self, holders: usize) {
@@ -121,7 +115,6 @@ impl Resources {
         if let Some(of_kind) = self.by_kind.get_mut(kind) {
             of_kind.all.insert(slot);
             of_kind.quantity += resource.quantity();
-            count_family(&mut self.by_family, self.kinds.family(kind), Quantity::ZERO, resource.quantity());
             of_kind.divisible += usize::from(resource.description.divisible);
             if !resource.free().is_zero() {
                 of_kind.free.insert((special(&resource), slot));
@@ -139,7 +132,6 @@ impl Resources {
         if let Some(of_kind) = self.by_kind.get_mut(kind) {
             of_kind.all.remove(&slot);
             of_kind.quantity = of_kind.quantity.saturating_sub(resource.quantity());
-            count_family(&mut self.by_family, self.kinds.family(kind), resource.quantity(), Quantity::ZERO);
             of_kind.divisible -= usize::from(resource.description.divisible);
             of_kind.free.remove(&(special(&resource), slot));
             if of_kind.all.is_empty() {
@@ -161,9 +153,6 @@ impl Resources {
             && let Some(of_kind) = self.by_kind.get_mut(resource.description.kind.as_str())
         {
             of_kind.quantity = of_kind.quantity.saturating_sub(was.0) + is.0;
-            if was.0 != is.0 {
-                count_family(&mut self.by_family, self.kinds.family(&resource.description.kind), was.0, is.0);
-            }
             of_kind.divisible = of_kind.divisible - was.1 + is.1;
             before.map(|key| of_kind.free.remove(&key));
             of_kind.free.extend(after);
@@ -265,11 +254,6 @@ impl Resources {
         self.fitting(requirement).map(|(_, resource)| resource.quantity()).sum()
     }
 
-    /// How much there is of a family, held or not, what is consumed excluded.
-    pub(crate) fn quantity_of_family(&self, family: &str) -> Quantity {
-        self.by_family.get(family).copied().unwrap_or_default()
-    }
-
     /// How many of what fits are divisible.
     pub(crate) fn divisible(&self, requirement: &Requirement) -> usize {
         if self.fits_every(requirement) {
@@ -300,19 +284,6 @@ impl Resources {
                         && of_kind.free.contains(&(special(resource), slot)) != resource.free().is_zero()
                 })
             })
-    }
-}
-
-/// There is another amount of a family.
-fn count_family(by_family: &mut BTreeMap<Box<str>, Quantity>, family: &str, was: Quantity, is: Quantity) {
-    let before = by_family.get(family).copied().unwrap_or_default();
-    let after = before.saturating_sub(was) + is;
-    if after.is_zero() {
-        by_family.remove(family);
-    } else if let Some(amount) = by_family.get_mut(family) {
-        *amount = after;
-    } else {
-        by_family.insert(family.into(), after);
     }
 }
 

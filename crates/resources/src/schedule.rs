@@ -20,7 +20,7 @@ use crate::group::{Key, takes};
 use crate::id::{Slot, WaiterId};
 use crate::pool::Pool;
 use crate::queue::{Place, Waiter};
-use crate::resource::Units;
+use crate::resource::{Resource, Units};
 use ratn_model::resource::{Quantity, Requirement};
 use std::collections::BTreeSet;
 use std::ops::Bound;
@@ -123,6 +123,7 @@ impl Pool {
         self.worked += 1 + assignment.looked_at;
         let hopeful = assignment.is_complete();
         waiter.missing = if hopeful { Vec::new() } else { assignment.missing };
+        waiter.kept = waiter.kept.filter(|_| hopeful);
         self.queue.demand_changed |= self.queue.set_hopeless(place, !hopeful) || !hopeful;
         let Some(waiter) = self.queue.waiters.get(&place.1) else { return };
         if hopeful == waiter.hopeful {
@@ -130,6 +131,7 @@ impl Pool {
         }
         if !hopeful {
             self.give_up(place.1);
+            self.competes_no_more(place.1);
             return;
         }
         let taken: Vec<bool> = waiter.request.requirements.iter().map(takes).collect();
@@ -155,12 +157,18 @@ impl Pool {
         }
         if let Some(waiter) = self.queue.waiters.get_mut(&place.1) {
             (waiter.hopeful, waiter.lacks, waiter.hopeful_since) = (true, lacks, self.now);
+            waiter.since = waiter.kept.map_or(self.now, |kept| kept.since);
         }
+        self.competes(place.1);
         self.queue.growth.look_later(self.now, &self.queue.provided);
     }
 
     /// Gives what is free in a family to those who lack it, in order; on from where an earlier turn stopped.
     fn share_out(&mut self, family: &Arc<str>, anew: bool) {
+        if self.turns_anew(family) {
+            self.queue.mark(family, anew);
+            return;
+        }
         let Some(known) = self.queue.families.get_mut(family) else { return };
         let stopped_at = self.queue.shared_until.remove(family).filter(|_| !anew);
         if anew {
@@ -259,7 +267,9 @@ impl Pool {
         self.worked += assignment.looked_at;
         let complete = assignment.is_complete();
         if (complete && !passes) || (!complete && kept) {
+            let missing = assignment.missing.clone();
             self.reserve(place, family, &indices, assignment);
+            self.reserve_parts(place, family, indices.into_iter().zip(missing));
         }
         if complete && self.limits.overtaken > 0 {
             self.reserve_all(place);
@@ -333,6 +343,38 @@ impl Pool {
             waiter.lacks.remove(family);
             if waiter.lacks.is_empty() {
                 self.queue.ready.insert(place);
+            }
+        }
+    }
+
+    /// Reserves, for each whole unit that a waiter lacks, what is free of one that is divided, so that it comes together: those with the most.
+    fn reserve_parts(&mut self, place: Place, family: &Arc<str>, missing: impl Iterator<Item = (usize, Quantity)>) {
+        for (index, missing) in missing.filter(|(_, missing)| !missing.is_zero()) {
+            let Some(waiter) = self.queue.waiters.get_mut(&place.1) else { return };
+            let requirement = &waiter.request.requirements[index];
+            let divisible = self.queue.groups.get(&waiter.groups[index]).is_some_and(|group| group.divisible > 0);
+            if !divisible || !requirement.count.is_whole() {
+                continue;
+            }
+            let (reserved, resources) = (&self.queue.reserved, &self.resources);
+            let left = |(slot, resource): (Slot, &Resource)| {
+                let fits = resource.description.divisible && resource.description.fits(requirement);
+                let of_others = reserved.get(&slot).copied().unwrap_or_default();
+                let left = resource.free().saturating_sub(of_others);
+                (fits && !resources.is_kept_back(resource) && !left.is_zero()).then_some((left, slot))
+            };
+            let mut parts: Vec<(Quantity, Slot)> = resources.free_of(&requirement.kind).filter_map(left).collect();
+            self.worked += parts.len();
+            parts.sort_by_key(|(left, _)| std::cmp::Reverse(*left));
+            parts.truncate(missing.units() as usize);
+            for (left, slot) in &parts {
+                *self.queue.reserved.entry(*slot).or_default() += *left;
+                *waiter.reserved[index].entry(*slot).or_default() += *left;
+            }
+            if !parts.is_empty()
+                && let Some(family) = self.queue.families.get_mut(family)
+            {
+                family.reserving.insert(place);
             }
         }
     }

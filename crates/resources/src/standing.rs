@@ -1,25 +1,30 @@
 //! What sessions are beside each other: the shares and due times that they say, the turns of their requests, and what is put to whose account.
 
-use crate::accounts::{Accounts, Within};
+use crate::accounts::{Accounts, OwnPlace, Rivals, Within};
 use crate::error::PoolError;
 use crate::event::Refusal;
-use crate::group::{Key, key, takes};
-use crate::id::SessionId;
+use crate::group::takes;
+use crate::id::{SessionId, WaiterId};
 use crate::memory::{Recalled, RequestId};
 use crate::pool::Pool;
 use crate::queue::AcquireRequest;
+use crate::replaced::{Earlier, Kept};
 use crate::turn::{Share, Standing, Turn, step};
 use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
-use std::collections::BTreeSet;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 /// A due time that is said again, counted from another moment, is the same within this.
 const SAME_DUE: Duration = Duration::from_secs(1);
 
+/// Those who wait, by family, as far as somebody was compared with them.
+type Compared = BTreeMap<String, Rivals>;
+
 impl Pool {
-    /// A session says what it is beside others. It counts for what is asked, held and given back from now on; requests that wait stay where
-    /// they are. Not written down: after a restart it is to be said again.
+    /// A session says what it is beside others. The share counts for what is held from now on, the due time for what waits, too. Not written
+    /// down: after a restart it is to be said again.
     ///
     /// # Errors
     /// An unknown session.
@@ -31,11 +36,15 @@ impl Pool {
             (_, due) => due,
         };
         if standing.share != before.share {
-            let units = |family: &str| self.resources.quantity_of_family(family);
-            self.accounts.has_share(id, standing.share, self.now, units);
+            self.accounts.has_share(id, standing.share, self.now);
         }
-        if let Some(session) = self.sessions.get_mut(id) {
-            session.standing = Standing { due, ..standing };
+        let Some(session) = self.sessions.get_mut(id) else { return Ok(()) };
+        session.standing = Standing { due, ..standing };
+        if due != before.due {
+            for waiter in session.waiters.clone() {
+                self.turn_anew(waiter, &mut Compared::new());
+            }
+            self.schedule();
         }
         Ok(())
     }
@@ -45,50 +54,143 @@ impl Pool {
         self.sessions.get(id).map(|session| session.standing).unwrap_or_default()
     }
 
-    /// When a request was asked, by the count of turns. One that it replaces leaves the queue.
-    pub(crate) fn asked_at(&mut self, request: &AcquireRequest, id: &RequestId) -> Timestamp {
-        let mut earlier = self.left.take(self.now, id);
-        if earlier.is_none()
-            && !request.instead_of.is_empty()
-            && let Some(session) = self.sessions.get(&request.session)
+    /// What a request keeps of one that it replaces, which leaves the queue; and whose it is, to put it back.
+    pub(crate) fn replaced_by(&mut self, request: &AcquireRequest, id: &RequestId) -> Option<(RequestId, Earlier)> {
+        if let Some(earlier) = self.left.take(self.now, id) {
+            return Some((id.clone(), earlier));
+        }
+        let session = self.sessions.get(&request.session).filter(|_| !request.instead_of.is_empty())?;
+        let replaced = RequestId::new(&session.opened_by, &request.instead_of);
+        if let Some(Recalled::Waiting(waiter)) = self.memory.reply(&replaced)
+            && self.queue.get(waiter).is_some_and(|waiter| waiter.request.session == request.session)
         {
-            let replaced = RequestId::new(&session.opened_by, &request.instead_of);
-            if let Some(Recalled::Waiting(waiter)) = self.memory.reply(&replaced)
-                && self.queue.get(waiter).is_some_and(|waiter| waiter.request.session == request.session)
-            {
-                self.refuse(waiter, Refusal::Cancelled);
+            self.refuse(waiter, Refusal::Cancelled);
+        }
+        self.left.take(self.now, &replaced).map(|earlier| (replaced, earlier))
+    }
+
+    /// The turn of a request that would wait from now on.
+    pub(crate) fn turn_of(&self, request: &AcquireRequest, kept: Option<Kept>, id: WaiterId) -> Turn {
+        if self.would_be_first(request, id) {
+            return self.first_turn(request, kept.map_or(self.now, |kept| kept.since), kept, &mut Compared::new());
+        }
+        self.turn_behind(request)
+    }
+
+    /// The turn of a request behind others of its session, or that does not compete.
+    pub(crate) fn turn_behind(&self, request: &AcquireRequest) -> Turn {
+        Turn::behind(request.speculative, self.standing(&request.session).due, request.priority)
+    }
+
+    /// The turn of the first request of its session.
+    fn first_turn(
+        &self,
+        request: &AcquireRequest,
+        since: Timestamp,
+        kept: Option<Kept>,
+        compared: &mut Compared,
+    ) -> Turn {
+        let (session, Standing { share, due }) = (&request.session, self.standing(&request.session));
+        let (mut since, mut ahead) = (since, Duration::ZERO);
+        for family in self.families_taken(&request.requirements) {
+            since = since.max(self.accounts.served(session, family));
+            if !compared.contains_key(family) {
+                compared.insert(family.to_owned(), self.accounts.rivals(family, self.now));
             }
-            earlier = self.left.take(self.now, &replaced);
+            let within = Within { session, family, share, now: self.now };
+            ahead = compared.get(family).map_or(ahead, |rivals| ahead.max(self.accounts.ahead(rivals, &within)));
         }
-        let groups = |request: &AcquireRequest| request.requirements.iter().map(key).collect::<Vec<Key>>();
-        let asked = earlier.and_then(|earlier| earlier.asked_for(self.now, request.speculative, &groups(request)));
-        asked.unwrap_or(self.now)
+        let kept = kept.and_then(|kept| kept.step).map_or(u32::MAX, |kept| kept.max(step(since, Duration::ZERO)));
+        Turn::of(request.speculative, step(since, ahead).min(kept), due, request.priority)
     }
 
-    /// The turn of a request that was asked at `asked` and waits from now on.
-    pub(crate) fn turn_of(&mut self, request: &AcquireRequest, asked: Timestamp) -> Turn {
-        let Standing { due, .. } = self.standing(&request.session);
-        let (mut clock, mut last, mut is_alone) = (asked, None, true);
-        for kind in self.kinds_taken(&request.requirements) {
-            self.in_account(&request.session, kind, |accounts, within| {
-                clock = clock.max(accounts.ask(within));
-                match accounts.alone(within.session, within.family) {
-                    Some(own) => last = last.max(own),
-                    None => is_alone = false,
-                }
-            });
-        }
-        let step = last.filter(|_| is_alone).unwrap_or_else(|| step(asked, clock));
-        Turn::of(request.speculative, step, due, request.priority)
+    fn would_be_first(&self, request: &AcquireRequest, id: WaiterId) -> bool {
+        let (own, session) = (request.own_place(id), &request.session);
+        self.families_taken(&request.requirements).iter().all(|family| self.accounts.is_first(session, family, &own))
     }
 
-    /// A request begins to wait, or does not any more.
-    pub(crate) fn count_waiting(&mut self, request: &AcquireRequest, turn: Turn, waits: bool) {
-        for kind in self.kinds_taken(&request.requirements) {
-            self.in_account(&request.session, kind, |accounts, within| match waits {
-                true => accounts.waits(within, turn.step()),
-                false => accounts.waits_no_more(within, turn.step()),
+    /// A waiter competes from now on: what exists would do for it.
+    pub(crate) fn competes(&mut self, id: WaiterId) {
+        let Some(request) = self.queue.get(id).map(|waiter| waiter.request.clone()) else { return };
+        self.in_accounts(&request, |accounts, within| accounts.waits(within, request.own_place(id)));
+        self.look_who_is_first(&request);
+        if self.families_taken(&request.requirements).is_empty() {
+            self.set_first(id, true);
+        }
+    }
+
+    /// It does not any more, though it stays.
+    pub(crate) fn competes_no_more(&mut self, id: WaiterId) {
+        let Some(request) = self.queue.get(id).map(|waiter| waiter.request.clone()) else { return };
+        self.set_first(id, false);
+        self.has_competed(&request, id, false);
+    }
+
+    /// It does not any more; it was served as the first of its session, or was not.
+    pub(crate) fn has_competed(&mut self, request: &AcquireRequest, id: WaiterId, served: bool) {
+        self.in_accounts(request, |accounts, within| accounts.waits_no_more(within, request.own_place(id), served));
+        self.look_who_is_first(request);
+    }
+
+    /// Who is the first of a session where a request competes, or has competed.
+    fn look_who_is_first(&mut self, request: &AcquireRequest) {
+        let mut concerned = BTreeSet::new();
+        for family in self.families_taken(&request.requirements) {
+            concerned.extend(self.accounts.first_two(&request.session, family));
+        }
+        for id in concerned {
+            let Some(waiter) = self.queue.get(id) else { continue };
+            let first = self.would_be_first(&waiter.request, id);
+            if first != waiter.first {
+                self.set_first(id, first);
+            }
+        }
+    }
+
+    fn set_first(&mut self, id: WaiterId, first: bool) {
+        let Some(waiter) = self.queue.waiters.get_mut(&id) else { return };
+        waiter.first = first;
+        let request = waiter.request.clone();
+        if first {
+            self.in_accounts(&request, |accounts, within| {
+                let rivals = accounts.rivals(within.family, within.now);
+                accounts.begins_turn(&rivals, within);
             });
+        }
+        self.turn_anew(id, &mut Compared::new());
+    }
+
+    /// Puts a waiter where it stands now; whether that is another place.
+    fn turn_anew(&mut self, id: WaiterId, compared: &mut Compared) -> bool {
+        let Some(waiter) = self.queue.get(id) else { return false };
+        let turn = match waiter.first {
+            true => self.first_turn(&waiter.request, waiter.since, waiter.kept, compared),
+            false => self.turn_behind(&waiter.request),
+        };
+        let moves = turn != waiter.turn;
+        if moves {
+            self.queue.move_to(id, turn);
+        }
+        moves
+    }
+
+    /// What sessions have had since is another amount: puts the first of each in a family where they stand now; whether one moved.
+    pub(crate) fn turns_anew(&mut self, family: &str) -> bool {
+        let (firsts, mut compared) = (self.accounts.firsts(family), Compared::new());
+        self.worked += firsts.len();
+        let mut moved = false;
+        for id in firsts {
+            moved |= self.turn_anew(id, &mut compared);
+        }
+        moved
+    }
+
+    /// Does something in the accounts that the session of a request has of the families that it takes something of.
+    fn in_accounts(&mut self, request: &AcquireRequest, mut act: impl FnMut(&mut Accounts, &Within<'_>)) {
+        let (session, Standing { share, .. }) = (&request.session, self.standing(&request.session));
+        for kind in kinds_taken(&request.requirements) {
+            let family = self.resources.family(kind);
+            act(&mut self.accounts, &Within { session, family, share, now: self.now });
         }
     }
 
@@ -96,8 +198,7 @@ impl Pool {
     pub(crate) fn in_account(&mut self, session: &SessionId, kind: &str, act: impl FnOnce(&mut Accounts, &Within<'_>)) {
         let Standing { share, .. } = self.standing(session);
         let family = self.resources.family(kind);
-        let units = self.resources.quantity_of_family(family);
-        act(&mut self.accounts, &Within { session, family, share, units, now: self.now });
+        act(&mut self.accounts, &Within { session, family, share, now: self.now });
     }
 
     /// The accounts of those who hold something, from now on. Nobody waits.
@@ -117,16 +218,14 @@ impl Pool {
         }
     }
 
-    /// A kind of each family of which something is wanted.
-    fn kinds_taken<'a>(&self, requirements: &'a [Requirement]) -> Vec<&'a str> {
-        let mut families = BTreeSet::new();
-        let taken = requirements.iter().filter(|requirement| takes(requirement)).map(|one| one.kind.as_str());
-        taken.filter(|kind| families.insert(self.resources.family(kind))).collect()
+    /// The families of which something is wanted.
+    fn families_taken<'a>(&'a self, requirements: &'a [Requirement]) -> BTreeSet<&'a str> {
+        kinds_taken(requirements).map(|kind| self.resources.family(kind)).collect()
     }
 
     /// The same of what everybody has, for the invariants.
     pub(crate) fn accounts_agree(&self) -> Result<(), String> {
-        let mut has = std::collections::BTreeMap::<_, (Quantity, usize)>::new();
+        let mut has = BTreeMap::<_, (Quantity, usize)>::new();
         for lease in self.leases.values() {
             for (slot, amount) in &lease.held {
                 let Some(resource) = self.resources.get(*slot) else { continue };
@@ -134,23 +233,32 @@ impl Pool {
                 has.entry((lease.session.clone(), family)).or_default().0 += *amount;
             }
         }
-        for (_, waiter) in self.queue.iter() {
-            for kind in self.kinds_taken(&waiter.request.requirements) {
-                let family = self.resources.family(kind).into();
-                has.entry((waiter.request.session.clone(), family)).or_default().1 += 1;
+        for (id, waiter) in self.queue.iter() {
+            let request = &waiter.request;
+            for family in self.families_taken(&request.requirements).into_iter().filter(|_| waiter.hopeful) {
+                has.entry((request.session.clone(), family.into())).or_default().1 += 1;
+            }
+            if waiter.first != (waiter.hopeful && self.would_be_first(request, id)) {
+                return Err(format!("{id} is the first of its session, or is not, and its account says otherwise"));
+            }
+            if waiter.first != waiter.turn.step().is_some() {
+                return Err(format!("the turn of {id} is not that of a first request, or of one behind it"));
             }
         }
-        self.accounts.agree(&has)?;
-        let mut units = std::collections::BTreeMap::<&str, Quantity>::new();
-        for (_, resource) in self.resources.iter() {
-            *units.entry(self.resources.family(&resource.description.kind)).or_default() += resource.quantity();
-        }
-        let counted = units.into_iter().all(|(family, units)| self.resources.quantity_of_family(family) == units);
-        if counted { Ok(()) } else { Err("the units of a family are miscounted".to_owned()) }
+        self.accounts.agree(&has)
     }
 }
 
+/// The kinds of which something is wanted.
+fn kinds_taken(requirements: &[Requirement]) -> impl Iterator<Item = &str> {
+    requirements.iter().filter(|requirement| takes(requirement)).map(|requirement| requirement.kind.as_str())
+}
+
 impl AcquireRequest {
+    fn own_place(&self, id: WaiterId) -> OwnPlace {
+        (self.speculative, Reverse(self.priority), id)
+    }
+
     /// For what may turn out not to be needed: all that is needed for certain comes before it.
     #[must_use]
     pub fn speculative(mut self, speculative: bool) -> AcquireRequest {

@@ -1,24 +1,24 @@
-//! Turns: the order in which waiting requests are served, as a number that a request gets when it asks and keeps.
+//! Turns: the order in which waiting requests are served.
 //!
-//! What is needed for certain comes before what is speculative. Then, by time in steps of [`LEAD`]: when it was asked, or later, where its
-//! session has had more than its share (`accounts.rs`), by [`AHEAD`] at the most. Within a step, the most urgent (bits 60 and up of a
-//! priority), then the session whose task is due first, then the larger priority, then who came first.
+//! Of each session only the first request competes, by its own order: certain before speculative, then the larger priority, then who came
+//! first. It is the first of what its session waits for in each family of kinds that it wants; requests for what does not exist do not
+//! count. Those behind it wait for it, behind the first ones of all others that are as certain. So a session alone is served by its own order.
+//!
+//! What is needed for certain comes before what is speculative. Then, by time in steps of [`LEAD`]: when a request became the first, or
+//! later, where its session has had more for its share than others who wait (`accounts.rs`), by [`AHEAD`] at the most. Within a step, the
+//! most urgent (bits 60 and up of a priority), then the session whose task is due first, then the larger priority, then who came first.
 //!
 //! ```text
-//!   asked ≤ time of the turn ≤ asked + AHEAD       step = time of the turn / LEAD, rounded down
+//!   first since ≤ time of the turn ≤ first since + AHEAD     step = time of the turn / LEAD, rounded down
 //!
-//!   w asked at a:                     step(w) ≤ ⌊(a + AHEAD) / LEAD⌋
-//!   v asked at b, is served before w: step(v) ≤ step(w), and step(v) ≥ ⌊b / LEAD⌋, so b < a + AHEAD + LEAD
+//!   w is the first since a:                            step(w) ≤ ⌊(a + AHEAD) / LEAD⌋
+//!   v is the first since b, and served before w:       step(v) ≤ step(w), and step(v) ≥ ⌊b / LEAD⌋, so b < a + AHEAD + LEAD
 //! ```
 //!
-//! So of what is needed for certain, nobody is passed by a request of another session that was asked `AHEAD + LEAD` later, whatever its
-//! priority, share or due time. A request may keep the time at which another one was asked that it replaces (`replaced.rs`); one that
-//! becomes certain so keeps [`LEAD`] of it at the most. It passes nobody who was there [`BOUND`] before it became certain.
-//!
-//! While nobody else waits for anything in the families of kinds that a request wants, it joins the last step of its own session there: it
-//! passes nobody by that, and a session alone is served by priority and arrival, for however long its requests wait.
-//!
-//! Where a turn comes from: VirtualClock (Zhang 1990), with a bound on how far a clock is ahead.
+//! So of what is needed for certain and the first of its session, nobody is passed by a request of another session that became the first
+//! `AHEAD + LEAD` later, whatever its priority, share or due time. A request may keep the time of another one that it replaces
+//! (`replaced.rs`); one that becomes certain so keeps [`LEAD`] of it at the most. It passes nobody who was the first [`BOUND`] before it became
+//! certain.
 
 use ratn_model::time::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -30,7 +30,7 @@ use std::time::Duration;
 pub const AHEAD: Duration = Duration::from_secs(60);
 /// What is asked within such a step of time is served by urgency, due time and priority.
 pub const LEAD: Duration = Duration::from_secs(10);
-/// Nobody who needs something for certain is passed by a request of another session that became certain so much later.
+/// The first request of a session that needs something for certain is not passed by one of another session that became certain so much later.
 pub const BOUND: Duration = Duration::from_secs(AHEAD.as_secs() + 2 * LEAD.as_secs());
 /// The bits of a priority from this one on are its urgency.
 const URGENCY_BITS: u32 = 60;
@@ -122,27 +122,35 @@ pub(crate) struct Turn {
 }
 
 const NEVER: u32 = u32::MAX;
+/// Behind every step of time.
+const BEHIND: u32 = u32::MAX;
 
 impl Turn {
     /// Behind every turn.
     pub(crate) const LAST: Turn =
         Turn { speculative: true, step: u32::MAX, urgency: Reverse(i8::MIN), due: NEVER, priority: Reverse(i64::MIN) };
 
-    /// Of a request that was asked at `asked`, of a session whose clock is at `clock`.
+    /// Of a request behind others of its session.
+    pub(crate) fn behind(speculative: bool, due: Option<Timestamp>, priority: i64) -> Turn {
+        Turn::of(speculative, BEHIND, due, priority)
+    }
+
+    /// Of the first request of its session.
     pub(crate) fn of(speculative: bool, step: u32, due: Option<Timestamp>, priority: i64) -> Turn {
         let due = due.map_or(NEVER, |due| seconds(due).min(NEVER - 1));
         let urgency = Reverse((priority >> URGENCY_BITS) as i8);
         Turn { speculative, step, urgency, due, priority: Reverse(priority) }
     }
 
-    pub(crate) fn step(self) -> u32 {
-        self.step
+    /// Nothing where others of its session are before it.
+    pub(crate) fn step(self) -> Option<u32> {
+        (self.step != BEHIND).then_some(self.step)
     }
 }
 
-/// The step of what was asked at `asked` by who has had what `clock` says.
-pub(crate) fn step(asked: Timestamp, clock: Timestamp) -> u32 {
-    seconds(clock.clamp(asked, asked + AHEAD)) / LEAD.as_secs() as u32
+/// The step of what is the first since then, of a session that is so far ahead of others.
+pub(crate) fn step(since: Timestamp, ahead: Duration) -> u32 {
+    seconds(since + ahead.min(AHEAD)) / LEAD.as_secs() as u32
 }
 
 fn seconds(at: Timestamp) -> u32 {
@@ -169,7 +177,9 @@ mod tests {
             Turn::of(false, 2, None, 7),
             Turn::of(false, 2, None, 0),
             Turn::of(false, 2, Some(at(50)), -1),
+            Turn::behind(false, Some(at(1)), i64::MAX),
             Turn::of(true, 0, Some(at(1)), i64::MAX),
+            Turn::behind(true, None, i64::MAX),
             Turn::LAST,
         ];
         assert!(order.is_sorted_by(|a, b| a < b), "{order:?}");
@@ -179,17 +189,17 @@ mod tests {
 
     #[test]
     fn a_turn_is_no_sooner_than_its_request_and_at_most_so_much_later() {
-        assert_eq!(step(at(25), at(0)), 2, "who has had nothing saves nothing up");
-        assert_eq!(step(at(25), at(38)), 3);
-        assert_eq!(step(at(25), at(1_000)), 8, "60 s later");
-        assert_eq!(step(Timestamp(u64::MAX), at(0)), u32::MAX / 10);
+        assert_eq!(step(at(25), Duration::ZERO), 2);
+        assert_eq!(step(at(25), Duration::from_secs(13)), 3);
+        assert_eq!(step(at(25), Duration::from_secs(1_000)), 8, "60 s later");
+        assert!(step(Timestamp(u64::MAX), Duration::ZERO) < BEHIND);
     }
 
     #[test]
     fn a_request_passes_none_that_was_asked_ahead_and_lead_before_it() {
         for asked in 0..200 {
-            let latest = step(at(asked), at(asked + 500));
-            let earliest = step(at(asked) + AHEAD + LEAD, at(0));
+            let latest = step(at(asked), Duration::from_secs(500));
+            let earliest = step(at(asked) + AHEAD + LEAD, Duration::ZERO);
             assert!(Turn::of(false, earliest, Some(at(0)), i64::MAX) > Turn::of(false, latest, None, i64::MIN));
         }
     }
