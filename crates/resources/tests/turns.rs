@@ -518,7 +518,7 @@ fn observe(
     ends: &mut BTreeSet<(u64, LeaseId)>,
     (grants, passes): (&mut usize, &mut usize),
 ) {
-    if now % 64 == 0 {
+    if now.is_multiple_of(64) {
         pool.check_invariants().unwrap();
     }
     let granted = pool.take_notices().into_iter().filter_map(|notice| match notice {
