@@ -86,7 +86,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         resumption = resumption.whole()?;
     }
     if let Some(ended) = resumption.replayed.ended.take() {
-        return finish(resumption, ended, place).await;
+        return Box::pin(finish(resumption, ended, place)).await;
     }
     let Resumption { program, history, replayed, log, checkpoint_every } = resumption;
     let Replayed { executive, standing, missing, events: replayed, .. } = replayed;
@@ -150,7 +150,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         }
         Ok(ended)
     };
-    shell.run_to_its_end(begin, interrupt).await
+    Box::pin(shell.run_to_its_end(begin, interrupt)).await
 }
 
 /// Does what a run had decided that was killed behind its end.
