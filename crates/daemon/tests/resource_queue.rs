@@ -230,6 +230,7 @@ async fn client_beside(system: &TestSystem, manager: &Daemon, name: &str, standi
     Client { session, resources }
 }
 
+#[expect(clippy::disallowed_methods, reason = "a due time is a moment of the wall clock")]
 fn due_in(seconds: u64) -> Standing {
     Standing { due: Some(SystemTime::now() + Duration::from_secs(seconds)), ..Standing::default() }
 }

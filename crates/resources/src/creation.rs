@@ -120,6 +120,8 @@ impl Pool {
                 Err(_) => {}
             }
         }
+        // Its own first: what a session had made is gone with it, and what it had deleted of others' is not there again.
+        free.sort_by_key(|(slot, _)| self.resources.get(*slot).is_none_or(|one| one.owner.as_ref() != Some(session)));
         let found: Quantity = free.iter().map(|(_, free)| *free).sum();
         let mut wanted = requirement.count;
         if found < wanted {

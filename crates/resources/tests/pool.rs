@@ -522,6 +522,16 @@ fn units_are_deleted_all_or_none_and_a_resource_without_units_is_gone() {
 }
 
 #[test]
+fn a_delete_by_requirement_takes_the_sessions_own_before_what_is_nobodys() {
+    let mut bench = Bench::new();
+    let nobodys = bench.pool.create(bench.now, None, ResourceSpec::new(ResourceClass::Task, "Box")).unwrap().id.clone();
+    let own = bench.create("b", ResourceSpec::new(ResourceClass::Task, "Box"));
+    let delete = requirement(ResourceOperation::Delete, "Box", 1);
+    assert_eq!(bench.pool.delete_units(bench.now, &session("b"), &delete).unwrap(), [own]);
+    assert_eq!(bench.pool.delete_units(bench.now, &session("b"), &delete).unwrap(), [nobodys]);
+}
+
+#[test]
 fn a_delete_by_requirement_takes_only_what_the_session_may_delete_by_id() {
     let mut bench = Bench::with(&[("Arm", 1)]);
     let arm = bench.pool.list().remove(0).id.clone();

@@ -2,7 +2,7 @@
 //! task control was killed. A pure fold; what is done with it is [`super::resume`]'s.
 
 use super::record::Decided;
-use ratn_executive::protocol::{Command, Event, Goal, Origin};
+use ratn_executive::protocol::{Command, Event, Goal, Note, Origin};
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
@@ -32,6 +32,10 @@ pub(super) struct Ledger {
     pub(super) first_revision: Revision,
     /// The root's revision of which the run has heard last: what others had made up to it is in its world.
     pub(super) knows: Revision,
+    /// The same when an instance was granted what it holds, or its last goal was given: from then on nobody else changes what it changes.
+    pub(super) began: BTreeMap<InstanceId, Revision>,
+    /// The first operation that failed, by its number: neither that one nor anything behind it is made.
+    pub(super) failed: Option<u64>,
     /// The number of the run's session: what it has made and holds is in that one. A session of its id that has another number was opened by
     /// a resumption that died before it had made anything so again.
     pub(super) session: u64,
@@ -81,6 +85,8 @@ pub(super) struct Confirmed {
     pub(super) commit: Revision,
     /// The resource manager, by the number of an operation.
     pub(super) operation: u64,
+    /// Of what was decided by this instance the first failed.
+    pub(super) failed: Option<InstanceId>,
 }
 
 /// An acquire.
@@ -144,6 +150,7 @@ impl Ledger {
             }
             Event::Woken => self.wakes = self.wakes.split_off(&Timestamp(at.0.saturating_add(1))),
             Event::Granted { instance, lease } => {
+                self.began.insert(*instance, self.knows);
                 self.held.insert(lease.id);
                 if let Some(asked) = self.waiting.remove(instance) {
                     let used_up = |r: &Requirement| r.operation == ResourceOperation::Consume;
@@ -153,6 +160,7 @@ impl Ledger {
             Event::Refused { instance, .. } => {
                 self.waiting.remove(instance);
             }
+            Event::RetirementFailed { instance, .. } => self.failed(*instance),
             Event::Projected { instance, attempt, projection } => {
                 // What need not be there first is perhaps only promised.
                 self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt || !asked.first);
@@ -196,6 +204,7 @@ impl Ledger {
                 self.projecting.insert(*instance, asked);
             }
             Command::Start { instance, attempt, goal } => {
+                self.began.insert(*instance, self.knows);
                 self.goals.insert(*instance, (*attempt, (**goal).clone()));
             }
             Command::Cancel { instance, attempt } => {
@@ -213,19 +222,39 @@ impl Ledger {
             Command::Commit { instance, writer, changes, evidence, revision } => {
                 let (instance, revision, writer) = (*instance, *revision, writer.clone());
                 let (changes, evidence) = (changes.clone(), evidence.clone());
-                let knows = self.knows;
-                self.commits.push(Decided { instance, writer, changes, evidence, revision, knows });
+                let knows = self.began.get(&instance).copied().unwrap_or(self.knows);
+                let behind = self.operations;
+                if self.failed.is_none() {
+                    self.commits.push(Decided { instance, writer, changes, evidence, revision, knows, behind });
+                }
             }
             Command::Operate { instance, operations } => {
                 self.operations += 1;
-                self.operated.push((self.operations, *instance, operations.clone()));
+                if self.failed.is_none() {
+                    self.operated.push((self.operations, *instance, operations.clone()));
+                }
             }
             Command::Wake { at } => {
                 self.wakes.insert(*at);
             }
             Command::End { outcome, .. } => self.ended = Some(outcome.clone()),
+            Command::Note(Note::Retired { instance } | Note::Squashed { instance }) => {
+                self.began.remove(instance);
+            }
             Command::Note(_) => {}
         }
+    }
+
+    /// What an instance had decided was not made, and so is nothing behind it: the recorder makes neither. A commit that failed may be made all the
+    /// same, with those behind it up to the next operation that failed: in order they come to what the program says. An operation may not: why it
+    /// was refused is not known to be over.
+    fn failed(&mut self, instance: InstanceId) {
+        let is_meant =
+            |(number, of, _): &&(u64, InstanceId, Vec<Requirement>)| *of == instance && *number > self.recorded;
+        let Some(&(failed, ..)) = self.operated.iter().find(is_meant) else { return };
+        self.failed = Some(failed);
+        self.operated.retain(|(number, ..)| *number < failed);
+        self.commits.retain(|decided| decided.behind < failed);
     }
 
     /// The operations that may not be done in the run's session, in order.
@@ -380,19 +409,8 @@ mod tests {
     #[test]
     fn a_goal_is_open_until_it_has_ended_or_is_cancelled_in_its_attempt() {
         let instance = InstanceId(1);
-        let goal = Goal {
-            improves: None,
-            provider: "arm".into(),
-            action: "follow".into(),
-            inputs: BTreeMap::new(),
-            seed: 0,
-            lease: None,
-            projection: None,
-            expected_s: None,
-            timeout_s: None,
-        };
         let mut ledger = Ledger::default();
-        ledger.command(&Command::Start { instance, attempt: 2, goal: Box::new(goal) });
+        ledger.command(&Command::Start { instance, attempt: 2, goal: Box::new(goal()) });
         ledger.command(&Command::Cancel { instance, attempt: 1 });
         assert_eq!(ledger.goals.len(), 1);
         ledger.event(Timestamp(1), &Event::Crashed { instance, attempt: 2, reason: String::new() });
@@ -467,6 +485,76 @@ mod tests {
         assert_eq!(ledger.commits.iter().map(|decided| decided.knows).collect::<Vec<_>>(), [Revision(0), Revision(5)]);
     }
 
+    fn goal() -> Goal {
+        Goal {
+            improves: None,
+            provider: "arm".into(),
+            action: "follow".into(),
+            inputs: BTreeMap::new(),
+            seed: 0,
+            lease: None,
+            projection: None,
+            expected_s: None,
+            timeout_s: None,
+        }
+    }
+
+    fn commits(instance: InstanceId, number: u64) -> Command {
+        let (writer, changes, evidence) = (String::new(), Vec::new(), Vec::new());
+        Command::Commit { instance, writer, changes, evidence, revision: Revision(number) }
+    }
+
+    #[test]
+    fn what_was_heard_of_behind_the_beginning_of_a_motion_is_not_what_its_commit_is_made_of() {
+        let (motion, other) = (InstanceId(1), InstanceId(2));
+        let mut ledger = Ledger::default();
+        let heard = |ledger: &mut Ledger, revision: u64| {
+            ledger.event(Timestamp(1), &Event::WorldChanged { revision: Revision(revision), facts: Vec::new() });
+        };
+        heard(&mut ledger, 4);
+        ledger.command(&Command::Start { instance: motion, attempt: 1, goal: Box::new(goal()) });
+        heard(&mut ledger, 10);
+        ledger.event(Timestamp(2), &Event::Granted { instance: other, lease: lease(7) });
+        heard(&mut ledger, 12);
+        for (number, instance) in (1..).zip([motion, other, InstanceId(3)]) {
+            ledger.command(&commits(instance, number));
+        }
+        assert_eq!(ledger.commits.iter().map(|decided| decided.knows.0).collect::<Vec<_>>(), [4, 10, 12]);
+        ledger.command(&Command::Note(Note::Retired { instance: motion }));
+        ledger.command(&Command::Note(Note::Squashed { instance: other }));
+        assert!(ledger.began.is_empty());
+    }
+
+    #[test]
+    fn nothing_is_left_to_do_of_an_operation_that_failed_and_of_what_is_behind_it() {
+        let operates = |instance: u64| Command::Operate {
+            instance: InstanceId(instance),
+            operations: vec![requirement(ResourceOperation::Create, "Box", 1)],
+        };
+        let mut ledger = Ledger::default();
+        for number in [1, 2, 3] {
+            ledger.command(&commits(InstanceId(number), number));
+            ledger.command(&operates(number));
+        }
+        let left = |ledger: &Ledger| {
+            let commits = ledger.commits.iter().map(|decided| decided.revision.0).collect::<Vec<_>>();
+            (commits, ledger.operated.iter().map(|(number, ..)| *number).collect::<Vec<_>>())
+        };
+        // A commit that failed may be made: what was done before is not taken for what failed.
+        ledger.event(Timestamp(1), &Event::Recorded { operation: 1, session: 7 });
+        let failed = |instance: u64| Event::RetirementFailed { instance: InstanceId(instance), reason: String::new() };
+        ledger.event(Timestamp(1), &failed(1));
+        assert_eq!(left(&ledger), (vec![1, 2, 3], vec![1, 2, 3]));
+        ledger.event(Timestamp(2), &failed(2));
+        assert_eq!(left(&ledger), (vec![1, 2], vec![1]));
+        // Those behind it fail as well, and what is decided on the way out is not made either.
+        ledger.event(Timestamp(2), &failed(3));
+        ledger.command(&commits(InstanceId(4), 4));
+        ledger.command(&operates(4));
+        assert_eq!(left(&ledger), (vec![1, 2], vec![1]));
+        assert_eq!((ledger.operations, ledger.failed), (4, Some(2)));
+    }
+
     #[test]
     fn what_is_forgotten_has_come_to_the_same() {
         use ResourceOperation::{Consume, Create, Delete};
@@ -507,7 +595,8 @@ mod tests {
                 ledger.command(&Command::Release { instance, lease: Some(LeaseId(number)), projection: None });
             }
             // The daemons are behind, the world pool further.
-            let confirmed = Confirmed { commit: Revision(number / 2), operation: number.saturating_sub(3) };
+            let confirmed =
+                Confirmed { commit: Revision(number / 2), operation: number.saturating_sub(3), failed: None };
             short.forget_but(4, confirmed);
             assert_eq!(short.created(), whole.created());
             assert_eq!(totals(&short), totals(&whole));

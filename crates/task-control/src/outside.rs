@@ -101,7 +101,7 @@ mod tests {
             let revision = self.mirror.apply(changes).unwrap_or_default();
             let (instance, writer) = (InstanceId(self.commits), String::new());
             let (changes_made, evidence, knows) = (changes.to_vec(), Vec::new(), Revision(0));
-            let decided = Decided { instance, writer, changes: changes_made, evidence, revision, knows };
+            let decided = Decided { instance, writer, changes: changes_made, evidence, revision, knows, behind: 0 };
             self.outside.decided("run", &decided);
             (decided.id("run"), changes.to_vec())
         }

@@ -59,6 +59,8 @@ pub(super) enum Record {
         operations: Vec<Requirement>,
         order: Order,
     },
+    /// Something had failed before task control was gone: nothing is made behind that.
+    Failed(String),
     /// Answers once everything before it is done: with the first failure of the run, if there was one.
     Flush(oneshot::Sender<Result<(), String>>),
 }
@@ -94,8 +96,10 @@ pub(super) struct Decided {
     pub(super) evidence: Evidence,
     /// What the run's root becomes: the pool's, as long as nobody else writes into it.
     pub(super) revision: Revision,
-    /// The pool's revision that the run had heard of when it decided that: what others had made until then it knew.
+    /// The pool's revision that the run had heard of when it began what led to that: what others had made until then it knew.
     pub(super) knows: Revision,
+    /// How many operations were decided before it: it is made behind them.
+    pub(super) behind: u64,
 }
 
 impl Decided {
@@ -210,13 +214,18 @@ impl Recorder {
                     // Whoever resumes the run does not do it again.
                     Some(failed.unwrap_or(Event::Recorded { operation: number, session: self.session }))
                 }
+                Record::Failed(reason) => {
+                    recorded = recorded.and(Err(reason));
+                    None
+                }
                 Record::Flush(done) => {
                     let _ = done.send(recorded.clone());
                     None
                 }
             };
-            if let (Some(Event::RetirementFailed { reason, .. }), Ok(())) = (&event, &recorded) {
+            if let (Some(Event::RetirementFailed { reason, instance }), Ok(())) = (&event, &recorded) {
                 recorded = Err(reason.clone());
+                self.done.lock().unwrap_or_else(PoisonError::into_inner).failed = Some(*instance);
             }
             // Nothing behind a failure counts: what is confirmed is confirmed without a gap.
             if recorded.is_ok() {

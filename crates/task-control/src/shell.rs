@@ -284,7 +284,14 @@ impl Shell {
         while let Ok(answer) = self.answers.try_recv() {
             self.performer.accept(answer, self.executive.root());
         }
-        let closed = self.performer.close().await;
+        let (done, closed) = self.performer.close().await;
+        if ended.is_ok() {
+            // Whoever resumes the run knows what is left to do of it.
+            let now = self.clock.now();
+            if let Err(error) = done.iter().try_for_each(|event| self.log.append(now, event, &[])) {
+                tracing::warn!("the event log does not say what was recorded at the end: {error:#}");
+            }
+        }
         Spans::end(spans).await;
         match (ended, closed) {
             // A success of which not everything is known afterwards is none.

@@ -197,6 +197,8 @@ pub(super) struct Performer {
     following: Option<AbortOnDropHandle<()>>,
     cancelled: Cancelled,
     recorded: Recorded,
+    /// How much of that the executive was told.
+    heard: Confirmed,
     /// Ids for projections that goals are given before they are there.
     promises: Promises,
     making: Making,
@@ -348,6 +350,7 @@ impl Performer {
             following: None,
             cancelled,
             recorded,
+            heard: Confirmed::default(),
             over: CancellationToken::new(),
             promises,
             making: Making::default(),
@@ -388,8 +391,14 @@ impl Performer {
         *self.recorded.borrow()
     }
 
+<<<<<<< HEAD
     fn confirm(&self, confirmed: Confirmed) {
         self.recorded.send_replace(confirmed);
+=======
+    fn confirm(&mut self, confirmed: Confirmed) {
+        *self.recorded.lock().unwrap_or_else(PoisonError::into_inner) = confirmed;
+        self.heard = confirmed;
+>>>>>>> m-resume2
     }
 
     /// Resolves when the session with the resource manager, and with it every lease, is gone. A manager that is not heard is waited for,
@@ -474,11 +483,8 @@ impl Performer {
                 self.release(instance, lease, projection, safe);
             }
             Command::Commit { instance, writer, changes, evidence, revision } => {
-                let knows = self.told.revision();
-                let decided = Decided { instance, writer, changes, evidence, revision, knows };
-                self.outside.decided(&self.run, &decided);
-                self.decided = decided.revision;
-                self.record(Record::Commit { decided, safe })?;
+                let (knows, behind) = (self.told.revision(), self.operations);
+                self.commit(Decided { instance, writer, changes, evidence, revision, knows, behind }, safe)?;
             }
             Command::Operate { instance, operations } => {
                 self.operations += 1;
@@ -493,11 +499,22 @@ impl Performer {
         self.over.cancel();
     }
 
-    /// Waits until what was decided is recorded and given back, and ends the session.
-    ///
-    /// # Errors
-    /// When something that was decided is not recorded: the world pool or the resource manager know less than what happened.
-    pub(super) async fn close(mut self) -> anyhow::Result<()> {
+    /// Waits until what was decided is recorded and given back, and ends the session. What nobody has heard of by then: how far the operations of
+    /// the run are done, and whose effects failed first. An error when something that was decided is not recorded: the world pool or the resource
+    /// manager know less than what happened.
+    pub(super) async fn close(self) -> (Vec<Event>, anyhow::Result<()>) {
+        let (heard, session, recorded) = (self.heard, self.number, Arc::clone(&self.recorded));
+        let closed = self.end().await;
+        let Confirmed { operation, failed, .. } = *recorded.lock().unwrap_or_else(PoisonError::into_inner);
+        let done = (operation > heard.operation).then_some(Event::Recorded { operation, session });
+        let failed = failed.filter(|_| heard.failed.is_none()).map(|instance| {
+            let reason = closed.as_ref().err().map_or_else(String::new, ToString::to_string);
+            Event::RetirementFailed { instance, reason }
+        });
+        (done.into_iter().chain(failed).collect(), closed)
+    }
+
+    async fn end(mut self) -> anyhow::Result<()> {
         self.begin_no_more();
         let recording = async {
             let (done, recorded) = oneshot::channel();
@@ -543,6 +560,12 @@ impl Performer {
             bail!("the world pool is more than {MAX_PENDING_RECORDS} requests behind, or gone");
         }
         Ok(())
+    }
+
+    fn commit(&mut self, decided: Decided, safe: Option<Mark>) -> anyhow::Result<()> {
+        self.outside.decided(&self.run, &decided);
+        self.decided = decided.revision;
+        self.record(Record::Commit { decided, safe })
     }
 
     fn operate(
@@ -679,6 +702,13 @@ impl Performer {
                         self.leases.granted(*instance, lease, (asked.requirements, asked.priority), Instant::now());
                         self.holds.set(self.leases.has_speculative());
                     }
+                }
+                match &event {
+                    Event::Recorded { operation, .. } => self.heard.operation = self.heard.operation.max(*operation),
+                    Event::RetirementFailed { instance, .. } => {
+                        self.heard.failed = self.heard.failed.or(Some(*instance))
+                    }
+                    _ => {}
                 }
                 // Also where it is the projection that could not be made, while its goal went on.
                 if let Event::Crashed { instance, attempt, .. } = &event {

@@ -35,10 +35,22 @@ use ratn_world::world::World;
 use std::borrow::Cow;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::PoisonError;
 use tokio_util::sync::CancellationToken;
 
 /// So many withdrawals of before are under way at once.
 const WITHDRAWN_AT_ONCE: usize = 64;
+
+/// As the resource manager names the refusal of what is not there, or not free.
+const NOT_ENOUGH: &str = "NOT_ENOUGH";
+
+/// What the world pool did not have of a run's commits.
+struct Missing {
+    /// So many were made.
+    made: usize,
+    /// These are behind an operation that may not be done.
+    behind: Vec<Decided>,
+}
 
 /// Refuses a world that is not the run's. Changes nothing.
 pub(crate) async fn check_world(place: &Place, ledger: &Ledger) -> anyhow::Result<()> {
@@ -119,8 +131,13 @@ impl Performer {
         mut ledger: Ledger,
         mirror: &World,
     ) -> anyhow::Result<Vec<Event>> {
-        let (_, revision, facts) = self.commit_again(program, &ledger).await?;
-        let facts = outside::differences(&World::from_facts(facts, revision), mirror);
+        let (missing, revision, facts) = self.commit_again(program, &ledger).await?;
+        let mut root = World::from_facts(facts, revision);
+        for decided in &missing.behind {
+            // What cannot be made of what others have left there is refused when it is its turn.
+            let _ = root.apply(&decided.changes);
+        }
+        let facts = outside::differences(&root, mirror);
         let changed = (!facts.is_empty()).then_some(Event::WorldChanged { revision, facts });
         self.stop_again(&ledger);
         // Before all that takes a while: whoever performs them waits for their run no longer than its grace.
@@ -132,12 +149,15 @@ impl Performer {
         let mut recorded = None;
         if self.is_own {
             self.sweep(&ledger, withdrawn).await?;
-            self.operate_again(&ledger)?;
         } else {
             self.make_anew(&ledger).await?;
             let operation = ledger.operations;
             self.confirm(Confirmed { operation, ..self.confirmed() });
             recorded = Some(Event::Recorded { operation, session: self.number });
+        }
+        self.go_on_recording(&ledger, missing)?;
+        if ledger.failed.is_some() {
+            self.record(Record::Failed("an operation had failed before task control came back".to_owned()))?;
         }
         for (instance, asked) in ledger.projecting {
             let named = asked.named.map(|id| Named { id, made: self.making.begin(id), again: true });
@@ -151,48 +171,59 @@ impl Performer {
         Ok(recorded.into_iter().chain(changed).collect())
     }
 
-    /// Does what a run that has ended had decided and may not have done: its commits; and its operations, where its session still lives. What it
-    /// had created is gone with that otherwise. So many of each.
+    /// Does what a run that has ended had decided and may not have done: its commits, and its operations. Where its session has ended these are what
+    /// takes away: what it had created is gone with that. So many of each.
     ///
     /// # Errors
     /// Where the commits cannot be made.
     pub(crate) async fn finish(&mut self, program: &Program, mut ledger: Ledger) -> anyhow::Result<(usize, usize)> {
-        let (commits, ..) = self.commit_again(program, &ledger).await?;
+        let (missing, ..) = self.commit_again(program, &ledger).await?;
+        let commits = missing.made + missing.behind.len();
         if !self.is_own {
-            return Ok((commits, 0));
+            let removed = self.remove_again(&ledger, &ledger.created()).await?;
+            // Nothing of it is open any more, for whoever comes next.
+            self.recorded.lock().unwrap_or_else(PoisonError::into_inner).operation = ledger.operations;
+            self.go_on_recording(&ledger, missing)?;
+            return Ok((commits, removed));
         }
         self.stop_again(&ledger);
         let withdrawn = self.withdraw_again(std::mem::take(&mut ledger.withdrawn));
         self.sweep(&ledger, withdrawn).await?;
-        Ok((commits, self.operate_again(&ledger)?))
+        Ok((commits, self.go_on_recording(&ledger, missing)?))
     }
 
-    /// Makes every commit that the world pool does not have. How many these were, and the root with all of them.
+    /// Makes every commit that the world pool does not have, up to the first one behind an operation that may not be done. What these were, and
+    /// the root with them.
     async fn commit_again(
         &mut self,
         program: &Program,
         ledger: &Ledger,
-    ) -> anyhow::Result<(usize, Revision, Vec<(FactKey, Value)>)> {
+    ) -> anyhow::Result<(Missing, Revision, Vec<(FactKey, Value)>)> {
         (self.acquires, self.operations, self.resumptions) = (ledger.acquires, ledger.operations, ledger.resumptions);
         let (mut root, _) = retry_unanswered(|| self.world.root()).await?;
         let there = self.commits_there(ledger, root).await?;
         if !self.is_own {
             self.refuse_what_came_between(program, ledger, there, root).await?;
         }
-        for decided in &ledger.commits[there..] {
+        let first = ledger.open_operations().next().map_or(u64::MAX, |(number, ..)| *number);
+        let (missing, mut made) = (&ledger.commits[there..], 0);
+        for decided in missing.iter().take_while(|decided| decided.behind < first) {
             let commit = decided.clone().commit(&self.run);
             match commit_next(&self.world, &self.trust, root, commit).await {
                 Ok(revision) => root = revision,
                 Err(undone) => bail!("the world pool does not take what the run had decided: {undone}"),
             }
+            made += 1;
         }
         let (revision, facts) = self.root().await?;
-        let commit = ledger.commits.last().map(|decided| decided.revision).unwrap_or_default();
+        let commit = ledger.commits[..there + made].last().map(|decided| decided.revision).unwrap_or_default();
         // All of it is in the root that was read.
-        self.decided = commit;
         self.told.committed(commit);
-        self.confirm(Confirmed { commit, operation: if self.is_own { ledger.recorded } else { 0 } });
-        Ok((ledger.commits.len() - there, revision, facts))
+        // Whoever gets what is given back waits for the rest.
+        self.decided = ledger.commits.last().map(|decided| decided.revision).unwrap_or_default();
+        let operation = if self.is_own { ledger.recorded } else { 0 };
+        self.confirm(Confirmed { commit, operation, failed: None });
+        Ok((Missing { made, behind: missing[made..].to_vec() }, revision, facts))
     }
 
     /// Tells goals to stop that may not have heard of it.
@@ -202,17 +233,23 @@ impl Performer {
         }
     }
 
-    /// Does the operations that may not be done, in order, under their ids; how many.
-    fn operate_again(&mut self, ledger: &Ledger) -> anyhow::Result<usize> {
-        let open: Vec<_> = ledger.open_operations().collect();
-        for (number, instance, operations) in &open {
-            self.operate(*instance, *number, operations.clone(), None)?;
+    /// Does the operations that may not be done, under their ids, where the session is the run's; and the commits behind them, all in the order in
+    /// which they were decided. How many operations.
+    fn go_on_recording(&mut self, ledger: &Ledger, missing: Missing) -> anyhow::Result<usize> {
+        let open: Vec<_> = if self.is_own { ledger.open_operations().cloned().collect() } else { Vec::new() };
+        let (operations, mut behind) = (open.len(), missing.behind.into_iter().peekable());
+        for (number, instance, operations) in open {
+            while let Some(decided) = behind.next_if(|decided| decided.behind < number) {
+                self.commit(decided, None)?;
+            }
+            self.operate(instance, number, operations, None)?;
         }
-        Ok(open.len())
+        behind.try_for_each(|decided| self.commit(decided, None))?;
+        Ok(operations)
     }
 
     /// The run had lost what it held: where others have changed since what it has yet to commit, or what that is made of, it is not true any more.
-    /// What it had heard of when it decided that is in it.
+    /// What it had heard of when it began what led to that is in it.
     async fn refuse_what_came_between(
         &self,
         program: &Program,
@@ -332,20 +369,7 @@ impl Performer {
     /// it used up: that is repeated only where it may not be done.
     async fn make_anew(&self, ledger: &Ledger) -> anyhow::Result<()> {
         let created = ledger.created();
-        for (number, instance, index, removal) in ledger.open_removals() {
-            if removal.operation == ResourceOperation::Consume && self.came_back(removal, &created).await? {
-                continue;
-            }
-            let request = operation_request(&self.run, instance, number, index);
-            match operate_once(&self.resources, &self.trust, &request, removal).await {
-                Ok(()) => {}
-                // It was done, and that is forgotten.
-                Err(Undone::Failed(error)) if !error.is_crash() => {
-                    tracing::warn!("`{removal}` was not repeated: {}", said(&error));
-                }
-                Err(undone) => bail!("`{removal}` may not be done and cannot be repeated: {undone}"),
-            }
-        }
+        self.remove_again(ledger, &created).await?;
         let mut again: Vec<&Requirement> = created.iter().collect();
         for consumption in ledger.used_up() {
             if self.came_back(consumption, &created).await? {
@@ -359,6 +383,32 @@ impl Performer {
             }
         }
         Ok(())
+    }
+
+    /// Does what takes away from others and may not be done; how much of that.
+    async fn remove_again(&self, ledger: &Ledger, created: &[Requirement]) -> anyhow::Result<usize> {
+        let mut removed = 0;
+        for (number, instance, index, removal) in ledger.open_removals() {
+            if removal.operation == ResourceOperation::Consume && self.came_back(removal, created).await? {
+                continue;
+            }
+            let request = operation_request(&self.run, instance, number, index);
+            match operate_once(&self.resources, &self.trust, &request, removal).await {
+                Ok(()) => removed += 1,
+                Err(Undone::Failed(error)) if error.reason() == NOT_ENOUGH && !self.is_there(removal).await? => {
+                    tracing::warn!("`{removal}` was not repeated, as it was done before: {}", said(&error));
+                }
+                Err(undone) => bail!("`{removal}` may not be done and cannot be repeated: {undone}"),
+            }
+        }
+        Ok(removed)
+    }
+
+    /// Whether there is anything of what is to be taken away, whoever holds it.
+    async fn is_there(&self, removal: &Requirement) -> anyhow::Result<bool> {
+        let kinds = [removal.kind.as_str()];
+        let there = retry_unanswered(|| self.resources.list(&kinds)).await?;
+        Ok(there.iter().any(|one| removal.accepts(|name| one.attributes.get(name).map(Cow::Borrowed))))
     }
 
     /// Whether what was used up came back with the end of the session: what is renewable did, and what the run creates itself is made anew.

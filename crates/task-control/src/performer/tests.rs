@@ -74,6 +74,11 @@ impl Performer {
     fn perform(&mut self, command: Command) -> anyhow::Result<()> {
         self.perform_when(None, command)
     }
+
+    /// Ends, where nobody asks what is done.
+    async fn closed(self) -> anyhow::Result<()> {
+        self.close().await.1
+    }
 }
 
 /// A performer with a resource manager, a world pool and one arm.
@@ -194,7 +199,7 @@ async fn an_acquire_of_the_event_that_gave_a_lease_back_can_be_withdrawn() -> an
     bench.performer.perform(Command::Withdraw { instance })?;
     bench.ask(other)?;
     bench.granted(other).await?;
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -218,7 +223,7 @@ async fn the_next_node_takes_a_lease_over_until_others_get_their_turn() -> anyho
     assert_eq!(bench.performer.accept(handed.context("no answer")?, &World::default()), None);
     bench.ask(first)?;
     bench.granted(first).await?;
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -252,7 +257,7 @@ async fn one_that_waits_takes_the_lease_over_and_leaves_the_queue() -> anyhow::R
     bench.performer.perform(Command::Release { instance: fourth, lease: Some(last), projection: None })?;
     bench.ask(first)?;
     bench.granted(first).await?;
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -275,7 +280,7 @@ async fn one_that_asks_again_in_the_step_that_gives_it_a_lease_has_it_once() -> 
     assert!(more.is_err(), "{more:?}");
     let held = bench.performer.resources.list(&["Arm"]).await?;
     assert_eq!(held.iter().flat_map(|arm| &arm.holdings).map(|one| one.lease).collect::<Vec<_>>(), [lease]);
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -293,8 +298,8 @@ async fn a_run_hears_of_who_waits_beside_it_for_what_it_holds_and_needs_that_for
     other.perform(Command::Withdraw { instance: waiter })?;
     other.perform(Command::Acquire { instance: waiter, requirements: arm(), priority: CERTAIN })?;
     assert_eq!(bench.event().await, Some(Event::WantedByOthers { holders: vec![holder] }));
-    other.close().await?;
-    bench.performer.close().await
+    other.closed().await?;
+    bench.performer.closed().await
 }
 
 /// A bench whose resource manager can be away: it is at a place of its own.
@@ -309,7 +314,7 @@ async fn with_manager_at(directory: &RuntimeDirectory) -> anyhow::Result<(Bench,
     offering.create(Resource::new("arm", ResourceClass::Module, "Arm")).await?;
     let (events, answers) = mpsc::channel(8);
     let performer = connect(&bench.endpoints, "task", events).await?;
-    std::mem::replace(&mut bench.performer, performer).close().await?;
+    std::mem::replace(&mut bench.performer, performer).closed().await?;
     bench.answers = answers;
     Ok((bench, robot))
 }
@@ -333,7 +338,7 @@ async fn a_lease_that_goes_back_while_the_manager_is_away_for_long_is_back_when_
     let next =
         tokio::time::timeout(Duration::from_secs(8), bench.granted(second)).await.context("it waits for itself")??;
     assert_ne!(next, lease);
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -355,7 +360,7 @@ async fn an_operation_at_the_end_of_a_run_waits_for_a_manager_that_is_away_and_f
         let (again, _ended) = manager_at(&directory);
         again
     };
-    let (closed, _again) = tokio::join!(bench.performer.close(), back);
+    let (closed, _again) = tokio::join!(bench.performer.closed(), back);
     closed
 }
 
@@ -372,7 +377,7 @@ async fn behind_an_operation_that_was_refused_nothing_is_committed() -> anyhow::
         revision: Revision(1),
     };
     bench.performer.perform(commit)?;
-    let refused = bench.performer.close().await.map_err(|error| error.to_string());
+    let refused = bench.performer.closed().await.map_err(|error| error.to_string());
     assert!(refused.is_err_and(|reason| reason.contains("Nothing")));
     let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
     assert_eq!(world.root().await?.0, Revision(0));
@@ -393,7 +398,7 @@ async fn a_commit_that_is_not_answered_is_not_made_when_the_session_is_gone() ->
     bench.endpoints.world_pool = directory.wait_for(world_pool::ROLE, SESSION_DEADLINE).await?;
     let (events, answers) = mpsc::channel(8);
     let performer = connect(&bench.endpoints, "task", events).await?;
-    std::mem::replace(&mut bench.performer, performer).close().await?;
+    std::mem::replace(&mut bench.performer, performer).closed().await?;
     bench.answers = answers;
     bench.performer.root().await?;
     // It is sent while the session lives, and the pool is away.
@@ -420,13 +425,22 @@ async fn a_commit_that_is_not_answered_is_not_made_when_the_session_is_gone() ->
     let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
     let changes = vec![Change::Set { fact, value: Value::Bool(false) }];
     retry_unanswered(|| world.commit("other/i1/1", changes.clone(), None)).await?;
-    let event = tokio::time::timeout(SESSION_DEADLINE, bench.event()).await?;
+    // Of what the others did it may hear before, with what it has decided itself on top.
+    let failed = async {
+        loop {
+            match bench.event().await {
+                Some(Event::WorldChanged { .. }) => {}
+                event => return event,
+            }
+        }
+    };
+    let event = tokio::time::timeout(SESSION_DEADLINE, failed).await?;
     let Some(Event::RetirementFailed { reason, .. }) = event else { bail!("it was to fail: {event:?}") };
     assert!(reason.contains("the run's session was lost"), "{reason}");
     let (revision, facts) = retry_unanswered(|| world.root()).await?;
     assert_eq!((revision, facts.len()), (Revision(1), 1));
     assert_eq!(facts[0].value, Value::Bool(false), "what the others know of stands");
-    bench.performer.close().await.expect_err("that is not recorded");
+    bench.performer.closed().await.expect_err("that is not recorded");
     Ok(())
 }
 
@@ -454,7 +468,7 @@ async fn an_acquire_that_a_bound_refuses_is_asked_for_again_until_there_is_room(
     let lease = bench.granted(second).await?;
     bench.performer.perform(Command::Release { instance: second, lease: Some(lease), projection: None })?;
     bench.granted(third).await?;
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -497,7 +511,7 @@ async fn a_grant_that_crosses_its_withdrawal_is_back_before_what_it_held_is_dele
     let quiet = tokio::time::timeout(Duration::from_millis(300), bench.event()).await;
     assert!(quiet.is_err(), "{quiet:?}");
     assert_eq!(bench.units("Token").await?, 0);
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -533,7 +547,7 @@ async fn who_comes_back_leaves_word_with_what_the_run_was_about_to_give_back() -
     let (_, notes) = next.acquire_with_notes(arm(), AcquireOptions::default()).await?;
     let notes: Vec<(&str, &str)> = notes.iter().map(|note| (note.session_id.as_str(), note.note.as_str())).collect();
     assert_eq!(notes, [(run.as_str(), "1 0")]);
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 /// A resource manager that a token ends, at the same place as the one before it.
@@ -575,8 +589,8 @@ async fn who_waits_beside_others_while_the_manager_is_started_again_is_served_an
     let answer = answers.recv().await.context("no answer")?;
     let Answer::Event { event, .. } = answer else { bail!("{answer:?}") };
     assert!(matches!(*event, Event::Granted { .. }), "{event:?}");
-    first.close().await?;
-    second.close().await
+    first.closed().await?;
+    second.closed().await
 }
 
 #[tokio::test]
@@ -590,12 +604,12 @@ async fn a_run_goes_beside_others_and_one_that_goes_alone_does_not() -> anyhow::
         .err()
         .context("it went")?;
     assert!(refused.to_string().contains("another run is under way on this system (`"), "{refused}");
-    second.close().await?;
-    bench.performer.close().await?;
+    second.closed().await?;
+    bench.performer.closed().await?;
     let third = Performer::connect(&alone, "run-3", "third", None, TraceContext::fresh(), events()).await?;
     let fourth = connect(&bench.endpoints, "fourth", events()).await.err().context("it went")?;
     assert!(fourth.to_string().starts_with("`third` is under way on this system and goes alone"), "{fourth}");
-    third.close().await
+    third.closed().await
 }
 
 /// The next grant, and what was told of the world last before it.
@@ -646,11 +660,11 @@ async fn who_gets_what_another_run_had_has_been_told_what_that_had_committed() -
     third.root().await?;
     third.perform(Command::Acquire { instance: InstanceId(1), requirements: arm(), priority: 0 })?;
     granted_after(&mut third, &mut answers).await?;
-    third.close().await?;
+    third.closed().await?;
     // Nobody waited in vain.
     assert!(began.elapsed() < Duration::from_secs(2), "{:?}", began.elapsed());
-    second.close().await?;
-    bench.performer.close().await
+    second.closed().await?;
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -680,7 +694,7 @@ async fn what_is_asked_for_behind_a_deletion_does_not_get_what_is_deleted() -> a
     // The disk is gone: that is heard first.
     let failed = bench.event().await;
     assert!(matches!(&failed, Some(Event::RetirementFailed { .. })), "{failed:?}");
-    bench.performer.close().await.expect_err("what was deleted is there");
+    bench.performer.closed().await.expect_err("what was deleted is there");
     Ok(())
 }
 
@@ -704,7 +718,7 @@ async fn a_lease_is_back_before_what_it_held_is_used_up() -> anyhow::Result<()> 
     bench.performer.perform(Command::Acquire { instance: first, requirements: exists, priority: 0 })?;
     let early = tokio::time::timeout(Duration::from_millis(300), bench.event()).await;
     assert!(early.is_err(), "{early:?}");
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -740,7 +754,7 @@ async fn who_comes_back_tells_a_goal_to_stop_that_may_not_have_been_told() -> an
     let event = bench.event().await;
     assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == SUCCESS), "{event:?}");
     assert_eq!(arm.running(), 0);
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -778,9 +792,9 @@ async fn what_was_left_is_told_to_the_next_holder_when_the_last_one_gave_up_befo
         revision: Revision(12),
     })?;
     granted_after(&mut third, &mut answers).await?;
-    third.close().await?;
-    second.close().await?;
-    bench.performer.close().await
+    third.closed().await?;
+    second.closed().await?;
+    bench.performer.closed().await
 }
 
 #[test]
@@ -856,7 +870,7 @@ async fn a_run_whose_effects_are_not_all_recorded_does_not_end_well() -> anyhow:
         changes,
         revision: Revision(99),
     })?;
-    let ended = bench.performer.close().await;
+    let ended = bench.performer.closed().await;
     assert!(ended.is_err_and(|error| error.to_string().contains("not all recorded")));
     Ok(())
 }
@@ -884,7 +898,7 @@ async fn a_projection_that_crosses_its_cancel_goes_back() -> anyhow::Result<()> 
     assert!(bench.performer.cancelled.lock().is_ok_and(|cancelled| cancelled.is_empty()));
     bench.performer.perform(project(2))?;
     assert!(matches!(bench.event().await, Some(Event::Projected { attempt: 2, .. })));
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 /// A projection of everything, at no lease.
@@ -928,7 +942,7 @@ async fn a_projection_is_named_before_it_is_there_and_shows_the_commit_on_its_wa
     bench.performer.perform(projection(instance, 3, true))?;
     assert!(bench.answers.try_recv().is_err());
     assert!(matches!(bench.event().await, Some(Event::Projected { attempt: 3, .. })));
-    bench.performer.close().await?;
+    bench.performer.closed().await?;
     let gone = world.query(Some(named), &[]).await;
     assert_eq!(gone.map_err(|error| error.reason().to_owned()).err().as_deref(), Some("PROJECTION_UNKNOWN"));
     Ok(())
@@ -950,7 +964,7 @@ async fn a_projection_that_was_named_and_not_asked_for_before_the_kill_is_asked_
     let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
     assert!(world.query(Some(named), &[]).await?.is_empty());
     bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
-    bench.performer.close().await?;
+    bench.performer.closed().await?;
     let gone = world.query(Some(named), &[]).await;
     assert_eq!(gone.map_err(|error| error.reason().to_owned()).err().as_deref(), Some("PROJECTION_UNKNOWN"));
     Ok(())
@@ -975,7 +989,7 @@ async fn of_a_named_projection_that_cannot_be_made_is_heard_afterwards() -> anyh
     assert_eq!(refused.map_err(|error| error.reason().to_owned()).err().as_deref(), Some("PROJECTION_UNKNOWN"));
     // What is given back is not waited for in vain.
     bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -990,7 +1004,7 @@ async fn a_grant_that_crosses_its_withdrawal_goes_back() -> anyhow::Result<()> {
     // Nobody holds the arm: the same instance gets it when it asks again.
     bench.ask(instance)?;
     bench.granted(instance).await?;
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 fn create(kind: &str, count: u32) -> Requirement {
@@ -1042,7 +1056,7 @@ async fn who_comes_back_to_a_living_session_does_nothing_twice() -> anyhow::Resu
     // It is asked for anew, and what nobody knew to have is free for it.
     bench.granted(InstanceId(2)).await?;
     assert_eq!(bench.units("Box").await?, 2);
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 fn operate(instance: u64, operation: Requirement) -> Command {
@@ -1075,7 +1089,7 @@ async fn what_the_log_says_to_be_done_is_not_done_again_although_the_manager_has
     assert_eq!(bench.any_event().await, Some(Event::Recorded { operation: 3, session }));
     assert_eq!([bench.units("Box").await?, bench.units("Tray").await?, bench.units("Cup").await?], [2, 1, 1]);
     assert_eq!(bench.performer.confirmed().operation, 3);
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -1110,7 +1124,7 @@ async fn a_session_in_which_a_resumption_died_is_not_the_runs() -> anyhow::Resul
     assert!(bench.performer.is_own && bench.performer.number == third);
     assert_eq!(bench.performer.take_up(&program(FETCH_BOXES), ledger, &World::default()).await?, []);
     assert_eq!(bench.units("Box").await?, 2);
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -1139,7 +1153,7 @@ async fn what_was_used_up_for_good_is_not_used_up_again_with_a_new_session() -> 
     let mut bench = bench.comes_back(false).await?;
     bench.performer.take_up(&program(FETCH_BOXES), ledger(&run, &operations), &World::default()).await?;
     assert_eq!(left(&bench).await?, expected);
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -1165,7 +1179,7 @@ async fn what_a_grant_had_used_up_that_nobody_heard_of_comes_back() -> anyhow::R
     tokio::time::timeout(SESSION_DEADLINE, bench.granted(instance)).await.context("the arm is held")??;
     let glue = bench.performer.resources.list(&["Glue"]).await?;
     assert_eq!(glue.iter().map(|one| one.free.units()).collect::<Vec<_>>(), [2], "it was used up once");
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -1199,7 +1213,143 @@ async fn what_a_run_knew_when_it_decided_does_not_stand_against_it_when_it_comes
     let refused = bench.performer.take_up(&program(FETCH_BOXES), ledger, &mirror).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
     assert_eq!(bench.performer.root().await?.0, Revision(3));
-    bench.performer.close().await
+    bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn what_a_run_heard_of_during_a_motion_stands_against_its_commit_when_it_comes_back_without_what_it_held()
+-> anyhow::Result<()> {
+    let bench = Bench::new().await?;
+    let (run, instance) = (bench.performer.run.clone(), InstanceId(1));
+    let mut ledger = ledger(&run, &[start(instance, 1, "work", LeaseId(1), "")]);
+    // It is suspended during its motion, and its session ends: whoever gets the arm changes the same. It goes on, hears of that before it hears of
+    // its session, and decides.
+    let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
+    let changes = vec![Change::Set { fact: fact.clone(), value: Value::Bool(false) }];
+    bench.performer.world.commit("other/i1/1", changes, None).await?;
+    let heard = Event::WorldChanged { revision: Revision(1), facts: vec![(fact, Some(Value::Bool(false)))] };
+    ledger.event(Timestamp(0), &heard);
+    ledger.event(Timestamp(0), &finished(instance));
+    ledger.command(&commits(1, 2));
+    let mut mirror = World::default();
+    mirror.apply(&done())?;
+    let mut bench = bench.comes_back(false).await?;
+    let refused = bench.performer.take_up(&program(FETCH_BOXES), ledger.clone(), &mirror).await;
+    assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
+    let refused = bench.performer.finish(&program(FETCH_BOXES), ledger).await;
+    assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
+    assert_eq!(bench.performer.root().await?.0, Revision(1));
+    bench.performer.closed().await
+}
+
+fn commits(instance: u64, number: u64) -> Command {
+    Command::Commit {
+        instance: InstanceId(instance),
+        writer: "place[1]".into(),
+        evidence: Vec::new(),
+        changes: done(),
+        revision: Revision(number),
+    }
+}
+
+fn delete(kind: &str) -> Requirement {
+    Requirement::new(ResourceOperation::Delete, kind)
+}
+
+#[tokio::test]
+async fn who_comes_back_commits_behind_an_operation_when_that_is_done_and_never_where_it_is_refused()
+-> anyhow::Result<()> {
+    let mut mirror = World::default();
+    mirror.apply(&done())?;
+    for (operation, there) in [(create("Box", 1), 2), (delete("Nothing"), 1)] {
+        let bench = Bench::new().await?;
+        let (run, session) = (bench.performer.run.clone(), bench.performer.number);
+        let decided = [commits(1, 1), operate(1, operation), commits(2, 2)];
+        let ledger = Ledger { session, ..ledger(&run, &decided) };
+        let mut bench = bench.comes_back(true).await?;
+        // Its mirror has all of it.
+        assert_eq!(bench.performer.take_up(&program(FETCH_BOXES), ledger, &mirror).await?, []);
+        if there == 1 {
+            let failed = bench.event().await;
+            assert!(matches!(&failed, Some(Event::RetirementFailed { .. })), "{failed:?}");
+        }
+        let world = bench.performer.world.clone();
+        assert_eq!(bench.performer.closed().await.is_ok(), there == 2);
+        assert_eq!(world.root().await?.0, Revision(there));
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn behind_what_had_failed_nothing_is_made_by_who_comes_back() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let run = bench.performer.run.clone();
+    let decided = [commits(1, 1), operate(1, delete("Nothing")), commits(2, 2)];
+    for command in decided.clone() {
+        bench.performer.perform(command)?;
+    }
+    // Nobody has heard of that when the run has ended.
+    let (events, answers) = mpsc::channel(8);
+    let before =
+        std::mem::replace(&mut bench.performer, connect_as(&bench.endpoints, "next", None, "task", events).await?);
+    bench.answers.close();
+    let (said, closed) = before.close().await;
+    bench.answers = answers;
+    assert!(closed.is_err());
+    let [Event::RetirementFailed { instance: InstanceId(1), reason }] = &said[..] else { bail!("{said:?}") };
+    assert!(reason.contains("Nothing"), "{reason}");
+    let mut ledger = ledger(&run, &decided);
+    said.iter().for_each(|event| ledger.event(Timestamp(0), event));
+    let place = place_of(&bench.endpoints);
+    assert_eq!((missing_commits(&place, &ledger).await?, ledger.open_operations().count()), (Some(0), 0));
+    let (events, _answers) = mpsc::channel(8);
+    let mut late = connect_as(&bench.endpoints, &run, None, "task", events).await?;
+    assert_eq!(late.finish(&program(FETCH_BOXES), ledger).await?, (0, 0));
+    assert_eq!(late.root().await?.0, Revision(1));
+    late.closed().await?;
+    bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn what_others_hold_now_is_deleted_by_who_comes_back_when_it_is_free_also_of_a_run_that_has_ended()
+-> anyhow::Result<()> {
+    for has_ended in [false, true] {
+        let mut bench = Bench::new().await?;
+        let run = bench.performer.run.clone();
+        let channels = Channels::new(&ClientTls::none());
+        // An operator's.
+        let operator = ResourceClient::new(&channels, &bench.endpoints.resource_manager, "")?;
+        operator.create(Resource::new("part", ResourceClass::Task, "Part")).await?;
+        let ledger = ledger(&run, &[operate(1, delete("Part"))]);
+        // It is killed before it has asked for that. Its session ends, and another run gets the part.
+        let (events, _answers) = mpsc::channel(8);
+        let other = connect(&bench.endpoints, "other", events).await?;
+        let part = vec![Requirement::new(ResourceOperation::Block, "Part")];
+        let lease = other.resources.acquire(part, AcquireOptions::default()).await?;
+        let come_back = async |bench: &mut Bench| {
+            if has_ended {
+                return bench.performer.finish(&program(FETCH_BOXES), ledger.clone()).await.map(|made| made.1);
+            }
+            let told = bench.performer.take_up(&program(FETCH_BOXES), ledger.clone(), &World::default()).await?;
+            Ok(told.len())
+        };
+        bench = bench.comes_back(false).await?;
+        let refused = come_back(&mut bench).await;
+        assert!(refused.is_err_and(|error| error.to_string().contains("delete Part")));
+        assert_eq!((bench.performer.confirmed().operation, bench.units("Part").await?), (0, 1));
+        other.resources.release(lease.id).await?;
+        bench = bench.comes_back(false).await?;
+        assert_eq!((come_back(&mut bench).await?, bench.units("Part").await?), (1, 0));
+        // Of what is done the log has word.
+        assert_eq!(bench.performer.confirmed().operation, 1);
+        let session = bench.performer.number;
+        let (said, closed) = bench.performer.close().await;
+        closed?;
+        let expected = has_ended.then_some(Event::Recorded { operation: 1, session });
+        assert_eq!(said, expected.into_iter().collect::<Vec<_>>());
+        other.closed().await?;
+    }
+    Ok(())
 }
 
 #[tokio::test]
@@ -1227,14 +1377,14 @@ async fn of_a_run_that_has_ended_what_was_not_recorded_is_made_and_nothing_else(
     let mut bench = bench.comes_back(true).await?;
     assert_eq!(bench.performer.finish(&program(FETCH_BOXES), ledger.clone()).await?, (1, 1));
     while bench.units("Box").await? == 0 {}
-    bench.performer.close().await?;
+    bench.performer.closed().await?;
     assert_eq!(missing_commits(&place, &ledger).await?, Some(0));
     // Its session is over, and with it what it had created.
     let (events, _answers) = mpsc::channel(1);
     let mut late = connect_as(&bench.endpoints, &run, Some(session), "task", events).await?;
     assert_eq!(late.finish(&program(FETCH_BOXES), ledger.clone()).await?, (0, 0));
     assert!(late.resources.list(&["Box"]).await?.is_empty());
-    late.close().await?;
+    late.closed().await?;
     let other = Ledger { first_revision: Revision(9), ..ledger };
     assert_eq!(missing_commits(&place, &other).await?, None, "it is another world");
     Ok(())
@@ -1251,7 +1401,7 @@ async fn who_comes_back_too_late_makes_anew_what_went_with_the_session() -> anyh
     assert_eq!(bench.units("Box").await?, 0);
     bench.performer.take_up(&program(FETCH_BOXES), ledger(&run, &[operate]), &World::default()).await?;
     assert_eq!(bench.units("Box").await?, 2);
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -1286,7 +1436,7 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     let later = Ledger { first_revision: Revision(9), ..open };
     let refused = check_world(&place_of(&bench.endpoints), &later).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("lost its state")));
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -1317,7 +1467,7 @@ async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() ->
     assert!(remembers(&place_of(&bench.endpoints), &short).await?);
     assert_eq!(of_the_world(bench.performer.take_up(&program(FETCH_BOXES), short, &mirror).await?), []);
     assert_eq!(bench.performer.root().await?.0, Revision(2));
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 /// `hang` ends when it is told to stop, `brake` a while after that; `work` at once.
@@ -1406,8 +1556,8 @@ async fn a_lease_goes_back_when_every_goal_under_it_has_ended() -> anyhow::Resul
     }
     granted_after(&mut second, &mut answers).await?;
     assert_eq!(arm.running(), 0, "whoever gets the arm finds it idle");
-    second.close().await?;
-    bench.performer.close().await
+    second.closed().await?;
+    bench.performer.closed().await
 }
 
 #[tokio::test]
@@ -1436,7 +1586,7 @@ async fn a_goal_waits_for_one_of_the_same_resource_that_was_told_to_stop() -> an
         let event = bench.event().await;
         assert!(matches!(&event, Some(Event::Finished { outcome, .. }) if outcome == SUCCESS), "{event:?}");
     }
-    bench.performer.close().await
+    bench.performer.closed().await
 }
 
 #[tokio::test]

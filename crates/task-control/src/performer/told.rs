@@ -350,6 +350,7 @@ mod tests {
             evidence: Vec::new(),
             revision: Revision(12),
             knows: Revision(0),
+            behind: 0,
         };
         assert_eq!(maker(&decided.id("run-1")), Some(("run-1".to_owned(), Revision(12))));
         assert_eq!(maker("by hand"), None);

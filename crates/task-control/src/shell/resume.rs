@@ -86,7 +86,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         resumption = resumption.whole()?;
     }
     if let Some(ended) = resumption.replayed.ended.take() {
-        return finish(resumption, ended, place).await;
+        return Box::pin(finish(resumption, ended, place)).await;
     }
     let Resumption { program, history, replayed, log, checkpoint_every } = resumption;
     let Replayed { executive, standing, missing, events: replayed, .. } = replayed;
@@ -150,15 +150,16 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         }
         Ok(ended)
     };
-    shell.run_to_its_end(begin, interrupt).await
+    Box::pin(shell.run_to_its_end(begin, interrupt)).await
 }
 
 /// Does what a run had decided that was killed behind its end.
 async fn finish(resumption: Resumption, ended: Ended, place: &Place) -> anyhow::Result<Ended> {
-    let Resumption { program, history, replayed, log, .. } = resumption;
+    let Resumption { program, history, replayed, mut log, .. } = resumption;
     let ledger = replayed.standing.ledger;
     let nothing = || ReplayError::Ended { outcome: ended.outcome.clone() };
-    let say = |what: String| history.messages().say(format_args!("{}: {what}", log.path().display()));
+    let path = log.path().to_owned();
+    let say = |what: String| history.messages().say(format_args!("{}: {what}", path.display()));
     let Some(missing) = performer::missing_commits(place, &ledger).await? else {
         say("whether all that the run did is in the world is not known: the world pool does not go back so far"
             .to_owned());
@@ -173,8 +174,10 @@ async fn finish(resumption: Resumption, ended: Ended, place: &Place) -> anyhow::
     let events = mpsc::channel(1).0;
     let performer = Performer::connect(place, &origin.run, &program.name, Some(ledger.session), trace, events).await;
     let mut performer = performer.context("cannot do what the run had decided")?;
+    let at = ledger.last;
     let finished = performer.finish(&program, ledger).await;
-    let closed = performer.close().await;
+    let (done, closed) = performer.close().await;
+    done.iter().try_for_each(|event| log.append(at, event, &[]))?;
     let (commits, operations) = finished?;
     closed?;
     if (commits, operations) == (0, 0) {

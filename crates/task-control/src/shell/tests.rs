@@ -281,23 +281,23 @@ states:
     let (place, (_asks, interrupt)) = (&bench.place, Interrupt::new());
     let outcome = run(bench.run.clone(), place, &interrupt).await?.outcome;
     assert_eq!(outcome, SUCCESS);
-    let nothing = resume(resumption_of(&bench.run).await?, place, &interrupt).await;
+    let nothing = Box::pin(resume(resumption_of(&bench.run).await?, place, &interrupt)).await;
     let ended = || replay::ReplayError::Ended { outcome: outcome.clone() };
     assert_eq!(nothing.err().and_then(|error| error.downcast().ok()), Some(ended()));
     // A world pool to which its last commit has not come.
-    let runtime = RuntimeDirectory::create(&bench.directory.path().join("other"))?;
+    let runtime = RuntimeDirectory::create(bench.directory.path().join("other"))?;
     let shutdown = CancellationToken::new();
     tokio::spawn(world_pool::run(WorldPoolConfig::default(), runtime.clone(), shutdown.clone()));
     let _shutdown = shutdown.drop_guard();
     let world_pool = runtime.wait_for(world_pool::ROLE, READY).await?;
     let place = &Place { endpoints: Endpoints { world_pool, ..place.endpoints.clone() }, ..place.clone() };
-    let finished = resume(resumption_of(&bench.run).await?, place, &interrupt).await?;
+    let finished = Box::pin(resume(resumption_of(&bench.run).await?, place, &interrupt)).await?;
     assert_eq!(finished.outcome, SUCCESS);
     let channels = ratn_worker::client::Channels::new(&place.tls);
     let world = ratn_worker::client::WorldClient::new(&channels, &place.endpoints.world_pool)?;
     let (_, facts) = world.root().await?;
     assert_eq!(facts.iter().map(|fact| fact.key.to_string()).collect::<Vec<_>>(), ["noted(desk)"]);
-    let nothing = resume(resumption_of(&bench.run).await?, place, &interrupt).await;
+    let nothing = Box::pin(resume(resumption_of(&bench.run).await?, place, &interrupt)).await;
     assert_eq!(nothing.err().and_then(|error| error.downcast().ok()), Some(ended()));
     Ok(())
 }
