@@ -225,7 +225,7 @@ impl Recorder {
             };
             if let (Some(Event::RetirementFailed { reason, instance }), Ok(())) = (&event, &recorded) {
                 recorded = Err(reason.clone());
-                self.done.lock().unwrap_or_else(PoisonError::into_inner).failed = Some(*instance);
+                self.done.send_modify(|done| done.failed = Some(*instance));
             }
             // Nothing behind a failure counts: what is confirmed is confirmed without a gap.
             if recorded.is_ok() {

@@ -391,14 +391,9 @@ impl Performer {
         *self.recorded.borrow()
     }
 
-<<<<<<< HEAD
-    fn confirm(&self, confirmed: Confirmed) {
-        self.recorded.send_replace(confirmed);
-=======
     fn confirm(&mut self, confirmed: Confirmed) {
-        *self.recorded.lock().unwrap_or_else(PoisonError::into_inner) = confirmed;
+        self.recorded.send_replace(confirmed);
         self.heard = confirmed;
->>>>>>> m-resume2
     }
 
     /// Resolves when the session with the resource manager, and with it every lease, is gone. A manager that is not heard is waited for,
@@ -505,7 +500,7 @@ impl Performer {
     pub(super) async fn close(self) -> (Vec<Event>, anyhow::Result<()>) {
         let (heard, session, recorded) = (self.heard, self.number, Arc::clone(&self.recorded));
         let closed = self.end().await;
-        let Confirmed { operation, failed, .. } = *recorded.lock().unwrap_or_else(PoisonError::into_inner);
+        let Confirmed { operation, failed, .. } = *recorded.borrow();
         let done = (operation > heard.operation).then_some(Event::Recorded { operation, session });
         let failed = failed.filter(|_| heard.failed.is_none()).map(|instance| {
             let reason = closed.as_ref().err().map_or_else(String::new, ToString::to_string);

@@ -35,7 +35,6 @@ use ratn_world::world::World;
 use std::borrow::Cow;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::PoisonError;
 use tokio_util::sync::CancellationToken;
 
 /// So many withdrawals of before are under way at once.
@@ -182,7 +181,7 @@ impl Performer {
         if !self.is_own {
             let removed = self.remove_again(&ledger, &ledger.created()).await?;
             // Nothing of it is open any more, for whoever comes next.
-            self.recorded.lock().unwrap_or_else(PoisonError::into_inner).operation = ledger.operations;
+            self.recorded.send_modify(|recorded| recorded.operation = ledger.operations);
             self.go_on_recording(&ledger, missing)?;
             return Ok((commits, removed));
         }

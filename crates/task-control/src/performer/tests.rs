@@ -1624,5 +1624,5 @@ async fn a_goal_without_a_projection_begins_when_what_was_decided_before_it_is_i
     let event = bench.event().await;
     assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == first), "{event:?}");
     assert_eq!(world.root().await?.1.len(), 1);
-    bench.performer.close().await
+    bench.performer.closed().await
 }
