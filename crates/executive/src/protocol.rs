@@ -243,6 +243,9 @@ pub enum Event {
         attempt: u32,
         /// What is known of it.
         reason: String,
+        /// It may have been done: nobody heard how it ended while task control was gone. What moves is not tried again then.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        unknown: bool,
     },
     /// The resource manager or world pool did not do what a retirement needs.
     RetirementFailed {

@@ -438,7 +438,7 @@ impl Simulation<'_> {
                 self.lose(lease)?;
                 // In reality what is performed under it ends before anything else begins there.
                 self.busy.given_back(lease);
-                Event::Crashed { instance, attempt, reason: "its lease was lost".to_owned() }
+                Event::Crashed { instance, attempt, reason: "its lease was lost".to_owned(), unknown: false }
             }
         };
         if let Event::WorldChanged { facts, .. } = &event {
@@ -683,7 +683,9 @@ impl Simulation<'_> {
                 let evidence = Vec::new();
                 Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason }
             }
-            Answer::Crashed => Event::Crashed { instance, attempt, reason: "the worker died".to_owned() },
+            Answer::Crashed => {
+                Event::Crashed { instance, attempt, reason: "the worker died".to_owned(), unknown: false }
+            }
             Answer::LeaseLost => {
                 let lease = goal.lease.as_ref().map(|lease| lease.id);
                 match lease.filter(|lease| self.leases.get(lease) == Some(&instance)) {
@@ -694,7 +696,7 @@ impl Simulation<'_> {
                         return;
                     }
                     // Of what is inside a routine only the worker dies.
-                    None => Event::Crashed { instance, attempt, reason: "the worker died".to_owned() },
+                    None => Event::Crashed { instance, attempt, reason: "the worker died".to_owned(), unknown: false },
                 }
             }
         };

@@ -393,7 +393,11 @@ impl System<'_> {
                 if goal.lease.as_ref().is_some_and(|lease| self.runs[run].lost.contains(&lease.id)) =>
             {
                 let reason = "its lease has ended".to_owned();
-                self.at(run, Duration::ZERO, Due::Event(Box::new(Event::Crashed { instance, attempt, reason })));
+                self.at(
+                    run,
+                    Duration::ZERO,
+                    Due::Event(Box::new(Event::Crashed { instance, attempt, reason, unknown: false })),
+                );
             }
             Command::Start { instance, attempt, goal } => {
                 self.happened(run, What::Began(self.path(run, instance)));
@@ -406,7 +410,7 @@ impl System<'_> {
                         Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason }
                     }
                     Answer::Crashed | Answer::LeaseLost => {
-                        Event::Crashed { instance, attempt, reason: "the worker died".to_owned() }
+                        Event::Crashed { instance, attempt, reason: "the worker died".to_owned(), unknown: false }
                     }
                 };
                 self.at(run, Duration::from_secs_f64(duration_s.max(0.0)), Due::Event(Box::new(event)));

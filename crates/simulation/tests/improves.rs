@@ -275,7 +275,12 @@ fn a_routine_that_asks_anew_comes_before_who_only_improves() {
                 }
                 Command::Start { instance, attempt, .. } if paths[&instance] == "r/a" => {
                     has_crashed = true;
-                    events.push_back(Event::Crashed { instance, attempt, reason: "its worker died".to_owned() });
+                    events.push_back(Event::Crashed {
+                        instance,
+                        attempt,
+                        reason: "its worker died".to_owned(),
+                        unknown: false,
+                    });
                 }
                 Command::Cancel { instance, .. } => stopped.push(paths[&instance].clone()),
                 _ => {}

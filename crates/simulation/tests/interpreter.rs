@@ -249,7 +249,13 @@ impl Bench {
     }
 
     fn crash(&mut self, instance: u64, attempt: u32) {
-        self.tell(Event::Crashed { instance: InstanceId(instance), attempt, reason: "its worker died".to_owned() });
+        self.crash_of(instance, attempt, false);
+    }
+
+    /// Its worker died, or nobody knows what became of it.
+    fn crash_of(&mut self, instance: u64, attempt: u32, unknown: bool) {
+        let (instance, reason) = (InstanceId(instance), "its worker died".to_owned());
+        self.tell(Event::Crashed { instance, attempt, reason, unknown });
     }
 }
 
@@ -275,6 +281,20 @@ fn while_paused_no_pia_begins_and_what_computes_goes_on() {
     bench.tell(Event::PauseRequested);
     bench.finish(3, 1);
     assert_eq!(bench.heard(), ["acquire 3", "start 3.1 under 3", "acquire 4", "release 3"]);
+}
+
+#[test]
+fn a_motion_of_which_nobody_knows_what_became_is_not_tried_again() {
+    let text = "states: [ go: { MOVE, retry: 2 } ]";
+    for (mode, unknown) in [(Mode::Hsm, true), (Mode::Cdtn, true), (Mode::Hsm, false), (Mode::Cdtn, false)] {
+        let mut bench = Bench::new(text, mode);
+        bench.grant(1, 1);
+        bench.crash_of(1, 1, unknown);
+        let heard = bench.heard();
+        let is_tried_again = heard.iter().filter(|word| word.starts_with("acquire")).count() == 2;
+        assert_eq!(is_tried_again, !unknown, "{mode:?} {heard:?}");
+        assert_eq!(heard.contains(&"end aborted".to_owned()), unknown, "{mode:?} {heard:?}");
+    }
 }
 
 #[test]

@@ -413,7 +413,7 @@ mod tests {
         ledger.command(&Command::Start { instance, attempt: 2, goal: Box::new(goal()) });
         ledger.command(&Command::Cancel { instance, attempt: 1 });
         assert_eq!(ledger.goals.len(), 1);
-        ledger.event(Timestamp(1), &Event::Crashed { instance, attempt: 2, reason: String::new() });
+        ledger.event(Timestamp(1), &Event::Crashed { instance, attempt: 2, reason: String::new(), unknown: false });
         assert!(ledger.goals.is_empty());
         // It may go on all the same, if its projection could not be made: whoever comes back tells it to stop.
         assert_eq!(ledger.stopped.iter().map(|(_, attempt, _)| *attempt).collect::<Vec<_>>(), [2]);

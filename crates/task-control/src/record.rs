@@ -356,7 +356,12 @@ impl MakingProjection {
                 self.promises.forget();
                 self.named = named;
                 self.take_back().await;
-                Some(Event::Crashed { instance, attempt, reason: format!("no projection: {}", said(&error)) })
+                Some(Event::Crashed {
+                    instance,
+                    attempt,
+                    reason: format!("no projection: {}", said(&error)),
+                    unknown: false,
+                })
             }
         }
     }

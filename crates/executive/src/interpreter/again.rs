@@ -84,7 +84,7 @@ impl Interpreter {
 
     /// An attempt ended without an answer: a computing or sensing node is tried again, up to its limit. What is behind that limit, and any PIA, counts as
     /// one that ended `aborted`.
-    pub(super) fn crashed(&mut self, context: &mut Context<'_>, thread: u64, reason: &str) {
+    pub(super) fn crashed(&mut self, context: &mut Context<'_>, thread: u64, reason: &str, unknown: bool) {
         let Some(current) = self.current(thread) else { return };
         let (attempt, id) = (current.attempt, current.state);
         match current.phase {
@@ -99,8 +99,10 @@ impl Interpreter {
         }
         current.crashes += 1;
         let limit = context.program.state(id).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
-        if context.plan.state(id).nature == NodeNature::Irreversible || current.crashes >= limit {
-            if !self.is_tried_again(context, thread, true) {
+        let is_irreversible = context.plan.state(id).nature == NodeNature::Irreversible;
+        if is_irreversible || current.crashes >= limit {
+            // Who may have moved does not move once more.
+            if is_irreversible && unknown || !self.is_tried_again(context, thread, true) {
                 self.end_node(context, thread, format!("crashed in attempt {attempt}: {reason}"));
             }
             return;

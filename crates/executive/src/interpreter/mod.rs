@@ -367,9 +367,9 @@ impl Interpreter {
                     self.run(context, thread);
                 }
             }
-            Event::Crashed { instance, attempt, reason } => {
+            Event::Crashed { instance, attempt, reason, unknown } => {
                 if let Some(thread) = of(self, instance, Some(attempt)) {
-                    self.crashed(context, thread, &reason);
+                    self.crashed(context, thread, &reason, unknown);
                 }
             }
             Event::Finished { instance, attempt, outcome, outputs, measured, evidence, reason } => {

@@ -36,10 +36,10 @@ impl Window {
                 self.goal_ended(context, id, Ended { outcome, outputs, reason, changes, in_circles: false });
             }
             (
-                Event::Crashed { reason, .. },
+                Event::Crashed { reason, unknown, .. },
                 Some(Status::Acquiring { .. } | Status::Granted(_) | Status::Projecting(_) | Status::Running(_)),
             ) => {
-                self.crashed(context, id, &reason);
+                self.crashed(context, id, &reason, unknown);
             }
             (event, _) => self.in_routine(context, event),
         }
@@ -176,7 +176,7 @@ impl Window {
     }
 
     /// An attempt ended without an answer.
-    fn crashed(&mut self, context: &mut Context<'_>, id: InstanceId, reason: &str) {
+    fn crashed(&mut self, context: &mut Context<'_>, id: InstanceId, reason: &str, unknown: bool) {
         let Some(instance) = self.graph.get(id) else { return };
         let Some(node) = instance.node() else { return };
         let limit = context.program.state(instance.state).annotations.attempts.unwrap_or(DEFAULT_ATTEMPTS);
@@ -186,7 +186,13 @@ impl Window {
         if !is_held {
             let crashes = self.graph.count_crash(id);
             if is_pia || crashes >= limit {
-                return self.goal_ended(context, id, Ended::aborted(format!("crashed in attempt {attempt}: {reason}")));
+                let ended = Ended::aborted(format!("crashed in attempt {attempt}: {reason}"));
+                // Who may have moved does not move once more.
+                return if is_pia && unknown {
+                    self.finish(context, id, ended)
+                } else {
+                    self.goal_ended(context, id, ended)
+                };
             }
         }
         self.give_back(context, id);

@@ -205,7 +205,7 @@ impl Timeline {
                 }
                 self.improvements.given(*instance, *attempt, *cost_s);
             }
-            Event::Crashed { instance, attempt, reason } => {
+            Event::Crashed { instance, attempt, reason, .. } => {
                 self.end(*instance, *attempt, at, Ending::Crashed(reason.clone()), &BTreeMap::new());
             }
             Event::PauseRequested => _ = self.paused.get_or_insert(at),

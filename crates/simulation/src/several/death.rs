@@ -69,7 +69,12 @@ impl Gone {
             Event::Finished { instance, attempt, .. } | Event::Crashed { instance, attempt, .. }
                 if at.since(self.since) >= Duration::from_secs_f64(SESSION_S) =>
             {
-                Event::Crashed { instance, attempt, reason: "it was stopped while task control was gone".to_owned() }
+                Event::Crashed {
+                    instance,
+                    attempt,
+                    reason: "it was stopped while task control was gone".to_owned(),
+                    unknown: true,
+                }
             }
             event => event,
         }

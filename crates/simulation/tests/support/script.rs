@@ -221,7 +221,7 @@ impl Outside {
                 let paths = super::paths(run);
                 let mut holders = run.log.iter().filter_map(|line| granted(&line.entry));
                 let instance = holders.find(|instance| paths[instance] == path).unwrap();
-                Event::Crashed { instance, attempt: 1, reason: "its lease was lost".to_owned() }
+                Event::Crashed { instance, attempt: 1, reason: "its lease was lost".to_owned(), unknown: false }
             }
             other => panic!("event: pause, resume, step, break, abort, world, signal or lease_lost, not {other}"),
         }

@@ -223,7 +223,7 @@ impl Performing {
         }
         match self.actions.attach_hearing(endpoint, self.goal.clone(), |said| self.said(said)).await {
             Ok(fate) if fate.orphaned => {
-                self.crashed(format!("it was stopped while task control was gone: {}", fate.outcome.reason))
+                self.unknown(format!("it was stopped while task control was gone: {}", fate.outcome.reason))
             }
             Ok(fate) => self.finished(fate.outcome),
             Err(error) if error.is_unreadable() => self.unreadable(endpoint, &error).await,
@@ -236,7 +236,7 @@ impl Performing {
                 self.given(endpoint).await
             }
             Err(error) if error.code() == Some(tonic::Code::NotFound) => {
-                self.crashed(format!("nobody knows what became of it while task control was gone: {}", said(&error)))
+                self.unknown(format!("nobody knows what became of it while task control was gone: {}", said(&error)))
             }
             Err(error) => self.lost(endpoint, &error).await,
         }
@@ -302,6 +302,8 @@ impl Performing {
                 _ => {}
             }
         }
+        // It may be under way still, and whoever comes next has the same resource.
+        let _ = tokio::time::timeout(CANCEL_DEADLINE, self.tell_to_stop(endpoint)).await;
         self.aborted(format!("its worker answered what cannot be read: {}", said(unreadable)))
     }
 
@@ -429,7 +431,14 @@ impl Performing {
     }
 
     fn crashed(&self, reason: String) -> Event {
-        Event::Crashed { instance: self.instance, attempt: self.attempt, reason: readable(&reason) }
+        let (instance, attempt, reason) = (self.instance, self.attempt, readable(&reason));
+        Event::Crashed { instance, attempt, reason, unknown: false }
+    }
+
+    /// It may have been done.
+    fn unknown(&self, reason: String) -> Event {
+        let (instance, attempt, reason) = (self.instance, self.attempt, readable(&reason));
+        Event::Crashed { instance, attempt, reason, unknown: true }
     }
 }
 
@@ -568,7 +577,7 @@ mod tests {
         bench.performing("work", None, 0).perform(Given::Before).await;
         let event = bench.event().await;
         assert!(
-            matches!(&event, Some(Event::Crashed { reason, .. }) if reason.contains("not known here")),
+            matches!(&event, Some(Event::Crashed { reason, unknown: true, .. }) if reason.contains("not known here")),
             "{event:?}"
         );
         // It has ended since.
@@ -589,7 +598,7 @@ mod tests {
         bench.performing("hang", None, 0).perform(Given::Before).await;
         let event = bench.event().await;
         assert!(
-            matches!(&event, Some(Event::Crashed { reason, .. }) if reason.contains("nobody listened")),
+            matches!(&event, Some(Event::Crashed { reason, unknown: true, .. }) if reason.contains("nobody listened")),
             "{event:?}"
         );
         Ok(())

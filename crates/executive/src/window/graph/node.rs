@@ -124,6 +124,8 @@ impl Graph {
     pub(crate) fn forget_tries(&mut self, id: InstanceId) {
         if let Some(node) = self.node_mut(id) {
             node.tries = 1;
+            // Of what only a prediction made of it nobody else knows.
+            node.crashes = 0;
         }
     }
 
