@@ -212,6 +212,12 @@ fn a_run_that_goes_on_after_its_task_control_was_killed_goes_on_in_its_trace() -
     let run = place.start_as("run", &["run", task, "--log", log_name, "--checkpoint-every", "2"])?;
     let waits = || Ok(std::fs::read_to_string(&log).unwrap_or_default().contains("\"signal\":\"go\"").then_some(()));
     wait_for("the wait for the signal", waits).with_context(|| run.said())?;
+    // It is made beside the run, a moment later.
+    let checkpoint = || {
+        let files: Result<Vec<_>, _> = std::fs::read_dir(place.path())?.collect();
+        Ok(files?.iter().any(|file| file.file_name().to_string_lossy().ends_with(".checkpoint")).then_some(()))
+    };
+    wait_for("a checkpoint", checkpoint).with_context(|| run.said())?;
     run.process()?.kill()?;
     drop(run);
     let before: Vec<Decoded> = collector.spans().into_iter().filter(|span| span.service == "ratn").collect();
