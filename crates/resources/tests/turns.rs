@@ -159,6 +159,32 @@ fn three_runs_have_two_arms_by_their_shares() {
     }
 }
 
+/// How often each of two runs gets the one arm within an hour. Both want it all the time, for a second; whenever the second one has got it, the first one
+/// asks until so many requests wait.
+fn grants_of_an_hour(pool: &mut Pool, wanted: &Requirement, waiting: usize) -> [u64; 2] {
+    let ask = |pool: &mut Pool, now: u64, number: usize| {
+        pool.acquire(at(now), AcquireRequest::new(run(number), vec![wanted.clone()])).unwrap()
+    };
+    let mut asked = BTreeMap::from([0, 1].map(|number| (ask(pool, 0, number), number)));
+    let (mut now, mut had) = (0, [0, 0]);
+    while now < 3_600_000 {
+        let granted = pool.take_notices().into_iter().find_map(|notice| match notice {
+            Notice::Granted { waiter, lease } => Some((waiter, lease.id)),
+            _ => None,
+        });
+        let (waiter, lease) = granted.unwrap();
+        let number = asked.remove(&waiter).unwrap();
+        had[number] += 1;
+        while number == 1 && asked.len() < waiting {
+            asked.insert(ask(pool, now, 0), 0);
+        }
+        now += 1_000;
+        asked.insert(ask(pool, now, number), number);
+        pool.release(at(now), Some(&run(number)), lease).unwrap();
+    }
+    had
+}
+
 #[test]
 fn who_has_much_waiting_has_no_more_for_that() {
     let one = Wants { hold_ms: (9_000, 11_000), ..Wants::one_arm() };
@@ -179,23 +205,7 @@ fn shares_hold_for_one_of_many_that_is_wanted_and_beside_who_wants_what_does_not
         if hopeless {
             pool.acquire(at(0), AcquireRequest::new(run(2), vec![block("Arm", 2)])).unwrap();
         }
-        let (mut now, mut had) = (0, [0, 0]);
-        let ask = |pool: &mut Pool, now: u64, number: usize| {
-            pool.acquire(at(now), AcquireRequest::new(run(number), vec![left.clone()])).unwrap()
-        };
-        let mut asked = BTreeMap::from([0, 1].map(|number| (ask(&mut pool, 0, number), number)));
-        while now < 3_600_000 {
-            let granted = pool.take_notices().into_iter().find_map(|notice| match notice {
-                Notice::Granted { waiter, lease } => Some((waiter, lease.id)),
-                _ => None,
-            });
-            let (waiter, lease) = granted.unwrap();
-            let number = asked.remove(&waiter).unwrap();
-            had[number] += 1;
-            now += 1_000;
-            asked.insert(ask(&mut pool, now, number), number);
-            pool.release(at(now), Some(&run(number)), lease).unwrap();
-        }
+        let had = grants_of_an_hour(&mut pool, &left, 1);
         about(&[100 * had[0] / (had[0] + had[1])], &[20], 5);
     }
 }
@@ -260,26 +270,7 @@ fn what_waits_for_long_lets_its_session_pass_nobody_who_comes_next() {
     // The first one has a request that is not served, and fills up whenever the other one does not wait.
     let mut pool = pool(&shares(&[1.0, 1.0]), [1, 0]);
     pool.acquire(at(0), AcquireRequest::new(run(0), vec![block("Arm", 2)])).unwrap();
-    let ask = |pool: &mut Pool, now: u64, number: usize| {
-        pool.acquire(at(now), AcquireRequest::new(run(number), vec![block("Arm", 1)])).unwrap()
-    };
-    let mut asked = BTreeMap::from([0, 1].map(|number| (ask(&mut pool, 0, number), number)));
-    let (mut now, mut had) = (0, [0, 0]);
-    while now < 3_600_000 {
-        let granted = pool.take_notices().into_iter().find_map(|notice| match notice {
-            Notice::Granted { waiter, lease } => Some((waiter, lease.id)),
-            _ => None,
-        });
-        let (waiter, lease) = granted.unwrap();
-        let number = asked.remove(&waiter).unwrap();
-        had[number] += 1;
-        while number == 1 && asked.len() < 6 {
-            asked.insert(ask(&mut pool, now, 0), 0);
-        }
-        now += 1_000;
-        asked.insert(ask(&mut pool, now, number), number);
-        pool.release(at(now), Some(&run(number)), lease).unwrap();
-    }
+    let had = grants_of_an_hour(&mut pool, &block("Arm", 1), 6);
     about(&[100 * had[0] / (had[0] + had[1])], &[50], 5);
 }
 

@@ -4,7 +4,8 @@ use ratn_cell::config::Setting;
 use ratn_worker::session::Standing;
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
-use time::{Date, Month};
+use time::OffsetDateTime;
+use time::format_description::well_known::Rfc3339;
 
 const SLOWEST: f64 = 0.01;
 const FASTEST: f64 = 1000.0;
@@ -99,37 +100,7 @@ pub(super) fn due(text: &str) -> Result<Due, String> {
 
 /// An instant in the form of RFC 3339.
 fn instant(text: &str) -> Option<SystemTime> {
-    let (date, rest) = text.split_once(['T', 't', ' '])?;
-    let (time, offset_s) = match rest.strip_suffix(['Z', 'z']) {
-        Some(time) => (time, 0),
-        None => {
-            let (time, offset) = rest.split_at(rest.rfind(['+', '-'])?);
-            let [hours, minutes] = numbers(&offset[1..], ':', [2, 2])?;
-            let offset = (hours < 24 && minutes < 60).then_some(i64::from(hours * 3_600 + minutes * 60))?;
-            (time, if offset.is_positive() && rest.contains('+') { offset } else { -offset })
-        }
-    };
-    let [year, month, day] = numbers(date, '-', [4, 2, 2])?;
-    let (whole, parts) = time.split_once('.').unwrap_or((time, "0"));
-    let [hour, minute, second] = numbers(whole, ':', [2, 2, 2])?;
-    let parts =
-        parts.bytes().all(|digit| digit.is_ascii_digit()).then(|| format!("0.{parts}").parse::<f64>().ok())??;
-    let small = |number: u32| u8::try_from(number).ok();
-    let month = Month::try_from(small(month)?).ok()?;
-    let date = Date::from_calendar_date(i32::try_from(year).ok()?, month, small(day)?).ok()?;
-    let at = date.with_hms(small(hour)?, small(minute)?, small(second)?).ok()?.assume_utc().unix_timestamp() - offset_s;
-    SystemTime::UNIX_EPOCH.checked_add(Duration::from_secs(u64::try_from(at).ok()?) + Duration::from_secs_f64(parts))
-}
-
-/// Numbers of so many digits with a separator between them.
-fn numbers<const N: usize>(text: &str, separator: char, digits: [usize; N]) -> Option<[u32; N]> {
-    let words: [&str; N] = text.split(separator).collect::<Vec<_>>().try_into().ok()?;
-    let number = |(word, digits): (&str, usize)| {
-        let is_number = word.len() == digits && word.bytes().all(|digit| digit.is_ascii_digit());
-        is_number.then(|| word.parse().ok()).flatten()
-    };
-    let numbers: Option<Vec<u32>> = words.into_iter().zip(digits).map(number).collect();
-    numbers?.try_into().ok()
+    OffsetDateTime::parse(text, &Rfc3339).ok().map(SystemTime::from)
 }
 
 pub(super) fn chart(text: &str) -> Result<PathBuf, String> {
