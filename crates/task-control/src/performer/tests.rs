@@ -10,7 +10,7 @@ use ratn_daemon::world_pool::{self, WorldPoolConfig};
 use ratn_executive::protocol::Origin;
 use ratn_model::catalogue::Provider;
 use ratn_model::fact::{Change, Footprint};
-use ratn_model::id::FencingToken;
+use ratn_model::id::{FencingToken, ProjectionId};
 use ratn_model::program::SUCCESS;
 use ratn_model::resource::{Lease, ResourceClass};
 use ratn_model::time::Timestamp;
