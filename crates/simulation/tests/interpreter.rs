@@ -460,7 +460,7 @@ fn a_region_that_goes_on_and_on_lets_the_worker_of_another_one_be_replaced_and_n
         - fork:
             concurrency: barrier
             regions:
-              - left: { action: brain/judge, computes: true, reads: [], resources: [{ block: Brain }, { consume: Charge, count: 0.4 }] }
+              - left: { action: brain/judge, pia: true, resources: [{ block: Brain }, { consume: Charge, count: 0.4 }], retry: 1 }
               - right: { states: [ one: { MOVE }, two: { MOVE }, three: { MOVE } ] }";
     let mut bench = Bench::new(text, Mode::Cdtn);
     bench.grant(1, 1);
@@ -513,10 +513,25 @@ fn a_routine_that_waits_keeps_no_room_that_only_the_reads_of_its_states_ask_for(
 
 #[test]
 fn a_state_that_fails_without_a_reason_is_named_in_both_modes() {
-    let text = task("states: [ look: { THINK } ]");
-    let reasons =
-        both(load(&text, "task.yaml", &NoFiles), |_| ("aborted", Value::Null)).map(|run| (run.outcome, run.reason));
-    assert_eq!(reasons, [(); 2].map(|()| ("aborted".to_owned(), "look".to_owned())));
+    for mode in MODES {
+        let mut bench = Bench::new("states: [ look: { THINK } ]", mode);
+        let instance = bench.asks();
+        bench.grant(instance, 1);
+        bench.tell(Event::Finished {
+            instance: InstanceId(instance),
+            attempt: 1,
+            outcome: "aborted".to_owned(),
+            outputs: BTreeMap::new(),
+            measured: Vec::new(),
+            evidence: Vec::new(),
+            reason: String::new(),
+        });
+        let reason = bench.commands.into_iter().find_map(|command| match command {
+            Command::End { reason, .. } => Some(reason),
+            _ => None,
+        });
+        assert_eq!(reason.as_deref(), Some("look"), "{mode:?}");
+    }
 }
 
 #[test]
