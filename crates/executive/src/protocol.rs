@@ -34,7 +34,7 @@ pub struct Learned {
 }
 
 /// Which run this is, so that task control can go on with it after it was killed.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Origin {
     /// Its id: the first part of every idempotent id, and the id of its session with the resource manager. Empty where nobody
     /// can resume it.
@@ -62,6 +62,9 @@ pub struct Origin {
     /// Paths (without visits) of PIAs beside which younger ones may run: their exceptions are imprecise.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub imprecise: Vec<String>,
+    /// Its share of what several runs need, where that is not the usual one, 1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub share: Option<f64>,
     /// What its actions are, so that a log can be read without the task. Nothing in logs of earlier versions.
     #[serde(default)]
     pub natures: Natures,
@@ -253,6 +256,9 @@ pub enum Event {
         instance: InstanceId,
         /// Why.
         reason: String,
+        /// What of it.
+        #[serde(default, skip_serializing_if = "Unmade::is_unknown")]
+        unmade: Unmade,
     },
     /// The user wants the run to end now. Asked for a second time it ends at once.
     AbortRequested {
@@ -503,6 +509,27 @@ impl fmt::Display for Awaited {
     }
 }
 
+/// What was not made of what an instance had decided.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Unmade {
+    /// Logs of earlier versions do not say.
+    #[default]
+    Unknown,
+    /// Nothing of it was refused for good: a commit that may still be made, or what was not tried because something before it had failed.
+    Untried,
+    /// The operation of this number was tried.
+    Operation(u64),
+}
+
+impl Unmade {
+    /// Whether the log does not say.
+    #[must_use]
+    pub fn is_unknown(&self) -> bool {
+        *self == Unmade::Unknown
+    }
+}
+
 /// A goal for a provider.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Goal {
@@ -526,6 +553,9 @@ pub struct Goal {
     /// Where it may go on when it has a result, and improve it until it is told to stop: the outputs that stay as they were at first.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub improves: Option<Box<[String]>>,
+    /// Its state reads no facts, so that it need not wait for what was decided before it. False in logs of earlier versions.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub reads_nothing: bool,
 }
 
 /// One line of an event log.

@@ -1,6 +1,6 @@
 //! What the findings of a task file say, and that no text makes the loader panic.
 
-#![allow(clippy::unwrap_used, reason = "a test may panic")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
 mod support;
 
@@ -301,4 +301,22 @@ proptest! {
         let damaged = format!("{}{inserted}{}", &FETCH[..from], &FETCH[to..]);
         let _ = load(&damaged, "task.yaml", &Catalogue::standard());
     }
+}
+
+#[test]
+fn where_the_system_has_no_world_model_a_state_that_reads_facts_is_told_that_it_is_for_these() {
+    let mut catalogue = unannotated();
+    catalogue.resources.remove("WorldModel");
+    let task = |reads: &str| {
+        format!(
+            "task: t\nstates:\n  - plan: {{ action: path_planner/plan, computes: true,{reads} resources: [PathPlanner] }}\n"
+        )
+    };
+    let found = |reads: &str| {
+        let findings = load(&task(reads), "task.yaml", &catalogue).err().unwrap_or_default();
+        findings.iter().map(ToString::to_string).filter(|one| one.contains("unknown-resource")).collect::<Vec<_>>()
+    };
+    let [told] = &found("")[..] else { panic!("{:?}", found("")) };
+    assert!(told.contains("the state reads facts") && told.contains("`reads: []`"), "{told}");
+    assert_eq!(found(" reads: [],"), [""; 0]);
 }

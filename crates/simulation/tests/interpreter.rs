@@ -424,6 +424,117 @@ fn who_waits_for_a_unit_whose_worker_died_begins_under_the_new_lease() {
 }
 
 #[test]
+fn while_a_region_whose_worker_died_pauses_its_unit_is_nobody_elses() {
+    let text = "states:
+  - both:
+      routine: true
+      states:
+        - fork:
+            concurrency: barrier
+            regions:
+              - left: { THINK, computes: true, reads: [], attempts: 1, retry: { count: 1, backoff: 5 } }
+              - right: { THINK, computes: true, reads: [] }";
+    let mut bench = Bench::new(text, Mode::Cdtn);
+    bench.grant_brain(1, 1);
+    assert_eq!(bench.heard(), ["acquire 1", "start 3.1 under 1"], "there is one brain");
+    bench.crash(3, 1);
+    assert_eq!(bench.heard(), ["acquire 4", "release 1"], "who has waited needs another one");
+    bench.grant_brain(4, 2);
+    assert_eq!(bench.heard(), ["start 4.1 under 2"]);
+    bench.finish(4, 1);
+    assert_eq!(bench.heard(), [""; 0]);
+    for _ in 0..5 {
+        bench.tell(Event::Woken);
+    }
+    assert_eq!(bench.heard(), ["start 3.2 under 2"], "the new one has not died");
+    bench.finish(3, 2);
+    assert_eq!(bench.heard(), ["release 2", "end success"]);
+}
+
+#[test]
+fn a_region_that_goes_on_and_on_lets_the_worker_of_another_one_be_replaced_and_nothing_is_used_up_again() {
+    let text = "states:
+  - both:
+      routine: true
+      states:
+        - fork:
+            concurrency: barrier
+            regions:
+              - left: { action: brain/judge, pia: true, resources: [{ block: Brain }, { consume: Charge, count: 0.4 }], retry: 1 }
+              - right: { states: [ one: { MOVE }, two: { MOVE }, three: { MOVE } ] }";
+    let mut bench = Bench::new(text, Mode::Cdtn);
+    bench.grant(1, 1);
+    assert_eq!(bench.heard(), ["acquire 1", "start 3.1 under 1", "start 4.1 under 1"]);
+    bench.crash(3, 1);
+    assert_eq!(bench.heard(), [""; 0], "a motion is under way");
+    bench.finish(4, 1);
+    let again = bench.commands.iter().find_map(|command| match command {
+        Command::Acquire { requirements, .. } => Some(requirements.clone()),
+        _ => None,
+    });
+    let again: Vec<String> = again.unwrap().into_iter().map(|one| one.kind).collect();
+    assert_eq!(again, ["Brain", "Arm"], "the charge is used up once");
+    assert_eq!(bench.heard(), ["acquire 3", "release 1"], "`two` waits");
+    bench.grant(3, 2);
+    assert_eq!(bench.heard(), ["start 3.2 under 2", "start 5.1 under 2"]);
+    bench.finish(5, 1);
+    assert_eq!(bench.heard(), ["start 6.1 under 2"]);
+    bench.finish(3, 2);
+    bench.finish(6, 1);
+    assert_eq!(bench.heard(), ["release 2", "end success"]);
+}
+
+#[test]
+fn a_routine_that_waits_keeps_no_room_that_only_the_reads_of_its_states_ask_for() {
+    let text = "states:
+  - both:
+      concurrency: barrier
+      regions:
+        - one:
+            shared: [ready(a)]
+            resources: [{ block: Pen, hold: true }]
+            states:
+              - plan: { action: brain/think, computes: true, reads: ['k(a)'], resources: [{ block: Brain }] }
+              - wait: { wait: { for: ready(a) } }
+              - note: { NOTE, reads: [] }
+        - two:
+            shared: [ready(a)]
+            states:
+              - think: { action: brain/think, computes: true, reads: ['n(a)'], resources: [{ block: Brain }] }
+              - make: { MOVE, reads: [], effects: [ready(a)] }";
+    for mode in MODES {
+        let mut setup = setup(load(&task(text), "task.yaml", &NoFiles), mode);
+        setup.resources.iter_mut().find(|(kind, _)| kind == "WorldModel").unwrap().1.count = 1.into();
+        let mut providers = Providers(|_: &str, _: u32, _: &Goal, _: &World| ("success", Value::Int(1)));
+        let run = run(setup, &mut providers).unwrap_or_else(|error| panic!("{mode:?}: {error}"));
+        assert_eq!(run.outcome, "success", "{mode:?}: {}", run.reason);
+    }
+}
+
+#[test]
+fn a_state_that_fails_without_a_reason_is_named_in_both_modes() {
+    for mode in MODES {
+        let mut bench = Bench::new("states: [ look: { THINK } ]", mode);
+        let instance = bench.asks();
+        bench.grant(instance, 1);
+        bench.tell(Event::Finished {
+            instance: InstanceId(instance),
+            attempt: 1,
+            outcome: "aborted".to_owned(),
+            outputs: BTreeMap::new(),
+            measured: Vec::new(),
+            evidence: Vec::new(),
+            reason: String::new(),
+        });
+        let reason = bench.commands.into_iter().find_map(|command| match command {
+            Command::End { reason, .. } => Some(reason),
+            _ => None,
+        });
+        assert_eq!(reason.as_deref(), Some("look"), "{mode:?}");
+    }
+}
+
+#[test]
 fn in_a_race_a_region_whose_worker_died_does_not_wait_for_the_others() {
     let text = "states:
   - race:

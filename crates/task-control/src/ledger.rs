@@ -2,7 +2,7 @@
 //! task control was killed. A pure fold; what is done with it is [`super::resume`]'s.
 
 use super::record::Decided;
-use ratn_executive::protocol::{Command, Event, Goal, Note, Origin};
+use ratn_executive::protocol::{Command, Event, Goal, Note, Origin, Unmade};
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
@@ -85,8 +85,8 @@ pub(super) struct Confirmed {
     pub(super) commit: Revision,
     /// The resource manager, by the number of an operation.
     pub(super) operation: u64,
-    /// Of what was decided by this instance the first failed.
-    pub(super) failed: Option<InstanceId>,
+    /// Of what was decided by this instance the first failed, and what that was.
+    pub(super) failed: Option<(InstanceId, Unmade)>,
 }
 
 /// An acquire.
@@ -160,7 +160,7 @@ impl Ledger {
             Event::Refused { instance, .. } => {
                 self.waiting.remove(instance);
             }
-            Event::RetirementFailed { instance, .. } => self.failed(*instance),
+            Event::RetirementFailed { instance, unmade, .. } => self.failed(*instance, *unmade),
             Event::Projected { instance, attempt, projection } => {
                 // What need not be there first is perhaps only promised.
                 self.projecting.retain(|id, asked| id != instance || asked.attempt != *attempt || !asked.first);
@@ -248,9 +248,13 @@ impl Ledger {
     /// What an instance had decided was not made, and so is nothing behind it: the recorder makes neither. A commit that failed may be made all the
     /// same, with those behind it up to the next operation that failed: in order they come to what the program says. An operation may not: why it
     /// was refused is not known to be over.
-    fn failed(&mut self, instance: InstanceId) {
-        let is_meant =
-            |(number, of, _): &&(u64, InstanceId, Vec<Requirement>)| *of == instance && *number > self.recorded;
+    fn failed(&mut self, instance: InstanceId, unmade: Unmade) {
+        let is_meant = |(number, of, _): &&(u64, InstanceId, Vec<Requirement>)| match unmade {
+            Unmade::Untried => false,
+            Unmade::Operation(failed) => *number == failed,
+            // A log of an earlier version: the first one that may be meant.
+            Unmade::Unknown => *of == instance && *number > self.recorded,
+        };
         let Some(&(failed, ..)) = self.operated.iter().find(is_meant) else { return };
         self.failed = Some(failed);
         self.operated.retain(|(number, ..)| *number < failed);
@@ -488,6 +492,7 @@ mod tests {
     fn goal() -> Goal {
         Goal {
             improves: None,
+            reads_nothing: false,
             provider: "arm".into(),
             action: "follow".into(),
             inputs: BTreeMap::new(),
@@ -542,7 +547,11 @@ mod tests {
         };
         // A commit that failed may be made: what was done before is not taken for what failed.
         ledger.event(Timestamp(1), &Event::Recorded { operation: 1, session: 7 });
-        let failed = |instance: u64| Event::RetirementFailed { instance: InstanceId(instance), reason: String::new() };
+        let failed = |instance: u64| Event::RetirementFailed {
+            instance: InstanceId(instance),
+            reason: String::new(),
+            unmade: Unmade::Unknown,
+        };
         ledger.event(Timestamp(1), &failed(1));
         assert_eq!(left(&ledger), (vec![1, 2, 3], vec![1, 2, 3]));
         ledger.event(Timestamp(2), &failed(2));
@@ -553,6 +562,30 @@ mod tests {
         ledger.command(&operates(4));
         assert_eq!(left(&ledger), (vec![1, 2], vec![1]));
         assert_eq!((ledger.operations, ledger.failed), (4, Some(2)));
+    }
+
+    #[test]
+    fn of_a_commit_that_failed_the_operation_of_the_same_state_is_left_to_do_and_all_behind_it() {
+        let operates = |instance: u64| Command::Operate {
+            instance: InstanceId(instance),
+            operations: vec![requirement(ResourceOperation::Create, "Box", 1)],
+        };
+        let mut ledger = Ledger::default();
+        for number in [1, 2] {
+            ledger.command(&commits(InstanceId(number), number));
+            ledger.command(&operates(number));
+        }
+        // The commit of the first, and so all behind it: nothing of that was tried.
+        for instance in [1, 1, 2, 2] {
+            let (instance, reason) = (InstanceId(instance), String::new());
+            ledger.event(Timestamp(1), &Event::RetirementFailed { instance, reason, unmade: Unmade::Untried });
+        }
+        assert_eq!((ledger.commits.len(), ledger.open_operations().count(), ledger.failed), (2, 2, None));
+        // A resumption makes them in order, and the second operation is refused.
+        ledger.event(Timestamp(2), &Event::Recorded { operation: 1, session: 7 });
+        let (instance, reason) = (InstanceId(2), String::new());
+        ledger.event(Timestamp(3), &Event::RetirementFailed { instance, reason, unmade: Unmade::Operation(2) });
+        assert_eq!((ledger.commits.len(), ledger.open_operations().count(), ledger.failed), (2, 0, Some(2)));
     }
 
     #[test]

@@ -213,7 +213,7 @@ impl Progress {
             Event::Refused { instance, reason } => {
                 say(&mut lines, at, &format!("refuse {}: {reason}", self.path(*instance)))
             }
-            Event::RetirementFailed { instance, reason } => {
+            Event::RetirementFailed { instance, reason, .. } => {
                 say(&mut lines, at, &format!("failed to make {} real: {reason}", self.path(*instance)));
             }
             Event::AbortRequested { reason, .. } => say(&mut lines, at, &format!("abort: {reason}")),

@@ -7,7 +7,7 @@ use super::ledger::{Confirmed, Projecting, operation_request};
 use super::performer::Answer;
 use super::promises::{Made, Promises};
 use super::safe_on_disk::Mark;
-use ratn_executive::protocol::Event;
+use ratn_executive::protocol::{Event, Unmade};
 use ratn_model::fact::Change;
 use ratn_model::id::{InstanceId, ProjectionId, Revision};
 use ratn_model::measurement::Evidence;
@@ -186,7 +186,8 @@ impl Recorder {
                 Record::Commit { decided: Decided { instance, .. }, .. } | Record::Operate { instance, .. }
                     if let Err(reason) = &recorded =>
                 {
-                    Some(Event::RetirementFailed { instance, reason: format!("not done behind what failed: {reason}") })
+                    let reason = format!("not done behind what failed: {reason}");
+                    Some(Event::RetirementFailed { instance, reason, unmade: Unmade::Untried })
                 }
                 Record::Commit { decided, safe } => {
                     let over = CancellationToken::new();
@@ -223,9 +224,9 @@ impl Recorder {
                     None
                 }
             };
-            if let (Some(Event::RetirementFailed { reason, instance }), Ok(())) = (&event, &recorded) {
+            if let (Some(Event::RetirementFailed { reason, instance, unmade }), Ok(())) = (&event, &recorded) {
                 recorded = Err(reason.clone());
-                self.done.send_modify(|done| done.failed = Some(*instance));
+                self.done.send_modify(|done| done.failed = Some((*instance, *unmade)));
             }
             // Nothing behind a failure counts: what is confirmed is confirmed without a gap.
             if recorded.is_ok() {
@@ -289,7 +290,7 @@ impl Recorder {
             Err(lost @ Undone::Lost) => format!("its effects are not recorded: {lost}"),
             Err(failed) => format!("the world pool did not take its effects: {failed}"),
         };
-        Some(Event::RetirementFailed { instance, reason })
+        Some(Event::RetirementFailed { instance, reason, unmade: Unmade::Untried })
     }
 
     async fn operate(
@@ -309,7 +310,7 @@ impl Recorder {
             let request = operation_request(&self.run, instance, number, index);
             if let Err(undone) = operate_once(&self.resources, &self.trust, &request, &operation).await {
                 let reason = format!("`{operation}` was not done: {undone}");
-                return Some(Event::RetirementFailed { instance, reason });
+                return Some(Event::RetirementFailed { instance, reason, unmade: Unmade::Operation(number) });
             }
         }
         None
@@ -408,7 +409,7 @@ async fn unsafe_on_disk(instance: InstanceId, safe: Option<Mark>) -> Option<Even
         None => true,
     };
     let reason = || "the event log, which says what has happened, cannot be made safe on its disk".to_owned();
-    (!is_safe).then(|| Event::RetirementFailed { instance, reason: reason() })
+    (!is_safe).then(|| Event::RetirementFailed { instance, reason: reason(), unmade: Unmade::Untried })
 }
 
 /// What is confirmed once a record is done.

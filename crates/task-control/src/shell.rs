@@ -192,6 +192,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
                 from: run.from,
                 robot: place.robot.clone(),
                 began_unix_ms,
+                share: share_told(place.standing),
                 imprecise: imprecise(&run.program),
                 natures: natures(&run.program, &place.catalogue),
             }),
@@ -222,6 +223,11 @@ pub fn breakpoints(program: &Program, states: &[String]) -> Result<Vec<String>, 
         Ok(path)
     };
     states.iter().map(breakpoint).collect()
+}
+
+/// A share that is not the usual one is kept, so that the run has it when it is resumed, too.
+fn share_told(standing: Standing) -> Option<f64> {
+    (standing.share != Standing::default().share).then_some(standing.share)
 }
 
 fn syncer_of(log: &LogWriter) -> anyhow::Result<Syncer> {

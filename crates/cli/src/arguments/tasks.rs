@@ -79,9 +79,10 @@ pub(crate) struct RunArguments {
     /// What comes first of what several runs on the system need
     #[arg(long, value_enum, value_name = "HOW", default_value = "normal")]
     pub(crate) urgency: UrgencyArgument,
-    /// How much the run is to have of what several runs need, beside the shares of the others, from 0.01 to 100
-    #[arg(long, value_name = "N", default_value_t = 1.0, value_parser = run_share)]
-    pub(crate) share: f64,
+    /// How much the run is to have of what several runs need, beside the shares of the others, from 0.01 to 100 [default: 1, or that of the run
+    /// that is resumed]
+    #[arg(long, value_name = "N", value_parser = run_share)]
+    pub(crate) share: Option<f64>,
     /// When the run is to have ended: a time from its start (90s, 15m, 2h), or an instant (2026-11-28T17:15:00Z). Of what several runs need
     /// at about the same time, the run that is due first comes first
     #[arg(long, value_name = "TIME", value_parser = due)]

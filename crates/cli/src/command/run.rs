@@ -208,8 +208,17 @@ impl Beside {
     fn of(arguments: &RunArguments) -> Result<Beside, Failure> {
         let due = arguments.due.map(|due| due.from(SystemTime::now())).transpose();
         let due = due.map_err(|why| Failure::Refused(format!("ratn: {why}")))?;
-        let standing = Standing { share: arguments.share, due };
+        let usual = Standing::default();
+        let standing = Standing { share: arguments.share.unwrap_or(usual.share), due };
         Ok(Beside { alone: arguments.alone, urgency: arguments.urgency.into(), standing })
+    }
+
+    /// Of a run that is resumed, and had this share: it keeps that unless another one is asked for.
+    fn going_on(arguments: &RunArguments, share: Option<f64>) -> Result<Beside, Failure> {
+        let mut beside = Beside::of(arguments)?;
+        let kept = share.filter(|share| arguments.share.is_none() && Standing::SHARES.contains(share));
+        beside.standing.share = kept.unwrap_or(beside.standing.share);
+        Ok(beside)
     }
 
     fn on(self, place: Place) -> Place {
@@ -279,4 +288,33 @@ fn log_file(task: &str) -> anyhow::Result<PathBuf> {
     let file =
         tempfile::Builder::new().prefix(&name).suffix(".jsonl").tempfile().context("cannot make an event log")?;
     Ok(file.into_temp_path().keep()?)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::panic, reason = "a test may panic")]
+
+    use super::*;
+    use crate::arguments::{Arguments, Command};
+    use clap::Parser;
+
+    fn arguments(words: &[&str]) -> RunArguments {
+        match Arguments::try_parse_from(["ratn", "run"].iter().chain(words)).map(|arguments| arguments.command) {
+            Ok(Command::Run(arguments)) => arguments,
+            _ => panic!("{words:?}"),
+        }
+    }
+
+    #[test]
+    fn a_run_that_is_resumed_keeps_its_share_unless_another_one_is_asked_for() {
+        let share = |words: &[&str], before| {
+            let beside = Beside::going_on(&arguments(words), before);
+            beside.map(|beside| beside.standing.share).ok()
+        };
+        assert_eq!(share(&["--resume", "log.jsonl"], Some(2.5)), Some(2.5));
+        assert_eq!(share(&["--resume", "log.jsonl", "--share", "1"], Some(2.5)), Some(1.0));
+        assert_eq!(share(&["--resume", "log.jsonl"], None), Some(1.0));
+        // Whoever has changed the log.
+        assert_eq!(share(&["--resume", "log.jsonl"], Some(-3.0)), Some(1.0));
+    }
 }

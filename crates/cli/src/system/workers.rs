@@ -30,6 +30,10 @@ pub(crate) struct Offered {
     pub(crate) startable: BTreeSet<String>,
     /// Kinds of which there are workers, or shall be.
     pub(crate) kept: BTreeSet<String>,
+    /// Kinds of which there shall be workers and are none, as their programs crash again and again; with what their process manager says.
+    pub(crate) given_up: BTreeMap<String, String>,
+    /// Hosts whose process managers do not answer: what they can start is not known.
+    pub(crate) unheard: BTreeSet<String>,
 }
 
 /// A worker with what it says of itself.
@@ -65,15 +69,38 @@ impl Offered {
         });
         let hosts = resources.iter().filter(|one| one.kind == HOST_KIND).filter_map(|host| {
             let client = ProcessClient::new(channels, &host.endpoint().parse().ok()?).ok()?;
-            Some(async move { tokio::time::timeout(PATIENCE, client.pools()).await })
+            Some(async move { (host.host.clone(), tokio::time::timeout(PATIENCE, client.pools()).await) })
         });
         let (workers, hosts) = tokio::join!(futures::future::join_all(asked), futures::future::join_all(hosts));
-        let pools = hosts.into_iter().filter_map(|answer| answer.ok()?.ok()).flat_map(|host| host.pools);
-        let pools: Vec<PoolStatus> = pools.filter(|pool| pool.max > 0).collect();
-        let keeps = |pool: &&PoolStatus| pool.min > 0 || pool.spares > 0 || !pool.workers.is_empty();
-        let kept = pools.iter().filter(keeps).map(|pool| pool.kind.clone()).collect();
-        let startable = pools.into_iter().map(|pool| pool.kind).collect();
-        Ok(Offered { workers, kinds, startable, kept })
+        let (mut pools, mut unheard) = (Vec::new(), BTreeSet::new());
+        for (host, answer) in hosts {
+            match answer {
+                Ok(Ok(host)) => pools.extend(host.pools.into_iter().filter(|pool| pool.max > 0)),
+                Ok(Err(_)) | Err(_) => drop(unheard.insert(host)),
+            }
+        }
+        Ok(Offered { workers, kinds, unheard, ..Offered::of_pools(pools) })
+    }
+
+    /// What there is by what process managers say of their pools.
+    fn of_pools(pools: Vec<PoolStatus>) -> Offered {
+        let mut offered = Offered::default();
+        for pool in pools {
+            let keeps = pool.min > 0 || pool.spares > 0 || !pool.workers.is_empty();
+            if keeps && pool.workers.is_empty() && !pool.failure.is_empty() {
+                offered.given_up.insert(pool.kind.clone(), pool.failure);
+            } else if keeps {
+                offered.kept.insert(pool.kind.clone());
+            }
+            offered.startable.insert(pool.kind);
+        }
+        offered
+    }
+
+    /// Who may still say what is not known: workers that are being started, and process managers that do not answer.
+    pub(crate) fn awaited(&self) -> Vec<String> {
+        let workers = self.away().into_iter().map(|kind| format!("workers of {kind}"));
+        workers.chain(self.unheard.iter().map(|host| format!("the process manager of {host}"))).collect()
     }
 
     /// Kinds of which there are workers, or shall be, and none is offered: they are being started, perhaps once more.
@@ -177,8 +204,28 @@ mod tests {
         let kinds = |all: &[&str]| all.iter().map(|kind| (*kind).to_owned()).collect();
         let kept = kinds(&["Inspector", "PathPlanner"]);
         let startable = kinds(&["Inspector", "PathPlanner", "Welder"]);
-        let offered = Offered { workers: vec![there], startable, kept, ..Offered::default() };
+        let unheard = kinds(&["compute"]);
+        let offered = Offered { workers: vec![there], startable, kept, unheard, ..Offered::default() };
         assert_eq!(offered.away(), ["Inspector"]);
+        assert_eq!(offered.awaited(), ["workers of Inspector", "the process manager of compute"]);
+    }
+
+    #[test]
+    fn workers_of_a_pool_that_has_given_up_are_not_waited_for() {
+        let pool = |kind: &str, failure: &str| PoolStatus {
+            template: kind.to_lowercase(),
+            kind: kind.to_owned(),
+            min: 1,
+            max: 1,
+            workers: Vec::new(),
+            failure: failure.to_owned(),
+            spares: 0,
+            crashes: 5,
+            last_exit: String::new(),
+        };
+        let offered = Offered::of_pools(vec![pool("Inspector", "5 crashes in a row"), pool("Welder", "")]);
+        assert_eq!((offered.awaited(), offered.startable.len()), (vec!["workers of Welder".to_owned()], 2));
+        assert_eq!(offered.given_up["Inspector"], "5 crashes in a row");
     }
 
     #[test]

@@ -9,6 +9,7 @@ use crate::plan::NodeNature;
 use crate::protocol::Command;
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Program, StateKind};
+use ratn_model::resource::ResourceOperation;
 use std::time::Duration;
 
 impl Interpreter {
@@ -142,10 +143,11 @@ impl Interpreter {
         if self.uses_lease(context.program, routine) {
             return;
         }
-        // Who waits for a turn asks, too, where whoever has asked was cut short.
+        // Who waits for a turn asks, too, where whoever has asked was cut short, or pauses while it has the unit whose worker died.
         let is_away =
             self.routines.get(&routine).is_some_and(|one| one.lease.is_none() && !one.requirements.is_empty());
-        let mut queued = self.queued(routine).filter(|_| is_away);
+        let has_died = is_away || self.currents_of(routine).any(Current::lost_its_worker);
+        let mut queued = self.queued(routine).filter(|_| has_died);
         let Some(thread) = self.stalled(routine).first().copied().or_else(|| queued.next()) else { return };
         drop(queued);
         let Some(instance) = self.current(thread).map(|current| current.instance) else { return };
@@ -153,6 +155,8 @@ impl Interpreter {
         if let Some(lease) = one.lease.take() {
             context.commands.push(Command::Release { instance, lease: Some(lease.id), projection: None });
         }
+        // What its first lease has used up is used up for all of it.
+        one.requirements.retain(|required| required.operation != ResourceOperation::Consume);
         let requirements = one.requirements.clone();
         self.know_of_new_lease(routine);
         if requirements.is_empty() {
@@ -183,6 +187,15 @@ impl Interpreter {
         }
     }
 
+    /// Whether what would begin now lets a worker be replaced first: another thread of its routine waits until nothing of the routine moves, which
+    /// would never be beside one that goes on and on. Who waits holds nothing; and who is in a race would lose it.
+    pub(super) fn gives_way(&self, program: &Program, thread: u64) -> bool {
+        let Some(own) = self.threads.get(&thread) else { return false };
+        let (Some(routine), Some(current)) = (own.routine, own.current.as_ref()) else { return false };
+        let goes_on = program.state(current.state).is_pause() || is_in_race(program, current.state);
+        !goes_on && self.stalled(routine).iter().any(|other| *other != thread)
+    }
+
     /// Whether anything of a routine moves under its lease, or asks for it.
     fn uses_lease(&self, program: &Program, routine: u64) -> bool {
         let uses = |current: &Current| match current.phase {
@@ -190,8 +203,7 @@ impl Interpreter {
             Phase::Running => !program.state(current.state).is_pause(),
             phase => matches!(phase, Phase::Acquiring | Phase::Projecting),
         };
-        let mut threads = self.threads_of(routine).filter_map(|thread| self.threads.get(&thread)?.current.as_ref());
-        threads.any(uses)
+        self.currents_of(routine).any(uses)
     }
 
     fn stalled(&self, routine: u64) -> Vec<u64> {
@@ -200,6 +212,14 @@ impl Interpreter {
 
     fn queued(&self, routine: u64) -> impl Iterator<Item = u64> {
         self.threads_of(routine).filter(|thread| matches!(self.phase(*thread), Some(Phase::Queued(_))))
+    }
+
+    /// What the threads of a routine are at.
+    fn currents_of(&self, routine: u64) -> impl Iterator<Item = &Current> {
+        self.threads
+            .values()
+            .filter(move |thread| thread.routine == Some(routine))
+            .filter_map(|one| one.current.as_ref())
     }
 
     fn threads_of(&self, routine: u64) -> impl Iterator<Item = u64> + '_ {

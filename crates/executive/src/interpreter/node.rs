@@ -58,7 +58,8 @@ impl Interpreter {
         if self.is_held(context, thread) {
             return self.set_phase(thread, Phase::Held);
         }
-        if self.routine_of(thread).is_some_and(|r| r.lease.is_none() && !r.requirements.is_empty()) {
+        let is_away = self.routine_of(thread).is_some_and(|r| r.lease.is_none() && !r.requirements.is_empty());
+        if is_away || self.gives_way(context.program, thread) {
             return self.set_phase(thread, Phase::Stalled);
         }
         let wanted = &context.plan.state(id).requirements;
@@ -229,6 +230,7 @@ impl Interpreter {
             timeout_s: state.annotations.timeout_s,
             // Nothing waits meanwhile, so it would be for nothing.
             improves: None,
+            reads_nothing: context.plan.state(current.state).reads_nothing(),
         };
         let timeout = state.annotations.timeout_s.map(|seconds| context.now + duration(seconds));
         if self.routine_of(thread).is_none() && self.is_pia(context, thread) {
@@ -318,7 +320,12 @@ impl Interpreter {
         if matches!(self.target, Target::Actual) {
             context.note(Note::Retired { instance });
         }
-        let reason = if outcome == SUCCESS { String::new() } else { format!("{}: {reason}", current.path) };
+        let reason = match reason.as_str() {
+            _ if outcome == SUCCESS => String::new(),
+            // Its worker gave none.
+            "" => current.path,
+            reason => format!("{}: {reason}", current.path),
+        };
         self.ended(thread, id, outcome, reason);
     }
 

@@ -31,9 +31,9 @@ impl Interpreter {
         let queued = self.threads.keys().copied().filter(is_queued);
         let mut has_begun = false;
         for thread in queued.collect::<Vec<_>>() {
-            // While all of it is asked for anew, nothing begins.
+            // While all of it is asked for anew, or is to be, nothing begins.
             let waits = self.routine_of(thread).is_some_and(|r| r.lease.is_none() && !r.requirements.is_empty());
-            if !waits && self.free_units(context, thread).is_some() {
+            if !waits && !self.gives_way(context.program, thread) && self.free_units(context, thread).is_some() {
                 has_begun = true;
                 // What it requires may have been changed while it waited.
                 if self.may_try(context, thread) {
@@ -102,9 +102,14 @@ impl Interpreter {
 }
 
 impl Current {
-    /// Whether its goal is under way, or the worker that it had is still to be replaced.
+    /// Whether its goal is under way, or the worker that it had is still to be replaced, also during a pause before its next try.
     fn works(&self) -> bool {
-        matches!(self.phase, Phase::Projecting | Phase::Running | Phase::Stalled)
+        self.lost_its_worker() || matches!(self.phase, Phase::Projecting | Phase::Running | Phase::Stalled)
+    }
+
+    /// Whether it pauses before its next try, and its unit is still the one whose worker died: the routine has not asked for all of it anew since.
+    pub(super) fn lost_its_worker(&self) -> bool {
+        self.has_died && matches!(self.phase, Phase::Backoff(_))
     }
 }
 

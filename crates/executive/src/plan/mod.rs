@@ -263,6 +263,11 @@ impl StatePlan {
         }
     }
 
+    /// Whether no fact is anything to it: its state says so, and none of its expressions looks one up.
+    pub(crate) fn reads_nothing(&self) -> bool {
+        self.reads.as_ref().is_some_and(Vec::is_empty)
+    }
+
     /// The number of an outcome by its name.
     pub(crate) fn outcome(&self, name: &str) -> Option<Outcome> {
         self.outcomes.iter().position(|outcome| &**outcome == name)

@@ -1,7 +1,7 @@
 //! Resources of a state: what it acquires when it starts, and what it creates, deletes or consumes when it ends.
 
-use super::{Names, Predicate, Subject, is_action};
-use ratn_model::program::{Program, ResourceExpr, State, WORLD_MODEL};
+use super::{Names, NodeNature, Predicate, Subject, is_action, nature};
+use ratn_model::program::{Origin, Program, ResourceExpr, State, WORLD_MODEL};
 use ratn_model::resource::{Quantity, ResourceClass, ResourceOperation};
 use std::collections::BTreeSet;
 
@@ -61,6 +61,19 @@ pub(super) fn operated_anywhere(program: &Program) -> BTreeSet<&str> {
     program.states.iter().flat_map(operated).collect()
 }
 
+/// Whether it is in a routine that works on the world as it is: what computes there does so at its place in the program, and looks at the root.
+/// Room for a projection that its `reads` alone ask for is none that the routine would hold until its end, over all that it waits for.
+fn looks_at_root(subject: &Subject<'_>) -> bool {
+    let acts = |routine: &State| nature::of(&Subject::of(subject.program, routine)) != NodeNature::Computes;
+    let states = std::iter::once(subject.state).chain(subject.around.iter().copied());
+    states.filter(|state| state.is_routine()).any(acts)
+}
+
+/// Whether a state blocks this because of its `reads`, and nobody says so.
+fn is_implied(state: &State, line: &ResourceExpr) -> bool {
+    line.kind == WORLD_MODEL && state.annotations.origin.get(WORLD_MODEL) == Some(&Origin::Reads)
+}
+
 /// Blocks of one state add up, those of states inside of each other merge by maximum. What an action consumes and what has to
 /// exist add up as they are, but only from the state itself and what it contains.
 fn requirements(subject: &Subject<'_>) -> Vec<ResourceExpr> {
@@ -70,11 +83,13 @@ fn requirements(subject: &Subject<'_>) -> Vec<ResourceExpr> {
     }
     let within = subject.contained.iter().map(|state| (state, true));
     let around = subject.around.iter().map(|state| (state, false));
+    let looks_at_root = looks_at_root(subject);
     let mut merged: Vec<ResourceExpr> = Vec::new();
     for (state, is_within) in within.chain(around) {
         let mut blocked: Vec<ResourceExpr> = Vec::new();
         for wanted in &state.annotations.resources {
             match wanted.operation {
+                ResourceOperation::Block if looks_at_root && is_implied(state, wanted) => {}
                 ResourceOperation::Block => merge(&mut blocked, wanted, |have, more| have + more),
                 ResourceOperation::Exists if is_within => merged.push(wanted.clone()),
                 ResourceOperation::Consume if is_action(state) => merged.push(wanted.clone()),

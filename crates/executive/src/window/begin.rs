@@ -405,6 +405,7 @@ impl Window {
             expected_s,
             timeout_s: state.annotations.timeout_s,
             improves,
+            reads_nothing: context.plan.state(instance.state).reads_nothing(),
         };
         if let Some(timeout_s) = state.annotations.timeout_s {
             self.set_timer(context, timeout_s, Timer::Timeout(id, attempt));

@@ -5,7 +5,7 @@ use super::Subject;
 use super::graph::Point;
 use crate::diagnostic::Findings;
 use crate::load::suggestion;
-use crate::program::{Nature, ResourceExpr, State, StateKind};
+use crate::program::{Nature, Origin, ResourceExpr, State, StateKind, WORLD_MODEL};
 use crate::resource::{Quantity, ResourceClass, ResourceOperation};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -51,7 +51,14 @@ fn offered(
     if offer.is_none() && !by_the_task {
         let known = subject.catalogue.resources.keys().map(String::as_str).chain(created.keys().copied());
         let message = format!("no template or module of the system provides `{}`", resource.kind);
-        let help = suggestion(&resource.kind, known, "", "offer it in the catalogue, or create it in an older state");
+        let is_implied =
+            resource.kind == WORLD_MODEL && state.annotations.origin.get(WORLD_MODEL) == Some(&Origin::Reads);
+        let help = if is_implied {
+            // No line of the task names it.
+            "the state reads facts, and so needs room for a projection: offer it (`[catalogue.resources.WorldModel]`), or say `reads: []`".to_owned()
+        } else {
+            suggestion(&resource.kind, known, "", "offer it in the catalogue, or create it in an older state")
+        };
         findings.error("unknown-resource", at, &state.path, message, help);
     }
     if let (Some(offer), Some(class)) = (offer, resource.class)

@@ -3,7 +3,7 @@
 use super::Answer;
 use super::told::Told;
 use crate::ledger::Confirmed;
-use crate::readable::readable;
+use crate::readable::{one_line, readable};
 use crate::record::said;
 use crate::safe_on_disk::Mark;
 use ratn_executive::protocol::Event;
@@ -107,7 +107,7 @@ pub(super) struct Performing {
     pub(super) outputs: Vec<String>,
     /// What has to be safe before it begins.
     pub(super) safe: Option<Mark>,
-    /// Without a projection: the root world, which has to have this commit of the run before it begins.
+    /// Without a projection: the root world, which has to have this commit of the run before it is given.
     pub(super) sees: Option<(watch::Receiver<Confirmed>, Revision)>,
     /// The run is over: nothing begins any more.
     pub(super) over: CancellationToken,
@@ -141,15 +141,9 @@ impl Performing {
                 () = before.cancelled() => {}
             }
         }
-        if let Some((mut confirmed, decided)) = self.sees.take() {
-            let is_there = async { confirmed.wait_for(|confirmed| confirmed.commit >= decided).await.is_ok() };
-            tokio::select! {
-                biased;
-                () = self.stop.cancelled() => return,
-                () = self.over.cancelled() => return,
-                // Where it never is the run ends.
-                is_there = is_there => if !is_there { return },
-            }
+        // One of before is looked for first.
+        if given == Given::Now && !self.sees_what_was_decided().await {
+            return;
         }
         if given != Given::ToStop && self.stop.is_cancelled() || self.over.is_cancelled() {
             return;
@@ -162,6 +156,19 @@ impl Performing {
             && !self.stop.is_cancelled()
         {
             let _ = self.events.send(event.into()).await;
+        }
+    }
+
+    /// Waits until the world that it looks at has what was decided before it; whether it is given then.
+    async fn sees_what_was_decided(&self) -> bool {
+        let Some((mut confirmed, decided)) = self.sees.clone() else { return true };
+        let is_there = async { confirmed.wait_for(|confirmed| confirmed.commit >= decided).await.is_ok() };
+        tokio::select! {
+            biased;
+            () = self.stop.cancelled() => false,
+            () = self.over.cancelled() => false,
+            // Where it never is the run ends.
+            is_there = is_there => is_there,
         }
     }
 
@@ -231,6 +238,7 @@ impl Performing {
             Err(error)
                 if error.code() == Some(tonic::Code::NotFound)
                     && self.would_be_known(endpoint).await
+                    && self.sees_what_was_decided().await
                     && !self.stop.is_cancelled() =>
             {
                 self.given(endpoint).await
@@ -379,7 +387,7 @@ impl Performing {
     fn said(&self, said: Said) {
         let (instance, attempt) = (self.instance, self.attempt);
         let event = match said {
-            Said::Progress { message, .. } => Event::Progressed { instance, attempt, message: readable(&message) },
+            Said::Progress { message, .. } => Event::Progressed { instance, attempt, message: one_line(&message) },
             // What it comes to when it was told to stop nobody waits for.
             Said::Improved(_) if self.stop.is_cancelled() => return,
             // What is not whole is no result.

@@ -2,7 +2,9 @@
 //! [`super::record`]. Never waits: every answer comes back as an event.
 
 mod acquiring;
+mod came_between;
 mod claim;
+mod giving_back;
 mod goal;
 mod handover;
 mod order;
@@ -16,7 +18,6 @@ mod watch;
 
 pub(super) use resume::{check_world, missing_commits, remembers};
 
-use super::decided::{Unanswered, insist};
 use super::ledger::{Confirmed, Projecting, acquire_request};
 use super::outside::Outside;
 use super::promises::{Making, Promises};
@@ -27,6 +28,7 @@ use crate::messages::Messages;
 use crate::safe_on_disk::Mark;
 use acquiring::{Acquiring, Asking, Waiting};
 use anyhow::{Context, bail};
+use came_between::CameBetween;
 pub use claim::{RUN_KIND, claim};
 use futures::FutureExt;
 use goal::{Given, Performing};
@@ -36,7 +38,7 @@ use ratn_executive::protocol::{CERTAIN, Command, Event, Goal, Note};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::condition::Condition;
 use ratn_model::fact::FactKey;
-use ratn_model::id::{InstanceId, LeaseId, ProjectionId, Revision};
+use ratn_model::id::{InstanceId, LeaseId, Revision};
 use ratn_model::resource::{LeasedResource, Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
@@ -86,12 +88,6 @@ fn holder(task: &str, path: &str) -> String {
     match path.chars().count() {
         length if length <= room => format!("{task}: {path}"),
         length => format!("{task}: …{}", path.chars().skip(length - room).collect::<String>()),
-    }
-}
-
-async fn end_projection(world: &WorldClient, trust: &Trust, instance: InstanceId, projection: ProjectionId) {
-    if let Err(undone) = insist(trust, Unanswered::GivenUp, || world.release(projection)).await {
-        tracing::warn!(%instance, "a projection was not given back: {undone}");
     }
 }
 
@@ -190,6 +186,8 @@ pub(super) struct Performer {
     /// How far the pool's root is known.
     root: Root,
     outside: Outside,
+    /// Of a run that came back without what it held, while anything of before is under way.
+    came_between: Option<CameBetween>,
     told: Told,
     /// The run's own number of its last commit.
     decided: Revision,
@@ -345,6 +343,7 @@ impl Performer {
             recorder,
             root,
             outside: Outside::default(),
+            came_between: None,
             told,
             decided: Revision::default(),
             following: None,
@@ -450,6 +449,7 @@ impl Performer {
         while self.giving_back.try_join_next().is_some() {}
         match command {
             // Waking is the shell's: it has the clock.
+            Command::Note(Note::Retired { instance } | Note::Squashed { instance }) => self.is_its_own(instance),
             Command::Note(_) | Command::End { .. } | Command::Wake { .. } => {}
             Command::Acquire { instance, requirements, priority } => {
                 self.acquires += 1;
@@ -465,7 +465,10 @@ impl Performer {
                 let asked = Projecting { attempt, base, changes, writers, reads, lease, first, named: None };
                 self.project(instance, asked)?;
             }
-            Command::Start { instance, attempt, goal } => self.start(instance, attempt, *goal, Given::Now, safe),
+            Command::Start { instance, attempt, goal } => {
+                self.is_its_own(instance);
+                self.start(instance, attempt, *goal, Given::Now, safe);
+            }
             Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
                 Some(job) if job.attempt == attempt => self.stopping.stop(job),
                 _ => {
@@ -479,7 +482,11 @@ impl Performer {
             }
             Command::Commit { instance, writer, changes, evidence, revision } => {
                 let (knows, behind) = (self.told.revision(), self.operations);
-                self.commit(Decided { instance, writer, changes, evidence, revision, knows, behind }, safe)?;
+                let decided = Decided { instance, writer, changes, evidence, revision, knows, behind };
+                if let Some(between) = &self.came_between {
+                    between.check(&decided)?;
+                }
+                self.commit(decided, safe)?;
             }
             Command::Operate { instance, operations } => {
                 self.operations += 1;
@@ -502,9 +509,9 @@ impl Performer {
         let closed = self.end().await;
         let Confirmed { operation, failed, .. } = *recorded.borrow();
         let done = (operation > heard.operation).then_some(Event::Recorded { operation, session });
-        let failed = failed.filter(|_| heard.failed.is_none()).map(|instance| {
+        let failed = failed.filter(|_| heard.failed.is_none()).map(|(instance, unmade)| {
             let reason = closed.as_ref().err().map_or_else(String::new, ToString::to_string);
-            Event::RetirementFailed { instance, reason }
+            Event::RetirementFailed { instance, reason, unmade }
         });
         (done.into_iter().chain(failed).collect(), closed)
     }
@@ -555,6 +562,14 @@ impl Performer {
             bail!("the world pool is more than {MAX_PENDING_RECORDS} requests behind, or gone");
         }
         Ok(())
+    }
+
+    /// What an instance does from now on it does with what the run holds, or it does nothing more.
+    fn is_its_own(&mut self, instance: InstanceId) {
+        if let Some(between) = &mut self.came_between {
+            between.forget(instance);
+        }
+        self.came_between.take_if(|between| between.is_over());
     }
 
     fn commit(&mut self, decided: Decided, safe: Option<Mark>) -> anyhow::Result<()> {
@@ -667,8 +682,13 @@ impl Performer {
             Answer::Event { event, withdrawn } => (*event, withdrawn.filter(|one| one.token.is_cancelled())),
             Answer::World(change) => {
                 self.root.reached(change.revision);
-                if told::maker(&change.commit).is_some_and(|(run, _)| run != self.run) {
+                let maker = told::maker(&change.commit).map(|(run, _)| run);
+                if maker.as_ref().is_some_and(|run| *run != self.run) {
                     self.told.beside_others(true);
+                }
+                if let Some(between) = self.came_between.as_mut().filter(|_| maker.as_ref() != Some(&self.run)) {
+                    let written = change.written.iter().map(|fact| &fact.key);
+                    between.more(change.revision, written.chain(&change.gone));
                 }
                 return self.outside.told(change, mirror);
             }
@@ -693,6 +713,7 @@ impl Performer {
                 if let Event::Granted { instance, .. } | Event::Refused { instance, .. } = &event {
                     let asked = self.asking.remove(*instance);
                     self.waiting_since.remove(instance);
+                    self.is_its_own(*instance);
                     if let (Event::Granted { lease, .. }, Some(asked)) = (&event, asked) {
                         self.leases.granted(*instance, lease, (asked.requirements, asked.priority), Instant::now());
                         self.holds.set(self.leases.has_speculative());
@@ -700,8 +721,8 @@ impl Performer {
                 }
                 match &event {
                     Event::Recorded { operation, .. } => self.heard.operation = self.heard.operation.max(*operation),
-                    Event::RetirementFailed { instance, .. } => {
-                        self.heard.failed = self.heard.failed.or(Some(*instance))
+                    Event::RetirementFailed { instance, unmade, .. } => {
+                        self.heard.failed = self.heard.failed.or(Some((*instance, *unmade)))
                     }
                     _ => {}
                 }
@@ -741,8 +762,8 @@ impl Performer {
         };
         let (resource, over) = (source.clone(), CancellationToken::new());
         let before = if given == Given::Now { self.stopping.before(&source) } else { Vec::new() };
-        // What has no projection looks at the root, in which everything that was decided before has to be.
-        let looks_at_root = given == Given::Now && goal.projection.is_none();
+        // What has no projection looks at the root, in which everything that was decided before has to be; unless nothing there is anything to it.
+        let looks_at_root = given != Given::ToStop && goal.projection.is_none() && !goal.reads_nothing;
         let sees = looks_at_root.then(|| (self.recorded.subscribe(), self.decided));
         let performing = Performing {
             instance,
@@ -819,83 +840,5 @@ impl Performer {
                 goal.provider, provider.resource, provider.resource
             )
         })
-    }
-
-    fn release(
-        &mut self,
-        instance: InstanceId,
-        lease: Option<LeaseId>,
-        projection: Option<ProjectionId>,
-        safe: Option<Mark>,
-    ) {
-        let over = |id: InstanceId, job: &Job| id == instance || (lease.is_some() && job.lease == lease);
-        let (ended, going_on): (BTreeMap<_, Job>, _) =
-            std::mem::take(&mut self.jobs).into_iter().partition(|(id, job)| over(*id, job));
-        self.jobs = going_on;
-        ended.values().for_each(|job| self.stopping.leave(job));
-        let idle = ended.into_values().map(|job| job.over).collect();
-        self.give_back_when(safe, instance, idle, lease, projection, None);
-    }
-
-    fn give_back(
-        &mut self,
-        instance: InstanceId,
-        lease: Option<LeaseId>,
-        projection: Option<ProjectionId>,
-        withdrawn: Option<Arc<DropGuard>>,
-    ) {
-        self.give_back_when(None, instance, Vec::new(), lease, projection, withdrawn);
-    }
-
-    fn give_back_when(
-        &mut self,
-        safe: Option<Mark>,
-        instance: InstanceId,
-        mut idle: Vec<CancellationToken>,
-        lease: Option<LeaseId>,
-        projection: Option<ProjectionId>,
-        withdrawn: Option<Arc<DropGuard>>,
-    ) {
-        if let Some(lease) = lease {
-            self.leases.given_back(lease);
-            self.holds.set(self.leases.has_speculative());
-        }
-        let (resources, world, trust) = (self.resources.clone(), self.world.clone(), self.trust.clone());
-        idle.extend(lease.into_iter().flat_map(|lease| self.stopping.under(lease)));
-        let returns = lease.map(|_| self.order.returning.begin());
-        let note = self.told.left(self.decided).to_string();
-        let (there, coming) = match projection.map(|id| (id, self.making.end(id))) {
-            Some((id, None)) => (Some(id), None),
-            Some((id, Some(coming))) => (None, Some((id, coming))),
-            None => (None, None),
-        };
-        let returning = async move {
-            // Whoever gets the resources next finds them idle.
-            for goal in idle {
-                goal.cancelled().await;
-            }
-            // What others do then stands on what is known here.
-            if let Some(safe) = safe {
-                safe.safe().await;
-            }
-            if let Some(projection) = there {
-                end_projection(&world, &trust, instance, projection).await;
-            }
-            if let Some(lease) = lease {
-                let release = || resources.release_with_note(lease, note.clone());
-                // A resource manager that is away holds it until it is told: it is waited for as long as the session may live.
-                if let Err(undone) = insist(&trust, Unanswered::Waits, release).await {
-                    tracing::warn!(%instance, "a lease was not given back: {undone}");
-                }
-            }
-            drop((returns, withdrawn));
-            // The lease is not kept until it is there.
-            if let Some((projection, coming)) = coming
-                && coming.await.is_ok()
-            {
-                end_projection(&world, &trust, instance, projection).await;
-            }
-        };
-        self.giving_back.spawn(trace::within(self.of(instance), returning));
     }
 }

@@ -12,7 +12,9 @@
 
 use super::Performer;
 use super::acquiring::late_request;
+use super::came_between::{CameBetween, refuse};
 use super::goal::Given;
+use super::told::maker;
 use crate::decided::{Unanswered, Undone, insist};
 use crate::ledger::{Confirmed, Ledger, operation_request};
 use crate::outside;
@@ -35,6 +37,7 @@ use ratn_world::world::World;
 use std::borrow::Cow;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
 
 /// So many withdrawals of before are under way at once.
@@ -126,7 +129,7 @@ impl Performer {
     /// Where the run cannot go on.
     pub(crate) async fn take_up(
         &mut self,
-        program: &Program,
+        program: &Arc<Program>,
         mut ledger: Ledger,
         mirror: &World,
     ) -> anyhow::Result<Vec<Event>> {
@@ -175,7 +178,11 @@ impl Performer {
     ///
     /// # Errors
     /// Where the commits cannot be made.
-    pub(crate) async fn finish(&mut self, program: &Program, mut ledger: Ledger) -> anyhow::Result<(usize, usize)> {
+    pub(crate) async fn finish(
+        &mut self,
+        program: &Arc<Program>,
+        mut ledger: Ledger,
+    ) -> anyhow::Result<(usize, usize)> {
         let (missing, ..) = self.commit_again(program, &ledger).await?;
         let commits = missing.made + missing.behind.len();
         if !self.is_own {
@@ -195,7 +202,7 @@ impl Performer {
     /// the root with them.
     async fn commit_again(
         &mut self,
-        program: &Program,
+        program: &Arc<Program>,
         ledger: &Ledger,
     ) -> anyhow::Result<(Missing, Revision, Vec<(FactKey, Value)>)> {
         (self.acquires, self.operations, self.resumptions) = (ledger.acquires, ledger.operations, ledger.resumptions);
@@ -215,6 +222,11 @@ impl Performer {
             made += 1;
         }
         let (revision, facts) = self.root().await?;
+        if !self.is_own && !ledger.began.is_empty() {
+            // What ended well meanwhile, and was not heard of, is to stand the same test.
+            let changed = self.changed_by_others(ledger, there, revision).await?;
+            self.came_between = Some(CameBetween::new(Arc::clone(program), ledger.began.clone(), changed));
+        }
         let commit = ledger.commits[..there + made].last().map(|decided| decided.revision).unwrap_or_default();
         // All of it is in the root that was read.
         self.told.committed(commit);
@@ -260,34 +272,42 @@ impl Performer {
         if missing.is_empty() {
             return Ok(());
         }
+        for (key, revision) in &self.changed_by_others(ledger, there, root).await? {
+            let is_meant = |decided: &&Decided| {
+                decided.knows < *revision && was_overtaken(program, &decided.writer, &decided.changes, key)
+            };
+            if let Some(decided) = missing.iter().find(is_meant) {
+                return refuse(decided, key);
+            }
+        }
+        Ok(())
+    }
+
+    /// The facts that others have changed behind the last commit of the run that the world pool had, with the last revision of each.
+    async fn changed_by_others(
+        &self,
+        ledger: &Ledger,
+        there: usize,
+        root: Revision,
+    ) -> anyhow::Result<BTreeMap<FactKey, Revision>> {
         let last = there.checked_sub(1).map(|last| ledger.commits[last].id(&self.run));
         let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
         let (_, oldest) = retry_unanswered(|| self.world.history(any.clone())).await?;
         let (mut told, mut is_behind) = (oldest.max(ledger.first_revision), last.is_none());
         let mut watch = retry_unanswered(|| self.world.watch(Some(told), &[])).await?;
+        let mut changed = BTreeMap::new();
         while told < root {
             let Some(WorldUpdate::Changed(change)) = watch.next().await? else {
                 bail!("the world pool does not tell of its revisions up to {root}");
             };
             told = change.revision;
-            if is_behind {
+            if is_behind && maker(&change.commit).is_none_or(|(run, _)| run != self.run) {
                 let written = change.written.iter().map(|fact| &fact.key);
-                for key in written.chain(&change.gone) {
-                    let is_meant = |decided: &&Decided| {
-                        decided.knows < told && was_overtaken(program, &decided.writer, &decided.changes, key)
-                    };
-                    if let Some(decided) = missing.iter().find(is_meant) {
-                        bail!(
-                            "what {} has changed is not in the world yet, and others have changed {key}, which it changes or is made of, \
-                             since the run lost its resources: run the task again, or begin it in the middle (`--from`)",
-                            decided.writer
-                        );
-                    }
-                }
+                changed.extend(written.chain(&change.gone).map(|key| (key.clone(), told)));
             }
             is_behind |= last.as_ref() == Some(&change.commit);
         }
-        Ok(())
+        Ok(changed)
     }
 
     async fn commits_there(&self, ledger: &Ledger, root: Revision) -> anyhow::Result<usize> {

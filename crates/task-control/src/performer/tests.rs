@@ -10,7 +10,7 @@ use ratn_daemon::world_pool::{self, WorldPoolConfig};
 use ratn_executive::protocol::Origin;
 use ratn_model::catalogue::Provider;
 use ratn_model::fact::{Change, Footprint};
-use ratn_model::id::FencingToken;
+use ratn_model::id::{FencingToken, ProjectionId};
 use ratn_model::program::SUCCESS;
 use ratn_model::resource::{Lease, ResourceClass};
 use ratn_model::time::Timestamp;
@@ -538,7 +538,7 @@ async fn who_comes_back_leaves_word_with_what_the_run_was_about_to_give_back() -
     let mut bench = bench.comes_back(true).await?;
     let mut mirror = World::default();
     mirror.apply(&done())?;
-    bench.performer.take_up(&program(FETCH_BOXES), ledger, &mirror).await?;
+    bench.performer.take_up(&fetch_boxes(), ledger, &mirror).await?;
     assert!(!bench.performer.order.returning.is_empty(), "it does not wait for that");
     let channels = Channels::new(&ClientTls::none());
     let next = Session::open(&channels, &bench.endpoints.resource_manager, "next", DEFAULT_TTL);
@@ -748,7 +748,7 @@ async fn who_comes_back_tells_a_goal_to_stop_that_may_not_have_been_told() -> an
     let catalogue = bench.performer.catalogue.clone();
     let mut bench = bench.comes_back(true).await?;
     bench.performer.catalogue = catalogue;
-    bench.performer.take_up(&program(FETCH_BOXES), ledger, &World::default()).await?;
+    bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?;
     // The next goal of that arm leaves when it stands still.
     bench.performer.perform(start(InstanceId(3), 1, "work", lease, &endpoint))?;
     let event = bench.event().await;
@@ -960,7 +960,7 @@ async fn a_projection_that_was_named_and_not_asked_for_before_the_kill_is_asked_
     let mut ledger = ledger(&bench.performer.run, &[projection(instance, 2, false)]);
     ledger.event(Timestamp(0), &Event::Projected { instance, attempt: 2, projection: named });
     let mut bench = bench.comes_back(true).await?;
-    bench.performer.take_up(&program(FETCH_BOXES), ledger, &World::default()).await?;
+    bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?;
     let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
     assert!(world.query(Some(named), &[]).await?.is_empty());
     bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
@@ -1024,6 +1024,11 @@ fn ledger(run: &str, commands: &[Command]) -> Ledger {
     ledger
 }
 
+/// As the log has it.
+fn fetch_boxes() -> Arc<ratn_model::program::Program> {
+    Arc::new(program(FETCH_BOXES))
+}
+
 /// What is told of the world.
 fn of_the_world(told: Vec<Event>) -> Vec<Event> {
     told.into_iter().filter(|event| matches!(event, Event::WorldChanged { .. })).collect()
@@ -1052,7 +1057,7 @@ async fn who_comes_back_to_a_living_session_does_nothing_twice() -> anyhow::Resu
     let mut mirror = World::default();
     mirror.apply(&done())?;
     let ledger = ledger(&run, &[commit, operate, waiting]);
-    bench.performer.take_up(&program(FETCH_BOXES), ledger, &mirror).await?;
+    bench.performer.take_up(&fetch_boxes(), ledger, &mirror).await?;
     // It is asked for anew, and what nobody knew to have is free for it.
     bench.granted(InstanceId(2)).await?;
     assert_eq!(bench.units("Box").await?, 2);
@@ -1085,7 +1090,7 @@ async fn what_the_log_says_to_be_done_is_not_done_again_although_the_manager_has
     }
     // It is killed before the third one.
     let mut bench = bench.comes_back(true).await?;
-    assert_eq!(bench.performer.take_up(&program(FETCH_BOXES), ledger, &World::default()).await?, []);
+    assert_eq!(bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?, []);
     assert_eq!(bench.any_event().await, Some(Event::Recorded { operation: 3, session }));
     assert_eq!([bench.units("Box").await?, bench.units("Tray").await?, bench.units("Cup").await?], [2, 1, 1]);
     assert_eq!(bench.performer.confirmed().operation, 3);
@@ -1114,7 +1119,7 @@ async fn a_session_in_which_a_resumption_died_is_not_the_runs() -> anyhow::Resul
     let mut bench = Bench { performer, endpoints, answers, _robot, _place, _shutdown };
     let third = bench.performer.number;
     assert!(!bench.performer.is_own && third != second);
-    let told = bench.performer.take_up(&program(FETCH_BOXES), ledger.clone(), &World::default()).await?;
+    let told = bench.performer.take_up(&fetch_boxes(), ledger.clone(), &World::default()).await?;
     assert_eq!(told, [Event::Recorded { operation: 1, session: third }]);
     assert_eq!(bench.units("Box").await?, 2);
     // From then on it is the run's.
@@ -1122,7 +1127,7 @@ async fn a_session_in_which_a_resumption_died_is_not_the_runs() -> anyhow::Resul
     assert_eq!((ledger.session, ledger.open_operations().count()), (third, 0));
     let mut bench = bench.comes_back(true).await?;
     assert!(bench.performer.is_own && bench.performer.number == third);
-    assert_eq!(bench.performer.take_up(&program(FETCH_BOXES), ledger, &World::default()).await?, []);
+    assert_eq!(bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?, []);
     assert_eq!(bench.units("Box").await?, 2);
     bench.performer.closed().await
 }
@@ -1151,7 +1156,7 @@ async fn what_was_used_up_for_good_is_not_used_up_again_with_a_new_session() -> 
     let expected = ["Battery", "Glue", "Screws"].map(|kind| (kind.to_owned(), 2)).into();
     assert_eq!(left(&bench).await?, expected);
     let mut bench = bench.comes_back(false).await?;
-    bench.performer.take_up(&program(FETCH_BOXES), ledger(&run, &operations), &World::default()).await?;
+    bench.performer.take_up(&fetch_boxes(), ledger(&run, &operations), &World::default()).await?;
     assert_eq!(left(&bench).await?, expected);
     bench.performer.closed().await
 }
@@ -1175,7 +1180,7 @@ async fn what_a_grant_had_used_up_that_nobody_heard_of_comes_back() -> anyhow::R
     let mut ledger = ledger(&run, &[acquire]);
     ledger.withdrawn.splice(0..0, (0..2_000).map(|number| format!("{run}/i9/{number}")));
     let mut bench = bench.comes_back(true).await?;
-    bench.performer.take_up(&program(FETCH_BOXES), ledger, &World::default()).await?;
+    bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?;
     tokio::time::timeout(SESSION_DEADLINE, bench.granted(instance)).await.context("the arm is held")??;
     let glue = bench.performer.resources.list(&["Glue"]).await?;
     assert_eq!(glue.iter().map(|one| one.free.units()).collect::<Vec<_>>(), [2], "it was used up once");
@@ -1204,13 +1209,13 @@ async fn what_a_run_knew_when_it_decided_does_not_stand_against_it_when_it_comes
     let mut mirror = World::default();
     mirror.apply(&done())?;
     let mut bench = bench.comes_back(false).await?;
-    bench.performer.take_up(&program(FETCH_BOXES), ledger.clone(), &mirror).await?;
+    bench.performer.take_up(&fetch_boxes(), ledger.clone(), &mirror).await?;
     assert_eq!(bench.performer.root().await?.0, Revision(2));
     // What others make of it from now on it has not heard of when it decides again.
     ledger.command(&decides(3));
     bench.performer.world.commit("other/i1/2", by_others(2), None).await?;
     let mut bench = bench.comes_back(false).await?;
-    let refused = bench.performer.take_up(&program(FETCH_BOXES), ledger, &mirror).await;
+    let refused = bench.performer.take_up(&fetch_boxes(), ledger, &mirror).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
     assert_eq!(bench.performer.root().await?.0, Revision(3));
     bench.performer.closed().await
@@ -1234,11 +1239,55 @@ async fn what_a_run_heard_of_during_a_motion_stands_against_its_commit_when_it_c
     let mut mirror = World::default();
     mirror.apply(&done())?;
     let mut bench = bench.comes_back(false).await?;
-    let refused = bench.performer.take_up(&program(FETCH_BOXES), ledger.clone(), &mirror).await;
+    let refused = bench.performer.take_up(&fetch_boxes(), ledger.clone(), &mirror).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
-    let refused = bench.performer.finish(&program(FETCH_BOXES), ledger).await;
+    let refused = bench.performer.finish(&fetch_boxes(), ledger).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
     assert_eq!(bench.performer.root().await?.0, Revision(1));
+    bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn what_ended_well_while_the_session_was_lost_is_refused_where_others_have_changed_the_same() -> anyhow::Result<()>
+{
+    let bench = Bench::new().await?;
+    let run = bench.performer.run.clone();
+    let [motion, other] = [1, 2].map(InstanceId);
+    // It is killed during two motions, and its session ends. Others change what the first one changes.
+    let mut ledger = ledger(&run, &[start(motion, 1, "work", LeaseId(1), ""), start(other, 1, "work", LeaseId(1), "")]);
+    ledger.event(Timestamp(0), &finished(other));
+    let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
+    let changes = vec![Change::Set { fact, value: Value::Bool(false) }];
+    bench.performer.world.commit("other/i1/1", changes, None).await?;
+    let mut bench = bench.comes_back(false).await?;
+    bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?;
+    // Both have ended well; what begins now knows of it.
+    let refused = bench.performer.perform(commits(1, 2));
+    assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
+    bench.performer.perform(Command::Note(Note::Retired { instance: motion }))?;
+    bench.performer.perform(start(other, 2, "work", LeaseId(2), ""))?;
+    bench.performer.perform(commits(2, 2))?;
+    assert!(bench.performer.came_between.is_none());
+    bench.performer.perform(commits(3, 3))?;
+    let world = bench.performer.world.clone();
+    bench.performer.closed().await?;
+    assert_eq!(world.root().await?.0, Revision(3));
+    Ok(())
+}
+
+#[tokio::test]
+async fn what_others_change_when_a_run_has_come_back_stands_against_what_it_began_before() -> anyhow::Result<()> {
+    let bench = Bench::new().await?;
+    let run = bench.performer.run.clone();
+    let ledger = ledger(&run, &[start(InstanceId(1), 1, "work", LeaseId(1), "")]);
+    let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
+    let change = |value| vec![Change::Set { fact: fact.clone(), value: Value::Int(value) }];
+    let mut bench = bench.comes_back(false).await?;
+    bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?;
+    bench.performer.world.commit("other/i1/1", change(1), None).await?;
+    while !matches!(bench.event().await.context("nothing is told")?, Event::WorldChanged { .. }) {}
+    let refused = bench.performer.perform(commits(1, 2));
+    assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
     bench.performer.closed().await
 }
 
@@ -1268,7 +1317,7 @@ async fn who_comes_back_commits_behind_an_operation_when_that_is_done_and_never_
         let ledger = Ledger { session, ..ledger(&run, &decided) };
         let mut bench = bench.comes_back(true).await?;
         // Its mirror has all of it.
-        assert_eq!(bench.performer.take_up(&program(FETCH_BOXES), ledger, &mirror).await?, []);
+        assert_eq!(bench.performer.take_up(&fetch_boxes(), ledger, &mirror).await?, []);
         if there == 1 {
             let failed = bench.event().await;
             assert!(matches!(&failed, Some(Event::RetirementFailed { .. })), "{failed:?}");
@@ -1296,7 +1345,7 @@ async fn behind_what_had_failed_nothing_is_made_by_who_comes_back() -> anyhow::R
     let (said, closed) = before.close().await;
     bench.answers = answers;
     assert!(closed.is_err());
-    let [Event::RetirementFailed { instance: InstanceId(1), reason }] = &said[..] else { bail!("{said:?}") };
+    let [Event::RetirementFailed { instance: InstanceId(1), reason, .. }] = &said[..] else { bail!("{said:?}") };
     assert!(reason.contains("Nothing"), "{reason}");
     let mut ledger = ledger(&run, &decided);
     said.iter().for_each(|event| ledger.event(Timestamp(0), event));
@@ -1304,7 +1353,7 @@ async fn behind_what_had_failed_nothing_is_made_by_who_comes_back() -> anyhow::R
     assert_eq!((missing_commits(&place, &ledger).await?, ledger.open_operations().count()), (Some(0), 0));
     let (events, _answers) = mpsc::channel(8);
     let mut late = connect_as(&bench.endpoints, &run, None, "task", events).await?;
-    assert_eq!(late.finish(&program(FETCH_BOXES), ledger).await?, (0, 0));
+    assert_eq!(late.finish(&fetch_boxes(), ledger).await?, (0, 0));
     assert_eq!(late.root().await?.0, Revision(1));
     late.closed().await?;
     bench.performer.closed().await
@@ -1328,9 +1377,9 @@ async fn what_others_hold_now_is_deleted_by_who_comes_back_when_it_is_free_also_
         let lease = other.resources.acquire(part, AcquireOptions::default()).await?;
         let come_back = async |bench: &mut Bench| {
             if has_ended {
-                return bench.performer.finish(&program(FETCH_BOXES), ledger.clone()).await.map(|made| made.1);
+                return bench.performer.finish(&fetch_boxes(), ledger.clone()).await.map(|made| made.1);
             }
-            let told = bench.performer.take_up(&program(FETCH_BOXES), ledger.clone(), &World::default()).await?;
+            let told = bench.performer.take_up(&fetch_boxes(), ledger.clone(), &World::default()).await?;
             Ok(told.len())
         };
         bench = bench.comes_back(false).await?;
@@ -1375,14 +1424,14 @@ async fn of_a_run_that_has_ended_what_was_not_recorded_is_made_and_nothing_else(
     let place = place_of(&bench.endpoints);
     assert_eq!(missing_commits(&place, &ledger).await?, Some(1));
     let mut bench = bench.comes_back(true).await?;
-    assert_eq!(bench.performer.finish(&program(FETCH_BOXES), ledger.clone()).await?, (1, 1));
+    assert_eq!(bench.performer.finish(&fetch_boxes(), ledger.clone()).await?, (1, 1));
     while bench.units("Box").await? == 0 {}
     bench.performer.closed().await?;
     assert_eq!(missing_commits(&place, &ledger).await?, Some(0));
     // Its session is over, and with it what it had created.
     let (events, _answers) = mpsc::channel(1);
     let mut late = connect_as(&bench.endpoints, &run, Some(session), "task", events).await?;
-    assert_eq!(late.finish(&program(FETCH_BOXES), ledger.clone()).await?, (0, 0));
+    assert_eq!(late.finish(&fetch_boxes(), ledger.clone()).await?, (0, 0));
     assert!(late.resources.list(&["Box"]).await?.is_empty());
     late.closed().await?;
     let other = Ledger { first_revision: Revision(9), ..ledger };
@@ -1399,7 +1448,7 @@ async fn who_comes_back_too_late_makes_anew_what_went_with_the_session() -> anyh
     while bench.units("Box").await? == 0 {}
     let mut bench = bench.comes_back(false).await?;
     assert_eq!(bench.units("Box").await?, 0);
-    bench.performer.take_up(&program(FETCH_BOXES), ledger(&run, &[operate]), &World::default()).await?;
+    bench.performer.take_up(&fetch_boxes(), ledger(&run, &[operate]), &World::default()).await?;
     assert_eq!(bench.units("Box").await?, 2);
     bench.performer.closed().await
 }
@@ -1420,7 +1469,7 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     let mut mirror = World::default();
     mirror.apply(&done())?;
     check_world(&place_of(&bench.endpoints), &open).await?;
-    assert_eq!(of_the_world(bench.performer.take_up(&program(FETCH_BOXES), open.clone(), &mirror).await?), []);
+    assert_eq!(of_the_world(bench.performer.take_up(&fetch_boxes(), open.clone(), &mirror).await?), []);
     let (revision, facts) = bench.performer.root().await?;
     assert_eq!((revision, facts.len()), (Revision(1), 1));
 
@@ -1429,7 +1478,7 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     let changes = vec![Change::Set { fact: fact.clone(), value: Value::Int(1) }];
     bench.performer.world.commit("other/1/2", changes, None).await?;
     check_world(&place_of(&bench.endpoints), &open).await?;
-    let changed = bench.performer.take_up(&program(FETCH_BOXES), open.clone(), &mirror).await?;
+    let changed = bench.performer.take_up(&fetch_boxes(), open.clone(), &mirror).await?;
     let facts = vec![(fact, Some(Value::Int(1)))];
     assert_eq!(of_the_world(changed), [Event::WorldChanged { revision: Revision(2), facts }]);
     // A pool that began anew.
@@ -1458,14 +1507,14 @@ async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() ->
     assert!(!remembers(&place_of(&bench.endpoints), &short).await?);
     let mut mirror = World::default();
     mirror.apply(&done())?;
-    let refused = bench.performer.take_up(&program(FETCH_BOXES), short.clone(), &mirror).await;
+    let refused = bench.performer.take_up(&fetch_boxes(), short.clone(), &mirror).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("resume the run again")));
     assert_eq!(bench.performer.root().await?.0, Revision(0));
     // With the whole log it has both, and the checkpoint is enough from then on.
-    assert_eq!(of_the_world(bench.performer.take_up(&program(FETCH_BOXES), whole, &mirror).await?), []);
+    assert_eq!(of_the_world(bench.performer.take_up(&fetch_boxes(), whole, &mirror).await?), []);
     assert_eq!(bench.performer.confirmed().commit, Revision(2));
     assert!(remembers(&place_of(&bench.endpoints), &short).await?);
-    assert_eq!(of_the_world(bench.performer.take_up(&program(FETCH_BOXES), short, &mirror).await?), []);
+    assert_eq!(of_the_world(bench.performer.take_up(&fetch_boxes(), short, &mirror).await?), []);
     assert_eq!(bench.performer.root().await?.0, Revision(2));
     bench.performer.closed().await
 }
@@ -1527,6 +1576,7 @@ fn start(instance: InstanceId, attempt: u32, action: &str, lease: LeaseId, endpo
             expected_s: None,
             timeout_s: None,
             improves: None,
+            reads_nothing: false,
         }),
     }
 }
@@ -1624,5 +1674,68 @@ async fn a_goal_without_a_projection_begins_when_what_was_decided_before_it_is_i
     let event = bench.event().await;
     assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == first), "{event:?}");
     assert_eq!(world.root().await?.1.len(), 1);
+    bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn a_goal_of_before_that_was_never_given_waits_for_what_was_decided_before_it() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (first, second) = (InstanceId(1), InstanceId(2));
+    let (_arm, endpoint) = serve_arm(&mut bench).await?;
+    // Whoever offers the arm is sure to be the same after a short while.
+    let channels = Channels::new(&ClientTls::none());
+    let manager = bench.endpoints.resource_manager.clone();
+    let robot = Session::open(&channels, &manager, "brief", Duration::from_secs(1));
+    robot.alive(SESSION_DEADLINE).await?;
+    let offering = ResourceClient::new(&channels, &manager, robot.id())?;
+    offering.create(Resource::new("brief-arm", ResourceClass::Module, "BriefArm")).await?;
+    let requirements = vec![Requirement::new(ResourceOperation::Block, "BriefArm")];
+    bench.performer.perform(Command::Acquire { instance: first, requirements, priority: 0 })?;
+    let lease = bench.granted(first).await?;
+    let goal = |instance| {
+        let Command::Start { mut goal, .. } = start(instance, 1, "work", lease, &endpoint) else {
+            unreachable!("it is a start")
+        };
+        if let Some(lease) = &mut goal.lease {
+            lease.resources[0].id = "brief-arm".to_owned();
+        }
+        *goal
+    };
+    // The commit is on its way for long; the log says that both goals are given, and the provider knows neither.
+    let (disk, slow) = Mark::not_yet();
+    bench.performer.perform_when(Some(slow), commits(1, 1))?;
+    bench.performer.start(first, 1, goal(first), Given::Before, None);
+    bench.performer.start(second, 1, Goal { reads_nothing: true, ..goal(second) }, Given::Before, None);
+    let event = bench.event().await;
+    assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == second), "{event:?}");
+    let early = tokio::time::timeout(Duration::from_secs(1), bench.event()).await;
+    assert!(early.is_err(), "{early:?}");
+    disk.send_replace(1);
+    let event = bench.event().await;
+    assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == first), "{event:?}");
+    bench.performer.closed().await
+}
+
+#[tokio::test]
+async fn a_motion_that_reads_nothing_does_not_wait_for_what_was_decided_before_it() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let (first, second) = (InstanceId(1), InstanceId(2));
+    bench.ask(first)?;
+    let lease = bench.granted(first).await?;
+    let (_arm, endpoint) = serve_arm(&mut bench).await?;
+    let (disk, slow) = Mark::not_yet();
+    bench.performer.perform_when(Some(slow), commits(1, 1))?;
+    for (instance, reads_nothing) in [(first, false), (second, true)] {
+        let Command::Start { attempt, goal, .. } = start(instance, 1, "work", lease, &endpoint) else {
+            bail!("it is a start")
+        };
+        let goal = Box::new(Goal { reads_nothing, ..*goal });
+        bench.performer.perform(Command::Start { instance, attempt, goal })?;
+    }
+    for expected in [second, first] {
+        let event = bench.event().await;
+        assert!(matches!(&event, Some(Event::Finished { instance, .. }) if *instance == expected), "{event:?}");
+        disk.send_replace(1);
+    }
     bench.performer.closed().await
 }

@@ -3,7 +3,7 @@
 use super::Answer;
 use super::told::{Told, maker};
 use crate::record::said;
-use ratn_executive::protocol::Event;
+use ratn_executive::protocol::{Event, Unmade};
 use ratn_model::id::{InstanceId, Revision};
 use ratn_proto::types::WorldUpdate;
 use ratn_worker::client::{CallError, WorldClient};
@@ -33,7 +33,7 @@ pub(super) async fn follow(world: WorldClient, after: Revision, events: mpsc::Se
             }
             Err(error) => {
                 let reason = format!("the world pool does not tell of its revisions after {from}: {}", said(&error));
-                let failed = Event::RetirementFailed { instance: InstanceId(0), reason };
+                let failed = Event::RetirementFailed { instance: InstanceId(0), reason, unmade: Unmade::Untried };
                 let _ = events.send(failed.into()).await;
                 return;
             }

@@ -178,6 +178,7 @@ impl Reference<'_> {
         let seed = seed(self.seed, path, if state.annotations.deterministic { 1 } else { tries });
         let goal = Goal {
             improves: None,
+            reads_nothing: false,
             provider: provider.as_str().into(),
             action: action.as_str().into(),
             inputs,

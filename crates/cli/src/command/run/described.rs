@@ -9,10 +9,11 @@ use crate::system::System;
 use anyhow::anyhow;
 use ratn_model::diagnostic::Diagnostic;
 use ratn_model::program::Program;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Workers that are away are waited for so long.
+/// Workers that are away, and process managers that do not answer, are waited for so long.
 const PATIENCE: Duration = Duration::from_secs(10);
 /// And are asked for so often.
 const POLL: Duration = Duration::from_millis(250);
@@ -34,15 +35,18 @@ pub(super) async fn program(
             Err(findings) => findings,
         };
         let lacks = findings.iter().any(|finding| NOT_DESCRIBED.contains(&finding.rule.as_str()));
-        let away = system.offered.away();
-        if !lacks || away.is_empty() {
+        let awaited = system.offered.awaited();
+        if !lacks {
             return Err(check::refused(&findings));
         }
+        if awaited.is_empty() {
+            return Err(given_up(&findings, &system.offered.given_up));
+        }
         if Instant::now() >= deadline {
-            return Err(in_vain(&findings, &away));
+            return Err(in_vain(&findings, &awaited));
         }
         if !is_said {
-            output::progress(format_args!("waits for workers of {} to say what they can do", away.join(", ")));
+            output::progress(format_args!("waits for {} to say what they can do", awaited.join(", ")));
             is_said = true;
         }
         tokio::select! {
@@ -53,12 +57,25 @@ pub(super) async fn program(
     }
 }
 
-fn in_vain(findings: &[Diagnostic], away: &[&str]) -> Failure {
+/// Whoever could say it is not being started any more.
+fn given_up(findings: &[Diagnostic], given_up: &BTreeMap<String, String>) -> Failure {
+    if given_up.is_empty() {
+        return check::refused(findings);
+    }
+    let pools: Vec<String> = given_up.iter().map(|(kind, why)| format!("{kind} ({why})")).collect();
+    let help = format!(
+        "ratn: what workers of {} can do is not known, as none is started any more: `ratn ps` and `ratn logs` say why",
+        pools.join(", ")
+    );
+    Failure::Refused(format!("{}\n{help}", check::refused(findings)))
+}
+
+fn in_vain(findings: &[Diagnostic], awaited: &[String]) -> Failure {
     let seconds = PATIENCE.as_secs();
     let help = format!(
-        "ratn: no worker of {} has been there for {seconds} s to say what it can do: `ratn ps` and `ratn logs` say what keeps it; start it, or name a \
+        "ratn: {} have not been there for {seconds} s to say what they can do: `ratn ps` and `ratn logs` say what keeps them; start them, or name a \
          file that says it in the system's config (`catalogues`)",
-        away.join(", ")
+        awaited.join(", ")
     );
     Failure::Refused(format!("{}\n{help}", check::refused(findings)))
 }

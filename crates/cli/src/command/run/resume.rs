@@ -28,11 +28,13 @@ pub(super) async fn run(
     if let Some(chart) = &arguments.gantt {
         output::check_writable(chart)?;
     }
-    let beside = Beside::of(arguments)?;
+    // What is said wrongly is refused first.
+    Beside::of(arguments)?;
     // From here on nobody else goes on with it.
     let log = |error| refused(&format_args!("{:#}", anyhow::Error::from(error)));
     let writer = LogWriter::go_on(file).map_err(log)?;
     let history = History::of(&writer, output::messages()).map_err(log)?;
+    let beside = Beside::going_on(arguments, history.share())?;
     let task = task.map(Path::to_owned).or_else(|| history.task());
     let task = task.ok_or_else(|| refused(&"it does not name its task file: say `ratn run --resume LOG TASK`"))?;
     let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;

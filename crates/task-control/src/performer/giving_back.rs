@@ -1,0 +1,101 @@
+//! What an instance of a run gives back: its lease, with word of what the run has committed, and its projection. Each when nothing works with it any
+//! more, and what was decided before is on the disk. Nothing waits for that but operations.
+
+use super::{Job, Performer};
+use crate::decided::{Unanswered, insist};
+use crate::safe_on_disk::Mark;
+use ratn_model::id::{InstanceId, LeaseId, ProjectionId};
+use ratn_worker::client::WorldClient;
+use ratn_worker::session::Trust;
+use ratn_worker::trace;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use tokio_util::sync::{CancellationToken, DropGuard};
+
+impl Performer {
+    /// What an instance held goes back when its goals, and those under the same lease, have ended.
+    pub(super) fn release(
+        &mut self,
+        instance: InstanceId,
+        lease: Option<LeaseId>,
+        projection: Option<ProjectionId>,
+        safe: Option<Mark>,
+    ) {
+        let over = |id: InstanceId, job: &Job| id == instance || (lease.is_some() && job.lease == lease);
+        let (ended, going_on): (BTreeMap<_, Job>, _) =
+            std::mem::take(&mut self.jobs).into_iter().partition(|(id, job)| over(*id, job));
+        self.jobs = going_on;
+        ended.values().for_each(|job| self.stopping.leave(job));
+        let idle = ended.into_values().map(|job| job.over).collect();
+        self.give_back_when(safe, instance, idle, lease, projection, None);
+    }
+
+    /// What it was given and does not want any more goes back.
+    pub(super) fn give_back(
+        &mut self,
+        instance: InstanceId,
+        lease: Option<LeaseId>,
+        projection: Option<ProjectionId>,
+        withdrawn: Option<Arc<DropGuard>>,
+    ) {
+        self.give_back_when(None, instance, Vec::new(), lease, projection, withdrawn);
+    }
+
+    fn give_back_when(
+        &mut self,
+        safe: Option<Mark>,
+        instance: InstanceId,
+        mut idle: Vec<CancellationToken>,
+        lease: Option<LeaseId>,
+        projection: Option<ProjectionId>,
+        withdrawn: Option<Arc<DropGuard>>,
+    ) {
+        if let Some(lease) = lease {
+            self.leases.given_back(lease);
+            self.holds.set(self.leases.has_speculative());
+        }
+        let (resources, world, trust) = (self.resources.clone(), self.world.clone(), self.trust.clone());
+        idle.extend(lease.into_iter().flat_map(|lease| self.stopping.under(lease)));
+        let returns = lease.map(|_| self.order.returning.begin());
+        let note = self.told.left(self.decided).to_string();
+        let (there, coming) = match projection.map(|id| (id, self.making.end(id))) {
+            Some((id, None)) => (Some(id), None),
+            Some((id, Some(coming))) => (None, Some((id, coming))),
+            None => (None, None),
+        };
+        let returning = async move {
+            // Whoever gets the resources next finds them idle.
+            for goal in idle {
+                goal.cancelled().await;
+            }
+            // What others do then stands on what is known here.
+            if let Some(safe) = safe {
+                safe.safe().await;
+            }
+            if let Some(projection) = there {
+                end_projection(&world, &trust, instance, projection).await;
+            }
+            if let Some(lease) = lease {
+                let release = || resources.release_with_note(lease, note.clone());
+                // A resource manager that is away holds it until it is told: it is waited for as long as the session may live.
+                if let Err(undone) = insist(&trust, Unanswered::Waits, release).await {
+                    tracing::warn!(%instance, "a lease was not given back: {undone}");
+                }
+            }
+            drop((returns, withdrawn));
+            // The lease is not kept until it is there.
+            if let Some((projection, coming)) = coming
+                && coming.await.is_ok()
+            {
+                end_projection(&world, &trust, instance, projection).await;
+            }
+        };
+        self.giving_back.spawn(trace::within(self.of(instance), returning));
+    }
+}
+
+async fn end_projection(world: &WorldClient, trust: &Trust, instance: InstanceId, projection: ProjectionId) {
+    if let Err(undone) = insist(trust, Unanswered::GivenUp, || world.release(projection)).await {
+        tracing::warn!(%instance, "a projection was not given back: {undone}");
+    }
+}
