@@ -69,8 +69,7 @@ pub fn survey(robot: &Robot) -> Survey {
                 lines.push(format!("{what:<10}{good} of {all} points can be served from above"));
                 faults.extend(beyond.into_iter().map(|why| format!("{what}: {why}")));
             }
-            let turned = turned(robot, workplace, &workplace.boxes);
-            faults.extend(turned.into_iter().map(|why| format!("boxes: {why}")));
+            faults.extend(turned(robot, workplace, &workplace.boxes).into_iter().map(|why| format!("boxes: {why}")));
             for share in &workplace.others {
                 let whose = others.iter().find(|other| other.arm_name() == share.arm);
                 let turned = whose.iter().flat_map(|arm| turned(arm, workplace, &share.boxes));
