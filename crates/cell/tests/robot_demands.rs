@@ -84,6 +84,15 @@ fn a_gripper_that_cannot_hold_is_told_with_what_is_wrong_with_it() {
         &[["<mimic joint='left_finger' multiplier='1' offset='0'/>", ""]],
         &["no link goes the other way", "mimics"],
     );
+    // The other one has no shape; the hand is not what they hang on.
+    let shape =
+        "<collision><origin xyz='0 -0.005 -0.06'/><geometry><box size='0.02 0.01 0.08'/></geometry></collision>";
+    finger(
+        &[[&format!("<link name='left_finger_b'>{shape}</link>"), "<link name='left_finger_b'/>"]],
+        &["`left_finger_b` has no shape"],
+    );
+    changed(&[], &[["hand = \"left_hand\"", "hand = \"left_2\""]])
+        .says(gripper, &["`left_finger_a` hangs on `left_hand`", "`hand` is `left_2`", "name `left_hand` as `hand`"]);
     // The finger slides along another axis, or inwards.
     let slides = |axis: &str| format!("<child link='left_finger_a'/><axis xyz='{axis}'/>");
     finger(&[[&slides("0 1 0"), &slides("1 0 0")]], &["`left_finger`", "goes by (40, 0, 0) mm", "along y"]);
@@ -105,6 +114,35 @@ fn a_gripper_that_cannot_hold_is_told_with_what_is_wrong_with_it() {
     let refused = changed(&[], &[[none, ""]]);
     let refused = Robot::from_file(&refused.folder.path().join("robot.toml")).unwrap_err().to_string();
     assert!(refused.contains("[workplace]") && refused.contains("the gripper opens to 0 m"), "{refused}");
+}
+
+#[test]
+fn a_base_that_may_not_be_at_the_origin_is_told() {
+    let slides = |name: &str, parent: &str, child: &str, axis: &str| {
+        format!(
+            "<joint name='{name}' type='prismatic'><parent link='{parent}'/><child link='{child}'/><axis xyz='{axis}'/>\
+             <limit lower='-5' upper='5' effort='1' velocity='0.5' acceleration='2'/></joint>"
+        )
+    };
+    let turns = "<joint name='heading' type='continuous'><parent link='along_y'/><child link='world'/><axis xyz='0 0 1'/>\
+                 <limit effort='1' velocity='0.5' acceleration='2'/></joint>";
+    let base = [
+        "<link name='root'/><link name='along_x'/><link name='along_y'/><link name='world'/>".to_owned(),
+        slides("x", "root", "along_x", "1 0 0"),
+        slides("y", "along_x", "along_y", "0 1 0"),
+        turns.to_owned(),
+    ]
+    .concat();
+    let within = |area: &str| {
+        let said = format!(
+            "[camera]\nlink = \"camera\"\n[base]\njoints = [\"x\", \"y\", \"heading\"]\nbody = \"world\"\n{area}"
+        );
+        changed(&[["<link name='world'/>", &base]], &[["[camera]\nlink = \"camera\"", &said]])
+    };
+    assert_eq!(within("").unmet(), []);
+    assert_eq!(within("area = { x = [0.0, 3.0], y = [-1.0, 1.0] }").unmet(), []);
+    within("area = { x = [-1.0, 3.0], y = [0.5, 1.0] }")
+        .says("[base]", &["y goes from 0.5 to 1 m", "origin", "`area`"]);
 }
 
 #[test]

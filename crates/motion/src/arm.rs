@@ -8,6 +8,7 @@
 use crate::joint_vector::JointVector;
 use crate::line::{self, LineError};
 use crate::mechanism::Mechanism;
+use crate::pairs::Pair;
 use crate::reach::Reach;
 use crate::robot::{Body, Configuration, Geometry, Link, Robot};
 use crate::space::{Obstacle, Space, State};
@@ -15,6 +16,7 @@ use crate::spheres::cover_within;
 use crate::surroundings::Surroundings;
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene, Shape};
+use std::collections::BTreeSet;
 
 /// How far the spheres stand out of a shape at most, in metres, unless the shape is very long.
 pub const OVERHANG_M: f64 = 0.01;
@@ -54,9 +56,12 @@ pub fn in_scene(robot: &Robot, scene: &Scene, here: &Configuration) -> (Mechanis
         (0..arm.links.len()).partition(|link| *link >= robot.model.links.len() || robot.arm_links.contains(link));
     let mut obstacles = Vec::new();
     for index in standing {
-        let beside: Vec<usize> = moving.iter().copied().filter(|link| !arm.is_checked(*link, index)).collect();
+        let is_beside = |link: &usize| !arm.is_checked(*link, index) || is_unseen(&arm, *link, index);
+        let beside: Vec<usize> = moving.iter().copied().filter(is_beside).collect();
         let link = &mut arm.links[index];
         link.spheres.clear();
+        link.meshes.clear();
+        link.covers = 0;
         for (i, body) in std::mem::take(&mut link.bodies).into_iter().enumerate() {
             let name = format!("link {} {i}", arm.links[index].name);
             arm.allowed.extend(beside.iter().map(|link| (*link, name.clone())));
@@ -75,6 +80,20 @@ pub fn in_scene(robot: &Robot, scene: &Scene, here: &Configuration) -> (Mechanis
         }
     }
     (arm, obstacles)
+}
+
+/// Of the pairs of links of which one at least moves with the arm, those that the vector checks do not look at though they are to be kept apart:
+/// spheres say nothing of them. The primitives of what stands are looked at as they are.
+pub(crate) fn unseen(robot: &Robot, arm: &Mechanism) -> BTreeSet<Pair> {
+    let moves = |link: &usize| robot.arm_links.contains(link);
+    let is_unseen = |(a, b): &&Pair| moves(a) && moves(b) || is_unseen(arm, *a, *b);
+    let by_shapes = arm.by_shapes.iter().filter(|(a, b)| arm.is_checked(*a, *b));
+    by_shapes.filter(is_unseen).copied().collect()
+}
+
+/// Whether what spheres stand for would always meet.
+fn is_unseen(arm: &Mechanism, a: usize, b: usize) -> bool {
+    arm.is_by_shapes(a, b) && [a, b].iter().any(|link| arm.links[*link].covers > 0)
 }
 
 /// The tool of the arm in the frame of the base.

@@ -1,8 +1,8 @@
 //! Does the robot, in a posture of its arm, touch the scene or itself?
 //!
 //! A [`Checker`] is made once per scene: what stands still (objects, base, mast) becomes a flat array of obstacles, what the
-//! arm moves (links, hand, fingers, the held object) an array of moving shapes. Bounding spheres decide most pairs, parry3d
-//! decides the rest. Which links are to be kept apart the mechanism says ([`arm::holding`](crate::arm::holding)). It says what touches what and how deep, and where contact is allowed; free motions are searched with the
+//! arm moves (links, hand, fingers, the held object) an array of moving shapes. Bounding spheres decide most pairs, distances
+//! decide the rest. Which links are to be kept apart the mechanism says ([`arm::holding`](crate::arm::holding)). It says what touches what and how deep, and where contact is allowed; free motions are searched with the
 //! vector checks of `arm` and `space`. Shapes that move are grown by a padding. Between two postures no further apart than [`Checker::steps`]
 //! allows, no point is further than the padding from its place in the nearer one: where both are free, the way between is.
 
@@ -12,11 +12,11 @@ use crate::joint_vector::JointVector;
 use crate::keep::Region;
 use crate::levers::Levers;
 use crate::mechanism::Mechanism;
+use crate::pairs::Pair;
 use crate::request::kept_out;
-use crate::robot::{Body, Configuration, Geometry, Robot, to_f32};
+use crate::robot::{Configuration, Geometry, Robot, to_f32};
+use crate::solid::{Form, Placed, Solid};
 use parry3d::math::{Pose as Pose32, Vector};
-use parry3d::query;
-use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene, Shape};
 use std::collections::BTreeSet;
@@ -57,7 +57,8 @@ pub struct Checker<'a> {
 struct Obstacle {
     name: String,
     link: Option<usize>,
-    shape: SharedShape,
+    form: Form,
+    solid: Solid,
     pose: Pose32,
     centre: Vector,
     radius: f32,
@@ -75,6 +76,17 @@ enum Entry {
     Never,
 }
 
+/// A shape of a link or of what stands.
+struct Part {
+    form: Form,
+    /// There.
+    at: Pose,
+    solid: Solid,
+    padded: Solid,
+    /// How far it reaches from its centre, and how much farther the padded one does.
+    reach: [f64; 2],
+}
+
 #[derive(Clone)]
 struct Moving {
     name: String,
@@ -86,9 +98,10 @@ struct Moving {
     is_with_tool: bool,
     role: Role,
     local: Pose,
+    form: Form,
     /// Grown by the padding.
-    padded: SharedShape,
-    shape: SharedShape,
+    padded: Solid,
+    solid: Solid,
     radius: f32,
     /// Obstacles that it can meet.
     obstacles: Vec<usize>,
@@ -173,10 +186,24 @@ impl<'a> Checker<'a> {
     /// The same, but nothing that moves may ever be in these boxes of the world.
     pub fn keeping_out_of(mut self, regions: &[Region]) -> Checker<'a> {
         for (i, Region { pose, size }) in regions.iter().enumerate() {
-            self.add_obstacle(kept_out(i), None, *pose, &Geometry::from(&Shape::Box { size: *size }), Entry::Never);
+            let part = Part::standing(&Geometry::from(&Shape::Box { size: *size }));
+            self.add_obstacle(kept_out(i), None, *pose, part, Entry::Never);
         }
         let all = 0..self.obstacles.len();
-        self.moving.iter_mut().for_each(|moving| moving.obstacles.extend(all.clone().skip(all.len() - regions.len())));
+        let apart = self.moving.iter_mut().filter(|moving| moving.form.counts(false));
+        apart.for_each(|moving| moving.obstacles.extend(all.clone().skip(all.len() - regions.len())));
+        self
+    }
+
+    /// The same for these pairs of links alone, and for nothing else.
+    pub(crate) fn of_pairs(mut self, pairs: &BTreeSet<Pair>) -> Checker<'a> {
+        let has = |a: usize, b: usize| pairs.contains(&(a.min(b), a.max(b)));
+        let (moving, obstacles) = (&mut self.moving, &self.obstacles);
+        for one in moving.iter_mut() {
+            let link = one.link;
+            one.obstacles.retain(|o| obstacles[*o].link.is_some_and(|other| has(link, other)));
+        }
+        self.pairs.retain(|(i, j)| has(moving[*i].link, moving[*j].link));
         self
     }
 
@@ -196,12 +223,27 @@ impl<'a> Checker<'a> {
                 () if hand.is_some() && link.parent == hand => Some((format!("link {}", link.name), i, Role::Finger)),
                 () => Some((format!("link {}", link.name), i, Role::Arm)),
             };
-            for body in &link.bodies {
+            let primitives = link.forms().map(|(form, body)| Part {
+                form,
+                at: body.pose,
+                solid: Solid::primitive(body, 0.0),
+                padded: Solid::primitive(body, self.padding),
+                // A padded box's corners move out by more than the padding.
+                reach: [body.geometry.radius(), self.padding * 3_f64.sqrt()],
+            });
+            let meshes = link.mesh_forms().map(|(form, meshed)| Part {
+                form,
+                at: meshed.pose,
+                solid: Solid::mesh(&meshed.mesh, 0.0),
+                padded: Solid::mesh(&meshed.mesh, self.padding),
+                reach: [meshed.mesh.radius(), self.padding],
+            });
+            for part in primitives.chain(meshes).collect::<Vec<Part>>() {
                 match &moving {
-                    Some((name, frame, role)) => self.add_moving(name.clone(), [i, *frame], *role, body),
+                    Some((name, frame, role)) => self.add_moving(name.clone(), [i, *frame], *role, part),
                     None => {
-                        let pose = self.poses[i].compose(&body.pose);
-                        self.add_obstacle(format!("link {}", link.name), Some(i), pose, &body.geometry, Entry::Pressed);
+                        let pose = self.poses[i].compose(&part.at);
+                        self.add_obstacle(format!("link {}", link.name), Some(i), pose, part, Entry::Pressed);
                     }
                 }
             }
@@ -213,54 +255,43 @@ impl<'a> Checker<'a> {
         for object in &scene.objects {
             // What is in the gripper has been added with the arm; `hands` says where the rest is.
             if let Placement::World(pose) = &object.placement {
-                let geometry = Geometry::from(&object.shape);
-                let body = geometry.at(*pose);
-                self.add_obstacle(object.name.clone(), None, body.pose, &geometry, Entry::Pressed);
+                let part = Part::standing(&Geometry::from(&object.shape));
+                self.add_obstacle(object.name.clone(), None, pose.compose(&part.at), part, Entry::Pressed);
             }
         }
     }
 
-    fn add_moving(&mut self, name: String, [link, frame]: [usize; 2], role: Role, body: &Body) {
-        self.moving.push(Moving {
-            name,
-            link,
-            frame,
-            is_with_tool: false,
-            role,
-            local: body.pose,
-            padded: body.geometry.shape(self.padding),
-            shape: body.geometry.shape(0.0),
-            // A padded box's corners move out by more than the padding.
-            radius: (body.geometry.radius() + self.padding * 3_f64.sqrt()) as f32,
-            obstacles: Vec::new(),
-        });
+    fn add_moving(&mut self, name: String, [link, frame]: [usize; 2], role: Role, part: Part) {
+        let Part { form, at, solid, padded, reach } = part;
+        let radius = reach.iter().sum::<f64>() as f32;
+        let (is_with_tool, obstacles) = (false, Vec::new());
+        let moving =
+            Moving { name, link, frame, is_with_tool, role, local: at, form, padded, solid, radius, obstacles };
+        self.moving.push(moving);
         self.placed.push(Pose32::IDENTITY);
         self.centres.push(Vector::ZERO);
     }
 
-    fn add_obstacle(&mut self, name: String, link: Option<usize>, pose: Pose, geometry: &Geometry, entry: Entry) {
+    fn add_obstacle(&mut self, name: String, link: Option<usize>, pose: Pose, part: Part, entry: Entry) {
         let pose = to_f32(&pose);
-        self.obstacles.push(Obstacle {
-            name,
-            link,
-            shape: geometry.shape(0.0),
-            pose,
-            centre: pose.translation,
-            radius: geometry.radius() as f32,
-            entry,
-        });
+        let Part { form, solid, reach: [radius, _], .. } = part;
+        let (centre, radius) = (pose.translation, radius as f32);
+        self.obstacles.push(Obstacle { name, link, form, solid, pose, centre, radius, entry });
     }
 
     /// Which pairs are to be kept apart: the arm says so of its links, and everything of the arm is to be kept from the objects.
     fn find_pairs(&mut self, arm: &Mechanism) {
+        let is_looked_at = |a: &Moving, form: Form, link: Option<usize>| {
+            let by_shapes = link.is_some_and(|link| arm.is_by_shapes(a.link, link));
+            let is_checked = link.is_none_or(|link| arm.is_checked(a.link, link));
+            is_checked && a.form.counts(by_shapes) && form.counts(by_shapes)
+        };
         for i in 0..self.moving.len() {
             let a = &self.moving[i];
-            let obstacles = (0..self.obstacles.len())
-                .filter(|o| self.obstacles[*o].link.is_none_or(|link| arm.is_checked(a.link, link)))
-                .collect();
-            let others = i + 1..self.moving.len();
-            let beside = others.filter(|j| arm.is_checked(a.link, self.moving[*j].link)).map(|j| (i, j));
-            self.pairs.extend(beside);
+            let beside = |o: &usize| is_looked_at(a, self.obstacles[*o].form, self.obstacles[*o].link);
+            let obstacles = (0..self.obstacles.len()).filter(beside).collect();
+            let among = |j: &usize| is_looked_at(a, self.moving[*j].form, Some(self.moving[*j].link));
+            self.pairs.extend((i + 1..self.moving.len()).filter(among).map(|j| (i, j)));
             self.moving[i].is_with_tool = arm.carrier(self.moving[i].link) == arm.carrier(self.robot.tool);
             self.moving[i].obstacles = obstacles;
         }
@@ -358,12 +389,9 @@ impl<'a> Checker<'a> {
     /// The same of one pair that does not touch, in the posture checked last; `up_to` if there is more.
     fn room_between(&self, i: usize, other: Other, contact: Contact, up_to: f64) -> f64 {
         let moving = &self.moving[i];
-        let (centre, radius, pose, shape) = match other {
-            Other::Obstacle(o) => {
-                let obstacle = &self.obstacles[o];
-                (obstacle.centre, obstacle.radius, &obstacle.pose, &obstacle.shape)
-            }
-            Other::Moving(j) => (self.centres[j], self.moving[j].radius, &self.placed[j], &self.moving[j].shape),
+        let (centre, radius) = match other {
+            Other::Obstacle(o) => (self.obstacles[o].centre, self.obstacles[o].radius),
+            Other::Moving(j) => (self.centres[j], self.moving[j].radius),
             Other::Cloud => return up_to,
         };
         let reach = moving.radius + radius + up_to as f32;
@@ -376,11 +404,8 @@ impl<'a> Checker<'a> {
             }
             _ => self.may_press(i, other, contact),
         };
-        match query::contact(&self.placed[i], &*moving.shape, pose, &**shape, up_to as f32) {
-            Ok(None) => up_to,
-            Ok(Some(contact)) => (f64::from(contact.dist) + tolerance).clamp(0.0, up_to),
-            Err(_) => 0.0,
-        }
+        let apart = self.apart_m(i, other, up_to);
+        (apart + tolerance).clamp(0.0, up_to)
     }
 
     /// Whether the straight motion from one posture to another touches nothing; `from` itself is not checked.
@@ -423,7 +448,7 @@ impl<'a> Checker<'a> {
                 let obstacle = &self.obstacles[o];
                 let reach = moving.radius + obstacle.radius;
                 if self.centres[i].distance_squared(obstacle.centre) < reach * reach
-                    && intersects(&self.placed[i], &moving.padded, &obstacle.pose, &obstacle.shape)
+                    && self.padded(i).touches(&Placed { pose: obstacle.pose, solid: &obstacle.solid })
                     && !self.allowed(i, Other::Obstacle(o), contact)
                 {
                     return Some((i, Other::Obstacle(o)));
@@ -440,7 +465,7 @@ impl<'a> Checker<'a> {
         for &(i, j) in &self.pairs {
             let reach = self.moving[i].radius + self.moving[j].radius;
             if self.centres[i].distance_squared(self.centres[j]) < reach * reach
-                && intersects(&self.placed[i], &self.moving[i].padded, &self.placed[j], &self.moving[j].shape)
+                && self.padded(i).touches(&Placed { pose: self.placed[j], solid: &self.moving[j].solid })
             {
                 return Some((i, Other::Moving(j)));
             }
@@ -483,7 +508,10 @@ impl<'a> Checker<'a> {
     /// less; negative: how deep one is in the other.
     fn gap_to_cloud(&self, i: usize, up_to: f64) -> f64 {
         let Some(cloud) = &self.cloud else { return up_to };
-        let (pose, shape) = (&self.placed[i], &self.moving[i].shape);
+        if !self.moving[i].form.counts(false) {
+            return up_to;
+        }
+        let (pose, shape) = (&self.placed[i], &self.moving[i].solid.shape);
         let radius = cloud.radius_m() as f32;
         let mut gap = up_to;
         cloud.visit_near(pose, shape, None, radius + up_to as f32, &mut |_, distance| {
@@ -495,14 +523,36 @@ impl<'a> Checker<'a> {
 
     /// How deep the unpadded shapes are inside each other, in metres, in the posture checked last.
     fn depth(&self, i: usize, other: Other) -> Option<f64> {
-        let (pose, shape) = match other {
-            Other::Obstacle(o) => (&self.obstacles[o].pose, &self.obstacles[o].shape),
-            Other::Moving(j) => (&self.placed[j], &self.moving[j].shape),
-            Other::Cloud => return Some(-self.gap_to_cloud(i, 2.0 * self.padding)),
+        let near = 2.0 * self.padding;
+        let apart = match other {
+            Other::Cloud => return Some(-self.gap_to_cloud(i, near)),
+            _ => self.apart_m(i, other, near),
         };
-        let prediction = 2.0 * self.padding as f32;
-        let contact = query::contact(&self.placed[i], &*self.moving[i].shape, pose, &**shape, prediction).ok()??;
-        Some(-f64::from(contact.dist))
+        (apart <= near).then_some(-apart)
+    }
+
+    fn padded(&self, i: usize) -> Placed<'_> {
+        Placed { pose: self.placed[i], solid: &self.moving[i].padded }
+    }
+
+    /// How far the unpadded shapes are from each other, in metres, or more than `enough_m`; below zero as far as they are deep in each other.
+    fn apart_m(&self, i: usize, other: Other, enough_m: f64) -> f64 {
+        let (pose, solid) = match other {
+            Other::Obstacle(o) => (self.obstacles[o].pose, &self.obstacles[o].solid),
+            Other::Moving(j) => (self.placed[j], &self.moving[j].solid),
+            Other::Cloud => return enough_m,
+        };
+        let own = Placed { pose: self.placed[i], solid: &self.moving[i].solid };
+        own.apart_m(&Placed { pose, solid }, enough_m)
+    }
+}
+
+impl Part {
+    /// What stands, with its axis along z.
+    fn standing(geometry: &Geometry) -> Part {
+        let body = geometry.at(Pose::IDENTITY);
+        let solid = || Solid::primitive(&body, 0.0);
+        Part { form: Form::Own, at: body.pose, solid: solid(), padded: solid(), reach: [geometry.radius(), 0.0] }
     }
 }
 
@@ -528,28 +578,10 @@ pub fn length(path: &[JointVector]) -> f64 {
     path.windows(2).map(|pair| distance(&pair[0], &pair[1])).sum()
 }
 
-/// Pairs that parry3d cannot decide count as touching; there are none among the primitives.
-fn intersects(pose_a: &Pose32, a: &SharedShape, pose_b: &Pose32, b: &SharedShape) -> bool {
-    !query::intersection_test(pose_a, &**a, pose_b, &**b).is_ok_and(|r| !r.intersecting)
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
-    use parry3d::shape::HalfSpace;
-
-    #[test]
-    fn a_pair_that_cannot_be_decided_touches() {
-        let floor = SharedShape::new(HalfSpace::new(Vector::new(0.0, 0.0, 1.0)));
-        let ball = SharedShape::ball(0.1);
-        let at = |z: f32| Pose32::from_translation(Vector::new(0.0, 0.0, z));
-        // parry3d says nothing about two half-spaces.
-        assert!(query::intersection_test(&at(1.0), &*floor, &at(0.0), &*floor).is_err());
-        assert!(intersects(&at(1.0), &floor, &at(0.0), &floor));
-        assert!(intersects(&at(0.05), &ball, &at(0.0), &floor));
-        assert!(!intersects(&at(0.2), &ball, &at(0.0), &floor));
-    }
 
     /// A robot whose arm is moved by `a` and then `b`, with what a URDF says between and behind them.
     fn robot(joints: &str, arm: &str, tool: &str) -> Robot {

@@ -55,6 +55,7 @@ fn of_spheres(mechanism: &Mechanism, larger_m: f64) -> Mechanism {
     let link = |link: &Link| Link {
         bodies: link.spheres.iter().map(body).collect(),
         meshes: Vec::new(),
+        covers: 0,
         padding_m: 0.0,
         ..link.clone()
     };

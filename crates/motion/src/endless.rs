@@ -11,6 +11,23 @@ use std::f64::consts::TAU;
 /// How far beyond the ends of a path a joint may turn, in radians.
 const BESIDE: f64 = TAU / 4.0;
 
+/// How many turns from zero a position may be. Beyond, positions lose the digits that a path needs.
+const MOST_TURNS: f64 = 1e4;
+
+/// What is wrong with positions of joints that turn without end; `which` of the problem's ends they are begins each line.
+pub(crate) fn wound_too_far(mechanism: &Mechanism, positions: &[f64], which: &str) -> Vec<String> {
+    let joints = mechanism.joints.iter().zip(&mechanism.endless).zip(positions);
+    let far = joints.filter(|((_, endless), position)| **endless && position.abs() > MOST_TURNS * TAU);
+    far.map(|((joint, _), position)| {
+        format!(
+            "{which}: {} is at {position:e} rad, {:.0} turns from zero: at most {MOST_TURNS} are taken; give the same posture within a turn",
+            joint.name,
+            (position / TAU).abs()
+        )
+    })
+    .collect()
+}
+
 /// A problem in which joints turn the short way.
 #[derive(Debug, Clone)]
 pub(crate) struct Unwound {

@@ -1,4 +1,4 @@
-//! The slow and exact check: every shape of the robot as the URDF has it, against every obstacle, by parry3d.
+//! The slow and exact check: every shape of the robot as the URDF has it, against every obstacle, by their distance ([`distance`](crate::distance)).
 //!
 //! It confirms what the vector kernels found, and says what touches what and how deep. A closed mesh is solid: what is wholly inside
 //! touches it, too.
@@ -6,20 +6,16 @@
 use crate::cloud::Cloud;
 use crate::frame::compose;
 use crate::geometry::Body;
-use crate::inside::Inside;
 use crate::mechanism::Mechanism;
-use crate::mesh::Mesh;
+use crate::mesh::Meshed;
 use crate::robot::to_f32;
 use crate::robot_model::Link;
+use crate::solid::{Form, Placed, Solid};
 use crate::space::Obstacle;
 use crate::surroundings::{MeshObstacle, Surroundings};
-use parry3d::math::{Pose as Pose32, Vector};
-use parry3d::query;
-use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::fmt;
-use std::sync::Arc;
 
 /// Two things that touch.
 #[derive(Debug, Clone, PartialEq)]
@@ -50,58 +46,21 @@ pub struct Exact<'a> {
     pairs: Vec<(usize, usize)>,
 }
 
-/// What a link or an obstacle has: its pose there, its shape, and how near to it is as good as touching, in metres.
+/// A shape of a link or an obstacle, and its pose there.
 #[derive(Debug)]
 struct Shape {
     at: Pose,
-    shape: SharedShape,
-    skin: f32,
-    /// Of a mesh; other shapes are solid by themselves.
-    inside: Option<Arc<Inside>>,
-}
-
-/// The shapes of meshes, each made once, however many links and obstacles have it.
-#[derive(Default)]
-struct Meshes(BTreeMap<*const Mesh, (SharedShape, Arc<Inside>)>);
-
-impl Meshes {
-    fn shape(&mut self, at: Pose, mesh: &Arc<Mesh>, padding_m: f64) -> Shape {
-        let made = || (mesh.shape(), Arc::new(Inside::new(mesh)));
-        let (shape, inside) = self.0.entry(Arc::as_ptr(mesh)).or_insert_with(made).clone();
-        Shape { at, shape, skin: padding_m as f32, inside: Some(inside) }
-    }
-}
-
-/// A shape in its place.
-struct Placed<'s> {
-    pose: Pose32,
-    shape: &'s Shape,
+    form: Form,
+    solid: Solid,
 }
 
 impl Shape {
-    fn primitive(body: &Body, padding_m: f64) -> Shape {
-        Shape { at: body.pose, shape: body.geometry.shape(padding_m), skin: 0.0, inside: None }
+    fn placed(&self, frame: &Pose) -> Placed<'_> {
+        Placed { pose: to_f32(&compose(frame, &self.at)), solid: &self.solid }
     }
 }
 
 impl Placed<'_> {
-    /// How deep this is in another shape whose surface it does not meet: as deep as the deepest of its parts, by a point of each.
-    fn depth_inside(&self, other: &Placed<'_>) -> Option<f64> {
-        let centre = [[0.0; 3]];
-        let points = self.shape.inside.as_ref().map_or(&centre[..], |inside| inside.corners());
-        let deep = |point: &[f64; 3]| {
-            let [x, y, z] = point.map(|c| c as f32);
-            let at = other.pose.inverse_transform_point(self.pose.transform_point(Vector::new(x, y, z)));
-            let is_inside = match &other.shape.inside {
-                Some(inside) => inside.contains([at.x, at.y, at.z].map(f64::from)),
-                None => other.shape.shape.contains_local_point(at),
-            };
-            let surface = || other.shape.shape.project_local_point(at, false).point;
-            is_inside.then(|| f64::from((surface() - at).length()))
-        };
-        points.iter().filter_map(deep).reduce(f64::max)
-    }
-
     /// How deep the deepest ball of a cloud is in this.
     fn depth_in(&self, cloud: &Cloud) -> Option<f64> {
         let mut deepest = None;
@@ -114,10 +73,9 @@ impl Placed<'_> {
 
     /// Shows the balls of a cloud that come within a margin, by number, and how deep they are in that.
     fn meet(&self, cloud: &Cloud, margin: f32, wants_more: &mut dyn FnMut(usize, f32) -> bool) {
-        let reach = cloud.radius_m() as f32 + self.shape.skin + margin;
-        let inside = self.shape.inside.as_deref();
-        cloud
-            .visit_near(&self.pose, &self.shape.shape, inside, reach, &mut |point, gap| wants_more(point, reach - gap));
+        let reach = cloud.radius_m() as f32 + self.solid.skin_m as f32 + margin;
+        let (shape, inside) = (&self.solid.shape, self.solid.inside.as_deref());
+        cloud.visit_near(&self.pose, shape, inside, reach, &mut |point, gap| wants_more(point, reach - gap));
     }
 }
 
@@ -125,20 +83,15 @@ impl<'a> Exact<'a> {
     /// A robot among obstacles.
     pub fn new(mechanism: &'a Mechanism, surroundings: impl Into<Surroundings<'a>>) -> Exact<'a> {
         let Surroundings { obstacles, clouds, meshes } = surroundings.into();
-        let mut shapes = Meshes::default();
         let solid = |obstacle: &'a Obstacle| {
             let body = obstacle.geometry.at(obstacle.pose);
-            (&*obstacle.name, Shape::primitive(&body, 0.0))
+            (&*obstacle.name, Shape { at: body.pose, form: Form::Own, solid: Solid::primitive(&body, 0.0) })
         };
-        let mut standing: Vec<(&str, Shape)> = obstacles.iter().map(solid).collect();
-        for MeshObstacle { name, pose, mesh, .. } in meshes {
-            standing.push((name, shapes.shape(*pose, mesh, 0.0)));
-        }
-        let mut bodies = |link: &Link| -> Vec<Shape> {
-            let primitives = link.bodies.iter().map(|body| Shape::primitive(body, link.padding_m));
-            primitives.chain(link.meshes.iter().map(|m| shapes.shape(m.pose, &m.mesh, link.padding_m))).collect()
+        let mesh = |MeshObstacle { name, pose, mesh, .. }: &'a MeshObstacle| {
+            (&**name, Shape { at: *pose, form: Form::Own, solid: Solid::mesh(mesh, 0.0) })
         };
-        let bodies = mechanism.links.iter().map(&mut bodies).collect();
+        let standing = obstacles.iter().map(solid).chain(meshes.iter().map(mesh)).collect();
+        let bodies = mechanism.links.iter().map(shapes).collect();
         Exact { mechanism, obstacles: standing, clouds, bodies, pairs: mechanism.pairs() }
     }
 
@@ -171,16 +124,14 @@ impl<'a> Exact<'a> {
 
     /// Whether two links meet where all links are in these poses, whatever is excepted.
     pub(crate) fn do_meet(&self, poses: &[Pose], a: usize, b: usize) -> bool {
-        let placed = |link: usize| {
-            self.bodies[link].iter().map(move |shape| Placed { pose: to_f32(&compose(&poses[link], &shape.at)), shape })
-        };
-        placed(a).any(|body| placed(b).any(|other| depth(&body, &other).is_some()))
+        let placed = |link: usize| self.bodies[link].iter().map(move |shape| shape.placed(&poses[link]));
+        placed(a).any(|body| placed(b).any(|other| body.touches(&other)))
     }
 
     /// The numbers of a cloud's points whose balls come within `margin_m` metres of the robot.
     pub(crate) fn points_near(&self, positions: &[f64], cloud: &Cloud, margin_m: f64) -> BTreeSet<usize> {
         let mut near = BTreeSet::new();
-        for body in self.placed(positions).iter().flatten() {
+        for (_, body) in self.placed(positions).iter().flatten().filter(|(form, _)| form.counts(false)) {
             body.meet(cloud, margin_m as f32, &mut |point, _| {
                 near.insert(point);
                 true
@@ -189,11 +140,11 @@ impl<'a> Exact<'a> {
         near
     }
 
-    fn placed(&self, positions: &[f64]) -> Vec<Vec<Placed<'_>>> {
+    fn placed(&self, positions: &[f64]) -> Vec<Vec<(Form, Placed<'_>)>> {
         let poses = self.mechanism.poses(positions);
         let mut placed = Vec::with_capacity(self.bodies.len());
         for (shapes, link) in self.bodies.iter().zip(&poses) {
-            placed.push(shapes.iter().map(|shape| Placed { pose: to_f32(&compose(link, &shape.at)), shape }).collect());
+            placed.push(shapes.iter().map(|shape| (shape.form, shape.placed(link))).collect());
         }
         placed
     }
@@ -201,12 +152,14 @@ impl<'a> Exact<'a> {
     /// Shows touches until it hears that no more are wanted.
     fn visit(&self, positions: &[f64], wants_more: &mut dyn FnMut(Touch) -> bool) {
         let placed = self.placed(positions);
+        let of_link = |link: usize, by_shapes: bool| {
+            placed[link].iter().filter(move |(form, _)| form.counts(by_shapes)).map(|(_, body)| body)
+        };
         let name = |link: usize| self.mechanism.links[link].name.clone();
-        for (link, bodies) in placed.iter().enumerate() {
-            for body in bodies {
+        for link in 0..placed.len() {
+            for body in of_link(link, false) {
                 for (obstacle, shape) in self.obstacles.iter().filter(|o| self.mechanism.is_kept_from(link, o.0)) {
-                    let other = Placed { pose: to_f32(&shape.at), shape };
-                    if let Some(depth_m) = depth(body, &other)
+                    if let Some(depth_m) = body.depth(&shape.placed(&Pose::IDENTITY))
                         && !wants_more(Touch { link: name(link), other: (*obstacle).to_owned(), depth_m })
                     {
                         return;
@@ -214,9 +167,9 @@ impl<'a> Exact<'a> {
                 }
             }
         }
-        for (link, bodies) in placed.iter().enumerate() {
+        for link in 0..placed.len() {
             for cloud in self.clouds.iter().filter(|cloud| self.mechanism.is_kept_from(link, &cloud.name)) {
-                let deepest = bodies.iter().filter_map(|body| body.depth_in(cloud)).reduce(f64::max);
+                let deepest = of_link(link, false).filter_map(|body| body.depth_in(cloud)).reduce(f64::max);
                 if let Some(depth_m) = deepest
                     && !wants_more(Touch { link: name(link), other: cloud.name.clone(), depth_m })
                 {
@@ -225,11 +178,14 @@ impl<'a> Exact<'a> {
             }
         }
         for &(link, second) in &self.pairs {
-            for (body, other) in placed[link].iter().flat_map(|body| placed[second].iter().map(move |o| (body, o))) {
-                if let Some(depth_m) = depth(body, other)
-                    && !wants_more(Touch { link: name(link), other: name(second), depth_m })
-                {
-                    return;
+            let by_shapes = self.mechanism.by_shapes.contains(&(link, second));
+            for body in of_link(link, by_shapes) {
+                for other in of_link(second, by_shapes) {
+                    if let Some(depth_m) = body.depth(other)
+                        && !wants_more(Touch { link: name(link), other: name(second), depth_m })
+                    {
+                        return;
+                    }
                 }
             }
         }
@@ -255,29 +211,12 @@ impl<'a> Exact<'a> {
     }
 }
 
-/// How deep two shapes are in each other, if they touch or one is inside the other; a pair that parry cannot decide counts as touching.
-fn depth(a: &Placed<'_>, b: &Placed<'_>) -> Option<f64> {
-    let meshes = a.shape.inside.is_some() || b.shape.inside.is_some();
-    // parry3d knows only the surface of a mesh.
-    let inside = || if meshes { a.depth_inside(b).or_else(|| b.depth_inside(a)) } else { None };
-    surfaces(a, b).or_else(inside)
-}
-
-fn surfaces(a: &Placed<'_>, b: &Placed<'_>) -> Option<f64> {
-    let skin = a.shape.skin + b.shape.skin;
-    let (first, second) = (&*a.shape.shape, &*b.shape.shape);
-    if skin > 0.0 {
-        return match query::contact(&a.pose, first, &b.pose, second, skin) {
-            Ok(contact) => contact.map(|c| f64::from(skin - c.dist)),
-            Err(_) => Some(0.0),
-        };
-    }
-    match query::intersection_test(&a.pose, first, &b.pose, second) {
-        Ok(found) if !found.intersecting => None,
-        Ok(_) => {
-            let contact = query::contact(&a.pose, first, &b.pose, second, 0.0).ok().flatten();
-            Some(contact.map_or(0.0, |c| -f64::from(c.dist)))
-        }
-        Err(_) => Some(0.0),
-    }
+/// All shapes of a link.
+fn shapes(link: &Link) -> Vec<Shape> {
+    let padding_m = link.padding_m;
+    let primitive =
+        |(form, body): (Form, &Body)| Shape { at: body.pose, form, solid: Solid::primitive(body, padding_m) };
+    let mesh =
+        |(form, meshed): (Form, &Meshed)| Shape { at: meshed.pose, form, solid: Solid::mesh(&meshed.mesh, padding_m) };
+    link.forms().map(primitive).chain(link.mesh_forms().map(mesh)).collect()
 }

@@ -8,6 +8,7 @@ use crate::mesh::MeshError;
 use crate::pairs::Checks;
 use crate::robot_model::{self, Drive, Joint, Link, RobotModel};
 use crate::robot_state::RobotState;
+use crate::solid::Form;
 use crate::spheres;
 use crate::urdf::RobotError;
 use ratn_model::pose::Pose;
@@ -128,7 +129,8 @@ impl Mechanism {
         let link = &mut self.links[link];
         link.padding_m = padding_m;
         let grown = |body: &Body| Body { geometry: body.geometry.grown(padding_m), ..*body };
-        link.spheres = link.bodies.iter().flat_map(|body| spheres::cover(&grown(body))).collect();
+        let own = link.forms().filter(|(form, _)| *form == Form::Own);
+        link.spheres = own.flat_map(|(_, body)| spheres::cover(&grown(body))).collect();
         link.spheres.extend(link.meshes.iter().flat_map(|meshed| meshed.cover(padding_m)));
     }
 
@@ -162,6 +164,11 @@ impl Mechanism {
     /// Whether two links are to be kept apart: not where the pair is excepted, nor where no planned joint moves one against the other.
     pub fn is_checked(&self, a: usize, b: usize) -> bool {
         self.carrier(a) != self.carrier(b) && !self.excepted.contains(&(a.min(b), a.max(b)))
+    }
+
+    /// Whether two links are told apart by their exact shapes alone.
+    pub fn is_by_shapes(&self, a: usize, b: usize) -> bool {
+        self.by_shapes.contains(&(a.min(b), a.max(b)))
     }
 
     /// The link nearest to a link towards the root, itself included, that a planned joint moves.

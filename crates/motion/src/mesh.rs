@@ -4,12 +4,14 @@
 //! around each. So everything of the mesh is in a sphere by construction, its inside too where it is closed. Files are found and
 //! read by `mesh_files` or by whoever uses the crate.
 
+use crate::frame::norm;
+use crate::inside::Inside;
 use crate::spheres::Sphere;
 use crate::{collada, obj, stl};
 use parry3d::math::Vector;
 use parry3d::shape::SharedShape;
 use ratn_model::pose::Pose;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// Triangles of a mesh at the most.
 pub const MAX_TRIANGLES: usize = 1_000_000;
@@ -76,9 +78,17 @@ pub enum MeshError {
 }
 
 /// Triangles, in metres.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Mesh {
     triangles: Vec<[[f64; 3]; 3]>,
+    /// As the exact checks want it, made when it is first asked for.
+    solid: OnceLock<(SharedShape, Arc<Inside>)>,
+}
+
+impl PartialEq for Mesh {
+    fn eq(&self, other: &Mesh) -> bool {
+        self.triangles == other.triangles
+    }
 }
 
 /// A mesh fixed to a link.
@@ -102,13 +112,13 @@ impl Mesh {
         let is_wild = |c: &f64| c.is_nan() || c.abs() > 1e3;
         match triangles.iter().position(|triangle| triangle.iter().flatten().any(is_wild)) {
             Some(triangle) => Err(MeshError::NotFinite { triangle }),
-            None => Ok(Mesh { triangles }),
+            None => Ok(Mesh::placed(triangles)),
         }
     }
 
     /// Triangles of a mesh, or some of them, that were moved.
     pub(crate) fn placed(triangles: Vec<[[f64; 3]; 3]>) -> Mesh {
-        Mesh { triangles }
+        Mesh { triangles, solid: OnceLock::new() }
     }
 
     /// Reads a file, by the end of its name: `.stl`, `.obj` or `.dae`; its numbers are multiplied by `scale` along x, y, z to be metres.
@@ -156,6 +166,21 @@ impl Mesh {
         let ball = || SharedShape::ball(0.0);
         // It refuses meshes without triangles only, and there are none.
         SharedShape::trimesh(corners.collect(), indices).unwrap_or_else(|_| ball())
+    }
+
+    /// The surface, for parry3d; the same one whenever it is asked for.
+    pub fn surface(&self) -> SharedShape {
+        self.solid().0
+    }
+
+    /// The surface and the inside; the same ones whenever it is asked for.
+    pub(crate) fn solid(&self) -> (SharedShape, Arc<Inside>) {
+        self.solid.get_or_init(|| (self.shape(), Arc::new(Inside::new(self)))).clone()
+    }
+
+    /// The farthest of its corners from its origin.
+    pub(crate) fn radius(&self) -> f64 {
+        self.triangles.iter().flatten().map(|corner| norm(*corner)).fold(0.0, f64::max)
     }
 
     /// Spheres that hold it, `padding` metres larger.

@@ -8,8 +8,8 @@
 //! - pairs that meet in every posture: nothing is there to be kept apart, and a check would forbid all postures.
 //!
 //! The search sees spheres. Where they meet so often though the shapes do not that it could not move, the exact check of the finished path alone
-//! sees the pair ([`Checks::by_shapes`]). With an SRDF that is so where the spheres meet in every posture that was looked at: they would forbid
-//! all that the SRDF leaves to be planned.
+//! sees the pair ([`Checks::by_shapes`]). With an SRDF that is so where the spheres leave hardly a posture of those in which the shapes are apart:
+//! they would forbid nearly all that the SRDF leaves to be planned.
 
 use crate::exact::Exact;
 use crate::mechanism::Mechanism;
@@ -31,6 +31,9 @@ const MORE_SAMPLES: usize = 1_000;
 
 /// Spheres that meet in this part of the postures though the shapes do not say nothing of a pair.
 const MISTAKEN: f64 = 0.1;
+
+/// With an SRDF: in this part of the postures in which the shapes are apart.
+const TAKEN: f64 = 0.9;
 
 /// Where both limits are infinite, positions are drawn from this far on both sides of zero, in radians or metres.
 const ENDLESS: f64 = std::f64::consts::PI;
@@ -80,7 +83,7 @@ enum Look {
     All,
     /// What to check.
     Checks,
-    /// Whether spheres say anything: one posture in which they are apart says so.
+    /// Whether spheres leave anything of the postures in which the shapes are apart.
     Undecided,
 }
 
@@ -112,8 +115,13 @@ impl Tally {
         match look {
             Look::All => true,
             Look::Checks => self.postures < SAMPLES || self.met == self.postures,
-            Look::Undecided => self.met + self.mistaken == self.postures,
+            Look::Undecided => self.postures < SAMPLES || self.met == self.postures || self.is_undecided(),
         }
+    }
+
+    /// Whether the spheres meet in nearly all postures in which the shapes are apart.
+    fn is_undecided(&self) -> bool {
+        self.mistaken > 0 && self.mistaken as f64 >= TAKEN * (self.postures - self.met) as f64
     }
 }
 
@@ -130,13 +138,11 @@ pub(crate) fn checks(model: &RobotModel) -> Checks {
     checks
 }
 
-/// Of the pairs that an SRDF does not except, those whose spheres meet in every posture though their shapes are apart in some, and whether the
-/// shapes met in any.
-pub(crate) fn undecided(model: &RobotModel, excepted: &BTreeSet<Pair>) -> BTreeMap<Pair, bool> {
+/// Of the pairs that an SRDF does not except, those whose spheres meet in nearly all postures in which their shapes are apart.
+pub(crate) fn undecided(model: &RobotModel, excepted: &BTreeSet<Pair>) -> BTreeSet<Pair> {
     let checks = Checks { excepted: excepted.clone(), ..Checks::default() };
     let tallies = tallies(model, checks, Look::Undecided).into_iter();
-    let undecided = tallies.filter(|(_, tally)| tally.is_open(Look::Undecided) && tally.mistaken > 0);
-    undecided.map(|(pair, tally)| (pair, tally.met > 0)).collect()
+    tallies.filter(|(_, tally)| tally.is_undecided()).map(|(pair, _)| pair).collect()
 }
 
 /// All pairs that some joint moves against each other, by kind, from a thousand postures.

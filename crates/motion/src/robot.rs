@@ -299,13 +299,13 @@ impl Robot {
         srdf: Option<&str>,
         load: &mut dyn FnMut(&str) -> Result<Vec<u8>, MeshError>,
     ) -> Result<Robot, RobotFault> {
-        let robot = Robot::on(description, RobotModel::read_in_primitives(urdf, srdf, load)?)?;
+        let robot = Robot::on(description, RobotModel::read_with_covers(urdf, srdf, load)?)?;
         // What is wrong with any arm is said at once.
         robot.other_arms().try_for_each(|arm| robot.with_arm(arm).map(drop))?;
         Ok(robot)
     }
 
-    /// Holds a description against a robot without meshes.
+    /// Holds a description against a robot whose meshes spheres stand for.
     fn on(description: RobotDescription, model: RobotModel) -> Result<Robot, RobotFault> {
         let link = |key: &'static str, name: &str| {
             let known = model.links.iter().map(|link| link.name.as_str());

@@ -14,6 +14,7 @@ use crate::mechanism::{MAX_JOINTS, Mechanism, MechanismError};
 use crate::mesh::{MeshError, Meshed};
 use crate::pairs::{self, Checks};
 use crate::robot_state::RobotState;
+use crate::solid::Form;
 use crate::spheres::Sphere;
 use crate::urdf::{self, Description, Loader, RobotError};
 use ratn_model::pose::Pose;
@@ -73,6 +74,8 @@ pub struct Link {
     pub bodies: Vec<Body>,
     /// and meshes.
     pub meshes: Vec<Meshed>,
+    /// How many of the bodies, the last ones, are spheres that stand for the meshes and hold them: all that needs primitives has these.
+    pub covers: usize,
     /// How much larger its bodies are taken, in metres.
     pub padding_m: f64,
     /// Spheres that hold all of it, padding included.
@@ -116,9 +119,34 @@ impl Link {
             drive,
             bodies: Vec::new(),
             meshes: Vec::new(),
+            covers: 0,
             padding_m: 0.0,
             spheres: Vec::new(),
         }
+    }
+
+    /// Its primitives, the spheres that stand for its meshes among them.
+    pub fn forms(&self) -> impl Iterator<Item = (Form, &Body)> {
+        let own = self.bodies.len() - self.covers;
+        self.bodies.iter().enumerate().map(move |(i, body)| (if i < own { Form::Own } else { Form::Cover }, body))
+    }
+
+    /// Its meshes.
+    pub fn mesh_forms(&self) -> impl Iterator<Item = (Form, &Meshed)> {
+        let form = if self.covers > 0 { Form::Covered } else { Form::Own };
+        self.meshes.iter().map(move |meshed| (form, meshed))
+    }
+
+    /// Has spheres stand for its meshes from now on.
+    fn cover_meshes(&mut self) {
+        let spheres = self
+            .meshes
+            .iter()
+            .flat_map(|mesh| mesh.cover(0.0))
+            .map(|Sphere { centre: [x, y, z], radius }| Geometry::Sphere { radius }.at(Pose::at(x, y, z)));
+        let before = self.bodies.len();
+        self.bodies.extend(spheres);
+        self.covers = self.bodies.len() - before;
     }
 
     /// Where it sits in its parent's frame, and what moves it there, where some joints move and the others stay where `positions` has them;
@@ -174,29 +202,15 @@ impl RobotModel {
         RobotModel::of(urdf::read(urdf, load)?, srdf)
     }
 
-    /// As [`RobotModel::read_with_meshes`], with spheres in place of each mesh that hold all of it: for whatever knows primitives alone.
-    pub(crate) fn read_in_primitives(
+    /// As [`RobotModel::read_with_meshes`], with spheres that hold each mesh beside it, for whatever knows primitives alone. Which pairs are checked
+    /// is what the meshes say.
+    pub(crate) fn read_with_covers(
         urdf: &str,
         srdf: Option<&str>,
         load: &mut Loader<'_>,
     ) -> Result<RobotModel, MechanismError> {
-        let mut description = urdf::read(urdf, load)?;
-        let has_meshes = description.links.iter().any(|link| !link.meshes.is_empty());
-        let exact = match srdf {
-            Some(_) if has_meshes => Some(RobotModel::of(description.clone(), srdf)?),
-            _ => None,
-        };
-        for link in &mut description.links {
-            let spheres = link.meshes.drain(..).flat_map(|mesh| mesh.cover(0.0));
-            link.bodies.extend(spheres.map(|Sphere { centre: [x, y, z], radius }| Body {
-                pose: Pose::at(x, y, z),
-                geometry: Geometry::Sphere { radius },
-            }));
-        }
-        let mut model = RobotModel::of(description, srdf)?;
-        // Spheres that stand for meshes say nothing where they always meet: what the meshes never do is no collision.
-        let apart = exact.iter().flat_map(|exact| pairs::undecided(exact, &exact.checks.excepted));
-        model.checks.excepted.extend(apart.filter(|(_, met)| !met).map(|(pair, _)| pair));
+        let mut model = RobotModel::read_with_meshes(urdf, srdf, load)?;
+        model.links.iter_mut().for_each(Link::cover_meshes);
         Ok(model)
     }
 
@@ -206,7 +220,7 @@ impl RobotModel {
         let mut model = RobotModel { name, joints, links, mimics, endless, checks: Checks::default() };
         model.checks = match excepted {
             Some(excepted) => {
-                let by_shapes = pairs::undecided(&model, &excepted).into_keys().collect();
+                let by_shapes = pairs::undecided(&model, &excepted);
                 Checks { excepted, by_shapes }
             }
             None => pairs::checks(&model),
@@ -247,6 +261,11 @@ impl RobotModel {
     /// Whether two links are excepted from checks. A link is never checked against itself.
     pub fn is_excepted(&self, a: usize, b: usize) -> bool {
         a == b || self.checks.excepted.contains(&(a.min(b), a.max(b)))
+    }
+
+    /// Whether two links are told apart by their exact shapes, because the spheres that hold them say nothing of them.
+    pub fn is_by_shapes(&self, a: usize, b: usize) -> bool {
+        self.checks.by_shapes.contains(&(a.min(b), a.max(b)))
     }
 
     /// What is planned for: `joints`, in this order, without any all of them; the others stay where `state` has them.

@@ -85,7 +85,7 @@ impl Straight {
         })
     }
 
-    /// Refuses what makes no sense; `which` is `approach` or `depart`.
+    /// Refuses what makes no sense; where there is no part, nobody looks at the frame. `which` is `approach` or `depart`.
     pub(crate) fn check(&self, which: &str, scene: &Scene) -> Result<(), PlanError> {
         let malformed = |part: &str, value: String, expected: String| {
             Err(PlanError::Malformed { what: format!("{which}_{part}"), value, expected })
@@ -99,7 +99,7 @@ impl Straight {
             return malformed("direction", format!("{:?}", self.direction), expected);
         }
         match &self.frame {
-            Frame::Object(name) if !scene.objects.iter().any(|object| object.name == *name) => {
+            Frame::Object(name) if self.is_some() && !scene.objects.iter().any(|object| object.name == *name) => {
                 let names: Vec<&str> = scene.objects.iter().take(MAX_NAMES).map(|o| o.name.as_str()).collect();
                 let objects = if names.is_empty() { "there is none".to_owned() } else { names.join(", ") };
                 malformed("frame", name.clone(), format!("world, base, tool, or an object of the scene ({objects})"))

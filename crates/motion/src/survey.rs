@@ -12,7 +12,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
 use std::ops::RangeInclusive;
 
 /// Postures looked at for how far the tool reaches.
@@ -20,6 +20,9 @@ const SAMPLES: usize = 5_000;
 /// Postures tried for one grasp.
 const SOLUTIONS: usize = 12;
 const TRIES: usize = 40;
+
+/// How boxes may lie beside straight, in radians: half a turn later they are as before.
+const TURNED_RAD: [f64; 3] = [-FRAC_PI_4, FRAC_PI_4, FRAC_PI_2];
 
 /// See the module.
 #[derive(Debug, Clone, PartialEq)]
@@ -66,8 +69,11 @@ pub fn survey(robot: &Robot) -> Survey {
                 lines.push(format!("{what:<10}{good} of {all} points can be served from above"));
                 faults.extend(beyond.into_iter().map(|why| format!("{what}: {why}")));
             }
+            faults.extend(turned(robot, workplace, &workplace.boxes).into_iter().map(|why| format!("boxes: {why}")));
             for share in &workplace.others {
                 let whose = others.iter().find(|other| other.arm_name() == share.arm);
+                let turned = whose.iter().flat_map(|arm| turned(arm, workplace, &share.boxes));
+                faults.extend(turned.map(|why| format!("boxes of the arm `{}`: {why}", share.arm)));
                 for (what, points) in [("boxes", region(workplace, &share.boxes)), ("places", share.places.poses())] {
                     let beyond: Vec<String> = whose
                         .iter()
@@ -151,6 +157,18 @@ fn region(workplace: &Workplace, boxes: &Boxes) -> Vec<Pose> {
     points.map(|(x, y)| Pose::at(x, y, workplace.table.top_m())).to_vec()
 }
 
+/// Why boxes that lie turned can be taken nowhere, of each way to lie of which that is so. The cell lays them turned anyhow, where they can be taken.
+fn turned(robot: &Robot, workplace: &Workplace, boxes: &Boxes) -> Vec<String> {
+    let points = region(workplace, boxes);
+    let nowhere = |yaw: f64| {
+        let lying = points.iter().map(|at| at.compose(&Pose::from_rpy([0.0; 3], 0.0, 0.0, yaw)));
+        let reasons: Option<Vec<String>> = lying.map(|at| beyond(robot, workplace, &at)).collect();
+        let reason = reasons?.pop()?;
+        Some(format!("the cell lays them turned, and turned by {:.0}° none can be taken: {reason}", yaw.to_degrees()))
+    };
+    TURNED_RAD.into_iter().filter_map(nowhere).collect()
+}
+
 /// The table, and a box on a point of a surface.
 fn scene(workplace: Option<&Workplace>, floor: Option<&Pose>) -> Scene {
     let Some(workplace) = workplace else { return Scene { base: Pose::IDENTITY, objects: Vec::new() } };
@@ -206,6 +224,62 @@ mod tests {
             assert_eq!(lines[0], format!("robot     {name}"));
             assert!(lines.iter().any(|line| line.starts_with("posture   home: free")), "{lines:#?}");
         }
+    }
+
+    #[test]
+    fn a_gripper_that_cannot_turn_does_not_take_boxes_that_lie_turned() {
+        let slide = |name: &str, parent: &str, child: &str, axis: &str| {
+            format!(
+                "<link name='{child}'/><joint name='{name}' type='prismatic'><parent link='{parent}'/><child link='{child}'/>\
+                 <axis xyz='{axis}'/><limit lower='-1' upper='1' velocity='1' effort='1'/></joint>"
+            )
+        };
+        let finger = |name: &str, side: &str, mimic: &str| {
+            format!(
+                "<link name='{name}'><collision><origin xyz='0 {side}0.005 -0.06'/><geometry><box size='0.02 0.01 0.08'/></geometry>\
+                 </collision></link><joint name='{name}' type='prismatic'><parent link='hand'/><child link='{name}'/>\
+                 <axis xyz='0 {side}1 0'/><limit lower='0' upper='0.04' velocity='1' effort='1'/>{mimic}</joint>"
+            )
+        };
+        let turn = |limits: &str| {
+            format!(
+                "<link name='hand'/><joint name='turn' type='revolute'><parent link='z'/><child link='hand'/><axis xyz='0 0 1'/>\
+                 <limit {limits} velocity='1' effort='1'/></joint>"
+            )
+        };
+        let urdf = |limits: &str| {
+            [
+                "<robot name='r'><link name='foot'/><link name='up'/><joint name='mount' type='fixed'><parent link='foot'/><child link='up'/>\
+                 <origin xyz='0 0 1.5'/></joint>"
+                    .to_owned(),
+                slide("x", "up", "x", "1 0 0"),
+                slide("y", "x", "y", "0 1 0"),
+                slide("z", "y", "z", "0 0 1"),
+                turn(limits),
+                finger("a", "", ""),
+                finger("b", "-", "<mimic joint='a'/>"),
+                "<link name='tool'/><joint name='tool' type='fixed'><parent link='hand'/><child link='tool'/>\
+                 <origin xyz='0 0 -0.1' rpy='3.141592653589793 0 0'/></joint></robot>"
+                    .to_owned(),
+            ]
+            .concat()
+        };
+        let toml = "name = 'r'\nurdf = 'r'\n[arm]\njoints = ['x', 'y', 'z', 'turn']\ntool = 'tool'\n[gripper]\njoint = 'a'\nhand = 'hand'\n\
+                    finger = 'a'\n[postures]\nhome = [0, 0, 0, 0]\n[workplace]\ntable = { centre = [0, 0, 0.675], size = [0.8, 1.4, 0.05] }\n\
+                    boxes = { x = [-0.1, 0.1], y = [-0.1, 0.1], least = [0.05, 0.04, 0.07], greatest = [0.10, 0.05, 0.10] }\n\
+                    places = { on = 'table', yaw = 0, at = [[0.2, 0.2, 0.70]] }\n";
+        let faults = |limits: &str| {
+            let description = crate::description::RobotDescription::read(toml).unwrap();
+            let robot = Robot::of(description, &urdf(limits), None, &mut |_| unreachable!("it has no meshes")).unwrap();
+            survey(&robot).faults
+        };
+        assert_eq!(faults("lower='-3.1' upper='3.1'"), Vec::<String>::new());
+        let stiff = faults("lower='-0.01' upper='0.01'");
+        assert_eq!(stiff.len(), TURNED_RAD.len(), "{stiff:?}");
+        assert!(
+            stiff[1].contains("turned by 45°") && stiff[1].contains("no posture of the arm gets there"),
+            "{stiff:?}"
+        );
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use crate::connect::{Budget, ConnectError, Route, connect};
 use crate::diagnosis::diagnosis;
-use crate::endless::{Unwound, unwound};
+use crate::endless::{Unwound, unwound, wound_too_far};
 use crate::exact::{Exact, Touch};
 use crate::mechanism::Mechanism;
 use crate::pace::Control;
@@ -71,6 +71,16 @@ pub fn run_with_isa(
         problem
     });
     let problem = filtered.as_ref().unwrap_or(problem);
+    let ends = [
+        ("start state", &problem.start, ConnectError::Start),
+        ("goal state", &problem.goal, ConnectError::Goal { goals: 1 }),
+    ];
+    for (which, positions, error) in ends {
+        let diagnosis = wound_too_far(mechanism, positions, which);
+        if !diagnosis.is_empty() {
+            return Trial { plan: 0.0, simplify: 0.0, outcome: Err(error), diagnosis };
+        }
+    }
     let unwound = unwound(mechanism, &problem.start, &problem.goal);
     let mechanism = &unwound.mechanism;
     let mut space = Space::with_isa(mechanism, problem.surroundings(), isa);

@@ -176,7 +176,11 @@ pub(crate) fn check_limits(joints: &[Joint], trajectory: &Curve) -> Result<(), V
 
 /// Looks at the middle of a piece of the curve: where there is more room than anything moves from there within the piece, the piece is
 /// free; else its halves are looked at, until they are so short that nothing moves by more than [`RESOLUTION_M`].
-fn check_collisions(checker: &mut Checker<'_>, trajectory: &Curve, contact: Contact) -> Result<(), Violation> {
+pub(crate) fn check_collisions(
+    checker: &mut Checker<'_>,
+    trajectory: &Curve,
+    contact: Contact,
+) -> Result<(), Violation> {
     let knots = trajectory.knots();
     let collides = |time_s| move |collision| Violation::Collision { time_s, collision };
     checker.room(&knots[0].positions, contact, 0.0).map_err(collides(0.0))?;

@@ -66,6 +66,23 @@ fn the_way_between_postures_that_are_nearly_a_turn_apart_is_short() {
 }
 
 #[test]
+fn positions_that_are_too_many_turns_from_zero_are_refused_and_say_so() {
+    let mechanism = clock("continuous", "");
+    let far = 1e4 * TAU;
+    check(&solve(&mechanism, [far - 1.0, 0.0], [0.5, 0.0], &[]).unwrap(), [far - 1.0, 0.0], [0.5, 0.0], 1.49..1.51);
+    for (start, goal, which) in [([far + 1.0, 0.0], [0.5, 0.0], "start"), ([0.5, 0.0], [0.0, -1e16], "goal")] {
+        let problem = Problem { start: start.to_vec(), goal: goal.to_vec(), ..Problem::default() };
+        let settings = Settings { budget: Budget { iterations: 20_000, seed: 1 }, repetitions: 1 };
+        let trial = trial::run(&mechanism, &problem, settings, &mut || 0.0);
+        assert!(trial.outcome.is_err(), "{:?}", trial.outcome);
+        let said = trial.diagnosis.join("; ");
+        assert!(said.contains(which) && said.contains("turns from zero") && said.contains("10000"), "{said}");
+    }
+    // A joint with limits is what they say.
+    assert!(solve(&clock("revolute", ""), [far, 0.0], [0.5, 0.0], &[]).is_none());
+}
+
+#[test]
 fn where_the_short_way_is_blocked_it_turns_the_other_way() {
     let mechanism = clock("continuous", "");
     let pose = Pose::at(-0.3, 0.0, 0.0);

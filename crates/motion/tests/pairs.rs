@@ -11,10 +11,13 @@ use ratn_motion::description::RobotDescription;
 use ratn_motion::exact::Exact;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
+use ratn_motion::pace::Control;
 use ratn_motion::pairs::{self, Kind, Pair};
+use ratn_motion::plan::{Goal, Request, plan};
 use ratn_motion::robot::Robot;
 use ratn_motion::robot_model::RobotModel;
 use ratn_motion::space::Space;
+use ratn_motion::validate::validate_trajectory;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 
 const AIMM: &str = include_str!("../robots/aimm.urdf");
@@ -225,37 +228,147 @@ fn with_an_srdf_too_pairs_whose_spheres_always_meet_are_decided_by_their_shapes(
     assert!(free > 30, "{free} of 300");
 }
 
-#[test]
-fn meshes_that_are_always_apart_do_not_collide_for_the_spheres_that_stand_for_them() {
-    let corner = |i: usize| {
-        [0.2, 0.2, 0.02]
-            .map(f64::from)
-            .iter()
-            .enumerate()
-            .map(|(k, h)| if i >> k & 1 == 1 { *h } else { -h })
-            .collect::<Vec<f64>>()
-    };
+/// An STL of a cuboid.
+fn cuboid_stl(half: [f64; 3]) -> Vec<u8> {
+    let corner = |i: usize| -> [f64; 3] { std::array::from_fn(|k| if i >> k & 1 == 1 { half[k] } else { -half[k] }) };
     let faces = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
     let mut stl = "solid plate\n".to_owned();
     for [a, b, c, d] in faces {
         for triangle in [[a, b, c], [a, c, d]] {
             stl += "facet normal 0 0 0\nouter loop\n";
-            for i in triangle {
-                let at = corner(i);
-                stl += &format!("vertex {} {} {}\n", at[0], at[1], at[2]);
+            for [x, y, z] in triangle.map(corner) {
+                stl += &format!("vertex {x} {y} {z}\n");
             }
             stl += "endloop\nendfacet\n";
         }
     }
-    stl += "endsolid plate\n";
+    (stl + "endsolid plate\n").into_bytes()
+}
+
+const PLATE: [f64; 3] = [0.2, 0.2, 0.02];
+const NO_PAIR_EXCEPTED: &str = "<robot name='plates'/>";
+
+/// A robot whose links are meshes of a plate.
+fn of_plates(urdf: &str, joints: &str, srdf: Option<&str>) -> Robot {
+    let toml = format!("name = 'plates'\nurdf = 'plates.urdf'\n[arm]\njoints = [{joints}]\ntool = 'high'\n");
+    let description = RobotDescription::read(&toml).unwrap();
+    Robot::of(description, urdf, srdf, &mut |_| Ok(cuboid_stl(PLATE))).unwrap()
+}
+
+/// The same as `ratn plan` has it.
+fn with_meshes(urdf: &str, srdf: Option<&str>) -> RobotModel {
+    RobotModel::read_with_meshes(urdf, srdf, &mut |_| Ok(cuboid_stl(PLATE))).unwrap()
+}
+
+#[test]
+fn meshes_that_are_always_apart_do_not_collide_for_the_spheres_that_stand_for_them() {
     let robot = |height: &str| {
         let urdf = plates("<mesh filename='plate.stl'/>").replace("0 0 0.044", height);
-        let toml = "name = 'plates'\nurdf = 'plates.urdf'\n[arm]\njoints = ['turn']\ntool = 'high'\n";
-        let description = RobotDescription::read(toml).unwrap();
-        Robot::of(description, &urdf, Some("<robot name='plates'/>"), &mut |_| Ok(stl.clone().into_bytes())).unwrap()
+        of_plates(&urdf, "'turn'", Some(NO_PAIR_EXCEPTED))
     };
     let touches = |robot: &Robot| robot.touches(&robot.at_zero(), &[]);
     assert_eq!(touches(&robot("0 0 0.044")), []);
     // Meshes that meet do.
     assert!(!touches(&robot("0 0 0.039")).is_empty());
+}
+
+/// A plate of a mesh that tilts about x and y, each by `limit` at the most, 4 mm above one that stands. The link between them has a shape, so
+/// that they are no neighbours.
+fn tilting(limit: f64) -> String {
+    let plate = "<collision><geometry><mesh filename='plate.stl'/></geometry></collision>";
+    let lamp = "<collision><origin xyz='0 0 1'/><geometry><sphere radius='0.01'/></geometry></collision>";
+    let hinge = |name: &str, parent: &str, child: &str, at: &str, axis: &str| {
+        format!(
+            "<joint name='{name}' type='revolute'><parent link='{parent}'/><child link='{child}'/><origin xyz='{at}'/><axis xyz='{axis}'/>\
+             <limit lower='-{limit}' upper='{limit}' velocity='1' effort='1'/></joint>"
+        )
+    };
+    format!(
+        "<robot name='plates'><link name='low'>{plate}</link><link name='between'>{lamp}</link><link name='high'>{plate}</link>{}{}</robot>",
+        hinge("x", "low", "between", "0 0 0.044", "1 0 0"),
+        hinge("y", "between", "high", "0 0 0", "0 1 0")
+    )
+}
+
+/// Whether a posture is free by the checker without and with room around what moves, and by the exact shapes.
+fn judged(robot: &Robot, posture: [f64; 2]) -> [bool; 3] {
+    let arm = JointVector::of(posture);
+    let free = |padding: f64| Checker::new(robot, &nothing(), &robot.at_zero(), padding).is_free(&arm, Contact::None);
+    let here = ratn_motion::robot::Configuration { arm, ..robot.at_zero() };
+    [free(0.0), free(0.002), robot.touches(&here, &[]).is_empty()]
+}
+
+#[test]
+fn meshes_whose_spheres_always_meet_are_told_apart_in_the_robots_of_workers_and_cells() {
+    // A corner comes down by 0.2 m times both angles.
+    let urdf = tilting(0.04);
+    for srdf in [None, Some(NO_PAIR_EXCEPTED)] {
+        let robot = of_plates(&urdf, "'x', 'y'", srdf);
+        assert_eq!(robot.model.checks(), with_meshes(&urdf, srdf).checks(), "{srdf:?}");
+        let plates = pair(&robot.model, "low", "high");
+        assert!(robot.model.checks().by_shapes.contains(&plates) && !robot.model.is_excepted(plates.0, plates.1));
+        assert_eq!(judged(&robot, [0.0, 0.0]), [true, true, true], "{srdf:?}");
+        assert_eq!(judged(&robot, [0.015, 0.0]), [true, false, true], "{srdf:?}");
+        assert_eq!(judged(&robot, [0.025, 0.0]), [false, false, false], "{srdf:?}");
+        assert_eq!(judged(&robot, [-0.02, 0.02]), [false, false, false], "{srdf:?}");
+        // The search, which does not see the pair, finds a way; what comes of it is free by the meshes, or refused.
+        let planned = |goal: [f64; 2]| {
+            let request = Request::new(robot.at_zero(), vec![Goal::Joints(JointVector::of(goal))]);
+            plan(&robot, &nothing(), &request, &mut |_| Control::Continue)
+        };
+        let free = planned([0.005, 0.0]).unwrap();
+        let here = robot.at_zero();
+        validate_trajectory(&robot, &nothing(), &here, &free.trajectory, Contact::None).unwrap();
+        let refused = planned([0.035, 0.0]).unwrap_err().to_string();
+        assert!(refused.contains("low") && refused.contains("high"), "{refused}");
+        // So does a controller refuse it that is sent there all the same.
+        let mut longer = free.trajectory.clone();
+        longer.points.iter_mut().for_each(|point| {
+            point.time_s *= 7.0;
+            point.positions.iter_mut().for_each(|q| *q *= 7.0);
+        });
+        let refused = validate_trajectory(&robot, &nothing(), &here, &longer, Contact::None).unwrap_err().to_string();
+        assert!(refused.contains("low") && refused.contains("high"), "{refused}");
+    }
+}
+
+#[test]
+fn meshes_that_were_apart_in_all_postures_that_were_looked_at_are_checked_where_they_meet() {
+    let limit = 0.0101;
+    let urdf = tilting(limit);
+    let exact = with_meshes(&urdf, None);
+    assert!(pairs::kinds(&exact)[&Kind::Never].contains(&pair(&exact, "low", "high")));
+    for srdf in [None, Some(NO_PAIR_EXCEPTED)] {
+        let robot = of_plates(&urdf, "'x', 'y'", srdf);
+        assert_eq!(judged(&robot, [0.0, 0.0]), [true, true, true]);
+        assert_eq!(judged(&robot, [limit, limit]), [false, false, false], "{srdf:?}");
+    }
+}
+
+#[test]
+fn with_an_srdf_a_pair_whose_spheres_leave_hardly_a_posture_is_decided_by_its_shapes() {
+    // The upper plate slides 4 mm above the lower one, almost off it.
+    let slid = |far: &str| {
+        let turn = "<axis xyz='0 0 1'/><limit lower='-3' upper='3' velocity='1' effort='1'/>";
+        let slide = format!("<axis xyz='1 0 0'/><limit lower='0' upper='{far}' velocity='1' effort='1'/>");
+        plates("<box size='0.4 0.4 0.04'/>").replace(turn, &slide).replace("revolute", "prismatic")
+    };
+    let checks = |urdf: &str| RobotModel::read(urdf, Some(NO_PAIR_EXCEPTED)).unwrap().checks().by_shapes.len();
+    let urdf = slid("0.44");
+    let mechanism = Mechanism::read(&urdf, Some(NO_PAIR_EXCEPTED), &[]).unwrap();
+    // There is a posture in which the spheres are apart.
+    let poses = mechanism.poses(&[0.44]);
+    let placed = |link: usize| {
+        let spheres = mechanism.links[link].spheres.iter();
+        spheres.map(|s| (poses[link].transform(s.centre), s.radius)).collect::<Vec<_>>()
+    };
+    let (low, high) = (placed(mechanism.link("low").unwrap()), placed(mechanism.link("high").unwrap()));
+    let gap = |(a, r): &([f64; 3], f64), (b, s): &([f64; 3], f64)| {
+        (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f64>().sqrt() - r - s
+    };
+    assert!(low.iter().all(|a| high.iter().all(|b| gap(a, b) > 0.0)));
+    assert_eq!(checks(&urdf), 1);
+    assert!(Space::new(&mechanism, &[]).is_free(&[0.0; MAX_JOINTS]));
+    // Spheres that leave many postures are looked at in the search.
+    assert_eq!(checks(&slid("0.9")), 0);
 }

@@ -385,6 +385,10 @@ fn a_straight_part_that_makes_no_sense_is_refused_with_what_is_expected() {
         let error = cell.plan(&request).unwrap_err();
         assert!(matches!(error, PlanError::Malformed { .. }) && error.to_string().starts_with(expected), "{error}");
     }
+    // Where no part is wanted its frame is not looked at.
+    let none =
+        Request { approach: part([1.0, 0.0, 0.0], "self", 0.0), ..request(cell.state(), vec![Goal::Pose(goal)]) };
+    cell.plan(&none).unwrap();
     // What does not fit the arm says which part, where it goes, how far the arm gets and why.
     let ahead = part([1.0, 0.0, 0.0], "world", 0.5);
     let far = request(cell.state(), vec![Goal::Joints(aimm::HOME)]);

@@ -297,8 +297,13 @@ async fn a_straight_way_through_way_points_is_all_or_an_error_that_says_how_far(
         ("c", vec![start.clone(), ("goal", Value::Joints(aimm::STOWED.to_vec())), straight], "expected poses"),
         (
             "d",
-            vec![start, ("goal", by(0.0, 0.1, 0.0)), way_points, ("straight", Value::Bool(false))],
+            vec![start.clone(), ("goal", by(0.0, 0.1, 0.0)), way_points, ("straight", Value::Bool(false))],
             "input `straight` is false, but `way_points` are there",
+        ),
+        (
+            "e",
+            vec![start, ("goal", by(0.0, 0.1, 0.0)), ("blend_m", Value::Float(0.02))],
+            "input `blend_m` is given, but the motion has no corners to round",
         ),
     ] {
         let outcome = system.client.execute(&system.planner, system.goal(id, &inputs), |_, _| {}).await.unwrap();

@@ -11,10 +11,11 @@
 
 use super::levers::Levers;
 use rapier3d::math::Pose as Pose32;
-use rapier3d::parry::query;
 use rapier3d::parry::shape::SharedShape;
 use ratn_model::pose::Pose;
+use ratn_motion::distance::gap;
 use ratn_motion::robot::{ArmPosition, Configuration, Joint, Robot, to_f32};
+use ratn_motion::solid::Form;
 use std::collections::BTreeMap;
 
 /// The distance of two parts that are both on their ways, in metres.
@@ -82,6 +83,7 @@ pub(super) enum Crossing {
 /// One body of a link, wherever it is on the way.
 struct Swept {
     link: usize,
+    form: Form,
     in_link: Pose,
     shape: SharedShape,
     /// The farthest that a point of it is from its origin.
@@ -149,7 +151,7 @@ fn ways_apart(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahead)
     let (ours, theirs) = (swept(robot, here, ours, RESOLUTION_M), swept(robot, here, theirs, RESOLUTION_M));
     let mut distances = MAX_DISTANCES;
     for a in &ours {
-        for b in theirs.iter().filter(|b| !robot.model.is_excepted(a.link, b.link)) {
+        for b in theirs.iter().filter(|b| a.is_kept_from(b, robot)) {
             let margin = APART_M as f32 + a.missed() + b.missed();
             if a.comes_to(b, margin, &mut distances)? {
                 return Err(Crossing::of(robot, a, b));
@@ -183,7 +185,7 @@ fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahea
             for (body, a) in bodies.iter().enumerate() {
                 let place = to_f32(&poses[a.link].compose(&a.in_link));
                 for (other, b) in others.iter().enumerate() {
-                    if robot.model.is_excepted(a.link, b.link) {
+                    if !a.is_kept_from(b, robot) {
                         continue;
                     }
                     let known = &mut allowed[body * others.len() + other];
@@ -295,15 +297,20 @@ impl Crossing {
 impl Swept {
     /// The bodies of the links that are compared, nowhere yet.
     fn all(robot: &Robot, ahead: &Ahead) -> Vec<Swept> {
-        let of_links =
-            ahead.links.iter().flat_map(|link| robot.model.links[*link].bodies.iter().map(move |b| (*link, b)));
-        of_links.map(|(link, body)| Swept::new(link, body.pose, body.geometry.shape(0.0))).collect()
+        let of_link = |link: &usize| {
+            let (link, of) = (*link, &robot.model.links[*link]);
+            let primitives = of.forms().map(|(form, body)| (form, body.pose, body.geometry.shape(0.0)));
+            let meshes = of.mesh_forms().map(|(form, meshed)| (form, meshed.pose, meshed.mesh.surface()));
+            let shapes: Vec<_> = primitives.chain(meshes).collect();
+            shapes.into_iter().map(move |(form, pose, shape)| Swept::new(link, form, pose, shape))
+        };
+        ahead.links.iter().flat_map(of_link).collect()
     }
 
-    fn new(link: usize, in_link: Pose, shape: SharedShape) -> Swept {
+    fn new(link: usize, form: Form, in_link: Pose, shape: SharedShape) -> Swept {
         let around = shape.compute_local_bounding_sphere();
         let radius = around.center.length() + around.radius;
-        Swept { link, in_link, shape, radius, places: Vec::new(), tree: Vec::new(), leg: 0.0, dropped: 0.0 }
+        Swept { link, form, in_link, shape, radius, places: Vec::new(), tree: Vec::new(), leg: 0.0, dropped: 0.0 }
     }
 
     /// The farthest that a point of the body is at one place from where it is at another.
@@ -357,9 +364,16 @@ impl Swept {
         self.tree.len() - 1
     }
 
-    fn distance(&self, at: &Pose32, other: &Swept, of: &Pose32) -> f32 {
+    /// How far it is at a place from another body at one, or something greater than `enough` where that is more.
+    fn distance(&self, at: &Pose32, other: &Swept, of: &Pose32, enough: f32) -> f32 {
         // A pair whose distance cannot be computed counts as one that touches.
-        query::distance(at, &*self.shape, of, &*other.shape).map_or(0.0, |apart| apart.distance)
+        gap(at, &*self.shape, of, &*other.shape, f64::from(enough)).map_or(0.0, |apart| apart.max(0.0) as f32)
+    }
+
+    /// Whether two bodies are to be kept apart: not where their links are excepted, nor where other shapes of theirs are looked at.
+    fn is_kept_from(&self, other: &Swept, robot: &Robot) -> bool {
+        let by_shapes = robot.model.is_by_shapes(self.link, other.link);
+        !robot.model.is_excepted(self.link, other.link) && self.form.counts(by_shapes) && other.form.counts(by_shapes)
     }
 
     /// How far it is from another body at the places of that one, or `up_to` where that is less.
@@ -368,7 +382,7 @@ impl Swept {
         for of in &other.places {
             if (at.translation - of.translation).length() - self.radius - other.radius < nearest {
                 *distances = distances.checked_sub(1).ok_or(Crossing::TooLong)?;
-                nearest = nearest.min(self.distance(at, other, of));
+                nearest = nearest.min(self.distance(at, other, of, nearest));
             }
         }
         Ok(nearest)
@@ -388,7 +402,7 @@ impl Swept {
                 continue;
             }
             *distances = distances.checked_sub(1).ok_or(Crossing::TooLong)?;
-            let distance = self.distance(at, other, of);
+            let distance = self.distance(at, other, of, around);
             if distance < margin {
                 return Ok(true);
             }
@@ -470,7 +484,8 @@ mod tests {
         for (i, a) in swept.iter().enumerate() {
             for b in &swept[..i] {
                 for margin in [0.01, 0.05, 0.2] {
-                    let nearest = a.places.iter().flat_map(|at| b.places.iter().map(|of| a.distance(at, b, of)));
+                    let nearest =
+                        a.places.iter().flat_map(|at| b.places.iter().map(|of| a.distance(at, b, of, f32::MAX)));
                     let expected = nearest.fold(f32::INFINITY, f32::min) < margin;
                     assert_eq!(a.comes_to(b, margin, &mut { MAX_DISTANCES }), Ok(expected));
                     found[usize::from(expected)] += 1;

@@ -66,6 +66,7 @@ pub fn unmet(robot: &Robot, setting: Setting) -> Vec<Unmet> {
             next: "name the link of its optical frame (z forward, x right, y down) as `link`".to_owned(),
         });
     }
+    unmet.extend(away(robot));
     if setting == Setting::Table && workplace.tableware.is_none() {
         unmet.push(Unmet {
             place: "[workplace.tableware]".to_owned(),
@@ -87,6 +88,23 @@ pub fn unmet(robot: &Robot, setting: Setting) -> Vec<Unmet> {
         unmet.extend(in_the_way(&view, &standing, &of_arm, &unmet));
     }
     unmet
+}
+
+/// A base that may not be at the origin.
+fn away(robot: &Robot) -> Option<Unmet> {
+    let ([x, y], heading) = robot.drive_area()?;
+    let limits = [("x", Some(x), "m"), ("y", Some(y), "m"), ("its heading", heading, "rad")];
+    let leaves_out = |(what, limits, unit): (&'static str, Option<[f64; 2]>, &'static str)| {
+        let [low, high] = limits?;
+        (!(low..=high).contains(&0.0)).then_some((what, [low, high], unit))
+    };
+    let (what, [low, high], unit) = limits.into_iter().find_map(leaves_out)?;
+    Some(Unmet {
+        place: "[base]".to_owned(),
+        what: format!("{what} goes from {low} to {high} {unit}, which leaves out 0"),
+        why: "the cell begins with the base at the origin",
+        next: "let `area` and the limits of the base's joints have the origin in them".to_owned(),
+    })
 }
 
 /// The boxes of an arm: of the first one those of the workplace.
@@ -147,6 +165,9 @@ fn ungrasping(view: &Robot, is_first: bool, boxes: Option<&Boxes>, of_arm: &str)
             "hang the fingers on a link behind the arm's last joint",
         );
     }
+    if let Some(unmet) = off_the_hand(view, finger, of_arm) {
+        return Some(unmet);
+    }
     let outward = if part.middle[1] < 0.0 { -1.0 } else { 1.0 };
     let (opens, ways) = (joint.upper, view.finger_ways());
     let goes = |way: [f64; 3], y: f64| (way[1] - y).abs().max(way[0].abs()).max(way[2].abs()) <= FINGER_OFF_M;
@@ -164,12 +185,24 @@ fn ungrasping(view: &Robot, is_first: bool, boxes: Option<&Boxes>, of_arm: &str)
             "let the joint slide the finger along y of the tool's frame, away from the middle, with 0 where the fingers meet",
         );
     }
-    if !ways.iter().any(|(_, way)| goes(*way, -outward * opens)) {
+    let opposite: Vec<usize> =
+        ways.iter().filter(|(_, way)| goes(*way, -outward * opens)).map(|(link, _)| *link).collect();
+    let Some(other) = opposite.first().map(|link| &view.model.links[*link].name) else {
         return unmet(
             format!("no link goes the other way when its finger `{name}` opens"),
             "a box is held between two fingers",
             "add the other finger, with a joint that mimics the first one",
         );
+    };
+    let Some(second) = opposite.iter().copied().find(|link| !view.model.links[*link].bodies.is_empty()) else {
+        return unmet(
+            format!("its other finger `{other}` has no shape"),
+            "a box is held between two fingers",
+            "give it a <collision> like that of the first one",
+        );
+    };
+    if let Some(unmet) = off_the_hand(view, second, of_arm) {
+        return Some(unmet);
     }
     let from_middle = part.middle[1].abs() - part.half[1];
     if from_middle.abs() > FINGER_OFF_M {
@@ -200,6 +233,18 @@ fn ungrasping(view: &Robot, is_first: bool, boxes: Option<&Boxes>, of_arm: &str)
         "the boxes are taken so",
         "let the pads be about the tool's frame, as large as they are, or change the boxes of [workplace]",
     )
+}
+
+/// A finger that does not hang on the hand.
+fn off_the_hand(view: &Robot, finger: usize, of_arm: &str) -> Option<Unmet> {
+    let (hand, on) = (view.hand()?, view.model.links[finger].parent?);
+    let name = |link: usize| &view.model.links[link].name;
+    (hand != on).then(|| Unmet {
+        place: format!("[gripper]{of_arm}"),
+        what: format!("its finger `{}` hangs on `{}`, and `hand` is `{}`", name(finger), name(on), name(hand)),
+        why: "what hangs on the hand may touch what is taken, and nothing else may",
+        next: format!("name `{}` as `hand`, or hang the finger on `{}`", name(on), name(hand)),
+    })
 }
 
 /// Whether fingers that are this far open hold a box of this size.

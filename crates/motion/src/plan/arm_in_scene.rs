@@ -7,7 +7,7 @@ use super::contact;
 use super::error::PlanError;
 use crate::arm::{self, joints};
 use crate::cloud::Cloud;
-use crate::collision::{Checker, Collision, Contact, PADDING_M};
+use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M};
 use crate::connect::{Budget, ConnectError, Route, connect};
 use crate::constrained::{self, Constraint};
 use crate::joint_vector::JointVector;
@@ -27,6 +27,7 @@ use crate::surroundings::Surroundings;
 use crate::timing::rough::Rough;
 use crate::timing::{Section, Speed, timed_while};
 use crate::trajectory::Curve;
+use crate::validate::check_collisions;
 use crate::way_points::{Followed, Follower, WayPoints};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -69,6 +70,8 @@ pub(super) struct ArmInScene<'a> {
     mechanism: Mechanism,
     checker: Checker<'a>,
     space: Space,
+    /// The pairs of links that the space does not look at, by their exact shapes.
+    unseen: Option<Checker<'a>>,
     /// What a camera saw that is nothing known, in the world frame.
     seen: Option<Arc<Cloud>>,
     /// The tool, in the frame of the base, which is at `base`.
@@ -84,6 +87,9 @@ impl<'a> ArmInScene<'a> {
     pub(super) fn new(robot: &'a Robot, scene: &'a Scene, request: &'a Request) -> Result<ArmInScene<'a>, PlanError> {
         let here = request.start.with_base(&scene.base);
         let (mechanism, mut obstacles) = arm::in_scene(robot, scene, &here);
+        let held = arm::holding(robot, scene, &here);
+        let unseen = Some(arm::unseen(robot, &held)).filter(|pairs| !pairs.is_empty());
+        let unseen = unseen.map(|pairs| Checker::new(robot, scene, &here, 0.0).of_pairs(&pairs));
         let base = arm::on_floor(robot, &scene.base);
         obstacles.extend(request.keep_out.iter().enumerate().map(|(i, region)| Obstacle {
             name: kept_out(i),
@@ -100,6 +106,7 @@ impl<'a> ArmInScene<'a> {
             request,
             checker: checker(robot, scene, request, &here, seen.as_ref(), PADDING_M),
             space: arm::space(&mechanism, surroundings),
+            unseen,
             reach: Reach::new(&mechanism, robot.tool, Pose::IDENTITY),
             base,
             seen,
@@ -359,7 +366,8 @@ impl<'a> ArmInScene<'a> {
         Ok(refinement.step(&mut self.space, &mut |_| pace.answer())?)
     }
 
-    /// The sections as one motion within the limits that were asked for, which keeps what is to be kept between all its knots as well.
+    /// The sections as one motion within the limits that were asked for, which keeps what is to be kept between all its knots as well, and on which
+    /// no two links meet that the search does not look at.
     pub(super) fn timed(
         &mut self,
         sections: &[Section],
@@ -381,6 +389,14 @@ impl<'a> ArmInScene<'a> {
                         .to_owned(),
                 }),
         };
-        request.tool_speed.within(&self.reach, &request.speed.into(), &mut time)
+        let curve = request.tool_speed.within(&self.reach, &request.speed.into(), &mut time)?;
+        match &mut self.unseen {
+            None => Ok(curve),
+            // What may be pressed is no link of the robot.
+            Some(unseen) => match check_collisions(unseen, &curve, Contact::Gripper(CONTACT_TOLERANCE_M)) {
+                Ok(()) => Ok(curve),
+                Err(violation) => Err(PlanError::Unseen { reason: violation.to_string() }),
+            },
+        }
     }
 }

@@ -67,6 +67,14 @@ pub enum PlanError {
         /// What is broken.
         reason: String,
     },
+    /// Two links meet on the way that was found. Spheres say nothing of them, so the search does not go around.
+    #[error(
+        "on the way that was found, {reason}; the search does not look at these two links: give finer shapes, or pass a posture aside"
+    )]
+    Unseen {
+        /// When, and which.
+        reason: String,
+    },
     /// There are goals, but no way was found.
     #[error(
         "no way found to any of {postures} goal postures after {iterations} iterations; on the straight way {collision}"

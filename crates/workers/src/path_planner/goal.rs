@@ -131,6 +131,7 @@ fn straight(goal: &GoalContext, which: &str, usual: fn(f64) -> Straight) -> Resu
 /// Whether the tool goes in straight lines all the way, and through which poses.
 fn way_points(goal: &GoalContext) -> Result<Option<WayPoints>, ActionFailure> {
     let straight = goal.port("straight").optional().map(|port| port.bool()).transpose()?;
+    let blend_m = goal.optional_float("blend_m")?;
     let through = match goal.port("way_points").optional() {
         Some(port) => Some(port.list()?.iter().map(|pose| pose.pose()).collect::<Result<Vec<_>, _>>()?),
         None => None,
@@ -139,11 +140,12 @@ fn way_points(goal: &GoalContext) -> Result<Option<WayPoints>, ActionFailure> {
         (Some(false), Some(_)) => Err(ActionFailure::aborted(
             "input `straight` is false, but `way_points` are there, which are passed in straight lines: leave one of them out",
         )),
+        (Some(false) | None, None) if blend_m.is_some() => Err(ActionFailure::aborted(
+            "input `blend_m` is given, but the motion has no corners to round: it rounds those of a motion with `straight: true` or \
+             `way_points`; give one of them, or leave it out",
+        )),
         (Some(false) | None, None) => Ok(None),
-        (_, through) => {
-            let blend_m = goal.optional_float("blend_m")?.unwrap_or(0.0);
-            Ok(Some(WayPoints { through: through.unwrap_or_default(), blend_m }))
-        }
+        (_, through) => Ok(Some(WayPoints { through: through.unwrap_or_default(), blend_m: blend_m.unwrap_or(0.0) })),
     }
 }
 

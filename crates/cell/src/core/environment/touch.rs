@@ -3,7 +3,7 @@
 //! The bodies are those that the physics moves, where it has put them; depth, place and speed are the answers of its own contact query
 //! on their shapes. Nothing of a planner is asked. Two kinds of pairs are left out: those of which neither is a link or is carried, because the
 //! robot does not decide what objects do to each other; and those that the robot is built to have in contact: links that hang on each
-//! other, what touches in its home posture (a capsule's end reaches into the next link, the base stands on the floor), and links between
+//! other, whose meshes are stood for by spheres that say nothing of them, what touches in its home posture (a capsule's end reaches into the next link, the base stands on the floor), and links between
 //! which a single joint decides (the flange and the link before the wrist): its limits keep them apart, not who plans.
 //! What is shared with the planner: the reader of the robot's description and its forward kinematics.
 
@@ -71,7 +71,7 @@ impl Joined {
         for (i, (a, pose_a, shape_a)) in shapes.iter().enumerate() {
             for (b, pose_b, shape_b) in &shapes[..i] {
                 let touch = contact(pose_a, &**shape_a, pose_b, &**shape_b, 0.0).ok().flatten();
-                if a == b || above(robot, *a) == Some(*b) || touch.is_some() {
+                if a == b || above(robot, *a) == Some(*b) || touch.is_some() || is_covered(robot, *a, *b) {
                     joined.links.insert([*b.min(a), *b.max(a)]);
                 }
             }
@@ -89,6 +89,11 @@ impl Joined {
     fn has(&self, a: usize, b: usize) -> bool {
         a == b || self.links.contains(&[a.min(b), a.max(b)])
     }
+}
+
+/// Whether spheres that stand for meshes say nothing of two links. The controllers look at the meshes.
+fn is_covered(robot: &Robot, a: usize, b: usize) -> bool {
+    robot.model.is_by_shapes(a, b) && [a, b].iter().any(|link| robot.model.links[*link].covers > 0)
 }
 
 /// The next link with a shape above another.

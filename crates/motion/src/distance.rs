@@ -1,0 +1,461 @@
+//! How far two shapes are from each other: the one number that says whether they touch.
+//!
+//! parry3d answers that three times (`intersection_test`, `distance`, `contact`), in `f32`, and the answers contradict each other. Beside
+//! cylinders and capsules they are off by up to a centimetre, to both sides: its search stops where rounding keeps it from a nearer point. So
+//! the search of Gilbert, Johnson and Keerthi (1988) is done here in `f64`. It goes on until a direction proves that the shapes are no nearer.
+//! Where it has to give up, they count as near as nothing disproves. Balls and capsules are a point and a segment with a radius, which is exact.
+//! Of a mesh the surface counts alone; the tree of parry3d finds the triangles that matter.
+
+use crate::frame::{cross, difference, norm, rotate};
+use parry3d::bounding_volume::Aabb;
+use parry3d::math::{Pose as Pose32, Vector};
+use parry3d::query::{self, DefaultQueryDispatcher, QueryDispatcher};
+use parry3d::shape::{Shape, TriMesh};
+use ratn_model::pose::Pose;
+
+/// Steps of a search at the most. Shapes whose sizes differ by a hundred take forty.
+const MAX_STEPS: usize = 128;
+
+/// How far a distance may be off, in metres and as a part of it.
+const ROUNDED_M: f64 = 1e-7;
+const ROUNDED: f64 = 1e-6;
+
+/// What is this near is at the same place, in metres.
+const SAME_M: f64 = 1e-10;
+
+/// Four corners whose volume is a smaller part of that of a box with their edges lie in a plane.
+const FLAT: f64 = 1e-12;
+
+type Point = [f64; 3];
+
+/// How far two shapes are from each other, in metres; something greater than `enough_m` where that is more than `enough_m`. Zero or less where
+/// they touch: then [`depth`] says how deep. `None` where it cannot be told.
+pub fn gap(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape, enough_m: f64) -> Option<f64> {
+    gap_in_first(&a_at.inv_mul(b_at), a, b, enough_m)
+}
+
+/// How deep two shapes that touch are in each other, in metres: how far one has to be moved at the least. What is found may be more than
+/// that, and is never less where neither is a mesh.
+pub fn depth(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> f64 {
+    let pose = a_at.inv_mul(b_at);
+    let contact = DefaultQueryDispatcher.contact(&pose, a, b, 0.0).ok().flatten();
+    let (Some(first), Some(second)) = (Round::of(a), Round::of(b)) else {
+        return contact.map_or(0.0, |contact| f64::from(-contact.dist).max(0.0));
+    };
+    let second = Turned::new(second, &pose);
+    let radii = first.radius + second.round.radius;
+    let cores = cores_apart(&first.core, &second, radii);
+    if cores > 0.0 {
+        return (radii - cores).max(0.0);
+    }
+    let own = first.core.axes().into_iter();
+    let axes = own.chain(second.round.core.axes().into_iter().map(|axis| second.rotate(axis)));
+    let found = contact.map(|contact| contact.normal1.to_array().map(f64::from));
+    let ways = axes.chain([second.at]).flat_map(|way| [way, way.map(|c| -c)]).chain(found);
+    let overlap = |way: Point| {
+        let length = norm(way);
+        (length > SAME_M).then(|| first.along(way.map(|c| c / length)) + second.along(way.map(|c| -c / length)))
+    };
+    ways.filter_map(overlap).fold(f64::INFINITY, f64::min).max(0.0)
+}
+
+/// As [`gap`], the second shape seen from the first.
+fn gap_in_first(pose: &Pose32, a: &dyn Shape, b: &dyn Shape, enough_m: f64) -> Option<f64> {
+    if let (Some(first), Some(second)) = (Round::of(a), Round::of(b)) {
+        return Some(between(&first, &Turned::new(second, pose), enough_m));
+    }
+    match (a.as_trimesh(), b.as_trimesh()) {
+        (Some(mesh), _) => Some(gap_to_mesh(pose, mesh, b, enough_m)),
+        (None, Some(mesh)) => Some(gap_to_mesh(&pose.inverse(), mesh, a, enough_m)),
+        (None, None) => query::distance(&Pose32::IDENTITY, a, pose, b).ok().map(|apart| f64::from(apart.distance)),
+    }
+}
+
+/// From the surface of a mesh to another shape.
+fn gap_to_mesh(pose: &Pose32, mesh: &TriMesh, other: &dyn Shape, enough_m: f64) -> f64 {
+    // The tree rounds to `f32`.
+    let beyond = (enough_m * (1.0 + ROUNDED) + ROUNDED_M) as f32;
+    let around = other.compute_aabb(pose);
+    let (middle, half) = (around.center(), around.half_extents());
+    let nearest = mesh.bvh().find_best(
+        beyond,
+        |node, _| Aabb { mins: node.mins() - middle - half, maxs: node.maxs() - middle + half }.distance_to_origin(),
+        // What cannot be told counts as touching.
+        |triangle, best| {
+            let gap = gap_in_first(pose, &mesh.triangle(triangle), other, f64::from(best));
+            Some(gap.unwrap_or(0.0) as f32)
+        },
+    );
+    f64::from(nearest.map_or(beyond, |(_, gap)| gap))
+}
+
+/// What a rounded shape is about.
+#[derive(Debug, Clone, Copy)]
+enum Core {
+    Point,
+    Segment([Point; 2]),
+    Triangle([Point; 3]),
+    /// Half of its edges.
+    Box(Point),
+    /// Along y: radius and half of its length.
+    Cylinder(f64, f64),
+}
+
+/// All points within a distance of a core.
+#[derive(Debug, Clone, Copy)]
+struct Round {
+    core: Core,
+    radius: f64,
+}
+
+/// A rounded shape as seen from another one.
+#[derive(Debug, Clone, Copy)]
+struct Turned {
+    round: Round,
+    /// The axes of its frame.
+    axes: [Point; 3],
+    at: Point,
+}
+
+impl Core {
+    /// The point that is farthest along a direction.
+    fn farthest(&self, way: Point) -> Point {
+        let farthest = |corners: &[Point]| {
+            corners.iter().copied().max_by(|a, b| dot(*a, way).total_cmp(&dot(*b, way))).unwrap_or_default()
+        };
+        match self {
+            Core::Point => [0.0; 3],
+            Core::Segment(ends) => farthest(ends),
+            Core::Triangle(corners) => farthest(corners),
+            Core::Box(half) => std::array::from_fn(|i| half[i].copysign(way[i])),
+            Core::Cylinder(radius, half_length) => {
+                let aside = way[0].hypot(way[2]);
+                let out = if aside > 0.0 { radius / aside } else { 0.0 };
+                [way[0] * out, half_length.copysign(way[1]), way[2] * out]
+            }
+        }
+    }
+
+    /// Directions across its faces.
+    fn axes(&self) -> Vec<Point> {
+        let [x, y, z] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        match self {
+            Core::Point | Core::Segment(_) => Vec::new(),
+            Core::Triangle([a, b, c]) => vec![cross(difference(*b, *a), difference(*c, *a))],
+            Core::Box(_) => vec![x, y, z],
+            Core::Cylinder(..) => vec![y],
+        }
+    }
+}
+
+impl Round {
+    fn of(shape: &dyn Shape) -> Option<Round> {
+        let point = |v: Vector| v.to_array().map(f64::from);
+        let sharp = |core: Core| Some(Round { core, radius: 0.0 });
+        if let Some(ball) = shape.as_ball() {
+            return Some(Round { core: Core::Point, radius: f64::from(ball.radius) });
+        }
+        if let Some(capsule) = shape.as_capsule() {
+            let core = Core::Segment([point(capsule.segment.a), point(capsule.segment.b)]);
+            return Some(Round { core, radius: f64::from(capsule.radius) });
+        }
+        if let Some(cuboid) = shape.as_cuboid() {
+            return sharp(Core::Box(point(cuboid.half_extents)));
+        }
+        if let Some(cylinder) = shape.as_cylinder() {
+            return sharp(Core::Cylinder(f64::from(cylinder.radius), f64::from(cylinder.half_height)));
+        }
+        let triangle = shape.as_triangle()?;
+        sharp(Core::Triangle([triangle.a, triangle.b, triangle.c].map(point)))
+    }
+
+    /// The farthest that it comes to along a direction of length 1.
+    fn along(&self, way: Point) -> f64 {
+        dot(self.core.farthest(way), way) + self.radius
+    }
+}
+
+impl Turned {
+    fn new(round: Round, pose: &Pose32) -> Turned {
+        let quaternion = pose.rotation.to_array().map(f64::from);
+        // Rounding to `f32` has left it not quite of length 1.
+        let length = quaternion.iter().map(|c| c * c).sum::<f64>().sqrt();
+        let turn = Pose { position: [0.0; 3], quaternion_xyzw: quaternion.map(|c| c / length) };
+        let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| rotate(&turn, axis));
+        Turned { round, axes, at: pose.translation.to_array().map(f64::from) }
+    }
+
+    fn rotate(&self, [x, y, z]: Point) -> Point {
+        let [a, b, c] = self.axes;
+        std::array::from_fn(|i| x * a[i] + y * b[i] + z * c[i])
+    }
+
+    /// The point of its core that is farthest along a direction.
+    fn farthest(&self, way: Point) -> Point {
+        let local = self.round.core.farthest(self.axes.map(|axis| dot(axis, way)));
+        sum(self.rotate(local), self.at)
+    }
+
+    fn along(&self, way: Point) -> f64 {
+        dot(self.farthest(way), way) + self.round.radius
+    }
+}
+
+/// The distance of two rounded shapes, or more than `enough_m`: that of their cores without the radii.
+fn between(a: &Round, b: &Turned, enough_m: f64) -> f64 {
+    let radii = a.radius + b.round.radius;
+    cores_apart(&a.core, b, enough_m + radii) - radii
+}
+
+/// The distance of two cores: that of their difference, all `p - q` with `p` in one and `q` in the other, from the origin.
+fn cores_apart(a: &Core, b: &Turned, enough_m: f64) -> f64 {
+    let farthest = |way: Point| difference(a.farthest(way), b.farthest(way.map(|c| -c)));
+    let mut simplex = Simplex::default();
+    let mut nearest = farthest(if norm(b.at) > SAME_M { b.at } else { [1.0, 0.0, 0.0] });
+    simplex.add(nearest);
+    // No point of the difference is nearer than this.
+    let mut least: f64 = 0.0;
+    for _ in 0..MAX_STEPS {
+        let far = norm(nearest);
+        if far <= SAME_M {
+            return 0.0;
+        }
+        let corner = farthest(nearest.map(|c| -c));
+        least = least.max(dot(corner, nearest) / far);
+        if least > enough_m || far - least <= ROUNDED_M + ROUNDED * far || simplex.has(&corner) {
+            return least;
+        }
+        simplex.add(corner);
+        nearest = simplex.reduce();
+        if simplex.count == 4 {
+            return 0.0;
+        }
+        if norm(nearest) >= far {
+            return least;
+        }
+    }
+    least
+}
+
+/// Up to four points whose hull comes near to the origin.
+#[derive(Debug, Clone, Copy, Default)]
+struct Simplex {
+    corners: [Point; 4],
+    count: usize,
+}
+
+impl Simplex {
+    fn corners(&self) -> &[Point] {
+        &self.corners[..self.count]
+    }
+
+    fn add(&mut self, corner: Point) {
+        self.corners[self.count] = corner;
+        self.count += 1;
+    }
+
+    fn has(&self, corner: &Point) -> bool {
+        self.corners().contains(corner)
+    }
+
+    /// The point of the hull that is nearest to the origin; leaves the corners of the least face that it is on, all four where the origin is
+    /// inside.
+    fn reduce(&mut self) -> Point {
+        let (mut nearest, mut least, mut face) = ([0.0; 3], f64::INFINITY, 0);
+        for chosen in 1..1_usize << self.count {
+            let point = match nearest_on(&self.chosen(chosen)) {
+                Some(point) => point,
+                None => continue,
+            };
+            let far = dot(point, point);
+            if far < least {
+                (nearest, least, face) = (point, far, chosen);
+            }
+        }
+        *self = self.chosen(face);
+        nearest
+    }
+
+    /// The corners whose bits are set.
+    fn chosen(&self, bits: usize) -> Simplex {
+        let mut chosen = Simplex::default();
+        (0..self.count).filter(|i| bits >> i & 1 == 1).for_each(|i| chosen.add(self.corners[i]));
+        chosen
+    }
+}
+
+/// The point nearest to the origin of the plane through all corners, where it is between them; the origin itself where it is inside of four.
+fn nearest_on(simplex: &Simplex) -> Option<Point> {
+    let corners = simplex.corners();
+    let first = *corners.first()?;
+    let edge = |i: usize| difference(corners[i], first);
+    let part = |u: f64, a: Point| a.map(|c| c * u);
+    match simplex.count {
+        1 => Some(first),
+        2 => {
+            let a = edge(1);
+            let u = -dot(first, a) / dot(a, a);
+            (u > 0.0 && u < 1.0).then(|| sum(first, part(u, a)))
+        }
+        3 => {
+            let (a, b) = (edge(1), edge(2));
+            let normal = cross(a, b);
+            let square = dot(normal, normal);
+            // Cramer's rule in the plane of the triangle.
+            let u = -dot(cross(first, b), normal) / square;
+            let v = dot(cross(first, a), normal) / square;
+            let is_between = u > 0.0 && v > 0.0 && u + v < 1.0;
+            is_between.then(|| part(dot(first, normal) / square, normal))
+        }
+        _ => {
+            let (a, b, c) = (edge(1), edge(2), edge(3));
+            let volume = dot(a, cross(b, c));
+            if volume.abs() < FLAT * norm(a) * norm(b) * norm(c) {
+                return None;
+            }
+            let share = |x: Point, y: Point| -dot(first, cross(x, y)) / volume;
+            let (u, v, w) = (share(b, c), share(c, a), share(a, b));
+            (u > 0.0 && v > 0.0 && w > 0.0 && u + v + w < 1.0).then_some([0.0; 3])
+        }
+    }
+}
+
+fn dot(a: Point, b: Point) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+fn sum(a: Point, b: Point) -> Point {
+    std::array::from_fn(|i| a[i] + b[i])
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::{depth, gap};
+    use crate::geometry::Geometry;
+    use crate::robot::to_f32;
+    use rand::{Rng, RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use ratn_model::pose::Pose;
+
+    type Point = [f64; 3];
+
+    fn plus(a: Point, b: Point, by: f64) -> Point {
+        std::array::from_fn(|i| a[i] + by * b[i])
+    }
+
+    fn dot(a: Point, b: Point) -> f64 {
+        (0..3).map(|i| a[i] * b[i]).sum()
+    }
+
+    #[derive(Debug, Clone, Copy)]
+    struct Solid {
+        geometry: Geometry,
+        /// Its axis along z.
+        pose: Pose,
+    }
+
+    impl Solid {
+        /// The nearest of its points.
+        fn nearest(&self, to: Point) -> Point {
+            let [x, y, z] = self.pose.inverse().transform(to);
+            let about = |middle: Point, radius: f64, at: Point| {
+                let off = plus(at, middle, -1.0);
+                let far = dot(off, off).sqrt();
+                if far <= radius { at } else { plus(middle, off, radius / far) }
+            };
+            let local = match self.geometry {
+                Geometry::Box { half: [a, b, c] } => [x.clamp(-a, a), y.clamp(-b, b), z.clamp(-c, c)],
+                Geometry::Cylinder { radius, half_length } => {
+                    let [x, y, _] = about([0.0; 3], radius, [x, y, 0.0]);
+                    [x, y, z.clamp(-half_length, half_length)]
+                }
+                Geometry::Capsule { radius, half_length } => {
+                    about([0.0, 0.0, z.clamp(-half_length, half_length)], radius, [x, y, z])
+                }
+                Geometry::Sphere { radius } => about([0.0; 3], radius, [x, y, z]),
+            };
+            self.pose.transform(local)
+        }
+
+        /// The greatest that its points come to along a direction.
+        fn along(&self, way: Point) -> f64 {
+            let [x, y, z] = self.pose.inverse().rotate(way);
+            let local = match self.geometry {
+                Geometry::Box { half: [a, b, c] } => a * x.abs() + b * y.abs() + c * z.abs(),
+                Geometry::Cylinder { radius, half_length } => radius * x.hypot(y) + half_length * z.abs(),
+                Geometry::Capsule { radius, half_length } => radius + half_length * z.abs(),
+                Geometry::Sphere { radius } => radius,
+            };
+            local + dot(self.pose.position, way)
+        }
+
+        fn grown(&self, by: f64) -> Solid {
+            Solid { geometry: self.geometry.grown(by), ..*self }
+        }
+
+        fn random(random: &mut impl Rng) -> Solid {
+            let mut length = || 10_f64.powf(random.random_range(-2.3..-0.4));
+            let (a, b, c) = (length(), length(), length());
+            let geometry = match random.random_range(0..4) {
+                0 => Geometry::Box { half: [a, b, c] },
+                1 => Geometry::Cylinder { radius: a, half_length: b },
+                2 => Geometry::Capsule { radius: a, half_length: b },
+                _ => Geometry::Sphere { radius: a },
+            };
+            let mut angle = || random.random_range(-3.2..3.2);
+            let (roll, pitch, yaw) = (angle(), angle(), angle());
+            let position = std::array::from_fn(|_| random.random_range(-1.0..1.0));
+            Solid { geometry, pose: Pose::from_rpy(position, roll, pitch, yaw) }
+        }
+    }
+
+    /// Points of two solids that are as near to each other as alternating projections come.
+    fn near(a: &Solid, b: &Solid, times: usize) -> [Point; 2] {
+        let (mut p, mut q) = (a.pose.position, b.pose.position);
+        for _ in 0..times {
+            q = b.nearest(p);
+            p = a.nearest(q);
+        }
+        [p, q]
+    }
+
+    #[test]
+    fn shapes_are_as_far_apart_as_they_were_put_and_those_that_overlap_touch() {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let (mut apart, mut touching) = (0, 0);
+        for _ in 0..40_000 {
+            let (a, mut b) = (Solid::random(&mut random), Solid::random(&mut random));
+            let [p, q] = near(&a, &b, 200);
+            let way = plus(q, p, -1.0);
+            let far = dot(way, way).sqrt();
+            let way = way.map(|c| c / far);
+            // A plane across the way between them proves how far apart they are.
+            let sure = -b.along(way.map(|c| -c)) - a.along(way);
+            if far < 1e-3 || far - sure > 1e-7 {
+                continue;
+            }
+            let wanted = [1e-2, 1e-3, 1e-4, 1e-5, 2e-6, -2e-6, -1e-5, -1e-4, -1e-3, -1e-2][random.random_range(0..10)];
+            b.pose.position = plus(b.pose.position, way, wanted - far);
+            let (body, other) = (a.geometry.at(a.pose), b.geometry.at(b.pose));
+            let (at, of) = (to_f32(&body.pose), to_f32(&other.pose));
+            let (shape, its) = (body.geometry.shape(0.0), other.geometry.shape(0.0));
+            let found = gap(&at, &*shape, &of, &*its, 0.1).unwrap();
+            let is_least = |m: f64| gap(&at, &*shape, &of, &*its, m).unwrap();
+            if wanted > 0.0 {
+                apart += 1;
+                assert!((found - wanted).abs() < 2e-6, "{found} instead of {wanted}: {a:?} {b:?}");
+                assert!(is_least(wanted / 2.0) > wanted / 2.0 && is_least(0.0) > 0.0, "{wanted}: {a:?} {b:?}");
+            } else if let [p, q] = near(&a.grown(wanted / 4.0), &b.grown(wanted / 4.0), 400)
+                && dot(plus(q, p, -1.0), plus(q, p, -1.0)).sqrt() < 1e-9
+            {
+                touching += 1;
+                assert!(found <= 0.0, "{found} instead of {wanted}: {a:?} {b:?}");
+                let deep = depth(&at, &*shape, &of, &*its);
+                // Both are shapes that were made smaller by a quarter of it: no way is shorter than two quarters.
+                assert!(deep > -0.4 * wanted, "{deep} instead of {wanted}: {a:?} {b:?}");
+            }
+        }
+        assert!(apart > 5_000 && touching > 2_000, "{apart} {touching}");
+    }
+}

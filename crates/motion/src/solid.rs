@@ -1,0 +1,141 @@
+//! A shape as the exact checks see it: what has an inside is solid, and all that is within its skin counts as the shape.
+//!
+//! Of a link whose meshes are stood for by spheres there are both. Two links whose spheres say nothing of each other
+//! ([`Checks::by_shapes`](crate::pairs::Checks::by_shapes)) are looked at by the meshes, everything else by the spheres ([`Form::counts`]): they
+//! hold the meshes, so nothing that touches is missed.
+
+use crate::distance;
+use crate::geometry::Body;
+use crate::inside::Inside;
+use crate::mesh::Mesh;
+use parry3d::math::{Pose as Pose32, Vector};
+use parry3d::shape::SharedShape;
+use std::sync::Arc;
+
+/// What a shape is of a link.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Form {
+    /// The shape itself.
+    Own,
+    /// A sphere, among those that stand for a mesh.
+    Cover,
+    /// A mesh that spheres stand for.
+    Covered,
+}
+
+impl Form {
+    /// Whether it is looked at with another shape; `by_shapes` says whether their links are told apart by their exact shapes.
+    pub fn counts(self, by_shapes: bool) -> bool {
+        match self {
+            Form::Own => true,
+            Form::Cover => !by_shapes,
+            Form::Covered => by_shapes,
+        }
+    }
+}
+
+/// See the module.
+#[derive(Debug, Clone)]
+pub(crate) struct Solid {
+    pub(crate) shape: SharedShape,
+    /// How near to it is as good as touching, in metres.
+    pub(crate) skin_m: f64,
+    /// Of a mesh; other shapes are solid by themselves.
+    pub(crate) inside: Option<Arc<Inside>>,
+}
+
+/// A shape in its place.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Placed<'s> {
+    pub(crate) pose: Pose32,
+    pub(crate) solid: &'s Solid,
+}
+
+impl Solid {
+    /// A primitive, larger on every side.
+    pub(crate) fn primitive(body: &Body, padding_m: f64) -> Solid {
+        Solid { shape: body.geometry.shape(padding_m), skin_m: 0.0, inside: None }
+    }
+
+    /// A mesh, larger on every side.
+    pub(crate) fn mesh(mesh: &Mesh, padding_m: f64) -> Solid {
+        let (shape, inside) = mesh.solid();
+        Solid { shape, skin_m: padding_m, inside: Some(inside) }
+    }
+}
+
+impl Placed<'_> {
+    /// Whether two shapes touch or one is inside the other; a pair that cannot be decided counts as touching.
+    pub(crate) fn touches(&self, other: &Placed<'_>) -> bool {
+        self.gap(other, 0.0) <= 0.0 || self.enclosed_m(other).is_some()
+    }
+
+    /// How deep two shapes are in each other, in metres, if they touch or one is inside the other.
+    pub(crate) fn depth(&self, other: &Placed<'_>) -> Option<f64> {
+        let apart = self.apart_m(other, 0.0);
+        (apart <= 0.0).then_some(-apart)
+    }
+
+    /// How far two shapes are from each other, in metres, something greater than `enough_m` where that is more; where they touch, as far below
+    /// zero as they are deep in each other.
+    pub(crate) fn apart_m(&self, other: &Placed<'_>, enough_m: f64) -> f64 {
+        let gap = self.gap(other, enough_m);
+        let skin_m = self.solid.skin_m + other.solid.skin_m;
+        if gap > -skin_m {
+            return match self.enclosed_m(other) {
+                Some(deep) => gap.min(0.0) - deep,
+                None => gap,
+            };
+        }
+        -distance::depth(&self.pose, &*self.solid.shape, &other.pose, &*other.solid.shape) - skin_m
+    }
+
+    /// Between the surfaces of the skins.
+    fn gap(&self, other: &Placed<'_>, enough_m: f64) -> f64 {
+        let skin_m = self.solid.skin_m + other.solid.skin_m;
+        let (shape, its) = (&*self.solid.shape, &*other.solid.shape);
+        distance::gap(&self.pose, shape, &other.pose, its, enough_m + skin_m).map_or(-skin_m, |gap| gap - skin_m)
+    }
+
+    /// How deep one is wholly inside the other.
+    fn enclosed_m(&self, other: &Placed<'_>) -> Option<f64> {
+        let meshes = self.solid.inside.is_some() || other.solid.inside.is_some();
+        // The distance knows only the surface of a mesh.
+        if meshes { self.depth_inside(other).or_else(|| other.depth_inside(self)) } else { None }
+    }
+
+    /// How deep this is in another shape whose surface it does not meet: as deep as the deepest of its parts, by a point of each.
+    fn depth_inside(&self, other: &Placed<'_>) -> Option<f64> {
+        let centre = [[0.0; 3]];
+        let points = self.solid.inside.as_ref().map_or(&centre[..], |inside| inside.corners());
+        let deep = |point: &[f64; 3]| {
+            let [x, y, z] = point.map(|c| c as f32);
+            let at = other.pose.inverse_transform_point(self.pose.transform_point(Vector::new(x, y, z)));
+            let is_inside = match &other.solid.inside {
+                Some(inside) => inside.contains([at.x, at.y, at.z].map(f64::from)),
+                None => other.solid.shape.contains_local_point(at),
+            };
+            let surface = || other.solid.shape.project_local_point(at, false).point;
+            is_inside.then(|| f64::from((surface() - at).length()))
+        };
+        points.iter().filter_map(deep).reduce(f64::max)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use parry3d::shape::HalfSpace;
+
+    #[test]
+    fn a_pair_that_cannot_be_decided_touches() {
+        let solid = |shape: SharedShape| Solid { shape, skin_m: 0.0, inside: None };
+        let floor = solid(SharedShape::new(HalfSpace::new(Vector::new(0.0, 0.0, 1.0))));
+        let ball = solid(SharedShape::ball(0.1));
+        let at = |solid, z: f32| Placed { pose: Pose32::from_translation(Vector::new(0.0, 0.0, z)), solid };
+        // parry3d says nothing about two half-spaces.
+        assert!(at(&floor, 1.0).touches(&at(&floor, 0.0)));
+        assert!(at(&ball, 0.05).touches(&at(&floor, 0.0)));
+        assert!(!at(&ball, 0.2).touches(&at(&floor, 0.0)));
+    }
+}
