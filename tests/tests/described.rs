@@ -12,7 +12,7 @@ use std::net::TcpStream;
 use support::{Place, wait_for};
 use tokio_util::sync::CancellationToken;
 
-const TASK: &str = "task: greet\nstates:\n  - hello: { action: greeter/greet, in: { n: 2 } }\n";
+const TASK: &str = "task: greet\nstates:\n  - hello: { action: greeter/greet, in: { n: 2 }, resources: [Greeter] }\n";
 
 /// `greeter/greet`, which no catalogue has.
 struct Greet;

@@ -112,7 +112,7 @@ mod tests {
     #[test]
     fn without_a_system_the_built_in_config_is_known() {
         let directory = tempfile::tempdir().unwrap();
-        let known = KnownSystem::of(directory.path().to_owned(), ClientTls::default());
+        let known = KnownSystem::of(directory.path().to_owned(), ClientTls::none());
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
         let config = runtime.block_on(async { tokio::task::spawn_blocking(move || known.config()).await.unwrap() });
         assert_eq!(config.unwrap().catalogue, SystemConfig::load(None).unwrap().catalogue);
