@@ -24,7 +24,7 @@ impl Action for Greet {
     }
 
     fn signature(&self) -> Option<Signature> {
-        Some(Signature::new().input("n", Type::Int).computes())
+        Some(Signature::new().input("n", Type::Int).computes().reads("at(?)"))
     }
 
     async fn execute(&self, _: GoalContext) -> ActionResult {
