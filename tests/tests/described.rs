@@ -42,7 +42,7 @@ fn a_dashboard_knows_the_actions_of_a_worker_that_describes_itself_and_came_late
     let file = place.path().join("task.yaml");
     std::fs::write(&file, TASK)?;
     let file = file.to_str().context("a path")?;
-    let dashboard = place.start_as("dashboard", &["dashboard", "--runtime-dir", named, "--edit", file])?;
+    let _dashboard = place.start_as("dashboard", &["dashboard", "--runtime-dir", named, "--edit", file])?;
     let url = wait_for("its address", || {
         let said = std::fs::read_to_string(place.path().join("dashboardout"))?;
         Ok(said.lines().next().and_then(|line| line.strip_prefix("http://")).map(str::to_owned))
