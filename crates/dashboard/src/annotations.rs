@@ -41,6 +41,7 @@ const MAX_PLACED: usize = 5_000;
 /// Keys of one value; all others have a list.
 const SINGLE: [&str; 7] = ["computes", "pia", "duration", "attempts", "deterministic", "routine", "exceptions"];
 
+type Kinds = dyn Fn() -> Vec<String> + Send + Sync;
 type Check = dyn Fn(&str) -> Result<Loaded, Vec<Diagnostic>> + Send + Sync;
 type Makespan = dyn Fn(&Program, &dyn Fn() -> bool) -> Result<f64, String> + Send + Sync;
 
@@ -50,7 +51,7 @@ pub struct Editing(Arc<Inner>);
 
 struct Inner {
     file: PathBuf,
-    kinds: Vec<String>,
+    kinds: Box<Kinds>,
     check: Box<Check>,
     makespan: Box<Makespan>,
     writing: Mutex<()>,
@@ -67,16 +68,16 @@ impl std::fmt::Debug for Editing {
 }
 
 impl Editing {
-    /// Of this file. `kinds` of resources are offered; `check` loads and checks a text as the file's; `makespan` says how many seconds a program
+    /// Of this file. `kinds` says which kinds of resources are offered; `check` loads and checks a text as the file's; `makespan` says how many seconds a program
     /// takes as a dataflow network, or why that cannot be said; it asks often whether it shall go on, and ends soon after it shall not.
     pub fn of(
         file: PathBuf,
-        kinds: Vec<String>,
+        kinds: impl Fn() -> Vec<String> + Send + Sync + 'static,
         check: impl Fn(&str) -> Result<Loaded, Vec<Diagnostic>> + Send + Sync + 'static,
         makespan: impl Fn(&Program, &dyn Fn() -> bool) -> Result<f64, String> + Send + Sync + 'static,
     ) -> Editing {
         let simulating = Arc::new(Semaphore::new(1));
-        let (check, makespan, writing) = (Box::new(check), Box::new(makespan), Mutex::new(()));
+        let (kinds, check, makespan, writing) = (Box::new(kinds), Box::new(check), Box::new(makespan), Mutex::new(()));
         Editing(Arc::new(Inner { file, kinds, check, makespan, writing, simulating, asked: AtomicU64::new(0) }))
     }
 
@@ -194,7 +195,7 @@ pub(crate) fn told(editing: &Editing) -> Result<wire::Annotations, Problem> {
         file: editing.name(),
         digest,
         problem,
-        kinds: inner.kinds.clone(),
+        kinds: (inner.kinds)(),
         findings: findings.iter().map(|one| finding(&written, one)).collect(),
         states,
         predicates,

@@ -616,7 +616,7 @@ async fn serve_editor() -> (Served, PathBuf) {
     let file = place.path().join("task.yaml");
     std::fs::write(&file, TASK).unwrap();
     let check = |text: &str| load(text, "task.yaml", &Catalogue::standard());
-    let edit = Some(Editing::of(file.clone(), vec!["Arm".to_owned()], check, |_, _| Ok(7.5)));
+    let edit = Some(Editing::of(file.clone(), || vec!["Arm".to_owned()], check, |_, _| Ok(7.5)));
     let dashboard = Dashboard::bind(Options { edit, ..options(&[], place.path()) }).await.unwrap();
     let url = dashboard.url();
     let (address, token) = url.strip_prefix("http://").unwrap().split_once("/#token=").unwrap();

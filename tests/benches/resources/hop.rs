@@ -156,20 +156,18 @@ pub(crate) struct Ran {
 impl Chain {
     pub(crate) fn new(system: &System, name: &'static str, world: bool) -> Chain {
         let mut task = format!("task: {name}\nworld: [\"done(s0)\"]\nstates:\n");
-        for node in 1..=NODES {
-            let before = node - 1;
-            let input = if node == 1 { "0".to_owned() } else { format!("s{before}.x") };
-            let (reads, effects) = if world {
-                (format!("\"done(s{before})\""), format!("effects: [\"done(s{node})\"], "))
-            } else {
-                Default::default()
-            };
-            writeln!(
-                task,
-                "  - s{node}: {{ action: noop/do, in: {{ x: {input} }}, computes: true, reads: [{reads}], {effects}resources: [{{ block: {KIND} }}] }}",
-            )
-            .unwrap();
-        }
+        (1..=NODES).for_each(|node| writeln!(task, "  - {}", step(node, world)).unwrap());
+        Chain::of(system, name, &task)
+    }
+
+    /// A chain of so many nodes, so many times, one after the other: a run that lasts.
+    pub(crate) fn repeated(system: &System, name: &'static str, nodes: usize, times: usize) -> Chain {
+        let mut task = format!("task: {name}\nstates:\n  - for: i in range({times})\n    do:\n");
+        (1..=nodes).for_each(|node| writeln!(task, "      - {}", step(node, false)).unwrap());
+        Chain::of(system, name, &task)
+    }
+
+    fn of(system: &System, name: &'static str, task: &str) -> Chain {
         std::fs::write(system.directory.join(format!("{name}.yaml")), task).unwrap();
         Chain { name, times: Times::default(), used: Vec::new(), runs: 0.0 }
     }
@@ -237,6 +235,20 @@ impl Chain {
             note(format!("{key}_switches_{role}"), (switches / self.runs / NODES as f64 * 10.0).round() / 10.0);
         }
     }
+}
+
+/// A node of a chain, which takes its input from the one before it.
+fn step(node: usize, world: bool) -> String {
+    let before = node - 1;
+    let input = if node == 1 { "0".to_owned() } else { format!("s{before}.x") };
+    let (reads, effects) = if world {
+        (format!("\"done(s{before})\""), format!("effects: [\"done(s{node})\"], "))
+    } else {
+        Default::default()
+    };
+    format!(
+        "s{node}: {{ action: noop/do, in: {{ x: {input} }}, computes: true, reads: [{reads}], {effects}resources: [{{ block: {KIND} }}] }}"
+    )
 }
 
 /// The worker: `--worker ID DIRECTORY ENDPOINT_FILE`.

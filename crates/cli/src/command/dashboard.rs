@@ -5,13 +5,15 @@ use crate::arguments::DashboardArguments;
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
 use crate::system::config::SystemConfig;
+use crate::system::known::KnownSystem;
 use crate::system::{CONFIG_FILE, public_directory};
 use crate::{input, output};
 use ratn_dashboard::{Dashboard, DashboardError, Editing, Options, Robots, Tasks};
-use ratn_model::catalogue::Catalogue;
+use ratn_model::diagnostic::{Diagnostic, Severity};
 use ratn_model::load::load_with;
-use ratn_model::program::Program;
+use ratn_model::program::{Location, Program};
 use ratn_model::resource::Quantity;
+use ratn_model::value::Value;
 use ratn_motion::robot::Robot;
 use ratn_simulation::sequential::{Assumptions, makespan_s};
 use ratn_worker::tls::ClientTls;
@@ -26,12 +28,13 @@ const MAX_EVENTS: usize = 50_000;
 /// Serves the pages until the user has seen enough.
 pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(), Failure> {
     let directory = public_directory(arguments.runtime_dir.as_deref())?;
+    let known = KnownSystem::of(directory.clone(), tls.clone());
     let options = Options {
         address: arguments.listen,
         logs: arguments.logs.clone(),
         control: arguments.control,
-        edit: arguments.edit.as_deref().map(|file| editing(file, &directory)).transpose()?,
-        tasks: tasks(catalogue(&directory)?),
+        edit: arguments.edit.as_deref().map(|file| editing(file, &known)).transpose()?,
+        tasks: tasks(known),
         robots: robots(directory.clone(), arguments.robot.clone()),
         ..Options::of(directory, tls.clone())
     };
@@ -56,8 +59,8 @@ pub(crate) fn run(arguments: &DashboardArguments, tls: &ClientTls) -> Result<(),
 
 /// The pages of a system that is up, to look at only; the address is said.
 pub(super) async fn of_system(directory: &Path, tls: &ClientTls) -> anyhow::Result<Dashboard> {
-    let catalogue = catalogue(directory).map_err(|failure| anyhow::anyhow!("{failure}"))?;
-    let (tasks, robots) = (tasks(catalogue), robots(directory.to_owned(), None));
+    let known = KnownSystem::of(directory.to_owned(), tls.clone());
+    let (tasks, robots) = (tasks(known), robots(directory.to_owned(), None));
     let options = Options { tasks, robots, ..Options::of(directory.to_owned(), tls.clone()) };
     let dashboard = Dashboard::bind(options).await?;
     output::progress(format_args!("its dashboard is at {}", dashboard.url()));
@@ -65,37 +68,50 @@ pub(super) async fn of_system(directory: &Path, tls: &ClientTls) -> anyhow::Resu
 }
 
 /// The task file whose annotations pages may change, checked as `ratn check` does.
-fn editing(file: &Path, directory: &Path) -> Result<Editing, Failure> {
+fn editing(file: &Path, known: &KnownSystem) -> Result<Editing, Failure> {
     let refused = |error| Failure::Refused(format!("{}: cannot be read: {error}", file.display()));
     input::read(file).map_err(refused)?;
-    let config = config(directory)?;
-    let assumptions = Assumptions {
-        parameters: BTreeMap::new(),
-        elements: ASSUMED_ELEMENTS,
-        durations_s: BTreeMap::new(),
-        units: config.promised_resources().into_iter().map(|(kind, units)| (kind, units.max(Quantity::ONE))).collect(),
-        attributes: config.module_attributes().clone(),
+    let name = file.display().to_string();
+    let of_kinds = known.clone();
+    let kinds =
+        move || of_kinds.config().map_or_else(|_| Vec::new(), |it| it.catalogue.resources.keys().cloned().collect());
+    let of_check = known.clone();
+    let check = move |text: &str| match of_check.config() {
+        Ok(config) => load_with(text, &name, &config.catalogue, &input::Libraries),
+        Err(problem) => Err(vec![no_config(&name, problem)]),
     };
-    let kinds = config.catalogue.resources.keys().cloned().collect();
-    let (catalogue, name) = (config.catalogue.clone(), file.display().to_string());
-    let check = move |text: &str| load_with(text, &name, &catalogue, &input::Libraries);
+    let of_makespan = known.clone();
     let makespan = move |program: &Program, goes_on: &dyn Fn() -> bool| {
+        let config = of_makespan.config()?;
         let parameters = program.bind_parameters(&[]).map_err(|error| error.to_string())?;
-        let assumptions = Assumptions { parameters, ..assumptions.clone() };
+        let assumptions = assumptions(&config, parameters);
         makespan_s(program, &config.catalogue, &assumptions, MAX_EVENTS, goes_on)
             .map_err(|obstacle| obstacle.to_string())
     };
     Ok(Editing::of(file.to_owned(), kinds, check, makespan))
 }
 
-/// That of the system that runs, or ran, in a directory; else the one that is built in.
-fn config(directory: &Path) -> Result<SystemConfig, Failure> {
-    let own = SystemConfig::read(&directory.join(CONFIG_FILE)).ok();
-    own.map_or_else(|| SystemConfig::load(None), Ok)
+/// There is nothing to check a file against.
+fn no_config(file: &str, problem: String) -> Diagnostic {
+    Diagnostic {
+        rule: "no-config".to_owned(),
+        severity: Severity::Error,
+        file: file.to_owned(),
+        location: Location::default(),
+        path: String::new(),
+        message: problem,
+        help: String::new(),
+    }
 }
 
-fn catalogue(directory: &Path) -> Result<Catalogue, Failure> {
-    Ok(config(directory)?.catalogue)
+fn assumptions(config: &SystemConfig, parameters: BTreeMap<String, Value>) -> Assumptions {
+    Assumptions {
+        parameters,
+        elements: ASSUMED_ELEMENTS,
+        durations_s: BTreeMap::new(),
+        units: config.promised_resources().into_iter().map(|(kind, units)| (kind, units.max(Quantity::ONE))).collect(),
+        attributes: config.module_attributes().clone(),
+    }
 }
 
 /// The robot that the user names, else the one that the log names. Of a log that names none, that of the system that runs, or ran, in a directory,
@@ -130,7 +146,7 @@ fn robot(named: &str) -> Result<Robot, String> {
 }
 
 /// Task files are read again whenever somebody asks: they are small, and may have been put back.
-fn tasks(catalogue: Catalogue) -> Tasks {
+fn tasks(known: KnownSystem) -> Tasks {
     Tasks::by(move |file| {
         if file.as_os_str().is_empty() {
             return Err("the log does not say which task file it is of".to_owned());
@@ -138,7 +154,7 @@ fn tasks(catalogue: Catalogue) -> Tasks {
         let place = file.display();
         let source = input::read(file).map_err(|error| format!("cannot read the task file {place}: {error}"))?;
         let name = place.to_string();
-        let loaded = load_with(&source, &name, &catalogue, &input::Libraries);
+        let loaded = load_with(&source, &name, &known.config()?.catalogue, &input::Libraries);
         loaded
             .map(|loaded| loaded.program)
             .map_err(|_| format!("`ratn check {place}` says what is wrong with the task file"))

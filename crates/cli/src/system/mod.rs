@@ -2,6 +2,7 @@
 
 pub(crate) mod catalogue;
 pub(crate) mod config;
+pub(crate) mod known;
 mod launch;
 pub(crate) mod workers;
 

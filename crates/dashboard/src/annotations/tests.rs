@@ -19,7 +19,7 @@ fn editing(folder: &tempfile::TempDir) -> Editing {
     std::fs::write(&file, TASK).unwrap();
     let check = |text: &str| load(text, "t.yaml", &Catalogue::standard());
     let makespan = |program: &Program, _: &dyn Fn() -> bool| Ok(program.states.len() as f64);
-    Editing::of(file, vec!["Arm".to_owned()], check, makespan)
+    Editing::of(file, || vec!["Arm".to_owned()], check, makespan)
 }
 
 fn proposal(editing: &Editing, state: &str, key: &str, items: Option<&[&str]>) -> Proposal {
@@ -287,7 +287,7 @@ fn endless(folder: &tempfile::TempDir) -> (Editing, Arc<AtomicU64>) {
         Err("ended".to_owned())
     };
     let check = |text: &str| load(text, "t.yaml", &Catalogue::standard());
-    (Editing::of(file, Vec::new(), check, makespan), going_on)
+    (Editing::of(file, Vec::new, check, makespan), going_on)
 }
 
 #[tokio::test]

@@ -189,11 +189,15 @@ function findingsList(findings: Finding[], where: boolean): HTMLElement | null {
   return h("ul", { class: "plain" }, ...findings.map(item));
 }
 
-/** What is in force under a key: nature has one key of three. */
-function inForce(lines: InForceLine[], key: string): Child {
-  const line = lines.find((one) => one.key === key);
-  return line === undefined ? null : h("p", { class: "faint" }, `In force: ${line.text} (${line.from})`);
+/**
+ * What is in force under a key, a sentence for each who says so: nature has one key of three, and beside the resources that a state names there may be
+ * the room of the world model that it takes for what it reads.
+ */
+export function inForce(lines: InForceLine[], key: string): string[] {
+  return lines.filter((one) => one.key === key).map((one) => `In force: ${one.text} (${one.from})`);
 }
+
+const inForceLines = (lines: InForceLine[], key: string): HTMLElement[] => inForce(lines, key).map((line) => h("p", { class: "faint" }, line));
 
 /** What the page wants of the whole. */
 export interface Desk {
@@ -338,7 +342,7 @@ export function annotationsPage(desk: Desk): Page {
     const findings = h("div", { id: `findings-${one.key}`, "aria-live": "polite" });
     const force = h("div", {});
     fields.set(one.key, { findings, force });
-    fill(force, inForce(now.in_force, one.key));
+    fill(force, ...inForceLines(now.in_force, one.key));
     const words = h("datalist", { id: `words-${one.key}` });
     const offer = (typed: string) => fill(words, ...completions(one.key, typed, all ?? { kinds: [], predicates: [], entities: [], places: [] }).map((value) => h("option", { value })));
     offer("");
@@ -437,7 +441,7 @@ export function annotationsPage(desk: Desk): Page {
     if (asked.changes.length === 0) {
       fill(result);
       showFindings(all?.findings ?? []);
-      for (const [key, { force }] of fields) fill(force, inForce(state()?.in_force ?? [], key));
+      for (const [key, { force }] of fields) fill(force, ...inForceLines(state()?.in_force ?? [], key));
       return;
     }
     try {
@@ -449,7 +453,7 @@ export function annotationsPage(desk: Desk): Page {
       const at = fields.get(answer.key);
       if (answer.problem !== "" && at !== undefined) append(at.findings, [h("p", { class: "bad" }, answer.problem)]);
       // Of a file that does not read it is not known: what was in force stays, so that nothing jumps while somebody types.
-      if (answer.in_force.length > 0) for (const [key, { force }] of fields) fill(force, inForce(answer.in_force, key));
+      if (answer.in_force.length > 0) for (const [key, { force }] of fields) fill(force, ...inForceLines(answer.in_force, key));
       const gain = h("p", {}, "What it gains is simulated …");
       fill(result, ...outcome(answer), answer.problem === "" && !answer.refused ? gain : null);
       update();

@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { begin, changesOf, completions, draftOf, gainText, isOther, maySave, sorted, wordsFor } from "../src/annotations.ts";
+import { begin, changesOf, completions, draftOf, gainText, inForce, isOther, maySave, sorted, wordsFor } from "../src/annotations.ts";
 
 const key = (name, items = null) => ({ key: name, said: items !== null, items: items ?? [], listed: name !== "duration" });
 const state = { path: "a/b", depth: 1, form: "action: x/y", line: 3, fixed: "", in_force: [], keys: [key("reads", ["at(table)"]), key("effects"), key("duration", ["2"])] };
@@ -29,6 +29,13 @@ test("findings stand under their key, at their state, or elsewhere", () => {
   const one = (path, name) => ({ severity: "error", rule: "r", path, key: name, line: 1, message: "m", help: "" });
   const { byKey, own, others } = sorted([one("a/b", "reads"), one("a/b", "reads"), one("a/b", "in"), one("a", "reads"), one("", "")], "a/b", ["reads", "effects"]);
   assert.deepEqual([byKey.get("reads").length, own.length, others.length], [2, 1, 2]);
+});
+
+test("the room of the world model that a state takes for what it reads is said beside its own resources", () => {
+  const line = (name, text, from) => ({ key: name, text, from });
+  const lines = [line("reads", "at(table)", "this state"), line("resources", "block Arm", "this state"), line("resources", "block WorldModel", "for what it reads")];
+  assert.deepEqual(inForce(lines, "resources"), ["In force: block Arm (this state)", "In force: block WorldModel (for what it reads)"]);
+  assert.deepEqual(inForce(lines, "effects"), []);
 });
 
 test("what is gained is said, and why it is not", () => {
