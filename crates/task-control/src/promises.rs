@@ -17,8 +17,10 @@ const KEPT: usize = 32;
 /// So long an id is used; the world pool keeps its promises three times as long.
 const FRESH: Duration = Duration::from_secs(10);
 
-/// Where more than so many records wait for the world pool, goals wait for their projections: the workers would.
-const FEW_BEHIND: usize = 4;
+/// Where more than so many records wait for the world pool, goals wait for their projections: the workers would. A node has two, a projection and a
+/// commit. Commits that wait for the same look at the disk are a call each and no more, so a disk that takes some milliseconds once holds nobody up,
+/// and what is behind it is made long before the pool is tired of whoever waits for it (a second).
+const FEW_BEHIND: usize = 16;
 
 /// The ids that are promised to a run; clones share them.
 #[derive(Debug, Clone, Default)]

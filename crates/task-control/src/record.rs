@@ -7,6 +7,7 @@ use super::ledger::{Confirmed, Projecting, operation_request};
 use super::performer::Answer;
 use super::promises::{Made, Promises};
 use super::safe_on_disk::Mark;
+use futures::FutureExt;
 use ratn_executive::protocol::{Event, Unmade};
 use ratn_model::fact::Change;
 use ratn_model::id::{InstanceId, ProjectionId, Revision};
@@ -192,20 +193,45 @@ impl Recorder {
                 Record::Commit { decided, safe } => {
                     let over = CancellationToken::new();
                     let (instance, under_way) = (decided.instance, UnderWay { id: decided.id(&self.run), over });
-                    let committing = self.commit(instance, decided.commit(&self.run), safe);
-                    let mut committing = pin!(trace::within(self.of(instance), committing));
                     let _answered = under_way.over.clone().drop_guard();
-                    loop {
+                    let mut with_it = Vec::new();
+                    let mut safe = pin!(unsafe_on_disk(instance, safe));
+                    let refused = loop {
                         tokio::select! {
                             biased;
-                            event = &mut committing => break event,
+                            refused = &mut safe => break refused,
                             Some(record) = records.recv(), if next.is_none() => match record {
-                                Record::Project { instance, asked, named } => {
-                                    self.project(instance, asked, named, Some(under_way.clone()));
-                                }
+                                Record::Project { instance, asked, named } => with_it.push((instance, asked, named)),
                                 record => next = Some(record),
                             },
                         }
+                    };
+                    let committing = async {
+                        match refused {
+                            Some(refused) => Some(refused),
+                            None => self.commit(instance, decided.commit(&self.run)).await,
+                        }
+                    };
+                    let mut committing = pin!(trace::within(self.of(instance), committing));
+                    // It leaves here, and these right behind it: the world pool is woken once.
+                    let answered = committing.as_mut().now_or_never();
+                    for (instance, asked, named) in with_it {
+                        self.project(instance, asked, named, Some(under_way.clone()));
+                    }
+                    match answered {
+                        Some(event) => event,
+                        None => loop {
+                            tokio::select! {
+                                biased;
+                                event = &mut committing => break event,
+                                Some(record) = records.recv(), if next.is_none() => match record {
+                                    Record::Project { instance, asked, named } => {
+                                        self.project(instance, asked, named, Some(under_way.clone()));
+                                    }
+                                    record => next = Some(record),
+                                },
+                            }
+                        },
                     }
                 }
                 Record::Operate { instance, number, operations, order } => {
@@ -278,10 +304,7 @@ impl Recorder {
         }));
     }
 
-    async fn commit(&self, instance: InstanceId, commit: Commit, safe: Option<Mark>) -> Option<Event> {
-        if let Some(refused) = unsafe_on_disk(instance, safe).await {
-            return Some(refused);
-        }
+    async fn commit(&self, instance: InstanceId, commit: Commit) -> Option<Event> {
         let reason = match commit_next(&self.world, &self.trust, self.root.get(), commit).await {
             Ok(revision) => {
                 self.root.reached(revision);

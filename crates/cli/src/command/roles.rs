@@ -57,7 +57,10 @@ pub(super) fn resource_manager(arguments: &KeptRoleArguments, tls: &ClientTls) -
 
 /// `ratn world-pool`
 pub(super) fn world_pool(arguments: &KeptRoleArguments, tls: &ClientTls) -> Result<(), Failure> {
-    daemon(&arguments.role, tls, world_pool::ROLE, async |system, host| {
+    let system = SystemConfig::load(arguments.role.config.as_deref())?;
+    // Every call comes to the one actor: what it is handed on the same thread costs no other one to be woken.
+    let runtime = tokio::runtime::Builder::new_current_thread();
+    daemon_on(runtime, &arguments.role, system, tls, world_pool::ROLE, async |system, host| {
         let mut config = system.world_pool;
         arguments.apply(world_pool::ROLE, &mut config.storage);
         config.listen = host.listen.unwrap_or(config.listen);

@@ -1739,3 +1739,57 @@ async fn a_motion_that_reads_nothing_does_not_wait_for_what_was_decided_before_i
     }
     bench.performer.closed().await
 }
+
+#[tokio::test]
+async fn a_projection_behind_a_commit_that_waits_for_the_disk_leaves_with_it_and_wakes_the_pool_once()
+-> anyhow::Result<()> {
+    let bench = Bench::new().await?;
+    let (place, channels) = (tempfile::tempdir()?, Channels::new(&ClientTls::none()));
+    let pool = place.path().join("pool.sock");
+    // It answers nothing: whether it is called at all is what counts.
+    let listener = tokio::net::UnixListener::bind(&pool)?;
+    let (events, _answers) = mpsc::channel(8);
+    let recorder = Recorder {
+        run: bench.performer.run.clone(),
+        world: WorldClient::new(&channels, &Endpoint::Unix(pool))?,
+        resources: bench.performer.resources.clone(),
+        cancelled: Cancelled::default(),
+        done: Recorded::default(),
+        events,
+        trust: bench.performer.trust.clone(),
+        session: bench.performer.number,
+        trace: TraceContext::fresh(),
+        root: Root::default(),
+        promises: Promises::default(),
+    };
+    let (records, work) = mpsc::channel(8);
+    let _recorder = AbortOnDropHandle::new(tokio::spawn(recorder.work(work)));
+    let (disk, slow) = Mark::not_yet();
+    let instance = InstanceId(1);
+    let decided = Decided {
+        instance,
+        writer: String::new(),
+        changes: done(),
+        evidence: Vec::new(),
+        revision: Revision(1),
+        knows: Revision(0),
+        behind: 0,
+    };
+    records.send(Record::Commit { decided, safe: Some(slow) }).await?;
+    let asked = Projecting {
+        attempt: 1,
+        base: Revision(1),
+        changes: Vec::new(),
+        writers: Vec::new(),
+        reads: Footprint::Everything,
+        lease: None,
+        first: true,
+        named: None,
+    };
+    records.send(Record::Project { instance: InstanceId(2), asked, named: None }).await?;
+    let early = tokio::time::timeout(Duration::from_millis(200), listener.accept()).await;
+    assert!(early.is_err(), "the projection went ahead of its commit");
+    disk.send_replace(1);
+    tokio::time::timeout(SESSION_DEADLINE, listener.accept()).await??;
+    bench.performer.closed().await
+}
