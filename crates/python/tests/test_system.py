@@ -36,6 +36,12 @@ def measures() -> dict:
     return {"values": [duration.value, outputs.value]}
 
 
+@ratn.task
+def dues(due: int = 1, mode: str = "fast") -> dict:
+    measured = measure(of=due)
+    return {"value": measured.value, "mode": mode}
+
+
 @pytest.fixture(scope="module")
 def system() -> Iterator[ratn.System]:
     os.environ["RATN"] = program()
@@ -120,6 +126,18 @@ def test_a_run_has_a_share_and_a_due_time(system: ratn.System) -> None:
 def test_a_share_or_a_due_time_that_cannot_be_is_refused(system: ratn.System, said: dict, expected: str) -> None:
     with pytest.raises(ratn.Error, match=expected):
         system.run(EXAMPLE, boxes=1, **said).result(60)
+
+
+def test_a_parameter_may_be_called_as_what_a_run_is_given(system: ratn.System) -> None:
+    run = system.run(dues, due=60, parameters={"due": 7, "mode": "slow"})
+    assert run.result(60).outputs == {"value": 7.5, "mode": "slow"}, run.messages()
+    with pytest.raises(TypeError, match="`boxes` is given twice"):
+        system.run(EXAMPLE, boxes=1, parameters={"boxes": 2})
+
+
+def test_a_task_that_is_called_says_what_runs_it() -> None:
+    with pytest.raises(TypeError, match=r"`system\.run\(dues, due=…\)`"):
+        dues(due=3)
 
 
 def test_a_resource_is_held_for_a_block_and_nobody_else_gets_it(system: ratn.System) -> None:

@@ -204,13 +204,17 @@ class System:
         urgency: str = "normal",
         share: float = 1.0,
         due: float | str | datetime.timedelta | datetime.datetime | None = None,
-        **parameters: Any,
+        parameters: Mapping[str, Any] | None = None,
+        **others: Any,
     ) -> Run:
-        """Begins a run of a task, or of a task file; its parameters are keyword arguments. ``mode`` is ``cdtn`` or ``hsm``.
+        """Begins a run of a task, or of a task file; its parameters are keyword arguments, or are in ``parameters``, where one is called as something here (``parameters={"due": 3}``). ``mode`` is ``cdtn`` or ``hsm``.
 
         It goes beside other runs of the system, unless it or one of them is to be ``alone``; ``urgency`` (``low``, ``normal``, ``high``) says whose needs come first. ``share`` (0.01 to 100) is how much it has of what several runs need, beside the shares of the others. ``due`` says when it is to have ended: seconds from its start or a ``timedelta``, a ``datetime`` (local time where it names no zone), or a text as ``ratn run --due`` has it (``"15m"``); of what several runs need at about the same time, the run that is due first comes first. The steps of a task (``@ratn.step``) are performed by workers that are the run's own and live as long as it: ``step_workers`` processes for each file. The run's log is in a temporary folder unless ``log`` says where; that goes with the ``Run``, unless the run is under way then.
         """
-        return Run(self, task, mode, seed, log, parameters, step_workers, alone, urgency, share, due)
+        given = {**(parameters or {}), **others}
+        if twice := set(parameters or {}) & set(others):
+            raise TypeError(f"parameter `{min(twice)}` is given twice, by its name and in `parameters`")
+        return Run(self, task, mode, seed, log, given, step_workers, alone, urgency, share, due)
 
     def acquire(
         self, *kinds: str, priority: int = 0, timeout_s: float | None = None, holder: str = "python"
