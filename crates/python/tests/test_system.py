@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import datetime
 import gc
+import json
 import os
 import pathlib
 import shutil
@@ -32,6 +34,12 @@ def measures() -> dict:
     with ratn.sequence("decide"):
         outputs = measure(of=2)
     return {"values": [duration.value, outputs.value]}
+
+
+@ratn.task
+def dues(due: int = 1, mode: str = "fast") -> dict:
+    measured = measure(of=due)
+    return {"value": measured.value, "mode": mode}
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +97,47 @@ def test_a_run_that_cannot_begin_says_why(system: ratn.System, tmp_path: pathlib
     broken.write_text("task: broken\nstates:\n  - x: { action: no_such/thing }\n")
     with pytest.raises(ratn.Error, match="no_such"):
         system.run(broken).result(60)
+
+
+def test_a_run_has_a_share_and_a_due_time(system: ratn.System) -> None:
+    def standing(**said: object) -> tuple[float, float | None]:
+        run = system.run(EXAMPLE, boxes=1, **said)
+        id = run.id
+        run.pause()
+        words = ["status", "--json", "--runtime-dir", str(system.runtime_dir)]
+        told = json.loads(subprocess.run([program(), *words], capture_output=True, text=True, check=True).stdout)
+        run.abort()
+        run.result(60)
+        (own,) = [one for one in told["runs"] if one["run"] == id]
+        return own["share"], own.get("due_in_s")
+
+    assert standing() == (1.0, None)
+    in_two_minutes = datetime.timedelta(minutes=2)
+    at = [datetime.datetime.now() + in_two_minutes, datetime.datetime.now(datetime.timezone.utc) + in_two_minutes]
+    for due in (120, 120.5, "2m", in_two_minutes, *at):
+        share, due_in_s = standing(share=2.5, due=due)
+        assert share == 2.5 and due_in_s is not None and 60 < due_in_s <= 120.5, (due, due_in_s)
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [({"share": 0}, "from 0.01 to 100"), ({"due": -5}, "expected a time"), ({"due": "soon"}, "expected a time"), ({"due": datetime.datetime(2026, 1, 1)}, "has passed")],
+)
+def test_a_share_or_a_due_time_that_cannot_be_is_refused(system: ratn.System, said: dict, expected: str) -> None:
+    with pytest.raises(ratn.Error, match=expected):
+        system.run(EXAMPLE, boxes=1, **said).result(60)
+
+
+def test_a_parameter_may_be_called_as_what_a_run_is_given(system: ratn.System) -> None:
+    run = system.run(dues, due=60, parameters={"due": 7, "mode": "slow"})
+    assert run.result(60).outputs == {"value": 7.5, "mode": "slow"}, run.messages()
+    with pytest.raises(TypeError, match="`boxes` is given twice"):
+        system.run(EXAMPLE, boxes=1, parameters={"boxes": 2})
+
+
+def test_a_task_that_is_called_says_what_runs_it() -> None:
+    with pytest.raises(TypeError, match=r"`system\.run\(dues, due=…\)`"):
+        dues(due=3)
 
 
 def test_a_resource_is_held_for_a_block_and_nobody_else_gets_it(system: ratn.System) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import datetime
 import json
 import os
 import pathlib
@@ -74,6 +75,15 @@ def _default_directory() -> pathlib.Path:
         return pathlib.Path(said)
     xdg = os.environ.get("XDG_RUNTIME_DIR")
     return pathlib.Path(xdg) / "ratn" if xdg else pathlib.Path(f"/tmp/ratn-{os.getuid()}")
+
+
+def _due(due: float | str | datetime.timedelta | datetime.datetime) -> str:
+    """A due time in the words of ``ratn run``."""
+    if isinstance(due, datetime.datetime):
+        return due.astimezone(datetime.timezone.utc).isoformat()
+    if isinstance(due, datetime.timedelta):
+        due = due.total_seconds()
+    return due if isinstance(due, str) else f"{due}s"
 
 
 @dataclass(frozen=True)
@@ -192,13 +202,19 @@ class System:
         step_workers: int = 1,
         alone: bool = False,
         urgency: str = "normal",
-        **parameters: Any,
+        share: float = 1.0,
+        due: float | str | datetime.timedelta | datetime.datetime | None = None,
+        parameters: Mapping[str, Any] | None = None,
+        **others: Any,
     ) -> Run:
-        """Begins a run of a task, or of a task file; its parameters are keyword arguments. ``mode`` is ``cdtn`` or ``hsm``.
+        """Begins a run of a task, or of a task file; its parameters are keyword arguments, or are in ``parameters``, where one is called as something here (``parameters={"due": 3}``). ``mode`` is ``cdtn`` or ``hsm``.
 
-        It goes beside other runs of the system, unless it or one of them is to be ``alone``; ``urgency`` (``low``, ``normal``, ``high``) says whose needs come first. The steps of a task (``@ratn.step``) are performed by workers that are the run's own and live as long as it: ``step_workers`` processes for each file. The run's log is in a temporary folder unless ``log`` says where; that goes with the ``Run``, unless the run is under way then.
+        It goes beside other runs of the system, unless it or one of them is to be ``alone``; ``urgency`` (``low``, ``normal``, ``high``) says whose needs come first. ``share`` (0.01 to 100) is how much it has of what several runs need, beside the shares of the others. ``due`` says when it is to have ended: seconds from its start or a ``timedelta``, a ``datetime`` (local time where it names no zone), or a text as ``ratn run --due`` has it (``"15m"``); of what several runs need at about the same time, the run that is due first comes first. The steps of a task (``@ratn.step``) are performed by workers that are the run's own and live as long as it: ``step_workers`` processes for each file. The run's log is in a temporary folder unless ``log`` says where; that goes with the ``Run``, unless the run is under way then.
         """
-        return Run(self, task, mode, seed, log, parameters, step_workers, alone, urgency)
+        given = {**(parameters or {}), **others}
+        if twice := set(parameters or {}) & set(others):
+            raise TypeError(f"parameter `{min(twice)}` is given twice, by its name and in `parameters`")
+        return Run(self, task, mode, seed, log, given, step_workers, alone, urgency, share, due)
 
     def acquire(
         self, *kinds: str, priority: int = 0, timeout_s: float | None = None, holder: str = "python"
@@ -265,6 +281,8 @@ class Run:
         step_workers: int = 1,
         alone: bool = False,
         urgency: str = "normal",
+        share: float = 1.0,
+        due: float | str | datetime.timedelta | datetime.datetime | None = None,
     ) -> None:
         self._system = system
         folder = pathlib.Path(tempfile.mkdtemp(prefix="ratn-run-"))
@@ -287,7 +305,8 @@ class Run:
         command = [_program(), "run", os.fspath(task), "--json", "--mode", mode]
         command += ["--runtime-dir", str(system.runtime_dir), "--log", str(self.log)]
         command += ["--seed", str(seed)] if seed is not None else []
-        command += ["--urgency", urgency, *(["--alone"] if alone else [])]
+        command += ["--urgency", urgency, *(["--alone"] if alone else []), f"--share={share}"]
+        command += [f"--due={_due(due)}"] if due is not None else []
         for name, value in parameters.items():
             # Texts are taken as they are.
             command += ["--set", f"{name}={literal(value) if isinstance(value, str) else expression(value)}"]

@@ -16,7 +16,7 @@ import types
 import typing
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 from ratn import _ports, _ratn, _source, _yaml
 from ratn._annotations import VALUES, Output, entry, outputs_said, raw
@@ -77,6 +77,14 @@ class Task:
 
     def __repr__(self) -> str:
         return f"<Task {self.name} of {self._file}>"
+
+    def __call__(self, *_: object, **given: object) -> NoReturn:
+        """A task is no function any more: says what runs it."""
+        shown = ", ".join([self.name, *(f"{name}=…" for name in given)])
+        raise TypeError(
+            f"the task `{self.name}` is traced already and is not called: run it with `system.run({shown})`; in another task "
+            f"perform it as a state of its own with `ratn.library(…)`, of its file (`{self.name}.to_yaml(\"{self.name}.yaml\")`)"
+        )
 
     def _repr_markdown_(self) -> str:
         return f"```yaml\n{self.to_yaml()}```"

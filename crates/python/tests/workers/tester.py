@@ -4,6 +4,7 @@ import asyncio
 import contextvars
 import logging
 import os
+import pathlib
 import sys
 import threading
 import time
@@ -71,15 +72,26 @@ async def nap(goal: ratn.Goal, seconds: float) -> dict:
 
 
 @w.action(anytime=True, effects=[], reads=[])
-def price(goal: ratn.Goal, item: str) -> TypedDict("Price", {"item": str, "cost": int}):
-    """A price, and lower ones as long as nobody pays."""
+def price(goal: ratn.Goal, item: str, half_file: str = "") -> TypedDict("Price", {"item": str, "cost": int}):
+    """A price, and lower ones as long as nobody pays. It makes a file when half of it is left."""
     first = {"item": item, "cost": 100}
     if goal.improves is None:
         return first
     for cost in range(100, 0, -1):
         goal.improved({"item": item, "cost": cost}, cost_s=cost)
+        if cost == 50 and half_file:
+            pathlib.Path(half_file).touch()
         goal.sleep(0.02)
     return first
+
+
+@w.action
+def await_file(goal: ratn.Goal, file: str, at_most_s: float) -> TypedDict("Awaited", {"there": bool}):
+    """Waits until a file is there, for at most so many seconds."""
+    until = time.monotonic() + at_most_s
+    while not pathlib.Path(file).exists() and time.monotonic() < until:
+        goal.sleep(0.02)
+    return {"there": pathlib.Path(file).exists()}
 
 
 @w.action
