@@ -44,7 +44,7 @@ impl Tree {
     /// The nearest node and its distance.
     #[inline]
     pub(crate) fn nearest(&self, to: &State) -> (usize, f32) {
-        let index = self.isa.nearest(&self.blocks, self.joints, self.states.len(), to);
+        let index = self.isa.nearest(&self.blocks, self.joints, to);
         (index, distance(&self.states[index], to))
     }
 

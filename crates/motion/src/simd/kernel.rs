@@ -569,16 +569,8 @@ fn group_in_cloud<V: Lanes, F: Visitor>(
 #[inline(always)]
 fn bounds<V: Lanes>([x, y, z]: [V; 3], radius: f32) -> [f32; 6] {
     let zero = V::splat(0.0);
-    let greatest = [x.peak(), y.peak(), z.peak()];
-    let least = [zero.sub(x).peak(), zero.sub(y).peak(), zero.sub(z).peak()];
-    [
-        greatest[0] + radius,
-        greatest[1] + radius,
-        greatest[2] + radius,
-        least[0] + radius,
-        least[1] + radius,
-        least[2] + radius,
-    ]
+    let peaks = V::peaks([x, y, z, zero.sub(x), zero.sub(y), zero.sub(z)]);
+    std::array::from_fn(|i| peaks[i] + radius)
 }
 
 /// Which obstacles of a row are about there, a bit each.

@@ -37,6 +37,14 @@ pub(super) trait Lanes: Copy {
     fn below(self, other: Self) -> u32;
     /// The greatest lane.
     fn peak(self) -> f32;
+    /// The greatest lanes of six, the first six of these numbers.
+    #[inline(always)]
+    fn peaks(six: [Self; 6]) -> [f32; 8] {
+        let [a, b, c, d, e, f] = six;
+        [a.peak(), b.peak(), c.peak(), d.peak(), e.peak(), f.peak(), 0.0, 0.0]
+    }
+    /// `yes` in the lanes that are below the other's, `no` in the others.
+    fn choose_below(self, other: Self, yes: Self, no: Self) -> Self;
     #[inline(always)]
     fn abs(self) -> Self {
         self.max(Self::splat(0.0).sub(self))
@@ -149,15 +157,18 @@ impl Isa {
 
     /// See [`nearest::nearest`].
     #[inline]
-    pub(crate) fn nearest(self, blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> usize {
+    pub(crate) fn nearest(self, blocks: &[Block], dimensions: usize, to: &[f32; 16]) -> usize {
         match self.0 {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx512 => unsafe { nearest_avx512(blocks, dimensions, count, to) },
+            Kind::Avx512 => unsafe { nearest_avx512(blocks, dimensions, to) },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
-            Kind::Avx2 => unsafe { nearest_avx2(blocks, dimensions, count, to) },
-            _ => nearest::nearest::<false>(blocks, dimensions, count, to),
+            Kind::Avx2 => unsafe { nearest_avx2(blocks, dimensions, to) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => unsafe { nearest_neon(blocks, dimensions, to) },
+            Kind::Plain => nearest::nearest::<[f32; 8]>(blocks, dimensions, to),
         }
     }
 }
@@ -206,14 +217,20 @@ fn fill_cloud_neon(cloud: &mut Cloud, points: &[[Block; 3]], reach: f32) {
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx2,fma")]
-fn nearest_avx512(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> usize {
-    nearest::nearest::<true>(blocks, dimensions, count, to)
+fn nearest_avx512(blocks: &[Block], dimensions: usize, to: &[f32; 16]) -> usize {
+    nearest::nearest::<x86::Wide16>(blocks, dimensions, to)
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
-fn nearest_avx2(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> usize {
-    nearest::nearest::<true>(blocks, dimensions, count, to)
+fn nearest_avx2(blocks: &[Block], dimensions: usize, to: &[f32; 16]) -> usize {
+    nearest::nearest::<x86::Wide8>(blocks, dimensions, to)
+}
+
+#[cfg(target_arch = "aarch64")]
+#[target_feature(enable = "neon")]
+fn nearest_neon(blocks: &[Block], dimensions: usize, to: &[f32; 16]) -> usize {
+    nearest::nearest::<arm::Pair>(blocks, dimensions, to)
 }
 
 #[cfg(target_arch = "aarch64")]
@@ -283,6 +300,10 @@ impl Lanes for [f32; 8] {
     fn peak(self) -> f32 {
         self.into_iter().fold(f32::NEG_INFINITY, f32::max)
     }
+    #[inline(always)]
+    fn choose_below(self, other: Self, yes: Self, no: Self) -> Self {
+        std::array::from_fn(|i| if self[i] < other[i] { yes[i] } else { no[i] })
+    }
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -351,8 +372,43 @@ mod x86 {
             unsafe { _mm512_reduce_max_ps(self.0) }
         }
         #[inline(always)]
+        fn peaks(six: [Self; 6]) -> [f32; 8] {
+            let [a, b, c, d, e, f] = six;
+            unsafe { peaks([halved(a.0), halved(b.0), halved(c.0), halved(d.0), halved(e.0), halved(f.0)]) }
+        }
+        #[inline(always)]
+        fn choose_below(self, other: Self, yes: Self, no: Self) -> Self {
+            Wide16(unsafe { _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_LT_OQ>(self.0, other.0), no.0, yes.0) })
+        }
+        #[inline(always)]
         fn abs(self) -> Self {
             Wide16(unsafe { _mm512_abs_ps(self.0) })
+        }
+    }
+
+    /// The greater ones of both halves.
+    #[inline(always)]
+    unsafe fn halved(a: __m512) -> __m256 {
+        unsafe {
+            let upper = _mm256_castpd_ps(_mm512_extractf64x4_pd::<1>(_mm512_castps_pd(a)));
+            _mm256_max_ps(_mm512_castps512_ps256(a), upper)
+        }
+    }
+
+    /// The greatest lanes of six vectors: half of the instructions of six by themselves, as two, then four of them are halved at once.
+    #[inline(always)]
+    unsafe fn peaks([a, b, c, d, e, f]: [__m256; 6]) -> [f32; 8] {
+        unsafe {
+            let ab = _mm256_max_ps(_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b));
+            let cd = _mm256_max_ps(_mm256_unpacklo_ps(c, d), _mm256_unpackhi_ps(c, d));
+            let ef = _mm256_max_ps(_mm256_unpacklo_ps(e, f), _mm256_unpackhi_ps(e, f));
+            let abcd = _mm256_max_ps(_mm256_shuffle_ps::<0x44>(ab, cd), _mm256_shuffle_ps::<0xee>(ab, cd));
+            let ef = _mm256_max_ps(ef, _mm256_shuffle_ps::<0xee>(ef, ef));
+            let lower = _mm256_permute2f128_ps::<0x20>(abcd, ef);
+            let all = _mm256_max_ps(lower, _mm256_permute2f128_ps::<0x31>(abcd, ef));
+            let mut peaks = [0.0; 8];
+            _mm256_storeu_ps(peaks.as_mut_ptr(), all);
+            peaks
         }
     }
 
@@ -416,6 +472,15 @@ mod x86 {
                 let two = _mm_max_ps(four, _mm_movehl_ps(four, four));
                 _mm_cvtss_f32(_mm_max_ss(two, _mm_movehdup_ps(two)))
             }
+        }
+        #[inline(always)]
+        fn peaks(six: [Self; 6]) -> [f32; 8] {
+            let [a, b, c, d, e, f] = six;
+            unsafe { peaks([a.0, b.0, c.0, d.0, e.0, f.0]) }
+        }
+        #[inline(always)]
+        fn choose_below(self, other: Self, yes: Self, no: Self) -> Self {
+            Wide8(unsafe { _mm256_blendv_ps(no.0, yes.0, _mm256_cmp_ps::<_CMP_LT_OQ>(self.0, other.0)) })
         }
         #[inline(always)]
         fn abs(self) -> Self {
@@ -499,8 +564,59 @@ mod arm {
             unsafe { vmaxvq_f32(vmaxq_f32(self.0, self.1)) }
         }
         #[inline(always)]
+        fn choose_below(self, other: Self, yes: Self, no: Self) -> Self {
+            let low = unsafe { vbslq_f32(vcltq_f32(self.0, other.0), yes.0, no.0) };
+            Pair(low, unsafe { vbslq_f32(vcltq_f32(self.1, other.1), yes.1, no.1) })
+        }
+        #[inline(always)]
         fn abs(self) -> Self {
             Pair(unsafe { vabsq_f32(self.0) }, unsafe { vabsq_f32(self.1) })
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn peaks<V: Lanes>() -> [f32; 8] {
+        // The greatest number of each is in another lane.
+        let mut six = [V::splat(0.0); 6];
+        for (i, vector) in six.iter_mut().enumerate() {
+            let mut block = Block([-10.0; 16]);
+            block.0[(i * 3 + 1) % V::WIDTH] = i as f32 - 2.0;
+            *vector = V::load(&block);
+        }
+        V::peaks(six)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx512f,avx2,fma")]
+    fn peaks_avx512() -> [f32; 8] {
+        peaks::<x86::Wide16>()
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2,fma")]
+    fn peaks_avx2() -> [f32; 8] {
+        peaks::<x86::Wide8>()
+    }
+
+    #[test]
+    fn the_greatest_lanes_of_six_vectors_are_those_of_each() {
+        for isa in Isa::available() {
+            let found = match isa.0 {
+                // SAFETY: only an instruction set that was found is listed.
+                #[cfg(target_arch = "x86_64")]
+                Kind::Avx512 => unsafe { peaks_avx512() },
+                // SAFETY: as above.
+                #[cfg(target_arch = "x86_64")]
+                Kind::Avx2 => unsafe { peaks_avx2() },
+                #[cfg(target_arch = "aarch64")]
+                Kind::Neon => peaks::<[f32; 8]>(),
+                Kind::Plain => peaks::<[f32; 8]>(),
+            };
+            assert_eq!(found[..6], [-2.0, -1.0, 0.0, 1.0, 2.0, 3.0], "{isa:?}");
         }
     }
 }

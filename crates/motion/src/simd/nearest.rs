@@ -4,34 +4,128 @@
 //! What is compared is half of the squared length of a node less its inner product with the goal: half of the squared distance, but for what is the
 //! same for all nodes. That is one instruction per joint and block.
 
-use super::lanes::Block;
+use super::lanes::{Block, Lanes};
 
-/// The index of the nearest of `count` points; node `i` is lane `i % 16` of the `dimensions + 1` blocks from `i / 16 * (dimensions + 1)` on, of
-/// which the last has half of the squared lengths. Unused lanes hold infinity there. The first of equals wins. `FUSED` where the
-/// processor multiplies and adds at once.
+/// Chains of sums that are worked on side by side: each instruction waits for the one before it in its chain, and a coordinate of the goal is
+/// fetched once for all of them.
+const CHAINS: usize = 4;
+
+/// The index of the nearest of some nodes; node `i` is lane `i % 16` of the `dimensions + 1` blocks from `i / 16 * (dimensions + 1)` on, of
+/// which the last has half of the squared lengths. Unused lanes hold infinity there. The first of equals wins.
 #[inline(always)]
-pub(super) fn nearest<const FUSED: bool>(blocks: &[Block], dimensions: usize, count: usize, to: &[f32; 16]) -> usize {
-    let mut best = [f32::INFINITY; 16];
-    let mut found = [0_u32; 16];
-    for (row, chunk) in blocks.chunks_exact(dimensions + 1).enumerate() {
-        let mut sum = chunk[dimensions].0;
-        for (block, goal) in chunk[..dimensions].iter().zip(to) {
-            for (sum, value) in sum.iter_mut().zip(&block.0) {
-                *sum = if FUSED { value.mul_add(-goal, *sum) } else { *sum - value * goal };
+pub(super) fn nearest<V: Lanes>(blocks: &[Block], dimensions: usize, to: &[f32; 16]) -> usize {
+    let parts = 16 / V::WIDTH;
+    let rows = CHAINS / parts;
+    let mut best = Best { sums: [V::splat(f32::INFINITY); CHAINS], rows: [V::splat(0.0); CHAINS] };
+    let mut row = 0;
+    let mut chunks = blocks.chunks_exact((dimensions + 1) * rows);
+    for chunk in &mut chunks {
+        best.look::<CHAINS>(chunk, dimensions, to, row);
+        row += rows;
+    }
+    for chunk in chunks.remainder().chunks_exact(dimensions + 1) {
+        if parts == 1 {
+            best.look::<1>(chunk, dimensions, to, row);
+        } else {
+            best.look::<2>(chunk, dimensions, to, row);
+        }
+        row += 1;
+    }
+    best.first()
+}
+
+/// Of each lane of each chain, the least sum and the row that it is in, which is a whole number.
+struct Best<V> {
+    sums: [V; CHAINS],
+    rows: [V; CHAINS],
+}
+
+impl<V: Lanes> Best<V> {
+    /// Looks at as many chains of nodes, the first of them in this row.
+    #[inline(always)]
+    fn look<const COUNT: usize>(&mut self, chunk: &[Block], dimensions: usize, to: &[f32; 16], row: usize) {
+        let parts = 16 / V::WIDTH;
+        let size = dimensions + 1;
+        let mut sums = [V::splat(0.0); COUNT];
+        for (chain, sum) in sums.iter_mut().enumerate() {
+            *sum = V::load_part(&chunk[chain / parts * size + dimensions], chain % parts);
+        }
+        for (dimension, goal) in to[..dimensions].iter().enumerate() {
+            let minus = V::splat(-goal);
+            for (chain, sum) in sums.iter_mut().enumerate() {
+                let along = V::load_part(&chunk[chain / parts * size + dimension], chain % parts);
+                *sum = along.mul_add(minus, *sum);
             }
         }
-        for lane in 0..16 {
-            let nearer = sum[lane] < best[lane];
-            best[lane] = if nearer { sum[lane] } else { best[lane] };
-            found[lane] = if nearer { row as u32 } else { found[lane] };
+        for (chain, sum) in sums.into_iter().enumerate() {
+            let here = V::splat((row + chain / parts) as f32);
+            self.rows[chain] = sum.choose_below(self.sums[chain], here, self.rows[chain]);
+            self.sums[chain] = sum.min(self.sums[chain]);
         }
     }
-    let mut nearest = (0, f32::INFINITY);
-    for lane in 0..16 {
-        let index = found[lane] as usize * 16 + lane;
-        if index < count && (best[lane], index) < (nearest.1, nearest.0) {
-            nearest = (index, best[lane]);
+
+    /// The first node of those with the least sum.
+    #[inline(always)]
+    fn first(&self) -> usize {
+        let parts = 16 / V::WIDTH;
+        let mut least = self.sums[0];
+        for sum in &self.sums[1..] {
+            least = least.min(*sum);
+        }
+        let least = V::splat(-V::splat(0.0).sub(least).peak());
+        let mut first = usize::MAX;
+        for chain in 0..CHAINS {
+            let mut lanes = V::ALL & !least.below(self.sums[chain]);
+            let mut rows = Block([0.0; 16]);
+            if lanes != 0 {
+                self.rows[chain].store(&mut rows);
+            }
+            while lanes != 0 {
+                let lane = lanes.trailing_zeros() as usize & 15;
+                lanes &= lanes - 1;
+                first = first.min(rows.0[lane] as usize * 16 + chain % parts * V::WIDTH + lane);
+            }
+        }
+        first
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Isa;
+    use super::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    #[test]
+    fn the_nearest_node_is_found_in_trees_of_all_sizes_and_the_first_of_equals() {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        for dimensions in [1, 6, 7, 8, 15, 16] {
+            // Whole numbers, few for each joint: sums without rounding, and many equals.
+            let mut posture = || -> [f32; 16] {
+                std::array::from_fn(|j| if j < dimensions { random.random_range(-2..=2) as f32 } else { 0.0 })
+            };
+            let (mut blocks, mut nodes) = (Vec::new(), Vec::new());
+            for count in 1..=200 {
+                let node = posture();
+                if (count - 1) % 16 == 0 {
+                    blocks.extend(std::iter::repeat_n(Block([0.0; 16]), dimensions));
+                    blocks.push(Block([f32::INFINITY; 16]));
+                }
+                let row = (count - 1) / 16 * (dimensions + 1);
+                for j in 0..dimensions {
+                    blocks[row + j].0[(count - 1) % 16] = node[j];
+                }
+                blocks[row + dimensions].0[(count - 1) % 16] = 0.5 * node.iter().map(|q| q * q).sum::<f32>();
+                nodes.push(node);
+                let to = posture();
+                let square = |node: &[f32; 16]| (0..16).map(|j| (node[j] - to[j]).powi(2)).sum::<f32>();
+                let least = nodes.iter().map(square).fold(f32::INFINITY, f32::min);
+                let first = nodes.iter().position(|node| square(node) == least);
+                for isa in Isa::available() {
+                    assert_eq!(Some(isa.nearest(&blocks, dimensions, &to)), first, "{isa:?} {dimensions} {count}");
+                }
+            }
         }
     }
-    nearest.0
 }
