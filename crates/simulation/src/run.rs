@@ -319,7 +319,8 @@ pub fn run_while(
             return Err(RunError::Stopped { at_s: simulation.now.seconds() });
         }
         let Some(((now, _), entry)) = simulation.agenda.pop_first() else {
-            return Err(RunError::Stuck { at_s: simulation.now.seconds(), waits: executive.explain() });
+            let waits = executive.explain().into_iter().chain(simulation.wanted()).collect();
+            return Err(RunError::Stuck { at_s: simulation.now.seconds(), waits });
         };
         simulation.now = now;
         let mut next = simulation.happens(entry)?;
@@ -745,6 +746,17 @@ impl Simulation<'_> {
                 self.send(late, "granted", instance, grant, Event::Granted { instance, lease });
             }
         }
+    }
+
+    /// What is asked of the resource pool and was not granted, for people.
+    fn wanted(&self) -> Vec<String> {
+        let asked = self.waiting.iter().filter_map(|(waiter, instance)| {
+            let (_, request) = self.pool.waiter(*waiter)?;
+            let path = self.paths.get(instance).map_or("a state", String::as_str);
+            let wanted: Vec<String> = request.requirements.iter().map(|wanted| format!("`{wanted}`")).collect();
+            Some(format!("{path} waits for {}, which nothing that there is grants", wanted.join(" and ")))
+        });
+        asked.collect()
     }
 
     fn check(&mut self, executive: &Executive) -> Result<(), RunError> {

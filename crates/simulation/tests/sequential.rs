@@ -123,6 +123,14 @@ fn a_task_that_cannot_be_brought_to_its_end_says_why() {
 }
 
 #[test]
+fn a_task_that_asks_for_what_is_not_there_says_what_that_is() {
+    let elsewhere = "resources: [{ block: Arm, where: { host: elsewhere } }]";
+    let task = format!("task: t\nstates:\n{}", move_arm("go", "1", 10).replace("resources: [{ block: Arm }]", elsewhere));
+    let said = check(&task).unwrap_err().to_string();
+    assert!(said.contains("go waits for `block Arm host=elsewhere`, which nothing that there is grants"), "{said}");
+}
+
+#[test]
 fn of_two_visits_that_end_together_the_chain_names_the_one_whose_output_is_taken() {
     let task = "task: t\nstates:\n  - for: b in [1, 2]\n    do:
     - plan: { action: brain/think, in: { a: $b }, computes: true, reads: [], resources: [{ block: Brain }], duration: 5 }

@@ -84,7 +84,7 @@ struct Parts {
     joints: ArmJoints,
     /// Which those are.
     chain: Option<JointChain>,
-    /// The attributes of the modules of a kind, one after the other: which arm each is, of a robot with several.
+    /// The attributes of the modules of a kind, one after the other: the cell's host, and of a robot with several arms which one each is.
     attributes: ModuleAttributes,
     /// Whether its workplace has a middle, into which several arms reach.
     middle: bool,
@@ -285,9 +285,11 @@ impl SystemConfig {
             });
             let modules = Module::of(&robot);
             let mut attributes = ModuleAttributes::new();
-            for (module, arm) in modules.iter().filter_map(|module| Some((module, module.arm_name(&robot)?))) {
-                let said = [("arm".to_owned(), Value::String(arm.to_owned()))].into();
-                attributes.entry(module.kind().to_owned()).or_default().push(said);
+            for module in &modules {
+                let arm = module.arm_name(&robot).map(|arm| ("arm", arm));
+                let said = [("host", self.cell.host.as_str())].into_iter().chain(arm);
+                let said = said.map(|(name, value)| (name.to_owned(), Value::String(value.to_owned())));
+                attributes.entry(module.kind().to_owned()).or_default().push(said.collect());
             }
             let middle = robot.workplace().is_some_and(|workplace| workplace.middle.is_some());
             self.parts = Parts { modules, joints, chain, attributes, middle };
@@ -401,7 +403,7 @@ impl SystemConfig {
             && self.process_manager.templates.iter().all(|template| template.kind != kind)
     }
 
-    /// Which arm each module of a kind is, of a robot with several arms.
+    /// On which host each module of a kind is, and of which arm where the robot has several.
     pub(crate) fn module_attributes(&self) -> &ModuleAttributes {
         &self.parts.attributes
     }
