@@ -412,7 +412,9 @@ fn a_request_keeps_no_time_of_one_of_another_session() {
     let mut pool = pool(&shares(&[1.0; 3]), [1, 0]);
     queued(&mut pool, 0, 1_000, arm(&run(2)));
     let (_, mut lease) = granted(&mut pool).unwrap();
-    (0..OLD).for_each(|number| drop(queued(&mut pool, 0, number, arm(&run(0)))));
+    for number in 0..OLD {
+        queued(&mut pool, 0, number, arm(&run(0)));
+    }
     let (mut victim, mut asked) = (None, BTreeMap::new());
     for number in 0..OLD {
         let now = 5_000 * (number + 1);
@@ -449,7 +451,9 @@ fn a_session_that_is_opened_anew_keeps_no_time_from_before_it_was_served() {
     // They are in the queue for a moment, and leave so that none of them becomes the first.
     let refresh = |pool: &mut Pool, now: u64, of: usize, from: u64| {
         pool.keep_alive(at(now), &sessions[of], "old", HOUR).unwrap();
-        (from..OLD).for_each(|number| drop(queued(pool, now, id(of, number), arm(&sessions[of]))));
+        for number in from..OLD {
+            queued(pool, now, id(of, number), arm(&sessions[of]));
+        }
         for number in (from..OLD).rev() {
             assert!(pool.withdraw(at(now), &sessions[of], &id(of, number).to_string()).unwrap());
         }
