@@ -12,21 +12,19 @@
 //! for, make no difference to others. What is held counts, not what it was needed for; what is consumed does not. Not written down: after a
 //! restart everybody begins anew.
 //!
-//! Nothing happens by itself: an account is settled when its session gets or gives back. To compare takes a look at each session there.
+//! Nothing happens by itself: an account is settled when its session gets or gives back. To compare takes a look at each session there, once
+//! for all that are compared at a moment.
 //!
 //! From: start-time fair queueing (Goyal, Vin, Cheng 1996), with a bound on how far apart accounts are.
 
 use crate::id::{SessionId, WaiterId};
+use crate::own_order::{Families, OwnOrder, OwnPlace, Settled};
 use crate::turn::{AHEAD, Share};
 use ratn_model::resource::Quantity;
 use ratn_model::time::Timestamp;
-use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
-
-/// Where a request stands among those of its own session: what is certain, then the larger priority, then who came first.
-pub(crate) type OwnPlace = (bool, Reverse<i64>, WaiterId);
 
 /// Nanoseconds, times units, for a share of 1.
 type Service = u128;
@@ -35,14 +33,29 @@ type Service = u128;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Accounts {
     families: BTreeMap<Arc<str>, FamilyAccounts>,
-    /// In which families a session has one.
-    sessions: BTreeMap<SessionId, BTreeSet<Arc<str>>>,
+    sessions: BTreeMap<SessionId, OfSession>,
+    /// Those of whom it is to be found out which of their requests are first ones.
+    unsettled: BTreeSet<SessionId>,
+    /// At so many accounts and requests was looked.
+    looked_at: usize,
+}
+
+/// What a session has in all families together.
+#[derive(Debug, Clone, Default)]
+struct OfSession {
+    /// In which families it has an account.
+    families: Families,
+    order: OwnOrder,
 }
 
 #[derive(Debug, Clone, Default)]
 struct FamilyAccounts {
     level: Service,
     accounts: BTreeMap<SessionId, Account>,
+    /// So many of them hold or wait.
+    active: usize,
+    /// Those who need something for certain at a moment, as long as nothing of it has changed.
+    rivals: Option<(Timestamp, Rivals)>,
 }
 
 /// What a session has and had of a family.
@@ -70,12 +83,20 @@ pub(crate) struct Within<'a> {
 
 /// Those who need something of a family for certain, at a moment.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Rivals {
+struct Rivals {
     /// The two that have had the least.
     least: [Option<(Service, SessionId)>; 2],
     /// The sum of their shares, in thousandths.
     shares: u128,
     /// What they hold, in thousandths.
+    held: u128,
+}
+
+/// What one of them is beside the others.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+struct Rival {
+    service: Service,
+    share: u128,
     held: u128,
 }
 
@@ -107,6 +128,12 @@ impl Account {
         self.service.saturating_add(cost)
     }
 
+    /// Nothing where it needs nothing for certain.
+    fn as_rival(&self, now: Timestamp) -> Option<Rival> {
+        let (share, held) = (self.share.thousandths().into(), self.held.thousandths().into());
+        self.needs_some().then(|| Rival { service: self.service_at(now), share, held })
+    }
+
     fn settle(&mut self, now: Timestamp) {
         self.service = self.service_at(now);
         self.settled = self.settled.max(now);
@@ -128,19 +155,42 @@ impl Beside {
 }
 
 impl FamilyAccounts {
-    fn rivals(&self, now: Timestamp) -> Rivals {
+    /// Finds the rivals of a moment, unless they are known; at how many accounts was looked for that.
+    fn find_rivals(&mut self, now: Timestamp) -> usize {
+        if self.rivals.as_ref().is_some_and(|(at, _)| *at == now) {
+            return 0;
+        }
         let mut rivals = Rivals::default();
-        for (session, account) in self.accounts.iter().filter(|(_, account)| account.needs_some()) {
-            let service = account.service_at(now);
-            rivals.shares += u128::from(account.share.thousandths());
-            rivals.held += u128::from(account.held.thousandths());
+        for (session, account) in &self.accounts {
+            let Some(Rival { service, share, held }) = account.as_rival(now) else { continue };
+            rivals.shares += share;
+            rivals.held += held;
             let less = |other: &Option<(Service, SessionId)>| other.as_ref().is_none_or(|(other, _)| service < *other);
             if let Some(at) = rivals.least.iter().position(less) {
                 rivals.least[at..].rotate_right(1);
                 rivals.least[at] = Some((service, session.clone()));
             }
         }
-        rivals
+        self.rivals = Some((now, rivals));
+        self.accounts.len()
+    }
+
+    /// One of them is another one at a moment. Where that leaves those who have had the least, the others need no look.
+    fn rival_changes(&mut self, session: &SessionId, now: Timestamp, before: Option<Rival>, after: Option<Rival>) {
+        if before == after {
+            return;
+        }
+        let Some((at, rivals)) = &mut self.rivals else { return };
+        let [_, second] = &rivals.least;
+        let had_least = rivals.least.iter().flatten().any(|(_, other)| other == session);
+        let has_less = |rival: Rival| second.as_ref().is_none_or(|(service, _)| rival.service < *service);
+        if *at != now || had_least || after.is_some_and(has_less) {
+            self.rivals = None;
+            return;
+        }
+        let (before, after) = (before.unwrap_or_default(), after.unwrap_or_default());
+        rivals.shares = (rivals.shares + after.share).saturating_sub(before.share);
+        rivals.held = (rivals.held + after.held).saturating_sub(before.held);
     }
 
     fn beside(&self, rivals: &Rivals, within: &Within<'_>) -> Beside {
@@ -161,21 +211,17 @@ impl FamilyAccounts {
 }
 
 impl Accounts {
-    /// Those who wait in a family, now.
-    pub(crate) fn rivals(&self, family: &str, now: Timestamp) -> Rivals {
-        self.families.get(family).map(|family| family.rivals(now)).unwrap_or_default()
-    }
-
     /// By how much a session is ahead of its rivals in a family, as time; [`AHEAD`] at the most.
-    pub(crate) fn ahead(&self, rivals: &Rivals, within: &Within<'_>) -> Duration {
-        self.families.get(within.family).map_or(Duration::ZERO, |family| family.beside(rivals, within).ahead())
+    pub(crate) fn ahead(&mut self, within: &Within<'_>) -> Duration {
+        self.beside(within).map_or(Duration::ZERO, |beside| beside.ahead())
     }
 
     /// A turn of a session begins: what it had is no further from what others had than [`AHEAD`].
-    pub(crate) fn begins_turn(&mut self, rivals: &Rivals, within: &Within<'_>) {
+    pub(crate) fn begins_turn(&mut self, within: &Within<'_>) {
+        let Some(beside) = self.beside(within) else { return };
         let Some(family) = self.families.get_mut(within.family) else { return };
-        let beside = family.beside(rivals, within);
         let Some(account) = family.accounts.get_mut(within.session) else { return };
+        let before = account.as_rival(within.now);
         account.settle(within.now);
         if let Some(least) = beside.least {
             let most = beside.most();
@@ -183,23 +229,58 @@ impl Accounts {
         }
         let least = beside.least.map_or(account.service, |least| least.min(account.service));
         family.level = family.level.max(least);
+        let after = account.as_rival(within.now);
+        family.rival_changes(within.session, within.now, before, after);
     }
 
-    /// Whether a request would be the first of its session in a family, or is.
-    pub(crate) fn is_first(&self, session: &SessionId, family: &str, own: &OwnPlace) -> bool {
-        let first = self.account(session, family).and_then(|account| account.waiting.first());
-        first.is_none_or(|first| own <= first)
+    fn beside(&mut self, within: &Within<'_>) -> Option<Beside> {
+        let family = self.families.get_mut(within.family)?;
+        self.looked_at += family.find_rivals(within.now);
+        let (_, rivals) = family.rivals.as_ref()?;
+        Some(family.beside(rivals, within))
     }
 
-    /// The first request of a session in a family, and the one behind it.
-    pub(crate) fn first_two(&self, session: &SessionId, family: &str) -> impl Iterator<Item = WaiterId> {
-        self.account(session, family).into_iter().flat_map(|account| account.waiting.iter().take(2)).map(|own| own.2)
+    /// At how many accounts and requests was looked since this was asked last.
+    pub(crate) fn take_looks(&mut self) -> usize {
+        std::mem::take(&mut self.looked_at)
+    }
+
+    /// A request of a session that takes something of these families waits from now on, as [`Accounts::waits`] has said of each.
+    pub(crate) fn joins(&mut self, session: &SessionId, families: Families, own: OwnPlace) {
+        if !families.is_empty() && self.sessions.entry(session.clone()).or_default().order.insert(families, own) {
+            self.unsettled.insert(session.clone());
+        }
+    }
+
+    /// The same of one that does not any more. To be said before [`Accounts::waits_no_more`].
+    pub(crate) fn parts(&mut self, session: &SessionId, families: &Families, own: &OwnPlace) {
+        if self.sessions.get_mut(session).is_some_and(|of| of.order.remove(families, own)) {
+            self.unsettled.insert(session.clone());
+        }
+    }
+
+    /// How the first requests of a session are others since requests of it have come and gone; nothing where that is settled for all.
+    pub(crate) fn settle_next(&mut self) -> Option<Settled> {
+        let session = self.unsettled.pop_first()?;
+        let settled = self.sessions.get_mut(&session).map(|of| of.order.settle()).unwrap_or_default();
+        self.looked_at += settled.looked_at;
+        Some(settled)
+    }
+
+    /// Whether a request of a session that takes something of these families is a first one, or would be.
+    pub(crate) fn is_first<'a>(
+        &self,
+        session: &SessionId,
+        families: impl IntoIterator<Item = &'a str>,
+        own: &OwnPlace,
+    ) -> bool {
+        self.sessions.get(session).is_none_or(|of| of.order.is_first(families, own))
     }
 
     /// The first request of each session in a family.
     pub(crate) fn firsts(&self, family: &str) -> Vec<WaiterId> {
-        let accounts = self.families.get(family).into_iter().flat_map(|family| family.accounts.values());
-        accounts.filter_map(|account| account.waiting.first()).map(|own| own.2).collect()
+        let sessions = self.families.get(family).into_iter().flat_map(|family| family.accounts.keys());
+        sessions.filter_map(|session| self.sessions.get(session)?.order.first_of(family)).collect()
     }
 
     /// When the last request of a session was served that was its first in a family.
@@ -240,17 +321,20 @@ impl Accounts {
 
     /// It has another share from now on.
     pub(crate) fn has_share(&mut self, session: &SessionId, share: Share, now: Timestamp) {
-        for family in self.sessions.get(session).cloned().unwrap_or_default() {
+        for family in self.sessions.get(session).map(|of| of.families.clone()).unwrap_or_default() {
             self.change(&Within { session, family: &family, share, now }, |_| {});
         }
     }
 
     /// Nothing of a session is left.
     pub(crate) fn forget(&mut self, session: &SessionId) {
-        for name in self.sessions.remove(session).unwrap_or_default() {
+        for name in self.sessions.remove(session).unwrap_or_default().families {
             let Some(family) = self.families.get_mut(&name) else { continue };
             let left = family.accounts.remove(session);
-            debug_assert!(!left.is_some_and(|left| left.is_active()), "{session} has ended and is active");
+            let is_active = left.is_some_and(|left| left.is_active());
+            debug_assert!(!is_active, "{session} has ended and is active");
+            family.active -= usize::from(is_active);
+            family.rivals = None;
             if family.accounts.is_empty() {
                 self.families.remove(&name);
             }
@@ -264,20 +348,23 @@ impl Accounts {
         let family = self.families.entry(name.clone()).or_default();
         if !family.accounts.contains_key(*session) {
             family.accounts.insert((*session).clone(), Account { settled: *now, ..Account::default() });
-            self.sessions.entry((*session).clone()).or_default().insert(name.clone());
+            self.sessions.entry((*session).clone()).or_default().families.insert(name.clone());
         }
         let Some(account) = family.accounts.get_mut(*session) else { return };
+        let (was_active, before) = (account.is_active(), account.as_rival(*now));
         account.settle(*now);
-        if !account.is_active() {
+        if !was_active {
             account.service = account.service.max(family.level);
         }
         account.share = *share;
         change(account);
-        let (is_active, service) = (account.is_active(), account.service);
+        let (is_active, service, after) = (account.is_active(), account.service, account.as_rival(*now));
+        family.active = family.active + usize::from(is_active) - usize::from(was_active);
+        family.rival_changes(session, *now, before, after);
         if is_active {
             return;
         }
-        if !family.accounts.values().any(Account::is_active) {
+        if family.active == 0 {
             family.level = family.level.max(service);
         }
         let level = family.level;
@@ -289,9 +376,9 @@ impl Accounts {
         if family.accounts.is_empty() {
             self.families.remove(&name);
         }
-        if let Some(families) = self.sessions.get_mut(*session) {
-            families.remove(&name);
-            if families.is_empty() {
+        if let Some(of) = self.sessions.get_mut(*session) {
+            of.families.remove(&name);
+            if of.families.is_empty() {
                 self.sessions.remove(*session);
             }
         }
@@ -302,7 +389,7 @@ impl Accounts {
         let mut active = 0;
         for (name, family) in &self.families {
             for (session, account) in &family.accounts {
-                if !self.sessions.get(session).is_some_and(|families| families.contains(name)) {
+                if !self.sessions.get(session).is_some_and(|of| of.families.contains(name)) {
                     return Err(format!("{session} does not know of its account of {name}"));
                 }
                 if !account.is_active() {
@@ -318,7 +405,13 @@ impl Accounts {
             }
         }
         let accounts = self.families.values().map(|family| family.accounts.len()).sum::<usize>();
-        let listed = self.sessions.values().map(BTreeSet::len).sum::<usize>();
+        let listed = self.sessions.values().map(|of| of.families.len()).sum::<usize>();
+        let counted = self.families.values().map(|family| family.active).sum::<usize>();
+        if counted != active || !self.unsettled.is_empty() {
+            return Err(
+                "so many accounts are not active, or it is not settled whose requests are first ones".to_owned()
+            );
+        }
         match active == has.len() && accounts == listed {
             true => Ok(()),
             false => Err("somebody who holds or waits has no account, or one is listed that is not there".to_owned()),
@@ -330,6 +423,7 @@ impl Accounts {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+    use std::cmp::Reverse;
 
     fn at(seconds: u64) -> Timestamp {
         Timestamp(seconds * 1_000_000_000)
@@ -357,10 +451,7 @@ mod tests {
         }
 
         fn ahead(&mut self, seconds: u64, who: usize) -> u64 {
-            let ahead = |accounts: &mut Accounts, within: &Within<'_>| {
-                accounts.ahead(&accounts.rivals("Arm", within.now), within).as_secs()
-            };
-            self.when(seconds, who, ahead)
+            self.when(seconds, who, |accounts, within| accounts.ahead(within).as_secs())
         }
     }
 
@@ -385,12 +476,12 @@ mod tests {
         let mut bench = Bench::new([1.0, 1.0, 1.0]);
         bench.when(0, 0, |accounts, within| accounts.holds(within, Quantity::ONE));
         bench.when(1_000, 0, |accounts, within| accounts.waits(within, own(1)));
-        bench.when(1_000, 0, |accounts, within| accounts.begins_turn(&accounts.rivals("Arm", within.now), within));
+        bench.when(1_000, 0, |accounts, within| accounts.begins_turn(within));
         // The other one comes when the first has had it for long: they begin alike.
         bench.when(1_000, 1, |accounts, within| accounts.waits(within, own(2)));
         assert_eq!((bench.ahead(1_000, 0), bench.ahead(1_000, 1)), (0, 0));
         // After another 500 s with it, the first owes 60 s at the most.
-        bench.when(1_500, 0, |accounts, within| accounts.begins_turn(&accounts.rivals("Arm", within.now), within));
+        bench.when(1_500, 0, |accounts, within| accounts.begins_turn(within));
         bench.when(1_500, 0, |accounts, within| accounts.holds_no_more(within, Quantity::ONE));
         bench.when(1_500, 1, |accounts, within| accounts.holds(within, Quantity::ONE));
         assert_eq!((bench.ahead(1_500, 0), bench.ahead(1_530, 0)), (60, 0));

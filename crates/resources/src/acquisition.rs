@@ -12,7 +12,7 @@ use crate::memory::{Recalled, Remembered, RequestId};
 use crate::pool::Pool;
 use crate::queue::{AcquireRequest, Place, Waiter};
 use crate::record::Effect;
-use crate::replaced::{Earlier, Kept};
+use crate::replaced::Earlier;
 use crate::resource::{Resource, Units};
 use crate::session::Session;
 use crate::session::Speaker;
@@ -200,7 +200,7 @@ impl Pool {
         request_id: RequestId,
         fingerprint: Fingerprint,
         groups: Vec<Key>,
-        kept: Option<Kept>,
+        kept: Option<Timestamp>,
     ) -> Result<WaiterId, PoolError> {
         let full = self.no_room(&request.session)?;
         self.next_waiter += 1;
@@ -236,7 +236,7 @@ impl Pool {
         let waiter = Waiter {
             request,
             turn,
-            asked: kept.map_or(self.now, |kept| kept.since),
+            asked: kept.unwrap_or(self.now),
             since,
             kept,
             first,
@@ -395,15 +395,16 @@ impl Pool {
             session.waiters.remove(&id);
             self.callers.waits_no_more(&session.opened_by, &waiter.groups);
         }
+        let kept = if competed { Some(waiter.since) } else { waiter.kept };
+        let kept = kept.map(|since| self.not_before_served(&waiter.request, since));
         if competed {
             self.has_competed(&waiter.request, id, granted && waiter.first);
         }
         let fingerprint = self.memory.waited(&waiter.request_id).unwrap_or_default();
         if !granted {
-            let had = Kept { since: waiter.since, step: waiter.turn.step() };
-            let kept = if competed { Some(had) } else { waiter.kept };
-            let (speculative, groups) = (waiter.request.speculative, waiter.groups.clone());
-            self.left.leaves(self.now, waiter.request_id.clone(), Earlier { kept, speculative, groups });
+            let (session, speculative) = (waiter.request.session.clone(), waiter.request.speculative);
+            let earlier = Earlier { session, kept, speculative, groups: waiter.groups.clone() };
+            self.left.leaves(self.now, waiter.request_id.clone(), earlier);
             self.withdrawals.heard_of(self.now, &self.limits, waiter.request_id.clone());
         }
         Some((waiter, fingerprint))

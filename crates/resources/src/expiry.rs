@@ -85,6 +85,7 @@ impl Pool {
         let now = self.now;
         self.pace.iter_mut().for_each(|pace| pace.heard_of(now));
         self.queue.growth.advance(now);
+        self.left.forget(now);
         let mut ended = self.queue.is_behind() || !self.queue.ready.is_empty() || !self.overdue.is_empty();
         while self.timers.first().is_some_and(|(at, _)| *at <= self.now) {
             let Some((_, timer)) = self.timers.pop_first() else { break };

@@ -58,6 +58,7 @@ mod lease;
 mod limits;
 mod look;
 mod memory;
+mod own_order;
 mod pace;
 mod pool;
 mod queue;

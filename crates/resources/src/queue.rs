@@ -6,7 +6,6 @@ use crate::group::{Family, Group, Key};
 use crate::growth::{Growth, Provided};
 use crate::id::{SessionId, Slot, WaiterId};
 use crate::memory::RequestId;
-use crate::replaced::Kept;
 use crate::resource::Units;
 use crate::turn::Turn;
 use ratn_model::resource::{Quantity, Requirement};
@@ -57,9 +56,9 @@ pub(crate) struct Waiter {
     pub(crate) asked: Timestamp,
     /// The same, by the count of turns: only while what exists would do.
     pub(crate) since: Timestamp,
-    /// What it has of the one that it replaces, as long as what exists would do.
-    pub(crate) kept: Option<Kept>,
-    /// Whether it is the first of its session in all families that it wants, of those for which what exists would do.
+    /// Since when the one waited that it replaces, as long as what exists would do.
+    pub(crate) kept: Option<Timestamp>,
+    /// Whether it is one of the first requests of its session (`own_order.rs`), of those for which what exists would do.
     pub(crate) first: bool,
     /// Forgotten again when it leaves without a lease, so that the client can ask once more.
     pub(crate) request_id: RequestId,

@@ -1,16 +1,21 @@
 //! Requests that take the place of others: asked again after a broken connection, with another priority, or for certain.
 //!
-//! Such a request keeps the time since which the other one waited, and its turn, where that waits still, or has left without a lease a moment
-//! ago, and wanted the same of what would have done for it. So nobody gains by leaving and coming back, nor loses, nor saves up time with a
-//! request that cannot be served. Each time is kept once: two requests do not share it.
+//! Such a request keeps the time since which the other one waited, where that is of the same session, waits still, or has left without a
+//! lease a moment ago, and wanted the same of what would have done for it. So nobody gains by leaving and coming back, nor loses, nor saves up
+//! time with a request that cannot be served. Each time is kept once: two requests do not share it.
+//!
+//! No time is kept from before the last request was served that was the first of the session there. Accounts (`accounts.rs`) may forget when
+//! that was: of a session that has ended, and of one that is where anybody begins. Here it is known for as long as a request is that has left
+//! before.
 
 use crate::group::Key;
+use crate::id::SessionId;
 use crate::memory::RequestId;
-use crate::turn::{LEAD, step};
+use crate::own_order::Families;
+use crate::turn::LEAD;
 use ratn_model::time::Timestamp;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
-use std::time::Duration;
 
 /// So many of one caller that have left are known at the most; its own oldest is forgotten first.
 const OF_CALLER: usize = 4_096;
@@ -18,26 +23,22 @@ const OF_CALLER: usize = 4_096;
 /// What a request was that waited.
 #[derive(Debug, Clone)]
 pub(crate) struct Earlier {
-    /// What it would keep itself; nothing where what exists would not have done for it.
-    pub(crate) kept: Option<Kept>,
+    pub(crate) session: SessionId,
+    /// Since when it waited; nothing where what exists would not have done for it.
+    pub(crate) kept: Option<Timestamp>,
     pub(crate) speculative: bool,
     /// What it wanted.
     pub(crate) groups: Vec<Key>,
-}
-
-/// What a request keeps of the one that it replaces.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Kept {
-    /// Since when that waited.
-    pub(crate) since: Timestamp,
-    /// The step of its turn, where it was the first of its session.
-    pub(crate) step: Option<u32>,
 }
 
 /// Requests that have left the queue without a lease, by caller.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Left {
     callers: BTreeMap<Arc<str>, OfCaller>,
+    /// When the last first request of a session was served in a family, where that was a moment ago.
+    served: BTreeMap<(SessionId, Arc<str>), Timestamp>,
+    /// When what is old was forgotten.
+    forgotten: Timestamp,
 }
 
 #[derive(Debug, Clone, Default)]
@@ -48,16 +49,14 @@ struct OfCaller {
 }
 
 impl Earlier {
-    /// What a request keeps that takes its place now.
-    pub(crate) fn kept_by(&self, now: Timestamp, speculative: bool, groups: &[Key]) -> Option<Kept> {
+    /// Since when a request has waited that takes its place now.
+    pub(crate) fn kept_by(&self, now: Timestamp, speculative: bool, groups: &[Key]) -> Option<Timestamp> {
         let kept = self.kept.filter(|_| self.groups == groups)?;
         if !self.speculative || speculative {
             return Some(kept);
         }
         // It becomes certain.
-        let least = Timestamp(now.0.saturating_sub(LEAD.as_nanos() as u64));
-        let step = kept.step.map(|was| was.max(step(least, Duration::ZERO)));
-        Some(Kept { since: kept.since.max(least), step })
+        Some(kept.max(Timestamp(now.0.saturating_sub(LEAD.as_nanos() as u64))))
     }
 }
 
@@ -82,15 +81,46 @@ impl Left {
         of_caller.order.push_back((now, id.id.clone()));
         of_caller.requests.insert(id.id, (now, earlier));
         of_caller.forget_old(now);
-        if self.callers.len() > 1 {
-            self.callers.retain(|_, of_caller| of_caller.order.back().is_some_and(|(at, _)| *at + LEAD >= now));
+    }
+
+    /// What is known of one of a session that has left no longer ago than a moment. It is not told twice.
+    pub(crate) fn take(&mut self, now: Timestamp, id: &RequestId, session: &SessionId) -> Option<Earlier> {
+        let requests = &mut self.callers.get_mut(&id.caller)?.requests;
+        requests.get(&id.id).filter(|(_, earlier)| earlier.session == *session)?;
+        let (left, earlier) = requests.remove(&id.id)?;
+        (left + LEAD >= now).then_some(earlier)
+    }
+
+    /// The first request of a session in some families is served.
+    pub(crate) fn first_was_served(&mut self, now: Timestamp, session: &SessionId, families: &Families) {
+        // What leaves from now on knows it by itself.
+        if self.callers.is_empty() {
+            return;
+        }
+        for family in families {
+            self.served.insert((session.clone(), family.clone()), now);
         }
     }
 
-    /// What is known of one that has left no longer ago than a moment. It is not told twice.
-    pub(crate) fn take(&mut self, now: Timestamp, id: &RequestId) -> Option<Earlier> {
-        let (left, earlier) = self.callers.get_mut(&id.caller)?.requests.remove(&id.id)?;
-        (left + LEAD >= now).then_some(earlier)
+    /// When that was last; of long ago nothing is known.
+    pub(crate) fn served(&self, session: &SessionId, family: &str) -> Timestamp {
+        if self.served.is_empty() {
+            return Timestamp(0);
+        }
+        self.served.get(&(session.clone(), Arc::from(family))).copied().unwrap_or(Timestamp(0))
+    }
+
+    /// What is old is forgotten, now and then.
+    pub(crate) fn forget(&mut self, now: Timestamp) {
+        if self.forgotten + LEAD >= now {
+            return;
+        }
+        self.forgotten = now;
+        self.callers.retain(|_, of_caller| {
+            of_caller.forget_old(now);
+            !of_caller.order.is_empty()
+        });
+        self.served.retain(|_, at| *at + LEAD >= now);
     }
 }
 
@@ -107,18 +137,22 @@ mod tests {
     }
 
     fn earlier(since: u64, speculative: bool) -> Earlier {
-        let kept = Some(Kept { since: at(since), step: Some(since as u32 / 10 + 1) });
-        Earlier { kept, speculative, groups: vec![Key::from([1].as_slice())] }
+        let groups = vec![Key::from([1].as_slice())];
+        Earlier { session: SessionId::from("s"), kept: Some(at(since)), speculative, groups }
+    }
+
+    fn take(left: &mut Left, now: u64, id: &RequestId) -> Option<Earlier> {
+        left.take(at(now), id, &SessionId::from("s"))
     }
 
     #[test]
-    fn what_left_a_moment_ago_is_known_once() {
+    fn what_left_a_moment_ago_is_known_once_and_to_its_session() {
         let mut left = Left::default();
         left.leaves(at(100), id("a", 1), earlier(5, false));
         left.leaves(at(100), id("a", 2), earlier(6, false));
-        let since = left.take(at(110), &id("a", 1)).and_then(|earlier| earlier.kept).map(|kept| kept.since);
-        assert_eq!(since, Some(at(5)));
-        assert!(left.take(at(110), &id("a", 1)).is_none() && left.take(at(111), &id("a", 2)).is_none());
+        assert!(left.take(at(110), &id("a", 1), &SessionId::from("other")).is_none());
+        assert_eq!(take(&mut left, 110, &id("a", 1)).and_then(|earlier| earlier.kept), Some(at(5)));
+        assert!(take(&mut left, 110, &id("a", 1)).is_none() && take(&mut left, 111, &id("a", 2)).is_none());
     }
 
     #[test]
@@ -128,21 +162,32 @@ mod tests {
         (0..2 * OF_CALLER).for_each(|number| left.leaves(at(200), id("b", number), earlier(6, false)));
         let of = &left.callers["b"];
         assert!(of.order.len() <= OF_CALLER && of.requests.len() <= OF_CALLER);
-        assert!(left.take(at(200), &id("b", 0)).is_none() && left.take(at(200), &id("b", OF_CALLER)).is_some());
-        assert!(left.take(at(200), &id("a", 0)).is_some());
-        left.leaves(at(300), id("a", 1), earlier(6, false));
-        assert_eq!(left.callers.len(), 1, "of callers who have left nothing for a while nothing is known");
+        assert!(take(&mut left, 200, &id("b", 0)).is_none() && take(&mut left, 200, &id("b", OF_CALLER)).is_some());
+        assert!(take(&mut left, 200, &id("a", 0)).is_some());
     }
 
     #[test]
-    fn a_request_keeps_the_turn_of_one_that_wanted_the_same_and_a_certain_one_little_of_a_speculative_one() {
+    fn what_is_old_is_forgotten_though_nobody_leaves_any_more() {
+        let (mut left, session, arm) = (Left::default(), SessionId::from("s"), Families::from([Arc::from("Arm")]));
+        left.first_was_served(at(199), &session, &arm);
+        assert_eq!(left.served(&session, "Arm"), at(0), "nothing has left before");
+        left.leaves(at(200), id("a", 0), earlier(6, false));
+        left.first_was_served(at(205), &session, &arm);
+        left.forget(at(210));
+        assert_eq!((left.callers.len(), left.served(&session, "Arm")), (1, at(205)));
+        left.forget(at(300));
+        assert!(left.callers.is_empty() && left.served.is_empty());
+    }
+
+    #[test]
+    fn a_request_keeps_the_time_of_one_that_wanted_the_same_and_a_certain_one_little_of_a_speculative_one() {
         let same = earlier(5, false).groups;
         let kept = |of: Earlier, speculative| of.kept_by(at(100), speculative, &same);
         for (was, is) in [(false, false), (true, true), (false, true)] {
-            assert_eq!(kept(earlier(5, was), is), Some(Kept { since: at(5), step: Some(1) }));
+            assert_eq!(kept(earlier(5, was), is), Some(at(5)));
         }
-        assert_eq!(kept(earlier(5, true), false), Some(Kept { since: at(90), step: Some(9) }));
-        assert_eq!(kept(earlier(95, true), false), Some(Kept { since: at(95), step: Some(10) }));
+        assert_eq!(kept(earlier(5, true), false), Some(at(90)));
+        assert_eq!(kept(earlier(95, true), false), Some(at(95)));
         assert_eq!(earlier(5, false).kept_by(at(100), false, &[]), None);
         assert_eq!(kept(Earlier { kept: None, ..earlier(5, false) }, false), None, "it could not be served");
     }

@@ -31,6 +31,7 @@ impl Pool {
     pub(crate) fn schedule(&mut self) {
         self.queue.unserved = false;
         loop {
+            self.settle_firsts();
             self.catch_up();
             let Some(id) = self.next_served() else { return };
             if self.has_done_enough() {
@@ -135,7 +136,8 @@ impl Pool {
             return;
         }
         let taken: Vec<bool> = waiter.request.requirements.iter().map(takes).collect();
-        let groups = waiter.groups.clone();
+        let (groups, since) = (waiter.groups.clone(), waiter.kept.unwrap_or(self.now));
+        let since = self.not_before_served(&waiter.request, since);
         let strict = self.limits.overtaken > 0 && waiter.overtaken >= self.limits.overtaken;
         let mut lacks = BTreeSet::new();
         for (key, _) in groups.iter().zip(taken).filter(|(_, takes)| *takes) {
@@ -156,8 +158,7 @@ impl Pool {
             self.queue.ready.insert(place);
         }
         if let Some(waiter) = self.queue.waiters.get_mut(&place.1) {
-            (waiter.hopeful, waiter.lacks, waiter.hopeful_since) = (true, lacks, self.now);
-            waiter.since = waiter.kept.map_or(self.now, |kept| kept.since);
+            (waiter.hopeful, waiter.lacks, waiter.hopeful_since, waiter.since) = (true, lacks, self.now, since);
         }
         self.competes(place.1);
         self.queue.growth.look_later(self.now, &self.queue.provided);

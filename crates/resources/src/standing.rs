@@ -1,26 +1,25 @@
 //! What sessions are beside each other: the shares and due times that they say, the turns of their requests, and what is put to whose account.
 
-use crate::accounts::{Accounts, OwnPlace, Rivals, Within};
+use crate::accounts::{Accounts, Within};
 use crate::error::PoolError;
 use crate::event::Refusal;
 use crate::group::takes;
 use crate::id::{SessionId, WaiterId};
 use crate::memory::{Recalled, RequestId};
+use crate::own_order::{Families, OwnPlace, Settled};
 use crate::pool::Pool;
 use crate::queue::AcquireRequest;
-use crate::replaced::{Earlier, Kept};
+use crate::replaced::Earlier;
 use crate::turn::{Share, Standing, Turn, step};
 use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::Duration;
 
 /// A due time that is said again, counted from another moment, is the same within this.
 const SAME_DUE: Duration = Duration::from_secs(1);
-
-/// Those who wait, by family, as far as somebody was compared with them.
-type Compared = BTreeMap<String, Rivals>;
 
 impl Pool {
     /// A session says what it is beside others. The share counts for what is held from now on, the due time for what waits, too. Not written
@@ -41,8 +40,10 @@ impl Pool {
         let Some(session) = self.sessions.get_mut(id) else { return Ok(()) };
         session.standing = Standing { due, ..standing };
         if due != before.due {
-            for waiter in session.waiters.clone() {
-                self.turn_anew(waiter, &mut Compared::new());
+            let waiters = session.waiters.clone();
+            self.worked += waiters.len();
+            for waiter in waiters {
+                self.turn_anew(waiter);
             }
             self.schedule();
         }
@@ -56,8 +57,8 @@ impl Pool {
 
     /// What a request keeps of one that it replaces, which leaves the queue; and whose it is, to put it back.
     pub(crate) fn replaced_by(&mut self, request: &AcquireRequest, id: &RequestId) -> Option<(RequestId, Earlier)> {
-        if let Some(earlier) = self.left.take(self.now, id) {
-            return Some((id.clone(), earlier));
+        if let Some(earlier) = self.left.take(self.now, id, &request.session) {
+            return Some((id.clone(), self.as_served(earlier, request)));
         }
         let session = self.sessions.get(&request.session).filter(|_| !request.instead_of.is_empty())?;
         let replaced = RequestId::new(&session.opened_by, &request.instead_of);
@@ -65,14 +66,27 @@ impl Pool {
             && self.queue.get(waiter).is_some_and(|waiter| waiter.request.session == request.session)
         {
             self.refuse(waiter, Refusal::Cancelled);
+            self.settle_firsts();
         }
-        self.left.take(self.now, &replaced).map(|earlier| (replaced, earlier))
+        let earlier = self.left.take(self.now, &replaced, &request.session)?;
+        Some((replaced, self.as_served(earlier, request)))
+    }
+
+    fn as_served(&self, earlier: Earlier, request: &AcquireRequest) -> Earlier {
+        Earlier { kept: earlier.kept.map(|since| self.not_before_served(request, since)), ..earlier }
+    }
+
+    /// The time since which a request waits, or when the last one was served that was the first of its session where it wants something.
+    pub(crate) fn not_before_served(&self, request: &AcquireRequest, since: Timestamp) -> Timestamp {
+        let session = &request.session;
+        let served = |family| self.accounts.served(session, family).max(self.left.served(session, family));
+        self.families_taken(&request.requirements).into_iter().map(served).fold(since, Timestamp::max)
     }
 
     /// The turn of a request that would wait from now on.
-    pub(crate) fn turn_of(&self, request: &AcquireRequest, kept: Option<Kept>, id: WaiterId) -> Turn {
+    pub(crate) fn turn_of(&mut self, request: &AcquireRequest, kept: Option<Timestamp>, id: WaiterId) -> Turn {
         if self.would_be_first(request, id) {
-            return self.first_turn(request, kept.map_or(self.now, |kept| kept.since), kept, &mut Compared::new());
+            return self.first_turn(request, kept.unwrap_or(self.now));
         }
         self.turn_behind(request)
     }
@@ -83,40 +97,28 @@ impl Pool {
     }
 
     /// The turn of the first request of its session.
-    fn first_turn(
-        &self,
-        request: &AcquireRequest,
-        since: Timestamp,
-        kept: Option<Kept>,
-        compared: &mut Compared,
-    ) -> Turn {
-        let (session, Standing { share, due }) = (&request.session, self.standing(&request.session));
-        let (mut since, mut ahead) = (since, Duration::ZERO);
-        for family in self.families_taken(&request.requirements) {
-            since = since.max(self.accounts.served(session, family));
-            if !compared.contains_key(family) {
-                compared.insert(family.to_owned(), self.accounts.rivals(family, self.now));
-            }
-            let within = Within { session, family, share, now: self.now };
-            ahead = compared.get(family).map_or(ahead, |rivals| ahead.max(self.accounts.ahead(rivals, &within)));
-        }
-        let kept = kept.and_then(|kept| kept.step).map_or(u32::MAX, |kept| kept.max(step(since, Duration::ZERO)));
-        Turn::of(request.speculative, step(since, ahead).min(kept), due, request.priority)
+    fn first_turn(&mut self, request: &AcquireRequest, since: Timestamp) -> Turn {
+        let since = self.not_before_served(request, since);
+        let (due, mut ahead) = (self.standing(&request.session).due, Duration::ZERO);
+        self.in_accounts(request, |accounts, within| ahead = ahead.max(accounts.ahead(within)));
+        self.worked += self.accounts.take_looks();
+        Turn::of(request.speculative, step(since, ahead), due, request.priority)
     }
 
     fn would_be_first(&self, request: &AcquireRequest, id: WaiterId) -> bool {
-        let (own, session) = (request.own_place(id), &request.session);
-        self.families_taken(&request.requirements).iter().all(|family| self.accounts.is_first(session, family, &own))
+        self.accounts.is_first(&request.session, self.families_taken(&request.requirements), &request.own_place(id))
     }
 
     /// A waiter competes from now on: what exists would do for it.
     pub(crate) fn competes(&mut self, id: WaiterId) {
         let Some(request) = self.queue.get(id).map(|waiter| waiter.request.clone()) else { return };
         self.in_accounts(&request, |accounts, within| accounts.waits(within, request.own_place(id)));
-        self.look_who_is_first(&request);
-        if self.families_taken(&request.requirements).is_empty() {
+        let families = self.families_of(&request);
+        if families.is_empty() {
             self.set_first(id, true);
         }
+        self.accounts.joins(&request.session, families, request.own_place(id));
+        self.settle_firsts();
     }
 
     /// It does not any more, though it stays.
@@ -124,27 +126,26 @@ impl Pool {
         let Some(request) = self.queue.get(id).map(|waiter| waiter.request.clone()) else { return };
         self.set_first(id, false);
         self.has_competed(&request, id, false);
+        self.settle_firsts();
     }
 
-    /// It does not any more; it was served as the first of its session, or was not.
+    /// It does not any more; it was served as the first of its session, or was not. Who is the first of its session then is to be settled.
     pub(crate) fn has_competed(&mut self, request: &AcquireRequest, id: WaiterId, served: bool) {
-        self.in_accounts(request, |accounts, within| accounts.waits_no_more(within, request.own_place(id), served));
-        self.look_who_is_first(request);
+        let (own, families) = (request.own_place(id), self.families_of(request));
+        if served {
+            self.left.first_was_served(self.now, &request.session, &families);
+        }
+        self.accounts.parts(&request.session, &families, &own);
+        self.in_accounts(request, |accounts, within| accounts.waits_no_more(within, own, served));
     }
 
-    /// Who is the first of a session where a request competes, or has competed.
-    fn look_who_is_first(&mut self, request: &AcquireRequest) {
-        let mut concerned = BTreeSet::new();
-        for family in self.families_taken(&request.requirements) {
-            concerned.extend(self.accounts.first_two(&request.session, family));
+    /// Who is the first of its session, where requests have come or gone. Once for all that come and go together.
+    pub(crate) fn settle_firsts(&mut self) {
+        while let Some(Settled { no_more, anew, .. }) = self.accounts.settle_next() {
+            no_more.into_iter().for_each(|id| self.set_first(id, false));
+            anew.into_iter().for_each(|id| self.set_first(id, true));
         }
-        for id in concerned {
-            let Some(waiter) = self.queue.get(id) else { continue };
-            let first = self.would_be_first(&waiter.request, id);
-            if first != waiter.first {
-                self.set_first(id, first);
-            }
-        }
+        self.worked += self.accounts.take_looks();
     }
 
     fn set_first(&mut self, id: WaiterId, first: bool) {
@@ -152,22 +153,17 @@ impl Pool {
         waiter.first = first;
         let request = waiter.request.clone();
         if first {
-            self.in_accounts(&request, |accounts, within| {
-                let rivals = accounts.rivals(within.family, within.now);
-                accounts.begins_turn(&rivals, within);
-            });
+            self.in_accounts(&request, Accounts::begins_turn);
         }
-        self.turn_anew(id, &mut Compared::new());
+        self.turn_anew(id);
     }
 
     /// Puts a waiter where it stands now; whether that is another place.
-    fn turn_anew(&mut self, id: WaiterId, compared: &mut Compared) -> bool {
+    fn turn_anew(&mut self, id: WaiterId) -> bool {
         let Some(waiter) = self.queue.get(id) else { return false };
-        let turn = match waiter.first {
-            true => self.first_turn(&waiter.request, waiter.since, waiter.kept, compared),
-            false => self.turn_behind(&waiter.request),
-        };
-        let moves = turn != waiter.turn;
+        let (request, since, before) = (waiter.request.clone(), waiter.since, waiter.turn);
+        let turn = if waiter.first { self.first_turn(&request, since) } else { self.turn_behind(&request) };
+        let moves = turn != before;
         if moves {
             self.queue.move_to(id, turn);
         }
@@ -176,11 +172,11 @@ impl Pool {
 
     /// What sessions have had since is another amount: puts the first of each in a family where they stand now; whether one moved.
     pub(crate) fn turns_anew(&mut self, family: &str) -> bool {
-        let (firsts, mut compared) = (self.accounts.firsts(family), Compared::new());
+        let firsts = self.accounts.firsts(family);
         self.worked += firsts.len();
         let mut moved = false;
         for id in firsts {
-            moved |= self.turn_anew(id, &mut compared);
+            moved |= self.turn_anew(id);
         }
         moved
     }
@@ -188,8 +184,9 @@ impl Pool {
     /// Does something in the accounts that the session of a request has of the families that it takes something of.
     fn in_accounts(&mut self, request: &AcquireRequest, mut act: impl FnMut(&mut Accounts, &Within<'_>)) {
         let (session, Standing { share, .. }) = (&request.session, self.standing(&request.session));
-        for kind in kinds_taken(&request.requirements) {
-            let family = self.resources.family(kind);
+        let families: BTreeSet<&str> =
+            kinds_taken(&request.requirements).map(|kind| self.resources.family(kind)).collect();
+        for family in families {
             act(&mut self.accounts, &Within { session, family, share, now: self.now });
         }
     }
@@ -223,6 +220,10 @@ impl Pool {
         kinds_taken(requirements).map(|kind| self.resources.family(kind)).collect()
     }
 
+    fn families_of(&self, request: &AcquireRequest) -> Families {
+        self.families_taken(&request.requirements).into_iter().map(Arc::from).collect()
+    }
+
     /// The same of what everybody has, for the invariants.
     pub(crate) fn accounts_agree(&self) -> Result<(), String> {
         let mut has = BTreeMap::<_, (Quantity, usize)>::new();
@@ -241,7 +242,7 @@ impl Pool {
             if waiter.first != (waiter.hopeful && self.would_be_first(request, id)) {
                 return Err(format!("{id} is the first of its session, or is not, and its account says otherwise"));
             }
-            if waiter.first != waiter.turn.step().is_some() {
+            if waiter.first == waiter.turn.is_behind() {
                 return Err(format!("the turn of {id} is not that of a first request, or of one behind it"));
             }
         }
@@ -278,5 +279,84 @@ impl Standing {
     /// With this share, and nothing due.
     pub fn of(share: Share) -> Standing {
         Standing { share, due: None }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use crate::expiry::Work;
+    use crate::limits::Limits;
+    use crate::resource::ResourceSpec;
+    use ratn_model::resource::{ResourceClass, ResourceOperation};
+
+    const KINDS: [&str; 4] = ["Arm", "Camera", "Gripper", "Tool"];
+    const SESSIONS: usize = 100;
+    const WAITERS: i64 = 200;
+
+    fn session(number: usize) -> SessionId {
+        SessionId::from(format!("s-{number}").as_str())
+    }
+
+    fn all_of_it(number: usize) -> AcquireRequest {
+        let blocks = |kind: &&str| Requirement::new(ResourceOperation::Block, *kind);
+        AcquireRequest::new(session(number), KINDS.iter().map(blocks).collect())
+    }
+
+    /// The first session holds all, each of them waits for it, and the second one often, until then.
+    fn crowded(until: Timestamp) -> Pool {
+        let mut pool = Pool::new(Limits::default());
+        for number in 0..SESSIONS {
+            pool.keep_alive(Timestamp(0), &session(number), "s", Duration::from_secs(3_600)).unwrap();
+        }
+        for kind in KINDS {
+            pool.create(Timestamp(0), None, ResourceSpec::new(ResourceClass::Module, kind)).unwrap();
+        }
+        for number in 0..SESSIONS {
+            pool.acquire(Timestamp(0), all_of_it(number)).unwrap();
+            pool.acquire(Timestamp(0), all_of_it(number).priority(1).deadline(until)).unwrap();
+        }
+        for priority in 0..WAITERS {
+            pool.acquire(Timestamp(0), all_of_it(1).priority(-priority).deadline(until)).unwrap();
+        }
+        while pool.next_deadline() == Some(Timestamp(0)) {
+            pool.advance(Timestamp(0));
+        }
+        pool.check_invariants().unwrap();
+        // What follows is not put off, and nothing else is counted.
+        pool.work = Work { per_turn: 0, per_call: 0 };
+        pool
+    }
+
+    /// As long as one look at each account of each family, and some more.
+    fn looked_little(pool: &Pool) {
+        assert!(pool.worked < 2 * KINDS.len() * SESSIONS + SESSIONS + 200, "{} looks", pool.worked);
+        pool.check_invariants().unwrap();
+    }
+
+    #[test]
+    fn a_session_that_ends_does_not_look_who_is_first_for_each_of_its_waiters() {
+        let mut pool = crowded(Timestamp(2_000_000_000_000));
+        pool.close_session(Timestamp(1), &session(1)).unwrap();
+        assert_eq!(pool.waiting(), 2 * SESSIONS - 3);
+        looked_little(&pool);
+    }
+
+    #[test]
+    fn of_all_that_are_refused_at_a_moment_is_looked_once_who_is_first() {
+        let then = Timestamp(1_000_000_000);
+        let mut pool = crowded(then);
+        pool.advance(then);
+        assert_eq!(pool.waiting(), SESSIONS - 1);
+        looked_little(&pool);
+    }
+
+    #[test]
+    fn another_due_time_takes_one_look() {
+        let mut pool = crowded(Timestamp(2_000_000_000_000));
+        let standing = Standing { due: Some(Timestamp(5_000_000_000)), ..Standing::default() };
+        pool.set_standing(Timestamp(1), &session(1), standing).unwrap();
+        looked_little(&pool);
     }
 }

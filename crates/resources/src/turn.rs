@@ -1,24 +1,26 @@
 //! Turns: the order in which waiting requests are served.
 //!
-//! Of each session only the first request competes, by its own order: certain before speculative, then the larger priority, then who came
-//! first. It is the first of what its session waits for in each family of kinds that it wants; requests for what does not exist do not
-//! count. Those behind it wait for it, behind the first ones of all others that are as certain. So a session alone is served by its own order.
+//! Of each session only the first requests compete, one for each family of kinds at the most (`own_order.rs`), by its own order: certain
+//! before speculative, then the larger priority, then who came first. Requests for what does not exist do not count. Those behind the first
+//! ones wait for them, behind the first ones of all others that are as certain. So a session alone is served by its own order, but that none
+//! waits for a family because of another one that waits behind others in another family.
 //!
-//! What is needed for certain comes before what is speculative. Then, by time in steps of [`LEAD`]: when a request became the first, or
-//! later, where its session has had more for its share than others who wait (`accounts.rs`), by [`AHEAD`] at the most. Within a step, the
+//! What is needed for certain comes before what is speculative. Then, by time in steps of [`LEAD`]: since when a request is due for a turn, or
+//! later, where its session has had more for its share than others who wait (`accounts.rs`), by [`AHEAD`] at the most. That is since when it
+//! waits and what exists would do, or, if that is later, since the last first one of its session was served in a family that it wants. So a
+//! first one that is withdrawn leaves its place to the next with the time since which that one waits, which may be long. Within a step, the
 //! most urgent (bits 60 and up of a priority), then the session whose task is due first, then the larger priority, then who came first.
 //!
 //! ```text
-//!   first since ≤ time of the turn ≤ first since + AHEAD     step = time of the turn / LEAD, rounded down
+//!   due since ≤ time of the turn ≤ due since + AHEAD         step = time of the turn / LEAD, rounded down
 //!
-//!   w is the first since a:                            step(w) ≤ ⌊(a + AHEAD) / LEAD⌋
-//!   v is the first since b, and served before w:       step(v) ≤ step(w), and step(v) ≥ ⌊b / LEAD⌋, so b < a + AHEAD + LEAD
+//!   w is due since a:                                  step(w) ≤ ⌊(a + AHEAD) / LEAD⌋
+//!   v is due since b, and served before w:             step(v) ≤ step(w), and step(v) ≥ ⌊b / LEAD⌋, so b < a + AHEAD + LEAD
 //! ```
 //!
-//! So of what is needed for certain and the first of its session, nobody is passed by a request of another session that became the first
-//! `AHEAD + LEAD` later, whatever its priority, share or due time. A request may keep the time of another one that it replaces
-//! (`replaced.rs`); one that becomes certain so keeps [`LEAD`] of it at the most. It passes nobody who was the first [`BOUND`] before it became
-//! certain.
+//! So of what is needed for certain and a first one of its session, nobody is passed by a request of another session that is due `AHEAD + LEAD`
+//! later, whatever its priority, share or due time. A request may keep the time of another one of its session that it replaces (`replaced.rs`);
+//! one that becomes certain so keeps [`LEAD`] of it at the most. It passes nobody who was due [`BOUND`] before it became certain.
 
 use ratn_model::time::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -30,7 +32,8 @@ use std::time::Duration;
 pub const AHEAD: Duration = Duration::from_secs(60);
 /// What is asked within such a step of time is served by urgency, due time and priority.
 pub const LEAD: Duration = Duration::from_secs(10);
-/// The first request of a session that needs something for certain is not passed by one of another session that became certain so much later.
+/// A first request of a session that needs something for certain is not passed by one of another session that is due so much later: that began
+/// to wait, became certain, or had another one of its session served before it.
 pub const BOUND: Duration = Duration::from_secs(AHEAD.as_secs() + 2 * LEAD.as_secs());
 /// The bits of a priority from this one on are its urgency.
 const URGENCY_BITS: u32 = 60;
@@ -142,9 +145,9 @@ impl Turn {
         Turn { speculative, step, urgency, due, priority: Reverse(priority) }
     }
 
-    /// Nothing where others of its session are before it.
-    pub(crate) fn step(self) -> Option<u32> {
-        (self.step != BEHIND).then_some(self.step)
+    /// Whether others of its session are before it.
+    pub(crate) fn is_behind(self) -> bool {
+        self.step == BEHIND
     }
 }
 

@@ -394,6 +394,149 @@ fn a_request_that_takes_the_place_of_another_keeps_its_time() {
     pool.check_invariants().unwrap();
 }
 
+fn arm(session: &SessionId) -> AcquireRequest {
+    AcquireRequest::new(session.clone(), vec![block("Arm", 1)])
+}
+
+fn granted(pool: &mut Pool) -> Option<(WaiterId, LeaseId)> {
+    pool.take_notices().into_iter().find_map(|notice| match notice {
+        Notice::Granted { waiter, lease } => Some((waiter, lease.id)),
+        _ => None,
+    })
+}
+
+/// Many old requests of one session wait, and one after the other is exchanged for one of a new session.
+#[test]
+fn a_request_keeps_no_time_of_one_of_another_session() {
+    const OLD: u64 = 300;
+    let mut pool = pool(&shares(&[1.0; 3]), [1, 0]);
+    queued(&mut pool, 0, 1_000, arm(&run(2)));
+    let (_, mut lease) = granted(&mut pool).unwrap();
+    for number in 0..OLD {
+        queued(&mut pool, 0, number, arm(&run(0)));
+    }
+    let (mut victim, mut asked) = (None, BTreeMap::new());
+    for number in 0..OLD {
+        let now = 5_000 * (number + 1);
+        if now == 100_000 {
+            victim = Some(queued(&mut pool, now, 1_001, arm(&run(1))));
+        }
+        let session = SessionId::from(format!("new-{number}").as_str());
+        pool.keep_alive(at(now), &session, "new", HOUR).unwrap();
+        // The last ones go first: they never were the first of their session.
+        pool.withdraw(at(now), &run(0), &(OLD - 1 - number).to_string()).unwrap();
+        let exchanged = arm(&session).instead_of(&(OLD - 1 - number).to_string());
+        asked.insert(queued(&mut pool, now, 2_000 + number, exchanged), now);
+        pool.release(at(now), None, lease).unwrap();
+        let (waiter, next) = granted(&mut pool).unwrap();
+        pool.check_invariants().unwrap();
+        if Some(waiter) == victim {
+            return;
+        }
+        if let Some(asked) = asked.get(&waiter) {
+            assert!(*asked < 100_000 + BOUND.as_millis() as u64, "passed by one that was asked at {asked} ms");
+        }
+        lease = next;
+    }
+    panic!("it is never served");
+}
+
+/// Two sessions take turns; each ends when it has been served, is opened anew under its id, and has requests from before.
+#[test]
+fn a_session_that_is_opened_anew_keeps_no_time_from_before_it_was_served() {
+    const OLD: u64 = 40;
+    let mut pool = pool(&shares(&[1.0; 2]), [1, 0]);
+    let sessions = ["old-0", "old-1"].map(SessionId::from);
+    let id = |of: usize, number: u64| 1_000 * of as u64 + number;
+    // They are in the queue for a moment, and leave so that none of them becomes the first.
+    let refresh = |pool: &mut Pool, now: u64, of: usize, from: u64| {
+        pool.keep_alive(at(now), &sessions[of], "old", HOUR).unwrap();
+        for number in from..OLD {
+            queued(pool, now, id(of, number), arm(&sessions[of]));
+        }
+        for number in (from..OLD).rev() {
+            assert!(pool.withdraw(at(now), &sessions[of], &id(of, number).to_string()).unwrap());
+        }
+    };
+    queued(&mut pool, 0, 9_000, arm(&run(1)));
+    let (_, mut lease) = granted(&mut pool).unwrap();
+    (0..2).for_each(|of| refresh(&mut pool, 0, of, 0));
+    let (mut victim, mut holder) = (None, None);
+    for turn in 0..2 * OLD {
+        let (now, of) = (5_000 * (turn + 1), turn as usize % 2);
+        if now == 25_000 {
+            victim = Some(queued(&mut pool, now, 9_001, arm(&run(0))));
+        }
+        refresh(&mut pool, now, of, turn / 2);
+        queued(&mut pool, now, id(of, turn / 2), arm(&sessions[of]));
+        match holder.replace(of) {
+            Some(holder) => pool.close_session(at(now), &sessions[holder]).unwrap(),
+            None => pool.release(at(now), None, lease).unwrap(),
+        }
+        let (waiter, next) = granted(&mut pool).unwrap();
+        pool.check_invariants().unwrap();
+        if Some(waiter) == victim {
+            return;
+        }
+        assert!(now < 25_000 + BOUND.as_millis() as u64, "it is passed again and again");
+        lease = next;
+    }
+    panic!("it is never served");
+}
+
+#[test]
+fn what_waits_for_something_else_keeps_its_run_from_nothing() {
+    let mut pool = pool(&shares(&[1.0; 4]), [1, 1]);
+    let ask = |pool: &mut Pool, now: u64, number: usize, units: [u32; 2], priority: i64| {
+        pool.acquire(at(now), AcquireRequest::new(run(number), wanted(units)).priority(priority)).unwrap()
+    };
+    // The last one keeps the camera.
+    ask(&mut pool, 0, 3, [0, 1], 0);
+    pool.take_notices();
+    ask(&mut pool, 0, 1, [1, 0], 0);
+    let (_, mut lease) = granted(&mut pool).unwrap();
+    let (mut holder, mut asked) = (1, BTreeMap::new());
+    for (units, priority) in [([0, 1], 3), ([1, 1], 2), ([1, 0], 1)] {
+        asked.insert(ask(&mut pool, 1_000, 0, units, priority), 0);
+    }
+    asked.insert(ask(&mut pool, 1_000, 2, [1, 0], 0), 2);
+    for turn in 1..360 {
+        let now = 10_000 * turn;
+        asked.insert(ask(&mut pool, now, holder, [1, 0], 0), holder);
+        pool.release(at(now), None, lease).unwrap();
+        let (waiter, next) = granted(&mut pool).unwrap();
+        pool.check_invariants().unwrap();
+        (holder, lease) = (asked[&waiter], next);
+        if holder == 0 {
+            assert!(now <= 1_000 + BOUND.as_millis() as u64 + 20_000, "only after {now} ms");
+            return;
+        }
+    }
+    panic!("it has no arm for an hour");
+}
+
+#[test]
+fn who_asks_again_is_put_off_for_what_it_has_as_before() {
+    for again in [false, true] {
+        let mut pool = pool(&shares(&[1.0; 4]), [2, 0]);
+        let of = |number: usize, priority: i64| arm(&run(number)).priority(priority);
+        queued(&mut pool, 0, 1, of(0, 0));
+        queued(&mut pool, 0, 2, of(2, 0));
+        let leases = pool.leases();
+        let other = leases.iter().find(|lease| lease.session == run(2)).unwrap().id;
+        pool.take_notices();
+        queued(&mut pool, 0, 3, of(0, 0));
+        let next = queued(&mut pool, 0, 4, of(3, -5));
+        if again {
+            queued(&mut pool, 2_000, 5, of(0, 0).instead_of("3"));
+        }
+        queued(&mut pool, 30_000, 6, of(1, 0));
+        pool.release(at(50_000), None, other).unwrap();
+        assert_eq!(granted(&mut pool).map(|(waiter, _)| waiter), Some(next), "asked again: {again}");
+        pool.check_invariants().unwrap();
+    }
+}
+
 /// A request that waits, as the test knows it.
 struct Waits {
     number: usize,
@@ -415,13 +558,22 @@ struct Line {
 }
 
 impl Line {
-    /// Whether a request is the first of its run in each kind that it wants.
+    /// Whether a request is a first one of its run: none before it that is one wants a kind that it wants.
     fn is_first(&self, id: WaiterId) -> bool {
         let place = |id: &WaiterId, of: &Waits| (of.certain_since.is_none(), Reverse(of.priority), *id);
-        let one = &self.waiting[&id];
-        let same = |other: &Waits| (0..2).any(|kind| one.units[kind] > 0 && other.units[kind] > 0);
-        let rivals = self.waiting.iter().filter(|(_, other)| other.number == one.number && same(other));
-        rivals.map(|(id, other)| place(id, other)).min() == Some(place(&id, one))
+        let of_run = self.waiting.iter().filter(|(_, other)| other.number == self.waiting[&id].number);
+        let mut of_run: Vec<(&WaiterId, &Waits)> = of_run.collect();
+        of_run.sort_by_key(|(id, of)| place(id, of));
+        let mut taken = [false; 2];
+        for (other, of) in of_run {
+            let wants = of.units.map(|units| units > 0);
+            let first = (0..2).all(|kind| !(wants[kind] && taken[kind]));
+            if *other == id {
+                return first;
+            }
+            (0..2).for_each(|kind| taken[kind] |= first && wants[kind]);
+        }
+        false
     }
 
     /// From then on a request of a run counts that was asked at a time, at the least.
