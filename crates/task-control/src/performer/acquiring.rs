@@ -21,6 +21,9 @@ use tokio::sync::mpsc::error::SendError;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
+/// What the resource manager says where the deadline of an acquire has passed.
+const TOO_LATE: &str = "NOT_GRANTED_IN_TIME";
+
 /// An acquire under way.
 #[derive(Debug)]
 pub(super) struct Asking {
@@ -220,7 +223,11 @@ impl Acquiring {
                 Ok(lease) = &mut self.handed, if !self.handed.is_terminated() => return Got::Handed(lease),
                 () = self.withdrawn.cancelled() => return Got::Nothing,
                 // A manager that does not answer is waited for until the run gives its session up ([`super::Performer::lost`]).
-                answer = retry_until_answered(REFUSED_PATIENCE, ask) => return Got::Answer(answer),
+                answer = retry_until_answered(REFUSED_PATIENCE, ask) => match answer {
+                    // It goes on waiting, with the time that it has waited. When it is needed for certain, it asks anew.
+                    Err(error) if self.options.speculative && error.reason() == TOO_LATE => continue,
+                    answer => return Got::Answer(answer),
+                },
                 // Others are not let pass any more.
                 () = self.told.others_after(late), if may_be_late => {}
             }

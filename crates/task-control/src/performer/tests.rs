@@ -472,6 +472,45 @@ async fn an_acquire_that_a_bound_refuses_is_asked_for_again_until_there_is_room(
 }
 
 #[tokio::test]
+async fn what_may_not_be_needed_is_not_refused_for_how_long_it_waits() -> anyhow::Result<()> {
+    let mut bench = Bench::new().await?;
+    let [first, second, third] = [1, 2, 3].map(InstanceId);
+    bench.ask(first)?;
+    let lease = bench.granted(first).await?;
+    let hurried = |performer: &Performer, instance: InstanceId, speculative: bool| {
+        let (_, handed) = oneshot::channel();
+        let (request, deadline) = (format!("{}/hurried/{instance}", performer.run), Duration::from_millis(100));
+        let (resources, world, told) = (&performer.resources, &performer.world, &performer.told);
+        let acquiring = Acquiring {
+            instance,
+            requirements: arm(),
+            options: AcquireOptions { request, speculative, deadline, ..AcquireOptions::default() },
+            waited: Duration::ZERO,
+            after: Vec::new(),
+            withdrawn: CancellationToken::new(),
+            handed,
+            resources: resources.clone(),
+            trust: performer.trust.clone(),
+            told: told.clone(),
+            whom: Whom { resources: resources.clone(), world: world.clone(), told: told.clone() },
+            over: Arc::new(CancellationToken::new().drop_guard()),
+        };
+        tokio::spawn(acquiring.ask(performer.events.clone()));
+    };
+    hurried(&bench.performer, second, true);
+    while bench.performer.resources.explain("").await?.is_empty() {
+        tokio::task::yield_now().await;
+    }
+    hurried(&bench.performer, third, false);
+    // It has asked later, with as much time.
+    let refused = bench.event().await;
+    assert!(matches!(refused, Some(Event::Refused { instance, .. }) if instance == third), "{refused:?}");
+    bench.performer.perform(Command::Release { instance: first, lease: Some(lease), projection: None })?;
+    bench.granted(second).await?;
+    bench.performer.closed().await
+}
+
+#[tokio::test]
 async fn what_is_handed_to_one_that_is_withdrawn_before_it_has_asked_goes_back() -> anyhow::Result<()> {
     let mut bench = Bench::new().await?;
     let [first, second, third] = [1, 2, 3].map(InstanceId);
