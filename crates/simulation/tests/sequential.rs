@@ -125,7 +125,8 @@ fn a_task_that_cannot_be_brought_to_its_end_says_why() {
 #[test]
 fn a_task_that_asks_for_what_is_not_there_says_what_that_is() {
     let elsewhere = "resources: [{ block: Arm, where: { host: elsewhere } }]";
-    let task = format!("task: t\nstates:\n{}", move_arm("go", "1", 10).replace("resources: [{ block: Arm }]", elsewhere));
+    let task =
+        format!("task: t\nstates:\n{}", move_arm("go", "1", 10).replace("resources: [{ block: Arm }]", elsewhere));
     let said = check(&task).unwrap_err().to_string();
     assert!(said.contains("go waits for `block Arm host=elsewhere`, which nothing that there is grants"), "{said}");
 }
