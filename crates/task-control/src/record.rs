@@ -333,7 +333,9 @@ impl Recorder {
             let request = operation_request(&self.run, instance, number, index);
             if let Err(undone) = operate_once(&self.resources, &self.trust, &request, &operation).await {
                 let reason = format!("`{operation}` was not done: {undone}");
-                return Some(Event::RetirementFailed { instance, reason, unmade: Unmade::Operation(number) });
+                // With the session lost it was not refused, and may be done by whoever resumes the run.
+                let unmade = if matches!(undone, Undone::Lost) { Unmade::Untried } else { Unmade::Operation(number) };
+                return Some(Event::RetirementFailed { instance, reason, unmade });
             }
         }
         None

@@ -76,6 +76,8 @@ impl Offered {
         for (host, answer) in hosts {
             match answer {
                 Ok(Ok(host)) => pools.extend(host.pools.into_iter().filter(|pool| pool.max > 0)),
+                // One that refuses to say is there, and will go on refusing.
+                Ok(Err(error)) if !error.is_crash() => {}
                 Ok(Err(_)) | Err(_) => drop(unheard.insert(host)),
             }
         }

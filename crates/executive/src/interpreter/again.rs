@@ -187,15 +187,6 @@ impl Interpreter {
         }
     }
 
-    /// Whether what would begin now lets a worker be replaced first: another thread of its routine waits until nothing of the routine moves, which
-    /// would never be beside one that goes on and on. Who waits holds nothing; and who is in a race would lose it.
-    pub(super) fn gives_way(&self, program: &Program, thread: u64) -> bool {
-        let Some(own) = self.threads.get(&thread) else { return false };
-        let (Some(routine), Some(current)) = (own.routine, own.current.as_ref()) else { return false };
-        let goes_on = program.state(current.state).is_pause() || is_in_race(program, current.state);
-        !goes_on && self.stalled(routine).iter().any(|other| *other != thread)
-    }
-
     /// Whether anything of a routine moves under its lease, or asks for it.
     fn uses_lease(&self, program: &Program, routine: u64) -> bool {
         let uses = |current: &Current| match current.phase {

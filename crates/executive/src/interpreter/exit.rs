@@ -87,7 +87,7 @@ impl Interpreter {
             }
         }
         let assigned = if good { self.assigned(context, thread, state, &written)? } else { Vec::new() };
-        self.change(context, thread, state, path, outcome, &written)?;
+        self.change(context, thread, (InstanceId(0), state), path, outcome, &written)?;
         if outcome == SUCCESS {
             self.operate(context, thread, state, InstanceId(0), &written)?;
         }
@@ -97,12 +97,12 @@ impl Interpreter {
         Ok(assigned)
     }
 
-    /// The effects that a composite state declares for an outcome happen.
+    /// The effects that a state declares for an outcome happen: those of an action are its instance's, those of a composite state nobody's.
     pub(super) fn change(
         &mut self,
         context: &mut Context<'_>,
         thread: u64,
-        state: &State,
+        (instance, state): (InstanceId, &State),
         path: &str,
         outcome: &str,
         outputs: &Outputs,
@@ -111,7 +111,7 @@ impl Interpreter {
         let changes = self
             .with_scope(context, thread, Some(outputs), |s| effects::actual(Some(declared), outcome, &[], s))
             .map_err(|error| error.to_string())?;
-        self.apply(context, InstanceId(0), path, changes.into())
+        self.apply(context, instance, path, changes.into())
     }
 
     /// The values that a state assigns to variables.

@@ -58,8 +58,7 @@ impl Interpreter {
         if self.is_held(context, thread) {
             return self.set_phase(thread, Phase::Held);
         }
-        let is_away = self.routine_of(thread).is_some_and(|r| r.lease.is_none() && !r.requirements.is_empty());
-        if is_away || self.gives_way(context.program, thread) {
+        if self.routine_of(thread).is_some_and(|r| r.lease.is_none() && !r.requirements.is_empty()) {
             return self.set_phase(thread, Phase::Stalled);
         }
         let wanted = &context.plan.state(id).requirements;

@@ -9,7 +9,7 @@ use crate::context::Context;
 use crate::hold::Hold;
 use crate::protocol::{Command, Note};
 use crate::way_out::{Place, WayOut, Within};
-use ratn_model::id::StateId;
+use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Finally, PREEMPTED, Program, StateKind};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
@@ -88,7 +88,7 @@ impl Interpreter {
                 self.has_problem(id, Err(cut.problem));
             }
         }
-        let left = self.leave_preempted(context, id, state, path);
+        let left = self.leave_preempted(context, id, (InstanceId(0), state), path);
         self.has_problem(id, left);
         self.leave_all(context, id);
     }
@@ -105,7 +105,7 @@ impl Interpreter {
                 return self.set(id, Todo::Enter(*last, None));
             }
             let Some(frame) = thread.frames.pop() else { break };
-            let left = self.leave_preempted(context, id, frame.owner, &frame.path);
+            let left = self.leave_preempted(context, id, (InstanceId(0), frame.owner), &frame.path);
             self.has_problem(id, left);
             if let Some(thread) = self.threads.get_mut(&id) {
                 thread.variables.truncate(frame.variables);
@@ -154,17 +154,17 @@ impl Interpreter {
         &mut self,
         context: &mut Context<'_>,
         thread: u64,
-        state: StateId,
+        (instance, state): (InstanceId, StateId),
         path: &str,
     ) -> Result<(), String> {
         let state = context.program.state(state);
-        let changed = self.change(context, thread, state, path, PREEMPTED, &Outputs::new());
+        let changed = self.change(context, thread, (instance, state), path, PREEMPTED, &Outputs::new());
         changed.map_err(|problem| format!("{path}: {problem}"))
     }
 
     /// What composite states say of being cut short is true, of one that a run is in which has been told to end.
     pub(crate) fn leave(&mut self, context: &mut Context<'_>, state: StateId, path: &str) -> Result<(), String> {
-        self.leave_preempted(context, MAIN, state, path)
+        self.leave_preempted(context, MAIN, (InstanceId(0), state), path)
     }
 
     /// What is still to be done where everything that is under way in the actual world is cut short.
@@ -221,7 +221,7 @@ impl Interpreter {
             Phase::Projecting | Phase::Running => {
                 context.commands.push(Command::Cancel { instance: current.instance, attempt: current.attempt });
                 if has_begun {
-                    result = self.leave_preempted(context, id, current.state, &current.path);
+                    result = self.leave_preempted(context, id, (current.instance, current.state), &current.path);
                 }
             }
         }

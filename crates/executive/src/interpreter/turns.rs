@@ -31,9 +31,9 @@ impl Interpreter {
         let queued = self.threads.keys().copied().filter(is_queued);
         let mut has_begun = false;
         for thread in queued.collect::<Vec<_>>() {
-            // While all of it is asked for anew, or is to be, nothing begins.
+            // While all of it is asked for anew, nothing begins.
             let waits = self.routine_of(thread).is_some_and(|r| r.lease.is_none() && !r.requirements.is_empty());
-            if !waits && !self.gives_way(context.program, thread) && self.free_units(context, thread).is_some() {
+            if !waits && self.free_units(context, thread).is_some() {
                 has_begun = true;
                 // What it requires may have been changed while it waited.
                 if self.may_try(context, thread) {
