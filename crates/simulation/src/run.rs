@@ -4,7 +4,6 @@
 mod busy;
 mod circumstances;
 mod resume;
-mod spared;
 
 pub use circumstances::{Circumstances, MAX_EVENTS, Mischief, Trigger};
 
@@ -23,7 +22,6 @@ use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use ratn_resources::{AcquireRequest, Limits, Notice, Pool, ResourceSpec, SessionId, WaiterId};
 use ratn_world::world::World;
-use spared::Spared;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
@@ -191,10 +189,6 @@ struct Simulation<'a> {
     told: BTreeSet<ProjectionId>,
     next_projection: u64,
     waiters: BTreeMap<InstanceId, WaiterId>,
-    /// Whose a waiter is: the same the other way round.
-    waiting: BTreeMap<WaiterId, InstanceId>,
-    /// How much of the pool has not been looked at.
-    spared: Spared,
     leases: BTreeMap<LeaseId, InstanceId>,
     /// Leases that ended by themselves.
     lost: BTreeSet<LeaseId>,
@@ -213,7 +207,7 @@ struct Simulation<'a> {
     end: Option<(String, BTreeMap<String, Value>, String)>,
 }
 
-/// Makes the run. After every step the invariants of the resource pool are checked; where hundreds wait, after every so many.
+/// Makes the run. After every step the invariants of the cores are checked.
 ///
 /// # Errors
 /// [`RunError`] where a core breaks a promise: the run gets stuck, never ends, or an invariant fails.
@@ -273,8 +267,6 @@ pub fn run_while(
         told: BTreeSet::new(),
         next_projection: 0,
         waiters: BTreeMap::new(),
-        waiting: BTreeMap::new(),
-        spared: Spared::default(),
         leases: BTreeMap::new(),
         lost: BTreeSet::new(),
         refusing: BTreeSet::new(),
@@ -535,15 +527,11 @@ impl Simulation<'_> {
                     .priority(priority)
                     .speculative(priority < CERTAIN);
                 let waiter = self.pool.acquire(self.now, request).map_err(|e| self.broken(e))?;
-                if let Some(before) = self.waiters.insert(instance, waiter) {
-                    self.waiting.remove(&before);
-                }
-                self.waiting.insert(waiter, instance);
+                self.waiters.insert(instance, waiter);
                 self.answers();
             }
             Command::Withdraw { instance } => {
                 if let Some(waiter) = self.waiters.remove(&instance) {
-                    self.waiting.remove(&waiter);
                     self.pool.cancel(self.now, waiter).map_err(|e| self.broken(e))?;
                 } else if !self.refusing.remove(&instance) {
                     self.take_back_grant(instance)?;
@@ -735,7 +723,7 @@ impl Simulation<'_> {
                 Notice::Refused { waiter, .. } => (waiter, None),
                 Notice::Event(_) => continue,
             };
-            let Some(instance) = self.waiting.remove(&waiter) else { continue };
+            let Some(instance) = self.waiters.iter().find(|(_, w)| **w == waiter).map(|(i, _)| *i) else { continue };
             self.waiters.remove(&instance);
             if let Some(lease) = lease {
                 self.leases.insert(lease.id, instance);
@@ -760,10 +748,7 @@ impl Simulation<'_> {
     }
 
     fn check(&mut self, executive: &Executive) -> Result<(), RunError> {
-        let parts = self.pool.waiting() + self.leases.len();
-        if self.circumstances.checks || executive.has_ended() || self.spared.is_due(parts) {
-            self.pool.check_invariants().map_err(|e| self.broken(e))?;
-        }
+        self.pool.check_invariants().map_err(|e| self.broken(e))?;
         self.check_mirror(executive.root())?;
         if executive.has_ended()
             && (!self.leases.is_empty() || !self.projections.is_empty() || !self.waiters.is_empty())
