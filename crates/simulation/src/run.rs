@@ -738,7 +738,7 @@ impl Simulation<'_> {
 
     /// What is asked of the resource pool and was not granted, for people.
     fn wanted(&self) -> Vec<String> {
-        let asked = self.waiting.iter().filter_map(|(waiter, instance)| {
+        let asked = self.waiters.iter().filter_map(|(instance, waiter)| {
             let (_, request) = self.pool.waiter(*waiter)?;
             let path = self.paths.get(instance).map_or("a state", String::as_str);
             let wanted: Vec<String> = request.requirements.iter().map(|wanted| format!("`{wanted}`")).collect();
