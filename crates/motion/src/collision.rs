@@ -204,7 +204,22 @@ impl<'a> Checker<'a> {
             one.obstacles.retain(|o| obstacles[*o].link.is_some_and(|other| has(link, other)));
         }
         self.pairs.retain(|(i, j)| has(moving[*i].link, moving[*j].link));
+        self.forget_idle();
+        self.reach = JointVector::zeros(self.reach.len());
+        self.find_reach();
         self
+    }
+
+    /// What moves and meets nothing that it is kept apart from is not looked at any more.
+    fn forget_idle(&mut self) {
+        let in_pairs: BTreeSet<usize> = self.pairs.iter().flat_map(|(i, j)| [*i, *j]).collect();
+        let is_kept = |i: &usize| in_pairs.contains(i) || !self.moving[*i].obstacles.is_empty();
+        let kept: Vec<usize> = (0..self.moving.len()).filter(is_kept).collect();
+        let now = |i: usize| kept.binary_search(&i).unwrap_or_default();
+        self.pairs = self.pairs.iter().map(|(i, j)| (now(*i), now(*j))).collect();
+        self.moving = kept.iter().map(|i| self.moving[*i].clone()).collect();
+        self.placed.truncate(kept.len());
+        self.centres.truncate(kept.len());
     }
 
     /// The same beside the balls of a cloud in the world frame, too.
@@ -448,7 +463,7 @@ impl<'a> Checker<'a> {
                 let obstacle = &self.obstacles[o];
                 let reach = moving.radius + obstacle.radius;
                 if self.centres[i].distance_squared(obstacle.centre) < reach * reach
-                    && self.padded(i).touches(&Placed { pose: obstacle.pose, solid: &obstacle.solid })
+                    && self.grown(i, obstacle.form).touches(&Placed { pose: obstacle.pose, solid: &obstacle.solid })
                     && !self.allowed(i, Other::Obstacle(o), contact)
                 {
                     return Some((i, Other::Obstacle(o)));
@@ -465,7 +480,9 @@ impl<'a> Checker<'a> {
         for &(i, j) in &self.pairs {
             let reach = self.moving[i].radius + self.moving[j].radius;
             if self.centres[i].distance_squared(self.centres[j]) < reach * reach
-                && self.padded(i).touches(&Placed { pose: self.placed[j], solid: &self.moving[j].solid })
+                && self
+                    .grown(i, self.moving[j].form)
+                    .touches(&Placed { pose: self.placed[j], solid: &self.moving[j].solid })
             {
                 return Some((i, Other::Moving(j)));
             }
@@ -531,8 +548,12 @@ impl<'a> Checker<'a> {
         (apart <= near).then_some(-apart)
     }
 
-    fn padded(&self, i: usize) -> Placed<'_> {
-        Placed { pose: self.placed[i], solid: &self.moving[i].padded }
+    /// Beside a shape of that form: with the padding, but for two links that are told apart by their meshes. Those may be made to run closer to
+    /// each other than it, and what happens between two postures is looked at on the finished motion.
+    fn grown(&self, i: usize, beside: Form) -> Placed<'_> {
+        let moving = &self.moving[i];
+        let by_meshes = [moving.form, beside].contains(&Form::Covered);
+        Placed { pose: self.placed[i], solid: if by_meshes { &moving.solid } else { &moving.padded } }
     }
 
     /// How far the unpadded shapes are from each other, in metres, or more than `enough_m`; below zero as far as they are deep in each other.

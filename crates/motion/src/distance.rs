@@ -23,6 +23,9 @@ const ROUNDED: f64 = 1e-6;
 /// What is this near is at the same place, in metres.
 const SAME_M: f64 = 1e-10;
 
+/// How far off what parry3d takes for the distance of shapes that touch may be, in metres.
+const ROUGH_M: f32 = 0.02;
+
 /// Four corners whose volume is a smaller part of that of a box with their edges lie in a plane.
 const FLAT: f64 = 1e-12;
 
@@ -38,7 +41,7 @@ pub fn gap(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape, enough_m:
 /// that, and is never less where neither is a mesh.
 pub fn depth(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> f64 {
     let pose = a_at.inv_mul(b_at);
-    let contact = DefaultQueryDispatcher.contact(&pose, a, b, 0.0).ok().flatten();
+    let contact = DefaultQueryDispatcher.contact(&pose, a, b, ROUGH_M).ok().flatten();
     let (Some(first), Some(second)) = (Round::of(a), Round::of(b)) else {
         return contact.map_or(0.0, |contact| f64::from(-contact.dist).max(0.0));
     };
@@ -48,10 +51,20 @@ pub fn depth(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> f64 
     if cores > 0.0 {
         return (radii - cores).max(0.0);
     }
-    let own = first.core.axes().into_iter();
-    let axes = own.chain(second.round.core.axes().into_iter().map(|axis| second.rotate(axis)));
+    let turned = |axes: Vec<Point>| axes.into_iter().map(|axis| second.rotate(axis)).collect::<Vec<Point>>();
+    let (lines, its) = (first.core.lines(), turned(second.round.core.lines()));
+    // Across faces, across one edge or axis of each, away from an axis, and from middle to middle: whatever the way, the shapes are no deeper in each
+    // other than along it.
+    let faces = [first.core.axes(), turned(second.round.core.axes())].concat();
+    let across = lines.iter().flat_map(|line| its.iter().map(|other| cross(*line, *other)));
+    let aside = |line: &Point| {
+        let along = dot(second.at, *line) / dot(*line, *line).max(f64::MIN_POSITIVE);
+        difference(second.at, line.map(|c| c * along))
+    };
+    let away = lines.iter().chain(&its).map(aside);
     let found = contact.map(|contact| contact.normal1.to_array().map(f64::from));
-    let ways = axes.chain([second.at]).flat_map(|way| [way, way.map(|c| -c)]).chain(found);
+    let ways = faces.into_iter().chain(across).chain(away).chain([second.at, [1.0, 0.0, 0.0]]).chain(found);
+    let ways = ways.flat_map(|way| [way, way.map(|c| -c)]);
     let overlap = |way: Point| {
         let length = norm(way);
         (length > SAME_M).then(|| first.along(way.map(|c| c / length)) + second.along(way.map(|c| -c / length)))
@@ -133,6 +146,18 @@ impl Core {
                 let out = if aside > 0.0 { radius / aside } else { 0.0 };
                 [way[0] * out, half_length.copysign(way[1]), way[2] * out]
             }
+        }
+    }
+
+    /// Its edges' directions, or its axis.
+    fn lines(&self) -> Vec<Point> {
+        let [x, y, z] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        match self {
+            Core::Point => Vec::new(),
+            Core::Segment([a, b]) => vec![difference(*b, *a)],
+            Core::Triangle([a, b, c]) => vec![difference(*b, *a), difference(*c, *b), difference(*a, *c)],
+            Core::Box(_) => vec![x, y, z],
+            Core::Cylinder(..) => vec![y],
         }
     }
 
@@ -457,5 +482,26 @@ mod tests {
             }
         }
         assert!(apart > 5_000 && touching > 2_000, "{apart} {touching}");
+    }
+
+    #[test]
+    fn shapes_that_hardly_overlap_are_hardly_deep_in_each_other() {
+        let at = |x: f64, y: f64, z: f64, roll: f64| Pose::from_rpy([x, y, z], roll, 0.0, 0.0);
+        let deep = |a: Geometry, a_at: Pose, b: Geometry, b_at: Pose| {
+            let (a, b) = (a.at(a_at), b.at(b_at));
+            depth(&to_f32(&a.pose), &*a.geometry.shape(0.0), &to_f32(&b.pose), &*b.geometry.shape(0.0))
+        };
+        let quarter = std::f64::consts::FRAC_PI_2;
+        let bottle = Geometry::Cylinder { radius: 0.03, half_length: 0.1 };
+        let side_by_side = deep(bottle, at(0.0, 0.0, 0.0, 0.0), bottle, at(0.055, 0.0, 0.05, 0.0));
+        assert!((side_by_side - 0.005).abs() < 1e-4, "{side_by_side}");
+        let bar = Geometry::Capsule { radius: 0.005, half_length: 0.1 };
+        let crossing = deep(bar, at(0.0, 0.0, 0.0, 0.0), bar, at(0.0, 0.0, 0.0, quarter));
+        assert!((crossing - 0.01).abs() < 1e-4, "{crossing}");
+        let same = deep(bar, at(0.0, 0.0, 0.0, 0.0), bar, at(0.0, 0.0, 0.0, 0.0));
+        assert!((same - 0.01).abs() < 1e-4, "{same}");
+        let beam = Geometry::Box { half: [0.02, 0.02, 0.1] };
+        let edges = deep(beam, at(0.0, 0.0, 0.0, 0.0), beam, at(0.039, 0.0, 0.0, quarter));
+        assert!((edges - 0.001).abs() < 1e-4, "{edges}");
     }
 }

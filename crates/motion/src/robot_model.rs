@@ -12,7 +12,7 @@ use crate::frame::compose;
 use crate::geometry::{Body, Geometry};
 use crate::mechanism::{MAX_JOINTS, Mechanism, MechanismError};
 use crate::mesh::{MeshError, Meshed};
-use crate::pairs::{self, Checks};
+use crate::pairs::{self, Checks, Pair};
 use crate::robot_state::RobotState;
 use crate::solid::Form;
 use crate::spheres::Sphere;
@@ -210,6 +210,13 @@ impl RobotModel {
         load: &mut Loader<'_>,
     ) -> Result<RobotModel, MechanismError> {
         let mut model = RobotModel::read_with_meshes(urdf, srdf, load)?;
+        if srdf.is_none() {
+            // Such spheres forbid no more than they did, and the search sees them: of pairs with meshes only those go by their shapes of which spheres
+            // leave hardly anything.
+            let undecided = pairs::undecided(&model, &model.checks.excepted);
+            let has_mesh = |(a, b): &Pair| [*a, *b].iter().any(|link| !model.links[*link].meshes.is_empty());
+            model.checks.by_shapes.retain(|pair| !has_mesh(pair) || undecided.contains(pair));
+        }
         model.links.iter_mut().for_each(Link::cover_meshes);
         Ok(model)
     }

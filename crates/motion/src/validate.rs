@@ -181,6 +181,16 @@ pub(crate) fn check_collisions(
     trajectory: &Curve,
     contact: Contact,
 ) -> Result<(), Violation> {
+    check_collisions_while(checker, trajectory, contact, &mut || true).map(|_| ())
+}
+
+/// The same as long as `goes_on`, which is asked before each look, says yes; whether all of it was looked at.
+pub(crate) fn check_collisions_while(
+    checker: &mut Checker<'_>,
+    trajectory: &Curve,
+    contact: Contact,
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Result<bool, Violation> {
     let knots = trajectory.knots();
     let collides = |time_s| move |collision| Violation::Collision { time_s, collision };
     checker.room(&knots[0].positions, contact, 0.0).map_err(collides(0.0))?;
@@ -189,6 +199,9 @@ pub(crate) fn check_collisions(
         // In order of time: the last is taken first.
         let mut pieces = vec![[0.0, pair[1].time_s - pair[0].time_s]];
         while let Some([from, to]) = pieces.pop() {
+            if !goes_on() {
+                return Ok(false);
+            }
             let middle = (from + to) / 2.0;
             let posture = cubics.map(|cubic| cubic.position_at(middle));
             let strays = JointVector::from_fn(posture.len(), |j| {
@@ -204,5 +217,5 @@ pub(crate) fn check_collisions(
     }
     let end = &knots[knots.len() - 1];
     checker.room(&end.positions, contact, 0.0).map_err(collides(end.time_s))?;
-    Ok(())
+    Ok(true)
 }

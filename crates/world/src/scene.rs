@@ -25,6 +25,9 @@ pub const BASE: &str = "base";
 /// Things stand on things at most this high: more is taken for a circle.
 pub const MAX_STACK: usize = 32;
 
+/// Nothing is larger or farther away, in metres. Planners compute with numbers that hold no more.
+pub const LARGEST_M: f64 = 1e6;
+
 /// Shapes in their places.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
@@ -129,7 +132,7 @@ fn object(world: &World, individual: &Term) -> Result<Option<SceneObject>, Scene
     let shape = shape(value).ok_or_else(|| SceneError::Malformed {
         fact: key.to_string(),
         value: value.to_string(),
-        expected: "{type: box, size: [x, y, z]} or {type: cylinder, radius: r, length: l}, all above 0",
+        expected: "{type: box, size: [x, y, z]} or {type: cylinder, radius: r, length: l}, all above 0 and at most 1000000 (metres)",
     })?;
     Ok(Some(SceneObject { name: individual.to_string(), shape, placement }))
 }
@@ -227,7 +230,12 @@ fn pose_of(world: &World, predicate: &str, individual: &Term) -> Result<Option<P
     let key = FactKey { predicate: predicate.to_owned(), arguments: vec![individual.clone()] };
     match world.get(&key) {
         None | Some(Value::Null) => Ok(None),
-        Some(Value::Pose(pose)) => Ok(Some(*pose)),
+        Some(Value::Pose(pose)) if pose.position.iter().all(|x| x.abs() <= LARGEST_M) => Ok(Some(*pose)),
+        Some(Value::Pose(pose)) => Err(SceneError::Malformed {
+            fact: key.to_string(),
+            value: Value::Pose(*pose).to_string(),
+            expected: "a pose no farther than 1000000 m along each axis",
+        }),
         Some(other) => {
             Err(SceneError::Malformed { fact: key.to_string(), value: other.to_string(), expected: "a pose" })
         }
@@ -235,12 +243,13 @@ fn pose_of(world: &World, predicate: &str, individual: &Term) -> Result<Option<P
 }
 
 fn shape(value: &Value) -> Option<Shape> {
-    let number = |name: &str| value.field(name).and_then(Value::as_number).filter(|x| *x > 0.0);
+    let is_length = |x: &f64| *x > 0.0 && *x <= LARGEST_M;
+    let number = |name: &str| value.field(name).and_then(Value::as_number).filter(is_length);
     match value.field("type")? {
         Value::String(kind) if kind == "box" => {
             let Some(Value::List(edges)) = value.field("size") else { return None };
-            let size: Vec<f64> = edges.iter().filter_map(Value::as_number).filter(|x| *x > 0.0).collect();
-            Some(Shape::Box { size: size.try_into().ok()? })
+            let size: Option<Vec<f64>> = edges.iter().map(|edge| edge.as_number().filter(is_length)).collect();
+            Some(Shape::Box { size: size?.try_into().ok()? })
         }
         Value::String(kind) if kind == "cylinder" => {
             Some(Shape::Cylinder { radius: number("radius")?, length: number("length")? })

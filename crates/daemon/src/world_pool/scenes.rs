@@ -57,19 +57,17 @@ impl Scenes {
         self.followed.clear();
     }
 
-    /// The scene of a revision, from the one before it that is kept.
+    /// The scene of a revision, from the one before it that is kept. What is between the two is looked at as one change: a revision of which no
+    /// scene can be made spoils none of those behind it.
     fn follow(&mut self, history: &History, revision: Revision) -> Result<LiveScene, QueryError> {
         let world = history.at(revision)?;
         let known = self.followed.range(..=revision).next_back();
         let scene = match known.filter(|(known, _)| history.at(**known).is_ok()) {
             Some((known, scene)) => {
                 let mut scene = scene.clone();
-                let mut before = history.at(*known)?;
-                for kept in history.after(*known)?.take_while(|kept| kept.world.revision() <= revision) {
-                    let changes: Vec<Change> = kept.changes().collect();
-                    scene.update(before, &kept.world, &changes)?;
-                    before = &kept.world;
-                }
+                let since = history.after(*known)?.take_while(|kept| kept.world.revision() <= revision);
+                let changes: Vec<Change> = since.flat_map(|kept| kept.changes()).collect();
+                scene.update(history.at(*known)?, world, &changes)?;
                 scene
             }
             None => LiveScene::of(world)?,
@@ -229,5 +227,26 @@ mod tests {
         assert_eq!(pool.scene(Some(id), &[]), Err(QueryError::Unknown { id }));
         commit(&mut pool, "bad", vec![Change::Set { fact: fact("at", 1), value: Value::Int(1) }]);
         assert!(matches!(pool.scene(None, &[]), Err(QueryError::Scene(_))));
+    }
+
+    #[test]
+    fn a_bad_fact_that_is_gone_spoils_no_scene_behind_it() {
+        let set = |predicate: &str, value: Value| Change::Set { fact: fact(predicate, 1), value };
+        let (text, far) = (Value::String("tray".to_owned()), Pose { position: [1e30, 0.0, 0.0], ..Pose::IDENTITY });
+        let huge = Shape::Box { size: [1e30; 3] }.to_value();
+        for bad in [set("at", text), set("shape", huge), set("at", Value::Pose(far))] {
+            let mut pool = pool();
+            let good = pool.scene(None, &[]).unwrap();
+            commit(&mut pool, "bad", vec![bad, at(2, 7.0)]);
+            assert!(matches!(pool.scene(None, &[]), Err(QueryError::Scene(_))));
+            let shape = Shape::Box { size: [0.1, 0.2, 0.3] }.to_value();
+            commit(&mut pool, "mended", vec![at(1, 0.0), set("shape", shape)]);
+            let delta = pool.scene(None, &[good.to]).unwrap();
+            assert_eq!((delta.from, delta.len()), (Some(good.to), 1), "one box is elsewhere");
+            commit(&mut pool, "gone", vec![Change::Delete { pattern: FactPattern::of(&fact("at", 1)) }]);
+            let mut planner = ratn_world::scene::delta::Scenes::new(4);
+            let whole = pool.scene(None, &[]).unwrap();
+            assert_eq!(*planner.apply(&whole).unwrap(), Scene::of(pool.root()).unwrap());
+        }
     }
 }

@@ -7,7 +7,7 @@ use super::contact;
 use super::error::PlanError;
 use crate::arm::{self, joints};
 use crate::cloud::Cloud;
-use crate::collision::{CONTACT_TOLERANCE_M, Checker, Collision, Contact, PADDING_M};
+use crate::collision::{Checker, Collision, Contact, PADDING_M};
 use crate::connect::{Budget, ConnectError, Route, connect};
 use crate::constrained::{self, Constraint};
 use crate::joint_vector::JointVector;
@@ -27,7 +27,7 @@ use crate::surroundings::Surroundings;
 use crate::timing::rough::Rough;
 use crate::timing::{Section, Speed, timed_while};
 use crate::trajectory::Curve;
-use crate::validate::check_collisions;
+use crate::validate::check_collisions_while;
 use crate::way_points::{Followed, Follower, WayPoints};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -392,9 +392,11 @@ impl<'a> ArmInScene<'a> {
         let curve = request.tool_speed.within(&self.reach, &request.speed.into(), &mut time)?;
         match &mut self.unseen {
             None => Ok(curve),
-            // What may be pressed is no link of the robot.
-            Some(unseen) => match check_collisions(unseen, &curve, Contact::Gripper(CONTACT_TOLERANCE_M)) {
-                Ok(()) => Ok(curve),
+            // No link of the robot may press another one.
+            Some(unseen) => match check_collisions_while(unseen, &curve, Contact::None, goes_on) {
+                Ok(true) => Ok(curve),
+                // Time is no limit of the first motion: what ends its check is that the caller does not want it any more.
+                Ok(false) => Err(PlanError::Cancelled),
                 Err(violation) => Err(PlanError::Unseen { reason: violation.to_string() }),
             },
         }

@@ -65,6 +65,16 @@ impl Robot {
                 digester.number(kind);
                 sizes.into_iter().for_each(|x| number(&mut digester, x));
             }
+            count(&mut digester, link.meshes.len());
+            for meshed in &link.meshes {
+                numbers_of(&meshed.pose).for_each(|x| number(&mut digester, x));
+                let corners = meshed.mesh.triangles().iter().flatten().flatten();
+                corners.for_each(|x| number(&mut digester, *x));
+            }
+        }
+        for pairs in [&self.model.checks.excepted, &self.model.checks.by_shapes] {
+            count(&mut digester, pairs.len());
+            pairs.iter().flat_map(|(a, b)| [*a, *b]).for_each(|link| count(&mut digester, link));
         }
         count(&mut digester, self.tool);
         count(&mut digester, self.camera.unwrap_or(usize::MAX));

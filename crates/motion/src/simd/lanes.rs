@@ -546,7 +546,7 @@ mod arm {
         }
         #[inline(always)]
         fn min(self, other: Self) -> Self {
-            Pair(unsafe { vminq_f32(self.0, other.0) }, unsafe { vminq_f32(self.1, other.1) })
+            Pair(unsafe { vminnmq_f32(self.0, other.0) }, unsafe { vminnmq_f32(self.1, other.1) })
         }
         #[inline(always)]
         fn sqrt(self) -> Self {

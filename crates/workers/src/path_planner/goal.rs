@@ -140,7 +140,7 @@ fn way_points(goal: &GoalContext) -> Result<Option<WayPoints>, ActionFailure> {
         (Some(false), Some(_)) => Err(ActionFailure::aborted(
             "input `straight` is false, but `way_points` are there, which are passed in straight lines: leave one of them out",
         )),
-        (Some(false) | None, None) if blend_m.is_some() => Err(ActionFailure::aborted(
+        (Some(false) | None, None) if blend_m.is_some_and(|blend_m| blend_m > 0.0) => Err(ActionFailure::aborted(
             "input `blend_m` is given, but the motion has no corners to round: it rounds those of a motion with `straight: true` or \
              `way_points`; give one of them, or leave it out",
         )),
