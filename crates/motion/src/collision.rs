@@ -4,7 +4,8 @@
 //! arm moves (links, hand, fingers, the held object) an array of moving shapes. Bounding spheres decide most pairs, distances
 //! decide the rest. Which links are to be kept apart the mechanism says ([`arm::holding`](crate::arm::holding)). It says what touches what and how deep, and where contact is allowed; free motions are searched with the
 //! vector checks of `arm` and `space`. Shapes that move are grown by a padding. Between two postures no further apart than [`Checker::steps`]
-//! allows, no point is further than the padding from its place in the nearer one: where both are free, the way between is.
+//! allows, no point is further than the padding from its place in the nearer one: where both are free, the way between is. Links that are told
+//! apart by their meshes have no padding: of those the finished motion is checked, from posture to posture (`validate`).
 
 use crate::cloud::Cloud;
 use crate::frame::compose;
@@ -548,8 +549,8 @@ impl<'a> Checker<'a> {
         (apart <= near).then_some(-apart)
     }
 
-    /// Beside a shape of that form: with the padding, but for two links that are told apart by their meshes. Those may be made to run closer to
-    /// each other than it, and what happens between two postures is looked at on the finished motion.
+    /// A moving shape as it is checked beside one of that form: with the padding, except where two links are told apart by their meshes. Such links may be
+    /// built to run closer to each other than the padding.
     fn grown(&self, i: usize, beside: Form) -> Placed<'_> {
         let moving = &self.moving[i];
         let by_meshes = [moving.form, beside].contains(&Form::Covered);

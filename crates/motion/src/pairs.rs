@@ -9,7 +9,8 @@
 //!
 //! The search sees spheres. Where they meet so often though the shapes do not that it could not move, the exact check of the finished path alone
 //! sees the pair ([`Checks::by_shapes`]). With an SRDF that is so where the spheres leave hardly a posture of those in which the shapes are apart:
-//! they would forbid nearly all that the SRDF leaves to be planned.
+//! they would forbid nearly all that the SRDF leaves to be planned. The robots of workers and cells, which know meshes by spheres that hold them,
+//! take that for links with meshes without an SRDF, too (`RobotModel::read_with_covers`).
 
 use crate::exact::Exact;
 use crate::mechanism::Mechanism;

@@ -375,18 +375,27 @@ fn a_step_lets_one_of_several_regions_begin() {
     assert_eq!(bench.heard(), ["acquire 1", "start 1.1 under 3"]);
 }
 
-#[test]
-fn a_routine_whose_worker_died_asks_anew_when_none_of_its_regions_uses_its_lease() {
-    let text = "states:
+const THINKS: &str = "{ THINK, computes: true, reads: [] }";
+
+/// A routine of two regions beside each other, in CDTN mode.
+fn routine_of(left: &str, right: &str) -> Bench {
+    let text = format!(
+        "states:
   - both:
       routine: true
       states:
         - fork:
             concurrency: barrier
             regions:
-              - left: { THINK, computes: true, reads: [] }
-              - right: { THINK, computes: true, reads: [] }";
-    let mut bench = Bench::new(text, Mode::Cdtn);
+              - left: {left}
+              - right: {right}"
+    );
+    Bench::new(&text, Mode::Cdtn)
+}
+
+#[test]
+fn a_routine_whose_worker_died_asks_anew_when_none_of_its_regions_uses_its_lease() {
+    let mut bench = routine_of(THINKS, THINKS);
     bench.grant(1, 1);
     assert_eq!(bench.heard(), ["acquire 1", "start 3.1 under 1", "start 4.1 under 1"]);
     bench.crash(3, 1);
@@ -401,16 +410,7 @@ fn a_routine_whose_worker_died_asks_anew_when_none_of_its_regions_uses_its_lease
 
 #[test]
 fn who_waits_for_a_unit_whose_worker_died_begins_under_the_new_lease() {
-    let text = "states:
-  - both:
-      routine: true
-      states:
-        - fork:
-            concurrency: barrier
-            regions:
-              - left: { THINK, computes: true, reads: [] }
-              - right: { THINK, computes: true, reads: [] }";
-    let mut bench = Bench::new(text, Mode::Cdtn);
+    let mut bench = routine_of(THINKS, THINKS);
     bench.grant_brain(1, 1);
     assert_eq!(bench.heard(), ["acquire 1", "start 3.1 under 1"], "there is one brain");
     bench.crash(3, 1);
@@ -425,16 +425,8 @@ fn who_waits_for_a_unit_whose_worker_died_begins_under_the_new_lease() {
 
 #[test]
 fn while_a_region_whose_worker_died_pauses_its_unit_is_nobody_elses() {
-    let text = "states:
-  - both:
-      routine: true
-      states:
-        - fork:
-            concurrency: barrier
-            regions:
-              - left: { THINK, computes: true, reads: [], attempts: 1, retry: { count: 1, backoff: 5 } }
-              - right: { THINK, computes: true, reads: [] }";
-    let mut bench = Bench::new(text, Mode::Cdtn);
+    let mut bench =
+        routine_of("{ THINK, computes: true, reads: [], attempts: 1, retry: { count: 1, backoff: 5 } }", THINKS);
     bench.grant_brain(1, 1);
     assert_eq!(bench.heard(), ["acquire 1", "start 3.1 under 1"], "there is one brain");
     bench.crash(3, 1);
@@ -453,16 +445,10 @@ fn while_a_region_whose_worker_died_pauses_its_unit_is_nobody_elses() {
 
 #[test]
 fn a_worker_is_replaced_when_nothing_of_its_routine_moves_and_nothing_is_used_up_again() {
-    let text = "states:
-  - both:
-      routine: true
-      states:
-        - fork:
-            concurrency: barrier
-            regions:
-              - left: { action: brain/judge, pia: true, resources: [{ block: Brain }, { consume: Charge, count: 0.4 }], retry: 1 }
-              - right: { states: [ one: { MOVE }, two: { MOVE }, three: { MOVE } ] }";
-    let mut bench = Bench::new(text, Mode::Cdtn);
+    let mut bench = routine_of(
+        "{ action: brain/judge, pia: true, resources: [{ block: Brain }, { consume: Charge, count: 0.4 }], retry: 1 }",
+        "{ states: [ one: { MOVE }, two: { MOVE }, three: { MOVE } ] }",
+    );
     bench.grant(1, 1);
     assert_eq!(bench.heard(), ["acquire 1", "start 3.1 under 1", "start 4.1 under 1"]);
     bench.crash(3, 1);

@@ -3,8 +3,9 @@
 //! The bodies are those that the physics moves, where it has put them; depth, place and speed are the answers of its own contact query
 //! on their shapes. Nothing of a planner is asked. Two kinds of pairs are left out: those of which neither is a link or is carried, because the
 //! robot does not decide what objects do to each other; and those that the robot is built to have in contact: links that hang on each
-//! other, whose meshes are stood for by spheres that say nothing of them, what touches in its home posture (a capsule's end reaches into the next link, the base stands on the floor), and links between
-//! which a single joint decides (the flange and the link before the wrist): its limits keep them apart, not who plans.
+//! other, what touches in its home posture (a capsule's end reaches into the next link, the base stands on the floor), and links between
+//! which a single joint decides (the flange and the link before the wrist): its limits keep them apart, not who plans. Two links that are told
+//! apart by their meshes are left out, too: the bodies have spheres in place of the meshes, and the spheres of such links nearly always meet.
 //! What is shared with the planner: the reader of the robot's description and its forward kinematics.
 
 use super::world::{Environment, FLOOR, LEVEL, TOUCH_M};
