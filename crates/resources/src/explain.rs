@@ -46,8 +46,12 @@ pub enum Obstacle {
     TooFew {
         /// The requirement.
         requirement: String,
-        /// How many units fit.
+        /// How many units that fit exist.
         exist: Quantity,
+        /// How many of those could be given for this requirement beside the others of its request, if nobody held any.
+        of_use: Quantity,
+        /// Whether it asks for a part of a unit and all that fits is given in whole units.
+        undivided: bool,
         /// Why those who could provide more do not, in their words.
         reasons: Vec<String>,
     },
@@ -103,29 +107,37 @@ impl Pool {
         let available = Available::FreeTo(&self.queue.reserved, &waiter.reserved);
         let free = Assignment::of(&self.resources, available, &requirements);
         let unreserved = Assignment::of(&self.resources, Available::Free(&Units::new()), &requirements);
-        let mut looked_at = ahead + free.looked_at + unreserved.looked_at;
-        let obstacles = requirements
-            .into_iter()
-            .zip(free.missing.iter().zip(unreserved.missing))
-            .filter(|(_, (missing, _))| !missing.is_zero())
-            .map(|(requirement, (_, without_queue))| {
+        let existing = Assignment::of(&self.resources, Available::Existing, &requirements);
+        let mut looked_at = ahead + free.looked_at + unreserved.looked_at + existing.looked_at;
+        let obstacles = (0..requirements.len())
+            .filter(|index| !free.missing[*index].is_zero())
+            .map(|index| {
+                let requirement = requirements[index];
                 // Twice all of the kind, or those who wait before it.
                 looked_at += 2 * self.resources.count(&requirement.kind) + ahead;
-                self.obstacle(id, requirement, !without_queue.is_zero())
+                let held = !unreserved.missing[index].is_zero();
+                self.obstacle(id, requirement, existing.missing[index], held)
             })
             .collect();
         let (asked, standing) = (waiter.asked, self.standing(&waiter.request.session));
         Some((Explanation { waiter: id, ahead, asked, standing, obstacles }, looked_at))
     }
 
-    fn obstacle(&self, id: WaiterId, requirement: &Requirement, held: bool) -> Obstacle {
+    /// `lacking`: so much could not be given if nobody held anything. `held`: others hold what is lacking now.
+    fn obstacle(&self, id: WaiterId, requirement: &Requirement, lacking: Quantity, held: bool) -> Obstacle {
         let text = requirement.to_string();
-        let exist = self.resources.quantity(requirement);
         if !self.resources.has_kind(&requirement.kind) {
             let reasons = self.shortages_of(requirement);
             Obstacle::MissingKind { requirement: text, kind: requirement.kind.clone(), reasons }
-        } else if exist < requirement.count {
-            Obstacle::TooFew { requirement: text, exist, reasons: self.shortages_of(requirement) }
+        } else if !lacking.is_zero() {
+            let undivided = !requirement.count.is_whole() && self.resources.divisible(requirement) == 0;
+            Obstacle::TooFew {
+                requirement: text,
+                exist: self.resources.quantity(requirement),
+                of_use: requirement.count.saturating_sub(lacking),
+                undivided,
+                reasons: self.shortages_of(requirement),
+            }
         } else if held {
             let holders = self
                 .resources
@@ -193,8 +205,15 @@ impl fmt::Display for Obstacle {
                 write!(f, "`{requirement}`: no resource of kind {kind} exists")?;
                 reasons.iter().try_for_each(|reason| write!(f, " ({reason})"))
             }
-            Obstacle::TooFew { requirement, exist, reasons } => {
-                write!(f, "`{requirement}`: only {exist} units that fit exist")?;
+            Obstacle::TooFew { requirement, exist, of_use, undivided, reasons } => {
+                match (exist == of_use, undivided) {
+                    (true, _) => write!(f, "`{requirement}`: only {exist} units that fit exist")?,
+                    (false, true) => write!(f, "`{requirement}`: what fits is given in whole units only")?,
+                    (false, false) => write!(
+                        f,
+                        "`{requirement}`: of the {exist} units that fit only {of_use} can be given beside what else the request asks for"
+                    )?,
+                }
                 reasons.iter().try_for_each(|reason| write!(f, " ({reason})"))
             }
             Obstacle::Held { requirement, holders, ending } => {

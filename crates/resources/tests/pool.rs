@@ -285,6 +285,28 @@ fn a_waiter_past_its_deadline_is_told_what_it_waited_for() {
 }
 
 #[test]
+fn what_could_not_be_given_if_nobody_held_anything_is_explained() {
+    let mut bench = Bench::with(&[("Arm", 2)]);
+    let half = Requirement { count: Quantity::from_thousandths(500), ..block("Arm") };
+    let two = || requirement(ResourceOperation::Block, "Arm", 2);
+    for (asked, said) in [
+        (vec![half], "`block Arm × 0.5`: what fits is given in whole units only"),
+        (vec![requirement(ResourceOperation::Block, "Arm", 3)], "`block Arm × 3`: only 2 units that fit exist"),
+        (
+            vec![two(), block("Arm")],
+            "`block Arm`: of the 2 units that fit only 0 can be given beside what else the request asks for",
+        ),
+        (vec![block("Leg")], "`block Leg`: no resource of kind Leg exists"),
+    ] {
+        let waiter = bench.acquire("a", &asked);
+        let explanation = bench.pool.explain(waiter).unwrap();
+        assert_eq!(explanation.to_string(), said);
+        assert!(!explanation.is_hopeful(), "{said}");
+        bench.pool.cancel(bench.now, waiter).unwrap();
+    }
+}
+
+#[test]
 fn a_lease_ends_when_its_own_time_is_over() {
     let mut bench = Bench::with(&[("Arm", 1)]);
     let request = AcquireRequest::new(session("a"), vec![block("Arm")]);

@@ -16,6 +16,7 @@ use ratn_worker::lease_watch::LeaseWatch;
 use ratn_worker::safety::{Safety, SafetyState};
 use ratn_worker::server::{Services, bind};
 use ratn_worker::tls::ClientTls;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
@@ -429,4 +430,33 @@ async fn an_action_whose_resource_is_not_watched_refuses_its_goals_and_says_why(
     cell.holds(&[7], &[]);
     let refused = cell.ask(goal("a", "lift", 7, "lift@here")).await.unwrap_err();
     assert_eq!((refused.code(), reason(&refused).as_str()), (Code::FailedPrecondition, "NOT_WATCHED"), "{refused:?}");
+}
+
+#[tokio::test]
+async fn a_goal_says_that_it_pauses_and_why_and_that_it_goes_on() {
+    let follow = Motion::of("follow", ARM);
+    let cell = cell(&[&follow], ActionServerBuilder::one_at_a_time).await;
+    cell.holds(&[7], &[]);
+    let (told, heard) = std::sync::mpsc::channel();
+    let (client, endpoint) = (cell.client.clone(), cell.endpoint.clone());
+    let moving = tokio::spawn(async move {
+        let tell = move |message: &str, _: &BTreeMap<String, Value>| told.send(message.to_owned()).unwrap();
+        client.execute(&endpoint, goal("a", "follow", 7, ARM), tell).await
+    });
+    let mut all = Vec::new();
+    let mut hear = async |message: &str| {
+        until(message, || {
+            all.extend(heard.try_iter());
+            all.last().is_some_and(|last| last == message)
+        })
+        .await;
+    };
+    hear("moving").await;
+    cell.safety.hold("a look").await.unwrap();
+    hear("pauses, held: a look").await;
+    cell.safety.go_on().await.unwrap();
+    hear("goes on").await;
+    follow.let_end.add_permits(1);
+    assert!(moving.await.unwrap().unwrap().is_success());
+    assert_eq!(all, ["moving", "pauses, held: a look", "goes on"]);
 }

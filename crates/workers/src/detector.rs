@@ -17,7 +17,7 @@ use ratn_perception::calibration::{Calibration, Surface};
 use ratn_perception::camera::{Camera, DepthImage, Intrinsics};
 use ratn_perception::detection::{Detection, DetectionError, ObjectClass, Prior, Region, locate, segment};
 use ratn_perception::mask::Ball;
-use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome, InputError, Port};
+use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome, InputError, Port, Signature};
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -77,6 +77,10 @@ impl Action for Segment {
         "segment"
     }
 
+    fn checked_by(&self) -> Option<Signature> {
+        Signature::bundled("detector", self.name())
+    }
+
     fn description(&self) -> &str {
         "Every object that stands on a surface, the nearest to the camera first."
     }
@@ -119,6 +123,10 @@ impl Action for Segment {
 impl Action for Locate {
     fn name(&self) -> &str {
         "locate"
+    }
+
+    fn checked_by(&self) -> Option<Signature> {
+        Signature::bundled("detector", self.name())
     }
 
     fn description(&self) -> &str {

@@ -16,7 +16,7 @@ pub use drive::DriveAction;
 use ratn_model::value::Value;
 use ratn_motion::plan::{Plan, PlanError, plan};
 use ratn_motion::robot::Robot;
-use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome, SceneCache};
+use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome, SceneCache, Signature};
 use ratn_worker::worker::{Worker, WorkerOptions};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -57,6 +57,10 @@ impl PlanAction {
 impl Action for PlanAction {
     fn name(&self) -> &str {
         "plan"
+    }
+
+    fn checked_by(&self) -> Option<Signature> {
+        Signature::bundled("path_planner", self.name())
     }
 
     fn description(&self) -> &str {

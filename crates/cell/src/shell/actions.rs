@@ -11,7 +11,7 @@ use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_perception::noise::MAX_FRAMES;
 use ratn_worker::action::{
-    Action, ActionFailure, ActionResult, ActionServer, Goal, GoalContext, GoalOutcome, NoResource,
+    Action, ActionFailure, ActionResult, ActionServer, Goal, GoalContext, GoalOutcome, NoResource, Signature,
 };
 use ratn_worker::client::Channels;
 use ratn_worker::lease_watch::LeaseWatch;
@@ -62,7 +62,15 @@ pub(crate) fn server(
         if resources.is_empty() {
             continue;
         }
+        let provider = match kind {
+            Module::Base => "base",
+            Module::Arm(_) => "arm",
+            Module::Gripper(_) => "gripper",
+            Module::PanTilt => "pan_tilt",
+            Module::Camera => "camera",
+        };
         builder = builder.action(ModuleAction {
+            provider,
             name,
             description,
             performers: resources,
@@ -132,6 +140,8 @@ struct Performer {
 }
 
 struct ModuleAction {
+    /// In the bundled catalogue.
+    provider: &'static str,
     name: &'static str,
     description: &'static str,
     /// The modules that can do it, at least one: of a robot with several arms one for each.
@@ -151,6 +161,10 @@ impl Action for ModuleAction {
 
     fn description(&self) -> &str {
         self.description
+    }
+
+    fn checked_by(&self) -> Option<Signature> {
+        Signature::bundled(self.provider, self.name)
     }
 
     fn resource(&self) -> Option<&str> {

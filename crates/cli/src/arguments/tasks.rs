@@ -26,7 +26,8 @@ pub(crate) struct CheckArguments {
     /// A catalogue that extends the config's, and overrides it where both say something; may be repeated
     #[arg(long, value_name = "FILE")]
     pub(crate) catalogue: Vec<PathBuf>,
-    /// Check against the system that runs there, too: what its workers say of themselves extends the catalogue, or is compared with it
+    /// Check against the system that runs there, too: what its workers say of themselves extends the catalogue, or is compared with it. Without
+    /// this, --config and --robot that of $RATN_RUNTIME_DIR, where one runs
     #[arg(long, value_name = "DIR")]
     pub(crate) runtime_dir: Option<PathBuf>,
     /// The robot: the name of a built-in one (aimm, panda, ur5, twin), or the path of a robot.toml; the config's unless given. The robot of a

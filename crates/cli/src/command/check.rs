@@ -7,7 +7,7 @@ use super::tables::improvement;
 use crate::arguments::CheckArguments;
 use crate::failure::Failure;
 use crate::system::config::SystemConfig;
-use crate::system::{System, catalogue, public_directory};
+use crate::system::{DIRECTORY_VARIABLE, System, catalogue, public_directory};
 use crate::{input, output};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
@@ -90,19 +90,22 @@ pub(crate) fn run(arguments: &CheckArguments, tls: &ClientTls) -> Result<(), Fai
     }
 }
 
-/// The config with the catalogue that a task is checked against, and the running system, where one is named.
+/// The config with the catalogue that a task is checked against, and the running system, where one is named, or meant.
 fn against(arguments: &CheckArguments, tls: &ClientTls) -> Result<(SystemConfig, Option<System>), Failure> {
     let robot = arguments.robot.as_deref();
     let given = arguments.config.as_deref().map(|file| SystemConfig::load_for(Some(file), robot)).transpose()?;
     let tls = &given.as_ref().map_or_else(|| Ok(tls.clone()), |config| config.client_tls(tls))?;
     let mut system = None;
-    if let Some(named) = arguments.runtime_dir.as_deref() {
-        let directory = public_directory(Some(named))?;
+    let named = arguments.runtime_dir.is_some();
+    // A system that only the environment names is meant where nothing else is said, and it runs.
+    let usual = given.is_none() && robot.is_none() && std::env::var_os(DIRECTORY_VARIABLE).is_some();
+    if named || usual {
+        let directory = public_directory(arguments.runtime_dir.as_deref())?;
         blocking_here(async {
             system = Box::pin(System::find(&directory, given.clone(), tls)).await?;
             Ok(())
         })?;
-        if system.is_none() {
+        if named && system.is_none() {
             return Err(Failure::Refused(format!("ratn: no system runs in {}", directory.display())));
         }
     }

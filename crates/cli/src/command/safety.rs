@@ -1,27 +1,23 @@
 //! `ratn stop`, `ratn hold`, `ratn go-on`: emergency stop and hold of every driver of a system.
 //!
-//! Drivers are the cell of this machine, which is asked at once, and whoever offers a resource of class module, or a process with a bound for
-//! its standstill, as the resource manager tells: without it the cell is stopped all the same. Exit code 0 only where everybody has confirmed.
+//! The cell of this machine is asked at once, and then the others that the resource manager tells of: without it the cell is stopped all the
+//! same. Exit code 0 only where everybody has confirmed.
 
 use super::blocking_on;
 use crate::arguments::{GoOnArguments, HoldArguments, SafetyArguments, StopArguments};
 use crate::columns::columns;
 use crate::failure::Failure;
 use crate::output;
+use crate::system::drivers::{self, Answers};
 use crate::system::public_directory;
 use anyhow::anyhow;
-use futures::future::join_all;
-use ratn_daemon::resource_manager;
-use ratn_model::resource::ResourceClass;
-use ratn_proto::types::ResourceFilter;
-use ratn_worker::client::{CallError, Channels, ResourceClient};
+use ratn_worker::client::Channels;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::safety::{SafetyClient, SafetyState};
 use ratn_worker::tls::ClientTls;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::time::Duration;
-use tokio::time::timeout;
 
 /// Who has not answered by then has not confirmed.
 const ANSWER_DEADLINE: Duration = Duration::from_secs(3);
@@ -35,8 +31,6 @@ enum Question {
     GoOn,
     Show,
 }
-
-type Answers = BTreeMap<Endpoint, Result<SafetyState, String>>;
 
 /// `ratn stop`
 pub(crate) fn stop(arguments: &StopArguments, tls: &ClientTls) -> Result<(), Failure> {
@@ -69,7 +63,8 @@ fn ask_all(arguments: &SafetyArguments, tls: &ClientTls, question: &Question) ->
         let known: BTreeSet<Endpoint> =
             arguments.endpoint.iter().cloned().chain(directory.find(ratn_cell::ROLE)).collect();
         // Whoever is known is asked while the others are looked for.
-        let (mut answers, offered) = tokio::join!(ask(&channels, question, &known), drivers(&channels, &directory));
+        let (mut answers, offered) =
+            tokio::join!(ask(&channels, question, &known), drivers::offered(&channels, &directory, ANSWER_DEADLINE));
         let others = match offered {
             Ok(offered) => offered.difference(&known).cloned().collect(),
             Err(reason) if known.is_empty() => {
@@ -93,42 +88,15 @@ fn ask_all(arguments: &SafetyArguments, tls: &ClientTls, question: &Question) ->
     })
 }
 
-/// Where what moves is served: modules, and processes that are offered with a bound for their standstill.
-async fn drivers(channels: &Channels, directory: &RuntimeDirectory) -> Result<BTreeSet<Endpoint>, String> {
-    let manager = directory.find(resource_manager::ROLE).map_err(|error| error.to_string())?;
-    let client = ResourceClient::new(channels, &manager, "").map_err(|error| error.to_string())?;
-    let of = |class| ResourceFilter { class: Some(class), ..ResourceFilter::default() };
-    let both = async {
-        let modules = client.list_where(of(ResourceClass::Module));
-        tokio::try_join!(modules, client.list_where(of(ResourceClass::Process)))
-    };
-    let listed = timeout(ANSWER_DEADLINE, both).await;
-    let (modules, mut processes) = listed
-        .map_err(|_| "the resource manager does not answer".to_owned())?
-        .map_err(|error: CallError| error.to_string())?;
-    processes.retain(|process| process.standstill().is_some());
-    Ok(modules.iter().chain(&processes).filter_map(|resource| resource.endpoint().parse().ok()).collect())
-}
-
 async fn ask(channels: &Channels, question: &Question, drivers: &BTreeSet<Endpoint>) -> Answers {
-    let one = async |endpoint: &Endpoint| {
-        let answer = timeout(ANSWER_DEADLINE, put(channels, question, endpoint)).await;
-        let late = || format!("no answer within {} s", ANSWER_DEADLINE.as_secs());
-        let answer = answer.map_err(|_| late()).and_then(|answer| answer.map_err(|error| error.to_string()));
-        (endpoint.clone(), answer)
-    };
-    join_all(drivers.iter().map(one)).await.into_iter().collect()
-}
-
-async fn put(channels: &Channels, question: &Question, endpoint: &Endpoint) -> Result<SafetyState, CallError> {
-    let driver = SafetyClient::new(channels, endpoint)?;
-    match question {
+    let put = async |driver: SafetyClient| match question {
         Question::Stop(reason) => driver.stop(reason).await,
         Question::Clear => driver.clear().await,
         Question::Hold(reason) => driver.hold(reason).await,
         Question::GoOn => driver.go_on().await,
         Question::Show => driver.state().await,
-    }
+    };
+    drivers::ask(channels, drivers, ANSWER_DEADLINE, put).await
 }
 
 fn table(answers: &Answers) -> String {

@@ -9,6 +9,7 @@ use crate::colour::Colours;
 use crate::columns::aligned;
 use crate::failure::Failure;
 use crate::repainting::{self, json_text};
+use crate::system::drivers::{self, Answers};
 use crate::system::public_directory;
 use ratn_daemon::resource_manager;
 use ratn_model::program::WORLD_MODEL;
@@ -18,10 +19,16 @@ use ratn_report::statistics::mode_name;
 use ratn_task_control::RUN_KIND;
 use ratn_task_control::control::{self, Awaiting, RunStatus};
 use ratn_worker::client::{Channels, ResourceClient};
+use ratn_worker::endpoint::Endpoint;
 use ratn_worker::runtime_directory::RuntimeDirectory;
+use ratn_worker::safety::{SafetyClient, SafetyState};
 use ratn_worker::tls::ClientTls;
 use serde::Serialize;
 use std::path::Path;
+use std::time::Duration;
+
+/// A driver that has not answered by then does not say what is in force.
+const PATIENCE: Duration = Duration::from_secs(1);
 
 /// More lines of one kind are counted, not shown.
 const MOST_LINES: usize = 40;
@@ -29,6 +36,8 @@ const MOST_LINES: usize = 40;
 /// What is shown.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(super) struct Status {
+    /// The drivers that are held or stopped, or do not say.
+    drivers: Vec<Driver>,
     /// What the runs here are doing, in the order of their ids.
     runs: Vec<RunStatus>,
     /// The ids of runs that are under way elsewhere, or do not say what they are doing.
@@ -37,6 +46,16 @@ pub(super) struct Status {
     waiting: Vec<Waiting>,
     /// Resources that nobody holds.
     free: Vec<String>,
+}
+
+/// A driver at which goals are not simply performed.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+struct Driver {
+    endpoint: String,
+    /// `held`, `stopped`, or `unknown`.
+    state: &'static str,
+    /// Who wants it and why, or why it is not known.
+    reason: String,
 }
 
 /// A part of a resource that somebody holds.
@@ -62,10 +81,11 @@ pub(crate) fn run(arguments: &StatusArguments, tls: &ClientTls) -> Result<(), Fa
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
         let manager = RuntimeDirectory::at(&directory).find(resource_manager::ROLE);
         let manager = manager.map_err(|error| Failure::Refused(format!("ratn: {error}")))?;
-        let client = ResourceClient::new(&Channels::new(tls), &manager, "")?;
+        let channels = Channels::new(tls);
+        let client = ResourceClient::new(&channels, &manager, "")?;
         let colours = Colours::of_output();
         repainting::repeat(arguments.watch, arguments.json, async || {
-            let status = Status::of(&directory, &client).await.map_err(unanswered)?;
+            let status = Status::of(&directory, &channels, &client).await.map_err(unanswered)?;
             Ok(match arguments.json {
                 true => json_text(&status, arguments.watch)?,
                 false => status.text(&directory, colours),
@@ -76,14 +96,16 @@ pub(crate) fn run(arguments: &StatusArguments, tls: &ClientTls) -> Result<(), Fa
 }
 
 impl Status {
-    pub(super) async fn of(directory: &Path, client: &ResourceClient) -> Result<Status, Failure> {
+    pub(super) async fn of(directory: &Path, channels: &Channels, client: &ResourceClient) -> Result<Status, Failure> {
         let runs = control::statuses(directory).await;
         let resources = client.list(&[]).await?;
         let waiting = client.explain("").await?;
-        Ok(Status::from(runs, &resources, waiting))
+        let state = async |driver: SafetyClient| driver.state().await;
+        let answers = drivers::ask(channels, &drivers::among(&resources), PATIENCE, state).await;
+        Ok(Status::from(runs, &resources, waiting, answers))
     }
 
-    fn from(runs: Vec<RunStatus>, resources: &[Resource], waiting: Vec<WaitingAcquire>) -> Status {
+    fn from(runs: Vec<RunStatus>, resources: &[Resource], waiting: Vec<WaitingAcquire>, answers: Answers) -> Status {
         let held = |resource: &Resource| {
             let held = |holding: &ratn_proto::types::Holding| Held {
                 resource: resource.id.clone(),
@@ -99,7 +121,17 @@ impl Status {
         let is_free = |resource: &&Resource| resource.holdings.is_empty() && resource.free > Quantity::ZERO;
         let is_said = |id: &str| runs.iter().any(|run| run.run == id);
         let elsewhere = resources.iter().filter(|resource| resource.kind == RUN_KIND && !is_said(&resource.id));
+        let driver = |(endpoint, answer): (Endpoint, Result<SafetyState, String>)| {
+            let (state, reason) = match answer {
+                Ok(SafetyState::Ready) => return None,
+                Ok(SafetyState::Held { reason }) => ("held", reason),
+                Ok(SafetyState::Stopped { reason }) => ("stopped", reason),
+                Err(reason) => ("unknown", reason),
+            };
+            Some(Driver { endpoint: endpoint.to_string(), state, reason })
+        };
         Status {
+            drivers: answers.into_iter().filter_map(driver).collect(),
             elsewhere: elsewhere.map(|resource| resource.id.clone()).collect(),
             runs,
             held: things().flat_map(held).collect(),
@@ -116,6 +148,8 @@ impl Status {
 
     pub(super) fn text(&self, directory: &Path, colours: Colours) -> String {
         let mut lines = Vec::new();
+        let rows = self.drivers.iter().map(|one| [one.endpoint.clone(), format!("{}: {}", one.state, one.reason)]);
+        section(&mut lines, &colours.yellow("drivers that do not simply go on"), rows.collect());
         if self.runs.is_empty() && self.elsewhere.is_empty() {
             lines.push(format!("no run is under way in {}", directory.display()));
         }
@@ -190,6 +224,7 @@ mod tests {
     #[test]
     fn what_runs_is_told_by_the_names_of_states_and_who_holds_what() {
         let status = Status {
+            drivers: vec![Driver { endpoint: "unix:cell.sock".to_owned(), state: "held", reason: "a look".to_owned() }],
             elsewhere: Vec::new(),
             runs: vec![RunStatus {
                 run: "run-1".to_owned(),
@@ -225,6 +260,8 @@ mod tests {
             free: vec!["arm@sim".to_owned(), "base@sim".to_owned()],
         };
         assert_snapshot!(status.text(Path::new("/run/ratn"), Colours::default()), @r"
+        drivers that do not simply go on:
+          unix:cell.sock  held: a look
         sort_boxes in CDTN mode: 12.3 s, paused; 3 states have ended
         share 2.5, due in 90 s
         event log: log.jsonl
@@ -245,10 +282,9 @@ mod tests {
         let kinds = [("run-7", RUN_KIND), ("world-model@compute", WORLD_MODEL), ("arm@sim", "Arm")];
         let resources: Vec<Resource> =
             kinds.into_iter().map(|(id, kind)| Resource::new(id, ResourceClass::Task, kind)).collect();
-        let status = Status::from(Vec::new(), &resources, Vec::new());
+        let status = Status::from(Vec::new(), &resources, Vec::new(), Answers::new());
         assert_eq!((status.free, status.elsewhere), (vec!["arm@sim".to_owned()], vec!["run-7".to_owned()]));
-        let nothing =
-            Status { runs: Vec::new(), elsewhere: Vec::new(), held: Vec::new(), waiting: Vec::new(), free: Vec::new() };
+        let nothing = Status::from(Vec::new(), &[], Vec::new(), Answers::new());
         assert_snapshot!(nothing.text(Path::new("/run/ratn"), Colours::default()), @"no run is under way in /run/ratn");
     }
 }

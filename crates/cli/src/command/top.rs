@@ -18,10 +18,11 @@ pub(crate) fn run(arguments: &TopArguments, tls: &ClientTls) -> Result<(), Failu
         let directory = public_directory(arguments.runtime_dir.as_deref())?;
         let manager = RuntimeDirectory::at(&directory).find(resource_manager::ROLE);
         let manager = manager.map_err(|error| Failure::Refused(format!("ratn: {error}")))?;
-        let client = ResourceClient::new(&Channels::new(tls), &manager, "")?;
+        let channels = Channels::new(tls);
+        let client = ResourceClient::new(&channels, &manager, "")?;
         let colours = Colours::of_output();
         let look = async || {
-            let status = Status::of(&directory, &client).await.map_err(unanswered)?;
+            let status = Status::of(&directory, &channels, &client).await.map_err(unanswered)?;
             let workers = pool::overview(Some(directory.clone()), tls).await.map_err(unanswered)?;
             Ok::<String, Failure>(format!("{}\n\n{workers}", status.text(&directory, colours)))
         };

@@ -2,6 +2,7 @@
 
 pub(crate) mod catalogue;
 pub(crate) mod config;
+pub(crate) mod drivers;
 pub(crate) mod known;
 mod launch;
 pub(crate) mod workers;
@@ -31,7 +32,7 @@ use std::sync::Arc;
 use workers::Offered;
 
 /// The environment variable that says where endpoint files are.
-const DIRECTORY_VARIABLE: &str = "RATN_RUNTIME_DIR";
+pub(crate) const DIRECTORY_VARIABLE: &str = "RATN_RUNTIME_DIR";
 /// In a runtime directory: the config of the system that runs there.
 pub(crate) const CONFIG_FILE: &str = "system.toml";
 const CELL: &str = "cell";

@@ -150,7 +150,7 @@ impl WorldFailure {
     }
 }
 
-fn bounded(mut message: String, values: BTreeMap<String, Value>) -> v1::GoalProgress {
+pub(super) fn bounded(mut message: String, values: BTreeMap<String, Value>) -> v1::GoalProgress {
     let values = wire_ports(values);
     let bytes = message.len() + ports_bytes(&values);
     if bytes <= MAX_PROGRESS_BYTES {

@@ -50,9 +50,16 @@ pub trait Action: Send + Sync + 'static {
         ""
     }
 
-    /// The action's ports, outcomes and annotations. Without them the catalogue of the system has to say them, and goals are not checked.
+    /// The action's ports, outcomes and annotations. Without them the catalogue of the system has to say them, and goals are
+    /// checked against [`Action::checked_by`] alone.
     fn signature(&self) -> Option<Signature> {
         None
+    }
+
+    /// What inputs of goals, and outputs after `success`, are checked against: the signature, unless a catalogue says it
+    /// ([`Signature::bundled`]).
+    fn checked_by(&self) -> Option<Signature> {
+        self.signature()
     }
 
     /// The id of the resource whose lease a goal needs, where that is not the worker's own.

@@ -6,14 +6,16 @@
 //! ```
 //! A goal has its resource until its action has returned, whatever was told of it before.
 
+use super::context::bounded as bounded_progress;
 use super::goal::{Ending, GoalEntry, StopCause};
 use super::server::Inner;
 use super::{Action, ActionFailure, ActionResult, GoalContext};
-use crate::safety::SafetyState;
+use crate::safety::{Safety, SafetyState};
 use crate::trace;
 use ratn_proto::MAX_PORTS_BYTES;
 use ratn_proto::convert::{ports_bytes, value_bytes, wire_ports};
 use ratn_proto::types::GoalOutcome;
+use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
@@ -58,6 +60,7 @@ pub(super) async fn run(
         entry.stop(StopCause::EmergencyStop(server.safety.stopped().await));
         std::future::pending::<Infallible>().await
     };
+    let pauses = async { tell_pauses(&entry, &server.safety).await };
     let overdue = async {
         entry.cancelled.cancelled().await;
         tokio::time::sleep(STOP_GRACE).await;
@@ -73,6 +76,7 @@ pub(super) async fn run(
         }
         never = deadline => match never {},
         never = stopped => match never {},
+        never = pauses => match never {},
     };
     let lost = result.as_ref().is_err_and(|failure| matches!(failure, ActionFailure::Lost(_)));
     let outcome = bounded(result.unwrap_or_else(GoalOutcome::from));
@@ -107,9 +111,32 @@ pub(super) async fn run(
     entry.returned.cancel();
 }
 
+/// Says of a goal that it pauses, and why, and that it goes on: else nobody who waits for it would know.
+async fn tell_pauses(entry: &GoalEntry, safety: &Safety) -> Infallible {
+    let (mut state, mut suspended) = (safety.watch(), entry.suspension());
+    let mut told = None;
+    loop {
+        let pauses = match &*state.borrow_and_update() {
+            SafetyState::Held { reason } => Some(format!("pauses, held: {reason}")),
+            _ => suspended.borrow_and_update().then(|| "pauses: the resource manager is not heard".to_owned()),
+        };
+        if pauses != told {
+            let message = pauses.clone().unwrap_or_else(|| "goes on".to_owned());
+            // Nobody may listen.
+            let _ = entry.progress.send(bounded_progress(message, BTreeMap::new()));
+            told = pauses;
+        }
+        // The senders are in the goal and in its server.
+        tokio::select! {
+            _ = state.changed() => {}
+            _ = suspended.changed() => {}
+        }
+    }
+}
+
 /// Performs a goal that is as the action says, and sees that what comes of it is.
 async fn perform(action: &dyn Action, mut context: GoalContext) -> ActionResult {
-    let Some(signature) = action.signature() else { return action.execute(context).await };
+    let Some(signature) = action.checked_by() else { return action.execute(context).await };
     let name = context.action.clone();
     signature.complete(&name, &mut context.inputs)?;
     let outcome = action.execute(context).await?;

@@ -1,9 +1,10 @@
 //! The signature of an action: its ports with types and defaults, its outcomes, and the annotations that a state which performs it may have.
 
-use ratn_model::catalogue::{ActionSignature, DescriptionError};
+use ratn_model::catalogue::{ActionSignature, Catalogue, DescriptionError};
 use ratn_model::value::{Type, Value};
 use ratn_proto::types::GoalOutcome;
 use std::collections::BTreeMap;
+use std::sync::LazyLock;
 
 /// The ports of an action, built from code: `Signature::new().input("from", Type::Pose).output("object", Type::String)`.
 ///
@@ -68,6 +69,13 @@ impl Signature {
     /// Without ports.
     pub fn new() -> Signature {
         Signature::default()
+    }
+
+    /// That of an action of the bundled system, as its catalogue (`deploy/catalogue.toml`) says it; `None` for one that is not there.
+    pub fn bundled(provider: &str, action: &str) -> Option<Signature> {
+        static STANDARD: LazyLock<Catalogue> = LazyLock::new(Catalogue::standard);
+        let said = STANDARD.action(provider, action)?.clone();
+        Some(Signature { said, defaults: BTreeMap::new() })
     }
 
     /// Adds an input that every goal must have.

@@ -9,7 +9,7 @@ use ratn_model::value::Value;
 use ratn_motion::base::{DriveError, DriveRequest, plan_drive};
 use ratn_motion::pace::Control;
 use ratn_motion::robot::Robot;
-use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome, SceneCache};
+use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, GoalOutcome, SceneCache, Signature};
 use ratn_world::scene::Scene;
 use std::sync::Arc;
 use std::time::Instant;
@@ -35,6 +35,10 @@ impl DriveAction {
 impl Action for DriveAction {
     fn name(&self) -> &str {
         "drive"
+    }
+
+    fn checked_by(&self) -> Option<Signature> {
+        Signature::bundled("path_planner", self.name())
     }
 
     fn description(&self) -> &str {

@@ -23,6 +23,9 @@ use std::sync::Arc;
 /// The fraction of the joints' limits where the goal says none.
 const DEFAULT_SPEED: f64 = 0.3;
 
+/// A planner is not kept for longer by one goal, in the robot's seconds.
+const MOST_BUDGET_S: f64 = 3_600.0;
+
 /// The radius of the ball about a point that was seen, in metres, where the goal says none.
 const POINT_RADIUS_M: f64 = 0.01;
 
@@ -85,9 +88,11 @@ impl Said {
 /// What is asked for, and the budget in the robot's seconds.
 pub(super) fn asked(goal: &GoalContext, robot: &Robot) -> Result<(Asked, Option<f64>), ActionFailure> {
     let budget_s = goal.optional_float("budget_s")?;
-    if budget_s.is_some_and(|s| !s.is_finite() || s < 0.0) {
+    if let Some(s) = budget_s
+        && !(0.0..=MOST_BUDGET_S).contains(&s)
+    {
         return Err(ActionFailure::aborted(format!(
-            "input `budget_s` is {budget_s:?}: expected seconds, not negative"
+            "input `budget_s` is {s}: expected seconds, from 0 to {MOST_BUDGET_S}"
         )));
     }
     let request = Request {

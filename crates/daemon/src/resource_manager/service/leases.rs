@@ -3,6 +3,7 @@
 use super::notes::Notes;
 use super::requests::{Requests, odd_reply, optional_session};
 use crate::access::Caller;
+use crate::details::status;
 use crate::resource_manager::actor::Message;
 use ratn_model::id::LeaseId;
 use ratn_proto::convert::{label, name};
@@ -11,13 +12,26 @@ use ratn_resources::{Reply, Request};
 use std::time::Instant;
 use tonic::{Code, Status};
 
+/// What a note may have, in bytes.
+const MAX_NOTE_BYTES: usize = 256;
+
+/// Whether this is one that the next holder may be told.
+fn note(text: &str) -> Result<(), Status> {
+    label(text, "note")?;
+    if text.len() > MAX_NOTE_BYTES {
+        let message = format!("note: has {} bytes: at most {MAX_NOTE_BYTES} are told to the next holder", text.len());
+        return Err(status(Code::InvalidArgument, "MALFORMED", message));
+    }
+    Ok(())
+}
+
 pub(super) async fn release(
     requests: &Requests,
     notes: &Notes,
     caller: &Caller,
     request: v1::ResourceServiceReleaseRequest,
 ) -> Result<v1::ResourceServiceReleaseResponse, Status> {
-    label(&request.note, "note")?;
+    note(&request.note)?;
     let session = optional_session(&request.session_id)?;
     let lease = LeaseId(request.lease_id);
     // Before: whoever gets its resources in the same turn is told already.
@@ -31,10 +45,10 @@ pub(super) async fn release(
     }
     let (released, revision) = match performed {
         Ok((_, revision)) => (true, revision),
-        Err(status) if status.code() == Code::NotFound => {
+        Err(refused) if refused.code() == Code::NotFound => {
             (false, requests.actor().ask(|answer| Message::Revision { answer }).await?.0)
         }
-        Err(status) => return Err(status),
+        Err(refused) => return Err(refused),
     };
     Ok(v1::ResourceServiceReleaseResponse { released, revision })
 }
@@ -51,4 +65,16 @@ pub(super) async fn confirm_standstill(
     let (reply, revision) = requests.perform(caller, request.request_id, confirm).await?;
     let Reply::Touched(freed) = reply else { return Err(odd_reply(&reply)) };
     Ok(v1::ConfirmStandstillResponse { freed: !freed.is_empty(), revision })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_note_has_at_most_256_bytes() {
+        assert!(note(&"x".repeat(256)).is_ok());
+        let refused = note(&"x".repeat(257)).unwrap_err();
+        assert_eq!(refused.message(), "note: has 257 bytes: at most 256 are told to the next holder");
+    }
 }
