@@ -440,14 +440,14 @@ async fn a_goal_says_that_it_pauses_and_why_and_that_it_goes_on() {
     let (told, heard) = std::sync::mpsc::channel();
     let (client, endpoint) = (cell.client.clone(), cell.endpoint.clone());
     let moving = tokio::spawn(async move {
-        let tell = move |message: &str, _: &BTreeMap<String, Value>| told.send(message.to_owned()).unwrap();
+        let tell = move |message: String, _: BTreeMap<String, Value>| told.send(message).unwrap();
         client.execute(&endpoint, goal("a", "follow", 7, ARM), tell).await
     });
-    let mut all = Vec::new();
-    let mut hear = async |message: &str| {
+    let all = std::cell::RefCell::new(Vec::new());
+    let hear = async |message: &str| {
         until(message, || {
-            all.extend(heard.try_iter());
-            all.last().is_some_and(|last| last == message)
+            all.borrow_mut().extend(heard.try_iter());
+            all.borrow().last().is_some_and(|last| last == message)
         })
         .await;
     };
@@ -458,5 +458,5 @@ async fn a_goal_says_that_it_pauses_and_why_and_that_it_goes_on() {
     hear("goes on").await;
     follow.let_end.add_permits(1);
     assert!(moving.await.unwrap().unwrap().is_success());
-    assert_eq!(all, ["moving", "pauses, held: a look", "goes on"]);
+    assert_eq!(*all.borrow(), ["moving", "pauses, held: a look", "goes on"]);
 }
