@@ -146,6 +146,11 @@ async fn arm_and_base_say_where_they_are_and_the_gripper_what_it_feels() {
     let another = ("arm", Value::String("another".to_owned()));
     let here = system.execute(&lease, "Arm", "where", [another]).await.unwrap();
     assert_eq!(here.outputs["joints"], Value::Joints(aimm::HOME.to_vec()));
+    // What is misspelt is not passed over.
+    let typo = ("sped", Value::Float(0.1));
+    let wrong = system.execute(&lease, "Arm", "move_to", [to_observation()[0].clone(), typo]).await.unwrap();
+    assert_eq!(wrong.outcome, "aborted");
+    assert_eq!(wrong.reason, "`move_to` has no input `sped`; it has joints, arm, speed");
     let felt = system.execute(&lease, "Gripper", "feel", []).await.unwrap();
     assert_eq!(felt.outputs["holding"], Value::Bool(false));
     system.end.cancel();

@@ -3,6 +3,7 @@
 use crate::binding::{self, BindError, Outputs};
 use crate::protocol::Awaited;
 use crate::signals::Signals;
+use crate::span::span;
 use ratn_model::expression::{EffectExpr, EvaluateError, Expr, Scope};
 use ratn_model::fact::{Change, FactPattern};
 use ratn_model::program::{ABORTED, SUCCESS, State, VIOLATED};
@@ -10,7 +11,6 @@ use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_model::wait::{ANSWER, TIMEOUT, VALUE, Wait};
 use ratn_world::world::World;
-use std::time::Duration;
 
 /// How a wait has ended.
 #[derive(Debug, Clone, PartialEq)]
@@ -37,15 +37,15 @@ pub(crate) fn begins(
         });
         value.map_err(BindError::at(format_args!("`{port}`"), state))
     };
-    let timeout = state.annotations.timeout_s.map(|seconds| now + duration(seconds));
+    let timeout = state.annotations.timeout_s.map(|seconds| now + span(seconds));
     Ok(match state.wait() {
         None => (Awaited::Time, Some(now)),
-        Some(Wait::Seconds(after)) => (Awaited::Time, Some(now + duration(seconds("seconds", after)?))),
+        Some(Wait::Seconds(after)) => (Awaited::Time, Some(now + span(seconds("seconds", after)?))),
         Some(Wait::Until(at)) => {
-            let at = Timestamp(0) + duration(seconds("until", at)?);
+            let at = Timestamp(0) + span(seconds("until", at)?);
             (Awaited::Time, Some(at.max(now)))
         }
-        Some(Wait::Limit(after)) => (Awaited::Time, Some(now + duration(seconds("seconds", after)?))),
+        Some(Wait::Limit(after)) => (Awaited::Time, Some(now + span(seconds("seconds", after)?))),
         Some(Wait::Watch(holds)) => {
             let all: Vec<String> = holds.iter().map(|condition| format!("not ({condition})")).collect();
             (Awaited::Condition { condition: all.join(" or ") }, None)
@@ -140,9 +140,4 @@ pub(crate) fn as_it_is(foreseen: Option<&Vec<EffectExpr>>, scope: &dyn Scope, ro
         }
     };
     bound.iter().map(Change::pattern).map(now).collect()
-}
-
-/// A span of the robot's time; what is below nothing is none.
-fn duration(seconds: f64) -> Duration {
-    Duration::try_from_secs_f64(seconds.max(0.0)).unwrap_or(Duration::MAX)
 }

@@ -11,6 +11,7 @@ use crate::lookahead::Problem;
 use crate::plan::Plan;
 use crate::protocol::{Command, Event, Mode};
 use crate::signals::Signals;
+use crate::span::span;
 use crate::way_out::{Leaving, WayOut};
 use crate::window::{End, Window};
 use ratn_model::expression::EffectExpr;
@@ -26,7 +27,6 @@ use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
-use std::time::Duration;
 
 /// Executes one program once.
 ///
@@ -221,8 +221,7 @@ impl Executive {
         }
         let end = match window {
             None => {
-                let seconds =
-                    program.deadline_s.map(|s| Duration::try_from_secs_f64(s.max(0.0)).unwrap_or(Duration::MAX));
+                let seconds = program.deadline_s.map(span);
                 self.deadline = seconds.map(|seconds| now + seconds);
                 context.commands.extend(self.deadline.map(|at| Command::Wake { at }));
                 let mut interpreter = Box::new(Interpreter::of_program(parameters));

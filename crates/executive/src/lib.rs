@@ -37,6 +37,7 @@ mod overtaken;
 mod plan;
 pub mod protocol;
 mod signals;
+mod span;
 mod way_out;
 mod window;
 

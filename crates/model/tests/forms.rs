@@ -303,11 +303,11 @@ states:
 ";
     assert_snapshot!(findings(source), @r#"
     task.yaml:3:20: error[type-mismatch]: `speculation_width` is a whole number of at least 1
-    task.yaml:4:11: error[type-mismatch]: `deadline` is a number of seconds, not below 0
+    task.yaml:4:11: error[type-mismatch]: `deadline` is a number of seconds, from 0 to 1000000000
     task.yaml:5:13: error[type-mismatch]: `exceptions` is `precise` or `imprecise`
     task.yaml:6:21: error[invalid-name]: expected an outcome, a name, found text
     task.yaml:8:42: error[type-mismatch] in a: `retry` is a whole number of at least 1
-    task.yaml:8:67: error[type-mismatch] in a: `timeout` is a number of seconds, not below 0
+    task.yaml:8:67: error[type-mismatch] in a: `timeout` is a number of seconds, from 0 to 1000000000
     task.yaml:9:42: error[type-mismatch] in b: `retry` is a whole number of at least 1
     task.yaml:9:60: error[type-mismatch] in b: expected true or false, found text
     task.yaml:9:110: error[conflicting-annotations] in b: `unordered` is said of a `block`. help: leave it out: nothing of it is held while the state runs

@@ -7,10 +7,10 @@ use super::{Current, DEFAULT_ATTEMPTS, Interpreter, Phase, Progress};
 use crate::context::Context;
 use crate::plan::NodeNature;
 use crate::protocol::Command;
+use crate::span::span;
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Program, StateKind};
 use ratn_model::resource::ResourceOperation;
-use std::time::Duration;
 
 impl Interpreter {
     /// Pauses between tries that are over, and goals that have had their time.
@@ -57,7 +57,7 @@ impl Interpreter {
         let Some(current) = self.current(thread) else { return false };
         let retry = context.program.state(current.state).annotations.retry;
         let Some(retry) = retry.filter(|retry| current.tries <= retry.count) else { return false };
-        let pause = duration(retry.backoff_s * f64::from(2_u32.saturating_pow(current.tries - 1)));
+        let pause = span(retry.backoff_s * f64::from(2_u32.saturating_pow(current.tries - 1)));
         let given = current.take_held();
         let until = context.now + pause;
         current.tries += 1;
@@ -230,9 +230,4 @@ impl Current {
 fn is_in_race(program: &Program, state: StateId) -> bool {
     std::iter::successors(program.state(state).parent, |id| program.state(*id).parent)
         .any(|around| matches!(program.state(around).kind, StateKind::Concurrency { preemptive: true, .. }))
-}
-
-/// A span of the robot's time; what is no number is none.
-pub(super) fn duration(seconds: f64) -> Duration {
-    Duration::try_from_secs_f64(seconds.max(0.0)).unwrap_or(Duration::MAX)
 }

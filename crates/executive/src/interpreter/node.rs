@@ -1,12 +1,12 @@
 //! One action: acquire, project, run, and what its end changes. A routine begins as an action does.
 
-use super::again::duration;
 use super::{Current, Interpreter, Phase, Target};
 use crate::binding::{self, Outputs};
 use crate::context::{Context, Made};
 use crate::effects;
 use crate::plan::NodeNature;
 use crate::protocol::{Command, Goal, Note};
+use crate::span::span;
 use ratn_model::expression::FactExpr;
 use ratn_model::fact::{FactKey, Footprint};
 use ratn_model::id::StateId;
@@ -231,7 +231,7 @@ impl Interpreter {
             improves: None,
             reads_nothing: context.plan.state(current.state).reads_nothing(),
         };
-        let timeout = state.annotations.timeout_s.map(|seconds| context.now + duration(seconds));
+        let timeout = state.annotations.timeout_s.map(|seconds| context.now + span(seconds));
         if self.routine_of(thread).is_none() && self.is_pia(context, thread) {
             self.hold.has_begun(instance);
         }

@@ -10,9 +10,9 @@ use crate::effects;
 use crate::interpreter::{DEFAULT_ATTEMPTS, Progress};
 use crate::plan::gives_outputs;
 use crate::protocol::{Command, Event, Note};
+use crate::span::span;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, PREEMPTED, STOPPED, SUCCESS, StateKind};
-use std::time::Duration;
 
 impl Window {
     /// An attempt has ended, with or without an answer.
@@ -91,7 +91,7 @@ impl Window {
         };
         let pause_s = retry.backoff_s * f64::from(2_u32.saturating_pow(tries - 1));
         self.give_back(context, id);
-        let not_before = context.now + Duration::try_from_secs_f64(pause_s).unwrap_or_default();
+        let not_before = context.now + span(pause_s);
         self.graph.try_again(id, not_before);
         self.wait(id, Wait::Backoff);
         self.rest(id);

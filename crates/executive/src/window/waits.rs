@@ -4,12 +4,12 @@
 //! one goes on: the work per event is proportional to what it touches, not to the window.
 
 use super::graph::Graph;
+use crate::span::span;
 use ratn_model::id::InstanceId;
 use ratn_model::time::Timestamp;
 use serde::{Deserialize, Serialize};
 use smallvec::SmallVec;
 use std::collections::{BTreeSet, VecDeque};
-use std::time::Duration;
 
 /// What an instance waits for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -217,7 +217,7 @@ impl Waits {
 
     /// Something happens after so many seconds: when.
     pub(crate) fn set_timer(&mut self, now: Timestamp, after_s: f64, timer: Timer) -> Timestamp {
-        let after = Duration::try_from_secs_f64(after_s.max(0.0)).unwrap_or(Duration::MAX);
+        let after = span(after_s);
         let at: Timestamp = now + after;
         self.set_timer_at(at, timer);
         at

@@ -199,6 +199,9 @@ fn only_looks(subject: &Subject<'_>, state: &State, findings: &mut Findings) {
             let i = state.annotations.resources.iter().position(|r| r.kind == kind);
             let at = i.map_or(state.location, |i| at(&format!("resources.{i}")));
             let message = format!("a state that {claim} cannot block `{kind}`, which moves the robot");
+            // Where a state around it holds it all along.
+            let around = "a state around it blocks that for all its states: do this before that one begins, and give what it makes in";
+            let help = if i.is_none() { around } else { help };
             findings.error("computes-actuates", at, &state.path, message, help);
         }
     }

@@ -350,6 +350,9 @@ pub(crate) fn positive(fields: &mut Fields<'_, '_>, node: &Node, what: &str) -> 
     Some(seconds)
 }
 
+/// A span that a task file gives is at most as long, some thirty years: longer ones are slips, and cannot all be counted.
+const LONGEST_S: f64 = 1e9;
+
 /// A number of seconds, not below 0.
 fn seconds(fields: &mut Fields<'_, '_>, node: &Node, what: &str) -> Option<f64> {
     let seconds = match node.content {
@@ -357,12 +360,12 @@ fn seconds(fields: &mut Fields<'_, '_>, node: &Node, what: &str) -> Option<f64> 
         Content::Float(seconds) => Some(seconds),
         _ => None,
     };
-    let seconds = seconds.filter(|s| s.is_finite() && *s >= 0.0);
+    let seconds = seconds.filter(|s| (0.0..=LONGEST_S).contains(s));
     if seconds.is_none() {
         let is_with_unit =
             matches!(&node.content, Content::Text(text) if text.starts_with(|c: char| c.is_ascii_digit()));
         let help = if is_with_unit { "leave the unit out" } else { "" };
-        fields.error("type-mismatch", node.at, format!("`{what}` is a number of seconds, not below 0"), help);
+        fields.error("type-mismatch", node.at, format!("`{what}` is a number of seconds, from 0 to {LONGEST_S}"), help);
     }
     seconds
 }

@@ -118,7 +118,7 @@ pub(super) struct Performing {
 pub(super) fn deadline_ms(timeout_s: Option<f64>, speed: f64) -> u64 {
     let Some(timeout_s) = timeout_s else { return 0 };
     // A float to an integer saturates.
-    (timeout_s / speed * 1e3).ceil() as u64 + DEADLINE_SLACK.as_millis() as u64
+    ((timeout_s / speed * 1e3).ceil() as u64).saturating_add(DEADLINE_SLACK.as_millis() as u64)
 }
 
 impl Performing {
