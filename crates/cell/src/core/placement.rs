@@ -38,7 +38,10 @@ pub enum PlacementError {
         seed: u64,
     },
     /// There are fewer places to bring boxes to.
-    #[error("{count} boxes: the [workplace] of `{robot}` has places for {places}")]
+    #[error(
+        "{count} boxes: the [workplace] of `{robot}` has places for {places}: say so many (`--boxes`, or `boxes` in [cell] of the config), or \
+         give the workplace more"
+    )]
     Places {
         /// How many boxes.
         count: usize,

@@ -50,7 +50,9 @@ fn said(word: Word, run: Option<&RunStatus>) -> String {
         Word::Pause => "is paused: no PIA begins any more; `ratn control step` lets one begin, `resume` all",
         Word::Resume => "goes on",
         Word::Step => "may begin one more PIA, and is paused then",
-        Word::Abort => "is told to end: what moves stops and holds, and everything is given back; if it is paused, its ways out (`finally`) wait for `ratn control resume`",
+        Word::Abort => {
+            "is told to end: what moves stops and holds, and everything is given back; if it is paused, its ways out (`finally`) wait for `ratn control resume`"
+        }
     };
     let under_way: Vec<&str> = run.into_iter().flat_map(|run| &run.under_way).map(|one| one.path.as_str()).collect();
     match under_way.as_slice() {
