@@ -1,6 +1,6 @@
 //! Recordings that are gone through again, and states that a cell is put back to.
 
-#![allow(clippy::unwrap_used, reason = "a test may panic")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
 mod bench;
 
@@ -143,6 +143,22 @@ fn what_is_no_snapshot_is_refused_with_the_reason() {
         another.contains("of the robot `aimm` (digest ") && another.contains("the robot `ur5` (digest "),
         "{another}"
     );
+    // Numbers from which physics cannot go on: a size, a place, a turn, a speed of the first object, a joint.
+    let object = |part: usize| format!("/environment/objects/0/{part}");
+    for (place, number) in [
+        (format!("{}/size/1", object(0)), -1e308),
+        (format!("{}/size/0", object(0)), 0.0),
+        (format!("{}/pose/position/0", object(1)), 1e308),
+        (format!("{}/pose/quaternion_xyzw/3", object(1)), 9.2e18),
+        (format!("{}/velocity/2", object(1)), 1e300),
+        ("/posture/arm/0".to_owned(), 1e300),
+        ("/posture/base/1".to_owned(), -1e300),
+    ] {
+        let mut wrong: serde_json::Value = serde_json::from_str(&text).unwrap();
+        *wrong.pointer_mut(&place).unwrap_or_else(|| panic!("{place}: {text}")) = number.into();
+        let refused = Snapshot::from_json(&wrong.to_string()).unwrap_err();
+        assert!(matches!(refused, SnapshotError::Inconsistent(_)), "{place}: {refused}");
+    }
     // One of an earlier version says no robot.
     let mut earlier: serde_json::Value = serde_json::from_str(&text).unwrap();
     earlier.as_object_mut().unwrap().remove("robot");

@@ -86,7 +86,7 @@ pub(crate) fn climb(
     is_free: &mut dyn FnMut(&JointVector, &JointVector) -> bool,
     control: &mut dyn FnMut() -> Control,
 ) -> Result<Option<Traced>, Stop> {
-    if !reach.has_families() {
+    if !reach.has_families() || lines.is_too_long() {
         return Ok(None);
     }
     let rungs = rungs(lines);

@@ -189,6 +189,10 @@ pub(crate) fn nearest(
     control: &mut dyn FnMut() -> Control,
 ) -> Result<Traced, Stop> {
     let mut traced = Traced::beginning(lines, start);
+    if lines.is_too_long() {
+        traced.ended = Some(Cause::TooLong);
+        return Ok(traced);
+    }
     for (index, piece) in lines.pieces.iter().enumerate() {
         traced.whither = piece.towards;
         let steps = piece.steps();
@@ -300,6 +304,11 @@ impl Lines {
             }
         }
         Lines { pieces }
+    }
+
+    /// Whether they would take more postures than one motion may have, of whatever arm.
+    pub(crate) fn is_too_long(&self) -> bool {
+        self.pieces.iter().fold(1, |sum: usize, piece| sum.saturating_add(piece.steps())) > MAX_STEPS
     }
 }
 

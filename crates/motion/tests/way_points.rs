@@ -10,7 +10,7 @@ use common::{Cell, request};
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
 use ratn_motion::arm;
-use ratn_motion::line::through;
+use ratn_motion::line::{Cause, through};
 use ratn_motion::pace::{Control, Progress};
 use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
 use ratn_motion::straight::Straight;
@@ -65,6 +65,11 @@ fn assert_along(places: &[[f64; 3]], corners: &[[f64; 3]], blend_m: f64) {
 
 fn check_any(arm: &Arm) {
     let from = arm.tool.pose(&arm.home);
+    // Nothing is made for each step of a way that no arm goes: 1e12 m would take terabytes.
+    for far_m in [1e4, 1e12, 1e300, f64::MAX] {
+        let traced = through(&arm.tool, &arm.home, &[Pose { position: [far_m, 0.0, 0.0], ..from }], 0.0);
+        assert_eq!((traced.ended, traced.postures.len()), (Some(Cause::TooLong), 1), "{far_m}");
+    }
     let there = |x: f64, y: f64, z: f64, turn: f64| from.compose(&Pose::from_rpy([x, y, z], turn, 0.0, -turn));
     let poses = [there(0.08, 0.0, 0.0, 0.1), there(0.08, 0.08, 0.0, 0.2), there(0.0, 0.08, 0.05, 0.0)];
     let corners: Vec<[f64; 3]> = std::iter::once(&from).chain(&poses).map(|pose| pose.position).collect();

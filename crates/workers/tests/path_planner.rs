@@ -227,6 +227,24 @@ async fn what_cannot_be_planned_is_aborted_with_the_reason() {
 }
 
 #[tokio::test]
+async fn nobody_holds_thousands_of_things() {
+    let system = system().await;
+    let fact = |predicate: &str, name: String, value| Change::Set {
+        fact: FactKey { predicate: predicate.to_owned(), arguments: vec![Term::Name(name)] },
+        value,
+    };
+    let shape = Shape::Box { size: [0.01; 3] }.to_value();
+    let changes = (0..65).flat_map(|i| {
+        let (pose, name) = (Value::Pose(Pose::IDENTITY), format!("held_{i}"));
+        [fact("in_gripper", name.clone(), pose), fact("shape", name, shape.clone())]
+    });
+    let pool = WorldClient::new(&Channels::new(&ClientTls::none()), &system.world_pool).unwrap();
+    pool.commit("many", changes.collect(), None).await.unwrap();
+    let outcome = system.client.execute(&system.planner, system.grasp("a", &[]), |_, _| {}).await.unwrap();
+    assert_eq!(outcome.reason, "by facts `in_gripper` 65 objects are held: at most 64 are planned with");
+}
+
+#[tokio::test]
 async fn where_a_part_is_that_the_robot_does_not_have_is_refused_instead_of_ignored() {
     let system = system_of(Robot::built_in("panda").unwrap()).await;
     let home = Value::Joints(vec![0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]);

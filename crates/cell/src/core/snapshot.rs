@@ -19,6 +19,7 @@ use ratn_model::time::Timestamp;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{ArmPosition, Configuration, Robot, RobotIdentity};
 use serde::{Deserialize, Serialize};
+use std::ops::RangeInclusive;
 
 /// The form of what is written; another one is refused.
 pub const FORM: u32 = 1;
@@ -123,6 +124,17 @@ pub enum SnapshotError {
     Inconsistent(&'static str),
 }
 
+/// The extents of what a cell has.
+const SIZES_M: RangeInclusive<f64> = 1e-4..=10.0;
+/// No place, angle or speed of a cell is beyond that.
+const LARGEST: f64 = 1e6;
+
+/// Whether it is one: not farther than anything is, and turned by a rotation.
+fn is_pose(pose: &Pose) -> bool {
+    let length = pose.quaternion_xyzw.iter().map(|x| x * x).sum::<f64>().sqrt();
+    pose.position.iter().all(|x| x.abs() <= LARGEST) && (length - 1.0).abs() < 1e-6
+}
+
 impl Snapshot {
     /// As text.
     pub fn to_json(&self) -> String {
@@ -154,7 +166,31 @@ impl Snapshot {
         if !(0.0..=1.0).contains(&snapshot.battery) {
             return Err(SnapshotError::Inconsistent("its battery is fuller than full or emptier than empty"));
         }
-        Ok(snapshot)
+        snapshot.check_numbers().map(|()| snapshot)
+    }
+
+    /// Whether physics can go on from its numbers.
+    fn check_numbers(&self) -> Result<(), SnapshotError> {
+        let wrong = |what| Err(SnapshotError::Inconsistent(what));
+        if self.environment.objects.iter().any(|(model, _)| !model.size.iter().all(|size| SIZES_M.contains(size))) {
+            return wrong("the size of an object is not from 0.1 mm to 10 m");
+        }
+        let states = || self.environment.objects.iter().map(|(_, state)| state);
+        let held = || self.all_held().flatten();
+        let poses = states().flat_map(|state| std::iter::once(&state.pose).chain(&state.rides));
+        if !poses.chain(held().map(|held| &held.in_tool)).all(is_pose) {
+            return wrong("a pose is farther away than 1,000 km, or its quaternion is not of length 1");
+        }
+        let Posture { base, pan, tilt, finger, closed_finger, .. } = &self.posture;
+        let of_states = states().flat_map(|state| state.velocity.into_iter().chain(state.spin));
+        let others = self.posture.other_arms.iter();
+        let of_others = others.flat_map(|arm| arm.joints.iter().copied().chain([arm.finger, arm.closed_finger]));
+        let of_posture = base.iter().chain(self.posture.arm.iter()).chain([pan, tilt, finger, closed_finger]).copied();
+        let rest = self.tilts.iter().copied().chain(held().map(|held| held.friction));
+        match of_states.chain(of_others).chain(of_posture).chain(rest).all(|x| x.abs() <= LARGEST) {
+            true => Ok(()),
+            false => wrong("a speed, a joint or a place of the robot is beyond 1,000,000"),
+        }
     }
 
     /// Whether a cell with this robot can be put back to it. A snapshot that does not say of which robot it is needs as many joints.

@@ -34,7 +34,11 @@ pub(super) const GRACE_MS: u64 = DEFAULT_TTL.as_millis() as u64;
 /// How long the resource of a provider that is gone may still be there: its process manager withdraws it at once, and where that one is
 /// gone too it ends with its session.
 const WITHDRAWAL_DEADLINE: Duration = Duration::from_secs(DEFAULT_TTL.as_secs() + 1);
-/// How often that is looked at.
+/// A provider refuses a goal so while one of another run, that it has been told to stop, still runs.
+const STILL_RUNNING: &str = "STILL_RUNNING";
+/// A worker that refuses for that is kept for so long before another one is asked for: at once it would be the same one again.
+const STILL_RUNNING_PAUSE: Duration = Duration::from_secs(5);
+/// How often a withdrawal is looked at.
 const WITHDRAWAL_POLL: Duration = Duration::from_millis(100);
 /// Who does not say within this time how a provider ended is not waited for.
 const END_DEADLINE: Duration = Duration::from_secs(1);
@@ -352,6 +356,12 @@ impl Performing {
     /// Who tries again at once would be given the same provider again, and nothing would come of any of its attempts: it is over when
     /// nobody can be given that one any more. Its lease is not given back before.
     async fn withdrawn(&self, endpoint: &Endpoint, error: &CallError) {
+        if error.reason() == STILL_RUNNING {
+            tokio::select! {
+                () = tokio::time::sleep(STILL_RUNNING_PAUSE) => {}
+                () = self.stop.cancelled() => {}
+            }
+        }
         if let Some((_, provider)) = self.provider(endpoint)
             && error.is_crash()
         {
@@ -726,7 +736,7 @@ mod tests {
     }
 
     /// A provider that was made elsewhere: this is its answer to every goal.
-    struct Elsewhere(GoalResult);
+    struct Elsewhere(Result<GoalResult, Status>);
 
     #[tonic::async_trait]
     impl ActionService for Elsewhere {
@@ -734,7 +744,7 @@ mod tests {
         type PerformStream = Answers<PerformResponse>;
 
         async fn execute(&self, _: Request<ExecuteRequest>) -> Result<Response<Self::ExecuteStream>, Status> {
-            let answer = ExecuteResponse { kind: Some(execute_response::Kind::Result(self.0.clone())) };
+            let answer = ExecuteResponse { kind: Some(execute_response::Kind::Result(self.0.clone()?)) };
             Ok(Response::new(Box::pin(futures::stream::iter([Ok(answer)]))))
         }
 
@@ -772,7 +782,7 @@ mod tests {
             let bound = bind(&Endpoint::Unix(bench._place.path().join(format!("elsewhere-{number}.sock")))).await?;
             let mut performing = bench.performing("work", None, 0);
             performing.endpoint = Ok(bound.endpoint().clone());
-            let services = Services::new().with(ActionServiceServer::new(Elsewhere(answer)));
+            let services = Services::new().with(ActionServiceServer::new(Elsewhere(Ok(answer))));
             tokio::spawn(bound.serve(services, CancellationToken::new()));
             performing.perform(Given::Now).await;
             let event = bench.event().await;
@@ -780,6 +790,25 @@ mod tests {
             assert!(outcome == ABORTED && reason.contains(expected), "{outcome}: {reason}");
             assert!(reason.len() < 40_000 && !reason.contains('\u{1b}'), "{reason}");
         }
+        Ok(())
+    }
+
+    #[tokio::test]
+    async fn a_worker_that_still_runs_anothers_goal_is_kept_for_a_while_and_not_asked_thrice_at_once()
+    -> anyhow::Result<()> {
+        let mut bench = Bench::new().await?;
+        let bound = bind(&Endpoint::Unix(bench._place.path().join("stuck.sock"))).await?;
+        let mut performing = bench.performing("work", None, 0);
+        performing.endpoint = Ok(bound.endpoint().clone());
+        let details = ErrorDetails::with_error_info(STILL_RUNNING, "ratn", HashMap::<String, String>::new());
+        let refused = Status::with_error_details(tonic::Code::ResourceExhausted, "goal a still runs", details);
+        let services = Services::new().with(ActionServiceServer::new(Elsewhere(Err(refused))));
+        tokio::spawn(bound.serve(services, CancellationToken::new()));
+        let began = std::time::Instant::now();
+        performing.perform(Given::Now).await;
+        assert!(began.elapsed() >= STILL_RUNNING_PAUSE, "{:?}", began.elapsed());
+        let Some(Event::Crashed { reason, .. }) = bench.event().await else { anyhow::bail!("no crash") };
+        assert!(reason.contains("goal a still runs"), "{reason}");
         Ok(())
     }
 

@@ -6,8 +6,11 @@ use ratn_model::value::Value;
 use ratn_motion::hands;
 use ratn_motion::robot::{Robot, RobotFault};
 use ratn_worker::action::{ActionFailure, GoalContext};
-use ratn_world::scene::{Placement, Scene};
+use ratn_world::scene::{Placement, Scene, SceneObject};
 use std::sync::Arc;
+
+/// With each held object the checks of every posture grow, those of which may press each other with the square.
+const MOST_HELD: usize = 64;
 
 /// The robot seen from the arm that moves.
 pub(super) fn moving(robot: &Arc<Robot>, goal: &GoalContext) -> Result<Arc<Robot>, ActionFailure> {
@@ -63,6 +66,12 @@ fn with_hands(
     scene: Arc<Scene>,
     seen: impl FnOnce(&Robot, Scene) -> Result<Scene, RobotFault>,
 ) -> Result<Arc<Scene>, ActionFailure> {
+    let is_held = |object: &&SceneObject| matches!(object.placement, Placement::Gripper(_) | Placement::Hand { .. });
+    let held = scene.objects.iter().filter(is_held).count();
+    if held > MOST_HELD {
+        let message = format!("by facts `in_gripper` {held} objects are held: at most {MOST_HELD} are planned with");
+        return Err(ActionFailure::aborted(message));
+    }
     if !scene.objects.iter().any(|object| matches!(object.placement, Placement::Hand { .. })) {
         return Ok(scene);
     }
