@@ -626,7 +626,7 @@ pub struct BlockRequest {
     /// What; its operation is block.
     #[prost(message, optional, tag = "3")]
     pub requirement: ::core::option::Option<Requirement>,
-    /// Larger first.
+    /// As in AcquireRequest.
     #[prost(int64, tag = "4")]
     pub priority: i64,
     /// How long to wait at the most, in milliseconds from the arrival of the call; at least 1.
@@ -724,8 +724,8 @@ pub struct AcquireRequest {
     /// Blocks, consumes and exists; at least one.
     #[prost(message, repeated, tag = "3")]
     pub requirements: ::prost::alloc::vec::Vec<Requirement>,
-    /// Larger first, of what was asked within the same ten seconds by sessions that have had about their shares; among equals first come,
-    /// first served. The bits from 2^60 on are the urgency, which comes before due times.
+    /// Larger first, among what one session asks for, and among the first requests of sessions that have had about their shares and asked
+    /// within the same ten seconds; among equals first come, first served. The bits from 2^60 on are the urgency, which comes before due times.
     #[prost(int64, tag = "4")]
     pub priority: i64,
     /// How long to wait at the most, in milliseconds from the arrival of the call; at least 1.
@@ -1773,7 +1773,8 @@ pub mod resource_service_client {
             self.inner.unary(req, path, codec).await
         }
         /// Waits until all requirements can be met at once and takes them under one lease; all or nothing. DEADLINE_EXCEEDED
-        /// after the deadline; FAILED_PRECONDITION when nothing could ever meet them; a cancelled call leaves the queue.
+        /// after the deadline, with what was waited for: what does not exist is waited for as well, because somebody may offer it
+        /// meanwhile. A cancelled call leaves the queue.
         pub async fn acquire(
             &mut self,
             request: impl tonic::IntoRequest<super::AcquireRequest>,
@@ -2125,7 +2126,8 @@ pub mod resource_service_server {
             request: tonic::Request<super::ExistsRequest>,
         ) -> std::result::Result<tonic::Response<super::ExistsResponse>, tonic::Status>;
         /// Waits until all requirements can be met at once and takes them under one lease; all or nothing. DEADLINE_EXCEEDED
-        /// after the deadline; FAILED_PRECONDITION when nothing could ever meet them; a cancelled call leaves the queue.
+        /// after the deadline, with what was waited for: what does not exist is waited for as well, because somebody may offer it
+        /// meanwhile. A cancelled call leaves the queue.
         async fn acquire(
             &self,
             request: tonic::Request<super::AcquireRequest>,
@@ -3356,10 +3358,11 @@ pub struct ProjectRequest {
     /// What of it may be seen.
     #[prost(message, optional, tag = "4")]
     pub reads: ::core::option::Option<Footprint>,
-    /// The lease that holds the room for it.
+    /// A lease of the caller's, with which the projection ends. What it holds is not looked at: `capacity` units of WorldModel are room for those
+    /// who ask for it, and `projections_per_caller` bounds everybody.
     #[prost(uint64, tag = "5")]
     pub lease_id: u64,
-    /// The lease's fencing token.
+    /// The lease's fencing token. Not looked at: the lease has to live, and that is what the resource manager says.
     #[prost(uint64, tag = "6")]
     pub token: u64,
     /// Who will make the change at the same place, by the path of its instance, so that its commit is compared with what was predicted
