@@ -1,0 +1,21 @@
+//! Spans of the robot's time, from seconds.
+
+use std::time::Duration;
+
+/// So many seconds. Less than nothing, and what is no number, is nothing; more than can be counted is for ever.
+pub(crate) fn span(seconds: f64) -> Duration {
+    Duration::try_from_secs_f64(seconds.max(0.0)).unwrap_or(Duration::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_counted_is_for_ever_and_never_at_once() {
+        assert_eq!(span(1e300), Duration::MAX);
+        assert_eq!(span(f64::INFINITY), Duration::MAX);
+        assert_eq!([span(-1.0), span(f64::NAN)], [Duration::ZERO; 2]);
+        assert_eq!(span(1.5), Duration::from_millis(1_500));
+    }
+}
