@@ -361,6 +361,17 @@ def test_joints_are_an_array_without_a_copy() -> None:
     assert numpy.asarray(ratn.Joints([])).shape == (0,)
 
 
+def test_a_system_whose_worker_cannot_be_loaded_says_why_and_is_not_waited_for(place: Place) -> None:
+    place.write("broken.py", "import ratn_has_no_such_module\n")
+    config = place.write("system.toml", NO_CATALOGUE + template("broken", "Broken", python="broken.py", interpreter=PYTHON, crash_limit=2))
+    with pytest.raises(ratn.Error) as raised:
+        ratn.System(config, runtime_dir=place.runtime)
+    assert "ModuleNotFoundError: No module named 'ratn_has_no_such_module'" in str(raised.value), raised.value
+    assert "`broken` crash-loops: 2 crashes in a row" in str(raised.value), raised.value
+    # All of its traceback is in the log.
+    assert "Traceback" in place.logs()
+
+
 def test_a_task_is_checked_against_what_workers_say_of_themselves(tester: Place) -> None:
     @ratn.task
     def halves() -> dict:
