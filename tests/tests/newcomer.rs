@@ -105,6 +105,41 @@ fn a_run_that_waits_for_a_worker_which_never_becomes_ready_says_why_in_its_line(
     Ok(())
 }
 
+/// A label reader that ends as soon as it is started.
+fn crashes(crash_limit: u32) -> String {
+    let crash = "program = \"/bin/sh\"\nargs = [\"-c\", \"echo there is no model; exit 3\"]\nmin = 1";
+    let once = NEVER_READY.replace("program = \"/bin/sleep\"\nargs = [\"600\"]\nmin = 0", crash);
+    once.replace("crash_limit = 1000", &format!("crash_limit = {crash_limit}"))
+}
+
+#[test]
+fn a_system_says_at_once_why_its_worker_crashes_and_is_not_waited_for_when_its_pool_has_given_up() -> anyhow::Result<()>
+{
+    let place = Place::new()?;
+    let (config, directory) = (place.path().join("system.toml"), place.path().join("run"));
+    let arguments = ["up", "--config", text(&config)?, "--runtime-dir", text(&directory)?];
+    std::fs::write(&config, crashes(1000))?;
+    let mut up = place.start_as("again", &arguments)?;
+    let why = "@compute: exited with status 3; its last words: there is no model";
+    let first = "a worker of `label` has crashed and is started again: label-";
+    let line = wait_for("the first crash", || {
+        let said = up.said();
+        Ok(said.lines().find(|line| line.contains(first)).map(str::to_owned))
+    })
+    .with_context(|| up.said())?;
+    ensure!(line.contains(why), "{line}");
+    up.signal(nix::sys::signal::Signal::SIGINT)?;
+    up.finish()?;
+
+    std::fs::write(&config, crashes(3))?;
+    let ended = place.ratn(&arguments).output()?;
+    let (out, err) = texts(&ended);
+    ensure!(ended.status.code() == Some(1), "{out}{err}");
+    ensure!(err.contains("the system cannot be started: `label` crash-loops: 3 crashes in a row; label-"), "{err}");
+    ensure!(err.contains(why) && err.contains(text(&directory.join("logs"))?) && !err.contains("not ready"), "{err}");
+    place.wait_until_empty()
+}
+
 #[test]
 fn the_demo_refuses_a_robot_of_ones_own_that_cannot_do_it_before_anything_is_started() -> anyhow::Result<()> {
     let place = Place::new()?;

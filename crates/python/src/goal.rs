@@ -1,6 +1,7 @@
 //! A goal as an action in Python sees it. Whatever waits lets go of Python's lock, and ends when the goal shall stop.
 
 use crate::error::{line, of_failure, of_world};
+use crate::numbers;
 use crate::value::{Fact, fields_from_python, fields_to_python, from_python};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -158,9 +159,10 @@ impl Goal {
     ) -> PyResult<()> {
         let key = fact(fact_text).map_err(PyValueError::new_err)?;
         let value = from_python(value)?;
+        let no_matrix = || PyValueError::new_err("covariance: expected a square matrix of numbers");
         let certainty = match (covariance, confidence) {
             (Some(_), Some(_)) => return Err(PyValueError::new_err("say a covariance or a confidence, not both")),
-            (Some(matrix), None) => Some(Certainty::Covariance(numbers(&from_python(matrix)?)?)),
+            (Some(matrix), None) => Some(Certainty::Covariance(numbers::taken(matrix).map_err(|_| no_matrix())?)),
             (None, confidence) => confidence.map(Certainty::Confidence),
         };
         certainty.as_ref().map_or(Ok(()), Certainty::check).map_err(PyValueError::new_err)?;
@@ -184,7 +186,7 @@ impl Goal {
             CallFailure::Cancelled { .. } => self.context.stopped(),
             error => ActionFailure::from(error),
         };
-        fields_to_python(py, &called.map_err(|error| of_failure(failure(error)))?)
+        fields_to_python(py, called.map_err(|error| of_failure(failure(error)))?)
     }
 
     /// Calls `back` without arguments, in another thread, when the goal shall stop. After the goal's end it is not called any more.
@@ -209,24 +211,5 @@ impl Goal {
 
     fn __repr__(&self) -> String {
         format!("<Goal {} of {}>", self.context.id, self.context.action)
-    }
-}
-
-/// A matrix, row by row or as rows, as its numbers.
-fn numbers(value: &Value) -> PyResult<Vec<f64>> {
-    let wrong = || PyValueError::new_err("covariance: expected a square matrix of numbers");
-    match value {
-        Value::Joints(numbers) => Ok(numbers.clone()),
-        Value::List(rows) => {
-            let mut all = Vec::new();
-            for row in rows {
-                match row {
-                    Value::List(_) => all.extend(numbers(row)?),
-                    number => all.push(number.as_number().ok_or_else(wrong)?),
-                }
-            }
-            Ok(all)
-        }
-        _ => Err(wrong()),
     }
 }

@@ -8,6 +8,7 @@ mod client;
 mod error;
 mod goal;
 mod log;
+mod numbers;
 mod task;
 mod threads;
 mod value;
@@ -21,6 +22,7 @@ fn _ratn(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<value::Pose>()?;
     module.add_class::<value::Joints>()?;
     module.add_class::<value::Trajectory>()?;
+    module.add_class::<numbers::Numbers>()?;
     module.add_class::<value::Fact>()?;
     module.add_class::<goal::Goal>()?;
     module.add_class::<client::Client>()?;

@@ -6,17 +6,20 @@
 //! | list, map | `list`, `dict` with names as keys |
 //! | pose, joints, trajectory | [`Pose`], [`Joints`], [`Trajectory`] |
 //!
-//! What has a method `tolist` (an array or a number of numpy) is taken as what that gives.
+//! An array of numpy is taken as its memory lies there ([`crate::numbers`]); what else has a method `tolist` as what that gives.
 
+use crate::numbers::{self, Floats, Numbers};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
+use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyBool, PyByteArray, PyBytes, PyDict, PyFloat, PyInt, PyList, PyString, PyTuple};
 use ratn_model::fact::Term;
 use ratn_model::measurement::Certainty;
 use ratn_model::pose;
 use ratn_model::value::{self, TrajectoryPoint, Value};
 use ratn_proto::types::FactRecord;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
+use std::sync::{Arc, OnceLock};
 
 /// Lists within lists, and the like: no deeper.
 const MAX_DEPTH: usize = 32;
@@ -109,16 +112,16 @@ impl Pose {
     }
 }
 
-/// Positions of a robot's joints: radians, metres for sliding ones, in the robot's order.
-#[pyclass(frozen, from_py_object, sequence, module = "ratn")]
-#[derive(Clone, Debug)]
-pub(crate) struct Joints(pub(crate) Vec<f64>);
+/// Positions of a robot's joints: radians, metres for sliding ones, in the robot's order. `numpy.asarray(joints)` is a view without a copy.
+#[pyclass(frozen, sequence, module = "ratn")]
+#[derive(Debug)]
+pub(crate) struct Joints(Floats);
 
 #[pymethods]
 impl Joints {
     #[new]
-    fn new(positions: Vec<f64>) -> Joints {
-        Joints(positions)
+    fn new(positions: &Bound<'_, PyAny>) -> PyResult<Joints> {
+        Ok(Joints(numbers::taken(positions)?.into()))
     }
 
     fn __len__(&self) -> usize {
@@ -126,48 +129,115 @@ impl Joints {
     }
 
     fn __getitem__(&self, index: isize) -> PyResult<f64> {
-        let from_end = |back: usize| self.0.len().checked_sub(back);
-        let place = if index < 0 { from_end(index.unsigned_abs()) } else { usize::try_from(index).ok() };
-        let found = place.and_then(|place| self.0.get(place)).copied();
+        let found = numbers::place(index, self.0.len()).map(|place| self.0[place]);
         found.ok_or_else(|| pyo3::exceptions::PyIndexError::new_err("there is no such joint"))
     }
 
     /// As a list of floats.
     fn tolist(&self) -> Vec<f64> {
-        self.0.clone()
+        self.0.to_vec()
     }
 
     /// What numpy makes an array of without a copy, which cannot be written to: the array keeps this alive, and nothing moves it.
     #[getter]
     fn __array_interface__<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let order = if cfg!(target_endian = "little") { "<" } else { ">" };
-        let told = PyDict::new(py);
-        told.set_item("version", 3)?;
-        told.set_item("shape", (self.0.len(),))?;
-        told.set_item("typestr", format!("{order}f8"))?;
-        told.set_item("data", (self.0.as_ptr() as usize, true))?;
-        Ok(told)
+        self.0.interface(py, &[self.0.len()])
     }
 
     fn __eq__(&self, other: &Joints) -> bool {
-        self.0 == other.0
+        self.0[..] == other.0[..]
     }
 
     fn __repr__(&self) -> String {
-        format!("Joints({:?})", self.0)
+        format!("Joints({:?})", &self.0[..])
     }
 }
 
 /// A timed path of joints: names, and points of seconds, positions (radians) and velocities (radians per second).
-#[pyclass(frozen, from_py_object, module = "ratn")]
-#[derive(Clone, Debug)]
-pub(crate) struct Trajectory(pub(crate) value::Trajectory);
+#[pyclass(frozen, module = "ratn")]
+#[derive(Debug)]
+pub(crate) struct Trajectory {
+    value: value::Trajectory,
+    columns: OnceLock<Columns>,
+}
+
+/// What the points of a trajectory have in common, put side by side when it is looked at for the first time.
+#[derive(Debug)]
+struct Columns {
+    times_s: Floats,
+    positions: Floats,
+    /// Nothing where a point has none.
+    velocities: Option<Floats>,
+}
+
+impl From<value::Trajectory> for Trajectory {
+    fn from(value: value::Trajectory) -> Trajectory {
+        Trajectory { value, columns: OnceLock::new() }
+    }
+}
+
+impl Trajectory {
+    fn columns(&self) -> &Columns {
+        self.columns.get_or_init(|| {
+            let (points, width) = (&self.value.points, self.value.joints.len());
+            let all = |of: fn(&TrajectoryPoint) -> &[f64]| {
+                let mut floats = Vec::with_capacity(points.len() * width);
+                points.iter().for_each(|point| floats.extend_from_slice(of(point)));
+                Floats::from(floats)
+            };
+            let velocities = points.iter().all(|point| point.velocities.len() == width);
+            Columns {
+                times_s: points.iter().map(|point| point.time_s).collect::<Vec<_>>().into(),
+                positions: all(|point| &point.positions),
+                velocities: velocities.then(|| all(|point| &point.velocities)),
+            }
+        })
+    }
+
+    /// Points of as many joints, from rows that lie one after the other.
+    fn of_columns(joints: Vec<String>, times_s: &[f64], rows: [Vec<f64>; 2]) -> PyResult<Trajectory> {
+        let width = joints.len();
+        for (name, row) in ["positions", "velocities"].iter().zip(&rows) {
+            if row.len() != width * times_s.len() {
+                let (points, numbers) = (times_s.len(), row.len());
+                let wrong = format!(
+                    "{name}: {points} points of {width} joints need as many rows and columns, and these are {numbers} numbers"
+                );
+                return Err(PyValueError::new_err(wrong));
+            }
+        }
+        let row = |rows: &[f64], number: usize| rows[number * width..(number + 1) * width].to_vec();
+        let point = |(number, time_s): (usize, &f64)| TrajectoryPoint {
+            time_s: *time_s,
+            positions: row(&rows[0], number),
+            velocities: row(&rows[1], number),
+        };
+        let points = times_s.iter().enumerate().map(point).collect();
+        Ok(value::Trajectory { joints, points }.into())
+    }
+}
 
 #[pymethods]
 impl Trajectory {
-    /// `Trajectory(joints, [(time_s, positions, velocities), …])`.
+    /// `Trajectory(joints, [(time_s, positions, velocities), …])`, or `Trajectory(joints, times_s=…, positions=…, velocities=…)` with arrays or lists: a
+    /// row for each point, a column for each joint.
     #[new]
-    fn new(joints: Vec<String>, points: Vec<(f64, Vec<f64>, Vec<f64>)>) -> PyResult<Trajectory> {
+    #[pyo3(signature = (joints, points=None, *, times_s=None, positions=None, velocities=None))]
+    fn new(
+        joints: Vec<String>,
+        points: Option<Vec<(f64, Vec<f64>, Vec<f64>)>>,
+        times_s: Option<&Bound<'_, PyAny>>,
+        positions: Option<&Bound<'_, PyAny>>,
+        velocities: Option<&Bound<'_, PyAny>>,
+    ) -> PyResult<Trajectory> {
+        let points = match (points, times_s, positions, velocities) {
+            (Some(points), None, None, None) => points,
+            (None, Some(times_s), Some(positions), Some(velocities)) => {
+                let rows = [numbers::taken(positions)?, numbers::taken(velocities)?];
+                return Trajectory::of_columns(joints, &numbers::taken(times_s)?, rows);
+            }
+            _ => return Err(PyTypeError::new_err("say `points`, or `times_s`, `positions` and `velocities`")),
+        };
         let width = joints.len();
         let mut taken = Vec::with_capacity(points.len());
         for (number, (time_s, positions, velocities)) in points.into_iter().enumerate() {
@@ -177,44 +247,77 @@ impl Trajectory {
             }
             taken.push(TrajectoryPoint { time_s, positions, velocities });
         }
-        Ok(Trajectory(value::Trajectory { joints, points: taken }))
+        Ok(value::Trajectory { joints, points: taken }.into())
     }
 
     #[getter]
     fn joints(&self) -> Vec<String> {
-        self.0.joints.clone()
+        self.value.joints.clone()
     }
 
     /// `(time_s, positions, velocities)` each.
     #[getter]
     fn points(&self) -> Vec<(f64, Vec<f64>, Vec<f64>)> {
         let point = |point: &TrajectoryPoint| (point.time_s, point.positions.clone(), point.velocities.clone());
-        self.0.points.iter().map(point).collect()
+        self.value.points.iter().map(point).collect()
+    }
+
+    /// Seconds from the start of the motion, of each point. numpy looks at them without a copy.
+    #[getter]
+    fn times_s(&self) -> Numbers {
+        Numbers::row(self.columns().times_s.clone())
+    }
+
+    /// Radians (metres for sliding joints): a row for each point, a column for each joint. numpy looks at them without a copy.
+    #[getter]
+    fn positions(&self) -> Numbers {
+        Numbers::matrix(self.columns().positions.clone(), self.value.joints.len())
+    }
+
+    /// Radians (metres) per second, as the positions; `None` where a point has none.
+    #[getter]
+    fn velocities(&self) -> Option<Numbers> {
+        let velocities = self.columns().velocities.clone()?;
+        Some(Numbers::matrix(velocities, self.value.joints.len()))
     }
 
     /// Seconds from the first to the last point.
     #[getter]
     fn duration_s(&self) -> f64 {
-        self.0.duration_s()
+        self.value.duration_s()
     }
 
     fn __eq__(&self, other: &Trajectory) -> bool {
-        self.0 == other.0
+        self.value == other.value
     }
 
     fn __repr__(&self) -> String {
-        format!("Trajectory({} joints, {} points, {} s)", self.0.joints.len(), self.0.points.len(), self.duration_s())
+        let (joints, points) = (self.value.joints.len(), self.value.points.len());
+        format!("Trajectory({joints} joints, {points} points, {} s)", self.duration_s())
     }
 }
 
 /// A fact of a world: `at(box_1) = pose(…)` has the predicate `at`, the key `("box_1",)` and a `Pose` as its value.
 #[pyclass(frozen, module = "ratn")]
-#[derive(Debug)]
-pub(crate) struct Fact(FactRecord);
+pub(crate) struct Fact {
+    record: Arc<FactRecord>,
+    /// Made when it is asked for: most facts of an answer are looked at by their keys only.
+    value: PyOnceLock<Py<PyAny>>,
+}
 
 impl Fact {
     pub(crate) fn all(records: Vec<FactRecord>) -> Vec<Fact> {
-        records.into_iter().map(Fact).collect()
+        records.into_iter().map(|record| Fact { record: Arc::new(record), value: PyOnceLock::new() }).collect()
+    }
+
+    fn made(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        match &self.record.value {
+            Value::Joints(_) => {
+                let positions = Floats::Of(Arc::clone(&self.record), positions);
+                Ok(Bound::new(py, Joints(positions))?.into_any().unbind())
+            }
+            value => to_python(py, value.clone()).map(Bound::unbind),
+        }
     }
 }
 
@@ -222,13 +325,13 @@ impl Fact {
 impl Fact {
     #[getter]
     fn predicate(&self) -> &str {
-        &self.0.key.predicate
+        &self.record.key.predicate
     }
 
     /// Its arguments, in order.
     #[getter]
     fn key<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
-        let terms = self.0.key.arguments.iter().map(|term| match term {
+        let terms = self.record.key.arguments.iter().map(|term| match term {
             Term::Int(number) => Ok(number.into_pyobject(py)?.into_any()),
             Term::Name(name) => Ok(PyString::new(py, name).into_any()),
         });
@@ -236,70 +339,98 @@ impl Fact {
     }
 
     #[getter]
-    fn value<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        to_python(py, &self.0.value)
+    fn value(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        Ok(self.value.get_or_try_init(py, || self.made(py))?.clone_ref(py))
     }
 
     /// The revision of the world with which it was written.
     #[getter]
     fn revision(&self) -> u64 {
-        self.0.revision.0
+        self.record.revision.0
     }
 
     /// What measured it; nothing where it was not measured.
     #[getter]
     fn source(&self) -> Option<String> {
-        self.0.measured.as_ref().map(|measured| measured.source.clone())
+        self.record.measured.as_ref().map(|measured| measured.source.clone())
     }
 
-    /// The covariance of its numbers, row by row, where its source said so.
+    /// The covariance of its numbers, where its source said so: a square matrix, at which numpy looks without a copy.
     #[getter]
-    fn covariance(&self) -> Option<Vec<f64>> {
-        match self.0.measured.as_ref()?.certainty.as_ref()? {
-            Certainty::Covariance(entries) => Some(entries.clone()),
-            Certainty::Confidence(_) => None,
-        }
+    fn covariance(&self) -> Option<Numbers> {
+        let is_told = !covariance(&self.record).is_empty();
+        is_told.then(|| Numbers::square(Floats::Of(Arc::clone(&self.record), covariance)))
     }
 
     /// The probability that it is so, where its source said so.
     #[getter]
     fn confidence(&self) -> Option<f64> {
-        match self.0.measured.as_ref()?.certainty.as_ref()? {
+        match self.record.measured.as_ref()?.certainty.as_ref()? {
             Certainty::Confidence(confidence) => Some(*confidence),
             Certainty::Covariance(_) => None,
         }
     }
 
     fn __repr__(&self) -> String {
-        format!("<Fact {} = {}>", self.0.key, self.0.value)
+        format!("<Fact {} = {}>", self.record.key, self.record.value)
     }
 }
 
-/// A value as Python has it.
-pub(crate) fn to_python<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>> {
+/// The joints' positions that are the value of a fact; none where it is another one.
+fn positions(record: &FactRecord) -> &[f64] {
+    if let Value::Joints(positions) = &record.value { positions } else { &[] }
+}
+
+/// The covariance of a fact, row by row; nothing where it has none.
+fn covariance(record: &FactRecord) -> &[f64] {
+    match record.measured.as_ref().and_then(|measured| measured.certainty.as_ref()) {
+        Some(Certainty::Covariance(entries)) => entries,
+        Some(Certainty::Confidence(_)) | None => &[],
+    }
+}
+
+/// A value as Python has it. What has numbers in it keeps its memory.
+pub(crate) fn to_python(py: Python<'_>, value: Value) -> PyResult<Bound<'_, PyAny>> {
     Ok(match value {
         Value::Null => py.None().into_bound(py),
-        Value::Bool(truth) => PyBool::new(py, *truth).to_owned().into_any(),
+        Value::Bool(truth) => PyBool::new(py, truth).to_owned().into_any(),
         Value::Int(number) => number.into_pyobject(py)?.into_any(),
-        Value::Float(number) => PyFloat::new(py, *number).into_any(),
-        Value::String(text) => PyString::new(py, text).into_any(),
-        Value::Pose(pose) => Bound::new(py, Pose(*pose))?.into_any(),
-        Value::Joints(positions) => Bound::new(py, Joints(positions.clone()))?.into_any(),
-        Value::Trajectory(trajectory) => Bound::new(py, Trajectory(trajectory.clone()))?.into_any(),
+        Value::Float(number) => PyFloat::new(py, number).into_any(),
+        Value::String(text) => PyString::new(py, &text).into_any(),
+        Value::Pose(pose) => Bound::new(py, Pose(pose))?.into_any(),
+        Value::Joints(positions) => Bound::new(py, Joints(positions.into()))?.into_any(),
+        Value::Trajectory(trajectory) => Bound::new(py, Trajectory::from(trajectory))?.into_any(),
         Value::List(items) => {
-            let items = items.iter().map(|item| to_python(py, item)).collect::<PyResult<Vec<_>>>()?;
+            let items = items.into_iter().map(|item| to_python(py, item)).collect::<PyResult<Vec<_>>>()?;
             PyList::new(py, items)?.into_any()
         }
         Value::Map(fields) => fields_to_python(py, fields)?.into_any(),
-        Value::Bytes(bytes) => PyBytes::new(py, bytes).into_any(),
+        Value::Bytes(bytes) => PyBytes::new(py, &bytes).into_any(),
     })
 }
 
 /// Ports, or the fields of a map, as Python has them.
-pub(crate) fn fields_to_python<'py>(py: Python<'py>, fields: &BTreeMap<String, Value>) -> PyResult<Bound<'py, PyDict>> {
+pub(crate) fn fields_to_python(py: Python<'_>, fields: BTreeMap<String, Value>) -> PyResult<Bound<'_, PyDict>> {
     let taken = PyDict::new(py);
     for (name, value) in fields {
         taken.set_item(name, to_python(py, value)?)?;
+    }
+    Ok(taken)
+}
+
+/// The inputs of a goal as Python has them. `arrays` are those that shall be arrays: of them what numpy looks at without a copy.
+pub(crate) fn inputs_to_python<'py>(
+    py: Python<'py>,
+    inputs: BTreeMap<String, Value>,
+    arrays: &HashSet<String>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let taken = PyDict::new(py);
+    for (name, value) in inputs {
+        let value = if arrays.contains(&name) { Numbers::of(value) } else { Err(value) };
+        match value {
+            Ok(numbers) => taken.set_item(name, Bound::new(py, numbers)?)?,
+            Err(value) => taken.set_item(name, to_python(py, value)?)?,
+        }
     }
     Ok(taken)
 }
@@ -359,10 +490,13 @@ fn taken(object: &Bound<'_, PyAny>, depth: usize) -> PyResult<Value> {
         return Ok(Value::Pose(pose.get().0));
     }
     if let Ok(joints) = object.cast::<Joints>() {
-        return Ok(Value::Joints(joints.get().0.clone()));
+        return Ok(Value::Joints(joints.get().0.to_vec()));
     }
     if let Ok(trajectory) = object.cast::<Trajectory>() {
-        return Ok(Value::Trajectory(trajectory.get().0.clone()));
+        return Ok(Value::Trajectory(trajectory.get().value.clone()));
+    }
+    if let Ok(numbers) = object.cast::<Numbers>() {
+        return Ok(numbers.get().value());
     }
     if let Ok(fields) = object.cast::<PyDict>() {
         return named(fields, depth + 1).map(Value::Map);
@@ -372,6 +506,9 @@ fn taken(object: &Bound<'_, PyAny>, depth: usize) -> PyResult<Value> {
     }
     if let Ok(tuple) = object.cast::<PyTuple>() {
         return items(tuple.iter().collect());
+    }
+    if let Some((floats, shape)) = numbers::array(object)? {
+        return Ok(numbers::nested(&floats, &shape));
     }
     if object.hasattr("tolist")? {
         return taken(&object.call_method0("tolist")?, depth + 1);

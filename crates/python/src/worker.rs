@@ -4,18 +4,18 @@
 use crate::error::{Aborted, Cancelled, Error, Lost, line};
 use crate::goal::Goal;
 use crate::threads::Threads;
-use crate::value::{fields_from_python, fields_to_python, from_python};
+use crate::value::{fields_from_python, from_python, inputs_to_python};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use ratn_model::value::Type;
+use ratn_model::value::{Type, Value};
 use ratn_proto::types::GoalOutcome;
 use ratn_worker::action::{Action, ActionFailure, ActionResult, GoalContext, Signature};
 use ratn_worker::arguments::Arguments;
 use ratn_worker::prelude::async_trait;
 use ratn_worker::safety::{Brakes, Safety, SafetyState};
 use ratn_worker::worker::WorkerError;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
@@ -50,6 +50,8 @@ pub(crate) struct Described {
     suspends: bool,
     /// It gives a result that can be used, and better ones later.
     anytime: bool,
+    /// The inputs that are arrays.
+    arrays: HashSet<String>,
     /// Called with the goal and its inputs as a dict; gives an outcome, its outputs as a dict and a reason.
     perform: Py<PyAny>,
 }
@@ -228,13 +230,20 @@ struct PythonAction {
     name: String,
     description: String,
     signature: Signature,
-    perform: Arc<Py<PyAny>>,
+    function: Arc<Function>,
     threads: Threads,
+}
+
+/// What performs the goals.
+struct Function {
+    perform: Py<PyAny>,
+    /// The inputs that it wants as arrays.
+    arrays: HashSet<String>,
 }
 
 impl PythonAction {
     fn of(py: Python<'_>, described: Described, kind: &str, threads: &Threads) -> PyResult<PythonAction> {
-        let Described { name, description, inputs, outputs, outcomes, perform, .. } = described;
+        let Described { name, description, inputs, outputs, outcomes, arrays, perform, .. } = described;
         let of_type = |port: &str, text: String| {
             let read = Type::try_from(text);
             read.map_err(|error| PyValueError::new_err(format!("port `{port}` of `{name}`: {error}")))
@@ -277,8 +286,9 @@ impl PythonAction {
         if described.anytime {
             signature = signature.anytime();
         }
-        let (suspends, perform, threads) = (described.suspends, Arc::new(perform), threads.clone());
-        Ok(PythonAction { suspends, name, description, signature, perform, threads })
+        let (suspends, threads) = (described.suspends, threads.clone());
+        let function = Arc::new(Function { perform, arrays });
+        Ok(PythonAction { suspends, name, description, signature, function, threads })
     }
 }
 
@@ -301,18 +311,27 @@ impl Action for PythonAction {
     }
 
     async fn execute(&self, goal: GoalContext) -> ActionResult {
-        let (goal, function, runtime) = (Arc::new(goal), Arc::clone(&self.perform), Handle::current());
-        let performed = self.threads.run(move |py| perform(py, &goal, &function, runtime));
+        let mut goal = goal;
+        // Python has their memory from here on.
+        let inputs = std::mem::take(&mut goal.inputs);
+        let (goal, function, runtime) = (Arc::new(goal), Arc::clone(&self.function), Handle::current());
+        let performed = self.threads.run(move |py| perform(py, &goal, inputs, &function, runtime));
         let performed = performed.map_err(|error| ActionFailure::Aborted(format!("no thread for it: {error}")))?;
         performed.await.unwrap_or_else(|_| Err(ActionFailure::Aborted("its thread has panicked".to_owned())))
     }
 }
 
-fn perform(py: Python<'_>, context: &Arc<GoalContext>, function: &Py<PyAny>, runtime: Handle) -> ActionResult {
+fn perform(
+    py: Python<'_>,
+    context: &Arc<GoalContext>,
+    inputs: BTreeMap<String, Value>,
+    function: &Function,
+    runtime: Handle,
+) -> ActionResult {
     let given = || -> PyResult<GoalOutcome> {
         let goal = Bound::new(py, Goal::new(Arc::clone(context), runtime))?;
-        let inputs = fields_to_python(py, &context.inputs)?;
-        let ended = function.bind(py).call1((&goal, inputs));
+        let inputs = inputs_to_python(py, inputs, &function.arrays)?;
+        let ended = function.perform.bind(py).call1((&goal, inputs));
         goal.get().is_over(py);
         let (outcome, outputs, reason): (String, Bound<'_, PyDict>, String) = ended?.extract()?;
         let (outputs, reason) = (fields_from_python(&outputs)?, shortened(reason));

@@ -19,10 +19,10 @@ GROUPS = {
     ],
     "Expressions": ["Value", "fn", "expr", "fact", "exists", "isin", "function"],
     "Steps, workers and drivers": ["step", "Step", "Worker", "Driver", "Outcome", "Goal"],
-    "Values": ["Pose", "Joints", "Trajectory"],
+    "Values": ["Pose", "Joints", "Trajectory", "Numbers"],
 }
 #: Classes that nobody makes but the package.
-NOT_MADE = {"Run", "Lease", "Projected", "WorldWatch", "Fact", "Nodes", "Why", "CriticalPath", "Report", "Chart", "Network", "Finding", "State", "Value", "Goal", "Annotations", "Step", "Task"}
+NOT_MADE = {"Run", "Lease", "Projected", "WorldWatch", "Fact", "Nodes", "Why", "CriticalPath", "Report", "Chart", "Network", "Finding", "State", "Value", "Goal", "Annotations", "Step", "Task", "Numbers"}
 
 
 def text(thing: object) -> str:

@@ -361,6 +361,75 @@ def test_joints_are_an_array_without_a_copy() -> None:
     assert numpy.asarray(ratn.Joints([])).shape == (0,)
 
 
+def test_arrays_of_a_trajectory_share_its_memory_and_make_one() -> None:
+    numpy = pytest.importorskip("numpy")
+    positions = numpy.arange(6.0).reshape(3, 2)
+    path = ratn.Trajectory(["a", "b"], times_s=[0, 1, 2.5], positions=positions, velocities=positions.T.reshape(3, 2))
+    assert path.points[1] == (1.0, [2.0, 3.0], [4.0, 1.0]) and path.duration_s == 2.5
+    assert path == ratn.Trajectory(["a", "b"], path.points)
+    seen = numpy.asarray(path.positions)
+    assert seen.shape == (3, 2) and (seen == positions).all() and numpy.asarray(path.times_s).tolist() == [0, 1, 2.5]
+    assert seen.ctypes.data == path.positions.__array_interface__["data"][0]
+    assert numpy.shares_memory(seen, numpy.asarray(path.positions))
+    with pytest.raises(ValueError, match="read-only"):
+        seen[0, 0] = 1
+    # What is made of an array is its own: that may be written to afterwards.
+    positions[:] = 9
+    assert path.positions[0] == [0.0, 1.0] and seen[0, 1] == 1.0
+    del path
+    assert seen.sum() == 15
+    with pytest.raises(ValueError, match="positions: 3 points of 2 joints"):
+        ratn.Trajectory(["a", "b"], times_s=[0, 1, 2], positions=[[1, 2]], velocities=positions)
+    with pytest.raises(TypeError, match="times_s"):
+        ratn.Trajectory(["a", "b"], times_s=[0, 1, 2])
+
+
+def test_numbers_are_rows_and_need_no_numpy() -> None:
+    path = ratn.Trajectory(["a", "b"], [(0, [1, 2], [0, 0]), (1, [3, 4], [0, 0])])
+    numbers = path.positions
+    assert len(numbers) == 2 and numbers[-1] == [3.0, 4.0] and list(numbers) == numbers.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    assert numbers.shape == (2, 2) and path.times_s.tolist() == [0.0, 1.0] and path.times_s[1] == 1.0
+    assert numbers == path.positions and numbers != path.velocities
+    assert repr(path.times_s) == "Numbers([0.0, 1.0])"
+    with pytest.raises(IndexError):
+        numbers[2]
+    with pytest.raises((TypeError, ValueError)):
+        ratn.Joints(["a", "b"])
+    assert ratn.Joints(path.times_s) == ratn.Joints(range(2))
+
+
+def test_numpy_looks_at_what_a_goal_has_where_it_lies(tester: Place) -> None:
+    """Images, paths, joints and lists: the arrays own no memory, and nobody may write to them."""
+    states = state("drawn", "tester/draw", "Tester") + state(
+        "seen", "tester/see", "Tester", "{ picture: drawn.picture, rows: drawn.rows, path: drawn.path, numbers: '[1, 2]', joints: 'joints(1, 2)' }"
+    )
+    outputs = "outputs:\n  views: { type: any, value: seen.views }\n  sums: { type: any, value: seen.sums }\n"
+    ended = tester.run(tester.write("views.yaml", task("views", states, outputs)))
+    assert ended["outcome"] == "success", f"{ended['reason']}\n{ended['stderr']}"
+    assert ended["outputs"]["views"] == dict.fromkeys(("joints", "numbers", "picture", "positions", "rows", "times_s", "velocities"), True)
+    assert sorted(ended["outputs"]["sums"]) == sorted([255 * 128, 15, 3, 3, 3, 15, 7.5])
+
+
+def test_a_covariance_is_a_matrix_where_the_fact_has_it(tester: Place) -> None:
+    measured = "  - looked: { action: tester/look, senses: ['at(?)'], measures: ['at'], effects: ['at(ball) = pose(0, 0, 0)'], resources: [Tester] }\n"
+    reads = state("sure", "tester/sure", "Tester", more="computes: true, reads: ['at(?)']").replace("[Tester]", "[Tester, world_model]")
+    outputs = "outputs:\n  views: { type: any, value: sure.views }\n  covariance: { type: any, value: sure.covariance }\n"
+    ended = tester.run(tester.write("sure.yaml", task("sure", measured + reads, outputs)))
+    assert ended["outcome"] == "success", f"{ended['reason']}\n{ended['stderr']}"
+    assert ended["outputs"] == {"views": [True] * 3, "covariance": [[0.25 * (row == column) for column in range(6)] for row in range(6)]}
+
+
+def test_a_system_whose_worker_cannot_be_loaded_says_why_and_is_not_waited_for(place: Place) -> None:
+    place.write("broken.py", "import ratn_has_no_such_module\n")
+    config = place.write("system.toml", NO_CATALOGUE + template("broken", "Broken", python="broken.py", interpreter=PYTHON, crash_limit=2))
+    with pytest.raises(ratn.Error) as raised:
+        ratn.System(config, runtime_dir=place.runtime)
+    assert "ModuleNotFoundError: No module named 'ratn_has_no_such_module'" in str(raised.value), raised.value
+    assert "`broken` crash-loops: 2 crashes in a row" in str(raised.value), raised.value
+    # All of its traceback is in the log.
+    assert "Traceback" in place.logs()
+
+
 def test_a_task_is_checked_against_what_workers_say_of_themselves(tester: Place) -> None:
     @ratn.task
     def halves() -> dict:

@@ -84,10 +84,10 @@ impl Processes {
         Ok(Processes { roles })
     }
 
-    /// Waits until `ready` says so. `missing` of it is what is not there yet, for people.
+    /// Waits until nothing is `missing`: what is not there yet, for people.
     ///
     /// # Errors
-    /// When a process ends, or after [`READY_DEADLINE`]; with the last words of the log.
+    /// What `missing` gives where waiting is in vain; or when a process ends, or after [`READY_DEADLINE`], with the last words of the log.
     pub(crate) async fn wait_until<F>(&mut self, mut missing: F) -> anyhow::Result<()>
     where
         F: AsyncFnMut() -> anyhow::Result<Vec<String>>,
@@ -161,11 +161,14 @@ fn last_words(log: &Path) -> String {
     )
 }
 
-/// What of `wanted` (resources by kind) is not among `there`.
-pub(crate) fn missing(wanted: &BTreeMap<String, Quantity>, there: &BTreeMap<String, Quantity>) -> Vec<String> {
+/// What of `wanted` (resources by kind) is not among `there`: by kind, for people.
+pub(crate) fn missing<'a>(
+    wanted: &'a BTreeMap<String, Quantity>,
+    there: &BTreeMap<String, Quantity>,
+) -> BTreeMap<&'a str, String> {
     let short = wanted.iter().filter_map(|(kind, n)| {
         let have = there.get(kind).copied().unwrap_or_default();
-        (have < *n).then(|| format!("{kind} ({have} of {n})"))
+        (have < *n).then(|| (kind.as_str(), format!("{kind} ({have} of {n})")))
     });
     short.collect()
 }

@@ -2,6 +2,7 @@
 
 pub(crate) mod catalogue;
 pub(crate) mod config;
+mod crashes;
 pub(crate) mod drivers;
 pub(crate) mod known;
 mod launch;
@@ -11,16 +12,18 @@ use crate::failure::Failure;
 use crate::output;
 use anyhow::Context;
 use config::{SystemConfig, is_same};
+use crashes::Crashes;
 use launch::Processes;
 use nix::unistd::{AccessFlags, access};
 use ratn_daemon::config::{Durability, state_directory};
 use ratn_model::resource::Quantity;
+use ratn_proto::types::PoolStatus;
 use ratn_proto::v1::cell_service_client::CellServiceClient;
 use ratn_proto::v1::{GetGroundTruthRequest, UnintendedContact};
 use ratn_task_control::Endpoints;
 use ratn_task_control::NotStarted;
 use ratn_task_control::shell::{Place, Urgency};
-use ratn_worker::client::{Channels, ResourceClient, WorldClient};
+use ratn_worker::client::{Channels, ProcessClient, ResourceClient, WorldClient};
 use ratn_worker::endpoint::{self, Endpoint};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::Standing;
@@ -29,6 +32,7 @@ use std::collections::BTreeMap;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 use workers::Offered;
 
 /// The environment variable that says where endpoint files are.
@@ -36,6 +40,9 @@ pub(crate) const DIRECTORY_VARIABLE: &str = "RATN_RUNTIME_DIR";
 /// In a runtime directory: the config of the system that runs there.
 pub(crate) const CONFIG_FILE: &str = "system.toml";
 const CELL: &str = "cell";
+const PROCESS_MANAGER: &str = "process-manager";
+/// While workers are missing at the start, their process manager is asked for the reason so often.
+const ASK_POOLS: Duration = Duration::from_millis(250);
 /// The kinds of objects that have to be carried upright.
 const UPRIGHT: [&str; 2] = ["bowl", "cup"];
 
@@ -51,7 +58,7 @@ pub(crate) struct Judgement {
 }
 
 /// The roles of a system on one machine, in the order in which they are started.
-const ROLES: [&str; 4] = ["resource-manager", "world-pool", CELL, "process-manager"];
+const ROLES: [&str; 4] = ["resource-manager", "world-pool", CELL, PROCESS_MANAGER];
 
 /// A running system.
 #[derive(Debug)]
@@ -110,7 +117,8 @@ impl System {
         let file = directory.path().join(CONFIG_FILE);
         std::fs::write(&file, config.to_toml()?).with_context(|| format!("cannot write {}", file.display()))?;
         let mut processes = Processes::start(&ROLES, &file, directory.path())?;
-        match ready(&mut processes, &directory, &config, tls).await {
+        let keeps = private.is_none().then(|| directory.path());
+        match ready(&mut processes, &directory, &config, tls, keeps).await {
             Ok(endpoints) => {
                 let offered = Box::pin(Offered::known(tls, &endpoints.resource_manager)).await;
                 let mismatches = offered.mismatches(&config.catalogue);
@@ -295,15 +303,17 @@ pub(crate) async fn running(directory: &Path, tls: &ClientTls) -> anyhow::Result
     Ok(Some(Endpoints { resource_manager, world_pool }))
 }
 
-/// Waits until every role is there and every resource that the config promises.
+/// Waits until every role is there and every resource that the config promises. `keeps` is the directory where it is there after a start in vain.
 async fn ready(
     processes: &mut Processes,
     directory: &RuntimeDirectory,
     config: &SystemConfig,
     tls: &ClientTls,
+    keeps: Option<&Path>,
 ) -> anyhow::Result<Endpoints> {
     let wanted = config.promised_resources();
     let channels = Channels::new(tls);
+    let (mut crashes, mut asked) = (Crashes::default(), None::<Instant>);
     let missing = async || {
         let roles = ROLES.iter().filter(|role| directory.find(role).is_err());
         let roles: Vec<String> = roles.map(|&role| role.to_owned()).collect();
@@ -317,10 +327,36 @@ async fn ready(
         for resource in resources {
             *there.entry(resource.kind).or_default() += resource.capacity;
         }
-        Ok(launch::missing(&wanted, &there))
+        let missing = launch::missing(&wanted, &there);
+        if !missing.is_empty() && asked.is_none_or(|at| at.elapsed() >= ASK_POOLS) {
+            asked = Some(Instant::now());
+            let pools = pools(&channels, directory).await;
+            if let Some(why) = crashes::given_up(&pools, &missing.keys().copied().collect()) {
+                anyhow::bail!("the system cannot be started: {why}{}", keeps.map(whole_logs).unwrap_or_default());
+            }
+            for said in crashes.news(&pools) {
+                output::progress(said);
+            }
+        }
+        Ok(missing.into_values().collect())
     };
     processes.wait_until(missing).await?;
     Ok(Endpoints { resource_manager: directory.find(ROLES[0])?, world_pool: directory.find(ROLES[1])? })
+}
+
+/// Where all is that workers have written.
+fn whole_logs(directory: &Path) -> String {
+    format!(" (the whole logs of workers are in {})", directory.join("logs").display())
+}
+
+/// The pools of the process manager, as far as it says. One that does not answer yet is asked again.
+async fn pools(channels: &Channels, directory: &RuntimeDirectory) -> Vec<PoolStatus> {
+    let client = directory.find(PROCESS_MANAGER).ok().and_then(|at| ProcessClient::new(channels, &at).ok());
+    let Some(client) = client else { return Vec::new() };
+    match tokio::time::timeout(ASK_POOLS, client.pools()).await {
+        Ok(Ok(host)) => host.pools,
+        Ok(Err(_)) | Err(_) => Vec::new(),
+    }
 }
 
 /// Where endpoint files are, as [`directory_of`] says.

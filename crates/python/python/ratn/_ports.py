@@ -6,7 +6,7 @@
 | ``ratn.Pose ratn.Joints ratn.Trajectory`` | ``pose joints trajectory`` |
 | ``list[T]``, ``dict[str, T]`` | ``list<T>``, ``map<T>`` |
 | a ``TypedDict`` | a record with these fields |
-| ``numpy.ndarray`` | ``list<float>``, given as an array |
+| ``numpy.ndarray`` | ``list<float>``, given as an array; ``Annotated[numpy.ndarray, "bytes"]`` is one of bytes |
 | ``Annotated[T, "joints"]`` | what the text says |
 | ``T | None`` with the default ``None`` | that of ``T``; a goal may leave it out |
 | ``typing.Any``, none | ``any`` |
@@ -186,7 +186,7 @@ def _own_nodes(function: ast.AST) -> typing.Iterator[ast.AST]:
 def fitting(value: Any, kind: str) -> Any:
     """An output as its port wants it: numbers as joints, an array as bytes."""
     if kind == "joints" and not isinstance(value, Joints) and hasattr(value, "__len__"):
-        return Joints([float(position) for position in value])
+        return Joints(value)
     if kind == "bytes" and hasattr(value, "tobytes"):
         return value.tobytes()
     return value

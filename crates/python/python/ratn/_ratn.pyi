@@ -20,6 +20,7 @@ __all__ = [
     "Lost",
     "Malformed",
     "NotFound",
+    "Numbers",
     "OutOfRange",
     "PermissionDenied",
     "Pose",
@@ -100,7 +101,7 @@ class Pose:
 
 @final
 class Joints(Sequence[float]):
-    def __new__(cls, positions: Iterable[float]) -> Joints: ...
+    def __new__(cls, positions: Iterable[Any]) -> Joints: ...
     def __len__(self) -> int: ...
     def __getitem__(self, key: int, /) -> float: ...  # type: ignore[override]
     @property
@@ -110,14 +111,36 @@ class Joints(Sequence[float]):
 @final
 class Trajectory:
     def __new__(
-        cls, joints: Sequence[str], points: Sequence[tuple[float, Sequence[float], Sequence[float]]]
+        cls,
+        joints: Sequence[str],
+        points: Sequence[tuple[float, Sequence[float], Sequence[float]]] | None = None,
+        *,
+        times_s: Iterable[Any] | None = None,
+        positions: Iterable[Any] | None = None,
+        velocities: Iterable[Any] | None = None,
     ) -> Trajectory: ...
     @property
     def joints(self) -> list[str]: ...
     @property
     def points(self) -> list[tuple[float, list[float], list[float]]]: ...
     @property
+    def times_s(self) -> Numbers: ...
+    @property
+    def positions(self) -> Numbers: ...
+    @property
+    def velocities(self) -> Numbers | None: ...
+    @property
     def duration_s(self) -> float: ...
+
+@final
+class Numbers(Sequence[Any]):
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+    def __len__(self) -> int: ...
+    def __getitem__(self, key: int, /) -> Any: ...  # type: ignore[override]
+    @property
+    def __array_interface__(self) -> dict[str, Any]: ...
+    def tolist(self) -> list[Any]: ...
 
 @final
 class Fact:
@@ -132,7 +155,7 @@ class Fact:
     @property
     def source(self) -> str | None: ...
     @property
-    def covariance(self) -> list[float] | None: ...
+    def covariance(self) -> Numbers | None: ...
     @property
     def confidence(self) -> float | None: ...
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, NoReturn, TypeVar
 
 from ratn import _ports, _ratn
-from ratn._ratn import Aborted, Cancelled, Goal, Lost
+from ratn._ratn import Aborted, Cancelled, Goal, Lost, Numbers
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -208,7 +208,8 @@ def _performed(
         import numpy
 
         if given[port] is not None:
-            given[port] = numpy.asarray(given[port], dtype=float)
+            # Without a copy where it is a block of numbers already.
+            given[port] = numpy.asarray(given[port], dtype=None if isinstance(given[port], Numbers) else float)
     # What a goal sets there is its own: its thread performs others after it.
     context, process = contextvars.copy_context(), os.getpid()
     try:

@@ -254,6 +254,52 @@ def deaf(goal: ratn.Goal) -> dict:
     return {}
 
 
+class Drawn(TypedDict):
+    picture: bytes
+    rows: Annotated[Any, "list<list<float>>"]
+    path: ratn.Trajectory
+
+
+@w.action(computes=True, reads=[])
+def draw(goal: ratn.Goal) -> Drawn:
+    """Gives arrays of several kinds, however they lie in memory."""
+    rows = np.arange(6.0).reshape(2, 3)
+    path = ratn.Trajectory(["a", "b"], times_s=np.array([0.0, 1.0, 2.0]), positions=rows.T, velocities=rows.T * 0.5)
+    return {"picture": np.arange(256, dtype=np.uint8), "rows": rows.T, "path": path}
+
+
+def is_view(array: np.ndarray) -> bool:
+    """Whether its memory is another object's, and nobody writes there."""
+    return not array.flags.owndata and not array.flags.writeable
+
+
+@w.action(computes=True, reads=[], outputs={"views": "map<bool>", "sums": "list<float>"})
+def see(
+    goal: ratn.Goal,
+    picture: Annotated[np.ndarray, "bytes"],
+    rows: Annotated[np.ndarray, "list<list<float>>"],
+    path: ratn.Trajectory,
+    numbers: np.ndarray,
+    joints: Annotated[np.ndarray, "joints"],
+) -> dict:
+    """Says which of its inputs numpy looks at where they lie."""
+    assert picture.dtype == np.uint8 and rows.shape == (3, 2) and np.asarray(path.positions).shape == (3, 2)
+    arrays = {"picture": picture, "rows": rows, "numbers": numbers, "joints": joints}
+    for name in ("times_s", "positions", "velocities"):
+        arrays[name] = np.asarray(getattr(path, name))
+        assert np.shares_memory(arrays[name], np.asarray(getattr(path, name)))
+    sums = [float(array.sum()) for array in arrays.values()]
+    return {"views": {name: is_view(array) for name, array in arrays.items()}, "sums": sums}
+
+
+@w.action(reads=["at(?)"], effects=[], outputs={"covariance": "list<list<float>>", "views": "list<bool>"})
+def sure(goal: ratn.Goal) -> dict:
+    """How sure a measured fact is, as numpy sees it."""
+    (fact,) = goal.facts("at(ball)")
+    first, second = np.asarray(fact.covariance), np.asarray(fact.covariance)
+    return {"covariance": first, "views": [is_view(first), np.shares_memory(first, second), fact.value is fact.value]}
+
+
 @w.action(outputs={"joints": ratn.Joints, "given": bool}, computes=True, reads=[])
 def odd(goal: ratn.Goal, numbers: np.ndarray | None = None) -> ratn.Outcome:
     return ratn.Outcome("success", {"joints": [1, 2.5], "given": isinstance(numbers, np.ndarray)})

@@ -6,6 +6,9 @@
 //! order is the resource manager's: who comes first of those that want any of it takes it over, also one that waits there already, whose
 //! request is then withdrawn ([`super::acquiring`]); where that one wants something else, too, nothing is handed over. What depends on the state of a resource (attributes,
 //! conditions, what is there or is used up) is asked anew every time.
+//!
+//! For a lease that went back the manager grants one to the first that waits there. That one is left to it: handed another lease meanwhile, it would
+//! withdraw its request, the manager would grant the next one, which has a lease by then, too, and so on, with a resource that nobody works with.
 
 use super::acquiring::Waiting;
 use ratn_executive::protocol::{CERTAIN, Command, Event};
@@ -18,9 +21,17 @@ use std::time::{Duration, Instant};
 /// How long after its grant a lease may be handed over: so much longer somebody outside this run may wait.
 const TURN: Duration = Duration::from_millis(100);
 
+/// How long the manager's grant for a lease that went back is expected: another client may have got it. The first that waits may be passed
+/// over for so long.
+const EXPECTED: Duration = TURN;
+
 /// The leases of a run, with what was asked for.
 #[derive(Debug, Default)]
-pub(super) struct Leases(BTreeMap<LeaseId, Held>);
+pub(super) struct Leases {
+    held: BTreeMap<LeaseId, Held>,
+    /// What went back, and when: for each of these the manager has a grant for whoever comes first of those that want exactly that.
+    went_back: Vec<(Vec<Requirement>, Instant)>,
+}
 
 #[derive(Debug)]
 struct Held {
@@ -45,25 +56,40 @@ pub(super) struct Handover {
 impl Leases {
     /// A lease is there; one that was handed over counts from its grant.
     pub(super) fn granted(&mut self, to: InstanceId, lease: &Lease, asked: (Vec<Requirement>, i64), now: Instant) {
-        let (requirements, is_speculative) = (asked.0, asked.1 < CERTAIN);
+        let (requirements, priority) = asked;
+        let is_speculative = priority < CERTAIN;
+        if !self.held.contains_key(&lease.id)
+            && let Some(expected) = self.went_back.iter().position(|(returned, _)| *returned == requirements)
+        {
+            self.went_back.remove(expected);
+        }
         let new = || Held { lease: lease.clone(), requirements, granted: now, holder: to, is_speculative };
-        let held = self.0.entry(lease.id).or_insert_with(new);
+        let held = self.held.entry(lease.id).or_insert_with(new);
         (held.holder, held.is_speculative) = (to, is_speculative);
     }
 
     /// Whether any lease was asked for in case it is needed.
     pub(super) fn has_speculative(&self) -> bool {
-        self.0.values().any(|held| held.is_speculative)
+        self.held.values().any(|held| held.is_speculative)
     }
 
     /// Who has a lease that was asked for in case it is needed.
     pub(super) fn speculative_holder(&self, lease: LeaseId) -> Option<InstanceId> {
-        self.0.get(&lease).filter(|held| held.is_speculative).map(|held| held.holder)
+        self.held.get(&lease).filter(|held| held.is_speculative).map(|held| held.holder)
     }
 
     /// A lease goes back.
-    pub(super) fn given_back(&mut self, lease: LeaseId) {
-        self.0.remove(&lease);
+    pub(super) fn given_back(&mut self, lease: LeaseId, now: Instant) {
+        self.went_back.retain(|(_, at)| now.duration_since(*at) < EXPECTED);
+        if let Some(held) = self.held.remove(&lease) {
+            self.went_back.push((held.requirements, now));
+        }
+    }
+
+    /// How many grants of exactly this the manager has for the run, for what went back.
+    fn expected(&self, requirements: &[Requirement], now: Instant) -> usize {
+        let is_expected = |at: &Instant| now.duration_since(*at) < EXPECTED;
+        self.went_back.iter().filter(|(returned, at)| returned == requirements && is_expected(at)).count()
     }
 
     /// Who takes over the lease that is given back for this event, if anybody does: whoever comes first of those that wait already and those
@@ -80,7 +106,7 @@ impl Leases {
             Command::Release { instance, lease, .. } if instance == ended => *lease,
             _ => None,
         });
-        let held = self.0.get(&given_back?)?;
+        let held = self.held.get(&given_back?)?;
         if outcome != SUCCESS || now.duration_since(held.granted) >= TURN {
             return None;
         }
@@ -90,7 +116,13 @@ impl Leases {
         // One that asks again with another priority is withdrawn before.
         let mut waits =
             waiting.in_order().map(|(id, asking)| (id, asking.requirements.as_slice(), true, asking.priority));
-        let waits = waits.find(|(id, requirements, ..)| held.is_wanted(requirements) && !is_withdrawn(*id));
+        let mut expected = self.expected(&held.requirements, now);
+        let waits = waits.find(|(id, requirements, ..)| {
+            let is_first = held.is_wanted(requirements) && !is_withdrawn(*id);
+            let is_left_to_the_manager = is_first && expected > 0 && held.serves(requirements);
+            expected -= usize::from(is_left_to_the_manager);
+            is_first && !is_left_to_the_manager
+        });
         let asks = commands.iter().rev().filter_map(|command| match command {
             Command::Acquire { instance, requirements, priority } => {
                 Some((*instance, requirements.as_slice(), false, *priority))
@@ -133,8 +165,12 @@ mod tests {
     }
 
     fn ended(outcome: &str) -> Event {
+        ended_of(FIRST, outcome)
+    }
+
+    fn ended_of(instance: InstanceId, outcome: &str) -> Event {
         Event::Finished {
-            instance: FIRST,
+            instance,
             attempt: 1,
             outcome: outcome.to_owned(),
             outputs: BTreeMap::new(),
@@ -223,6 +259,46 @@ mod tests {
         let again = [withdrawn, asks(12, planner(), 9)];
         assert_eq!(handover(&ended(SUCCESS), &again, &queue, 1), Some(InstanceId(12)), "what it asks for now");
         assert_eq!(handover(&ended(SUCCESS), &[], &queue, 100), None, "its turn is over");
+    }
+
+    #[test]
+    fn the_first_that_waits_is_left_to_the_manager_for_a_lease_that_went_back() {
+        let lease = |id: u64| {
+            let resource = LeasedResource {
+                id: format!("path-planner-{id}"),
+                kind: "PathPlanner".to_owned(),
+                endpoint: String::new(),
+                superclasses: Vec::new(),
+            };
+            Lease { id: LeaseId(id), token: FencingToken(id), resources: vec![resource] }
+        };
+        let begin = Instant::now();
+        let after = |ms: u64| begin + Duration::from_millis(ms);
+        let mut leases = Leases::default();
+        for id in [7, 8] {
+            leases.granted(InstanceId(id), &lease(id), (planner(), 0), begin);
+        }
+        let next = |leases: &Leases, ms: u64| {
+            let ended = ended_of(InstanceId(8), SUCCESS);
+            let commands = [Command::Release { instance: InstanceId(8), lease: Some(LeaseId(8)), projection: None }];
+            let queue = waiting(&[(planner(), 9), (planner(), 5), (planner(), 5)]);
+            leases.handover(&ended, &commands, &queue, after(ms)).map(|handover| handover.to)
+        };
+        assert_eq!(next(&leases, 50), Some(InstanceId(11)));
+        leases.given_back(LeaseId(7), after(50));
+        assert_eq!(next(&leases, 50), Some(InstanceId(12)), "the manager has one for the first");
+        leases.granted(InstanceId(11), &lease(9), (planner(), 9), after(51));
+        assert_eq!(next(&leases, 51), Some(InstanceId(11)), "it has come");
+
+        leases.given_back(LeaseId(9), after(60));
+        let other = vec![Requirement::new(ResourceOperation::Block, "Arm")];
+        leases.granted(InstanceId(2), &lease(10), (other, 0), after(61));
+        assert_eq!(next(&leases, 61), Some(InstanceId(12)), "another grant is not that");
+        let mut later = Leases::default();
+        later.granted(InstanceId(8), &lease(8), (planner(), 0), after(150));
+        later.went_back.push((planner(), after(60)));
+        assert_eq!(next(&later, 159), Some(InstanceId(12)));
+        assert_eq!(next(&later, 160), Some(InstanceId(11)), "another client has it");
     }
 
     #[test]
