@@ -6,7 +6,7 @@ import { Clock, Film, lasts } from "./film";
 import { forward } from "./kinematics";
 import { Looks } from "./looks";
 import { type Matrix, type Vector, along, compose, identity, length, minus, origin, placed, plus, shifted } from "./matrix";
-import { Orbit } from "./orbit";
+import { Orbit, whole } from "./orbit";
 import type { Site } from "./pages";
 import { type Colour, type Lines, Painter, type Solid, outline } from "./webgl";
 import type { Cell, Object as Thing, Robot, Shape, Track, Truth } from "./wire";
@@ -244,7 +244,7 @@ export class CellView {
     const bound = (axis: 0 | 1 | 2, pick: (...all: number[]) => number) => places.map((place) => place[axis]).reduce((a, b) => pick(a, b));
     const [low, high] = [Math.min, Math.max].map((pick): Vector => [bound(0, pick), bound(1, pick), bound(2, pick)]) as [Vector, Vector];
     const at: Vector = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2];
-    return { at, distance: Math.min(Math.max(length(minus(high, low)) * 1.05, 1), 40) };
+    return { at, distance: Math.min(Math.max(whole(length(minus(high, low)) / 2), 1), 40) };
   }
 
   private list(moment: number): void {
