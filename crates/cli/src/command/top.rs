@@ -30,7 +30,9 @@ pub(crate) fn run(arguments: &TopArguments, tls: &ClientTls) -> Result<(), Failu
             let text = |most| format!("{}\n\n{workers}", status.text(&directory, colours, most));
             // Where there is little room, fewer lines of a kind leave some for the others.
             let most = match repainting::room().filter(|_| !arguments.once) {
-                Some((width, height)) => (LEAST_LINES..=MOST_LINES).rev().find(|most| fits(&text(*most), width, height)),
+                Some((width, height)) => {
+                    (LEAST_LINES..=MOST_LINES).rev().find(|most| fits(&text(*most), width, height))
+                }
                 None => Some(MOST_LINES),
             };
             Ok::<String, Failure>(text(most.unwrap_or(LEAST_LINES)))
