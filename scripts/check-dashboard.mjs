@@ -90,6 +90,20 @@ async function axe(page, what) {
   assert.deepEqual(result.value, [], `axe on ${what}`);
 }
 
+/** On a phone in landscape nothing is wider than it, and what steers and what chooses is in view. */
+async function fitsPhone(page, name) {
+  const { wide, tall, beyond } = await page.evaluate(() => ({
+    wide: document.documentElement.scrollWidth - innerWidth,
+    tall: document.querySelector("main").clientHeight,
+    beyond: [...document.querySelectorAll("header.top > :not(.skip), header.top button, header.top a[aria-current=page]")]
+      .filter((one) => one.getBoundingClientRect().right > innerWidth || one.getBoundingClientRect().left < 0)
+      .map((one) => one.textContent),
+  }));
+  assert.ok(wide <= 0, `${name} is ${wide} px wider than the phone`);
+  assert.ok(tall >= 220, `${name} has ${tall} px for itself`);
+  assert.deepEqual(beyond, [], `${name} on a phone: cut off in the line at the top`);
+}
+
 async function shot(page, name) {
   await page.screenshot({ path: join(SHOTS, `${name}.png`) });
 }
@@ -166,6 +180,17 @@ async function control() {
   await page.click("dialog button[value=yes]");
   await page.waitForSelector(".badge.paused");
   step("it is paused, once that was confirmed");
+  const phone = await open(shown.url, { viewport: { width: 740, height: 360 }, hasTouch: true });
+  await phone.waitForSelector(".badge.paused");
+  await phone.waitForSelector("header .danger");
+  for (const name of ["run", "cell"]) {
+    await go(phone, name);
+    await axe(phone, `${name} of a run that can be steered, on a phone`);
+    await shot(phone, `phone-${name}`);
+    await fitsPhone(phone, name);
+  }
+  assert.deepEqual(phone.problems, []);
+  await phone.context().close();
   await go(page, "network");
   const why = await until("a sentence that says why something waits", async () => {
     const texts = await page.locator("#waiting li").allTextContents();
@@ -378,10 +403,7 @@ async function replay(log) {
     await go(dark, name);
     await axe(dark, `${name}, dark, on a phone`);
     await shot(dark, `dark-phone-${name}`);
-    const wide = await dark.evaluate(() => document.documentElement.scrollWidth - innerWidth);
-    assert.ok(wide <= 0, `${name} is ${wide} px wider than the phone`);
-    const tall = await dark.evaluate(() => document.querySelector("main").clientHeight);
-    assert.ok(tall >= 220, `${name} has ${tall} px for itself`);
+    await fitsPhone(dark, name);
   }
   assert.deepEqual(dark.problems, []);
   await dark.context().close();
@@ -458,8 +480,8 @@ function pickAndPlace() {
 }
 
 /** How many colours there are on the canvas in 3D, and what its pixels add up to, in the frame in which it was painted. */
-const painted = (page) =>
-  page.evaluate(async () => {
+async function painted(page, choose = () => false) {
+  const { counts, all, sum } = await page.evaluate(async () => {
     const canvas = document.querySelector("canvas");
     // It paints in the next frame, before what is asked for after it.
     for (const key of ["+", "-"]) canvas.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
@@ -474,8 +496,11 @@ const painted = (page) =>
       counts.set(colour, (counts.get(colour) ?? 0) + 1);
       sum = (sum * 31 + colour) >>> 0;
     }
-    return { colours: counts.size, background: Math.max(...counts.values()) / (data.length / 4), sum };
+    return { counts: [...counts], all: data.length / 4, sum };
   });
+  const chosen = counts.filter(([colour]) => choose(colour >> 16, (colour >> 8) & 255, colour & 255)).reduce((sum, [, count]) => sum + count, 0);
+  return { colours: counts.length, background: Math.max(...counts.map(([, count]) => count)) / all, sum, chosen };
+}
 
 /** Two fingers go apart. */
 async function pinch(page, x, y) {
@@ -626,6 +651,53 @@ async function cell() {
   both.child.kill("SIGTERM");
   await both.ended;
   step("a log is shown with the robot that it names, or says which one it needs");
+}
+
+/** A robot whose description says what is seen of it: meshes in their colours, and one that is not there. */
+async function visuals() {
+  const place = join(PLACE, "robot");
+  mkdirSync(place);
+  const mesh = (file, more) => `<visual><geometry><mesh filename="${file}"/></geometry>${more}</visual>`;
+  const red = '<material name="red"><color rgba="1 0 0 1"/></material>';
+  const seen = { base: mesh("tower.obj", red), arm_4: mesh("tower.obj", ""), hand: mesh("gone.stl", "") };
+  let urdf = readFileSync("crates/motion/robots/aimm.urdf", "utf8");
+  for (const [link, visual] of Object.entries(seen)) urdf = urdf.replace(`<link name="${link}">`, `$&${visual}`);
+  writeFileSync(join(place, "aimm.urdf"), urdf);
+  for (const file of ["aimm.toml", "aimm.srdf"]) writeFileSync(join(place, file), readFileSync(`crates/motion/robots/${file}`));
+  // A tower of four sides, with a tip.
+  writeFileSync(join(place, "tower.obj"), "v -.3 -.3 0\nv .3 -.3 0\nv .3 .3 0\nv -.3 .3 0\nv 0 0 .9\nf 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\nf 4 3 2 1\n");
+  const log = join(PLACE, "seen.jsonl");
+  writeFileSync(log, pickAndPlace());
+  const shown = await dashboard([log, "--robot", join(place, "aimm.toml"), "--runtime-dir", join(PLACE, "nothing")]);
+  const page = await open(shown.url);
+  const asked = [];
+  page.on("request", (request) => request.url().includes("/api/mesh") && asked.push(new URL(request.url()).search));
+  await go(page, "cell");
+  await page.waitForFunction(() => document.querySelector("canvas")?.dataset.meshes === "2");
+  assert.equal(asked.length, 1, `a mesh that two links show is asked for once: ${asked}`);
+  await page.waitForFunction(() => document.querySelector("aside").textContent.includes("Not seen of it: hand: the mesh `gone.stl`"));
+  const isRed = (red, green, blue) => red > 90 && red > 8 * green && red > 8 * blue;
+  const drawn = await painted(page, isRed);
+  assert.ok(drawn.chosen > 500, `${drawn.chosen} red points of the mesh`);
+  await axe(page, "the cell of a robot with visuals");
+  await shot(page, "cell-visuals");
+  await page.click("text=What can collide");
+  await page.waitForFunction(() => document.querySelector("canvas").dataset.meshes === "0");
+  assert.equal((await painted(page, isRed)).chosen, 0, "what can collide has the colour of every robot");
+  await page.click("text=What can collide");
+  await page.waitForFunction(() => document.querySelector("canvas").dataset.meshes === "2");
+  // A replay shows them where the joints are.
+  await page.locator("footer input[type=range]").evaluate((slider) => {
+    slider.value = "8.5";
+    slider.dispatchEvent(new Event("input"));
+  });
+  await page.waitForFunction(() => document.querySelector("#moving")?.textContent.includes("transfer"));
+  assert.notEqual((await painted(page, isRed)).sum, drawn.sum);
+  assert.deepEqual(page.problems, []);
+  await page.context().close();
+  shown.child.kill("SIGTERM");
+  await shown.ended;
+  step(`a robot is drawn by the meshes of its description, in their colours: ${drawn.chosen} points are those of a red one`);
 }
 
 async function large() {
@@ -848,8 +920,7 @@ async function annotations() {
   await dark.waitForSelector('[data-key="duration 0"]');
   await axe(dark, "Annotations, dark, on a phone");
   await shot(dark, "dark-phone-annotations");
-  const wide = await dark.evaluate(() => document.documentElement.scrollWidth - innerWidth);
-  assert.ok(wide <= 0, `Annotations is ${wide} px wider than the phone`);
+  await fitsPhone(dark, "Annotations");
   assert.deepEqual(dark.problems, []);
   await dark.context().close();
   step("a file that somebody else has written is read again; dark, on a phone, axe finds nothing");
@@ -863,6 +934,7 @@ try {
   const live = wants("control") ? await control() : "crates/report/src/fixtures/two_boxes.jsonl";
   if (wants("replay")) await replay(live);
   if (wants("cell")) await cell();
+  if (wants("visuals")) await visuals();
   if (wants("annotations")) await annotations();
   if (wants("injected")) await injected();
   if (wants("large")) await large();

@@ -10,6 +10,7 @@ mod colour;
 mod columns;
 mod command;
 mod failure;
+mod fitted;
 mod input;
 mod interrupt;
 mod live;

@@ -4,6 +4,7 @@
 //! error, except when its reader has had enough of it (`ratn report LOG | head`).
 
 use crate::failure::Failure;
+use crate::fitted::{rows, visible};
 use nix::errno::Errno;
 use nix::unistd::{AccessFlags, access};
 use ratn_task_control::Messages;
@@ -70,25 +71,10 @@ impl Progress {
             return String::new();
         }
         let width = terminal_size::terminal_size_of(io::stderr()).map_or(usize::MAX, |(width, _)| usize::from(width.0));
-        format!("\x1b[{}A\r\x1b[J", rows(&area, width))
+        // A terminal that has become narrower since breaks those that are longer.
+        let all: usize = area.iter().map(|length| rows(*length, width)).sum();
+        format!("\x1b[{all}A\r\x1b[J")
     }
-}
-
-/// How many rows lines take: a terminal that has become narrower since breaks those that are longer.
-fn rows(lengths: &[usize], width: usize) -> usize {
-    lengths.iter().map(|length| length.div_ceil(width.max(1)).max(1)).sum()
-}
-
-/// How many characters of a line are seen: without what colours it.
-fn visible(line: &str) -> usize {
-    let mut is_colour = false;
-    let seen = line.chars().filter(|c| {
-        is_colour |= *c == '\x1b';
-        let is_seen = !is_colour;
-        is_colour &= *c != 'm';
-        is_seen
-    });
-    seen.count()
 }
 
 /// [`progress`], for task control.
@@ -156,12 +142,6 @@ fn write(to: &mut impl Write, text: &impl Display) -> anyhow::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_line_that_is_broken_by_a_narrower_terminal_takes_several_rows() {
-        assert_eq!(visible("\x1b[32mruns  plan\x1b[0m"), 10);
-        assert_eq!((rows(&[10, 0, 25], 80), rows(&[10, 0, 25], 10), rows(&[3], 0)), (3, 5, 3));
-    }
 
     struct Broken(ErrorKind);
 

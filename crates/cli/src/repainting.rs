@@ -1,5 +1,8 @@
-//! What is shown again whenever it changes: on a terminal in the same place, elsewhere one text after the other.
+//! What is shown again whenever it changes: on a terminal in the same place, as much as there is room for, elsewhere one text after the
+//! other.
 
+use crate::colour::can_paint;
+use crate::fitted::fitted;
 use crate::output;
 use std::io::IsTerminal;
 use std::time::Duration;
@@ -16,10 +19,14 @@ pub(crate) async fn repeat<E: From<anyhow::Error>>(
 ) -> Result<(), E> {
     let mut shown: Option<String> = None;
     loop {
-        let text = look().await?;
+        let mut text = look().await?;
+        let room = room().filter(|_| watch && !json);
+        if let Some((width, height)) = room {
+            text = fitted(&text, width, height);
+        }
         if shown.as_ref() != Some(&text) {
             let reads = match watch && !json {
-                true if std::io::stdout().is_terminal() => output::line(format_args!("\x1b[H\x1b[J{text}")),
+                true if room.is_some() => output::line(format_args!("\x1b[H\x1b[J{text}")),
                 true if shown.is_some() => output::line(format_args!("\n{text}")),
                 _ => output::line(&text),
             };
@@ -30,6 +37,15 @@ pub(crate) async fn repeat<E: From<anyhow::Error>>(
         }
         tokio::time::sleep(PERIOD).await;
     }
+}
+
+/// The columns and rows of the terminal of standard output, where it can be painted on. It may have others a moment later.
+pub(crate) fn room() -> Option<(usize, usize)> {
+    if !std::io::stdout().is_terminal() || !can_paint() {
+        return None;
+    }
+    let size = terminal_size::terminal_size_of(std::io::stdout());
+    Some(size.map_or((80, 24), |(width, height)| (width.0.into(), height.0.into())))
 }
 
 /// JSON as one document for people, or as one line of many.

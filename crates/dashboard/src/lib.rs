@@ -11,6 +11,7 @@ mod film;
 mod fold;
 mod gate;
 mod logs;
+mod looks;
 mod patience;
 mod robot;
 mod server;
@@ -22,5 +23,5 @@ mod world;
 
 pub use annotations::Editing;
 pub use logs::MAX_LOGS;
-pub use robot::Robots;
+pub use robot::{Known, Robots};
 pub use server::{Dashboard, DashboardError, Options, Tasks};

@@ -1,10 +1,13 @@
 //! A robot as the pages draw it: its links, its joints, and which of those an arm, a head, fingers or a base are. Pure.
 
 use crate::film::{Film, MOST_JOINTS, Part, Track};
+use crate::looks::{self, Packed};
 use crate::wire;
+use hyper::body::Bytes;
 use ratn_model::id::InstanceId;
 use ratn_model::pose::Pose;
 use ratn_motion::geometry::{Body, Geometry};
+use ratn_motion::looks::{Looks, VisualForm};
 use ratn_motion::robot::{Configuration, Robot};
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
 use std::collections::BTreeMap;
@@ -15,6 +18,8 @@ const MOST_LINKS: usize = 512;
 const MOST_SHAPES: usize = 4_096;
 /// Objects that are told.
 const MOST_OBJECTS: usize = 400;
+/// Visuals that are not read are named, the first of them.
+const MOST_LACKS: usize = 8;
 /// A longer name is cut.
 const MOST_CHARACTERS: usize = 200;
 /// The posture in which a cell begins.
@@ -24,11 +29,22 @@ const HOME: &str = "home";
 #[derive(Clone)]
 pub struct Robots(Arc<Load>);
 
-type Load = dyn Fn(&str) -> Result<(Robot, String), String> + Send + Sync;
+type Load = dyn Fn(&str) -> Result<Known, String> + Send + Sync;
+
+/// A robot that is known.
+#[derive(Debug)]
+pub struct Known {
+    /// The robot.
+    pub robot: Robot,
+    /// What it looks like. A robot without visuals is drawn as what of it can collide.
+    pub looks: Looks,
+    /// Whence it is known, in a few words.
+    pub whence: String,
+}
 
 impl Robots {
-    /// Loads it so, given what the log says of it: a name or a path, or nothing. Beside the robot stands whence it is known, in a few words.
-    pub fn by(load: impl Fn(&str) -> Result<(Robot, String), String> + Send + Sync + 'static) -> Robots {
+    /// Loads it so, given what the log says of it: a name or a path, or nothing.
+    pub fn by(load: impl Fn(&str) -> Result<Known, String> + Send + Sync + 'static) -> Robots {
         Robots(Arc::new(load))
     }
 
@@ -38,7 +54,7 @@ impl Robots {
     }
 
     pub(crate) fn load(&self, of_log: &str) -> Result<Shown, String> {
-        (self.0)(of_log).and_then(|(robot, whence)| Shown::of(&robot, whence))
+        (self.0)(of_log).and_then(|known| Shown::of(&known))
     }
 }
 
@@ -52,6 +68,8 @@ impl std::fmt::Debug for Robots {
 #[derive(Debug)]
 pub(crate) struct Shown {
     told: wire::Robot,
+    /// The meshes of its visuals, by their numbers.
+    meshes: Vec<Bytes>,
     joints: BTreeMap<String, usize>,
     arms: Vec<Arm>,
     head: Vec<usize>,
@@ -67,9 +85,10 @@ struct Arm {
 }
 
 impl Shown {
-    fn of(robot: &Robot, whence: String) -> Result<Shown, String> {
+    fn of(known: &Known) -> Result<Shown, String> {
+        let Known { robot, looks, whence } = known;
         let model = &robot.model;
-        let shapes: usize = model.links.iter().map(|link| link.bodies.len()).sum();
+        let shapes = model.links.iter().map(|link| link.bodies.len()).sum::<usize>().max(looks.visuals.len());
         if model.links.len() > MOST_LINKS || model.joints.len() > MOST_LINKS || shapes > MOST_SHAPES {
             return Err(format!(
                 "{} has {} links and {shapes} shapes: at most {MOST_LINKS} and {MOST_SHAPES} are shown",
@@ -94,11 +113,13 @@ impl Shown {
         let slides = |index: usize| {
             model.links.iter().filter_map(|link| link.drive).any(|drive| drive.joint == index && drive.slides)
         };
+        let packed = looks::packed(&looks.meshes);
         let told = wire::Robot {
             known: true,
             name: robot.name().to_owned(),
-            note: whence,
-            links: model.links.iter().map(link).collect(),
+            note: whence.clone(),
+            lacks: lacks(looks),
+            links: model.links.iter().map(|one| link(one, visuals(one, looks, &packed))).collect(),
             joints: (model.joints.iter().enumerate())
                 .map(|(index, joint)| wire::Joint {
                     name: joint.name.clone(),
@@ -108,7 +129,14 @@ impl Shown {
                 .collect(),
             tools,
         };
-        Ok(Shown { told, arms, head: indices(robot.head_joints()), base: indices(robot.base_joints()), joints })
+        let (head, base) = (indices(robot.head_joints()), indices(robot.base_joints()));
+        let meshes = packed.into_iter().map(|mesh| Bytes::from(mesh.bytes)).collect();
+        Ok(Shown { told, meshes, arms, head, base, joints })
+    }
+
+    /// The corners of a mesh, by its number ([`looks`]).
+    pub(crate) fn mesh(&self, number: usize) -> Option<Bytes> {
+        self.meshes.get(number).cloned()
     }
 
     /// As the pages know it.
@@ -251,7 +279,40 @@ pub(crate) fn true_object(name: &str, size: [f64; 3], pose: &Pose, held: bool) -
     wire::Object { name: cut(name), shape: shape("box", &size, pose), held }
 }
 
-fn link(link: &ratn_motion::robot::Link) -> wire::Link {
+/// What of a link is seen. Of one of which something cannot be read that is what can collide, too.
+fn visuals(link: &ratn_motion::robot::Link, looks: &Looks, packed: &[Packed]) -> Vec<wire::Visual> {
+    let own = looks.visuals.iter().filter(|visual| visual.link == link.name);
+    let mut seen: Vec<wire::Visual> = own
+        .map(|visual| {
+            let colour = visual.colour.map(|colour| colour.map(round).to_vec());
+            match &visual.form {
+                VisualForm::Primitive(primitive) => wire::Visual { shape: body(primitive), mesh: None, colour },
+                VisualForm::Mesh { mesh, pose } => {
+                    let centre = Pose { position: packed[*mesh].centre, ..Pose::IDENTITY };
+                    let shape = shape("mesh", &packed[*mesh].size, &pose.compose(&centre));
+                    wire::Visual { shape, mesh: Some(*mesh), colour }
+                }
+            }
+        })
+        .collect();
+    if !looks.visuals.is_empty() && looks.lacks.iter().any(|lack| lack.link == link.name) {
+        let stands_in = |one: &Body| wire::Visual { shape: body(one), mesh: None, colour: None };
+        seen.extend(link.bodies.iter().map(stands_in));
+    }
+    seen
+}
+
+/// What is not seen of a robot, in a sentence each.
+fn lacks(looks: &Looks) -> Vec<String> {
+    let told = looks.lacks.iter().take(MOST_LACKS).map(|lack| match lack.link.as_str() {
+        "" => cut(&lack.reason),
+        link => cut(&format!("{link}: {}", lack.reason)),
+    });
+    let more = looks.lacks.len().saturating_sub(MOST_LACKS);
+    told.chain((more > 0).then(|| format!("{more} more"))).collect()
+}
+
+fn link(link: &ratn_motion::robot::Link, visuals: Vec<wire::Visual>) -> wire::Link {
     wire::Link {
         name: link.name.clone(),
         parent: link.parent,
@@ -261,6 +322,7 @@ fn link(link: &ratn_motion::robot::Link) -> wire::Link {
         slides: link.drive.is_some_and(|drive| drive.slides),
         factor: link.drive.map_or(1.0, |drive| drive.factor),
         shapes: link.bodies.iter().map(body).collect(),
+        visuals,
     }
 }
 
@@ -311,7 +373,8 @@ mod tests {
     use super::*;
 
     fn shown(name: &str) -> Shown {
-        Shown::of(&Robot::built_in(name).unwrap(), "the test".to_owned()).unwrap()
+        let (robot, looks) = (Robot::built_in(name).unwrap(), Looks::default());
+        Shown::of(&Known { robot, looks, whence: "the test".to_owned() }).unwrap()
     }
 
     fn film(lines: &[&str]) -> Film {

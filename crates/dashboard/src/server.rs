@@ -7,7 +7,8 @@ use crate::patience::Patient;
 use crate::robot::{self, Robots};
 use crate::system::{Heard, System};
 use crate::{task, wire};
-use hyper::body::{Body, Incoming};
+use http_body_util::Full;
+use hyper::body::{Body, Bytes, Incoming};
 use hyper::header::{ALLOW, CONTENT_TYPE, HeaderValue};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
@@ -51,6 +52,7 @@ const MOST_ROBOTS: usize = 16;
 /// A robot that could not be read is not tried again for so long.
 const ROBOT_AGAIN: Duration = Duration::from_secs(3);
 const JSON: &str = "application/json";
+const BYTES: &str = "application/octet-stream";
 
 /// The pages, as `scripts/build-dashboard` makes them of `web/`.
 const PAGES: [(&str, &str, &str); 5] = [
@@ -240,6 +242,7 @@ enum Told {
 /// What a page is answered.
 enum Answer {
     Json(String),
+    Bytes(Bytes),
     Refused(StatusCode, String),
 }
 
@@ -384,12 +387,12 @@ async fn body(mut incoming: Incoming) -> Option<Vec<u8>> {
 }
 
 impl Shown {
-    async fn answer(&self, head: &Head, body: &[u8]) -> Response<String> {
+    async fn answer(&self, head: &Head, body: &[u8]) -> Response<Full<Bytes>> {
         let path = head.uri.path();
         if let Some((_, kind, page)) = PAGES.iter().find(|(name, _, _)| *name == path) {
             return match (gate::asks_here(&head.headers), &head.method) {
                 (Err(refused), _) => refusal(StatusCode::FORBIDDEN, &refused.to_string()),
-                (Ok(_), &Method::GET) => response(StatusCode::OK, kind, (*page).to_owned()),
+                (Ok(_), &Method::GET) => response(StatusCode::OK, kind, *page),
                 (Ok(_), _) => not_allowed("GET"),
             };
         }
@@ -404,6 +407,7 @@ impl Shown {
             (&Method::GET, "/api/task") => self.task(&query).await,
             (&Method::GET, "/api/world") => self.world(&query).await,
             (&Method::GET, "/api/robot") => self.robot(&query).await,
+            (&Method::GET, "/api/mesh") => self.mesh(&query).await,
             (&Method::GET, "/api/cell") => self.cell(&query).await,
             (&Method::GET, "/api/system") => json(&self.system.told().await),
             (&Method::GET, "/api/tail") => self.tail(&query).await,
@@ -422,8 +426,8 @@ impl Shown {
             (_, "/api/control" | "/api/scale") => return not_allowed("POST"),
             (
                 _,
-                "/api/about" | "/api/run" | "/api/task" | "/api/world" | "/api/robot" | "/api/cell" | "/api/system"
-                | "/api/tail",
+                "/api/about" | "/api/run" | "/api/task" | "/api/world" | "/api/robot" | "/api/mesh" | "/api/cell"
+                | "/api/system" | "/api/tail",
             ) => {
                 return not_allowed("GET");
             }
@@ -431,6 +435,7 @@ impl Shown {
         };
         match answer {
             Answer::Json(text) => response(StatusCode::OK, JSON, text),
+            Answer::Bytes(bytes) => response(StatusCode::OK, BYTES, bytes),
             Answer::Refused(status, problem) => refusal(status, &problem),
         }
     }
@@ -512,6 +517,28 @@ impl Shown {
         .await
     }
 
+    /// The corners of a mesh of the robot of a log: by number, so that no question can name a file.
+    async fn mesh(&self, query: &Query<'_>) -> Answer {
+        let id = match query.asked() {
+            Ok((id, _)) => id,
+            Err(problem) => return Answer::Refused(StatusCode::BAD_REQUEST, problem),
+        };
+        let Some(number) = query.number("mesh").and_then(|number| usize::try_from(number).ok()) else {
+            let problem = "say which mesh: `mesh=NUMBER`, as /api/robot lists them".to_owned();
+            return Answer::Refused(StatusCode::BAD_REQUEST, problem);
+        };
+        let robots = self.robots.clone();
+        self.looking(move |logs| {
+            let known = robots.get(&logs.robot(id)?);
+            Ok(match known.as_deref().map(|shown| shown.mesh(number)) {
+                Ok(Some(bytes)) => Answer::Bytes(bytes),
+                Ok(None) => Answer::Refused(StatusCode::NOT_FOUND, format!("the robot has no mesh {number}")),
+                Err(problem) => Answer::Refused(StatusCode::NOT_FOUND, problem.clone()),
+            })
+        })
+        .await
+    }
+
     async fn cell(&self, query: &Query<'_>) -> Answer {
         let (id, asked) = match query.asked() {
             Ok(asked) => asked,
@@ -532,18 +559,28 @@ impl Shown {
         .await
     }
 
-    /// Reads a log in a thread in which that keeps nobody waiting.
+    /// Reads a log for an answer in JSON.
     async fn reading(
         &self,
         read: impl FnOnce(&Logs) -> Result<serde_json::Result<String>, NotTold> + Send + 'static,
     ) -> Answer {
+        self.looking(move |logs| {
+            Ok(match read(logs)? {
+                Ok(text) => Answer::Json(text),
+                Err(error) => Answer::Refused(StatusCode::INTERNAL_SERVER_ERROR, error.to_string()),
+            })
+        })
+        .await
+    }
+
+    /// Looks at the logs in a thread in which that keeps nobody waiting.
+    async fn looking(&self, look: impl FnOnce(&Logs) -> Result<Answer, NotTold> + Send + 'static) -> Answer {
         let Ok(_place) = self.reading.acquire().await else {
             return Answer::Refused(StatusCode::SERVICE_UNAVAILABLE, "the dashboard ends".to_owned());
         };
         let logs = self.logs.clone();
-        match tokio::task::spawn_blocking(move || read(&logs)).await {
-            Ok(Ok(Ok(text))) => Answer::Json(text),
-            Ok(Ok(Err(error))) => Answer::Refused(StatusCode::INTERNAL_SERVER_ERROR, error.to_string()),
+        match tokio::task::spawn_blocking(move || look(&logs)).await {
+            Ok(Ok(answer)) => answer,
             Ok(Err(error @ NotTold::Unknown(_))) => Answer::Refused(StatusCode::NOT_FOUND, error.to_string()),
             Ok(Err(error @ NotTold::Log(_))) => Answer::Refused(StatusCode::UNPROCESSABLE_ENTITY, chain(&error)),
             Err(_) => {
@@ -751,19 +788,19 @@ fn chain(error: &dyn std::error::Error) -> String {
     text
 }
 
-fn refusal(status: StatusCode, problem: &str) -> Response<String> {
+fn refusal(status: StatusCode, problem: &str) -> Response<Full<Bytes>> {
     let refusal = wire::Refusal { problem: problem.to_owned() };
     response(status, JSON, serde_json::to_string(&refusal).unwrap_or_default())
 }
 
-fn not_allowed(method: &'static str) -> Response<String> {
+fn not_allowed(method: &'static str) -> Response<Full<Bytes>> {
     let mut response = refusal(StatusCode::METHOD_NOT_ALLOWED, &format!("only {method}"));
     response.headers_mut().insert(ALLOW, HeaderValue::from_static(method));
     response
 }
 
-fn response(status: StatusCode, kind: &'static str, body: String) -> Response<String> {
-    let mut response = Response::new(body);
+fn response(status: StatusCode, kind: &'static str, body: impl Into<Bytes>) -> Response<Full<Bytes>> {
+    let mut response = Response::new(Full::new(body.into()));
     *response.status_mut() = status;
     let headers = response.headers_mut();
     headers.insert(CONTENT_TYPE, HeaderValue::from_static(kind));

@@ -597,6 +597,8 @@ wire! {
         name: String,
         /// Whence it is known, or why it is not.
         note: String,
+        /// What of its visuals is not drawn, and why, in a sentence each.
+        lacks: Vec<String>,
         /// Parents before children; the first one is where the world's origin is.
         links: Vec<Link>,
         /// The joints that have a position of their own; the links say which of them moves what.
@@ -623,6 +625,18 @@ wire! {
         factor: f64,
         /// What of it can collide.
         shapes: Vec<Shape>,
+        /// What of it is seen. A robot on which nothing is seen is drawn as what of it can collide.
+        visuals: Vec<Visual>,
+    }
+
+    /// A shape that is seen.
+    Visual {
+        /// Its form.
+        shape: Shape,
+        /// Of a mesh the number by which its corners are asked for.
+        mesh: Option<usize>,
+        /// Red, green and blue from 0 to 1; none where the robot's description says none.
+        colour: Option<Vec<f64>>,
     }
 
     /// A joint.
@@ -643,11 +657,11 @@ wire! {
         quaternion: Vec<f64>,
     }
 
-    /// A primitive, its axis along z.
+    /// A primitive, its axis along z, or a mesh in its bounding box.
     Shape {
-        /// `box`, `cylinder`, `capsule` or `sphere`.
+        /// `box`, `cylinder`, `capsule`, `sphere`, or of a visual also `mesh`.
         kind: &'static str,
-        /// Of a box its edges along x, y, z; else the radius and the length along z, of a capsule that of its straight part.
+        /// Of a box and of the box around a mesh the edges along x, y, z; else the radius and the length along z, of a capsule that of its straight part.
         size: Vec<f64>,
         /// Where its centre is.
         at: Place,

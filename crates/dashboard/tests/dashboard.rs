@@ -2,10 +2,12 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
-use ratn_dashboard::{Dashboard, DashboardError, Editing, MAX_LOGS, Options, Robots};
+use ratn_dashboard::{Dashboard, DashboardError, Editing, Known, MAX_LOGS, Options, Robots};
 use ratn_executive::protocol::Mode;
 use ratn_model::catalogue::Catalogue;
 use ratn_model::load::load;
+use ratn_motion::looks::Looks;
+use ratn_motion::mesh::MeshError;
 use ratn_motion::robot::Robot;
 use ratn_task_control::control::RunStatus;
 use ratn_worker::tls::ClientTls;
@@ -43,8 +45,12 @@ impl Answer {
 
 fn options(logs: &[&Path], directory: &Path) -> Options {
     let logs = logs.iter().map(|path| path.to_path_buf()).collect();
-    let robots = Robots::by(|_| Ok((Robot::aimm(), "the built-in robot".to_owned())));
+    let robots = Robots::by(|_| Ok(known(Robot::aimm(), "the built-in robot")));
     Options { logs, robots, patience: PATIENCE, ..Options::of(directory.to_owned(), ClientTls::none()) }
+}
+
+fn known(robot: Robot, whence: &str) -> Known {
+    Known { robot, looks: Looks::default(), whence: whence.to_owned() }
 }
 
 async fn serve(logs: &[&Path], control: bool) -> Served {
@@ -63,7 +69,7 @@ impl Served {
         connection.write_all(request.as_bytes()).await.unwrap();
         let mut answer = Vec::new();
         let _ = connection.read_to_end(&mut answer).await;
-        let answer = String::from_utf8(answer).unwrap();
+        let answer = String::from_utf8_lossy(&answer);
         let (head, body) = answer.split_once("\r\n\r\n").unwrap_or((&answer, ""));
         let status = head.split(' ').nth(1).and_then(|status| status.parse().ok()).unwrap_or(0);
         Answer { status, head: head.to_lowercase(), body: body.to_owned() }
@@ -296,10 +302,10 @@ async fn each_log_is_shown_with_the_robot_that_it_names() {
     };
     let files = [of("ur5"), of("panda"), of("nobody"), log_of(&[started("earlier")])];
     let robots = Robots::by(|of_log| match of_log {
-        "" => Ok((Robot::aimm(), "the built-in robot".to_owned())),
-        _ => Robot::built_in(of_log)
-            .map(|robot| (robot, "as the log says".to_owned()))
-            .ok_or(format!("there is no {of_log}")),
+        "" => Ok(known(Robot::aimm(), "the built-in robot")),
+        _ => {
+            Robot::built_in(of_log).map(|robot| known(robot, "as the log says")).ok_or(format!("there is no {of_log}"))
+        }
     });
     let paths: Vec<&Path> = files.iter().map(tempfile::NamedTempFile::path).collect();
     let dashboard = Dashboard::bind(Options { robots, ..options(&paths, place.path()) }).await.unwrap();
@@ -323,6 +329,79 @@ async fn each_log_is_shown_with_the_robot_that_it_names() {
             r#"true "aimm" "the built-in robot" true"#
         ]
     );
+}
+
+/// A built-in robot, and what would be seen of some of its links.
+fn seen_robot(links: &str) -> Known {
+    let looks = Looks::read(&format!("<robot name='seen'>{links}</robot>"), &mut |file| match file {
+        "one.obj" => Ok(b"v 0 0 0\nv 2 0 0\nv 0 4 0\nf 1 2 3\n".to_vec()),
+        _ => Err(MeshError::Read { reason: "there is no such file".to_owned() }),
+    });
+    Known { looks, ..known(Robot::built_in("panda").unwrap(), "as the log says") }
+}
+
+#[tokio::test]
+async fn visuals_are_told_and_their_meshes_served_by_number_and_nothing_else() {
+    let place = tempfile::tempdir().unwrap();
+    let links: Vec<String> =
+        Robot::built_in("panda").unwrap().model.links.iter().map(|link| link.name.clone()).collect();
+    let [one, two, three] = [&links[0], &links[1], &links[2]];
+    let visual = |geometry: &str| format!("<visual><origin xyz='1 0 0'/><geometry>{geometry}</geometry></visual>");
+    let described = format!(
+        "<link name='{one}'>{}{}</link><link name='{two}'>{}</link><link name='{three}'/>\
+         <joint name='a' type='fixed'><parent link='{one}'/><child link='{two}'/></joint>\
+         <joint name='b' type='fixed'><parent link='{one}'/><child link='{three}'/></joint>",
+        visual("<mesh filename='one.obj' scale='1 1 2'/>"),
+        visual("<sphere radius='0.5'/>")
+            .replace("</visual>", "<material name='m'><color rgba='1 0.5 0 1'/></material></visual>"),
+        visual("<mesh filename='/etc/passwd.stl'/>"),
+    );
+    let file = log_of(&[started("seen")]);
+    let robots = Robots::by(move |_| Ok(seen_robot(&described)));
+    let dashboard = Dashboard::bind(Options { robots, ..options(&[file.path()], place.path()) }).await.unwrap();
+    let url = dashboard.url();
+    let (address, token) = url.strip_prefix("http://").unwrap().split_once("/#token=").unwrap();
+    let served = Served { address: address.to_owned(), token: token.to_owned(), _place: place };
+    tokio::spawn(dashboard.serve());
+    let log = served.log().await;
+
+    let robot = served.get(&format!("/api/robot?log={log}")).await.json();
+    let visuals = &robot["links"][0]["visuals"];
+    let mesh = json!({ "shape": { "kind": "mesh", "size": [2.0, 4.0, 0.0], "at": { "position": [2.0, 2.0, 0.0], "quaternion": [0.0, 0.0, 0.0, 1.0] } }, "mesh": 0, "colour": null });
+    assert_eq!(visuals[0], mesh);
+    assert_eq!((&visuals[1]["colour"], &visuals[1]["shape"]["kind"]), (&json!([1.0, 0.5, 0.0]), &json!("sphere")));
+    // Of what cannot be read that is drawn what can collide, and the page says so; of a link without visuals nothing is seen.
+    assert_eq!(
+        robot["lacks"],
+        json!([format!("{two}: the mesh `/etc/passwd.stl`: cannot be read: there is no such file")])
+    );
+    let shapes = |link: usize| robot["links"][link]["shapes"].as_array().unwrap().clone();
+    let seen = |link: usize| {
+        robot["links"][link]["visuals"].as_array().unwrap().iter().map(|one| one["shape"].clone()).collect::<Vec<_>>()
+    };
+    assert!(!shapes(1).is_empty() && !shapes(2).is_empty());
+    assert_eq!((seen(1), seen(2)), (shapes(1), vec![]));
+
+    let corners = served.get(&format!("/api/mesh?log={log}&mesh=0")).await;
+    assert_eq!(corners.status, 200);
+    for header in ["content-type: application/octet-stream", "content-length: 36", "x-content-type-options: nosniff"] {
+        assert!(corners.head.contains(header), "{}", corners.head);
+    }
+    for (query, status) in [
+        (format!("log={log}&mesh=1"), 404),
+        (format!("log={log}&mesh=18446744073709551616"), 400),
+        (format!("log={log}&mesh=-1"), 400),
+        (format!("log={log}&mesh=/etc/passwd.stl"), 400),
+        (format!("log={log}"), 400),
+        ("log=99&mesh=0".to_owned(), 404),
+        ("mesh=0".to_owned(), 400),
+    ] {
+        assert_eq!(served.get(&format!("/api/mesh?{query}")).await.status, status, "{query}");
+    }
+    assert_eq!(served.ask("POST", &format!("/api/mesh?log={log}&mesh=0")).await.status, 405);
+    let unknown =
+        Served { token: "0".repeat(64), address: served.address.clone(), _place: tempfile::tempdir().unwrap() };
+    assert_eq!(unknown.get(&format!("/api/mesh?log={log}&mesh=0")).await.status, 401);
 }
 
 #[tokio::test]

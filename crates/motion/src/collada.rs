@@ -1,10 +1,11 @@
 //! Reading Collada (.dae): the geometries that the scene shows, moved as its nodes say, in metres by its `unit`.
 //!
-//! As in ROS the `up_axis` is not applied: the axes are those of the file. Triangles and polygons are read; materials, normals, textures
-//! and cameras say nothing of the shape. Skinned meshes and polygons with holes are refused, and faces that do not use up their list of
-//! corners. A geometry is read once, however often the scene shows it.
+//! As in ROS the `up_axis` is not applied: the axes are those of the file. Triangles and polygons are read; normals, textures
+//! and cameras are not. Skinned meshes and polygons with holes are refused, and faces that do not use up their list of
+//! corners. A geometry is read once, however often the scene shows it. Of materials the diffuse colour is read; what is wrong with one costs the
+//! colour alone, as it says nothing of the shape.
 
-use crate::mesh::{MAX_TRIANGLES, MeshError};
+use crate::mesh::{Colour, MAX_TRIANGLES, MeshError, Part};
 use crate::polygon;
 use crate::xml_text;
 use std::collections::BTreeMap;
@@ -32,8 +33,8 @@ const MOST_APART: usize = 1_000;
 
 const IDENTITY: Matrix = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
 
-/// The triangles of a file.
-pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
+/// The triangles of a file, with the colours of their materials.
+pub(crate) fn parts(bytes: &[u8]) -> Result<Vec<Part>, MeshError> {
     let root = read(bytes)?;
     let mut by_id = BTreeMap::new();
     collect(&root, &mut by_id);
@@ -47,8 +48,9 @@ pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
         positions: BTreeMap::new(),
         read: 0,
         arrays: BTreeMap::new(),
-        triangles: Vec::new(),
-        shown: 0,
+        shown: Vec::new(),
+        triangles: 0,
+        elements: 0,
     };
     let scene = root.child("scene").and_then(|scene| scene.child("instance_visual_scene"));
     match scene {
@@ -62,15 +64,15 @@ pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
         None => {
             for library in root.children_named("library_geometries") {
                 for geometry in library.children_named("geometry") {
-                    file.show(geometry, &IDENTITY)?;
+                    file.show(geometry, None, &IDENTITY)?;
                 }
             }
         }
     }
-    for corner in file.triangles.iter_mut().flatten() {
+    for corner in file.shown.iter_mut().flat_map(|part| &mut part.triangles).flatten() {
         *corner = corner.map(|c| c * meter);
     }
-    Ok(file.triangles)
+    Ok(file.shown)
 }
 
 /// The length of the file's unit, in metres.
@@ -190,17 +192,23 @@ fn collect<'e>(element: &'e Element, by_id: &mut BTreeMap<&'e str, &'e Element>)
 
 struct File<'e> {
     by_id: BTreeMap<&'e str, &'e Element>,
-    /// What has been read, by the place of its element in memory: triangles of geometries as the file has them,
-    geometries: BTreeMap<*const Element, Rc<[Triangle]>>,
+    /// What has been read, by the place of its element in memory: geometries as the file has them,
+    geometries: BTreeMap<*const Element, Rc<[Painted<'e>]>>,
     /// and positions of `vertices` and of sources.
     positions: BTreeMap<*const Element, Rc<[[f64; 3]]>>,
     /// How many these are, and the numbers of arrays, which several sources may share.
     read: usize,
     arrays: BTreeMap<*const Element, Rc<[f64]>>,
-    /// Of the scene.
+    /// The scene, and how many triangles and elements it has so far.
+    shown: Vec<Part>,
+    triangles: usize,
+    elements: usize,
+}
+
+/// Triangles of a geometry with the symbol of their material, which means something where the geometry is shown.
+struct Painted<'e> {
+    material: Option<&'e str>,
     triangles: Vec<Triangle>,
-    /// Elements so far.
-    shown: usize,
 }
 
 impl<'e> File<'e> {
@@ -213,8 +221,8 @@ impl<'e> File<'e> {
     }
 
     fn count(&mut self, element: &Element) -> Result<(), MeshError> {
-        self.shown += 1 + element.text.len() / LONG_TEXT;
-        if self.shown > MOST_SHOWN {
+        self.elements += 1 + element.text.len() / LONG_TEXT;
+        if self.elements > MOST_SHOWN {
             let reason = "the scene shows too many nodes, or instances of them";
             return Err(element.wrong(format!("{reason}: at most {MOST_SHOWN} elements are supported, export it flat")));
         }
@@ -249,7 +257,7 @@ impl<'e> File<'e> {
             match child.name.as_str() {
                 "node" => self.node(child, &place, depth + 1)?,
                 "instance_node" => self.node(self.named(child, "url")?, &place, depth + 1)?,
-                "instance_geometry" => self.show(self.named(child, "url")?, &place)?,
+                "instance_geometry" => self.show(self.named(child, "url")?, Some(child), &place)?,
                 "instance_controller" => {
                     return Err(child.wrong("skinned meshes are not supported: export it without controllers"));
                 }
@@ -259,43 +267,70 @@ impl<'e> File<'e> {
         Ok(())
     }
 
-    /// Adds the triangles of a geometry to the scene.
-    fn show(&mut self, geometry: &'e Element, place: &Matrix) -> Result<(), MeshError> {
+    /// Adds the triangles of a geometry to the scene, with the materials of its instance there.
+    fn show(&mut self, geometry: &'e Element, instance: Option<&'e Element>, place: &Matrix) -> Result<(), MeshError> {
         self.count(geometry)?;
-        let triangles = match self.geometries.get(&std::ptr::from_ref(geometry)) {
+        let painted = match self.geometries.get(&std::ptr::from_ref(geometry)) {
             Some(read) => read.clone(),
             None => {
-                let read: Rc<[Triangle]> = self.geometry(geometry)?.into();
+                let read: Rc<[Painted<'e>]> = self.geometry(geometry)?.into();
                 self.geometries.insert(geometry, read.clone());
                 read
             }
         };
-        let all = self.triangles.len() + triangles.len();
-        if all > MAX_TRIANGLES {
-            return Err(MeshError::Count { triangles: all });
+        self.triangles += painted.iter().map(|part| part.triangles.len()).sum::<usize>();
+        if self.triangles > MAX_TRIANGLES {
+            return Err(MeshError::Count { triangles: self.triangles });
         }
         // What is mirrored is turned, so that the same side is outside.
         let is_mirrored = determinant(place) < 0.0;
-        self.triangles.extend(triangles.iter().map(|triangle| {
-            let [a, b, c] = triangle.map(|corner| apply(place, corner));
-            if is_mirrored { [a, c, b] } else { [a, b, c] }
-        }));
+        for part in painted.iter() {
+            let colour = part.material.and_then(|symbol| self.colour(symbol, instance));
+            let moved = part.triangles.iter().map(|triangle| {
+                let [a, b, c] = triangle.map(|corner| apply(place, corner));
+                if is_mirrored { [a, c, b] } else { [a, b, c] }
+            });
+            match self.shown.last_mut() {
+                Some(last) if last.colour == colour => last.triangles.extend(moved),
+                _ => self.shown.push(Part { colour, triangles: moved.collect() }),
+            }
+        }
         Ok(())
     }
 
-    fn geometry(&mut self, geometry: &'e Element) -> Result<Vec<Triangle>, MeshError> {
+    /// The diffuse colour of the material that a symbol means where a geometry is shown.
+    fn colour(&self, symbol: &str, instance: Option<&'e Element>) -> Option<Colour> {
+        let bound = instance?.child("bind_material")?.child("technique_common")?;
+        let is_meant = |one: &&Element| one.attribute("symbol") == Some(symbol);
+        let material = self.named(bound.children_named("instance_material").find(is_meant)?, "target").ok()?;
+        let effect = self.named(material.child("instance_effect")?, "url").ok()?;
+        let shading = effect.child("profile_COMMON")?.child("technique")?;
+        let diffuse = shading.children.iter().find_map(|model| model.child("diffuse"))?;
+        let colour: Vec<f64> = diffuse.child("color")?.numbers().ok()?;
+        colour.first_chunk().copied()
+    }
+
+    fn geometry(&mut self, geometry: &'e Element) -> Result<Vec<Painted<'e>>, MeshError> {
         let mesh = geometry.child("mesh").ok_or_else(|| geometry.wrong("a geometry that is no `mesh`"))?;
-        let mut triangles = Vec::new();
+        let (mut painted, mut count) = (Vec::new(), 0);
         for part in &mesh.children {
             match part.name.as_str() {
-                "triangles" | "polylist" | "polygons" => self.faces(part, &mut triangles)?,
+                "triangles" | "polylist" | "polygons" => {
+                    let mut triangles = Vec::new();
+                    self.faces(part, &mut triangles)?;
+                    count += triangles.len();
+                    if count > MAX_TRIANGLES {
+                        return Err(MeshError::Count { triangles: count });
+                    }
+                    painted.push(Painted { material: part.attribute("material"), triangles });
+                }
                 "trifans" | "tristrips" => {
                     return Err(part.wrong(format!("`{}` are not supported: export triangles", part.name)));
                 }
                 _ => {}
             }
         }
-        Ok(triangles)
+        Ok(painted)
     }
 
     fn faces(&mut self, part: &'e Element, triangles: &mut Vec<Triangle>) -> Result<(), MeshError> {

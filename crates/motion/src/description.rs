@@ -202,16 +202,8 @@ impl Robot {
     /// # Errors
     /// [`DescriptionError`] names the file and what does not fit.
     pub fn from_file(file: &Path) -> Result<Robot, DescriptionError> {
-        let text = read_text(file)?;
-        let description =
-            RobotDescription::read(&text).map_err(|reason| DescriptionError::Form { file: file.to_owned(), reason })?;
-        let folder = file.parent().unwrap_or(Path::new("."));
-        let urdf_file = folder.join(&description.urdf);
-        let urdf = read_text(&urdf_file)?;
-        let srdf_file = description.srdf.as_ref().map(|srdf| folder.join(srdf));
+        let Files { description, urdf_file, urdf, srdf_file, meshes } = Files::read(file)?;
         let srdf = srdf_file.as_deref().map(read_text).transpose()?;
-        let packages = description.packages.iter().map(|package| folder.join(package)).collect();
-        let meshes = MeshFiles { beside: urdf_file.parent().unwrap_or(folder).to_owned(), packages };
         let fault = |fault| {
             // A line is one of the file that has it.
             let file = match &fault {
@@ -222,6 +214,33 @@ impl Robot {
             DescriptionError::Fault { file: file.to_owned(), fault: Box::new(fault) }
         };
         Robot::of(description, &urdf, srdf.as_deref(), &mut |name| meshes.read(name)).map_err(fault)
+    }
+}
+
+/// What a `robot.toml` says, and the files that it names.
+pub(crate) struct Files {
+    description: RobotDescription,
+    urdf_file: PathBuf,
+    /// The text of the URDF.
+    pub(crate) urdf: String,
+    srdf_file: Option<PathBuf>,
+    /// Where the meshes are that the URDF names.
+    pub(crate) meshes: MeshFiles,
+}
+
+impl Files {
+    /// Reads the description and the URDF.
+    pub(crate) fn read(file: &Path) -> Result<Files, DescriptionError> {
+        let text = read_text(file)?;
+        let description =
+            RobotDescription::read(&text).map_err(|reason| DescriptionError::Form { file: file.to_owned(), reason })?;
+        let folder = file.parent().unwrap_or(Path::new("."));
+        let urdf_file = folder.join(&description.urdf);
+        let urdf = read_text(&urdf_file)?;
+        let srdf_file = description.srdf.as_ref().map(|srdf| folder.join(srdf));
+        let packages = description.packages.iter().map(|package| folder.join(package)).collect();
+        let meshes = MeshFiles { beside: urdf_file.parent().unwrap_or(folder).to_owned(), packages };
+        Ok(Files { description, urdf_file, urdf, srdf_file, meshes })
     }
 }
 

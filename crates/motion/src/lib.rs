@@ -35,6 +35,7 @@ pub mod keep;
 mod ladder;
 mod levers;
 pub mod line;
+pub mod looks;
 pub mod mechanism;
 pub mod mesh;
 pub mod mesh_files;

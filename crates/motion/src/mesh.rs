@@ -91,6 +91,15 @@ impl PartialEq for Mesh {
     }
 }
 
+/// Red, green and blue, each from 0 to 1.
+pub type Colour = [f64; 3];
+
+/// Triangles of a file that follow each other and have one colour, if the file says which.
+pub(crate) struct Part {
+    pub(crate) colour: Option<Colour>,
+    pub(crate) triangles: Vec<[[f64; 3]; 3]>,
+}
+
 /// A mesh fixed to a link.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Meshed {
@@ -127,23 +136,39 @@ impl Mesh {
     /// # Errors
     /// [`MeshError`] says what is wrong with it.
     pub fn read(name: &str, bytes: &[u8], scale: [f64; 3]) -> Result<Mesh, MeshError> {
+        let mut triangles = Vec::new();
+        for mut part in Mesh::parts(name, bytes, scale, &mut |_| None)? {
+            triangles.append(&mut part.triangles);
+        }
+        Mesh::new(triangles)
+    }
+
+    /// Reads a file, as [`Mesh::read`], with its colours; in the order of the file. `beside` gives what is in a file that it names.
+    pub(crate) fn parts(
+        name: &str,
+        bytes: &[u8],
+        scale: [f64; 3],
+        beside: &mut dyn FnMut(&str) -> Option<Vec<u8>>,
+    ) -> Result<Vec<Part>, MeshError> {
         if scale.iter().any(|s| *s == 0.0 || !s.is_finite()) {
             return Err(MeshError::Scale { scale });
         }
+        let plain = |triangles| vec![Part { colour: None, triangles }];
         let name = name.to_ascii_lowercase();
-        let mut triangles = match name.rsplit_once('.') {
-            Some((_, "stl")) => stl::triangles(bytes)?,
-            Some((_, "obj")) => obj::triangles(bytes)?,
-            Some((_, "dae")) => collada::triangles(bytes)?,
+        let mut parts = match name.rsplit_once('.') {
+            Some((_, "stl")) => plain(stl::triangles(bytes)?),
+            Some((_, "obj")) => obj::parts(bytes, beside)?,
+            Some((_, "dae")) => collada::parts(bytes)?,
             _ => return Err(MeshError::Kind),
         };
-        for corner in triangles.iter_mut().flatten() {
-            *corner = std::array::from_fn(|i| corner[i] * scale[i]);
+        let is_mirrored = scale.iter().product::<f64>() < 0.0;
+        for triangle in parts.iter_mut().flat_map(|part| &mut part.triangles) {
+            *triangle = triangle.map(|corner| std::array::from_fn(|i| corner[i] * scale[i]));
+            if is_mirrored {
+                triangle.swap(1, 2);
+            }
         }
-        if scale.iter().product::<f64>() < 0.0 {
-            triangles.iter_mut().for_each(|triangle| triangle.swap(1, 2));
-        }
-        Mesh::new(triangles)
+        Ok(parts)
     }
 
     /// Reads an STL, as [`Mesh::read`].

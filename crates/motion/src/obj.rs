@@ -1,16 +1,25 @@
-//! Reading Wavefront OBJ: vertices and faces; normals, textures, groups and materials say nothing of the shape.
+//! Reading Wavefront OBJ: vertices and faces; normals, textures and groups say nothing of the shape. Of materials the diffuse colour is read;
+//! what is wrong with one costs the colour alone.
 
-use crate::mesh::{MAX_TRIANGLES, MeshError};
+use crate::mesh::{Colour, MAX_TRIANGLES, MeshError, Part};
 use crate::polygon;
 use std::borrow::Cow;
+use std::collections::BTreeMap;
 
-/// The triangles of a file; a face of more corners is cut ([`polygon`]).
-pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<[[f64; 3]; 3]>, MeshError> {
+/// Materials of a file at the most, and files of them that are read.
+const MOST_MATERIALS: usize = 4_096;
+const MOST_LIBRARIES: usize = 16;
+
+/// The triangles of a file; a face of more corners is cut ([`polygon`]). `library` gives what is in a file of materials that it names, if anybody
+/// asks for colours.
+pub(crate) fn parts(bytes: &[u8], library: &mut dyn FnMut(&str) -> Option<Vec<u8>>) -> Result<Vec<Part>, MeshError> {
     let text = std::str::from_utf8(bytes).map_err(|error| {
         let line = bytes[..error.valid_up_to()].iter().filter(|b| **b == b'\n').count() + 1;
         MeshError::Text { line, reason: "it is no text in UTF-8".to_owned() }
     })?;
-    let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
+    let (mut vertices, mut triangles) = (Vec::new(), 0);
+    let mut parts = vec![Part { colour: None, triangles: Vec::new() }];
+    let (mut materials, mut libraries) = (BTreeMap::new(), 0);
     let mut lines = text.lines().enumerate();
     while let Some((index, line)) = lines.next() {
         let wrong = |reason: String| MeshError::Text { line: index + 1, reason };
@@ -28,15 +37,48 @@ pub(crate) fn triangles(bytes: &[u8]) -> Result<Vec<[[f64; 3]; 3]>, MeshError> {
                 if corners.len() < 3 {
                     return Err(wrong(format!("a face `f` has at least three corners, this has {}", corners.len())));
                 }
-                triangles.extend(polygon::triangles(&corners).map_err(wrong)?);
-                if triangles.len() > MAX_TRIANGLES {
-                    return Err(MeshError::Count { triangles: triangles.len() });
+                let face = polygon::triangles(&corners).map_err(wrong)?;
+                triangles += face.len();
+                if triangles > MAX_TRIANGLES {
+                    return Err(MeshError::Count { triangles });
+                }
+                if let Some(part) = parts.last_mut() {
+                    part.triangles.extend(face);
+                }
+            }
+            Some("mtllib") if libraries < MOST_LIBRARIES => {
+                libraries += 1;
+                let name = words.collect::<Vec<&str>>().join(" ");
+                library(&name).into_iter().for_each(|bytes| colours(&bytes, &mut materials));
+            }
+            Some("usemtl") => {
+                let colour = materials.get(&words.collect::<Vec<&str>>().join(" ")).copied();
+                if parts.last().is_some_and(|part| part.colour != colour) {
+                    parts.push(Part { colour, triangles: Vec::new() });
                 }
             }
             _ => {}
         }
     }
-    Ok(triangles)
+    Ok(parts)
+}
+
+/// Adds the diffuse colours of the materials of a file, by name.
+fn colours(bytes: &[u8], materials: &mut BTreeMap<String, Colour>) {
+    let mut material = None;
+    for line in String::from_utf8_lossy(bytes).lines() {
+        let mut words = line.split('#').next().unwrap_or("").split_whitespace();
+        match words.next() {
+            Some("newmtl") => material = Some(words.collect::<Vec<&str>>().join(" ")),
+            Some("Kd") if materials.len() < MOST_MATERIALS => {
+                let numbers: Vec<f64> = words.map_while(|word| word.parse().ok()).collect();
+                if let (Some(name), Some(colour)) = (material.take(), numbers.first_chunk()) {
+                    materials.insert(name, *colour);
+                }
+            }
+            _ => {}
+        }
+    }
 }
 
 /// A line with those that it goes on with: after a backslash at its end.

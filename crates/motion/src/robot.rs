@@ -275,6 +275,11 @@ impl Robot {
         RobotDescription::read(description).ok()
     }
 
+    /// The URDF of the robot of this name that we ship.
+    pub(crate) fn built_in_urdf(name: &str) -> Option<&'static str> {
+        BUILT_IN.into_iter().find(|(known, ..)| *known == name).map(|(_, _, urdf, _)| urdf)
+    }
+
     /// The robot of this name that we ship.
     pub fn built_in(name: &str) -> Option<Robot> {
         let (_, description, urdf, srdf) = BUILT_IN.into_iter().find(|(known, ..)| *known == name)?;

@@ -77,7 +77,7 @@ pub enum RobotError {
 ///
 /// # Errors
 /// [`RobotError::Fault`] names the line.
-fn parse(text: &str) -> Result<urdf_rs::Robot, RobotError> {
+pub(crate) fn parse(text: &str) -> Result<urdf_rs::Robot, RobotError> {
     urdf_faults::check(text)?;
     urdf_rs::read_from_string(text).map_err(|error| RobotError::Urdf(error.to_string()))
 }
@@ -288,7 +288,7 @@ fn shapes(link: &urdf_rs::Link, load: &mut Loader<'_>) -> Result<(Vec<Body>, Vec
 /// What is in a mesh file.
 pub(crate) type Loader<'l> = dyn FnMut(&str) -> Result<Vec<u8>, MeshError> + 'l;
 
-fn primitive(geometry: &urdf_rs::Geometry) -> Option<Geometry> {
+pub(crate) fn primitive(geometry: &urdf_rs::Geometry) -> Option<Geometry> {
     Some(match geometry {
         urdf_rs::Geometry::Box { size } => Geometry::Box { half: size.0.map(|s| s / 2.0) },
         urdf_rs::Geometry::Cylinder { radius, length } => {
@@ -302,7 +302,7 @@ fn primitive(geometry: &urdf_rs::Geometry) -> Option<Geometry> {
     })
 }
 
-fn origin(pose: &urdf_rs::Pose) -> Pose {
+pub(crate) fn origin(pose: &urdf_rs::Pose) -> Pose {
     let [roll, pitch, yaw] = pose.rpy.0;
     Pose::from_rpy(pose.xyz.0, roll, pitch, yaw)
 }

@@ -8,12 +8,13 @@ use crate::system::config::SystemConfig;
 use crate::system::known::KnownSystem;
 use crate::system::{CONFIG_FILE, public_directory};
 use crate::{input, output};
-use ratn_dashboard::{Dashboard, DashboardError, Editing, Options, Robots, Tasks};
+use ratn_dashboard::{Dashboard, DashboardError, Editing, Known, Options, Robots, Tasks};
 use ratn_model::diagnostic::{Diagnostic, Severity};
 use ratn_model::load::load_with;
 use ratn_model::program::{Location, Program};
 use ratn_model::resource::Quantity;
 use ratn_model::value::Value;
+use ratn_motion::looks::Looks;
 use ratn_motion::robot::Robot;
 use ratn_simulation::sequential::{Assumptions, makespan_s};
 use ratn_worker::tls::ClientTls;
@@ -120,29 +121,30 @@ fn robots(directory: PathBuf, named: Option<String>) -> Robots {
     Robots::by(move |of_log| {
         let own = || SystemConfig::read(&directory.join(CONFIG_FILE)).ok().map(|config| config.robot);
         if let Some(named) = &named {
-            return Ok((robot(named)?, "as --robot says".to_owned()));
+            return robot(named, "as --robot says".to_owned());
         }
         if !of_log.is_empty() {
             let needs =
                 |why| format!("the log is of the robot {of_log}: {why}; --robot names another description of it");
-            return Ok((robot(of_log).map_err(needs)?, "as the log says".to_owned()));
+            return robot(of_log, "as the log says".to_owned()).map_err(needs);
         }
         let (robot_of, whence) = match own() {
             Some(own) => (own, format!("the robot of the system in {}", directory.display())),
             None => (SystemConfig::default().robot, "the built-in robot".to_owned()),
         };
-        Ok((robot(&robot_of)?, format!("{whence}: the log does not say which one, --robot names another one")))
+        robot(&robot_of, format!("{whence}: the log does not say which one, --robot names another one"))
     })
 }
 
 /// A built-in robot, or one that a file describes.
-fn robot(named: &str) -> Result<Robot, String> {
+fn robot(named: &str, whence: String) -> Result<Known, String> {
     // A log may name anything: opening a pipe would wait for whoever writes it.
     let is_other = |file: &Path| std::fs::metadata(file).is_ok_and(|is| !is.is_file());
     if Robot::built_in(named).is_none() && is_other(Path::new(named)) {
         return Err(format!("the robot {named} is not known: it is no regular file"));
     }
-    Robot::named_or_file(named).map_err(|error| format!("the robot {named} is not known: {error}"))
+    let robot = Robot::named_or_file(named).map_err(|error| format!("the robot {named} is not known: {error}"))?;
+    Ok(Known { robot, looks: Looks::named_or_file(named), whence })
 }
 
 /// Task files are read again whenever somebody asks: they are small, and may have been put back.

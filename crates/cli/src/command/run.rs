@@ -7,6 +7,7 @@ use super::{blocking_here, check};
 use crate::arguments::{JsonArgument, ModeArgument, RunArguments, SystemArguments, UrgencyArgument};
 use crate::colour::can_paint;
 use crate::failure::Failure;
+use crate::fitted::shortened;
 use crate::interrupt::Interrupt;
 use crate::live::{Live, Way};
 use crate::output;
@@ -29,6 +30,9 @@ use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::SystemTime;
+
+/// Characters of an output that a terminal shows.
+const MOST_OF_AN_OUTPUT: usize = 300;
 
 impl From<ModeArgument> for Mode {
     fn from(mode: ModeArgument) -> Mode {
@@ -264,7 +268,11 @@ fn say(ended: &Ended, log: &Path, arguments: &RunArguments) -> anyhow::Result<()
         });
         return output::result(json_text(&document, how == JsonArgument::Lines)?);
     }
-    let outputs = ended.outputs.iter().map(|(name, value)| format!("\n{name} = {value}"));
+    // A person at a terminal does not read a covariance of many numbers, and it would move the rest out of sight.
+    let most = if std::io::stdout().is_terminal() { MOST_OF_AN_OUTPUT } else { usize::MAX };
+    let outputs = ended.outputs.iter().map(|(name, value)| {
+        format!("\n{name} = {}", shortened(&value.to_string(), most, "--json prints all, and so does a pipe"))
+    });
     output::result(format_args!("{statistics}{}", outputs.collect::<String>()))
 }
 

@@ -31,7 +31,7 @@ use std::time::Duration;
 const PATIENCE: Duration = Duration::from_secs(1);
 
 /// More lines of one kind are counted, not shown.
-const MOST_LINES: usize = 40;
+pub(super) const MOST_LINES: usize = 40;
 
 /// What is shown.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -88,7 +88,7 @@ pub(crate) fn run(arguments: &StatusArguments, tls: &ClientTls) -> Result<(), Fa
             let status = Status::of(&directory, &channels, &client).await.map_err(unanswered)?;
             Ok(match arguments.json {
                 true => json_text(&status, arguments.watch)?,
-                false => status.text(&directory, colours),
+                false => status.text(&directory, colours, MOST_LINES),
             })
         })
         .await
@@ -146,8 +146,10 @@ impl Status {
         }
     }
 
-    pub(super) fn text(&self, directory: &Path, colours: Colours) -> String {
+    /// For people, with at most so many lines of one kind.
+    pub(super) fn text(&self, directory: &Path, colours: Colours, most: usize) -> String {
         let mut lines = Vec::new();
+        let section = |lines: &mut Vec<String>, head: &str, rows| section(lines, head, rows, most);
         let rows = self.drivers.iter().map(|one| [one.endpoint.clone(), format!("{}: {}", one.state, one.reason)]);
         section(&mut lines, &colours.yellow("drivers that do not simply go on"), rows.collect());
         if self.runs.is_empty() && self.elsewhere.is_empty() {
@@ -200,12 +202,12 @@ fn beside(run: &RunStatus, runs: usize) -> Option<String> {
 }
 
 /// A head and a line each; nothing where there are none.
-fn section(lines: &mut Vec<String>, head: &str, mut rows: Vec<[String; 2]>) {
+fn section(lines: &mut Vec<String>, head: &str, mut rows: Vec<[String; 2]>, most: usize) {
     if rows.is_empty() {
         return;
     }
-    let hidden = rows.len().saturating_sub(MOST_LINES);
-    rows.truncate(MOST_LINES);
+    let hidden = rows.len().saturating_sub(most);
+    rows.truncate(most);
     lines.push(format!("{head}:"));
     lines.extend(aligned(&rows).into_iter().map(|line| format!("  {line}")));
     if hidden > 0 {
@@ -259,7 +261,7 @@ mod tests {
             waiting: vec![Waiting { holder: "sort_boxes: look".to_owned(), obstacles: Vec::new() }],
             free: vec!["arm@sim".to_owned(), "base@sim".to_owned()],
         };
-        assert_snapshot!(status.text(Path::new("/run/ratn"), Colours::default()), @r"
+        assert_snapshot!(status.text(Path::new("/run/ratn"), Colours::default(), MOST_LINES), @r"
         drivers that do not simply go on:
           unix:cell.sock  held: a look
         sort_boxes in CDTN mode: 12.3 s, paused; 3 states have ended
@@ -279,12 +281,14 @@ mod tests {
           sort_boxes: look  its turn
         free: arm@sim, base@sim
         ");
+        let short = status.text(Path::new("/run/ratn"), Colours::default(), 0);
+        assert!(short.contains("held:\n  and 1 more\n"), "{short}");
         let kinds = [("run-7", RUN_KIND), ("world-model@compute", WORLD_MODEL), ("arm@sim", "Arm")];
         let resources: Vec<Resource> =
             kinds.into_iter().map(|(id, kind)| Resource::new(id, ResourceClass::Task, kind)).collect();
         let status = Status::from(Vec::new(), &resources, Vec::new(), Answers::new());
         assert_eq!((status.free, status.elsewhere), (vec!["arm@sim".to_owned()], vec!["run-7".to_owned()]));
         let nothing = Status::from(Vec::new(), &[], Vec::new(), Answers::new());
-        assert_snapshot!(nothing.text(Path::new("/run/ratn"), Colours::default()), @"no run is under way in /run/ratn");
+        assert_snapshot!(nothing.text(Path::new("/run/ratn"), Colours::default(), MOST_LINES), @"no run is under way in /run/ratn");
     }
 }

@@ -1,16 +1,20 @@
 //! `ratn top`: a whole system at a glance, again and again.
 
-use super::status::Status;
+use super::status::{MOST_LINES, Status};
 use super::{blocking_on, pool, unanswered};
 use crate::arguments::TopArguments;
 use crate::colour::Colours;
 use crate::failure::Failure;
+use crate::fitted::fits;
 use crate::repainting;
 use crate::system::public_directory;
 use ratn_daemon::resource_manager;
 use ratn_worker::client::{Channels, ResourceClient};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
+
+/// Lines of one kind that are shown also where there is no room for all of them.
+const LEAST_LINES: usize = 2;
 
 /// Shows it until the user has seen enough.
 pub(crate) fn run(arguments: &TopArguments, tls: &ClientTls) -> Result<(), Failure> {
@@ -24,7 +28,15 @@ pub(crate) fn run(arguments: &TopArguments, tls: &ClientTls) -> Result<(), Failu
         let look = async || {
             let status = Status::of(&directory, &channels, &client).await.map_err(unanswered)?;
             let workers = pool::overview(Some(directory.clone()), tls).await.map_err(unanswered)?;
-            Ok::<String, Failure>(format!("{}\n\n{workers}", status.text(&directory, colours)))
+            let text = |most| format!("{}\n\n{workers}", status.text(&directory, colours, most));
+            // Where there is little room, fewer lines of a kind leave some for the others.
+            let most = match repainting::room().filter(|_| !arguments.once) {
+                Some((width, height)) => {
+                    (LEAST_LINES..=MOST_LINES).rev().find(|most| fits(&text(*most), width, height))
+                }
+                None => Some(MOST_LINES),
+            };
+            Ok::<String, Failure>(text(most.unwrap_or(LEAST_LINES)))
         };
         repainting::repeat(!arguments.once, false, look).await
     })

@@ -24,7 +24,9 @@ export class Refused extends Error {
   }
 }
 
-async function ask<T>(path: string, query: Record<string, string | number | null>, method = "GET", body: unknown = null): Promise<T> {
+type Query = Record<string, string | number | null>;
+
+async function fetched(path: string, query: Query, method: string, body: unknown): Promise<Response> {
   const pairs = Object.entries(query).flatMap(([name, value]) => (value === null ? [] : [[name, String(value)]]));
   const text = new URLSearchParams(pairs).toString();
   const response = await fetch(`/api/${path}${text === "" ? "" : `?${text}`}`, {
@@ -33,12 +35,14 @@ async function ask<T>(path: string, query: Record<string, string | number | null
     cache: "no-store",
     ...(body === null ? {} : { body: JSON.stringify(body) }),
   });
+  if (response.ok) return response;
   const answer: unknown = await response.json();
-  if (!response.ok) {
-    const problem = typeof answer === "object" && answer !== null && "problem" in answer ? String(answer.problem) : response.statusText;
-    throw new Refused(response.status, problem);
-  }
-  return answer as T;
+  const problem = typeof answer === "object" && answer !== null && "problem" in answer ? String(answer.problem) : response.statusText;
+  throw new Refused(response.status, problem);
+}
+
+async function ask<T>(path: string, query: Query, method = "GET", body: unknown = null): Promise<T> {
+  return (await (await fetched(path, query, method, body)).json()) as T;
 }
 
 export const api = {
@@ -48,6 +52,7 @@ export const api = {
   task: (log: number) => ask<Task>("task", { log }),
   world: (log: number, at: number | null, epoch: number, filter: string) => ask<World>("world", { log, at, epoch, filter }),
   robot: (log: number) => ask<Robot>("robot", { log }),
+  mesh: async (log: number, mesh: number) => (await fetched("mesh", { log, mesh }, "GET", null)).arrayBuffer(),
   cell: (log: number, at: number | null, epoch: number, version: number) => ask<Cell>("cell", { log, at, epoch, version }),
   system: () => ask<System>("system", {}),
   tail: (worker: string) => ask<Tail>("tail", { worker }),

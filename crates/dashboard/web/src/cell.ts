@@ -4,8 +4,9 @@ import { api } from "./api";
 import { type Child, count, fill, h, seconds, table } from "./dom";
 import { Clock, Film, lasts } from "./film";
 import { forward } from "./kinematics";
+import { Looks } from "./looks";
 import { type Matrix, type Vector, along, compose, identity, length, minus, origin, placed, plus, shifted } from "./matrix";
-import { Orbit } from "./orbit";
+import { Orbit, whole } from "./orbit";
 import type { Site } from "./pages";
 import { type Colour, type Lines, Painter, type Solid, outline } from "./webgl";
 import type { Cell, Object as Thing, Robot, Shape, Track, Truth } from "./wire";
@@ -51,18 +52,22 @@ export class CellView {
   private listed = 0;
   private listedOf: { cell: Cell | null; moment: number } | null = null;
   private paths = new Map<number, Path>();
+  private readonly looks = new Looks((mesh) => api.mesh(this.log ?? 0, mesh), () => this.repaint());
+  private readonly collides: HTMLButtonElement;
 
   constructor(
     private readonly element: HTMLElement,
     private readonly site: Site,
   ) {
     const show = (text: string, act: () => void, label = text) => h("button", { "aria-label": label, onclick: act }, text);
+    this.collides = h("button", { hidden: true, "aria-pressed": "false", onclick: () => this.turnOver() }, "What can collide");
     const bar = h(
       "div",
       { class: "row" },
       show("+", () => this.orbit.zoom(1.25), "Zoom in"),
       show("−", () => this.orbit.zoom(1 / 1.25), "Zoom out"),
       show("All of it", () => this.orbit.fit()),
+      this.collides,
       this.note,
     );
     const legend = h("div", { class: "legend below" }, h("span", {}, "solid: as believed"), h("span", {}, "outlined: as it is"), h("span", {}, "line: the way of what moves"));
@@ -97,6 +102,7 @@ export class CellView {
     }
     const robot = this.robot ?? (await api.robot(log));
     if (log !== this.log) return;
+    if (robot !== this.robot) void this.looks.take(robot);
     this.robot = robot;
     // One that is not known may be known when the page is opened again.
     const frame = this.site.store.frame;
@@ -137,6 +143,12 @@ export class CellView {
     });
   }
 
+  private turnOver(): void {
+    this.looks.collides = !this.looks.collides;
+    this.collides.setAttribute("aria-pressed", String(this.looks.collides));
+    this.repaint();
+  }
+
   /** The robot at a moment, if it is known and the log is one of it. */
   private frames(moment: number): { robot: Robot; frames: Matrix[]; positions: number[] } | null {
     const robot = this.robot;
@@ -157,10 +169,9 @@ export class CellView {
     const lines: Lines[] = [floor(colour("line"))];
     const shown = this.frames(moment);
     const tool = this.tool(shown?.robot ?? null, shown?.frames ?? []);
-    shown?.robot.links.forEach((link, index) => {
-      const frame = shown.frames[index] ?? identity();
-      for (const { kind, size, at } of link.shapes) solids.push({ kind, size, frame: compose(frame, placed(at)), colour: colour("cell-robot") });
-    });
+    if (shown !== null) solids.push(...this.looks.solids(shown.robot, shown.frames, colour("cell-robot")));
+    const meshes = solids.filter(({ kind }) => kind === "mesh").length;
+    painter.keepOnly(this.looks.loaded);
     if (shown === null && this.cell !== null) lines.push(...axes(placed(this.cell.base), colour));
     for (const object of this.objects) {
       const at = placed(object.shape.at);
@@ -176,6 +187,7 @@ export class CellView {
     painter.paint(this.orbit.view(w / t), this.orbit.back, colour("paper"), solids, lines);
     this.canvas.dataset["paintedMs"] = (performance.now() - began).toFixed(1);
     this.canvas.dataset["solids"] = String(solids.length);
+    this.canvas.dataset["meshes"] = String(meshes);
     this.canvas.dataset["moment"] = moment.toFixed(3);
   }
 
@@ -232,7 +244,7 @@ export class CellView {
     const bound = (axis: 0 | 1 | 2, pick: (...all: number[]) => number) => places.map((place) => place[axis]).reduce((a, b) => pick(a, b));
     const [low, high] = [Math.min, Math.max].map((pick): Vector => [bound(0, pick), bound(1, pick), bound(2, pick)]) as [Vector, Vector];
     const at: Vector = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2];
-    return { at, distance: Math.min(Math.max(length(minus(high, low)) * 1.05, 1), 40) };
+    return { at, distance: Math.min(Math.max(whole(length(minus(high, low)) / 2), 1), 40) };
   }
 
   private list(moment: number): void {
@@ -246,6 +258,7 @@ export class CellView {
     const text = notes.length === 0 ? "" : `${notes.join("; ")}${shown === null ? ": only objects and the base are shown" : ""}`;
     this.note.hidden = text === "";
     if (this.note.textContent !== text) this.note.textContent = text;
+    this.collides.hidden = shown === null || !this.looks.areKnown(shown.robot);
     const held = this.objects.filter((object) => object.held);
     fill(
       this.side,
@@ -271,6 +284,7 @@ export class CellView {
     };
     return [
       h("p", {}, `${robot.name}, ${robot.note}. Joints are as commanded.`),
+      ...[...robot.lacks, this.looks.problem].filter((text) => text !== "").map((text) => h("p", { class: "warn" }, `Not seen of it: ${text}`)),
       h("p", {}, `The tool is at ${tools.join("; ")}. The base is at ${where(this.cell?.base.position ?? [])}.`),
       h("h2", {}, "What moves"),
       moving.length === 0 ? h("p", { class: "faint" }, "Nothing moves.") : h("ul", { class: "plain", id: "moving" }, ...moving.map(item)),

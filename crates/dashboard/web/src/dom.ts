@@ -91,6 +91,7 @@ export function bytes(value: number): string {
 /** A table with a caption; `numbers` are the columns that stand at the right. */
 export function table(caption: string, head: string[], rows: Child[][], numbers: number[] = []): HTMLElement {
   const cell = (index: number) => (numbers.includes(index) ? { class: "number" } : {});
+  if (rows.length === 0) return h("p", { class: "nothing" }, h("b", {}, caption), " none");
   // A table that is wider than the page is scrolled, by keys, too.
   return h(
     "div",

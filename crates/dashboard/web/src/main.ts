@@ -6,7 +6,7 @@ import { confirm } from "./confirm";
 import { count, fill, h, seconds } from "./dom";
 import { type Page, type Site, cellPage, comparePage, hostsPage, networkPage, resourcesPage, runPage, worldPage } from "./pages";
 import { Store } from "./store";
-import { applyTheme, colour, nextTheme, theme } from "./theme";
+import { type Theme, applyTheme, colour, nextTheme, theme } from "./theme";
 import type { About, Awaits, Run, Told } from "./wire";
 
 const PERIOD_MS = 300;
@@ -93,8 +93,13 @@ const footer = h("footer", { "aria-label": "Replay" }, live, play, pace, slider,
 const app = document.getElementById("app");
 app?.append(header, h("div", {}, problem, summary, questions, announcer), page.element, footer);
 
-function showTheme(now: string): void {
-  themeButton.textContent = now === "auto" ? "Colours: as the system" : `Colours: ${now}`;
+/** What stands for the colours where there is no room for words. */
+const SIGNS: Record<Theme, string> = { auto: "◐", light: "○", dark: "●" };
+
+function showTheme(now: Theme): void {
+  const text = now === "auto" ? "Colours: as the system" : `Colours: ${now}`;
+  fill(themeButton, h("span", { class: "sign", "aria-hidden": "true" }, SIGNS[now]), h("span", { class: "wordy" }, text));
+  themeButton.title = text;
   page.update();
 }
 
@@ -114,7 +119,10 @@ function route(): void {
   if (next !== page) page.element.replaceWith(next.element);
   page = next;
   for (const [key, link] of links) {
-    if (key === name) link.setAttribute("aria-current", "page");
+    if (key === name) {
+      link.setAttribute("aria-current", "page");
+      link.scrollIntoView({ block: "nearest", inline: "nearest" });
+    }
     else link.removeAttribute("aria-current");
   }
   document.title = `${NAMES[name]} – ratn`;
@@ -197,7 +205,7 @@ function showLogs(now: About): void {
   if (logs.dataset["of"] !== text) {
     logs.dataset["of"] = text;
     fill(logs, ...now.logs.map((one) => h("option", { value: one.id, title: one.path, selected: one.id === log }, `${one.name}${one.live ? " (live)" : ""}`)));
-    logs.disabled = now.logs.length === 0;
+    logs.hidden = now.logs.length === 0;
   }
   if (now.logs.length === 0) {
     fill(summary, h("span", {}, `No run is under way in ${now.directory}. `), h("span", { class: "faint" }, "Begin one with `ratn run`; it is shown as soon as it begins."));

@@ -3,6 +3,9 @@
 import { type Matrix, type Vector, compose, cross, looking, minus, perspective, plus, unit } from "./matrix";
 
 const ANGLE = 0.8;
+
+/** From how far away a sphere of this radius is in view as a whole. */
+export const whole = (radius: number): number => radius / Math.sin(ANGLE / 2);
 const LINE_PX = 16;
 const NEAREST_M = 0.15;
 const FARTHEST_M = 60;

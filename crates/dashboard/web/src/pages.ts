@@ -84,9 +84,13 @@ export function runPage(site: Site): Page {
     "div",
     { class: "row" },
     by,
-    h("button", { "aria-label": "Zoom in", onclick: scale(1.5) }, "+"),
-    h("button", { "aria-label": "Zoom out", onclick: scale(1 / 1.5) }, "−"),
-    h("button", { onclick: () => (gantt.fit(), view.repaint()) }, "All of it"),
+    h(
+      "span",
+      { class: "row together" },
+      h("button", { "aria-label": "Zoom in", onclick: scale(1.5) }, "+"),
+      h("button", { "aria-label": "Zoom out", onclick: scale(1 / 1.5) }, "−"),
+      h("button", { onclick: () => (gantt.fit(), view.repaint()) }, "All of it"),
+    ),
   );
   const legend = h("div", { class: "legend below" });
   append(legend, ACTIVITIES.map(([kind, text]) => h("span", {}, sample(kind, false), text)));
@@ -251,9 +255,13 @@ export function networkPage(site: Site): Page {
     }),
     search,
     causes,
-    h("button", { "aria-label": "Zoom in", onclick: scale(1.4) }, "+"),
-    h("button", { "aria-label": "Zoom out", onclick: scale(1 / 1.4) }, "−"),
-    h("button", { onclick: () => (network.fit(), view.repaint()) }, "All of it"),
+    h(
+      "span",
+      { class: "row together" },
+      h("button", { "aria-label": "Zoom in", onclick: scale(1.4) }, "+"),
+      h("button", { "aria-label": "Zoom out", onclick: scale(1 / 1.4) }, "−"),
+      h("button", { onclick: () => (network.fit(), view.repaint()) }, "All of it"),
+    ),
     tree,
     breakpoints.element,
   );

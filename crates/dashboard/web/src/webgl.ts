@@ -1,15 +1,17 @@
 // Draws primitives and lines with WebGL 2. It knows nothing of robots: it is given shapes with their frames and colours.
 
-import { type Matrix, compose, identity, scaled, shifted } from "./matrix";
+import { type Matrix, type Vector, compose, identity, scaled, shifted } from "./matrix";
 
 export type Colour = readonly [number, number, number];
 
-/** A primitive, its axis along z: what `Shape` of the contract is, in the world. */
+/** A primitive, its axis along z, or a mesh in its bounding box: what `Shape` of the contract is, in the world. */
 export interface Solid {
   kind: string;
   size: readonly number[];
   frame: Matrix;
   colour: Colour;
+  /** Of a mesh its corners, as the program packs them. */
+  corners?: ArrayBuffer;
 }
 
 /** Lines from each even point to the odd one behind it, in the world; three numbers a point. */
@@ -30,7 +32,7 @@ void main() {
   gl_Position = view * frame * vec4(point, 1.0);
 }`;
 
-/** Light from above and from the side of the eye; lines have no side. */
+/** Light from above and from the side of the eye; lines have no side. A surface is seen from both sides, whichever its file takes for the outer one. */
 const FRAGMENT = `#version 300 es
 precision highp float;
 uniform vec3 colour;
@@ -42,30 +44,37 @@ void main() {
   float light = 1.0;
   if (lit) {
     vec3 n = normalize(facing);
-    light = 0.5 + 0.25 * max(n.z, -0.4 * n.z) + 0.35 * max(dot(n, eye), 0.0);
+    light = 0.5 + 0.25 * max(n.z, -0.4 * n.z) + 0.35 * abs(dot(n, eye));
   }
   painted = vec4(colour * light, 1.0);
 }`;
 
 const ROUND = 28;
 
+/** Of a corner of a mesh that was packed: its bytes, and where its normal begins. */
+const CORNER_BYTES = 12;
+const NORMAL_AT = 8;
+
 interface Mesh {
   vertices: WebGLVertexArrayObject;
+  buffer: WebGLBuffer;
   count: number;
 }
 
 export class Painter {
   private readonly program: WebGLProgram;
-  private readonly meshes: Record<string, Mesh>;
+  private readonly primitives: Record<string, Mesh>;
+  /** Meshes that are on the graphics card. */
+  private readonly loaded = new Map<ArrayBuffer, Mesh>();
   private readonly lines: { vertices: WebGLVertexArrayObject; buffer: WebGLBuffer };
 
   constructor(private readonly gl: WebGL2RenderingContext) {
     this.program = program(gl);
-    this.meshes = { box: this.mesh(box()), cylinder: this.mesh(turnedAround(CYLINDER)), sphere: this.mesh(turnedAround(HALF_CIRCLE)) };
+    this.primitives = { box: this.primitive(box()), cylinder: this.primitive(turnedAround(CYLINDER)), sphere: this.primitive(turnedAround(HALF_CIRCLE)) };
     const [vertices, buffer] = [gl.createVertexArray(), gl.createBuffer()];
     gl.bindVertexArray(vertices);
     gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-    this.attribute("point", 0, 12);
+    this.attribute("point", gl.FLOAT, 0, 12);
     this.lines = { vertices, buffer };
   }
 
@@ -91,24 +100,46 @@ export class Painter {
     }
   }
 
-  private solid({ kind, size, frame, colour }: Solid): void {
+  private solid({ kind, size, frame, colour, corners }: Solid): void {
     const [a, b, c] = [size[0] ?? 0, size[1] ?? 0, size[2] ?? 0];
     this.gl.uniform3f(this.at("colour"), ...colour);
-    if (kind === "box") this.draw("box", scaled(frame, [a, b, c]));
+    if (kind === "mesh") this.mesh(corners, frame, [a, b, c]);
+    else if (kind === "box") this.draw("box", scaled(frame, [a, b, c]));
     else if (kind === "sphere") this.draw("sphere", scaled(frame, [a, a, a]));
     else this.draw("cylinder", scaled(frame, [a, a, b]));
     if (kind !== "capsule") return;
     for (const end of [-b / 2, b / 2]) this.draw("sphere", scaled(shifted(frame, [0, 0, end]), [a, a, a]));
   }
 
-  private draw(mesh: string, frame: Matrix): void {
-    const found = this.meshes[mesh];
-    if (found === undefined) return;
+  private draw(primitive: string, frame: Matrix): void {
+    const found = this.primitives[primitive];
+    if (found !== undefined) this.triangles(found, frame, normals(frame));
+  }
+
+  /** Corners are parts of the bounding box; normals are in metres. */
+  private mesh(corners: ArrayBuffer | undefined, frame: Matrix, size: Vector): void {
+    if (corners === undefined) return;
+    const known = this.loaded.get(corners) ?? this.load(corners);
+    const box = scaled(frame, size);
+    this.triangles(known, shifted(box, [-0.5, -0.5, -0.5]), normals(frame));
+  }
+
+  private triangles({ vertices, count }: Mesh, frame: Matrix, turn: Float32Array): void {
     const gl = this.gl;
     gl.uniformMatrix4fv(this.at("frame"), false, Float32Array.from(frame));
-    gl.uniformMatrix3fv(this.at("turn"), false, normals(frame));
-    gl.bindVertexArray(found.vertices);
-    gl.drawArrays(gl.TRIANGLES, 0, found.count);
+    gl.uniformMatrix3fv(this.at("turn"), false, turn);
+    gl.bindVertexArray(vertices);
+    gl.drawArrays(gl.TRIANGLES, 0, count);
+  }
+
+  /** Gives back the room of meshes that are not shown any more. */
+  keepOnly(shown: ReadonlySet<ArrayBuffer>): void {
+    for (const [corners, { vertices, buffer }] of this.loaded) {
+      if (shown.has(corners)) continue;
+      this.gl.deleteVertexArray(vertices);
+      this.gl.deleteBuffer(buffer);
+      this.loaded.delete(corners);
+    }
   }
 
   private readonly places = new Map<string, WebGLUniformLocation | null>();
@@ -121,21 +152,37 @@ export class Painter {
     return place;
   }
 
-  private mesh(triangles: number[]): Mesh {
+  private primitive(triangles: number[]): Mesh {
     const gl = this.gl;
-    const vertices = gl.createVertexArray();
-    gl.bindVertexArray(vertices);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ARRAY_BUFFER, Float32Array.from(triangles), gl.STATIC_DRAW);
-    this.attribute("point", 0, 24);
-    this.attribute("normal", 12, 24);
-    return { vertices, count: triangles.length / 6 };
+    const mesh = this.stored(Float32Array.from(triangles), triangles.length / 6);
+    this.attribute("point", gl.FLOAT, 0, 24);
+    this.attribute("normal", gl.FLOAT, 12, 24);
+    return mesh;
   }
 
-  private attribute(name: string, offset: number, stride: number): void {
+  private load(corners: ArrayBuffer): Mesh {
+    const gl = this.gl;
+    const mesh = this.stored(corners, Math.floor(corners.byteLength / CORNER_BYTES));
+    this.attribute("point", gl.UNSIGNED_SHORT, 0, CORNER_BYTES);
+    this.attribute("normal", gl.BYTE, NORMAL_AT, CORNER_BYTES);
+    this.loaded.set(corners, mesh);
+    return mesh;
+  }
+
+  private stored(corners: ArrayBuffer | Float32Array<ArrayBuffer>, count: number): Mesh {
+    const gl = this.gl;
+    const [vertices, buffer] = [gl.createVertexArray(), gl.createBuffer()];
+    gl.bindVertexArray(vertices);
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    gl.bufferData(gl.ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    return { vertices, buffer, count };
+  }
+
+  /** Whole numbers are parts of the greatest one of their kind. */
+  private attribute(name: string, kind: number, offset: number, stride: number): void {
     const place = this.gl.getAttribLocation(this.program, name);
     this.gl.enableVertexAttribArray(place);
-    this.gl.vertexAttribPointer(place, 3, this.gl.FLOAT, false, stride, offset);
+    this.gl.vertexAttribPointer(place, 3, kind, kind !== this.gl.FLOAT, stride, offset);
   }
 }
 

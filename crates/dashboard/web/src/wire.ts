@@ -522,6 +522,8 @@ export interface Robot {
   name: string;
   /** Whence it is known, or why it is not. */
   note: string;
+  /** What of its visuals is not drawn, and why, in a sentence each. */
+  lacks: string[];
   /** Parents before children; the first one is where the world's origin is. */
   links: Link[];
   /** The joints that have a position of their own; the links say which of them moves what. */
@@ -548,6 +550,18 @@ export interface Link {
   factor: number;
   /** What of it can collide. */
   shapes: Shape[];
+  /** What of it is seen. A robot on which nothing is seen is drawn as what of it can collide. */
+  visuals: Visual[];
+}
+
+/** A shape that is seen. */
+export interface Visual {
+  /** Its form. */
+  shape: Shape;
+  /** Of a mesh the number by which its corners are asked for. */
+  mesh: number | null;
+  /** Red, green and blue from 0 to 1; none where the robot's description says none. */
+  colour: number[] | null;
 }
 
 /** A joint. */
@@ -568,11 +582,11 @@ export interface Place {
   quaternion: number[];
 }
 
-/** A primitive, its axis along z. */
+/** A primitive, its axis along z, or a mesh in its bounding box. */
 export interface Shape {
-  /** `box`, `cylinder`, `capsule` or `sphere`. */
+  /** `box`, `cylinder`, `capsule`, `sphere`, or of a visual also `mesh`. */
   kind: string;
-  /** Of a box its edges along x, y, z; else the radius and the length along z, of a capsule that of its straight part. */
+  /** Of a box and of the box around a mesh the edges along x, y, z; else the radius and the length along z, of a capsule that of its straight part. */
   size: number[];
   /** Where its centre is. */
   at: Place;

@@ -4,11 +4,12 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import { Clock, Film, between } from "../src/film.ts";
 import { forward } from "../src/kinematics.ts";
+import { Looks } from "../src/looks.ts";
 import { along, compose, identity, origin, shifted, turned } from "../src/matrix.ts";
 import { outline } from "../src/webgl.ts";
 
 const place = (position = [0, 0, 0], quaternion = [0, 0, 0, 1]) => ({ position, quaternion });
-const link = (name, parent, more = {}) => ({ name, parent, at: place(), joint: null, axis: [0, 0, 1], slides: false, factor: 1, shapes: [], ...more });
+const link = (name, parent, more = {}) => ({ name, parent, at: place(), joint: null, axis: [0, 0, 1], slides: false, factor: 1, shapes: [], visuals: [], ...more });
 const close = (found, expected) => expected.forEach((value, index) => assert.ok(Math.abs(found[index] - value) < 1e-9, `${found} is not ${expected}`));
 
 /** An upper arm of 1 m that turns about z, a forearm of 0.5 m that turns the same way, two fingers of which one mimics the other. */
@@ -16,6 +17,7 @@ const robot = {
   known: true,
   name: "two",
   note: "",
+  lacks: [],
   links: [
     link("root", null),
     link("upper", 0, { at: place([0, 0, 1]), joint: 0 }),
@@ -103,4 +105,41 @@ test("a rod goes from one point to the other, and an outline has the edges of it
   const box = outline("box", [2, 4, 6], turned([0, 0, 1], Math.PI / 2));
   assert.equal(box.length, 12 * 2 * 3);
   close([Math.max(...box.filter((_, index) => index % 3 === 0)), Math.max(...box.filter((_, index) => index % 3 === 1))], [2, 1]);
+});
+
+test("a robot is drawn as it is seen, with its meshes when they are there, or as what of it can collide", async () => {
+  const shape = (kind, at) => ({ kind, size: [1, 2, 3], at: place(at) });
+  const visuals = [
+    { shape: shape("box", [1, 0, 0]), mesh: null, colour: [1, 0, 0] },
+    { shape: shape("mesh", [0, 1, 0]), mesh: 4, colour: null },
+    { shape: shape("mesh", [0, 2, 0]), mesh: 4, colour: null },
+    { shape: shape("mesh", [0, 3, 0]), mesh: 5, colour: null },
+  ];
+  const seen = { ...robot, links: [link("root", null, { shapes: [shape("sphere")], visuals }), link("bare", 0, { shapes: [shape("box")] })] };
+  const corners = new ArrayBuffer(36);
+  const asked = [];
+  let arrived = 0;
+  const ask = async (mesh) => {
+    asked.push(mesh);
+    if (mesh === 5) throw new Error("it is gone");
+    return corners;
+  };
+  const looks = new Looks(ask, () => (arrived += 1));
+  const frames = [shifted(identity(), [0, 0, 7]), identity()];
+  const kinds = () => looks.solids(seen, frames, [0.5, 0.5, 0.5]).map(({ kind }) => kind);
+  const loading = looks.take(seen);
+  assert.deepEqual(kinds(), ["box"], "meshes are on their way");
+  await loading;
+  assert.deepEqual([asked, arrived, looks.problem], [[4, 5], 1, "A mesh is not there: it is gone"], "each is asked for once");
+  const [box, mesh] = looks.solids(seen, frames, [0.5, 0.5, 0.5]);
+  assert.deepEqual([kinds(), box.colour, mesh.colour], [["box", "mesh", "mesh"], [1, 0, 0], [0.5, 0.5, 0.5]]);
+  assert.equal(mesh.corners, corners);
+  close(origin(mesh.frame), [0, 1, 7]);
+  looks.collides = true;
+  assert.deepEqual(kinds(), ["sphere", "box"]);
+  // One whose description says nothing of it is drawn so in any case, and another robot's meshes are forgotten.
+  looks.collides = false;
+  await looks.take(robot);
+  assert.deepEqual([looks.areKnown(robot), looks.loaded.size, looks.problem], [false, 0, ""]);
+  assert.deepEqual(looks.solids({ ...robot, links: [link("only", null, { shapes: [shape("sphere")] })] }, [identity()], [0, 0, 0]).map(({ kind }) => kind), ["sphere"]);
 });

@@ -1,0 +1,83 @@
+//! How much of a text there is room for on a terminal, which breaks lines that are too long. What colours a line takes no room.
+
+/// How many characters of a line are seen.
+pub(crate) fn visible(line: &str) -> usize {
+    let mut is_colour = false;
+    let seen = line.chars().filter(|c| {
+        is_colour |= *c == '\x1b';
+        let is_seen = !is_colour;
+        is_colour &= *c != 'm';
+        is_seen
+    });
+    seen.count()
+}
+
+/// How many rows a line of so many characters takes.
+pub(crate) fn rows(length: usize, width: usize) -> usize {
+    length.div_ceil(width.max(1)).max(1)
+}
+
+/// Whether there is room for all of a text, with the last row free.
+pub(crate) fn fits(text: &str, width: usize, height: usize) -> bool {
+    text.lines().map(|line| rows(visible(line), width)).sum::<usize>() < height.max(1)
+}
+
+/// The first lines of a text, as many as there is room for, and how many more there are. The last row stays free, so that the end of the last
+/// line moves nothing out of the terminal.
+pub(crate) fn fitted(text: &str, width: usize, height: usize) -> String {
+    if fits(text, width, height) {
+        return text.to_owned();
+    }
+    let room = height.saturating_sub(1);
+    let lines: Vec<&str> = text.lines().collect();
+    let rows_of = |lines: &[&str]| lines.iter().map(|line| rows(visible(line), width)).sum::<usize>();
+    let more = |kept: usize| format!("… and {} more lines: there is no room for them", lines.len() - kept);
+    let has_room = |kept: &usize| rows_of(&lines[..*kept]) + rows(visible(&more(*kept)), width) <= room;
+    let kept = (0..lines.len()).rev().find(has_room).unwrap_or(0);
+    let mut shown: Vec<&str> = lines[..kept].to_vec();
+    let more = more(kept);
+    shown.push(&more);
+    shown.join("\n")
+}
+
+/// The beginning of a long text, and how much more there is of it.
+pub(crate) fn shortened(text: &str, most: usize, where_all_is: &str) -> String {
+    let all = text.chars().count();
+    if all <= most {
+        return text.to_owned();
+    }
+    let beginning: String = text.chars().take(most).collect();
+    format!("{beginning}… ({} more characters: {where_all_is})", all - most)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_colours_a_line_takes_no_room() {
+        assert_eq!(visible("\x1b[32mruns  plan\x1b[0m"), 10);
+        assert_eq!((rows(10, 80), rows(0, 80), rows(25, 10), rows(3, 0)), (1, 1, 3, 3));
+        let coloured = "\x1b[32mruns  plan\x1b[0m";
+        assert_eq!(fitted(coloured, 10, 2), coloured);
+    }
+
+    #[test]
+    fn what_is_left_out_of_a_long_text_is_said() {
+        assert_eq!(shortened("ünder ten", 9, "there"), "ünder ten");
+        assert_eq!(shortened("ünder ten", 5, "see there"), "ünder… (4 more characters: see there)");
+    }
+
+    #[test]
+    fn lines_that_find_no_room_are_counted() {
+        let text = "1\n2\n3\n4\n5";
+        assert_eq!(fitted(text, 80, 6), text);
+        assert_eq!(fitted(text, 80, 5), "1\n2\n3\n… and 2 more lines: there is no room for them");
+        // A line that is broken takes several rows, as does what is said of the others.
+        assert_eq!(fitted("a\nbbbbbbbbbbbb\nc\nd", 6, 3), "… and 4 more lines: there is no room for them");
+        assert_eq!(
+            fitted("a\nb\nc\nd\ne\nf\ng\nh\ni\nj\nk", 40, 6),
+            "a\nb\nc\n… and 8 more lines: there is no room for them"
+        );
+    }
+}
