@@ -18,7 +18,7 @@ mod watch;
 
 pub(super) use resume::{check_world, missing_commits, remembers};
 
-use super::ledger::{Confirmed, Projecting, acquire_request};
+use super::ledger::{Began, Confirmed, Projecting, acquire_request};
 use super::outside::Outside;
 use super::promises::{Making, Promises};
 use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Named, Record, Recorded, Recorder, Root};
@@ -29,6 +29,7 @@ use crate::safe_on_disk::Mark;
 use acquiring::{Acquiring, Asking, Waiting};
 use anyhow::{Context, bail};
 use came_between::CameBetween;
+pub(crate) use came_between::{Overtaken, Untouched};
 pub use claim::{RUN_KIND, claim};
 use futures::FutureExt;
 use goal::{Given, Performing};
@@ -481,12 +482,14 @@ impl Performer {
                 self.release(instance, lease, projection, safe);
             }
             Command::Commit { instance, writer, changes, evidence, revision } => {
-                let (knows, behind) = (self.told.revision(), self.operations);
-                let decided = Decided { instance, writer, changes, evidence, revision, knows, behind };
-                if let Some(between) = &self.came_between {
-                    between.check(&decided)?;
-                }
-                self.commit(decided, safe)?;
+                let began = Began { knows: self.told.revision(), held_until: None };
+                let behind = self.operations;
+                let decided = Decided { instance, writer, changes, evidence, revision, began, behind };
+                let untouched = match &self.came_between {
+                    Some(between) => between.check(&decided)?,
+                    None => None,
+                };
+                self.commit(decided, untouched, safe)?;
             }
             Command::Operate { instance, operations } => {
                 self.operations += 1;
@@ -572,10 +575,10 @@ impl Performer {
         self.came_between.take_if(|between| between.is_over());
     }
 
-    fn commit(&mut self, decided: Decided, safe: Option<Mark>) -> anyhow::Result<()> {
+    fn commit(&mut self, decided: Decided, untouched: Option<Untouched>, safe: Option<Mark>) -> anyhow::Result<()> {
         self.outside.decided(&self.run, &decided);
         self.decided = decided.revision;
-        self.record(Record::Commit { decided, safe })
+        self.record(Record::Commit { decided, untouched, safe })
     }
 
     fn operate(
@@ -686,9 +689,8 @@ impl Performer {
                 if maker.as_ref().is_some_and(|run| *run != self.run) {
                     self.told.beside_others(true);
                 }
-                if let Some(between) = self.came_between.as_mut().filter(|_| maker.as_ref() != Some(&self.run)) {
-                    let written = change.written.iter().map(|fact| &fact.key);
-                    between.more(change.revision, written.chain(&change.gone));
+                if let Some(between) = &mut self.came_between {
+                    between.told(&change);
                 }
                 return self.outside.told(change, mirror);
             }

@@ -249,6 +249,7 @@ pub(super) fn maker(commit: &str) -> Option<(String, Revision)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ledger::Began;
     use crate::record::Decided;
     use ratn_model::id::InstanceId;
 
@@ -349,7 +350,7 @@ mod tests {
             changes: Vec::new(),
             evidence: Vec::new(),
             revision: Revision(12),
-            knows: Revision(0),
+            began: Began::default(),
             behind: 0,
         };
         assert_eq!(maker(&decided.id("run-1")), Some(("run-1".to_owned(), Revision(12))));
