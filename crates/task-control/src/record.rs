@@ -50,7 +50,7 @@ pub(super) enum Record {
     },
     Commit {
         decided: Decided,
-        /// Under which condition it is made, where the run has lost what it was made with.
+        /// Under which condition it is made, where the run has lost, or given back, what it was made with.
         untouched: Option<Untouched>,
         /// What has to be safe before.
         safe: Option<Mark>,
@@ -149,7 +149,7 @@ pub(super) struct Recorder {
 pub(super) struct Root(Arc<AtomicU64>);
 
 impl Root {
-    fn get(&self) -> Revision {
+    pub(super) fn get(&self) -> Revision {
         Revision(self.0.load(Ordering::SeqCst))
     }
 

@@ -1,10 +1,12 @@
 //! What others have changed since a run lost what it held: a commit that it had decided before, or that a motion leads to which it had begun before,
 //! is made only where that is not what the commit is made of, or overwrites.
 //!
+//! The same of a commit that is so late that whoever holds now what its run has given back does not wait for it any more.
+//!
 //! From when on others count the log says ([`Ledger`]), however often the run was taken up since. It is looked at when a commit is decided, so that
 //! nothing begins behind one that is refused, and once more when it is made ([`Untouched`]), as it may have waited for a slow disk.
 
-use super::told::maker;
+use super::told::{PENDING_PATIENCE, maker};
 use crate::decided::{Unanswered, Undone, insist};
 use crate::ledger::Ledger;
 use crate::record::Decided;
@@ -16,9 +18,10 @@ use ratn_model::program::Program;
 use ratn_proto::types::{WorldChange, WorldUpdate};
 use ratn_worker::client::{CallError, WorldClient};
 use ratn_worker::session::Trust;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 
 /// What others have changed in some revisions of the root.
 #[derive(Debug, Default)]
@@ -44,11 +47,14 @@ impl fmt::Display for Overtaken {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Overtaken::By(key) => {
-                write!(f, "others have changed {key}, which it changes or is made of, since the run lost its resources")
+                write!(
+                    f,
+                    "others have changed {key}, which it changes or is made of, since the run had what that was made with"
+                )
             }
             Overtaken::Unknown => write!(
                 f,
-                "what others have changed since the run lost its resources is not known: the world pool does not keep it so long"
+                "what others have changed since the run had what that was made with is not known: the world pool does not keep it so long"
             ),
         }
     }
@@ -174,12 +180,45 @@ pub(crate) struct Untouched {
     run: String,
     /// Up to here that is so.
     seen: Revision,
+    /// The commit's number in its run, where others count only when it is late.
+    late: Option<(Left, Revision)>,
+}
+
+/// Since when others may not wait any more for what a run had decided when it gave something back. Clones share it.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Left(Arc<Mutex<VecDeque<(Revision, Instant)>>>);
+
+impl Left {
+    /// Something goes back while the commits up to `decided`, but for those up to `made`, are on their way.
+    pub(super) fn goes_back(&self, decided: Revision, made: Revision, at: Instant) {
+        let mut left = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        while left.front().is_some_and(|(number, _)| *number <= made) {
+            left.pop_front();
+        }
+        let is_known = left.back().is_some_and(|(number, _)| *number >= decided);
+        if decided > made && !is_known {
+            left.push_back((decided, at));
+        }
+    }
+
+    /// Whether whoever holds now what the run held when it decided this commit may have gone on without it.
+    fn is_late(&self, commit: Revision) -> bool {
+        let left = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        // In the order of numbers, and of time.
+        let first = left.iter().find(|(number, _)| *number >= commit);
+        first.is_some_and(|(_, at)| at.elapsed() >= PENDING_PATIENCE)
+    }
 }
 
 impl Untouched {
     /// Up to this revision it is so.
     pub(super) fn behind(program: &Arc<Program>, run: &str, seen: Revision) -> Untouched {
-        Untouched { program: Arc::clone(program), run: run.to_owned(), seen }
+        Untouched { program: Arc::clone(program), run: run.to_owned(), seen, late: None }
+    }
+
+    /// It counts only when the run's commit of this number is later than others wait for it.
+    pub(super) fn when_late(self, left: &Left, commit: Revision) -> Untouched {
+        Untouched { late: Some((left.clone(), commit)), ..self }
     }
 
     /// Looks whether it is so up to another revision.
@@ -192,7 +231,8 @@ impl Untouched {
         (world, trust): (&WorldClient, &Trust),
         (writer, changes): (&str, &[Change]),
     ) -> Result<(), Undone> {
-        if root <= self.seen {
+        let counts = self.late.as_ref().is_none_or(|(left, commit)| left.is_late(*commit));
+        if root <= self.seen || !counts {
             return Ok(());
         }
         let look = || ChangedByOthers::of(world, &self.run, self.seen, root);

@@ -10,6 +10,7 @@ use ratn_worker::session::Trust;
 use ratn_worker::trace;
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Instant;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 impl Performer {
@@ -52,6 +53,7 @@ impl Performer {
     ) {
         if let Some(lease) = lease {
             self.leases.given_back(lease);
+            self.left.goes_back(self.decided, self.recorded.borrow().commit, Instant::now());
             self.holds.set(self.leases.has_speculative());
         }
         let (resources, world, trust) = (self.resources.clone(), self.world.clone(), self.trust.clone());

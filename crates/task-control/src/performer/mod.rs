@@ -28,7 +28,7 @@ use crate::messages::Messages;
 use crate::safe_on_disk::Mark;
 use acquiring::{Acquiring, Asking, Waiting};
 use anyhow::{Context, bail};
-use came_between::CameBetween;
+use came_between::{CameBetween, Left};
 pub(crate) use came_between::{Overtaken, Untouched};
 pub use claim::{RUN_KIND, claim};
 use futures::FutureExt;
@@ -40,6 +40,7 @@ use ratn_model::catalogue::Catalogue;
 use ratn_model::condition::Condition;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, Revision};
+use ratn_model::program::Program;
 use ratn_model::resource::{LeasedResource, Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
@@ -158,7 +159,7 @@ impl From<Event> for Answer {
 /// One run's hands.
 pub(super) struct Performer {
     run: String,
-    task: String,
+    program: Arc<Program>,
     urgency: Urgency,
     standing: Standing,
     /// The robot's seconds per second.
@@ -189,6 +190,8 @@ pub(super) struct Performer {
     outside: Outside,
     /// Of a run that came back without what it held, while anything of before is under way.
     came_between: Option<CameBetween>,
+    /// What went back while commits were on their way.
+    left: Left,
     told: Told,
     /// The run's own number of its last commit.
     decided: Revision,
@@ -257,7 +260,7 @@ impl Performer {
     pub(super) async fn connect(
         place: &Place,
         run: &str,
-        task: &str,
+        program: &Arc<Program>,
         before: Option<u64>,
         trace: TraceContext,
         events: mpsc::Sender<Answer>,
@@ -287,7 +290,7 @@ impl Performer {
         let told = Told::new(&run);
         let others = claim::look_for_others(resources.clone(), run.clone(), told.clone());
         let others = AbortOnDropHandle::new(tokio::spawn(others));
-        match claim(&resources, &run, task, place.alone).await {
+        match claim(&resources, &run, &program.name, place.alone).await {
             Ok(has_others) => told.beside_others(has_others),
             // What a run that comes back holds is still its own.
             Err(refused) if is_own => {
@@ -323,7 +326,7 @@ impl Performer {
         let recorder = AbortOnDropHandle::new(tokio::spawn(trace::within(trace, recorder.work(work))));
         Ok(Performer {
             run,
-            task: task.to_owned(),
+            program: Arc::clone(program),
             urgency: place.urgency,
             standing,
             speed: place.speed,
@@ -345,6 +348,7 @@ impl Performer {
             root,
             outside: Outside::default(),
             came_between: None,
+            left: Left::default(),
             told,
             decided: Revision::default(),
             following: None,
@@ -485,10 +489,13 @@ impl Performer {
                 let began = Began { knows: self.told.revision(), held_until: None };
                 let behind = self.operations;
                 let decided = Decided { instance, writer, changes, evidence, revision, began, behind };
-                let untouched = match &self.came_between {
+                let lost = match &self.came_between {
                     Some(between) => between.check(&decided)?,
                     None => None,
                 };
+                let late =
+                    || Untouched::behind(&self.program, &self.run, self.root.get()).when_late(&self.left, revision);
+                let untouched = Some(lost.unwrap_or_else(late));
                 self.commit(decided, untouched, safe)?;
             }
             Command::Operate { instance, operations } => {
@@ -621,7 +628,7 @@ impl Performer {
             speculative: priority < CERTAIN,
             instead_of: before.map_or_else(String::new, |(_, last)| last.in_queue(waited)),
             deadline: ACQUIRE_DEADLINE,
-            holder: holder(&self.task, self.paths.get(&instance).map_or(&instance.to_string(), |path| path)),
+            holder: holder(&self.program.name, self.paths.get(&instance).map_or(&instance.to_string(), |path| path)),
         };
         let asked = requirements.iter().map(|one| self.of_performers(one.clone())).collect();
         let (hand, withdrawal) = (Some(hand), withdrawn.clone());

@@ -35,7 +35,12 @@ async fn connect_as(
     task: &str,
     events: mpsc::Sender<Answer>,
 ) -> anyhow::Result<Performer> {
-    Performer::connect(&place_of(endpoints), run, task, before, TraceContext::fresh(), events).await
+    Performer::connect(&place_of(endpoints), run, &self::task(task), before, TraceContext::fresh(), events).await
+}
+
+/// A task of this name.
+fn task(name: &str) -> Arc<Program> {
+    Arc::new(Program { name: name.to_owned(), ..program(FETCH_BOXES) })
 }
 
 fn place_of(endpoints: &Endpoints) -> Place {
@@ -660,14 +665,14 @@ async fn a_run_goes_beside_others_and_one_that_goes_alone_does_not() -> anyhow::
     let events = || mpsc::channel(1).0;
     let second = connect(&bench.endpoints, "second", events()).await?;
     let alone = Place { alone: true, ..place_of(&bench.endpoints) };
-    let refused = Performer::connect(&alone, "run-3", "third", None, TraceContext::fresh(), events())
+    let refused = Performer::connect(&alone, "run-3", &task("third"), None, TraceContext::fresh(), events())
         .await
         .err()
         .context("it went")?;
     assert!(refused.to_string().contains("another run is under way on this system (`"), "{refused}");
     second.closed().await?;
     bench.performer.closed().await?;
-    let third = Performer::connect(&alone, "run-3", "third", None, TraceContext::fresh(), events()).await?;
+    let third = Performer::connect(&alone, "run-3", &task("third"), None, TraceContext::fresh(), events()).await?;
     let fourth = connect(&bench.endpoints, "fourth", events()).await.err().context("it went")?;
     assert!(fourth.to_string().starts_with("`third` is under way on this system and goes alone"), "{fourth}");
     third.closed().await
@@ -1448,6 +1453,30 @@ async fn what_others_change_while_a_commit_waits_for_the_disk_stands_against_it_
             assert_eq!((failed.0, failed.2), (InstanceId(1), Unmade::Untried));
         }
         assert_eq!(bench.performer.world.root().await?.0, Revision(if is_made { 3 } else { 2 }));
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_commit_that_others_do_not_wait_for_any_more_is_made_where_they_have_not_changed_what_it_is_made_of()
+-> anyhow::Result<()> {
+    for (is_late, by_another, is_made) in [(false, "done", true), (true, "other", true), (true, "done", false)] {
+        let mut bench = Bench::new().await?;
+        bench.performer.root().await?;
+        let (disk, slow) = Mark::not_yet();
+        bench.performer.perform_when(Some(slow), commits(1, 1))?;
+        bench.ask(InstanceId(1))?;
+        let lease = bench.granted(InstanceId(1)).await?;
+        if is_late {
+            let since = Instant::now().checked_sub(told::PENDING_PATIENCE).context("just booted")?;
+            bench.performer.left.goes_back(Revision(1), Revision(0), since);
+        }
+        bench.goes_on(InstanceId(1), lease, None)?;
+        bench.performer.world.commit("other/i1/1", by_others(by_another), None).await?;
+        disk.send_replace(1);
+        let closed = bench.performer.closed().await;
+        assert_eq!(closed.is_ok(), is_made, "late: {is_late}, by another: {by_another}, {closed:?}");
+        assert!(is_made || closed.is_err_and(|error| error.to_string().contains("others have changed done")));
     }
     Ok(())
 }

@@ -110,7 +110,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
     // Of the same trace as before.
     let trace = trace_of(&origin.run, &program.name, seed, origin.began_unix_ms);
     let before = Some(ledger.session);
-    let performer = Performer::connect(place, &origin.run, &program.name, before, trace, events).await;
+    let performer = Performer::connect(place, &origin.run, &program, before, trace, events).await;
     let performer = performer.context("cannot go on with the run")?;
     let shell = Shell {
         executive,
@@ -191,7 +191,7 @@ async fn finish(resumption: Resumption, ended: Ended, place: &Place) -> anyhow::
     let trace = trace_of(&origin.run, &program.name, seed, origin.began_unix_ms);
     // Nobody hears of anything any more.
     let events = mpsc::channel(1).0;
-    let performer = Performer::connect(place, &origin.run, &program.name, Some(ledger.session), trace, events).await;
+    let performer = Performer::connect(place, &origin.run, &program, Some(ledger.session), trace, events).await;
     let mut performer = performer.context("cannot do what the run had decided")?;
     let at = ledger.last;
     if let Some(lost) = performer.session_lost(&ledger).await? {
