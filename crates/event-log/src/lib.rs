@@ -532,12 +532,16 @@ mod tests {
         assert_eq!(tail.more().unwrap(), []);
         let line =
             |entry: &LogEntry| serde_json::to_string(&LogLine { at: Timestamp(0), entry: entry.clone() }).unwrap();
-        let (first, second) = (line(&LogEntry::Event(started())), line(&LogEntry::Event(Event::Resumed)));
+        let (first, second) =
+            (line(&LogEntry::Event(started())), line(&LogEntry::Event(Event::Resumed { share: None })));
         std::fs::write(&path, format!("{first}\n{}", &second[..9])).unwrap();
         assert_eq!(tail.more().unwrap().len(), 1);
         assert_eq!(tail.more().unwrap(), []);
         std::fs::write(&path, format!("{first}\n{second}\n")).unwrap();
-        assert_eq!(tail.more().unwrap(), [LogLine { at: Timestamp(0), entry: LogEntry::Event(Event::Resumed) }]);
+        assert_eq!(
+            tail.more().unwrap(),
+            [LogLine { at: Timestamp(0), entry: LogEntry::Event(Event::Resumed { share: None }) }]
+        );
     }
 
     #[test]
@@ -568,7 +572,7 @@ mod tests {
         // Who goes on with it writes over the torn line.
         let mut writer = LogWriter::go_on(file.path()).unwrap();
         writer.go_on_behind(&log);
-        writer.append(Timestamp(2), &Event::Resumed, &[]).unwrap();
+        writer.append(Timestamp(2), &Event::Resumed { share: None }, &[]).unwrap();
         writer.make_durable().unwrap();
         let log = read(file.path()).unwrap();
         assert_eq!((log.lines.len(), log.torn), (2, None));
@@ -597,7 +601,7 @@ mod tests {
         let refused = log.append(Timestamp(1), &Event::Woken, &[Command::Wake { at: Timestamp(2) }, end]).unwrap_err();
         assert!(matches!(&refused, LogError::LineTooLong { what, .. } if what == "command end"), "{refused}");
         assert_eq!((log.written(), log.lines()), (bytes, lines));
-        log.append(Timestamp(2), &Event::Resumed, &[]).unwrap();
+        log.append(Timestamp(2), &Event::Resumed { share: None }, &[]).unwrap();
         assert_eq!(read(file.path()).unwrap().lines.len(), 3);
     }
 

@@ -62,7 +62,7 @@ pub struct Origin {
     /// Paths (without visits) of PIAs beside which younger ones may run: their exceptions are imprecise.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub imprecise: Vec<String>,
-    /// Its share of what several runs need, where that is not the usual one, 1.
+    /// Its share of what several runs need, where that is not the usual one, 1; until it is resumed with another one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub share: Option<f64>,
     /// What its actions are, so that a log can be read without the task. Nothing in logs of earlier versions.
@@ -119,13 +119,23 @@ pub enum Event {
         origin: Box<Origin>,
     },
     /// Task control was gone and goes on from its log. Logged; changes nothing.
-    Resumed,
+    Resumed {
+        /// Its share of what several runs need, from now on, where that is another one than before.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        share: Option<f64>,
+    },
     /// What the run has created, deleted and used up is so at the resource manager. Logged; changes nothing.
     Recorded {
         /// Up to this one of its [`Command::Operate`]s, which are numbered from 1.
         operation: u64,
         /// In the session of this number: the run's from now on, where it had another before.
         session: u64,
+    },
+    /// The session in which the run had what it held was gone when task control came back. Logged; changes nothing.
+    SessionLost {
+        /// The world pool's revision of the last commit that the run has made, or at which it began: up to it the run held what it works with. What
+        /// others have changed behind it, they may have changed with the same resources.
+        held_until: Revision,
     },
     /// The moment of a [`Command::Wake`] has come. Logged, as every event.
     Woken,

@@ -144,7 +144,7 @@ impl Leaving {
         let before = std::mem::replace(&mut self.last, context.now);
         match event {
             // The time in which nobody was there is not its own.
-            Event::Resumed => {
+            Event::Resumed { .. } => {
                 self.until = self.until + context.now.since(before);
                 context.commands.push(Command::Wake { at: self.until });
             }

@@ -217,7 +217,7 @@ impl<W: Write> Writer for Perfetto<W> {
     fn line(&mut self, line: &LogLine, run: &Timeline, changed: &Changed) -> io::Result<()> {
         let at_s = line.at.seconds();
         if let LogEntry::Event(event) = &line.entry
-            && !matches!(event, Event::Progressed { .. } | Event::Recorded { .. })
+            && !matches!(event, Event::Progressed { .. } | Event::Recorded { .. } | Event::SessionLost { .. })
         {
             self.ends_at_last(run, at_s)?;
             self.ends = None;

@@ -1,13 +1,15 @@
 //! One run of one task in virtual time: the same loop as the real task control's (receive, handle, perform), with the cores
 //! called directly.
 
+mod agenda;
 mod busy;
 mod circumstances;
 mod resume;
 
-pub use circumstances::{Circumstances, MAX_EVENTS, Mischief, Trigger};
+pub use circumstances::{Checks, Circumstances, MAX_EVENTS, Mischief, Trigger};
 
 use crate::dice::Dice;
+use agenda::{Agenda, Entry};
 use busy::Busy;
 use ratn_executive::executive::Executive;
 use ratn_executive::lookahead::{Lookout, Memory, Problem, Search};
@@ -165,14 +167,6 @@ pub enum RunError {
     },
 }
 
-/// What is going to happen.
-enum Entry {
-    /// This event.
-    Event(Event),
-    /// A resource of a lease vanishes, and the goal under it ends.
-    Loss { lease: LeaseId, instance: InstanceId, attempt: u32 },
-}
-
 struct Simulation<'a> {
     now: Timestamp,
     pool: Pool,
@@ -189,6 +183,8 @@ struct Simulation<'a> {
     told: BTreeSet<ProjectionId>,
     next_projection: u64,
     waiters: BTreeMap<InstanceId, WaiterId>,
+    /// The same by waiter.
+    waiting: BTreeMap<WaiterId, InstanceId>,
     leases: BTreeMap<LeaseId, InstanceId>,
     /// Leases that ended by themselves.
     lost: BTreeSet<LeaseId>,
@@ -198,8 +194,7 @@ struct Simulation<'a> {
     circumstances: Circumstances,
     paths: BTreeMap<InstanceId, String>,
     busy: Busy,
-    agenda: BTreeMap<(Timestamp, u64), Entry>,
-    next_entry: u64,
+    agenda: Agenda,
     latency: Duration,
     dice: Dice,
     oracle: &'a mut dyn Oracle,
@@ -207,7 +202,7 @@ struct Simulation<'a> {
     end: Option<(String, BTreeMap<String, Value>, String)>,
 }
 
-/// Makes the run. After every step the invariants of the cores are checked.
+/// Makes the run. After every step it is checked that the pool and the executive's mirror are as they have to be ([`Checks::Environment`]).
 ///
 /// # Errors
 /// [`RunError`] where a core breaks a promise: the run gets stuck, never ends, or an invariant fails.
@@ -267,6 +262,7 @@ pub fn run_while(
         told: BTreeSet::new(),
         next_projection: 0,
         waiters: BTreeMap::new(),
+        waiting: BTreeMap::new(),
         leases: BTreeMap::new(),
         lost: BTreeSet::new(),
         refusing: BTreeSet::new(),
@@ -274,8 +270,7 @@ pub fn run_while(
         circumstances,
         paths: BTreeMap::new(),
         busy: Busy::new(setup.program.clone()),
-        agenda: BTreeMap::new(),
-        next_entry: 0,
+        agenda: Agenda::default(),
         latency: setup.latency,
         dice: Dice(setup.seed),
         oracle,
@@ -310,7 +305,7 @@ pub fn run_while(
         if !goes_on() {
             return Err(RunError::Stopped { at_s: simulation.now.seconds() });
         }
-        let Some(((now, _), entry)) = simulation.agenda.pop_first() else {
+        let Some((now, entry)) = simulation.agenda.pop_first() else {
             let waits = executive.explain().into_iter().chain(simulation.wanted()).collect();
             return Err(RunError::Stuck { at_s: simulation.now.seconds(), waits });
         };
@@ -343,12 +338,14 @@ pub fn run_while(
             let restored = Executive::restore(setup.program.clone(), setup.tolerance, &executive.checkpoint());
             executive = restored.map_err(|problem| simulation.broken(format!("its checkpoint: {problem}")))?;
         }
-        simulation.check(&executive)?;
-        if simulation.circumstances.checks {
+        if simulation.circumstances.checks >= Checks::Environment {
+            simulation.check(&executive)?;
+        }
+        if simulation.circumstances.checks >= Checks::Everything {
             executive.check_invariants().map_err(|problem| simulation.broken(problem))?;
         }
         // A timer that is due now, but not yet heard of, wakes whom it is for.
-        let is_over = simulation.agenda.first_key_value().is_none_or(|((next, _), _)| *next > now);
+        let is_over = simulation.agenda.next_at().is_none_or(|next| next > now);
         if simulation.circumstances.examines && is_over {
             executive.check_quiescence(now).map_err(|problem| simulation.broken(problem))?;
         }
@@ -381,8 +378,7 @@ fn advice(outlook: &Problem, orders: usize, seed: u64, memory: &mut Memory) -> O
 
 impl Simulation<'_> {
     fn at(&mut self, delay: Duration, event: Event) {
-        self.next_entry += 1;
-        self.agenda.insert((self.now + delay, self.next_entry), Entry::Event(event));
+        self.agenda.add(self.now + delay, Entry::Event(event));
     }
 
     /// What comes before the run begins: the executive keeps it, and has nothing to say to it.
@@ -528,10 +524,12 @@ impl Simulation<'_> {
                     .speculative(priority < CERTAIN);
                 let waiter = self.pool.acquire(self.now, request).map_err(|e| self.broken(e))?;
                 self.waiters.insert(instance, waiter);
+                self.waiting.insert(waiter, instance);
                 self.answers();
             }
             Command::Withdraw { instance } => {
                 if let Some(waiter) = self.waiters.remove(&instance) {
+                    self.waiting.remove(&waiter);
                     self.pool.cancel(self.now, waiter).map_err(|e| self.broken(e))?;
                 } else if !self.refusing.remove(&instance) {
                     self.take_back_grant(instance)?;
@@ -572,17 +570,13 @@ impl Simulation<'_> {
                 self.busy.end(instance, attempt);
                 let path = self.paths.get(&instance).map_or("", String::as_str);
                 let crosses = self.circumstances.mischief.crosses(path, attempt);
-                let cancelled: Vec<_> =
-                    self.agenda.iter().filter(|(_, e)| is_answer(e, instance, attempt)).map(|(at, _)| *at).collect();
-                for at in cancelled {
-                    match self.agenda.remove(&at) {
-                        Some(Entry::Event(Event::Projected { projection, .. })) if !self.told.contains(&projection) => {
+                for (place, entry) in self.agenda.take_answers(instance, attempt) {
+                    match entry {
+                        Entry::Event(Event::Projected { projection, .. }) if !self.told.contains(&projection) => {
                             self.projections.remove(&projection);
                         }
-                        Some(Entry::Event(Event::Projected { .. })) => {}
-                        Some(answer @ Entry::Event(_)) if crosses => {
-                            self.agenda.insert(at, answer);
-                        }
+                        Entry::Event(Event::Projected { .. }) => {}
+                        answer @ Entry::Event(_) if crosses => self.agenda.put_back(place, answer),
                         _ => {}
                     }
                 }
@@ -638,7 +632,7 @@ impl Simulation<'_> {
     /// A withdrawal that crossed its grant.
     fn take_back_grant(&mut self, instance: InstanceId) -> Result<(), RunError> {
         let held = |lease: &LeaseId| self.leases.get(lease) == Some(&instance);
-        let crossed = self.agenda.values().find_map(|entry| match entry {
+        let crossed = self.agenda.entries().find_map(|entry| match entry {
             Entry::Event(Event::Granted { instance: to, lease }) if *to == instance => {
                 Some(lease.id).filter(|lease| held(lease))
             }
@@ -692,8 +686,7 @@ impl Simulation<'_> {
                 match lease.filter(|lease| self.leases.get(lease) == Some(&instance)) {
                     Some(lease) => {
                         let at = self.now + Duration::from_secs_f64(after_s.max(0.0));
-                        self.next_entry += 1;
-                        self.agenda.insert((at, self.next_entry), Entry::Loss { lease, instance, attempt });
+                        self.agenda.add(at, Entry::Loss { lease, instance, attempt });
                         return;
                     }
                     // Of what is inside a routine only the worker dies.
@@ -723,7 +716,7 @@ impl Simulation<'_> {
                 Notice::Refused { waiter, .. } => (waiter, None),
                 Notice::Event(_) => continue,
             };
-            let Some(instance) = self.waiters.iter().find(|(_, w)| **w == waiter).map(|(i, _)| *i) else { continue };
+            let Some(instance) = self.waiting.remove(&waiter) else { continue };
             self.waiters.remove(&instance);
             if let Some(lease) = lease {
                 self.leases.insert(lease.id, instance);
@@ -819,13 +812,4 @@ pub(crate) fn shown(world: World, reads: &Footprint) -> World {
     let Footprint::Patterns(patterns) = reads else { return world };
     let facts = patterns.iter().flat_map(|read| world.matching(read));
     World::from_facts(facts.map(|(key, fact)| (key.clone(), fact.value.clone())), world.revision())
-}
-
-fn is_answer(entry: &Entry, to: InstanceId, of: u32) -> bool {
-    matches!(entry,
-        Entry::Event(Event::Finished { instance, attempt, .. }
-        | Event::Improved { instance, attempt, .. }
-        | Event::Crashed { instance, attempt, .. }
-        | Event::Projected { instance, attempt, .. })
-        | Entry::Loss { instance, attempt, .. } if *instance == to && *attempt == of)
 }

@@ -235,9 +235,36 @@ fn count_to(iterations: usize, task: &str, readers: usize) -> Duration {
     shell.took
 }
 
-/// What `ratn check` takes to say what keeps it sequential.
-fn check_counting(iterations: usize) -> Duration {
-    let program = load(&counting(iterations), "task.yaml", &NoFiles);
+/// Every iteration computes while the arm still moves.
+fn computing_ahead(iterations: usize) -> String {
+    format!(
+        "task: ahead
+horizon: {horizon}
+states:
+  - go: {{ action: arm/move, pia: true, reads: [], effects: ['gone() = true'], duration: 1000000, resources: [{{ block: Arm }}] }}
+  - each:
+      for: i in range({iterations})
+      do:
+        - think: {{ action: brain/think, in: {{ a: $i }}, computes: true, reads: [], duration: 2, resources: [{{ block: Brain }}] }}
+  - end: {{ action: arm/move, in: {{ a: 7 }}, pia: true, reads: [], effects: ['n() = x'], resources: [{{ block: Arm }}] }}
+",
+        horizon = 4 * iterations + 10
+    )
+}
+
+/// What the executive takes for it.
+fn compute_ahead(iterations: usize) -> Duration {
+    let mut shell = Shell::new(&computing_ahead(iterations));
+    shell.compute_ahead();
+    assert_eq!(shell.started["brain"], iterations, "all are computed ahead");
+    shell.finish();
+    assert_eq!(shell.executive.root().get(&fact("n()")), Some(&Value::Int(8)));
+    shell.took
+}
+
+/// What `ratn check` takes to say what keeps a task sequential.
+fn check(task: &str) -> Duration {
+    let program = load(task, "task.yaml", &NoFiles);
     let parameters = program.bind_parameters(&[]).unwrap();
     let assumptions = Assumptions {
         parameters,
@@ -256,7 +283,9 @@ fn check_counting(iterations: usize) -> Duration {
 fn a_chain_of_effects_comes_to_its_sum() {
     count_to(6, &counting(6), 1);
     count_to(6, &counting_and_reading(6), 7);
-    check_counting(6);
+    check(&counting(6));
+    compute_ahead(6);
+    check(&computing_ahead(6));
 }
 
 #[test]
@@ -273,7 +302,17 @@ fn a_chain_of_effects_that_every_iteration_reads_costs_as_much_as_it_is_long() {
 
 #[test]
 fn what_check_says_of_a_chain_of_effects_costs_as_much_as_it_is_long() {
-    is_linear("check", [100, 1_000], check_counting);
+    is_linear("check", [100, 1_000], |n| check(&counting(n)));
+}
+
+#[test]
+fn a_loop_that_computes_ahead_costs_as_much_as_it_is_long() {
+    is_linear("a loop that computes ahead", [1_000, 10_000], compute_ahead);
+}
+
+#[test]
+fn what_check_says_of_a_loop_that_computes_ahead_costs_as_much_as_it_is_long() {
+    is_linear("check", [100, 1_000], |n| check(&computing_ahead(n)));
 }
 
 /// Runs in a thread with as little stack as threads have by default.

@@ -343,7 +343,7 @@ fn a_way_out_has_its_minute_whatever_time_nobody_was_there() {
         let back = bench.asks();
         // Longer than a way out may take.
         bench.now += 100;
-        bench.tell(Event::Resumed);
+        bench.tell(Event::Resumed { share: None });
         bench.grant(back, 2);
         bench.finish(back, 1);
         assert_eq!(

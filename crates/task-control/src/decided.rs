@@ -2,6 +2,7 @@
 //! can do without it. It is made again while it is not answered, for 30 s while it is refused for load, and only while the run's session has what it had: what a run has
 //! lost others may have got and changed. That is asked before every try, as a try may hang for longer than a session lives.
 
+use crate::performer::Overtaken;
 use crate::record::said;
 use ratn_worker::client::{CallError, LoadPatience};
 use ratn_worker::session::Trust;
@@ -29,6 +30,8 @@ pub(super) enum Unanswered {
 pub(super) enum Undone {
     /// The session was lost before. Whether the last try was performed is not known where one was made.
     Lost,
+    /// Others have changed what it is made of.
+    Overtaken(Overtaken),
     /// It was refused, or not answered.
     Failed(CallError),
 }
@@ -40,6 +43,7 @@ impl fmt::Display for Undone {
                 f,
                 "the run's session was lost before, and whoever had its resources since may have changed the same"
             ),
+            Undone::Overtaken(overtaken) => write!(f, "{overtaken}"),
             Undone::Failed(error) => write!(f, "{}", said(error)),
         }
     }

@@ -54,11 +54,6 @@ impl History {
         self.started()?.0.from.clone()
     }
 
-    /// Its share of what several runs need, where that is not the usual one.
-    pub fn share(&self) -> Option<f64> {
-        self.started()?.0.share
-    }
-
     /// How the run is executed, and what its random choices are derived from.
     pub(crate) fn mode_and_seed(&self) -> (Mode, u64) {
         match &self.first.entry {

@@ -96,7 +96,7 @@ impl Fold {
             }
             Event::Crashed { instance, .. } => drop(self.started.remove(instance)),
             // How long it took is not known of what was under way.
-            Event::Resumed => self.started.clear(),
+            Event::Resumed { .. } => self.started.clear(),
             _ => {}
         }
     }

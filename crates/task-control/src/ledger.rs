@@ -32,8 +32,8 @@ pub(super) struct Ledger {
     pub(super) first_revision: Revision,
     /// The root's revision of which the run has heard last: what others had made up to it is in its world.
     pub(super) knows: Revision,
-    /// The same when an instance was granted what it holds, or its last goal was given: from then on nobody else changes what it changes.
-    pub(super) began: BTreeMap<InstanceId, Revision>,
+    /// How what is under way began.
+    pub(super) began: BTreeMap<InstanceId, Began>,
     /// The first operation that failed, by its number: neither that one nor anything behind it is made.
     pub(super) failed: Option<u64>,
     /// The number of the run's session: what it has made and holds is in that one. A session of its id that has another number was opened by
@@ -76,6 +76,15 @@ pub(super) struct Ledger {
     pub(super) wakes: BTreeSet<Timestamp>,
     /// The run's outcome, once it has ended.
     pub(super) ended: Option<String>,
+}
+
+/// The beginning of an instance: it was granted what it holds, or its last goal was given.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Began {
+    /// The revision that the run had heard of then.
+    pub(super) knows: Revision,
+    /// Up to this revision it held what it works with, where the run has lost that since; where it has not, nobody else changes what it changes.
+    pub(super) held_until: Option<Revision>,
 }
 
 /// How far the daemons have confirmed what the run has decided, which they do in order.
@@ -126,6 +135,14 @@ pub(super) fn operation_request(run: &str, instance: InstanceId, number: u64, in
     format!("{run}/{instance}/operate-{number}.{index}")
 }
 
+impl Began {
+    /// Behind which revision others' changes count, where they do: what the run had heard of, it knew, and what they changed while it held what it
+    /// worked with, they did not change with that.
+    pub(super) fn others_count(&self) -> Option<Revision> {
+        self.held_until.map(|held| held.max(self.knows))
+    }
+}
+
 impl Ledger {
     /// An event that the executive was given.
     pub(super) fn event(&mut self, at: Timestamp, event: &Event) {
@@ -140,8 +157,10 @@ impl Ledger {
                 self.session = *session;
                 self.recorded = self.recorded.max(*operation);
             }
+            Event::SessionLost { held_until } => self.lose(*held_until),
             Event::WorldChanged { revision, .. } => self.knows = self.knows.max(*revision),
-            Event::Resumed => {
+            Event::Resumed { share } => {
+                self.origin.share = share.or(self.origin.share);
                 self.resumptions += 1;
                 for (instance, asked) in &mut self.waiting {
                     let again = acquire_request(&self.origin.run, *instance, asked.number, self.resumptions);
@@ -150,7 +169,7 @@ impl Ledger {
             }
             Event::Woken => self.wakes = self.wakes.split_off(&Timestamp(at.0.saturating_add(1))),
             Event::Granted { instance, lease } => {
-                self.began.insert(*instance, self.knows);
+                self.begins(*instance);
                 self.held.insert(lease.id);
                 if let Some(asked) = self.waiting.remove(instance) {
                     let used_up = |r: &Requirement| r.operation == ResourceOperation::Consume;
@@ -204,7 +223,7 @@ impl Ledger {
                 self.projecting.insert(*instance, asked);
             }
             Command::Start { instance, attempt, goal } => {
-                self.began.insert(*instance, self.knows);
+                self.begins(*instance);
                 self.goals.insert(*instance, (*attempt, (**goal).clone()));
             }
             Command::Cancel { instance, attempt } => {
@@ -222,10 +241,10 @@ impl Ledger {
             Command::Commit { instance, writer, changes, evidence, revision } => {
                 let (instance, revision, writer) = (*instance, *revision, writer.clone());
                 let (changes, evidence) = (changes.clone(), evidence.clone());
-                let knows = self.began.get(&instance).copied().unwrap_or(self.knows);
-                let behind = self.operations;
+                let now = || Began { knows: self.knows, held_until: None };
+                let (began, behind) = (self.began.get(&instance).copied().unwrap_or_else(now), self.operations);
                 if self.failed.is_none() {
-                    self.commits.push(Decided { instance, writer, changes, evidence, revision, knows, behind });
+                    self.commits.push(Decided { instance, writer, changes, evidence, revision, began, behind });
                 }
             }
             Command::Operate { instance, operations } => {
@@ -243,6 +262,24 @@ impl Ledger {
             }
             Command::Note(_) => {}
         }
+    }
+
+    /// It works from now on with what the run holds.
+    fn begins(&mut self, instance: InstanceId) {
+        self.began.insert(instance, Began { knows: self.knows, held_until: None });
+    }
+
+    /// What the run held is gone. Of what was lost before, others' changes count since then.
+    fn lose(&mut self, held_until: Revision) {
+        let decided = self.commits.iter_mut().map(|decided| &mut decided.began);
+        for began in self.began.values_mut().chain(decided) {
+            began.held_until.get_or_insert(held_until);
+        }
+    }
+
+    /// What is under way with what the run has lost, and behind which revision others' changes count against it.
+    pub(super) fn lost(&self) -> impl Iterator<Item = (InstanceId, Revision)> {
+        self.began.iter().filter_map(|(instance, began)| Some((*instance, began.others_count()?)))
     }
 
     /// What an instance had decided was not made, and so is nothing behind it: the recorder makes neither. A commit that failed may be made all the
@@ -402,7 +439,7 @@ mod tests {
         assert_eq!(ledger.withdrawn, [acquire_request("r", two, 2, 0)]);
         assert_eq!((ledger.held.len(), ledger.used_up().count()), (1, 1));
 
-        ledger.event(Timestamp(9), &Event::Resumed);
+        ledger.event(Timestamp(9), &Event::Resumed { share: None });
         assert_eq!(ledger.waiting[&three].request, acquire_request("r", three, 3, 1));
         ledger.command(&Command::Release { instance: one, lease: Some(LeaseId(7)), projection: None });
         assert!(ledger.held.is_empty());
@@ -486,7 +523,10 @@ mod tests {
         decides(&mut ledger, 1);
         ledger.event(Timestamp(1), &Event::WorldChanged { revision: Revision(5), facts: Vec::new() });
         decides(&mut ledger, 2);
-        assert_eq!(ledger.commits.iter().map(|decided| decided.knows).collect::<Vec<_>>(), [Revision(0), Revision(5)]);
+        assert_eq!(
+            ledger.commits.iter().map(|decided| decided.began.knows).collect::<Vec<_>>(),
+            [Revision(0), Revision(5)]
+        );
     }
 
     fn goal() -> Goal {
@@ -524,10 +564,38 @@ mod tests {
         for (number, instance) in (1..).zip([motion, other, InstanceId(3)]) {
             ledger.command(&commits(instance, number));
         }
-        assert_eq!(ledger.commits.iter().map(|decided| decided.knows.0).collect::<Vec<_>>(), [4, 10, 12]);
+        assert_eq!(ledger.commits.iter().map(|decided| decided.began.knows.0).collect::<Vec<_>>(), [4, 10, 12]);
         ledger.command(&Command::Note(Note::Retired { instance: motion }));
         ledger.command(&Command::Note(Note::Squashed { instance: other }));
         assert!(ledger.began.is_empty());
+    }
+
+    #[test]
+    fn what_was_lost_once_is_lost_since_then_until_it_begins_anew() {
+        let [motion, other] = [1, 2].map(InstanceId);
+        let mut ledger = Ledger::default();
+        let starts = |ledger: &mut Ledger, instance| {
+            ledger.command(&Command::Start { instance, attempt: 1, goal: Box::new(goal()) });
+        };
+        let heard = |ledger: &mut Ledger, revision: u64| {
+            ledger.event(Timestamp(1), &Event::WorldChanged { revision: Revision(revision), facts: Vec::new() });
+        };
+        let lost = |ledger: &Ledger| ledger.lost().map(|(instance, behind)| (instance.0, behind.0)).collect::<Vec<_>>();
+        starts(&mut ledger, motion);
+        heard(&mut ledger, 5);
+        starts(&mut ledger, other);
+        ledger.command(&commits(InstanceId(3), 1));
+        assert_eq!(lost(&ledger), []);
+        for held_until in [4, 9] {
+            ledger.event(Timestamp(1), &Event::SessionLost { held_until: Revision(held_until) });
+            assert_eq!(lost(&ledger), [(1, 4), (2, 5)], "it knew of what was changed before it began");
+        }
+        ledger.command(&commits(motion, 2));
+        starts(&mut ledger, motion);
+        ledger.command(&commits(motion, 3));
+        assert_eq!(lost(&ledger), [(2, 5)]);
+        let counts = ledger.commits.iter().map(|decided| decided.began.others_count().map(|behind| behind.0));
+        assert_eq!(counts.collect::<Vec<_>>(), [Some(5), Some(4), None]);
     }
 
     #[test]

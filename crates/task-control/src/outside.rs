@@ -69,6 +69,7 @@ pub(super) fn differences(root: &World, mirror: &World) -> Vec<(FactKey, Option<
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ledger::Began;
     use ratn_model::fact::FactPattern;
     use ratn_model::id::{InstanceId, Revision};
     use ratn_proto::types::FactRecord;
@@ -100,8 +101,8 @@ mod tests {
             self.commits += 1;
             let revision = self.mirror.apply(changes).unwrap_or_default();
             let (instance, writer) = (InstanceId(self.commits), String::new());
-            let (changes_made, evidence, knows) = (changes.to_vec(), Vec::new(), Revision(0));
-            let decided = Decided { instance, writer, changes: changes_made, evidence, revision, knows, behind: 0 };
+            let (changes_made, evidence, began) = (changes.to_vec(), Vec::new(), Began::default());
+            let decided = Decided { instance, writer, changes: changes_made, evidence, revision, began, behind: 0 };
             self.outside.decided("run", &decided);
             (decided.id("run"), changes.to_vec())
         }

@@ -228,7 +228,10 @@ impl Progress {
                     say(&mut lines, at, &format!("world  and {} more facts", facts.len() - MOST_FACTS));
                 }
             }
-            Event::Resumed => say(&mut lines, at, "task control goes on"),
+            Event::Resumed { .. } => say(&mut lines, at, "task control goes on"),
+            Event::SessionLost { .. } => {
+                say(&mut lines, at, "the session of the run has ended, and what it held is gone")
+            }
             Event::Signalled { signal, value: Value::Null } => say(&mut lines, at, &format!("signal {signal}")),
             Event::Signalled { signal, value } => say(&mut lines, at, &format!("signal {signal} = {value}")),
             Event::Answered { instance, choice } => {

@@ -3,8 +3,8 @@
 //! asked for while that is on its way.
 
 use super::decided::{Unanswered, Undone, insist};
-use super::ledger::{Confirmed, Projecting, operation_request};
-use super::performer::Answer;
+use super::ledger::{Began, Confirmed, Projecting, operation_request};
+use super::performer::{Answer, Untouched};
 use super::promises::{Made, Promises};
 use super::safe_on_disk::Mark;
 use futures::FutureExt;
@@ -50,6 +50,8 @@ pub(super) enum Record {
     },
     Commit {
         decided: Decided,
+        /// Under which condition it is made, where the run has lost, or given back, what it was made with.
+        untouched: Option<Untouched>,
         /// What has to be safe before.
         safe: Option<Mark>,
     },
@@ -97,8 +99,8 @@ pub(super) struct Decided {
     pub(super) evidence: Evidence,
     /// What the run's root becomes: the pool's, as long as nobody else writes into it.
     pub(super) revision: Revision,
-    /// The pool's revision that the run had heard of when it began what led to that: what others had made until then it knew.
-    pub(super) knows: Revision,
+    /// How what led to that began.
+    pub(super) began: Began,
     /// How many operations were decided before it: it is made behind them.
     pub(super) behind: u64,
 }
@@ -147,7 +149,7 @@ pub(super) struct Recorder {
 pub(super) struct Root(Arc<AtomicU64>);
 
 impl Root {
-    fn get(&self) -> Revision {
+    pub(super) fn get(&self) -> Revision {
         Revision(self.0.load(Ordering::SeqCst))
     }
 
@@ -190,7 +192,7 @@ impl Recorder {
                     let reason = format!("not done behind what failed: {reason}");
                     Some(Event::RetirementFailed { instance, reason, unmade: Unmade::Untried })
                 }
-                Record::Commit { decided, safe } => {
+                Record::Commit { decided, untouched, safe } => {
                     let over = CancellationToken::new();
                     let (instance, under_way) = (decided.instance, UnderWay { id: decided.id(&self.run), over });
                     let _answered = under_way.over.clone().drop_guard();
@@ -209,7 +211,7 @@ impl Recorder {
                     let committing = async {
                         match refused {
                             Some(refused) => Some(refused),
-                            None => self.commit(instance, decided.commit(&self.run)).await,
+                            None => self.commit(instance, decided.commit(&self.run), untouched).await,
                         }
                     };
                     let mut committing = pin!(trace::within(self.of(instance), committing));
@@ -304,13 +306,13 @@ impl Recorder {
         }));
     }
 
-    async fn commit(&self, instance: InstanceId, commit: Commit) -> Option<Event> {
-        let reason = match commit_next(&self.world, &self.trust, self.root.get(), commit).await {
+    async fn commit(&self, instance: InstanceId, commit: Commit, untouched: Option<Untouched>) -> Option<Event> {
+        let reason = match commit_next(&self.world, &self.trust, self.root.get(), commit, untouched).await {
             Ok(revision) => {
                 self.root.reached(revision);
                 return None;
             }
-            Err(lost @ Undone::Lost) => format!("its effects are not recorded: {lost}"),
+            Err(lost @ (Undone::Lost | Undone::Overtaken(_))) => format!("its effects are not recorded: {lost}"),
             Err(failed) => format!("the world pool did not take its effects: {failed}"),
         };
         Some(Event::RetirementFailed { instance, reason, unmade: Unmade::Untried })
@@ -448,15 +450,20 @@ fn confirms(record: &Record) -> Confirmed {
 
 /// Commits on top of whatever others have committed, while the run has what it had; the pool's root with it. `known` is a revision that the
 /// pool has had: one that has lost it takes nothing. What others committed before the run is asked whether it has what it had, they committed while
-/// the run held what its commit is about; so that is asked behind the reading of the root and before the commit.
+/// the run held what its commit is about; so that is asked behind the reading of the root and before the commit. What was made with what the run has
+/// lost since is committed only where it is `untouched` up to the root on which it is made.
 pub(super) async fn commit_next(
     world: &WorldClient,
     trust: &Trust,
     mut known: Revision,
     mut commit: Commit,
+    mut untouched: Option<Untouched>,
 ) -> Result<Revision, Undone> {
     let mut attempts = MAX_OVERTAKEN;
     loop {
+        if let Some(untouched) = &mut untouched {
+            untouched.up_to(known, (world, trust), (&commit.writer, &commit.changes)).await?;
+        }
         commit.revision = Some(Revision(known.0 + 1));
         match insist(trust, Unanswered::GivenUp, || world.commit_as(commit.clone())).await {
             Ok((revision, _)) => return Ok(revision),

@@ -140,7 +140,7 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
     let id = fresh_id("run");
     let began_unix_ms = unix_ms();
     let trace = trace_of(&id, &run.program.name, run.seed, began_unix_ms);
-    let performer = Performer::connect(place, &id, &run.program.name, None, trace, events).await;
+    let performer = Performer::connect(place, &id, &run.program, None, trace, events).await;
     let performer = performer.context("cannot begin the run")?;
     // A run that is refused leaves no log.
     let log = LogWriter::create(&run.log)?;

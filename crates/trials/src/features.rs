@@ -171,6 +171,18 @@ impl Features {
     /// [`Features::WAYS_OUT`], with outputs of everything that contains states.
     pub const OUTPUTS: Features = Features { outputs: true, ..Features::WAYS_OUT };
 
+    /// What a task file can say of actions whose catalogue says a part of it ([`crate::inherited()`]).
+    pub const INHERITED: Features = Features {
+        transitions: false,
+        preemptive: false,
+        facts: true,
+        keys: true,
+        amounts: true,
+        supplies: true,
+        estimates: true,
+        ..Features::ALL
+    };
+
     /// Imprecise motions that fail, in programs that never look at the world: where a failure leads is then the same in both
     /// modes, whatever younger motions have done meanwhile.
     pub const IMPRECISE: Features = Features {

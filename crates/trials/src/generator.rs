@@ -17,7 +17,7 @@
 //! numbers and things); values that are poses, joint positions or trajectories; selectors of task resources; task resources and
 //! batteries that run out; consumption inside of routines; facts in `duration`; preemptive concurrencies within others, in
 //! routines, or with anything that may fail to begin; transitions into the middle of a state; libraries of files (what the
-//! loader makes of one is made directly).
+//! loader makes of one is made directly). What actions say in a catalogue is made of its programs by [`crate::inherited()`].
 
 use super::{
     AGAIN, ARGUMENTS, Dice, EMPTY, FOUND, Features, PART, PREDICATES, TOOL, anytime, around, finds, is_in_routine,

@@ -122,8 +122,10 @@ fn leaves_otherwise(
     is_otherwise.then(|| {
         let acts: Vec<&str> = told.acts.iter().map(|act| act.path.as_str()).collect();
         format!(
-            "there is no place at which a run that is told to end does this: {acts:?} {:?} {:?}",
-            told.changes, part.reason
+            "there is no place at which a run that is told to end does this: {acts:?} {:?} {:?}, and leaves {:?}",
+            told.changes,
+            part.reason,
+            part.world.iter().map(|(key, fact)| format!("{key} = {}", fact.value)).collect::<Vec<_>>()
         )
     })
 }

@@ -20,7 +20,7 @@
 //!
 //! | | |
 //! |---|---|
-//! | programs | `generator`, `features`, `listing` |
+//! | programs | `generator`, `features`, `listing`; as task files with a catalogue that says a part of them: `inherited` |
 //! | their world | `oracle`, `awaited`, `anytime`, `dice` |
 //! | both modes beside each other | `trial`, `outside`, `interrupt`, `story`, `weak`, `blind` |
 //! | both modes beside a plain evaluation of the program | `reference` |
@@ -33,6 +33,7 @@ mod blind;
 mod features;
 mod finds;
 mod generator;
+mod inherited;
 mod interrupt;
 mod listing;
 mod lists;
@@ -48,6 +49,7 @@ mod weak;
 
 pub use features::Features;
 pub use generator::program;
+pub use inherited::{Inherited, inherited};
 pub use interrupt::trial_interrupted;
 pub use listing::listing;
 pub use oracle::HashOracle;

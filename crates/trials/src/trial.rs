@@ -14,7 +14,7 @@ use ratn_model::program::{Program, SUCCESS, State, StateKind};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
-use ratn_simulation::run::{Circumstances, Mischief, Run, RunError, Setup, Trigger, run_under};
+use ratn_simulation::run::{Checks, Circumstances, Mischief, Run, RunError, Setup, Trigger, run_under};
 use std::collections::{BTreeMap, BTreeSet};
 use std::num::NonZeroUsize;
 use std::sync::Arc;
@@ -298,7 +298,7 @@ fn circumstances(program: &Program, conditions: &Conditions) -> Circumstances {
         events: if conditions.pauses { pauses(program, seed) } else { Vec::new() },
         mischief: Mischief { seed, twice_percent: percent, late_percent: percent, crossing_percent: 2 * percent },
         // Long programs are not examined, which would take minutes.
-        checks: !is_long(program),
+        checks: if is_long(program) { Checks::Environment } else { Checks::Everything },
         examines: !is_long(program),
         checkpoint_every: (!is_long(program)).then(|| checkpoint_every(seed)),
         refused: refused(program, conditions),

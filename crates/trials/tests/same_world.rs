@@ -13,8 +13,8 @@ use ratn_model::expression::{Expr, Function};
 use ratn_model::program::{Program, State, StateKind};
 use ratn_model::value::Value;
 use ratn_trials::{
-    Conditions, Features, Shrunk, Verdict, execute, listing, no_verdict, program, shrink_by, trial, trial_from_outside,
-    trial_interrupted,
+    Conditions, Features, Inherited, Shrunk, Verdict, execute, inherited, listing, no_verdict, program, shrink_by,
+    trial, trial_from_outside, trial_interrupted,
 };
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -238,6 +238,30 @@ fn random_programs_with_outputs_of_everything_leave_the_same_world_in_both_modes
     none_fails(trial_from_outside, OUTPUTS, 60, &Features::OUTPUTS);
 }
 
+/// What seed the programs with inherited annotations begin with.
+const INHERITED: u64 = 13 << 41;
+
+/// What an action says in the catalogue is in force where its state says nothing else, and the state's word where it does; then the program is one
+/// as any other.
+#[test]
+fn random_programs_whose_actions_say_what_their_states_would_leave_the_same_world_in_both_modes() {
+    let (mut loaded, mut refused) = (0, Vec::new());
+    for seed in INHERITED..INHERITED + number("RATN_INHERITED", 300) {
+        match inherited(seed) {
+            Inherited::Differs(problem) => panic!("seed {seed}: {problem}"),
+            Inherited::Refused(findings) => refused.push(findings),
+            Inherited::Program(made) => {
+                loaded += 1;
+                let (made, conditions) = (Arc::new(*made), Conditions::of(seed, &Features::INHERITED));
+                if let Verdict::Differs(problem) = trial(&made, &conditions) {
+                    panic!("seed {seed}: {problem}\n{}", listing(&made));
+                }
+            }
+        }
+    }
+    assert!(refused.len() < loaded, "{} of {} are refused, the first for {:?}", refused.len(), loaded, refused.first());
+}
+
 /// A pause asked for what a state around it blocks.
 #[test]
 fn programs_that_once_failed_because_a_pause_was_refused_leave_the_same_world() {
@@ -442,4 +466,12 @@ fn motions_are_given_better_results_than_the_first() {
         }
     }
     assert!(better * 10 > motions, "{better} of {motions} results were better than the first");
+}
+
+/// The reference knew nothing of what was waited for and came when nobody waited any more, and of a run that is told to end in a pause between
+/// two tries, the second of which does not begin.
+#[test]
+fn programs_that_once_failed_because_a_wait_was_interrupted_do_the_first_of_what_they_would_have_done() {
+    once_failed(trial_interrupted, &Features::WATCHED, &[7_300_134_085, 7_300_201_374, 7_300_206_647]);
+    once_failed(trial_interrupted, &Features::WAITS, &[9_320_001_228]);
 }

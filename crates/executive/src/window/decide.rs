@@ -191,8 +191,7 @@ impl Window {
         let mut seen = Seen::default();
         for (name, expression, what) in parts {
             // Assignments may be made of the outputs.
-            let before = outputs.clone();
-            let value = self.look(context, instance.id, Some(&before), |instance, view| {
+            let value = self.look(context, instance.id, Some(&outputs), |instance, view| {
                 let mut looked = Seen::default();
                 let value = expression.evaluate(view).map_err(|error| {
                     // Left by an outcome of its own, before it was written: there is nobody to wait for.

@@ -193,7 +193,8 @@ impl Window {
             | Event::Started { .. }
             | Event::Progressed { .. }
             | Event::Recorded { .. }
-            | Event::Resumed => {}
+            | Event::SessionLost { .. }
+            | Event::Resumed { .. } => {}
         }
         self.go_on(context)
     }

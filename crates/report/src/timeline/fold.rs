@@ -88,7 +88,7 @@ impl Timeline {
     /// Takes the next line, and says what it has changed.
     pub fn apply(&mut self, line: &LogLine) -> Changed {
         let at = line.at.seconds();
-        if line.entry == LogEntry::Event(Event::Resumed) {
+        if matches!(line.entry, LogEntry::Event(Event::Resumed { .. })) {
             self.absences.push(Span { from_s: self.end_s, to_s: at });
         }
         self.end_s = self.end_s.max(at);
@@ -157,7 +157,7 @@ impl Timeline {
             Event::Woken => Cause::Time,
             Event::Advised { .. } => Cause::Advice,
             Event::WantedByOthers { .. } => Cause::AnotherRun,
-            Event::Resumed => Cause::Resumed,
+            Event::Resumed { .. } => Cause::Resumed,
             Event::PauseRequested
             | Event::ResumeRequested
             | Event::StepRequested
@@ -166,7 +166,7 @@ impl Timeline {
             | Event::AbortRequested { .. } => Cause::Operator,
             Event::Signalled { signal, .. } => Cause::Signal(signal.as_str().into()),
             // It changes nothing.
-            Event::Progressed { .. } | Event::Recorded { .. } => return,
+            Event::Progressed { .. } | Event::Recorded { .. } | Event::SessionLost { .. } => return,
         };
         match event {
             Event::Started { task, mode, parameters, seed, capacity, breakpoints, origin, .. } => {
@@ -219,12 +219,13 @@ impl Timeline {
             Event::Projected { .. }
             | Event::Progressed { .. }
             | Event::Recorded { .. }
+            | Event::SessionLost { .. }
             | Event::WorldChanged { .. }
             | Event::RetirementFailed { .. }
             | Event::AbortRequested { .. }
             | Event::Signalled { .. }
             | Event::Answered { .. }
-            | Event::Resumed
+            | Event::Resumed { .. }
             | Event::Woken
             | Event::WantedByOthers { .. }
             | Event::Advised { .. } => {}
@@ -472,8 +473,9 @@ fn instance_of(event: &Event) -> Option<InstanceId> {
         | Event::Answered { instance, .. }
         | Event::RetirementFailed { instance, .. } => Some(*instance),
         Event::Started { .. }
-        | Event::Resumed
+        | Event::Resumed { .. }
         | Event::Recorded { .. }
+        | Event::SessionLost { .. }
         | Event::Woken
         | Event::PauseRequested
         | Event::ResumeRequested

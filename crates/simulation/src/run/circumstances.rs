@@ -24,8 +24,8 @@ pub struct Circumstances {
     pub events: Vec<(Trigger, Event)>,
     /// How messages go wrong.
     pub mischief: Mischief,
-    /// After every event the executive's invariants are checked. Costs the whole window each time.
-    pub checks: bool,
+    /// What is checked after every event.
+    pub checks: Checks,
     /// After the last event of every moment it is checked that nobody could go on who was not woken; on a copy of the executive, so
     /// that the run is the same without.
     pub examines: bool,
@@ -41,6 +41,18 @@ pub struct Circumstances {
     pub checkpoint_every: Option<NonZeroUsize>,
 }
 
+/// How much is checked after every event of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+pub enum Checks {
+    /// Nothing: the run is a prediction, and shall cost what it does.
+    Nothing,
+    /// That the resource pool keeps its promises, and the executive's mirror is the root. Costs all that is in the pool each time.
+    #[default]
+    Environment,
+    /// The executive's invariants, too. Costs the whole window each time.
+    Everything,
+}
+
 impl Default for Circumstances {
     fn default() -> Circumstances {
         Circumstances {
@@ -48,7 +60,7 @@ impl Default for Circumstances {
             max_events: MAX_EVENTS,
             events: Vec::new(),
             mischief: Mischief::default(),
-            checks: false,
+            checks: Checks::default(),
             examines: false,
             refused: BTreeSet::new(),
             resume_after: None,

@@ -33,19 +33,17 @@ struct Visit {
 
 /// The chain, from the first to the last.
 pub(super) fn chain(program: &Program, log: &[LogLine]) -> Vec<Link> {
-    let visits = visits(log);
+    let visits = Visits::of(log);
     let mut links = Vec::new();
-    let last = visits.iter().filter(|(_, visit)| visit.began.is_some()).max_by_key(|(id, visit)| (visit.ended, **id));
-    let mut at = last.map(|(id, visit)| (*id, visit));
+    let last = visits.all.iter().filter(|(_, visit)| visit.began.is_some());
+    let mut at = last.max_by_key(|(id, visit)| (visit.ended, **id)).map(|(id, visit)| (*id, visit));
     while let Some((id, visit)) = at {
         let (Some(began), Some(ended)) = (visit.began, visit.ended) else { break };
         // What ended just then, the closest bond first. Of equals, the youngest.
         let before = visits
-            .iter()
-            .filter(|(other, earlier)| {
-                **other != id && earlier.ended == Some(began) && earlier.began.is_some_and(|b| b < began)
-            })
-            .map(|(other, earlier)| (bond(program, &visits, *other, id), *other, earlier))
+            .ended_at(began)
+            .filter(|(other, earlier)| *other != id && earlier.began.is_some_and(|b| b < began))
+            .map(|(other, earlier)| (bond(program, &visits, other, id), other, earlier))
             .max_by_key(|(bond, other, _)| (std::cmp::Reverse(bond.clone()), *other));
         let because = match &before {
             Some((bond, _, _)) => bond.sentence(),
@@ -60,6 +58,53 @@ pub(super) fn chain(program: &Program, log: &[LogLine]) -> Vec<Link> {
 }
 
 /// What was executed, and when.
+struct Visits {
+    all: BTreeMap<InstanceId, Visit>,
+    by_end: BTreeMap<Timestamp, Vec<InstanceId>>,
+    /// Those that began, by every path with visits that they are at or within, the oldest first.
+    within: BTreeMap<String, Vec<InstanceId>>,
+    /// The same by the path around and the name of the state, whichever visit of it.
+    of_state: BTreeMap<(String, String), Vec<InstanceId>>,
+}
+
+impl Visits {
+    fn of(log: &[LogLine]) -> Visits {
+        let all = visits(log);
+        let (mut by_end, mut within, mut of_state) =
+            (BTreeMap::<Timestamp, Vec<InstanceId>>::new(), BTreeMap::<_, Vec<_>>::new(), BTreeMap::<_, Vec<_>>::new());
+        for (id, visit) in &all {
+            visit.ended.iter().for_each(|ended| by_end.entry(*ended).or_default().push(*id));
+            let parts: Vec<&str> = visit.path.split('/').collect();
+            for depth in (0..parts.len()).filter(|_| visit.began.is_some()) {
+                let name = parts[depth].split(['[', '#']).next().unwrap_or_default();
+                within.entry(parts[..=depth].join("/")).or_default().push(*id);
+                of_state.entry((parts[..depth].join("/"), name.to_owned())).or_default().push(*id);
+            }
+        }
+        Visits { all, by_end, within, of_state }
+    }
+
+    fn ended_at(&self, at: Timestamp) -> impl Iterator<Item = (InstanceId, &Visit)> {
+        self.by_end.get(&at).into_iter().flatten().map(|id| (*id, &self.all[id]))
+    }
+
+    /// The visit that writes what a visit takes of `source`: the latest before it, in the same iterations of the loops around both, and of
+    /// what is within `source` the one that ended last.
+    fn source(&self, program: &Program, source: StateId, behind: InstanceId) -> Option<InstanceId> {
+        // The states around the source, which are those around the visit too, with their iterations and visits.
+        let source = program.state(source);
+        let depth = source.path.split('/').count() - 1;
+        let place = |path: &str, depth: usize| path.split('/').take(depth).collect::<Vec<_>>().join("/");
+        let older = |all: &'_ [InstanceId]| all.partition_point(|id| *id < behind);
+        let around = place(&self.all[&behind].path, depth);
+        let visits = self.of_state.get(&(around, source.name.clone()))?;
+        let latest = visits[..older(visits)].last()?;
+        // All that is within one visit of the source has its place in common.
+        let own = self.within.get(&place(&self.all[latest].path, depth + 1))?;
+        own[..older(own)].iter().copied().max_by_key(|id| (self.all[id].ended, *id))
+    }
+}
+
 fn visits(log: &[LogLine]) -> BTreeMap<InstanceId, Visit> {
     let mut visits: BTreeMap<InstanceId, Visit> = BTreeMap::new();
     for line in log {
@@ -113,12 +158,12 @@ impl Bond {
 }
 
 /// Why the visit `behind` waits for the visit `before`. Where a state is visited several times, each visit takes the outputs of one visit.
-fn bond(program: &Program, visits: &BTreeMap<InstanceId, Visit>, before: InstanceId, behind: InstanceId) -> Bond {
-    let (earlier, visit) = (&visits[&before], &visits[&behind]);
+fn bond(program: &Program, visits: &Visits, before: InstanceId, behind: InstanceId) -> Bond {
+    let (earlier, visit) = (&visits.all[&before], &visits.all[&behind]);
     let state = program.state(visit.state);
     let takes = |expression: &Expr| {
         expression.flows().into_iter().any(|source| {
-            is_within(program, earlier.state, source) && source_visit(program, visits, source, behind) == Some(before)
+            is_within(program, earlier.state, source) && visits.source(program, source, behind) == Some(before)
         })
     };
     let takes_in = |state: &State, is_meant: fn(Slot<'_>) -> bool| {
@@ -149,28 +194,6 @@ fn bond(program: &Program, visits: &BTreeMap<InstanceId, Visit>, before: Instanc
 /// Whether a state is another one or within it.
 fn is_within(program: &Program, state: StateId, outer: StateId) -> bool {
     std::iter::successors(Some(state), |id| program.state(*id).parent).any(|ancestor| ancestor == outer)
-}
-
-/// The visit that writes what a visit takes of `source`: the latest before it, in the same iterations of the loops around both, and of
-/// what is within `source` the one that ended last.
-fn source_visit(
-    program: &Program,
-    visits: &BTreeMap<InstanceId, Visit>,
-    source: StateId,
-    behind: InstanceId,
-) -> Option<InstanceId> {
-    // The states around the source, which are those around the visit too, with their iterations and visits.
-    let depth = program.state(source).path.split('/').count() - 1;
-    let place = |path: &str, depth: usize| path.split('/').take(depth).map(str::to_owned).collect::<Vec<_>>();
-    let shared = place(&visits[&behind].path, depth);
-    let written = visits.range(..behind).filter(|(_, visit)| {
-        visit.began.is_some() && is_within(program, visit.state, source) && place(&visit.path, depth) == shared
-    });
-    // All that is within one visit of the source has its place in common.
-    let (_, latest) = written.clone().next_back()?;
-    let own = place(&latest.path, depth + 1);
-    let within = written.filter(|(_, visit)| place(&visit.path, depth + 1) == own);
-    within.max_by_key(|(id, visit)| (visit.ended, **id)).map(|(id, _)| *id)
 }
 
 fn around<'a>(program: &'a Program, state: &'a State) -> impl Iterator<Item = &'a State> {

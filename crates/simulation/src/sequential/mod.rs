@@ -10,7 +10,7 @@ mod providers;
 
 pub use chain::Link;
 
-use crate::run::{Circumstances, Run, RunError, Setup, run_while};
+use crate::run::{Checks, Circumstances, Run, RunError, Setup, run_while};
 use annotate::{annotated, missing};
 use providers::AssumedProviders;
 use ratn_executive::protocol::{Command, LogEntry};
@@ -282,7 +282,7 @@ fn simulate_within(
     };
     let mut providers = AssumedProviders::new(&program, assumptions);
     let (attributes, max_events) = (assumptions.attributes.clone(), bound.max_events);
-    let circumstances = Circumstances { attributes, max_events, ..Circumstances::default() };
+    let circumstances = Circumstances { attributes, max_events, checks: Checks::Nothing, ..Circumstances::default() };
     let run = run_while(setup, &mut providers, circumstances, bound.goes_on);
     let run = run.map_err(|source| Obstacle::Run { mode: name, source })?;
     unknown.extend(providers.unknown_durations());

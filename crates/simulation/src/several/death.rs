@@ -138,7 +138,7 @@ impl System<'_> {
         self.asks_again(run)?;
         let log = &mut self.runs[run].log;
         log.extend(missing.into_iter().map(|command| LogLine { at: self.now, entry: LogEntry::Command(command) }));
-        let commands = self.decide(run, Event::Resumed);
+        let commands = self.decide(run, Event::Resumed { share: None });
         self.perform_all(run, others)?;
         self.perform_all(run, commands)?;
         let facts = self.differences(run);

@@ -52,7 +52,9 @@ impl Performer {
         withdrawn: Option<Arc<DropGuard>>,
     ) {
         if let Some(lease) = lease {
-            self.leases.given_back(lease, Instant::now());
+            let now = Instant::now();
+            self.leases.given_back(lease, now);
+            self.left.goes_back(self.decided, self.recorded.borrow().commit, now);
             self.holds.set(self.leases.has_speculative());
         }
         let (resources, world, trust) = (self.resources.clone(), self.world.clone(), self.trust.clone());

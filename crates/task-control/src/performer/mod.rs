@@ -18,7 +18,7 @@ mod watch;
 
 pub(super) use resume::{check_world, missing_commits, remembers};
 
-use super::ledger::{Confirmed, Projecting, acquire_request};
+use super::ledger::{Began, Confirmed, Projecting, acquire_request};
 use super::outside::Outside;
 use super::promises::{Making, Promises};
 use super::record::{Cancelled, Decided, MAX_PENDING_RECORDS, Named, Record, Recorded, Recorder, Root};
@@ -28,7 +28,8 @@ use crate::messages::Messages;
 use crate::safe_on_disk::Mark;
 use acquiring::{Acquiring, Asking, Waiting};
 use anyhow::{Context, bail};
-use came_between::CameBetween;
+use came_between::{CameBetween, Left};
+pub(crate) use came_between::{Overtaken, Untouched};
 pub use claim::{RUN_KIND, claim};
 use futures::FutureExt;
 use goal::{Given, Performing};
@@ -39,6 +40,7 @@ use ratn_model::catalogue::Catalogue;
 use ratn_model::condition::Condition;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, Revision};
+use ratn_model::program::Program;
 use ratn_model::resource::{LeasedResource, Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
@@ -157,7 +159,7 @@ impl From<Event> for Answer {
 /// One run's hands.
 pub(super) struct Performer {
     run: String,
-    task: String,
+    program: Arc<Program>,
     urgency: Urgency,
     standing: Standing,
     /// The robot's seconds per second.
@@ -188,6 +190,8 @@ pub(super) struct Performer {
     outside: Outside,
     /// Of a run that came back without what it held, while anything of before is under way.
     came_between: Option<CameBetween>,
+    /// What went back while commits were on their way.
+    left: Left,
     told: Told,
     /// The run's own number of its last commit.
     decided: Revision,
@@ -256,7 +260,7 @@ impl Performer {
     pub(super) async fn connect(
         place: &Place,
         run: &str,
-        task: &str,
+        program: &Arc<Program>,
         before: Option<u64>,
         trace: TraceContext,
         events: mpsc::Sender<Answer>,
@@ -286,7 +290,7 @@ impl Performer {
         let told = Told::new(&run);
         let others = claim::look_for_others(resources.clone(), run.clone(), told.clone());
         let others = AbortOnDropHandle::new(tokio::spawn(others));
-        match claim(&resources, &run, task, place.alone).await {
+        match claim(&resources, &run, &program.name, place.alone).await {
             Ok(has_others) => told.beside_others(has_others),
             // What a run that comes back holds is still its own.
             Err(refused) if is_own => {
@@ -322,7 +326,7 @@ impl Performer {
         let recorder = AbortOnDropHandle::new(tokio::spawn(trace::within(trace, recorder.work(work))));
         Ok(Performer {
             run,
-            task: task.to_owned(),
+            program: Arc::clone(program),
             urgency: place.urgency,
             standing,
             speed: place.speed,
@@ -344,6 +348,7 @@ impl Performer {
             root,
             outside: Outside::default(),
             came_between: None,
+            left: Left::default(),
             told,
             decided: Revision::default(),
             following: None,
@@ -481,12 +486,17 @@ impl Performer {
                 self.release(instance, lease, projection, safe);
             }
             Command::Commit { instance, writer, changes, evidence, revision } => {
-                let (knows, behind) = (self.told.revision(), self.operations);
-                let decided = Decided { instance, writer, changes, evidence, revision, knows, behind };
-                if let Some(between) = &self.came_between {
-                    between.check(&decided)?;
-                }
-                self.commit(decided, safe)?;
+                let began = Began { knows: self.told.revision(), held_until: None };
+                let behind = self.operations;
+                let decided = Decided { instance, writer, changes, evidence, revision, began, behind };
+                let lost = match &self.came_between {
+                    Some(between) => between.check(&decided)?,
+                    None => None,
+                };
+                let late =
+                    || Untouched::behind(&self.program, &self.run, self.root.get()).when_late(&self.left, revision);
+                let untouched = Some(lost.unwrap_or_else(late));
+                self.commit(decided, untouched, safe)?;
             }
             Command::Operate { instance, operations } => {
                 self.operations += 1;
@@ -572,10 +582,10 @@ impl Performer {
         self.came_between.take_if(|between| between.is_over());
     }
 
-    fn commit(&mut self, decided: Decided, safe: Option<Mark>) -> anyhow::Result<()> {
+    fn commit(&mut self, decided: Decided, untouched: Option<Untouched>, safe: Option<Mark>) -> anyhow::Result<()> {
         self.outside.decided(&self.run, &decided);
         self.decided = decided.revision;
-        self.record(Record::Commit { decided, safe })
+        self.record(Record::Commit { decided, untouched, safe })
     }
 
     fn operate(
@@ -618,7 +628,7 @@ impl Performer {
             speculative: priority < CERTAIN,
             instead_of: before.map_or_else(String::new, |(_, last)| last.in_queue(waited)),
             deadline: ACQUIRE_DEADLINE,
-            holder: holder(&self.task, self.paths.get(&instance).map_or(&instance.to_string(), |path| path)),
+            holder: holder(&self.program.name, self.paths.get(&instance).map_or(&instance.to_string(), |path| path)),
         };
         let asked = requirements.iter().map(|one| self.of_performers(one.clone())).collect();
         let (hand, withdrawal) = (Some(hand), withdrawn.clone());
@@ -686,9 +696,8 @@ impl Performer {
                 if maker.as_ref().is_some_and(|run| *run != self.run) {
                     self.told.beside_others(true);
                 }
-                if let Some(between) = self.came_between.as_mut().filter(|_| maker.as_ref() != Some(&self.run)) {
-                    let written = change.written.iter().map(|fact| &fact.key);
-                    between.more(change.revision, written.chain(&change.gone));
+                if let Some(between) = &mut self.came_between {
+                    between.told(&change);
                 }
                 return self.outside.told(change, mirror);
             }

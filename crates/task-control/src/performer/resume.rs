@@ -12,9 +12,8 @@
 
 use super::Performer;
 use super::acquiring::late_request;
-use super::came_between::{CameBetween, refuse};
+use super::came_between::{CameBetween, ChangedByOthers, Untouched, refuse};
 use super::goal::Given;
-use super::told::maker;
 use crate::decided::{Unanswered, Undone, insist};
 use crate::ledger::{Confirmed, Ledger, operation_request};
 use crate::outside;
@@ -23,7 +22,6 @@ use crate::shell::Place;
 use anyhow::bail;
 use futures::{StreamExt, stream};
 use ratn_executive::protocol::Event;
-use ratn_executive::was_overtaken;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::program::Program;
@@ -52,6 +50,8 @@ struct Missing {
     made: usize,
     /// These are behind an operation that may not be done.
     behind: Vec<Decided>,
+    /// Up to this revision nothing stands against these.
+    seen: Revision,
 }
 
 /// Refuses a world that is not the run's. Changes nothing.
@@ -75,7 +75,7 @@ pub(crate) async fn remembers(place: &Place, ledger: &Ledger) -> anyhow::Result<
     }
     let world = WorldClient::new(&Channels::new(&place.tls), &place.endpoints.world_pool)?;
     let (root, _) = retry_unanswered(|| world.root()).await?;
-    Ok(youngest_there(&world, ledger, root).await?.0.is_some())
+    Ok(youngest_there(&world, ledger, root).await?.youngest.is_some())
 }
 
 /// How many of the ledger's commits the world pool lacks; `None` where it cannot be told any more.
@@ -85,9 +85,10 @@ pub(crate) async fn missing_commits(place: &Place, ledger: &Ledger) -> anyhow::R
     if root < ledger.first_revision {
         return Ok(None);
     }
-    let (there, oldest) = youngest_there(&world, ledger, root).await?;
-    let is_unknown = ledger.forgotten > 0 || is_before(ledger, oldest);
-    Ok(there.or((!is_unknown).then_some(0)).map(|there| ledger.commits.len() - there))
+    let There { youngest, oldest_kept } = youngest_there(&world, ledger, root).await?;
+    let is_unknown = ledger.forgotten > 0 || is_before(ledger, oldest_kept);
+    let there = youngest.map(|(count, _)| count).or((!is_unknown).then_some(0));
+    Ok(there.map(|there| ledger.commits.len() - there))
 }
 
 /// Whether commits of the run may be older than what the pool can tell of.
@@ -95,13 +96,16 @@ fn is_before(ledger: &Ledger, oldest: Revision) -> bool {
     oldest > ledger.first_revision && !ledger.commits.is_empty()
 }
 
-/// How many of the ledger's commits the pool has: they were made in order, so those up to the youngest that it tells of. `None`
-/// where it tells of none; with the oldest revision that it can tell of.
-async fn youngest_there(
-    world: &WorldClient,
-    ledger: &Ledger,
-    root: Revision,
-) -> anyhow::Result<(Option<usize>, Revision)> {
+/// What the pool has of a run's commits.
+struct There {
+    /// How many of those in the ledger, and the pool's revision of the last of them; `None` where it tells of none.
+    youngest: Option<(usize, Revision)>,
+    /// The oldest revision that it can tell of.
+    oldest_kept: Revision,
+}
+
+/// How many of the ledger's commits the pool has: they were made in order, so those up to the youngest that it tells of.
+async fn youngest_there(world: &WorldClient, ledger: &Ledger, root: Revision) -> anyhow::Result<There> {
     // Any fact says how far back the pool can tell.
     let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
     let (_, oldest) = retry_unanswered(|| world.history(any.clone())).await?;
@@ -110,18 +114,32 @@ async fn youngest_there(
     let ids: BTreeMap<String, usize> =
         ledger.commits.iter().enumerate().map(|(place, decided)| (decided.id(run), place + 1)).collect();
     let mut watch = retry_unanswered(|| world.watch(Some(after), &[])).await?;
-    let (mut told, mut there) = (after, None);
+    let (mut told, mut youngest) = (after, None);
     while told < root {
         let Some(WorldUpdate::Changed(change)) = watch.next().await? else {
             bail!("the world pool does not tell of its revisions up to {root}");
         };
         told = change.revision;
-        there = ids.get(&change.commit).copied().or(there);
+        youngest = ids.get(&change.commit).map(|count| (*count, told)).or(youngest);
     }
-    Ok((there, oldest))
+    Ok(There { youngest, oldest_kept: oldest })
 }
 
 impl Performer {
+    /// That the run has lost what it held, where its session is not there any more: it is in the log before anything is made in another one.
+    ///
+    /// # Errors
+    /// Where the world pool does not say what it has of the run.
+    pub(crate) async fn session_lost(&self, ledger: &Ledger) -> anyhow::Result<Option<Event>> {
+        if self.is_own {
+            return Ok(None);
+        }
+        let (root, _) = retry_unanswered(|| self.world.root()).await?;
+        let there = youngest_there(&self.world, ledger, root).await?;
+        let held_until = there.youngest.map_or(ledger.first_revision, |(_, revision)| revision);
+        Ok(Some(Event::SessionLost { held_until }))
+    }
+
     /// Takes up everything that is open, in the order in which it was decided. What the executive is to be told: that all of it is so in a new
     /// session, and what has changed from outside meanwhile.
     ///
@@ -157,7 +175,7 @@ impl Performer {
             self.confirm(Confirmed { operation, ..self.confirmed() });
             recorded = Some(Event::Recorded { operation, session: self.number });
         }
-        self.go_on_recording(&ledger, missing)?;
+        self.go_on_recording(program, &ledger, missing)?;
         if ledger.failed.is_some() {
             self.record(Record::Failed("an operation had failed before task control came back".to_owned()))?;
         }
@@ -189,13 +207,13 @@ impl Performer {
             let removed = self.remove_again(&ledger, &ledger.created()).await?;
             // Nothing of it is open any more, for whoever comes next.
             self.recorded.send_modify(|recorded| recorded.operation = ledger.operations);
-            self.go_on_recording(&ledger, missing)?;
+            self.go_on_recording(program, &ledger, missing)?;
             return Ok((commits, removed));
         }
         self.stop_again(&ledger);
         let withdrawn = self.withdraw_again(std::mem::take(&mut ledger.withdrawn));
         self.sweep(&ledger, withdrawn).await?;
-        Ok((commits, self.go_on_recording(&ledger, missing)?))
+        Ok((commits, self.go_on_recording(program, &ledger, missing)?))
     }
 
     /// Makes every commit that the world pool does not have, up to the first one behind an operation that may not be done. What these were, and
@@ -206,26 +224,27 @@ impl Performer {
         ledger: &Ledger,
     ) -> anyhow::Result<(Missing, Revision, Vec<(FactKey, Value)>)> {
         (self.acquires, self.operations, self.resumptions) = (ledger.acquires, ledger.operations, ledger.resumptions);
-        let (mut root, _) = retry_unanswered(|| self.world.root()).await?;
+        let (seen, _) = retry_unanswered(|| self.world.root()).await?;
+        let mut root = seen;
         let there = self.commits_there(ledger, root).await?;
-        if !self.is_own {
-            self.refuse_what_came_between(program, ledger, there, root).await?;
-        }
+        self.refuse_what_came_between(program, &ledger.commits[there..], root).await?;
         let first = ledger.open_operations().next().map_or(u64::MAX, |(number, ..)| *number);
         let (missing, mut made) = (&ledger.commits[there..], 0);
         for decided in missing.iter().take_while(|decided| decided.behind < first) {
+            let untouched = decided.began.held_until.map(|_| Untouched::behind(program, &self.run, seen));
             let commit = decided.clone().commit(&self.run);
-            match commit_next(&self.world, &self.trust, root, commit).await {
+            match commit_next(&self.world, &self.trust, root, commit, untouched).await {
                 Ok(revision) => root = revision,
+                Err(Undone::Overtaken(overtaken)) => return refuse(&decided.writer, &overtaken),
                 Err(undone) => bail!("the world pool does not take what the run had decided: {undone}"),
             }
             made += 1;
         }
         let (revision, facts) = self.root().await?;
-        if !self.is_own && !ledger.began.is_empty() {
+        if let Some(since) = ledger.lost().map(|(_, behind)| behind).min() {
             // What ended well meanwhile, and was not heard of, is to stand the same test.
-            let changed = self.changed_by_others(ledger, there, revision).await?;
-            self.came_between = Some(CameBetween::new(Arc::clone(program), ledger.began.clone(), changed));
+            let changed = self.changed_by_others(since, revision).await?;
+            self.came_between = CameBetween::new(program, &self.run, ledger, changed);
         }
         let commit = ledger.commits[..there + made].last().map(|decided| decided.revision).unwrap_or_default();
         // All of it is in the root that was read.
@@ -234,7 +253,7 @@ impl Performer {
         self.decided = ledger.commits.last().map(|decided| decided.revision).unwrap_or_default();
         let operation = if self.is_own { ledger.recorded } else { 0 };
         self.confirm(Confirmed { commit, operation, failed: None });
-        Ok((Missing { made, behind: missing[made..].to_vec() }, revision, facts))
+        Ok((Missing { made, behind: missing[made..].to_vec(), seen }, revision, facts))
     }
 
     /// Tells goals to stop that may not have heard of it.
@@ -246,80 +265,56 @@ impl Performer {
 
     /// Does the operations that may not be done, under their ids, where the session is the run's; and the commits behind them, all in the order in
     /// which they were decided. How many operations.
-    fn go_on_recording(&mut self, ledger: &Ledger, missing: Missing) -> anyhow::Result<usize> {
+    fn go_on_recording(&mut self, program: &Arc<Program>, ledger: &Ledger, missing: Missing) -> anyhow::Result<usize> {
+        let (run, seen) = (self.run.clone(), missing.seen);
+        let untouched = |decided: &Decided| decided.began.held_until.map(|_| Untouched::behind(program, &run, seen));
         let open: Vec<_> = if self.is_own { ledger.open_operations().cloned().collect() } else { Vec::new() };
         let (operations, mut behind) = (open.len(), missing.behind.into_iter().peekable());
         for (number, instance, operations) in open {
             while let Some(decided) = behind.next_if(|decided| decided.behind < number) {
-                self.commit(decided, None)?;
+                let untouched = untouched(&decided);
+                self.commit(decided, untouched, None)?;
             }
             self.operate(instance, number, operations, None)?;
         }
-        behind.try_for_each(|decided| self.commit(decided, None))?;
+        behind.try_for_each(|decided| {
+            let untouched = untouched(&decided);
+            self.commit(decided, untouched, None)
+        })?;
         Ok(operations)
     }
 
-    /// The run had lost what it held: where others have changed since what it has yet to commit, or what that is made of, it is not true any more.
-    /// What it had heard of when it began what led to that is in it.
+    /// Of what was lost before it was committed: where others have changed since what that changes or is made of, it is not true any more.
     async fn refuse_what_came_between(
         &self,
         program: &Program,
-        ledger: &Ledger,
-        there: usize,
+        missing: &[Decided],
         root: Revision,
     ) -> anyhow::Result<()> {
-        let missing = &ledger.commits[there..];
-        if missing.is_empty() {
-            return Ok(());
-        }
-        for (key, revision) in &self.changed_by_others(ledger, there, root).await? {
-            let is_meant = |decided: &&Decided| {
-                decided.knows < *revision && was_overtaken(program, &decided.writer, &decided.changes, key)
-            };
-            if let Some(decided) = missing.iter().find(is_meant) {
-                return refuse(decided, key);
-            }
-        }
-        Ok(())
+        let lost = || missing.iter().filter_map(|decided| Some((decided, decided.began.others_count()?)));
+        let Some(since) = lost().map(|(_, behind)| behind).min() else { return Ok(()) };
+        let changed = self.changed_by_others(since, root).await?;
+        let overtaken = lost().find_map(|(decided, behind)| {
+            let overtaken = changed.overtakes(program, &decided.writer, &decided.changes, behind)?;
+            Some((decided, overtaken))
+        });
+        overtaken.map_or(Ok(()), |(decided, overtaken)| refuse(&decided.writer, &overtaken))
     }
 
-    /// The facts that others have changed behind the last commit of the run that the world pool had, with the last revision of each.
-    async fn changed_by_others(
-        &self,
-        ledger: &Ledger,
-        there: usize,
-        root: Revision,
-    ) -> anyhow::Result<BTreeMap<FactKey, Revision>> {
-        let last = there.checked_sub(1).map(|last| ledger.commits[last].id(&self.run));
-        let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
-        let (_, oldest) = retry_unanswered(|| self.world.history(any.clone())).await?;
-        let (mut told, mut is_behind) = (oldest.max(ledger.first_revision), last.is_none());
-        let mut watch = retry_unanswered(|| self.world.watch(Some(told), &[])).await?;
-        let mut changed = BTreeMap::new();
-        while told < root {
-            let Some(WorldUpdate::Changed(change)) = watch.next().await? else {
-                bail!("the world pool does not tell of its revisions up to {root}");
-            };
-            told = change.revision;
-            if is_behind && maker(&change.commit).is_none_or(|(run, _)| run != self.run) {
-                let written = change.written.iter().map(|fact| &fact.key);
-                changed.extend(written.chain(&change.gone).map(|key| (key.clone(), told)));
-            }
-            is_behind |= last.as_ref() == Some(&change.commit);
-        }
-        Ok(changed)
+    async fn changed_by_others(&self, behind: Revision, root: Revision) -> anyhow::Result<ChangedByOthers> {
+        Ok(retry_unanswered(|| ChangedByOthers::of(&self.world, &self.run, behind, root)).await?)
     }
 
     async fn commits_there(&self, ledger: &Ledger, root: Revision) -> anyhow::Result<usize> {
         match youngest_there(&self.world, ledger, root).await? {
-            (None, _) if ledger.forgotten > 0 => {
+            There { youngest: None, .. } if ledger.forgotten > 0 => {
                 bail!("the world pool has lost commits of the run since it was asked for them; resume the run again")
             }
-            (None, oldest) if is_before(ledger, oldest) => bail!(
-                "the world pool keeps no revision of this run any more (the oldest is {oldest}): what it has of the run's commits \
-                   is not known; run the task again"
+            There { youngest: None, oldest_kept } if is_before(ledger, oldest_kept) => bail!(
+                "the world pool keeps no revision of this run any more (the oldest is {oldest_kept}): what it has of the run's \
+                 commits is not known; run the task again"
             ),
-            (there, _) => Ok(there.unwrap_or(0)),
+            There { youngest, .. } => Ok(youngest.map_or(0, |(count, _)| count)),
         }
     }
 

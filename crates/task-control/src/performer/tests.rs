@@ -2,12 +2,12 @@
 
 use super::*;
 use crate::Endpoints;
-use crate::ledger::Ledger;
+use crate::ledger::{Began, Ledger};
 use crate::task_for_tests::{FETCH_BOXES, program};
 use anyhow::Context;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
-use ratn_executive::protocol::Origin;
+use ratn_executive::protocol::{Origin, Unmade};
 use ratn_model::catalogue::Provider;
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{FencingToken, ProjectionId};
@@ -35,7 +35,12 @@ async fn connect_as(
     task: &str,
     events: mpsc::Sender<Answer>,
 ) -> anyhow::Result<Performer> {
-    Performer::connect(&place_of(endpoints), run, task, before, TraceContext::fresh(), events).await
+    Performer::connect(&place_of(endpoints), run, &self::task(task), before, TraceContext::fresh(), events).await
+}
+
+/// A task of this name.
+fn task(name: &str) -> Arc<Program> {
+    Arc::new(Program { name: name.to_owned(), ..program(FETCH_BOXES) })
 }
 
 fn place_of(endpoints: &Endpoints) -> Place {
@@ -94,11 +99,15 @@ struct Bench {
 
 impl Bench {
     async fn new() -> anyhow::Result<Bench> {
+        Bench::new_with(WorldPoolConfig::default()).await
+    }
+
+    async fn new_with(config: WorldPoolConfig) -> anyhow::Result<Bench> {
         let place = tempfile::tempdir()?;
         let directory = RuntimeDirectory::create(place.path())?;
         let shutdown = CancellationToken::new();
         tokio::spawn(resource_manager::run(ResourceManagerConfig::default(), directory.clone(), shutdown.clone()));
-        tokio::spawn(world_pool::run(WorldPoolConfig::default(), directory.clone(), shutdown.clone()));
+        tokio::spawn(world_pool::run(config, directory.clone(), shutdown.clone()));
         let endpoints = Endpoints {
             resource_manager: directory.wait_for(resource_manager::ROLE, SESSION_DEADLINE).await?,
             world_pool: directory.wait_for(world_pool::ROLE, SESSION_DEADLINE).await?,
@@ -171,6 +180,24 @@ impl Bench {
         }
         self.performer = connect_as(&self.endpoints, &run, Some(before), "task", events).await?;
         Ok(self)
+    }
+
+    /// Takes up what its log says, as a resumption does: that it has lost what it held is in the log before.
+    async fn takes_up(&mut self, mut ledger: Ledger, mirror: &World) -> anyhow::Result<Vec<Event>> {
+        self.loses(&mut ledger).await?;
+        self.performer.take_up(&fetch_boxes(), ledger, mirror).await
+    }
+
+    /// Does what a run that has ended had decided.
+    async fn finishes(&mut self, mut ledger: Ledger) -> anyhow::Result<(usize, usize)> {
+        self.loses(&mut ledger).await?;
+        self.performer.finish(&fetch_boxes(), ledger).await
+    }
+
+    async fn loses(&self, ledger: &mut Ledger) -> anyhow::Result<()> {
+        let lost = self.performer.session_lost(ledger).await?;
+        lost.iter().for_each(|lost| ledger.event(Timestamp(0), lost));
+        Ok(())
     }
 
     /// How many units of a kind there are.
@@ -577,7 +604,7 @@ async fn who_comes_back_leaves_word_with_what_the_run_was_about_to_give_back() -
     let mut bench = bench.comes_back(true).await?;
     let mut mirror = World::default();
     mirror.apply(&done())?;
-    bench.performer.take_up(&fetch_boxes(), ledger, &mirror).await?;
+    bench.takes_up(ledger, &mirror).await?;
     assert!(!bench.performer.order.returning.is_empty(), "it does not wait for that");
     let channels = Channels::new(&ClientTls::none());
     let next = Session::open(&channels, &bench.endpoints.resource_manager, "next", DEFAULT_TTL);
@@ -638,14 +665,14 @@ async fn a_run_goes_beside_others_and_one_that_goes_alone_does_not() -> anyhow::
     let events = || mpsc::channel(1).0;
     let second = connect(&bench.endpoints, "second", events()).await?;
     let alone = Place { alone: true, ..place_of(&bench.endpoints) };
-    let refused = Performer::connect(&alone, "run-3", "third", None, TraceContext::fresh(), events())
+    let refused = Performer::connect(&alone, "run-3", &task("third"), None, TraceContext::fresh(), events())
         .await
         .err()
         .context("it went")?;
     assert!(refused.to_string().contains("another run is under way on this system (`"), "{refused}");
     second.closed().await?;
     bench.performer.closed().await?;
-    let third = Performer::connect(&alone, "run-3", "third", None, TraceContext::fresh(), events()).await?;
+    let third = Performer::connect(&alone, "run-3", &task("third"), None, TraceContext::fresh(), events()).await?;
     let fourth = connect(&bench.endpoints, "fourth", events()).await.err().context("it went")?;
     assert!(fourth.to_string().starts_with("`third` is under way on this system and goes alone"), "{fourth}");
     third.closed().await
@@ -783,11 +810,11 @@ async fn who_comes_back_tells_a_goal_to_stop_that_may_not_have_been_told() -> an
     ledger.event(Timestamp(0), &Event::Granted { instance: routine, lease: held });
     ledger.command(&started);
     ledger.command(&Command::Cancel { instance: motion, attempt: 1 });
-    ledger.event(Timestamp(0), &Event::Resumed);
+    ledger.event(Timestamp(0), &Event::Resumed { share: None });
     let catalogue = bench.performer.catalogue.clone();
     let mut bench = bench.comes_back(true).await?;
     bench.performer.catalogue = catalogue;
-    bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?;
+    bench.takes_up(ledger, &World::default()).await?;
     // The next goal of that arm leaves when it stands still.
     bench.performer.perform(start(InstanceId(3), 1, "work", lease, &endpoint))?;
     let event = bench.event().await;
@@ -999,7 +1026,7 @@ async fn a_projection_that_was_named_and_not_asked_for_before_the_kill_is_asked_
     let mut ledger = ledger(&bench.performer.run, &[projection(instance, 2, false)]);
     ledger.event(Timestamp(0), &Event::Projected { instance, attempt: 2, projection: named });
     let mut bench = bench.comes_back(true).await?;
-    bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?;
+    bench.takes_up(ledger, &World::default()).await?;
     let world = WorldClient::new(&Channels::new(&ClientTls::none()), &bench.endpoints.world_pool)?;
     assert!(world.query(Some(named), &[]).await?.is_empty());
     bench.performer.perform(Command::Release { instance, lease: None, projection: Some(named) })?;
@@ -1059,7 +1086,7 @@ fn done() -> Vec<Change> {
 fn ledger(run: &str, commands: &[Command]) -> Ledger {
     let mut ledger = Ledger { origin: Origin { run: run.to_owned(), ..Origin::default() }, ..Ledger::default() };
     commands.iter().for_each(|command| ledger.command(command));
-    ledger.event(Timestamp(0), &Event::Resumed);
+    ledger.event(Timestamp(0), &Event::Resumed { share: None });
     ledger
 }
 
@@ -1096,7 +1123,7 @@ async fn who_comes_back_to_a_living_session_does_nothing_twice() -> anyhow::Resu
     let mut mirror = World::default();
     mirror.apply(&done())?;
     let ledger = ledger(&run, &[commit, operate, waiting]);
-    bench.performer.take_up(&fetch_boxes(), ledger, &mirror).await?;
+    bench.takes_up(ledger, &mirror).await?;
     // It is asked for anew, and what nobody knew to have is free for it.
     bench.granted(InstanceId(2)).await?;
     assert_eq!(bench.units("Box").await?, 2);
@@ -1129,7 +1156,7 @@ async fn what_the_log_says_to_be_done_is_not_done_again_although_the_manager_has
     }
     // It is killed before the third one.
     let mut bench = bench.comes_back(true).await?;
-    assert_eq!(bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?, []);
+    assert_eq!(bench.takes_up(ledger, &World::default()).await?, []);
     assert_eq!(bench.any_event().await, Some(Event::Recorded { operation: 3, session }));
     assert_eq!([bench.units("Box").await?, bench.units("Tray").await?, bench.units("Cup").await?], [2, 1, 1]);
     assert_eq!(bench.performer.confirmed().operation, 3);
@@ -1158,7 +1185,7 @@ async fn a_session_in_which_a_resumption_died_is_not_the_runs() -> anyhow::Resul
     let mut bench = Bench { performer, endpoints, answers, _robot, _place, _shutdown };
     let third = bench.performer.number;
     assert!(!bench.performer.is_own && third != second);
-    let told = bench.performer.take_up(&fetch_boxes(), ledger.clone(), &World::default()).await?;
+    let told = bench.takes_up(ledger.clone(), &World::default()).await?;
     assert_eq!(told, [Event::Recorded { operation: 1, session: third }]);
     assert_eq!(bench.units("Box").await?, 2);
     // From then on it is the run's.
@@ -1166,7 +1193,7 @@ async fn a_session_in_which_a_resumption_died_is_not_the_runs() -> anyhow::Resul
     assert_eq!((ledger.session, ledger.open_operations().count()), (third, 0));
     let mut bench = bench.comes_back(true).await?;
     assert!(bench.performer.is_own && bench.performer.number == third);
-    assert_eq!(bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?, []);
+    assert_eq!(bench.takes_up(ledger, &World::default()).await?, []);
     assert_eq!(bench.units("Box").await?, 2);
     bench.performer.closed().await
 }
@@ -1195,7 +1222,7 @@ async fn what_was_used_up_for_good_is_not_used_up_again_with_a_new_session() -> 
     let expected = ["Battery", "Glue", "Screws"].map(|kind| (kind.to_owned(), 2)).into();
     assert_eq!(left(&bench).await?, expected);
     let mut bench = bench.comes_back(false).await?;
-    bench.performer.take_up(&fetch_boxes(), ledger(&run, &operations), &World::default()).await?;
+    bench.takes_up(ledger(&run, &operations), &World::default()).await?;
     assert_eq!(left(&bench).await?, expected);
     bench.performer.closed().await
 }
@@ -1219,7 +1246,7 @@ async fn what_a_grant_had_used_up_that_nobody_heard_of_comes_back() -> anyhow::R
     let mut ledger = ledger(&run, &[acquire]);
     ledger.withdrawn.splice(0..0, (0..2_000).map(|number| format!("{run}/i9/{number}")));
     let mut bench = bench.comes_back(true).await?;
-    bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?;
+    bench.takes_up(ledger, &World::default()).await?;
     tokio::time::timeout(SESSION_DEADLINE, bench.granted(instance)).await.context("the arm is held")??;
     let glue = bench.performer.resources.list(&["Glue"]).await?;
     assert_eq!(glue.iter().map(|one| one.free.units()).collect::<Vec<_>>(), [2], "it was used up once");
@@ -1248,13 +1275,13 @@ async fn what_a_run_knew_when_it_decided_does_not_stand_against_it_when_it_comes
     let mut mirror = World::default();
     mirror.apply(&done())?;
     let mut bench = bench.comes_back(false).await?;
-    bench.performer.take_up(&fetch_boxes(), ledger.clone(), &mirror).await?;
+    bench.takes_up(ledger.clone(), &mirror).await?;
     assert_eq!(bench.performer.root().await?.0, Revision(2));
     // What others make of it from now on it has not heard of when it decides again.
     ledger.command(&decides(3));
     bench.performer.world.commit("other/i1/2", by_others(2), None).await?;
     let mut bench = bench.comes_back(false).await?;
-    let refused = bench.performer.take_up(&fetch_boxes(), ledger, &mirror).await;
+    let refused = bench.takes_up(ledger, &mirror).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
     assert_eq!(bench.performer.root().await?.0, Revision(3));
     bench.performer.closed().await
@@ -1278,9 +1305,9 @@ async fn what_a_run_heard_of_during_a_motion_stands_against_its_commit_when_it_c
     let mut mirror = World::default();
     mirror.apply(&done())?;
     let mut bench = bench.comes_back(false).await?;
-    let refused = bench.performer.take_up(&fetch_boxes(), ledger.clone(), &mirror).await;
+    let refused = bench.takes_up(ledger.clone(), &mirror).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
-    let refused = bench.performer.finish(&fetch_boxes(), ledger).await;
+    let refused = bench.finishes(ledger).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
     assert_eq!(bench.performer.root().await?.0, Revision(1));
     bench.performer.closed().await
@@ -1299,7 +1326,7 @@ async fn what_ended_well_while_the_session_was_lost_is_refused_where_others_have
     let changes = vec![Change::Set { fact, value: Value::Bool(false) }];
     bench.performer.world.commit("other/i1/1", changes, None).await?;
     let mut bench = bench.comes_back(false).await?;
-    bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?;
+    bench.takes_up(ledger, &World::default()).await?;
     // Both have ended well; what begins now knows of it.
     let refused = bench.performer.perform(commits(1, 2));
     assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
@@ -1322,11 +1349,150 @@ async fn what_others_change_when_a_run_has_come_back_stands_against_what_it_bega
     let fact = FactKey { predicate: "done".to_owned(), arguments: Vec::new() };
     let change = |value| vec![Change::Set { fact: fact.clone(), value: Value::Int(value) }];
     let mut bench = bench.comes_back(false).await?;
-    bench.performer.take_up(&fetch_boxes(), ledger, &World::default()).await?;
+    bench.takes_up(ledger, &World::default()).await?;
     bench.performer.world.commit("other/i1/1", change(1), None).await?;
     while !matches!(bench.event().await.context("nothing is told")?, Event::WorldChanged { .. }) {}
     let refused = bench.performer.perform(commits(1, 2));
     assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
+    bench.performer.closed().await
+}
+
+/// A run that was killed during two motions and has lost its session; others have changed what the first motion changes. It was taken up once, and
+/// has committed since what the second one led to. Its log, and the number of the session that it has now.
+async fn taken_up_once() -> anyhow::Result<(Bench, Ledger, u64)> {
+    let bench = Bench::new().await?;
+    let run = bench.performer.run.clone();
+    let begun = [1, 2].map(|instance| start(InstanceId(instance), 1, "work", LeaseId(1), ""));
+    let mut ledger = Ledger { session: bench.performer.number, ..ledger(&run, &begun) };
+    bench.performer.world.commit("other/i1/1", by_others("done"), None).await?;
+    let mut bench = bench.comes_back(false).await?;
+    bench.loses(&mut ledger).await?;
+    let told = bench.performer.take_up(&fetch_boxes(), ledger.clone(), &World::default()).await?;
+    told.iter().for_each(|event| ledger.event(Timestamp(0), event));
+    let again = start(InstanceId(2), 2, "work", LeaseId(2), "");
+    for command in [again, commits_what(2, 2, by_others("tidy"))] {
+        bench.performer.perform(command.clone())?;
+        ledger.command(&command);
+    }
+    bench.performer.recorded.subscribe().wait_for(|done| done.commit == Revision(2)).await?;
+    let number = bench.performer.number;
+    assert_eq!(ledger.session, number);
+    ledger.event(Timestamp(0), &Event::Resumed { share: None });
+    Ok((bench, ledger, number))
+}
+
+fn by_others(fact: &str) -> Vec<Change> {
+    let fact = FactKey { predicate: fact.to_owned(), arguments: Vec::new() };
+    vec![Change::Set { fact, value: Value::Int(7) }]
+}
+
+fn commits_what(instance: u64, number: u64, changes: Vec<Change>) -> Command {
+    let (instance, writer) = (InstanceId(instance), "place[1]".into());
+    Command::Commit { instance, writer, evidence: Vec::new(), changes, revision: Revision(number) }
+}
+
+fn is_refused<T>(done: anyhow::Result<T>) -> bool {
+    done.is_err_and(|error| error.to_string().contains("others have changed done"))
+}
+
+#[tokio::test]
+async fn what_others_changed_stands_against_a_commit_however_often_its_run_is_taken_up_since() -> anyhow::Result<()> {
+    for lives in [true, false] {
+        // Its resumption was refused for that: the log has the commit.
+        let (bench, mut ledger, number) = taken_up_once().await?;
+        ledger.command(&commits(1, 3));
+        let mut bench = bench.comes_back_to(number, lives).await?;
+        assert_eq!(bench.performer.is_own, lives);
+        assert!(is_refused(bench.takes_up(ledger.clone(), &World::default()).await), "lives: {lives}");
+        assert!(is_refused(bench.finishes(ledger).await), "lives: {lives}");
+        assert_eq!(bench.performer.root().await?.0, Revision(2));
+        // It was killed once more, during the motion.
+        let (bench, ledger, number) = taken_up_once().await?;
+        let mut bench = bench.comes_back_to(number, lives).await?;
+        bench.takes_up(ledger, &World::default()).await?;
+        assert!(is_refused(bench.performer.perform(commits(1, 3))), "lives: {lives}");
+        bench.performer.perform(start(InstanceId(1), 2, "work", LeaseId(3), ""))?;
+        bench.performer.perform(commits(1, 4))?;
+        let world = bench.performer.world.clone();
+        bench.performer.closed().await?;
+        assert_eq!(world.root().await?.0, Revision(3), "what begins now knows of it");
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn what_others_change_while_a_commit_waits_for_the_disk_stands_against_it_where_the_run_has_lost_what_it_held()
+-> anyhow::Result<()> {
+    for (by_another, is_made) in [("other", true), ("done", false)] {
+        let bench = Bench::new().await?;
+        let ledger = ledger(&bench.performer.run, &[start(InstanceId(1), 1, "work", LeaseId(1), "")]);
+        let mut bench = bench.comes_back(false).await?;
+        bench.takes_up(ledger, &World::default()).await?;
+        // What the run makes itself does not stand against it.
+        bench.performer.perform(commits(9, 1))?;
+        let (disk, slow) = Mark::not_yet();
+        bench.performer.perform_when(Some(slow), commits(1, 2))?;
+        let mut done = bench.performer.recorded.subscribe();
+        done.wait_for(|done| done.commit == Revision(1)).await?;
+        bench.performer.world.commit("other/i1/1", by_others(by_another), None).await?;
+        disk.send_replace(1);
+        if is_made {
+            done.wait_for(|done| done.commit == Revision(2)).await?;
+        } else {
+            let refused = async {
+                loop {
+                    match bench.event().await.context("nothing is told")? {
+                        Event::RetirementFailed { instance, reason, unmade } => break Ok((instance, reason, unmade)),
+                        _ => {}
+                    }
+                }
+            };
+            let failed: anyhow::Result<_> = tokio::time::timeout(SESSION_DEADLINE, refused).await?;
+            let failed = failed?;
+            assert!(failed.1.contains("others have changed done"), "{failed:?}");
+            assert_eq!((failed.0, failed.2), (InstanceId(1), Unmade::Untried));
+        }
+        assert_eq!(bench.performer.world.root().await?.0, Revision(if is_made { 3 } else { 2 }));
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_commit_that_others_do_not_wait_for_any_more_is_made_where_they_have_not_changed_what_it_is_made_of()
+-> anyhow::Result<()> {
+    for (is_late, by_another, is_made) in [(false, "done", true), (true, "other", true), (true, "done", false)] {
+        let mut bench = Bench::new().await?;
+        bench.performer.root().await?;
+        let (disk, slow) = Mark::not_yet();
+        bench.performer.perform_when(Some(slow), commits(1, 1))?;
+        bench.ask(InstanceId(1))?;
+        let lease = bench.granted(InstanceId(1)).await?;
+        if is_late {
+            let since = Instant::now().checked_sub(told::PENDING_PATIENCE).context("just booted")?;
+            bench.performer.left.goes_back(Revision(1), Revision(0), since);
+        }
+        bench.goes_on(InstanceId(1), lease, None)?;
+        bench.performer.world.commit("other/i1/1", by_others(by_another), None).await?;
+        disk.send_replace(1);
+        let closed = bench.performer.closed().await;
+        assert_eq!(closed.is_ok(), is_made, "late: {is_late}, by another: {by_another}, {closed:?}");
+        assert!(is_made || closed.is_err_and(|error| error.to_string().contains("others have changed done")));
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn a_commit_is_refused_where_the_world_pool_does_not_go_back_to_where_its_run_had_what_it_held()
+-> anyhow::Result<()> {
+    let bench = Bench::new_with(WorldPoolConfig { revisions_kept: 2, ..WorldPoolConfig::default() }).await?;
+    let ledger = ledger(&bench.performer.run, &[start(InstanceId(1), 1, "work", LeaseId(1), "")]);
+    for number in 1..=4 {
+        bench.performer.world.commit(&format!("other/i1/{number}"), by_others("done"), None).await?;
+    }
+    let mut bench = bench.comes_back(false).await?;
+    bench.takes_up(ledger, &World::default()).await?;
+    let refused = bench.performer.perform(commits(1, 5));
+    assert!(refused.is_err_and(|error| error.to_string().contains("does not keep it so long")));
     bench.performer.closed().await
 }
 
@@ -1356,7 +1522,7 @@ async fn who_comes_back_commits_behind_an_operation_when_that_is_done_and_never_
         let ledger = Ledger { session, ..ledger(&run, &decided) };
         let mut bench = bench.comes_back(true).await?;
         // Its mirror has all of it.
-        assert_eq!(bench.performer.take_up(&fetch_boxes(), ledger, &mirror).await?, []);
+        assert_eq!(bench.takes_up(ledger, &mirror).await?, []);
         if there == 1 {
             let failed = bench.event().await;
             assert!(matches!(&failed, Some(Event::RetirementFailed { .. })), "{failed:?}");
@@ -1416,9 +1582,9 @@ async fn what_others_hold_now_is_deleted_by_who_comes_back_when_it_is_free_also_
         let lease = other.resources.acquire(part, AcquireOptions::default()).await?;
         let come_back = async |bench: &mut Bench| {
             if has_ended {
-                return bench.performer.finish(&fetch_boxes(), ledger.clone()).await.map(|made| made.1);
+                return bench.finishes(ledger.clone()).await.map(|made| made.1);
             }
-            let told = bench.performer.take_up(&fetch_boxes(), ledger.clone(), &World::default()).await?;
+            let told = bench.takes_up(ledger.clone(), &World::default()).await?;
             Ok(told.len())
         };
         bench = bench.comes_back(false).await?;
@@ -1463,7 +1629,7 @@ async fn of_a_run_that_has_ended_what_was_not_recorded_is_made_and_nothing_else(
     let place = place_of(&bench.endpoints);
     assert_eq!(missing_commits(&place, &ledger).await?, Some(1));
     let mut bench = bench.comes_back(true).await?;
-    assert_eq!(bench.performer.finish(&fetch_boxes(), ledger.clone()).await?, (1, 1));
+    assert_eq!(bench.finishes(ledger.clone()).await?, (1, 1));
     while bench.units("Box").await? == 0 {}
     bench.performer.closed().await?;
     assert_eq!(missing_commits(&place, &ledger).await?, Some(0));
@@ -1487,7 +1653,7 @@ async fn who_comes_back_too_late_makes_anew_what_went_with_the_session() -> anyh
     while bench.units("Box").await? == 0 {}
     let mut bench = bench.comes_back(false).await?;
     assert_eq!(bench.units("Box").await?, 0);
-    bench.performer.take_up(&fetch_boxes(), ledger(&run, &[operate]), &World::default()).await?;
+    bench.takes_up(ledger(&run, &[operate]), &World::default()).await?;
     assert_eq!(bench.units("Box").await?, 2);
     bench.performer.closed().await
 }
@@ -1508,7 +1674,7 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     let mut mirror = World::default();
     mirror.apply(&done())?;
     check_world(&place_of(&bench.endpoints), &open).await?;
-    assert_eq!(of_the_world(bench.performer.take_up(&fetch_boxes(), open.clone(), &mirror).await?), []);
+    assert_eq!(of_the_world(bench.takes_up(open.clone(), &mirror).await?), []);
     let (revision, facts) = bench.performer.root().await?;
     assert_eq!((revision, facts.len()), (Revision(1), 1));
 
@@ -1517,7 +1683,7 @@ async fn a_commit_that_did_not_leave_is_made_what_others_did_is_told_and_another
     let changes = vec![Change::Set { fact: fact.clone(), value: Value::Int(1) }];
     bench.performer.world.commit("other/1/2", changes, None).await?;
     check_world(&place_of(&bench.endpoints), &open).await?;
-    let changed = bench.performer.take_up(&fetch_boxes(), open.clone(), &mirror).await?;
+    let changed = bench.takes_up(open.clone(), &mirror).await?;
     let facts = vec![(fact, Some(Value::Int(1)))];
     assert_eq!(of_the_world(changed), [Event::WorldChanged { revision: Revision(2), facts }]);
     // A pool that began anew.
@@ -1546,14 +1712,14 @@ async fn a_world_pool_that_has_none_of_the_commits_left_needs_the_whole_log() ->
     assert!(!remembers(&place_of(&bench.endpoints), &short).await?);
     let mut mirror = World::default();
     mirror.apply(&done())?;
-    let refused = bench.performer.take_up(&fetch_boxes(), short.clone(), &mirror).await;
+    let refused = bench.takes_up(short.clone(), &mirror).await;
     assert!(refused.is_err_and(|error| error.to_string().contains("resume the run again")));
     assert_eq!(bench.performer.root().await?.0, Revision(0));
     // With the whole log it has both, and the checkpoint is enough from then on.
-    assert_eq!(of_the_world(bench.performer.take_up(&fetch_boxes(), whole, &mirror).await?), []);
+    assert_eq!(of_the_world(bench.takes_up(whole, &mirror).await?), []);
     assert_eq!(bench.performer.confirmed().commit, Revision(2));
     assert!(remembers(&place_of(&bench.endpoints), &short).await?);
-    assert_eq!(of_the_world(bench.performer.take_up(&fetch_boxes(), short, &mirror).await?), []);
+    assert_eq!(of_the_world(bench.takes_up(short, &mirror).await?), []);
     assert_eq!(bench.performer.root().await?.0, Revision(2));
     bench.performer.closed().await
 }
@@ -1811,10 +1977,10 @@ async fn a_projection_behind_a_commit_that_waits_for_the_disk_leaves_with_it_and
         changes: done(),
         evidence: Vec::new(),
         revision: Revision(1),
-        knows: Revision(0),
+        began: Began::default(),
         behind: 0,
     };
-    records.send(Record::Commit { decided, safe: Some(slow) }).await?;
+    records.send(Record::Commit { decided, untouched: None, safe: Some(slow) }).await?;
     let asked = Projecting {
         attempt: 1,
         base: Revision(1),

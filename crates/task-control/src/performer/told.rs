@@ -23,8 +23,9 @@ const AGAIN: Duration = Duration::from_millis(500);
 /// What is not known after this time never will be.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// A commit of a run that is under way which a pool that answers has not got after so long is not waited for: it will not come, or it was never
-/// made. Longer than what is in front of it in its run is tried ([`crate::decided`]).
-const PENDING_PATIENCE: Duration = Duration::from_secs(45);
+/// made. Longer than what is in front of it in its run is tried ([`crate::decided`]); one that comes later is made only where nobody has changed what it is
+/// made of (`came_between`).
+pub(super) const PENDING_PATIENCE: Duration = Duration::from_secs(45);
 /// Of so many other runs it is known what was heard; then the one is forgotten of which nothing was heard for longest: who has to know of it asks.
 const MOST_RUNS: usize = 1024;
 
@@ -249,6 +250,7 @@ pub(super) fn maker(commit: &str) -> Option<(String, Revision)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ledger::Began;
     use crate::record::Decided;
     use ratn_model::id::InstanceId;
 
@@ -349,7 +351,7 @@ mod tests {
             changes: Vec::new(),
             evidence: Vec::new(),
             revision: Revision(12),
-            knows: Revision(0),
+            began: Began::default(),
             behind: 0,
         };
         assert_eq!(maker(&decided.id("run-1")), Some(("run-1".to_owned(), Revision(12))));

@@ -7,6 +7,7 @@ use crate::checkpoint::{Checkpointer, ReplayedState};
 use crate::control::Control;
 use crate::history::{History, HistoryError};
 use crate::interrupt::Interrupt;
+use crate::ledger::Ledger;
 use crate::performer::{self, Performer};
 use crate::replay::{self, ReplayError, Replayed};
 use crate::shell::MAX_PENDING_EVENTS;
@@ -17,6 +18,7 @@ use ratn_executive::lookahead::Lookout;
 use ratn_executive::protocol::{Command, Event};
 use ratn_model::program::Program;
 use ratn_worker::robot_clock::RobotClock;
+use ratn_worker::session::Standing;
 use std::sync::Arc;
 use std::time::Instant;
 use tokio::sync::mpsc;
@@ -44,6 +46,11 @@ impl Resumption {
         let program = Arc::new(program);
         let replayed = history.replay(&program)?;
         Ok(Resumption::of(program, history, replayed, log, checkpoint_every))
+    }
+
+    /// The share that the run had last of what several runs need, where the log says one.
+    pub fn share(&self) -> Option<f64> {
+        self.replayed.standing.ledger.origin.share
     }
 
     /// The same from the whole log, where its checkpoint does not know enough.
@@ -103,7 +110,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
     // Of the same trace as before.
     let trace = trace_of(&origin.run, &program.name, seed, origin.began_unix_ms);
     let before = Some(ledger.session);
-    let performer = Performer::connect(place, &origin.run, &program.name, before, trace, events).await;
+    let performer = Performer::connect(place, &origin.run, &program, before, trace, events).await;
     let performer = performer.context("cannot go on with the run")?;
     let shell = Shell {
         executive,
@@ -135,9 +142,15 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         let before = Before { log: shell.log.path().to_owned(), bytes: shell.log.written(), last: ledger.last };
         shell.spans = Spans::of_a_run_that_goes_on(before, shell.clock.now(), place.speed, &place.messages);
         // Request ids of now on have the number of this resumption: it is in the log before they are used.
-        let (now, commands) = shell.decide(&Event::Resumed)?;
+        let resumed = Event::Resumed { share: another_share(&ledger, place.standing) };
+        let (now, commands) = shell.decide(&resumed)?;
+        ledger.event(now, &resumed);
+        let lost = shell.performer.session_lost(&ledger).await?;
+        if let Some(lost) = &lost {
+            shell.decide(lost)?;
+            ledger.event(now, lost);
+        }
         shell.log.make_durable()?;
-        ledger.event(now, &Event::Resumed);
         shell.performer.know(shell.progress.paths());
         let told = shell.performer.take_up(&Arc::clone(&shell.program), ledger, &mirror).await?;
         // Commits are there by now.
@@ -153,10 +166,16 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
     Box::pin(shell.run_to_its_end(begin, interrupt)).await
 }
 
+/// The share of a run that goes on, where it has another one than before.
+fn another_share(ledger: &Ledger, standing: Standing) -> Option<f64> {
+    let before = ledger.origin.share.unwrap_or(Standing::default().share);
+    (standing.share != before).then_some(standing.share)
+}
+
 /// Does what a run had decided that was killed behind its end.
 async fn finish(resumption: Resumption, ended: Ended, place: &Place) -> anyhow::Result<Ended> {
     let Resumption { program, history, replayed, mut log, .. } = resumption;
-    let ledger = replayed.standing.ledger;
+    let mut ledger = replayed.standing.ledger;
     let nothing = || ReplayError::Ended { outcome: ended.outcome.clone() };
     let path = log.path().to_owned();
     let say = |what: String| history.messages().say(format_args!("{}: {what}", path.display()));
@@ -172,9 +191,14 @@ async fn finish(resumption: Resumption, ended: Ended, place: &Place) -> anyhow::
     let trace = trace_of(&origin.run, &program.name, seed, origin.began_unix_ms);
     // Nobody hears of anything any more.
     let events = mpsc::channel(1).0;
-    let performer = Performer::connect(place, &origin.run, &program.name, Some(ledger.session), trace, events).await;
+    let performer = Performer::connect(place, &origin.run, &program, Some(ledger.session), trace, events).await;
     let mut performer = performer.context("cannot do what the run had decided")?;
     let at = ledger.last;
+    if let Some(lost) = performer.session_lost(&ledger).await? {
+        log.append(at, &lost, &[])?;
+        log.make_durable()?;
+        ledger.event(at, &lost);
+    }
     let finished = performer.finish(&program, ledger).await;
     let (done, closed) = performer.close().await;
     done.iter().try_for_each(|event| log.append(at, event, &[]))?;

@@ -345,3 +345,40 @@ async fn a_run_that_waits_has_what_it_was_sent_also_after_it_was_killed() -> any
     assert_eq!(ended.outputs, outputs, "the signal that was kept before it was killed has ended the last wait");
     Ok(())
 }
+
+#[tokio::test]
+async fn a_share_that_is_given_to_a_resumption_is_that_of_the_next_one_too() -> anyhow::Result<()> {
+    let mut bench = Bench::new(|waiting| *waiting = program(WAITING)).await?;
+    let (_asks, interrupt) = Interrupt::new();
+    bench.place.standing.share = 2.0;
+    tokio::select! {
+        ended = run(bench.run.clone(), &bench.place, &interrupt) => panic!("it ended: {ended:?}"),
+        () = waits(&bench.place, "next") => {}
+    }
+    for (had, has) in [(2.0, 2.0), (2.0, 5.0), (5.0, 1.0)] {
+        let resumption = resumption_of(&bench.run).await?;
+        assert_eq!(resumption.share(), Some(had));
+        bench.place.standing.share = has;
+        let is_up = async {
+            loop {
+                let status = crate::control::status(&bench.place.directory, ANY_RUN).await.ok().flatten();
+                if status.is_some_and(|status| !status.awaits.is_empty() && status.share == has) {
+                    break;
+                }
+                tokio::task::yield_now().await;
+            }
+        };
+        tokio::select! {
+            ended = resume(resumption, &bench.place, &interrupt) => panic!("it ended: {ended:?}"),
+            () = is_up => {}
+        }
+    }
+    assert_eq!(resumption_of(&bench.run).await?.share(), Some(1.0), "the usual one, too");
+    let lines = bench.lines()?;
+    let resumed = lines.iter().filter_map(|line| match &line.entry {
+        LogEntry::Event(Event::Resumed { share }) => Some(*share),
+        _ => None,
+    });
+    assert_eq!(resumed.collect::<Vec<_>>(), [None, Some(5.0), Some(1.0)]);
+    Ok(())
+}

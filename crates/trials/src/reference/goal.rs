@@ -96,6 +96,7 @@ impl Reference<'_> {
             }
             let (goal, performance) = self.perform(state, path, variables, tries, attempt)?;
             *inputs = goal.inputs;
+            self.may_come();
             let seconds = performance.duration_s.min(annotations.timeout_s.unwrap_or(f64::INFINITY));
             if let Err(cut) = self.may_be_cut().and_then(|()| self.takes(seconds)) {
                 if cut == Fail::Cut && (is_irreversible(state) || self.has_lost()) {
@@ -207,10 +208,7 @@ impl Reference<'_> {
         for (_, event) in Vec::<(Trigger, Event)>::from_iter(now) {
             let Event::WorldChanged { facts, .. } = event else { continue };
             for (key, value) in facts {
-                match value {
-                    Some(value) => drop(self.result.facts.insert(key, value)),
-                    None => drop(self.result.facts.remove(&key)),
-                }
+                self.becomes(key, value);
             }
         }
     }

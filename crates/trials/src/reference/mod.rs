@@ -47,7 +47,7 @@ use evaluate::{Place, Read};
 use facts::Facts;
 use race::Races;
 use ratn_executive::protocol::Event;
-use ratn_model::fact::Change;
+use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::StateId;
 use ratn_model::program::{ABORTED, Program, SUCCESS};
 use ratn_model::value::Value;
@@ -122,6 +122,8 @@ struct Reference<'a> {
     steps: usize,
     /// Whether the run is told to end at the places where an action waits or is under way, as they come in each region.
     choices: Option<Choices>,
+    /// What the environment was about to change when a wait for it was cut short: it may come at any moment of the way out, or never.
+    coming: Vec<(FactKey, Option<Value>)>,
     /// This thread of control is on its way out.
     is_leaving: bool,
     /// What was cut short had not been entered.
@@ -169,6 +171,7 @@ pub(super) fn evaluate_cut(
     let (mut reference, mut variables) = Reference::of(given);
     reference.choices = Some(choices);
     let end = reference.task(&mut variables);
+    reference.may_come();
     let choices = reference.choices.unwrap_or_default();
     match end {
         Err(Fail::Cut) => {
@@ -205,6 +208,7 @@ impl<'a> Reference<'a> {
             regions: BTreeMap::new(),
             steps: 0,
             choices: None,
+            coming: Vec::new(),
             is_leaving: false,
             is_outside: false,
             races: Races::default(),
@@ -219,6 +223,23 @@ impl Reference<'_> {
     fn may_be_cut(&mut self) -> Result<(), Fail> {
         let is_cut = !self.is_leaving && self.choices.as_mut().is_some_and(Choices::choose);
         if is_cut { Err(self.cut_by_the_run()) } else { Ok(()) }
+    }
+
+    /// A moment at which what was waited for may come, though nobody waits for it any more.
+    fn may_come(&mut self) {
+        if !self.coming.is_empty() && self.choices.as_mut().is_some_and(Choices::choose) {
+            for (key, value) in std::mem::take(&mut self.coming) {
+                self.becomes(key, value);
+            }
+        }
+    }
+
+    /// The environment makes a fact so.
+    fn becomes(&mut self, key: FactKey, value: Option<Value>) {
+        match value {
+            Some(value) => drop(self.result.facts.insert(key, value)),
+            None => drop(self.result.facts.remove(&key)),
+        }
     }
 
     fn task(&mut self, variables: &mut Vec<(String, Value)>) -> Result<String, Fail> {

@@ -18,7 +18,10 @@ impl Reference<'_> {
         variables: &mut Vec<(String, Value)>,
         in_routine: bool,
     ) -> Result<String, Fail> {
-        self.may_be_cut()?;
+        if let Err(cut) = self.may_be_cut() {
+            self.awaits(state, path, variables);
+            return Err(cut);
+        }
         let ended = fails(self.waited(state, path, variables))?;
         let assigned = match &ended {
             Ok((_, outputs)) => fails(self.assigned(state, variables, outputs))?,
@@ -32,6 +35,17 @@ impl Reference<'_> {
         self.outputs.insert(state.id, outputs);
         assign(variables, assigned);
         Ok(outcome)
+    }
+
+    /// What is waited for where the run is told to end may be on its way.
+    fn awaits(&mut self, state: &State, path: &str, variables: &[(String, Value)]) {
+        if let Some(Wait::Condition(condition)) = state.wait()
+            && condition.is_true(&self.place(variables, None)) == Ok(false)
+            && let Some((_, Event::WorldChanged { facts, .. })) = self.oracle.awaited(path, InstanceId(0))
+        {
+            self.coming.extend(facts);
+            self.may_come();
+        }
     }
 
     fn waited(&mut self, state: &State, path: &str, variables: &[(String, Value)]) -> Result<(String, Outputs), Fail> {
@@ -52,10 +66,7 @@ impl Reference<'_> {
                     return Ok((late, Outputs::new()));
                 };
                 for (key, value) in facts {
-                    match value {
-                        Some(value) => drop(self.result.facts.insert(key, value)),
-                        None => drop(self.result.facts.remove(&key)),
-                    }
+                    self.becomes(key, value);
                 }
                 self.is_watched()?;
                 if condition.is_true(&self.place(variables, None))? {

@@ -50,6 +50,7 @@ impl Reference<'_> {
         if self.steps > MAX_STEPS {
             return Err(Fail::NotMine("a run without an end"));
         }
+        self.may_come();
         if let Err(cut) = self.is_watched() {
             self.is_outside = !matches!(state.kind, StateKind::Action { .. });
             return Err(cut);
@@ -251,6 +252,8 @@ impl Reference<'_> {
                 return Ok(outcome);
             }
             if around.children().any(|child| self.program.state(child).is_between_tries()) {
+                // The next try may have no place of its own, where it does not begin at all.
+                self.may_be_cut()?;
                 self.tell(&below(path, &visit("pause")), in_routine, SUCCESS, (Outputs::new(), Outputs::new()));
             }
             if let Some(before) = again.before {

@@ -2,15 +2,18 @@
 //!
 //! The stream is opened with the first call, and again with the first one after it broke; the calls that were under way then fail
 //! as calls of their own would. A call does not wait until the other side has answered the opening: many servers do that with their first
-//! message, which is the answer to a call.
+//! message, which is the answer to a call. A call that is given up before the stream is there is not sent: whoever made it may have done something
+//! else since.
 
 use super::Protocol;
 use crate::panic::exit_on_panic;
 use crate::trace;
 use std::collections::BTreeMap;
+use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll};
 use tokio::sync::{mpsc, oneshot};
-use tokio_stream::wrappers::ReceiverStream;
+use tokio_stream::Stream as Incoming;
 use tonic::{Response, Status, Streaming};
 
 /// Requests that wait for the connection; more make their callers wait.
@@ -29,8 +32,41 @@ pub(crate) struct Multiplexer<P: Protocol> {
 
 /// An open stream.
 struct Stream<P: Protocol> {
-    requests: mpsc::Sender<P::Request>,
+    requests: mpsc::Sender<Sent<P>>,
     calls: Arc<Mutex<Calls<P>>>,
+}
+
+/// A request on its way.
+struct Sent<P: Protocol> {
+    /// The call that it is, which goes only while somebody waits for its answer; nothing where it tells of one that was dropped.
+    call: Option<u64>,
+    request: P::Request,
+}
+
+/// What is sent over a stream, in order.
+pub(crate) struct Outgoing<P: Protocol> {
+    requests: mpsc::Receiver<Sent<P>>,
+    calls: Arc<Mutex<Calls<P>>>,
+}
+
+impl<P: Protocol> Incoming for Outgoing<P> {
+    type Item = P::Request;
+
+    fn poll_next(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<P::Request>> {
+        let Outgoing { requests, calls } = self.get_mut();
+        loop {
+            match requests.poll_recv(context) {
+                Poll::Ready(Some(Sent { call, request })) => {
+                    let calls = calls.lock().unwrap_or_else(PoisonError::into_inner);
+                    if call.is_none_or(|id| calls.waiting.contains_key(&id)) {
+                        return Poll::Ready(Some(request));
+                    }
+                }
+                Poll::Ready(None) => return Poll::Ready(None),
+                Poll::Pending => return Poll::Pending,
+            }
+        }
+    }
 }
 
 /// The calls under way.
@@ -49,11 +85,7 @@ struct Waiting<P: Protocol> {
 
 impl<P: Protocol> Multiplexer<P> {
     /// Makes a call that has one answer; `open` is called where there is no stream.
-    pub(crate) async fn call<F>(
-        &self,
-        open: impl FnOnce(ReceiverStream<P::Request>) -> F,
-        call: P::Call,
-    ) -> Result<P::Answer, Status>
+    pub(crate) async fn call<F>(&self, open: impl FnOnce(Outgoing<P>) -> F, call: P::Call) -> Result<P::Answer, Status>
     where
         F: Future<Output = Opened<P>> + Send + 'static,
     {
@@ -63,7 +95,7 @@ impl<P: Protocol> Multiplexer<P> {
     /// As [`Multiplexer::call`]; what the other side is told when the call is dropped is completed then.
     pub(crate) async fn call_dropped_with<F>(
         &self,
-        open: impl FnOnce(ReceiverStream<P::Request>) -> F,
+        open: impl FnOnce(Outgoing<P>) -> F,
         call: P::Call,
         when_dropped: impl FnOnce(&mut P::Call),
     ) -> Result<P::Answer, Status>
@@ -76,7 +108,7 @@ impl<P: Protocol> Multiplexer<P> {
     /// Makes a call that may have other answers before the last one.
     pub(crate) async fn call_with_progress<F>(
         &self,
-        open: impl FnOnce(ReceiverStream<P::Request>) -> F,
+        open: impl FnOnce(Outgoing<P>) -> F,
         call: P::Call,
         mut on_progress: impl FnMut(P::Answer),
     ) -> Result<P::Answer, Status>
@@ -100,7 +132,7 @@ impl<P: Protocol> Multiplexer<P> {
         self.kept().as_ref().is_some_and(|stream| !stream.calls().waiting.is_empty())
     }
 
-    fn open<F>(&self, open: impl FnOnce(ReceiverStream<P::Request>) -> F) -> Stream<P>
+    fn open<F>(&self, open: impl FnOnce(Outgoing<P>) -> F) -> Stream<P>
     where
         F: Future<Output = Opened<P>> + Send + 'static,
     {
@@ -109,8 +141,8 @@ impl<P: Protocol> Multiplexer<P> {
             return stream.clone();
         }
         let (requests, outgoing) = mpsc::channel(OUTGOING);
-        let opened = open(ReceiverStream::new(outgoing));
         let calls = Arc::new(Mutex::new(Calls { last_id: 0, waiting: BTreeMap::new(), broken: None }));
+        let opened = open(Outgoing { requests: outgoing, calls: Arc::clone(&calls) });
         tokio::spawn(exit_on_panic("the reader of a stream of calls", read(opened, Arc::clone(&calls))));
         kept.insert(Stream { requests, calls }).clone()
     }
@@ -133,7 +165,7 @@ impl<P: Protocol> Stream<P> {
         let mut under_way = UnderWay { stream: self, id, when_dropped: told };
         let traceparent = trace::current().map_or_else(String::new, |context| context.to_string());
         // Where that fails the stream has broken, and `answered` says why.
-        let _ = self.requests.send(P::request(id, call, traceparent)).await;
+        let _ = self.requests.send(Sent { call: Some(id), request: P::request(id, call, traceparent) }).await;
         let answer = answered.await;
         under_way.when_dropped = None;
         answer.unwrap_or_else(|_| Err(closed()))
@@ -192,7 +224,7 @@ impl<P: Protocol, F: FnOnce(&mut P::Call)> Drop for UnderWay<'_, P, F> {
         self.stream.calls().waiting.remove(&self.id);
         let Some((id, mut call, complete)) = self.when_dropped.take() else { return };
         complete(&mut call);
-        let told = P::request(id, call, String::new());
+        let told = Sent { call: None, request: P::request(id, call, String::new()) };
         if let Err(mpsc::error::TrySendError::Full(told)) = self.stream.requests.try_send(told) {
             let requests = self.stream.requests.clone();
             tokio::spawn(async move { requests.send(told).await });
@@ -251,5 +283,43 @@ impl<P: Protocol> Default for Multiplexer<P> {
 impl<P: Protocol> std::fmt::Debug for Multiplexer<P> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Multiplexer").finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::multiplex::WorldCalls;
+    use futures::{FutureExt, StreamExt};
+    use ratn_proto::v1::WorldPoolServiceReleaseRequest;
+    use ratn_proto::v1::calls_request::Kind;
+
+    fn release(projection_id: u64) -> Kind {
+        Kind::Release(WorldPoolServiceReleaseRequest { projection_id })
+    }
+
+    #[tokio::test]
+    async fn a_call_that_is_given_up_before_the_stream_is_there_is_not_sent() {
+        let multiplexer = Multiplexer::<WorldCalls>::default();
+        let (connected, is_connected) = oneshot::channel::<()>();
+        let (told, sent) = oneshot::channel();
+        let open = |mut requests: Outgoing<WorldCalls>| async move {
+            let _ = is_connected.await;
+            let mut all = Vec::new();
+            while let Some(Some(request)) = requests.next().now_or_never() {
+                all.push(WorldCalls::parts(request).1);
+            }
+            let _ = told.send(all);
+            Err(Status::unavailable("enough"))
+        };
+        let again = |_: Outgoing<WorldCalls>| std::future::ready(Err(Status::unavailable("another stream")));
+        let mut given_up = Box::pin(multiplexer.call(open, release(1)));
+        assert!(given_up.as_mut().now_or_never().is_none());
+        let mut waits = Box::pin(multiplexer.call(again, release(2)));
+        assert!(waits.as_mut().now_or_never().is_none());
+        drop(given_up);
+        let _ = connected.send(());
+        assert_eq!(sent.await.unwrap_or_default(), [Some(release(2))]);
+        assert_eq!(waits.await.map_err(|status| status.message().to_owned()), Err("enough".to_owned()));
     }
 }

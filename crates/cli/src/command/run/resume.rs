@@ -34,7 +34,6 @@ pub(super) async fn run(
     let log = |error| refused(&format_args!("{:#}", anyhow::Error::from(error)));
     let writer = LogWriter::go_on(file).map_err(log)?;
     let history = History::of(&writer, output::messages()).map_err(log)?;
-    let beside = Beside::going_on(arguments, history.share())?;
     let task = task.map(Path::to_owned).or_else(|| history.task());
     let task = task.ok_or_else(|| refused(&"it does not name its task file: say `ratn run --resume LOG TASK`"))?;
     let given = arguments.config.as_deref().map(|file| SystemConfig::load(Some(file))).transpose()?;
@@ -48,6 +47,7 @@ pub(super) async fn run(
     let program = Box::pin(described::program(&task, history.from().as_deref(), &mut system, interrupt)).await?;
     let resumption = Resumption::new(program, history, writer, arguments.checkpoint_every)
         .map_err(|error| refused(&format_args!("{:#}", anyhow::Error::from(error))))?;
+    let beside = Beside::going_on(arguments, resumption.share())?;
     output::progress(format_args!("on the system in {}", directory.display()));
     let place = beside.on(system.place());
     let ended = tokio::select! {

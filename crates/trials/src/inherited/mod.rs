@@ -1,0 +1,317 @@
+//! Random programs whose actions say in the catalogue what their states would, so that these say only what differs.
+//!
+//! A random program is written as a task file. Of each of its actions some annotations are said by the state, some by its action, some by both; an
+//! action speaks of its own inputs, and now and then of one that the state does not give. What is then in force is evaluated here once more
+//! (`in_force`), and the loader has to come to the same; and the loaded program is one as any other, for both modes and the reference.
+
+mod in_force;
+mod written;
+
+use super::{Dice, Features, generator};
+use in_force::{Inputs, Said, in_force};
+use ratn_model::catalogue::{ActionSignature, Annotations as OfAction, Catalogue, Provider};
+use ratn_model::expression::{EffectExpr, Expr, FactExpr};
+use ratn_model::load::load;
+use ratn_model::program::{Annotations, Nature, Program, ResourceExpr, SUCCESS, State, StateKind, WORLD_MODEL};
+use ratn_model::resource::{Quantity, ResourceOperation};
+use ratn_model::value::Type;
+use serde_json::{Map, Value as Json, json};
+use std::collections::BTreeMap;
+
+/// What came of a random program with inherited annotations.
+#[derive(Debug)]
+pub enum Inherited {
+    /// It loads, and this is in force where it was to be.
+    Program(Box<Program>),
+    /// The rules refuse it, as they do some random programs.
+    Refused(Vec<String>),
+    /// Something else is in force than should be: of which state, and what.
+    Differs(String),
+}
+
+/// So many of a hundred annotations are said by the action, by the state, by both.
+const SHARES: [u64; 3] = [45, 35, 20];
+/// An input of every action that no state gives.
+const NEVER_GIVEN: &str = "never";
+
+/// The random program of a seed, written with a catalogue that says a part of it, and loaded.
+pub fn inherited(seed: u64) -> Inherited {
+    let mut program = generator::program(seed, &Features::INHERITED);
+    let mut dice = Dice(seed ^ 0x1e_4e71_7ed0);
+    name_actions(&mut program);
+    let mut catalogue = Catalogue { resources: written::resources(), ..Catalogue::default() };
+    let mut own: BTreeMap<String, Map<String, Json>> = BTreeMap::new();
+    let mut expected: BTreeMap<String, Annotations> = BTreeMap::new();
+    for state in &program.states {
+        let StateKind::Action { provider, action, inputs, outputs } = &state.kind else { continue };
+        let given: Inputs = inputs.iter().cloned().collect();
+        let (of_state, of_action) = divided(&state.annotations, &given, &mut dice);
+        let is_in_projection = written::is_in_projection(&program, state);
+        let mut in_force = in_force(&of_state, &of_action, &given, &state.outcomes, is_in_projection);
+        let before = &state.annotations;
+        (in_force.retry, in_force.timeout_s) = (before.retry, before.timeout_s);
+        (in_force.attempts, in_force.deterministic) = (before.attempts, before.deterministic);
+        expected.insert(state.path.clone(), in_force);
+        own.insert(state.path.clone(), said_by_state(&program, state, &of_state));
+        let optional = inputs.iter().map(|(name, _)| name.clone()).chain([NEVER_GIVEN.to_owned()]);
+        let signature = ActionSignature {
+            optional: optional.map(|name| (name, Type::Any)).collect(),
+            outputs: outputs.clone(),
+            outcomes: state.outcomes.clone(),
+            annotations: said_by_action(&of_action),
+            ..ActionSignature::default()
+        };
+        let kind = performer(&state.annotations).to_owned();
+        let new = || Provider { resource: kind, joints: None, chain: None, actions: BTreeMap::new() };
+        catalogue.providers.entry(provider.clone()).or_insert_with(new).actions.insert(action.clone(), signature);
+    }
+    if let Err(wrong) = catalogue.check() {
+        return Inherited::Differs(format!("the catalogue does not read: {wrong}"));
+    }
+    let text = written::task(&program, &|state| own.get(&state.path).cloned().unwrap_or_default());
+    let loaded = match load(&text, "inherited.yaml", &catalogue) {
+        Ok(loaded) => loaded.program,
+        Err(findings) => return Inherited::Refused(findings.iter().map(ToString::to_string).collect()),
+    };
+    for state in loaded.states.iter().filter(|state| matches!(state.kind, StateKind::Action { .. })) {
+        let Some(expected) = expected.get(&state.path) else {
+            return Inherited::Differs(format!("a state {} was not written", state.path));
+        };
+        let (theirs, ours) = (as_said(&loaded, state, &state.annotations), as_said(&program, state, expected));
+        if theirs != ours {
+            let path = &state.path;
+            return Inherited::Differs(format!("{path}: in force is {theirs}, and should be {ours}\n{text}"));
+        }
+    }
+    Inherited::Program(Box::new(loaded))
+}
+
+/// Every action has a name of its own, and is one of what performs it.
+fn name_actions(program: &mut Program) {
+    for state in &mut program.states {
+        let performer = performer(&state.annotations).to_lowercase();
+        if let StateKind::Action { provider, action, .. } = &mut state.kind {
+            (*provider, *action) = (performer, format!("do{}", state.id.0));
+        }
+    }
+}
+
+/// The kind of the resource that performs an action: the first that it blocks.
+fn performer(annotations: &Annotations) -> &str {
+    let blocks = |line: &&ResourceExpr| line.operation == ResourceOperation::Block;
+    annotations.resources.iter().find(blocks).map_or("Planner", |line| &line.kind)
+}
+
+/// As a state says it that says all of it, to compare.
+fn as_said(program: &Program, state: &State, all: &Annotations) -> String {
+    let said = Said {
+        nature: Some(all.nature.clone()),
+        reads: all.reads.clone(),
+        requires: Some(all.requires.clone()),
+        effects: Some(all.effects.clone()),
+        resources: Some(all.resources.clone()),
+        duration: all.duration_s.clone(),
+    };
+    let state = State { annotations: all.clone(), ..state.clone() };
+    Json::Object(said_by_state(program, &state, &said)).to_string()
+}
+
+/// Who says what of all that is said of a state: the state, and its action in terms of its inputs.
+fn divided(all: &Annotations, given: &Inputs, dice: &mut Dice) -> (Said, Said) {
+    let (mut state, mut action) = (Said::default(), Said::default());
+    let who = |dice: &mut Dice| {
+        let chance = dice.below(100);
+        (chance >= SHARES[0], chance < SHARES[0] || chance >= SHARES[0] + SHARES[1])
+    };
+    let any = |fact: &FactExpr| FactExpr { arguments: vec![None; fact.arguments.len()], ..fact.clone() };
+    let (own, of_action) = who(dice);
+    if own {
+        state.nature = Some(all.nature.clone());
+    }
+    if of_action {
+        action.nature = match &all.nature {
+            // Nothing in its catalogue says that an action moves: that it is no other is.
+            Nature::Irreversible => own.then_some(Nature::Computes),
+            Nature::Computes => Some(Nature::Computes),
+            Nature::Senses(facts) => of_inputs(facts, given).filter(|facts| !facts.is_empty()).map(Nature::Senses),
+        };
+        let is_said = action.nature.is_some() || all.nature == Nature::Irreversible;
+        if !is_said {
+            state.nature = Some(all.nature.clone());
+        }
+    }
+    if let Some(reads) = &all.reads {
+        let (own, of_action) = who(dice);
+        let inputs = of_inputs(reads, given);
+        action.reads = inputs.filter(|_| of_action).map(|mut facts| {
+            if own {
+                facts = facts.iter().map(any).collect();
+            } else if dice.percent(10) {
+                facts.push(FactExpr { predicate: "p0".to_owned(), arguments: vec![Some(variable(NEVER_GIVEN))] });
+            }
+            facts
+        });
+        state.reads = (own || action.reads.is_none()).then(|| reads.clone());
+    }
+    if !all.requires.is_empty() {
+        let (own, of_action) = who(dice);
+        let inputs: Vec<Option<Expr>> = all.requires.iter().map(|one| in_terms_of(one, given)).collect();
+        let inputs: Option<Vec<Expr>> = inputs.into_iter().collect();
+        action.requires = inputs.filter(|_| of_action);
+        state.requires = (own || action.requires.is_none()).then(|| all.requires.clone());
+    }
+    divide_effects(all, given, dice, &mut state, &mut action);
+    divide_resources(all, dice, &mut state, &mut action);
+    if let Some(duration) = &all.duration_s {
+        let (own, of_action) = who(dice);
+        action.duration = in_terms_of(duration, given).filter(|_| of_action);
+        state.duration = (own || action.duration.is_none()).then(|| duration.clone());
+    }
+    // What only computes has no effects, by its own word.
+    if action.nature == Some(Nature::Computes) && action.effects.as_ref().is_some_and(has_some) {
+        state.effects = Some(all.effects.clone());
+        action.effects = None;
+    }
+    (state, action)
+}
+
+fn has_some(effects: &BTreeMap<String, Vec<EffectExpr>>) -> bool {
+    effects.values().any(|effects| !effects.is_empty())
+}
+
+/// An action says what some predicates become with success, the state the rest: of those predicates, too, now and then.
+fn divide_effects(all: &Annotations, given: &Inputs, dice: &mut Dice, state: &mut Said, action: &mut Said) {
+    let Some(success) = all.effects.get(SUCCESS) else {
+        state.effects = (!all.effects.is_empty()).then(|| all.effects.clone());
+        return;
+    };
+    let (mut own, mut of_action) = (Vec::new(), Vec::new());
+    for effect in success {
+        let inputs = effect_in_terms_of(effect, given).filter(|_| dice.percent(60));
+        match inputs {
+            Some(inputs) => of_action.push(inputs),
+            None => own.push(effect.clone()),
+        }
+    }
+    if dice.percent(15)
+        && let Some(EffectExpr::Set(fact, _)) = own.first()
+        && let Some(overridden) = effect_in_terms_of(&EffectExpr::Delete(fact.clone()), given)
+    {
+        of_action.push(overridden);
+    }
+    if dice.percent(8) {
+        let fact = FactExpr { predicate: "p1".to_owned(), arguments: vec![Some(variable(NEVER_GIVEN))] };
+        of_action.push(EffectExpr::Delete(fact));
+    }
+    let mut by_outcome = all.effects.clone();
+    by_outcome.remove(SUCCESS);
+    if !own.is_empty() || of_action.is_empty() && dice.percent(50) {
+        by_outcome.insert(SUCCESS.to_owned(), own);
+    }
+    state.effects = (!by_outcome.is_empty()).then_some(by_outcome);
+    let says = !of_action.is_empty() || state.effects.as_ref().is_none_or(|own| !own.contains_key(SUCCESS));
+    action.effects = says.then(|| BTreeMap::from([(SUCCESS.to_owned(), of_action)]));
+}
+
+/// An action can only say of which kinds it blocks one, its performer's among them.
+fn divide_resources(all: &Annotations, dice: &mut Dice, state: &mut Said, action: &mut Said) {
+    let plain = |line: &ResourceExpr| {
+        *line == ResourceExpr { kind: line.kind.clone(), ..ResourceExpr::new(ResourceOperation::Block, "") }
+            && line.count == Quantity::ONE
+    };
+    let kinds: std::collections::BTreeSet<&str> = all.resources.iter().map(|line| line.kind.as_str()).collect();
+    let is_plain = !all.resources.is_empty() && all.resources.iter().all(plain) && kinds.len() == all.resources.len();
+    if is_plain && dice.percent(60) {
+        action.resources = Some(all.resources.clone());
+        return;
+    }
+    state.resources = Some(all.resources.clone());
+    if dice.percent(30) {
+        action.resources = Some(vec![ResourceExpr::new(ResourceOperation::Block, performer(all))]);
+    }
+}
+
+fn variable(name: &str) -> Expr {
+    Expr::Variable(name.to_owned())
+}
+
+fn of_inputs(facts: &[FactExpr], given: &Inputs) -> Option<Vec<FactExpr>> {
+    let fact = |fact: &FactExpr| match in_terms_of(&Expr::Fact(fact.clone()), given)? {
+        Expr::Fact(fact) => Some(fact),
+        _ => None,
+    };
+    facts.iter().map(fact).collect()
+}
+
+fn effect_in_terms_of(effect: &EffectExpr, given: &Inputs) -> Option<EffectExpr> {
+    // A text in a catalogue is one effect.
+    if matches!(effect, EffectExpr::ForEach { .. }) {
+        return None;
+    }
+    let (mut effect, mut is_known) = (effect.clone(), true);
+    effect.each_expression_mut(&mut |expression| match in_terms_of(expression, given) {
+        Some(now) => *expression = now,
+        None => is_known = false,
+    });
+    is_known.then_some(effect)
+}
+
+/// An expression of a state in terms of what it gives the inputs of its action; none where it names anything else.
+fn in_terms_of(expression: &Expr, given: &Inputs) -> Option<Expr> {
+    let is_simple = |given: &Expr| matches!(given, Expr::Variable(_) | Expr::Port { .. });
+    let (mut expression, mut is_known) = (expression.clone(), true);
+    expression.rewrite(&mut |part| {
+        let input = given.iter().find(|(_, value)| is_simple(value) && *value == part).map(|(input, _)| input.clone());
+        match (&*part, input) {
+            (_, Some(input)) => *part = Expr::Variable(input),
+            (Expr::Variable(_) | Expr::Port { .. }, None) => is_known = false,
+            _ => {}
+        }
+    });
+    is_known.then_some(expression)
+}
+
+/// The keys of a task file.
+fn said_by_state(program: &Program, state: &State, said: &Said) -> Map<String, Json> {
+    let mut keys = Map::new();
+    keys.extend(said.nature.as_ref().map(|nature| written::nature(program, nature)));
+    let facts = |facts: &Vec<FactExpr>| facts.iter().map(|fact| json!(written::fact(program, fact))).collect();
+    keys.extend(said.reads.as_ref().map(|reads| ("reads".to_owned(), facts(reads))));
+    let texts = |all: &Vec<Expr>| all.iter().map(|one| json!(written::text(program, one))).collect();
+    keys.extend(said.requires.as_ref().map(|requires| ("requires".to_owned(), texts(requires))));
+    let effects = said.effects.as_ref().map(|effects| Json::Object(written::by_outcome(program, effects)));
+    keys.extend(effects.map(|effects| ("effects".to_owned(), effects)));
+    let resources = said.resources.as_ref();
+    let resources = resources.map(|all| all.iter().map(|line| written::resource(program, line)).collect());
+    keys.extend(resources.map(|resources| ("resources".to_owned(), resources)));
+    keys.extend(
+        said.duration.as_ref().map(|duration| ("duration".to_owned(), json!(written::text(program, duration)))),
+    );
+    let annotations = &state.annotations;
+    let retry = annotations.retry.map(|retry| json!({ "times": retry.count, "backoff": retry.backoff_s }));
+    keys.extend(retry.map(|retry| ("retry".to_owned(), retry)));
+    keys.extend(annotations.timeout_s.map(|limit| ("timeout".to_owned(), json!(limit))));
+    keys.extend(annotations.attempts.map(|attempts| ("attempts".to_owned(), json!(attempts))));
+    keys.extend(annotations.deterministic.then(|| ("deterministic".to_owned(), json!(true))));
+    keys
+}
+
+/// The texts of a catalogue.
+fn said_by_action(said: &Said) -> OfAction {
+    let texts = |facts: &Vec<FactExpr>| facts.iter().map(ToString::to_string).collect::<Vec<_>>();
+    let kind =
+        |line: &ResourceExpr| if line.kind == WORLD_MODEL { "world_model".to_owned() } else { line.kind.clone() };
+    OfAction {
+        computes: said.nature == Some(Nature::Computes),
+        senses: match &said.nature {
+            Some(Nature::Senses(facts)) => texts(facts),
+            _ => Vec::new(),
+        },
+        reads: said.reads.as_ref().map(texts),
+        requires: said.requires.iter().flatten().map(ToString::to_string).collect(),
+        effects: said.effects.as_ref().map(|all| all.values().flatten().map(ToString::to_string).collect()),
+        resources: said.resources.iter().flatten().map(kind).collect(),
+        duration: said.duration.as_ref().map(ToString::to_string),
+        anytime: false,
+    }
+}
