@@ -23,6 +23,11 @@ use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
+/// The world pool does not keep a revision any more.
+const FORGOTTEN: &str = "REVISION_FORGOTTEN";
+/// So often the oldest revision is asked for.
+const TRIES: u32 = 8;
+
 /// What others have changed in some revisions of the root.
 #[derive(Debug, Default)]
 pub(super) struct ChangedByOthers {
@@ -63,6 +68,22 @@ impl fmt::Display for Overtaken {
 impl ChangedByOthers {
     /// What others than a run have changed behind a revision, as far as the pool keeps that, up to another one that it has had.
     pub(super) async fn of(
+        world: &WorldClient,
+        run: &str,
+        behind: Revision,
+        up_to: Revision,
+    ) -> Result<ChangedByOthers, CallError> {
+        for _ in 1..TRIES {
+            match ChangedByOthers::asked(world, run, behind, up_to).await {
+                // Others have made the oldest one leave since it was asked for.
+                Err(error) if error.reason() == FORGOTTEN => {}
+                answered => return answered,
+            }
+        }
+        ChangedByOthers::asked(world, run, behind, up_to).await
+    }
+
+    async fn asked(
         world: &WorldClient,
         run: &str,
         behind: Revision,

@@ -117,10 +117,12 @@ impl Leases {
         let mut waits =
             waiting.in_order().map(|(id, asking)| (id, asking.requirements.as_slice(), true, asking.priority));
         let mut expected = self.expected(&held.requirements, now);
-        let waits = waits.find(|(id, requirements, ..)| {
+        let mut left_is_certain = false;
+        let waits = waits.find(|(id, requirements, _, priority)| {
             let is_first = held.is_wanted(requirements) && !is_withdrawn(*id);
             let is_left_to_the_manager = is_first && expected > 0 && held.serves(requirements);
             expected -= usize::from(is_left_to_the_manager);
+            left_is_certain |= is_left_to_the_manager && *priority >= CERTAIN;
             is_first && !is_left_to_the_manager
         });
         let asks = commands.iter().rev().filter_map(|command| match command {
@@ -131,7 +133,11 @@ impl Leases {
         });
         // Of equals the first, and who waits already is before who asks now.
         let first = asks.filter(|(_, requirements, ..)| held.is_wanted(requirements)).chain(waits);
-        let (to, requirements, waits, _) = first.max_by_key(|(.., priority)| *priority)?;
+        let (to, requirements, waits, priority) = first.max_by_key(|(.., priority)| *priority)?;
+        // What is needed for certain is not passed over for what may not be: the manager may have nothing for it after all.
+        if left_is_certain && priority < CERTAIN {
+            return None;
+        }
         held.serves(requirements).then(|| Handover { to, lease: held.lease.clone(), waits })
     }
 }
@@ -287,6 +293,11 @@ mod tests {
         assert_eq!(next(&leases, 50), Some(InstanceId(11)));
         leases.given_back(LeaseId(7), after(50));
         assert_eq!(next(&leases, 50), Some(InstanceId(12)), "the manager has one for the first");
+        let ended = ended_of(InstanceId(8), SUCCESS);
+        let commands = [Command::Release { instance: InstanceId(8), lease: Some(LeaseId(8)), projection: None }];
+        let queue = waiting(&[(planner(), CERTAIN), (planner(), 5)]);
+        let passed = leases.handover(&ended, &commands, &queue, after(50));
+        assert!(passed.is_none(), "what is needed for certain is not passed over for what may not be");
         leases.granted(InstanceId(11), &lease(9), (planner(), 9), after(51));
         assert_eq!(next(&leases, 51), Some(InstanceId(11)), "it has come");
 

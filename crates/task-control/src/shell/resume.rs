@@ -143,12 +143,15 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         shell.spans = Spans::of_a_run_that_goes_on(before, shell.clock.now(), place.speed, &place.messages);
         // Request ids of now on have the number of this resumption: it is in the log before they are used.
         let resumed = Event::Resumed { share: another_share(&ledger, place.standing) };
-        let (now, commands) = shell.decide(&resumed)?;
+        let (mut now, mut commands) = shell.decide(&resumed)?;
         ledger.event(now, &resumed);
         let lost = shell.performer.session_lost(&ledger).await?;
         if let Some(lost) = &lost {
-            shell.decide(lost)?;
-            ledger.event(now, lost);
+            // Time has passed: what was due meanwhile leads to commands, too.
+            let (later, more) = shell.decide(lost)?;
+            ledger.event(later, lost);
+            now = later;
+            commands.extend(more);
         }
         shell.log.make_durable()?;
         shell.performer.know(shell.progress.paths());

@@ -118,6 +118,8 @@ async fn tell_pauses(entry: &GoalEntry, safety: &Safety) -> Infallible {
     loop {
         let pauses = match &*state.borrow_and_update() {
             SafetyState::Held { reason } => Some(format!("pauses, held: {reason}")),
+            // It ends, and its end says so.
+            SafetyState::Stopped { .. } => told.clone(),
             _ => suspended.borrow_and_update().then(|| "pauses: the resource manager is not heard".to_owned()),
         };
         if pauses != told {
