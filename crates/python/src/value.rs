@@ -161,6 +161,9 @@ pub(crate) struct Trajectory {
     columns: OnceLock<Columns>,
 }
 
+/// A point as Python has it: seconds, positions, velocities.
+type Point = (f64, Vec<f64>, Vec<f64>);
+
 /// What the points of a trajectory have in common, put side by side when it is looked at for the first time.
 #[derive(Debug)]
 struct Columns {
@@ -225,7 +228,7 @@ impl Trajectory {
     #[pyo3(signature = (joints, points=None, *, times_s=None, positions=None, velocities=None))]
     fn new(
         joints: Vec<String>,
-        points: Option<Vec<(f64, Vec<f64>, Vec<f64>)>>,
+        points: Option<Vec<Point>>,
         times_s: Option<&Bound<'_, PyAny>>,
         positions: Option<&Bound<'_, PyAny>>,
         velocities: Option<&Bound<'_, PyAny>>,
@@ -257,7 +260,7 @@ impl Trajectory {
 
     /// `(time_s, positions, velocities)` each.
     #[getter]
-    fn points(&self) -> Vec<(f64, Vec<f64>, Vec<f64>)> {
+    fn points(&self) -> Vec<Point> {
         let point = |point: &TrajectoryPoint| (point.time_s, point.positions.clone(), point.velocities.clone());
         self.value.points.iter().map(point).collect()
     }

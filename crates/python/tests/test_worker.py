@@ -411,7 +411,7 @@ def test_numpy_looks_at_what_a_goal_has_where_it_lies(tester: Place) -> None:
 
 
 def test_a_covariance_is_a_matrix_where_the_fact_has_it(tester: Place) -> None:
-    measured = "  - looked: { action: tester/look, senses: ['at(?)'], measures: ['at'], effects: ['at(ball) = pose(0, 0, 0)'], resources: [Tester] }\n"
+    measured = "  - looked: { action: tester/look, senses: ['at(?)'], effects: ['at(ball) = pose(0, 0, 0)'], resources: [Tester] }\n"
     reads = state("sure", "tester/sure", "Tester", more="computes: true, reads: ['at(?)']").replace("[Tester]", "[Tester, world_model]")
     outputs = "outputs:\n  views: { type: any, value: sure.views }\n  covariance: { type: any, value: sure.covariance }\n"
     ended = tester.run(tester.write("sure.yaml", task("sure", measured + reads, outputs)))
