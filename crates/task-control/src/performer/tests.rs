@@ -1441,9 +1441,9 @@ async fn what_others_change_while_a_commit_waits_for_the_disk_stands_against_it_
         } else {
             let refused = async {
                 loop {
-                    match bench.event().await.context("nothing is told")? {
-                        Event::RetirementFailed { instance, reason, unmade } => break Ok((instance, reason, unmade)),
-                        _ => {}
+                    let event = bench.event().await.context("nothing is told")?;
+                    if let Event::RetirementFailed { instance, reason, unmade } = event {
+                        break Ok((instance, reason, unmade));
                     }
                 }
             };
