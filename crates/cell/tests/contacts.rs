@@ -10,6 +10,7 @@ use ratn_cell::core::protocol::{Ending, Event, Request};
 use ratn_cell::core::recording::Line;
 use ratn_model::pose::Pose;
 use ratn_motion::aimm;
+use ratn_motion::description::RobotDescription;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::plan::Goal;
 use ratn_motion::robot::{Configuration, Robot, UNSAID};
@@ -61,6 +62,72 @@ fn an_arm_that_is_folded_into_its_own_base_touches_it() {
     let found = touches(at(0.0, JointVector::of([FRAC_PI_2, -2.0, 0.0, 0.0, 0.0, 0.0, 0.0])), &[]);
     let of_robot = |touch: &&Touch| touch.things.iter().all(|thing| matches!(thing, Thing::Link(_)));
     assert!(found.iter().find(of_robot).is_some_and(|touch| touch.depth_m > TOLERANCE_M), "{found:?}");
+}
+
+/// Two plates, which are meshes: the upper one hangs on joints beside the lower one and slides along z towards it. The spheres that hold them meet
+/// wherever it is.
+fn plates() -> Robot {
+    let slide = |name: &str, parent: &str, child: &str, axis: &str| {
+        format!(
+            "<joint name='{name}' type='prismatic'><parent link='{parent}'/><child link='{child}'/><axis xyz='{axis}'/>\
+             <limit lower='-0.006' upper='0.006' effort='1' velocity='1'/></joint>"
+        )
+    };
+    let plate = |name: &str, at: &str, scale: &str| {
+        format!(
+            "<link name='{name}'><collision><origin xyz='{at}'/><geometry><mesh filename='cube.stl' scale='{scale}'/></geometry></collision></link>"
+        )
+    };
+    let urdf = [
+        "<robot name='plates'><link name='foot'/><link name='rail'/>",
+        "<joint name='mount' type='fixed'><parent link='foot'/><child link='lower'/></joint>",
+        &plate("lower", "0 0 0", "0.3 0.2 0.005"),
+        &slide("y", "foot", "rail", "0 1 0"),
+        &slide("z", "rail", "upper", "0 0 1"),
+        &plate("upper", "0 0 0.008", "0.2 0.1 0.005"),
+        "</robot>",
+    ]
+    .concat();
+    let description = "name = 'plates'\nurdf = 'plates.urdf'\n[arm]\njoints = ['y', 'z']\ntool = 'upper'\n[postures]\nhome = [0, 0]\n";
+    // A cube about the origin, with edges of 1.
+    let corner = |i: usize| [0, 1, 2].map(|axis| if i >> axis & 1 == 0 { -0.5 } else { 0.5 });
+    let faces = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+    let triangles = faces.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]);
+    let vertex = |[x, y, z]: [f64; 3]| format!("vertex {x} {y} {z}\n");
+    let facet = |triangle: [usize; 3]| {
+        let corners: String = triangle.iter().map(|i| vertex(corner(*i))).collect();
+        format!("facet normal 0 0 0\nouter loop\n{corners}endloop\nendfacet\n")
+    };
+    let stl = format!("solid cube\n{}endsolid cube\n", triangles.map(facet).collect::<String>());
+    let description = RobotDescription::read(description).unwrap();
+    Robot::of(description, &urdf, Some("<robot name='plates'/>"), &mut |_| Ok(stl.clone().into_bytes())).unwrap()
+}
+
+#[test]
+fn links_that_are_meshes_touch_where_these_do() {
+    let robot = plates();
+    let [lower, upper] = ["lower", "upper"].map(|name| robot.link(name).unwrap());
+    assert!(robot.model.is_by_shapes(lower, upper), "spheres say enough of them");
+    let at = |z: f64| Configuration { arm: JointVector::of([0.001, z]), ..robot.at_zero() };
+    let mut environment = Environment::new(&robot, &at(0.0), &[], &[]);
+    let mut touch = |z: f64| {
+        environment.step(&robot, &at(z));
+        let found = environment.touches();
+        assert!(found.len() < 2, "{found:?}");
+        found.into_iter().next()
+    };
+    // At zero there are 3 mm between them.
+    assert_eq!(touch(0.0), None);
+    assert_eq!(touch(-0.0024), None);
+    for depth_m in [-2e-4, 2e-4, 1e-3, 2e-3] {
+        let met = touch(-0.003 - depth_m).unwrap();
+        assert_eq!(met.things, ["lower", "upper"].map(|name| Thing::Link(name.to_owned())));
+        assert!((met.depth_m - depth_m).abs() < 2e-5, "{met:?} instead of {depth_m}");
+        assert!(met.normal[2] > 0.99 && met.at[2].abs() < 0.004, "{met:?}");
+    }
+    // One that is wholly inside the other touches it, too.
+    let deep = touch(-0.006).unwrap();
+    assert!(deep.depth_m > 1e-3, "{deep:?}");
 }
 
 #[test]

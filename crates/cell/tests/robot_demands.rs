@@ -8,6 +8,8 @@ mod gantry;
 use ratn_cell::config::{CellConfig, Setting};
 use ratn_cell::core::cell::Cell;
 use ratn_cell::core::demands::{Unmet, unmet};
+use ratn_motion::base::{DriveRequest, plan_drive};
+use ratn_motion::pace::Control;
 use ratn_motion::robot::Robot;
 use tempfile::TempDir;
 
@@ -143,6 +145,32 @@ fn a_base_that_may_not_be_at_the_origin_is_told() {
     assert_eq!(within("area = { x = [0.0, 3.0], y = [-1.0, 1.0] }").unmet(), []);
     within("area = { x = [-1.0, 3.0], y = [0.5, 1.0] }")
         .says("[base]", &["y goes from 0.5 to 1 m", "origin", "`area`"]);
+    let heading = |lower: f64, upper: f64| {
+        let limited = turns
+            .replace("continuous", "revolute")
+            .replace("<limit ", &format!("<limit lower='{lower}' upper='{upper}' "));
+        let said = "[camera]\nlink = \"camera\"\n[base]\njoints = [\"x\", \"y\", \"heading\"]\nbody = \"world\"\n";
+        let base = base.replace(turns, &limited);
+        changed(&[["<link name='world'/>", &base]], &[["[camera]\nlink = \"camera\"", said]])
+    };
+    // 0 is 2π there, and a drive begins at that.
+    let turned = heading(4.0, 8.0);
+    assert_eq!(turned.unmet(), []);
+    let cell = Cell::new(turned.config.clone()).unwrap();
+    let here = cell.configuration();
+    let request = DriveRequest {
+        start: here,
+        goals: vec![[0.3, 0.0, 0.5]],
+        position_tolerance_m: 0.0,
+        heading_tolerance_rad: 0.0,
+        speed: 0.5,
+        seen: None,
+        seed: 1,
+    };
+    let plan = plan_drive(cell.robot(), &cell.scene(), &request, &mut |_| Control::Continue).unwrap();
+    let headings: Vec<f64> = plan.trajectory.points.iter().map(|point| point.positions[2]).collect();
+    assert!(headings.iter().all(|heading| (4.0..=8.0).contains(heading)), "{headings:?}");
+    heading(1.0, 5.0).says("[base]", &["its heading goes from 1 to 5 rad", "origin"]);
 }
 
 #[test]

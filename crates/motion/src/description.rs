@@ -10,6 +10,8 @@ use crate::workplace::Workplace;
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
 
 /// What a `robot.toml` says.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -144,10 +146,12 @@ pub enum DescriptionError {
         reason: String,
     },
     /// Its names do not fit the URDF.
-    #[error("{}: {fault}", file.display())]
+    #[error("{}: {}{fault}", file.display(), line.map_or_else(String::new, |line| format!("line {line}: ")))]
     Fault {
         /// The file.
         file: PathBuf,
+        /// Where it names what does not fit, from 1.
+        line: Option<usize>,
         /// What does not fit.
         fault: Box<RobotFault>,
     },
@@ -202,7 +206,7 @@ impl Robot {
     /// # Errors
     /// [`DescriptionError`] names the file and what does not fit.
     pub fn from_file(file: &Path) -> Result<Robot, DescriptionError> {
-        let Files { description, urdf_file, urdf, srdf_file, meshes } = Files::read(file)?;
+        let Files { text, description, urdf_file, urdf, srdf_file, meshes } = Files::read(file)?;
         let srdf = srdf_file.as_deref().map(read_text).transpose()?;
         let fault = |fault| {
             // A line is one of the file that has it.
@@ -211,7 +215,8 @@ impl Robot {
                 RobotFault::Model(MechanismError::Srdf(_)) => srdf_file.as_deref().unwrap_or(file),
                 _ => file,
             };
-            DescriptionError::Fault { file: file.to_owned(), fault: Box::new(fault) }
+            let line = fault.named().and_then(|name| line_of(&text, name));
+            DescriptionError::Fault { file: file.to_owned(), line, fault: Box::new(fault) }
         };
         Robot::of(description, &urdf, srdf.as_deref(), &mut |name| meshes.read(name)).map_err(fault)
     }
@@ -219,6 +224,7 @@ impl Robot {
 
 /// What a `robot.toml` says, and the files that it names.
 pub(crate) struct Files {
+    text: String,
     description: RobotDescription,
     urdf_file: PathBuf,
     /// The text of the URDF.
@@ -240,8 +246,28 @@ impl Files {
         let srdf_file = description.srdf.as_ref().map(|srdf| folder.join(srdf));
         let packages = description.packages.iter().map(|package| folder.join(package)).collect();
         let meshes = MeshFiles { beside: urdf_file.parent().unwrap_or(folder).to_owned(), packages };
-        Ok(Files { description, urdf_file, urdf, srdf_file, meshes })
+        Ok(Files { text, description, urdf_file, urdf, srdf_file, meshes })
     }
+}
+
+/// The line of a `robot.toml` in which a value is this text, from 1; the first one of several.
+fn line_of(text: &str, name: &str) -> Option<usize> {
+    let read = DeTable::parse(text).ok()?;
+    let mut first: Option<usize> = None;
+    let mut left: Vec<&Spanned<DeValue<'_>>> = read.get_ref().values().collect();
+    while let Some(value) = left.pop() {
+        match value.get_ref() {
+            DeValue::String(said) if said == name => {
+                let begins = value.span().start;
+                first = Some(first.map_or(begins, |first| first.min(begins)));
+            }
+            DeValue::Array(values) => left.extend(values.iter()),
+            DeValue::Table(values) => left.extend(values.values()),
+            _ => {}
+        }
+    }
+    let before = text.get(..first?)?;
+    Some(1 + before.matches('\n').count())
 }
 
 fn read_text(file: &Path) -> Result<String, DescriptionError> {

@@ -12,6 +12,7 @@ use parry3d::math::{Pose as Pose32, Vector};
 use parry3d::query::{self, DefaultQueryDispatcher, QueryDispatcher};
 use parry3d::shape::{Shape, TriMesh};
 use ratn_model::pose::Pose;
+use std::cell::Cell;
 
 /// Steps of a search at the most. Shapes whose sizes differ by a hundred take forty.
 const MAX_STEPS: usize = 128;
@@ -34,7 +35,16 @@ type Point = [f64; 3];
 /// How far two shapes are from each other, in metres; something greater than `enough_m` where that is more than `enough_m`. Zero or less where
 /// they touch: then [`depth`] says how deep. `None` where it cannot be told.
 pub fn gap(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape, enough_m: f64) -> Option<f64> {
-    gap_in_first(&a_at.inv_mul(b_at), a, b, enough_m)
+    gap_in_first(&a_at.inv_mul(b_at), a, b, enough_m, &Cell::new(u32::MAX))
+}
+
+/// As [`gap`], with so many searches at the most: one for each two triangles, or a triangle and another shape, that are compared. Those that were made
+/// are taken off; where none is `left`, it could not be told.
+pub fn gap_within([a_at, b_at]: [&Pose32; 2], [a, b]: [&dyn Shape; 2], enough_m: f64, left: &mut u32) -> Option<f64> {
+    let searches = Cell::new(*left);
+    let gap = gap_in_first(&a_at.inv_mul(b_at), a, b, enough_m, &searches);
+    *left = searches.get();
+    gap.filter(|_| *left > 0)
 }
 
 /// How deep two shapes that touch are in each other, in metres: how far one has to be moved at the least. What is found may be more than
@@ -73,19 +83,20 @@ pub fn depth(a_at: &Pose32, a: &dyn Shape, b_at: &Pose32, b: &dyn Shape) -> f64 
 }
 
 /// As [`gap`], the second shape seen from the first.
-fn gap_in_first(pose: &Pose32, a: &dyn Shape, b: &dyn Shape, enough_m: f64) -> Option<f64> {
+fn gap_in_first(pose: &Pose32, a: &dyn Shape, b: &dyn Shape, enough_m: f64, searches: &Cell<u32>) -> Option<f64> {
     if let (Some(first), Some(second)) = (Round::of(a), Round::of(b)) {
+        searches.set(searches.get().checked_sub(1)?);
         return Some(between(&first, &Turned::new(second, pose), enough_m));
     }
     match (a.as_trimesh(), b.as_trimesh()) {
-        (Some(mesh), _) => Some(gap_to_mesh(pose, mesh, b, enough_m)),
-        (None, Some(mesh)) => Some(gap_to_mesh(&pose.inverse(), mesh, a, enough_m)),
+        (Some(mesh), _) => Some(gap_to_mesh(pose, mesh, b, enough_m, searches)),
+        (None, Some(mesh)) => Some(gap_to_mesh(&pose.inverse(), mesh, a, enough_m, searches)),
         (None, None) => query::distance(&Pose32::IDENTITY, a, pose, b).ok().map(|apart| f64::from(apart.distance)),
     }
 }
 
 /// From the surface of a mesh to another shape.
-fn gap_to_mesh(pose: &Pose32, mesh: &TriMesh, other: &dyn Shape, enough_m: f64) -> f64 {
+fn gap_to_mesh(pose: &Pose32, mesh: &TriMesh, other: &dyn Shape, enough_m: f64, searches: &Cell<u32>) -> f64 {
     // The tree rounds to `f32`.
     let beyond = (enough_m * (1.0 + ROUNDED) + ROUNDED_M) as f32;
     let around = other.compute_aabb(pose);
@@ -93,9 +104,9 @@ fn gap_to_mesh(pose: &Pose32, mesh: &TriMesh, other: &dyn Shape, enough_m: f64) 
     let nearest = mesh.bvh().find_best(
         beyond,
         |node, _| Aabb { mins: node.mins() - middle - half, maxs: node.maxs() - middle + half }.distance_to_origin(),
-        // What cannot be told counts as touching.
+        // What cannot be told counts as touching; then nothing else is looked at.
         |triangle, best| {
-            let gap = gap_in_first(pose, &mesh.triangle(triangle), other, f64::from(best));
+            let gap = gap_in_first(pose, &mesh.triangle(triangle), other, f64::from(best), searches);
             Some(gap.unwrap_or(0.0) as f32)
         },
     );
@@ -356,8 +367,9 @@ fn sum(a: Point, b: Point) -> Point {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
-    use super::{depth, gap};
+    use super::{depth, gap, gap_within};
     use crate::geometry::Geometry;
+    use crate::mesh::Mesh;
     use crate::robot::to_f32;
     use rand::{Rng, RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
@@ -482,6 +494,27 @@ mod tests {
             }
         }
         assert!(apart > 5_000 && touching > 2_000, "{apart} {touching}");
+    }
+
+    #[test]
+    fn the_work_of_two_meshes_has_a_bound() {
+        // Waves that run along each other.
+        let height = |i: u32| f64::from(i % 2) * 1e-3;
+        let at = |i: u32, j: u32| [f64::from(i) * 0.01, f64::from(j) * 0.01, height(i)];
+        let cells = (0..20).flat_map(|i| (0..20).map(move |j| (i, j)));
+        let triangles = cells.flat_map(|(i, j)| {
+            [[at(i, j), at(i + 1, j), at(i, j + 1)], [at(i + 1, j), at(i, j + 1), at(i + 1, j + 1)]]
+        });
+        let surface = Mesh::new(triangles.collect()).unwrap().surface();
+        let (here, above) = (to_f32(&Pose::IDENTITY), to_f32(&Pose::at(0.0, 0.0, 0.002)));
+        let within = |left: &mut u32| gap_within([&here, &above], [&*surface, &*surface], 0.1, left);
+        let mut left = 1_000_000;
+        let found = within(&mut left).unwrap();
+        assert_eq!(Some(found), gap(&here, &*surface, &above, &*surface, 0.1));
+        let made = 1_000_000 - left;
+        assert!(made > 100, "{made}");
+        let mut left = made / 2;
+        assert_eq!((within(&mut left), left), (None, 0));
     }
 
     #[test]

@@ -81,7 +81,7 @@ impl Looks {
     /// Those that a URDF describes; `load` gives what is in the file of a mesh.
     pub fn read(urdf: &str, load: &mut dyn FnMut(&str) -> Result<Vec<u8>, MeshError>) -> Looks {
         let robot = match urdf::parse(urdf) {
-            Ok(robot) => robot,
+            Ok((robot, _)) => robot,
             Err(error) => return Looks::unread(error.to_string()),
         };
         let materials = materials(&robot);

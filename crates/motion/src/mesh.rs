@@ -63,6 +63,15 @@ pub enum MeshError {
         /// Along x, y, z.
         scale: [f64; 3],
     },
+    /// So large that its numbers are hardly metres.
+    #[error(
+        "it is {extent_m:.0} m long: where its numbers are millimetres, give it `scale=\"0.001 0.001 0.001\"`; where it is as large as that, \
+         `scale=\"1 1 1\"`"
+    )]
+    Large {
+        /// Along the longest side of the box that holds it, in metres.
+        extent_m: f64,
+    },
     /// Not finite.
     #[error("a corner of triangle {triangle} is not finite, or it is beyond a kilometre")]
     NotFinite {
@@ -201,6 +210,16 @@ impl Mesh {
     /// The surface and the inside; the same ones whenever it is asked for.
     pub(crate) fn solid(&self) -> (SharedShape, Arc<Inside>) {
         self.solid.get_or_init(|| (self.shape(), Arc::new(Inside::new(self)))).clone()
+    }
+
+    /// The longest side of the box along its axes that holds it, in metres.
+    pub(crate) fn extent_m(&self) -> f64 {
+        let corners = || self.triangles.iter().flatten();
+        let along = |i: usize| {
+            let least = corners().map(|corner| corner[i]).fold(f64::INFINITY, f64::min);
+            corners().map(|corner| corner[i]).fold(f64::NEG_INFINITY, f64::max) - least
+        };
+        (0..3).map(along).fold(0.0, f64::max)
     }
 
     /// The farthest of its corners from its origin.

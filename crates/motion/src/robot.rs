@@ -217,6 +217,25 @@ pub enum RobotFault {
     },
 }
 
+impl RobotFault {
+    /// The link or joint of the description that does not fit.
+    pub(crate) fn named(&self) -> Option<&str> {
+        match self {
+            RobotFault::Model(MechanismError::Robot(
+                RobotError::Missing { name, .. } | RobotError::NotPlannable { name, .. },
+            )) => Some(name),
+            RobotFault::NoLink { link: name, .. }
+            | RobotFault::Model(MechanismError::Twice { joint: name })
+            | RobotFault::Beside { joint: name, .. }
+            | RobotFault::JointOfTwo { joint: name, .. }
+            | RobotFault::Order { joint: name, .. }
+            | RobotFault::Kind { joint: name, .. }
+            | RobotFault::Finger { finger: name, .. } => Some(name),
+            _ => None,
+        }
+    }
+}
+
 /// The robots that we ship: name, description, URDF and SRDF.
 const BUILT_IN: [(&str, &str, &str, &str); 4] = [
     (

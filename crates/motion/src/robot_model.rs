@@ -17,8 +17,9 @@ use crate::robot_state::RobotState;
 use crate::solid::Form;
 use crate::spheres::Sphere;
 use crate::urdf::{self, Description, Loader, RobotError};
+use crate::urdf_tree::JointText;
 use ratn_model::pose::Pose;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// How far apart the limits of a joint that is planned for may be, in radians (metres for one that slides).
 const WIDEST: f64 = 1e4;
@@ -38,6 +39,8 @@ pub struct RobotModel {
     pub(crate) mimics: BTreeSet<String>,
     /// The names of the joints that turn without end: after a whole turn everything is where it was.
     pub(crate) endless: BTreeSet<String>,
+    /// Where its joints are in the URDF.
+    pub(crate) texts: BTreeMap<String, JointText>,
     /// What the SRDF says of pairs of links, or, without one, what follows from how they meet ([`pairs`]).
     pub(crate) checks: Checks,
 }
@@ -222,9 +225,9 @@ impl RobotModel {
     }
 
     fn of(description: Description, srdf: Option<&str>) -> Result<RobotModel, MechanismError> {
-        let Description { name, joints, links, mimics, endless } = description;
+        let Description { name, joints, links, mimics, endless, texts } = description;
         let excepted = srdf.map(|text| srdf::excepted(text, &links)).transpose()?;
-        let mut model = RobotModel { name, joints, links, mimics, endless, checks: Checks::default() };
+        let mut model = RobotModel { name, joints, links, mimics, endless, texts, checks: Checks::default() };
         model.checks = match excepted {
             Some(excepted) => {
                 let by_shapes = pairs::undecided(&model, &excepted);
@@ -316,14 +319,20 @@ impl RobotModel {
 
     /// The index of a joint that can be planned for.
     pub(crate) fn plannable(&self, name: &str) -> Result<usize, RobotError> {
-        let unsupported = |reason| RobotError::Unsupported { what: "joint", name: name.to_owned(), reason };
+        let text = self.texts.get(name);
+        let refused = |reason: String| {
+            let place = text.map_or_else(String::new, |text| format!(" (line {} of the URDF)", text.line));
+            Err(RobotError::NotPlannable { name: name.to_owned(), reason: reason + &place })
+        };
         if self.mimics.contains(name) {
-            return Err(unsupported("it follows another joint and cannot be planned for"));
+            return refused("it mimics another joint; name that one".to_owned());
         }
         let missing = || RobotError::Missing { what: "joint", name: name.to_owned() };
         let index = self.joint(name).ok_or_else(missing)?;
         let Joint { lower, upper, .. } = self.joints[index];
-        let refused = |reason: String| Err(RobotError::NotPlannable { name: name.to_owned(), reason });
+        if lower >= upper && text.is_some_and(|text| !text.has_limit) && !self.endless.contains(name) {
+            return refused("it has no `<limit>`; add one with `lower`, `upper` and `velocity`".to_owned());
+        }
         if !(lower.is_finite() && upper.is_finite()) {
             return refused(format!("its limits are {lower} to {upper}: planning needs finite ones; {FOR_ENDLESS}"));
         }

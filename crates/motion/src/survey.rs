@@ -12,6 +12,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+use std::collections::BTreeMap;
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
 use std::ops::RangeInclusive;
 
@@ -157,16 +158,29 @@ fn region(workplace: &Workplace, boxes: &Boxes) -> Vec<Pose> {
     points.map(|(x, y)| Pose::at(x, y, workplace.table.top_m())).to_vec()
 }
 
-/// Why boxes that lie turned can be taken nowhere, of each way to lie of which that is so. The cell lays them turned anyhow, where they can be taken.
+/// Why boxes that lie turned can be taken nowhere, with all ways to lie of which that is so for one reason; nothing where straight ones cannot be
+/// either. The cell lays them turned anyhow, where they can be taken.
 fn turned(robot: &Robot, workplace: &Workplace, boxes: &Boxes) -> Vec<String> {
     let points = region(workplace, boxes);
     let nowhere = |yaw: f64| {
         let lying = points.iter().map(|at| at.compose(&Pose::from_rpy([0.0; 3], 0.0, 0.0, yaw)));
         let reasons: Option<Vec<String>> = lying.map(|at| beyond(robot, workplace, &at)).collect();
-        let reason = reasons?.pop()?;
-        Some(format!("the cell lays them turned, and turned by {:.0}° none can be taken: {reason}", yaw.to_degrees()))
+        reasons?.pop()
     };
-    TURNED_RAD.into_iter().filter_map(nowhere).collect()
+    if nowhere(0.0).is_some() {
+        return Vec::new();
+    }
+    let mut ways: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    for yaw in TURNED_RAD {
+        if let Some(reason) = nowhere(yaw) {
+            ways.entry(reason).or_default().push(format!("{:.0}°", yaw.to_degrees()));
+        }
+    }
+    let said = |(reason, angles): (String, Vec<String>)| {
+        let angles = angles.join(", ");
+        format!("the cell lays them turned, and turned by {angles} none can be taken: {reason}")
+    };
+    ways.into_iter().map(said).collect()
 }
 
 /// The table, and a box on a point of a surface.
@@ -213,7 +227,7 @@ fn beyond(robot: &Robot, workplace: &Workplace, floor: &Pose) -> Option<String> 
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
     use super::*;
 
     #[test]
@@ -268,18 +282,23 @@ mod tests {
                     finger = 'a'\n[postures]\nhome = [0, 0, 0, 0]\n[workplace]\ntable = { centre = [0, 0, 0.675], size = [0.8, 1.4, 0.05] }\n\
                     boxes = { x = [-0.1, 0.1], y = [-0.1, 0.1], least = [0.05, 0.04, 0.07], greatest = [0.10, 0.05, 0.10] }\n\
                     places = { on = 'table', yaw = 0, at = [[0.2, 0.2, 0.70]] }\n";
-        let faults = |limits: &str| {
-            let description = crate::description::RobotDescription::read(toml).unwrap();
+        let faults_from = |limits: &str, home: &str| {
+            let toml = toml.replace("home = [0, 0, 0, 0]", &format!("home = [0, 0, 0, {home}]"));
+            let description = crate::description::RobotDescription::read(&toml).unwrap();
             let robot = Robot::of(description, &urdf(limits), None, &mut |_| unreachable!("it has no meshes")).unwrap();
             survey(&robot).faults
         };
+        let faults = |limits: &str| faults_from(limits, "0");
         assert_eq!(faults("lower='-3.1' upper='3.1'"), Vec::<String>::new());
         let stiff = faults("lower='-0.01' upper='0.01'");
-        assert_eq!(stiff.len(), TURNED_RAD.len(), "{stiff:?}");
+        let [said] = &stiff[..] else { panic!("{stiff:?}") };
         assert!(
-            stiff[1].contains("turned by 45°") && stiff[1].contains("no posture of the arm gets there"),
-            "{stiff:?}"
+            said.contains("turned by -45°, 45°, 90°") && said.contains("no posture of the arm gets there"),
+            "{said}"
         );
+        // Where not even a straight one can be taken, that says it all.
+        let nowhere = faults_from("lower='0.3' upper='0.4'", "0.3");
+        assert!(!nowhere.is_empty() && nowhere.iter().all(|fault| !fault.contains("turned")), "{nowhere:?}");
     }
 
     #[test]

@@ -6,6 +6,7 @@ use crate::robot_model::{Drive, Joint, Link};
 use crate::spheres;
 use crate::urdf_faults;
 use crate::urdf_faults::UrdfFault;
+use crate::urdf_tree::JointText;
 use ratn_model::pose::Pose;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -73,13 +74,14 @@ pub enum RobotError {
     },
 }
 
-/// What a text describes.
+/// What a text describes, and where it says so of its joints.
 ///
 /// # Errors
 /// [`RobotError::Fault`] names the line.
-pub(crate) fn parse(text: &str) -> Result<urdf_rs::Robot, RobotError> {
-    urdf_faults::check(text)?;
-    urdf_rs::read_from_string(text).map_err(|error| RobotError::Urdf(error.to_string()))
+pub(crate) fn parse(text: &str) -> Result<(urdf_rs::Robot, BTreeMap<String, JointText>), RobotError> {
+    let joints = urdf_faults::check(text)?;
+    let robot = urdf_rs::read_from_string(text).map_err(|error| RobotError::Urdf(error.to_string()))?;
+    Ok((robot, joints))
 }
 
 /// What a URDF describes.
@@ -94,10 +96,15 @@ pub(crate) struct Description {
     pub(crate) mimics: BTreeSet<String>,
     /// The names of those that turn without end, and that no other joint mimics.
     pub(crate) endless: BTreeSet<String>,
+    /// Where the joints are in the text.
+    pub(crate) texts: BTreeMap<String, JointText>,
 }
 
 /// Limits of a joint that has none, in radians: a whole turn.
 const ENDLESS_RAD: f64 = std::f64::consts::PI;
+
+/// A mesh of a link that is longer than this has its numbers in millimetres, unless a `scale` says that it has not.
+const PLAUSIBLE_M: f64 = 25.0;
 
 /// Where a URDF names no acceleration, the speed is reached in this time, in seconds.
 const TIME_TO_SPEED_S: f64 = 0.25;
@@ -110,7 +117,7 @@ const TIME_TO_ACCELERATION_S: f64 = 0.1;
 /// # Errors
 /// [`RobotError`] names the link or joint.
 pub(crate) fn read(text: &str, load: &mut Loader<'_>) -> Result<Description, RobotError> {
-    let urdf = parse(text)?;
+    let (urdf, texts) = parse(text)?;
     let moves = |j: &&urdf_rs::Joint| j.joint_type != urdf_rs::JointType::Fixed && j.mimic.is_none();
     let mut driving: Vec<(&str, Limits)> =
         urdf.joints.iter().filter(moves).map(|joint| (joint.name.as_str(), Limits::of(joint))).collect();
@@ -129,7 +136,7 @@ pub(crate) fn read(text: &str, load: &mut Loader<'_>) -> Result<Description, Rob
     let is_endless = |j: &&urdf_rs::Joint| j.joint_type == urdf_rs::JointType::Continuous && j.mimic.is_none();
     let endless = urdf.joints.iter().filter(is_endless).map(|j| j.name.clone());
     let endless = endless.filter(|name| !followed.contains(name.as_str())).collect();
-    Ok(Description { name: urdf.name, joints, links, mimics, endless })
+    Ok(Description { name: urdf.name, joints, links, mimics, endless, texts })
 }
 
 /// What a description says of how a joint may move.
@@ -277,8 +284,11 @@ fn shapes(link: &urdf_rs::Link, load: &mut Loader<'_>) -> Result<(Vec<Body>, Vec
             bodies.push(geometry.at(pose));
         } else if let urdf_rs::Geometry::Mesh { filename, scale } = &collision.geometry {
             let failed = |source| RobotError::Mesh { link: link.name.clone(), file: filename.clone(), source };
-            let scale = scale.map_or([1.0; 3], |scale| scale.0);
-            let mesh = load(filename).and_then(|bytes| Mesh::read(filename, &bytes, scale)).map_err(failed)?;
+            let factors = scale.map_or([1.0; 3], |scale| scale.0);
+            let mesh = load(filename).and_then(|bytes| Mesh::read(filename, &bytes, factors)).map_err(failed)?;
+            if scale.is_none() && mesh.extent_m() > PLAUSIBLE_M {
+                return Err(failed(MeshError::Large { extent_m: mesh.extent_m() }));
+            }
             meshes.push(Meshed { pose, mesh: Arc::new(mesh) });
         }
     }

@@ -2,8 +2,9 @@
 //! none or that no robot can have, limits that contradict themselves, links that are not one tree (`urdf_tree`). The reader of the whole description ([`urdf_rs`])
 //! loses the lines.
 
-use crate::urdf_tree::{Place, Tree};
+use crate::urdf_tree::{JointText, Place, Tree};
 use crate::xml_text;
+use std::collections::BTreeMap;
 use xml::common::Position;
 use xml::reader::XmlEvent;
 
@@ -94,11 +95,11 @@ const ATTRIBUTES: &[(&str, &str, &str, Value, bool)] = &[
 /// The types of joints that there are.
 const TYPES: [&str; 7] = ["revolute", "continuous", "prismatic", "fixed", "floating", "planar", "spherical"];
 
-/// Looks for the first fault.
+/// Looks for the first fault; without one, what the text says of its joints.
 ///
 /// # Errors
 /// [`UrdfFault`].
-pub(crate) fn check(text: &str) -> Result<(), UrdfFault> {
+pub(crate) fn check(text: &str) -> Result<BTreeMap<String, JointText>, UrdfFault> {
     let mut reader = xml_text::reader(text.as_bytes());
     let (mut open, mut tree, mut has_limits): (Vec<String>, _, _) = (Vec::new(), Tree::default(), false);
     // Of the link or joint that is being read, its name, and of a joint whether it moves.
@@ -155,7 +156,9 @@ pub(crate) fn check(text: &str) -> Result<(), UrdfFault> {
                             tree.last_joint()
                         )));
                     }
+                    ("joint", "mimic") if open.len() == 2 => tree.follows(text("joint"), at),
                     ("joint", "limit") if has_limits => {
+                        tree.limited();
                         contradiction(text("lower"), text("upper")).map_or(Ok(()), |reason| {
                             Err(fault(format!("the joint `{}`: {reason}", tree.last_joint())))
                         })?;
@@ -167,7 +170,7 @@ pub(crate) fn check(text: &str) -> Result<(), UrdfFault> {
             Ok(XmlEvent::EndElement { .. }) => {
                 open.pop();
             }
-            Ok(XmlEvent::EndDocument) => return tree.check(),
+            Ok(XmlEvent::EndDocument) => return tree.check().map(|()| tree.joints()),
             Ok(_) => {}
         }
     }
@@ -232,12 +235,13 @@ mod tests {
     #[test]
     fn a_fault_is_found_with_its_line() {
         let fault = |text: &str| check(text).err().map(|fault| fault.to_string()).unwrap_or_default();
-        assert_eq!(check("<robot name='r'><link name='l'/></robot>"), Ok(()));
+        assert!(check("<robot name='r'><link name='l'/></robot>").is_ok());
         assert_eq!(fault("<robot name='r'>\n <link/>\n</robot>"), "line 2, column 2: `link` has no attribute `name`");
         let joint = |inner: &str| {
             format!("<robot name='r'><link name='l'/>\n<joint name='j' type='revolute'>\n{inner}</joint></robot>")
         };
-        assert_eq!(check(&joint("<axis xyz='0 0 1'/>")), Ok(()));
+        let read = check(&joint("<axis xyz='0 0 1'/>")).unwrap_or_default();
+        assert_eq!(read.get("j"), Some(&JointText { line: 2, has_limit: false }));
         let said = fault(&joint("<axis xyz='0 0'/>"));
         assert_eq!(said, "line 3, column 1: `xyz` of `axis` is `0 0` instead of 3 numbers (in the joint `j`)");
         let said = fault(&joint("<limit lower='low' velocity='1'/>"));

@@ -1,4 +1,4 @@
-//! Which links of a URDF hang on which, before anything else is read: every name once, every reference to something that is there, and one
+//! Which links of a URDF hang on which, before anything else is read: every name once, every reference to a link or joint that is there, and one
 //! tree that holds all links.
 //!
 //! What breaks this is refused with its line. A reader that went on would leave out what hangs on no tree with the root.
@@ -28,6 +28,19 @@ struct Joint {
     name: String,
     parent: Option<End>,
     child: Option<End>,
+    /// The joint that it follows, and where it names that.
+    follows: Option<End>,
+    at: Place,
+    has_limit: bool,
+}
+
+/// Where a joint begins in the text, and whether its limits are there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct JointText {
+    /// From 1.
+    pub(crate) line: u64,
+    /// It has an element `limit`.
+    pub(crate) has_limit: bool,
 }
 
 /// Links and joints in the order of the text.
@@ -55,7 +68,8 @@ impl Tree {
     /// # Errors
     /// [`UrdfFault`] where there is one with this name.
     pub(crate) fn joint(&mut self, name: &str, at: Place) -> Result<(), UrdfFault> {
-        self.joints.push(Joint { name: name.to_owned(), parent: None, child: None });
+        let (parent, child, follows) = (None, None, None);
+        self.joints.push(Joint { name: name.to_owned(), parent, child, follows, at, has_limit: false });
         is_first(&mut self.joint_places, "joint", name, at)
     }
 
@@ -65,6 +79,26 @@ impl Tree {
             let end = if which == "parent" { &mut joint.parent } else { &mut joint.child };
             *end = Some((link.to_owned(), at));
         }
+    }
+
+    /// The joint that was added last follows another one.
+    pub(crate) fn follows(&mut self, joint: &str, at: Place) {
+        if let Some(last) = self.joints.last_mut() {
+            last.follows = Some((joint.to_owned(), at));
+        }
+    }
+
+    /// The joint that was added last has limits.
+    pub(crate) fn limited(&mut self) {
+        if let Some(last) = self.joints.last_mut() {
+            last.has_limit = true;
+        }
+    }
+
+    /// What was read of the joints, by their names.
+    pub(crate) fn joints(self) -> BTreeMap<String, JointText> {
+        let text = |joint: Joint| (joint.name, JointText { line: joint.at.line, has_limit: joint.has_limit });
+        self.joints.into_iter().map(text).collect()
     }
 
     /// The name of the joint that was added last.
@@ -79,6 +113,9 @@ impl Tree {
     pub(crate) fn check(&self) -> Result<(), UrdfFault> {
         let mut parents: BTreeMap<&str, (&Joint, Place)> = BTreeMap::new();
         for joint in &self.joints {
+            if let Some((followed, at)) = &joint.follows {
+                self.is_followed(joint, followed, *at)?;
+            }
             for (which, end) in [("parent", &joint.parent), ("child", &joint.child)] {
                 if let Some((link, at)) = end {
                     self.is_there(joint, which, link, *at)?;
@@ -129,6 +166,16 @@ impl Tree {
                 "the link `{link}` does not hang on the root `{root}`: the joints towards it go in a circle"
             ))),
         }
+    }
+
+    fn is_followed(&self, joint: &Joint, followed: &str, at: Place) -> Result<(), UrdfFault> {
+        if self.joint_places.contains_key(followed) {
+            return Ok(());
+        }
+        let known = self.joint_places.keys().map(String::as_str);
+        let help = suggestion(followed, known, "", "is its name misspelt?");
+        let name = &joint.name;
+        Err(at.fault(format!("the joint `{name}` mimics `{followed}`: the robot has no such joint; {help}")))
     }
 
     fn is_there(&self, joint: &Joint, which: &str, link: &str, at: Place) -> Result<(), UrdfFault> {

@@ -86,6 +86,22 @@ fn a_text_and_a_binary_stl_are_the_same_mesh() {
 }
 
 #[test]
+fn a_mesh_in_millimetres_without_a_scale_is_refused_with_what_to_write() {
+    let with = |scale: &str| {
+        let urdf = robot("elbow.stl").replace("scale='0.001 0.001 0.001'", scale);
+        let read = Mechanism::read_with_meshes(&urdf, None, &[], &mut |_| Ok(binary(&elbow())));
+        let error = read.err()?;
+        Some(format!("{error}: {}", std::error::Error::source(&error).map(ToString::to_string).unwrap_or_default()))
+    };
+    let said = with("").unwrap();
+    assert!(said.contains("`elbow.stl` of link `l1`") && said.contains("200 m long"), "{said}");
+    assert!(said.contains("scale=\"0.001 0.001 0.001\""), "{said}");
+    // Whoever says so has it as large as that.
+    assert_eq!(with("scale='1 1 1'"), None);
+    assert_eq!(with("scale='0.001 0.001 0.001'"), None);
+}
+
+#[test]
 fn every_point_of_a_mesh_is_in_one_of_its_spheres_and_they_stay_close() {
     let square = [[0.0, 0.0], [30.0, 0.0], [30.0, 30.0], [0.0, 30.0]];
     let long = prism(&square, 900.0);

@@ -5,6 +5,7 @@
 use ratn_motion::description::RobotDescription;
 use ratn_motion::joint_vector::JointVector;
 use ratn_motion::robot::{Robot, RobotFault};
+use std::path::PathBuf;
 
 /// An arm of two joints with a tool and a joint of no part.
 const URDF: &str = r#"<robot name="two">
@@ -56,6 +57,35 @@ fn every_built_in_robot_takes_its_postures() {
         assert_eq!(robot.name(), name);
         assert!(robot.postures().iter().all(|(_, posture)| robot.clamp(posture) == *posture));
     }
+}
+
+#[test]
+fn what_does_not_fit_is_refused_with_its_line() {
+    let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("descriptions-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    let file = folder.join("robot.toml");
+    let refused = |toml: &str, urdf: &str| {
+        std::fs::write(&file, toml).unwrap();
+        std::fs::write(folder.join("two.urdf"), urdf).unwrap();
+        let said = Robot::from_file(&file).unwrap_err().to_string();
+        said.strip_prefix(&format!("{}: ", file.display())).map(str::to_owned).unwrap_or(said)
+    };
+    let changed = |from: &str, to: &str| {
+        assert!(TOML.contains(from), "{from}");
+        refused(&TOML.replace(from, to), URDF)
+    };
+    assert_eq!(changed(r#""b"]"#, r#""c"]"#), "line 5: the robot description has no joint `c`");
+    assert!(changed(r#"tool = "tool""#, r#"tool = "hand""#).starts_with("line 6: `arm.tool`"));
+    // Where a name is written, and not where a comment has it.
+    let said = changed("[arm]\njoints = [\"a\", \"b\"]", "# was \"c\"\n[arm]\njoints = [\n  \"a\",\n  \"c\",\n]");
+    assert!(said.starts_with("line 8: "), "{said}");
+    let without = URDF.replacen("<limit lower=\"-2\" upper=\"2\" velocity=\"1\" effort=\"1\"/>", "", 1);
+    let said = refused(TOML, &without);
+    assert_eq!(
+        said,
+        "line 5: the joint `a` cannot be planned for: it has no `<limit>`; add one with `lower`, `upper` and `velocity` (line 3 of the URDF)"
+    );
+    std::fs::remove_dir_all(&folder).unwrap();
 }
 
 #[test]

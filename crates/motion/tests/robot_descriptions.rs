@@ -84,6 +84,18 @@ fn two_joints_or_links_with_one_name_are_refused_with_both_places() {
 }
 
 #[test]
+fn a_mimic_of_an_unknown_joint_is_refused_where_it_stands() {
+    let follows = |name: &str| {
+        let finger = |name: &str, more: &str| with(name, "hand", &format!("{name}_link"), more);
+        let (own, mimic) =
+            ("<limit lower='-1' upper='1' velocity='1' effort='1'/>", format!("<mimic joint='{name}'/>"));
+        robot(&[link("hand"), link("left_link"), link("right_link"), finger("left", own), finger("right", &mimic)])
+    };
+    says(&follows("lift"), &["line 6", "the joint `right` mimics `lift`", "did you mean `left`?"]);
+    assert!(RobotModel::read(&follows("left"), None).is_ok());
+}
+
+#[test]
 fn limits_that_contradict_themselves_are_refused_and_endless_ones_are_held() {
     let turning = |limit: &str| {
         robot(&[link("base"), link("a"), link("b"), joint("other", "base", "a"), with("turn", "a", "b", limit)])

@@ -7,13 +7,13 @@
 //! The comparison runs on the cell's only thread, where an emergency stop waits for its end. So its work is bounded. Of two ways, places that one
 //! comes to again are kept once, and the places of a body form a binary tree of which whole branches are ruled out by one distance. Beside a
 //! part that stands, postures are passed over as long as no joint has moved anything by as much as there was room (conservative advancement,
-//! Mirtich 1996). A comparison that takes more than [`MAX_POSTURES`] or [`MAX_DISTANCES`] is given up ([`Crossing::TooLong`]).
+//! Mirtich 1996). A comparison that takes more than [`MAX_POSTURES`], [`MAX_DISTANCES`] or [`MAX_SEARCHES`] is given up ([`Crossing::TooLong`]).
 
 use super::levers::Levers;
 use rapier3d::math::Pose as Pose32;
 use rapier3d::parry::shape::SharedShape;
 use ratn_model::pose::Pose;
-use ratn_motion::distance::gap;
+use ratn_motion::distance::gap_within;
 use ratn_motion::robot::{ArmPosition, Configuration, Joint, Robot, to_f32};
 use ratn_motion::solid::Form;
 use std::collections::BTreeMap;
@@ -29,6 +29,8 @@ const ROUNDED_M: f32 = 3e-4;
 pub(super) const MAX_POSTURES: usize = 40_000;
 /// The most distances of two bodies that are computed for one comparison.
 const MAX_DISTANCES: u32 = 200_000;
+/// The most searches of these: where a body is a mesh, each of its triangles that is near the other body takes one, which is some microsecond.
+const MAX_SEARCHES: u32 = 1_000_000;
 /// Of places on two ways that are nearer to each other than that one is kept, in metres: it is added to the distance on either side.
 const RESOLUTION_M: f32 = 0.008;
 /// The same of a part that stands; of an arm the fingers alone may move.
@@ -41,6 +43,13 @@ pub(super) enum Part {
     Arm(usize),
     /// The camera's head. Its joints are pan and tilt, and it has no fingers.
     Head,
+}
+
+/// What of its bounds a comparison has left.
+#[derive(Debug, Clone)]
+struct Work {
+    distances: u32,
+    searches: u32,
 }
 
 /// What a part, or the fingers of an arm alone, will do.
@@ -149,11 +158,11 @@ fn ways_apart(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahead)
         return Err(Crossing::TooLong);
     }
     let (ours, theirs) = (swept(robot, here, ours, RESOLUTION_M), swept(robot, here, theirs, RESOLUTION_M));
-    let mut distances = MAX_DISTANCES;
+    let mut work = Work::WHOLE;
     for a in &ours {
         for b in theirs.iter().filter(|b| a.is_kept_from(b, robot)) {
             let margin = APART_M as f32 + a.missed() + b.missed();
-            if a.comes_to(b, margin, &mut distances)? {
+            if a.comes_to(b, margin, &mut work)? {
                 return Err(Crossing::of(robot, a, b));
             }
         }
@@ -167,7 +176,7 @@ fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahea
     let (bodies, others) = (Swept::all(robot, ours), swept(robot, here, theirs, FINE_M));
     let levers = ours.levers(robot);
     let between = ours.between_courses(robot);
-    let (mut distances, mut configuration) = (MAX_DISTANCES, *here);
+    let (mut work, mut configuration) = (Work::WHOLE, *here);
     for course in &ours.courses {
         // How near each pair may come, once it is known how near it is at the start; and whether that is nearer than it should be.
         let mut allowed: Vec<Option<(f32, bool)>> = vec![None; bodies.len() * others.len()];
@@ -191,7 +200,7 @@ fn stays_beside(robot: &Robot, here: &Configuration, ours: &Ahead, theirs: &Ahea
                     let known = &mut allowed[body * others.len() + other];
                     let sure = BESIDE_M as f32 + b.missed();
                     let up_to = known.map_or(f32::INFINITY, |(least, _)| (room.max(leg) + least).max(sure + leg));
-                    let distance = a.nearest(&place, b, up_to, &mut distances)?;
+                    let distance = a.nearest(&place, b, up_to, &mut work)?;
                     let (least, is_near) = match *known {
                         // Once it has been far enough away it comes back as any other.
                         _ if distance >= sure + leg => (sure, false),
@@ -281,6 +290,10 @@ impl Ahead {
     }
 }
 
+impl Work {
+    const WHOLE: Work = Work { distances: MAX_DISTANCES, searches: MAX_SEARCHES };
+}
+
 impl Kept {
     fn nothing() -> Kept {
         Kept { known: BTreeMap::new(), last: None, before: None }
@@ -365,9 +378,15 @@ impl Swept {
     }
 
     /// How far it is at a place from another body at one, or something greater than `enough` where that is more.
-    fn distance(&self, at: &Pose32, other: &Swept, of: &Pose32, enough: f32) -> f32 {
-        // A pair whose distance cannot be computed counts as one that touches.
-        gap(at, &*self.shape, of, &*other.shape, f64::from(enough)).map_or(0.0, |apart| apart.max(0.0) as f32)
+    fn distance(&self, at: &Pose32, other: &Swept, of: &Pose32, enough: f32, work: &mut Work) -> Result<f32, Crossing> {
+        work.distances = work.distances.checked_sub(1).ok_or(Crossing::TooLong)?;
+        let shapes = [&*self.shape, &*other.shape];
+        match gap_within([at, of], shapes, f64::from(enough), &mut work.searches) {
+            Some(apart) => Ok(apart.max(0.0) as f32),
+            None if work.searches == 0 => Err(Crossing::TooLong),
+            // A pair whose distance cannot be computed counts as one that touches.
+            None => Ok(0.0),
+        }
     }
 
     /// Whether two bodies are to be kept apart: not where their links are excepted, nor where other shapes of theirs are looked at.
@@ -377,19 +396,18 @@ impl Swept {
     }
 
     /// How far it is from another body at the places of that one, or `up_to` where that is less.
-    fn nearest(&self, at: &Pose32, other: &Swept, up_to: f32, distances: &mut u32) -> Result<f32, Crossing> {
+    fn nearest(&self, at: &Pose32, other: &Swept, up_to: f32, work: &mut Work) -> Result<f32, Crossing> {
         let mut nearest = up_to;
         for of in &other.places {
             if (at.translation - of.translation).length() - self.radius - other.radius < nearest {
-                *distances = distances.checked_sub(1).ok_or(Crossing::TooLong)?;
-                nearest = nearest.min(self.distance(at, other, of, nearest));
+                nearest = nearest.min(self.distance(at, other, of, nearest, work)?);
             }
         }
         Ok(nearest)
     }
 
     /// Whether any of its places is nearer than `margin` to any place of another body.
-    fn comes_to(&self, other: &Swept, margin: f32, distances: &mut u32) -> Result<bool, Crossing> {
+    fn comes_to(&self, other: &Swept, margin: f32, work: &mut Work) -> Result<bool, Crossing> {
         let (Some(ours), Some(theirs)) = (self.tree.len().checked_sub(1), other.tree.len().checked_sub(1)) else {
             return Ok(false);
         };
@@ -401,8 +419,7 @@ impl Swept {
             if (at.translation - of.translation).length() - self.radius - other.radius > around {
                 continue;
             }
-            *distances = distances.checked_sub(1).ok_or(Crossing::TooLong)?;
-            let distance = self.distance(at, other, of, around);
+            let distance = self.distance(at, other, of, around, work)?;
             if distance < margin {
                 return Ok(true);
             }
@@ -481,13 +498,15 @@ mod tests {
         let ahead = swings(&robot, 0.9, 60, 1);
         let swept = swept(&robot, &here(&robot), &ahead, 0.008);
         let mut found = [0, 0];
+        let distance = |a: &Swept, at: &Pose32, b: &Swept, of: &Pose32| {
+            a.distance(at, b, of, f32::MAX, &mut Work::WHOLE.clone()).unwrap()
+        };
         for (i, a) in swept.iter().enumerate() {
             for b in &swept[..i] {
                 for margin in [0.01, 0.05, 0.2] {
-                    let nearest =
-                        a.places.iter().flat_map(|at| b.places.iter().map(|of| a.distance(at, b, of, f32::MAX)));
+                    let nearest = a.places.iter().flat_map(|at| b.places.iter().map(|of| distance(a, at, b, of)));
                     let expected = nearest.fold(f32::INFINITY, f32::min) < margin;
-                    assert_eq!(a.comes_to(b, margin, &mut { MAX_DISTANCES }), Ok(expected));
+                    assert_eq!(a.comes_to(b, margin, &mut Work::WHOLE.clone()), Ok(expected));
                     found[usize::from(expected)] += 1;
                 }
             }
@@ -503,6 +522,8 @@ mod tests {
         let compared = keep_apart(&robot, &here(&robot), &long, &short, Other::Moves);
         assert_eq!(compared, Err(Crossing::TooLong));
         let swept = swept(&robot, &here(&robot), &short, 0.008);
-        assert_eq!(swept[0].comes_to(&swept[1], 0.0, &mut 0), Err(Crossing::TooLong));
+        for mut none in [Work { distances: 0, ..Work::WHOLE }, Work { searches: 0, ..Work::WHOLE }] {
+            assert_eq!(swept[0].comes_to(&swept[1], 0.0, &mut none), Err(Crossing::TooLong));
+        }
     }
 }

@@ -16,6 +16,7 @@ use ratn_motion::robot::{Configuration, Robot};
 use ratn_motion::space::Obstacle;
 use ratn_motion::top_grasp::grasp_poses;
 use ratn_motion::workplace::{Boxes, HOME, Workplace};
+use std::f64::consts::TAU;
 use std::fmt;
 
 /// A demand that a robot does not meet.
@@ -96,7 +97,9 @@ fn away(robot: &Robot) -> Option<Unmet> {
     let limits = [("x", Some(x), "m"), ("y", Some(y), "m"), ("its heading", heading, "rad")];
     let leaves_out = |(what, limits, unit): (&'static str, Option<[f64; 2]>, &'static str)| {
         let [low, high] = limits?;
-        (!(low..=high).contains(&0.0)).then_some((what, [low, high], unit))
+        // A heading is the same after a whole turn: a drive begins at the one that is within the limits.
+        let origins: &[f64] = if unit == "rad" { &[0.0, TAU, -TAU] } else { &[0.0] };
+        (!origins.iter().any(|at| (low..=high).contains(at))).then_some((what, [low, high], unit))
     };
     let (what, [low, high], unit) = limits.into_iter().find_map(leaves_out)?;
     Some(Unmet {

@@ -2,13 +2,18 @@
 //!
 //! rapier3d moves what can be moved; floor and furniture stand still, and the robot's links go where its joints are, whatever is
 //! in their way. `grip` says what the fingers can hold, `riding` what goes along with a base that drives, `touch`
-//! what touches what, planned or not. Nothing here reads a clock: the step is fixed, time is the number of steps,
+//! what touches what, planned or not, and `overlap` how deep. Nothing here reads a clock: the step is fixed, time is the number of steps,
 //! and the same steps with the same joints give the same world to the last bit on one machine ([`Environment::digest`]).
 
+mod convex;
 mod grip;
 mod object;
+mod overlap;
+mod polygon;
 mod riding;
+mod shell;
 mod touch;
+mod vector;
 mod world;
 
 pub use grip::{Grip, Hold, Load, Slip};

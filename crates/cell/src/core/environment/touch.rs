@@ -1,22 +1,28 @@
 //! What touches what: every pair of bodies, the robot's links among each other and against furniture included.
 //!
-//! The bodies are those that the physics moves, where it has put them; depth, place and speed are the answers of its own contact query
-//! on their shapes. Nothing of a planner is asked. Two kinds of pairs are left out: those of which neither is a link or is carried, because the
+//! The bodies are those that the physics moves, where it has put them. How deep they are in each other is the judge's own answer (`overlap`): that of
+//! the engine is off by up to centimetres where cylinders and capsules are deep in each other, and by millimetres where they hardly touch. Nothing of a
+//! planner is asked. Two kinds of pairs are left out: those of which neither is a link or is carried, because the
 //! robot does not decide what objects do to each other; and those that the robot is built to have in contact: links that hang on each
 //! other, what touches in its home posture (a capsule's end reaches into the next link, the base stands on the floor), and links between
 //! which a single joint decides (the flange and the link before the wrist): its limits keep them apart, not who plans. Two links that are told
-//! apart by their meshes are left out, too: the bodies have spheres in place of the meshes, and the spheres of such links nearly always meet.
+//! apart by their meshes are looked at by those and by their primitives (`shell`): the bodies have spheres in place of the meshes, and the spheres of
+//! such links nearly always meet.
 //! What is shared with the planner: the reader of the robot's description and its forward kinematics.
 
+use super::convex::Convex;
+use super::overlap::{Meeting, meeting};
+use super::shell::Shell;
 use super::world::{Environment, FLOOR, LEVEL, TOUCH_M};
 use rapier3d::math::{Pose as Pose32, Vector};
 use rapier3d::parry::bounding_volume::{Aabb, BoundingVolume};
-use rapier3d::parry::query::contact;
+use rapier3d::parry::shape::Shape;
 use rapier3d::prelude::{Collider, ColliderHandle, RigidBody, RigidBodyHandle};
+use ratn_model::pose::Pose;
 use ratn_motion::robot::{Configuration, Drive, Geometry, Robot};
 use ratn_motion::workplace::HOME;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// A body that can touch another.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -56,6 +62,10 @@ const ALIGNED: f64 = 1e-9;
 pub(super) struct Joined {
     links: BTreeSet<[usize; 2]>,
     on_floor: BTreeSet<usize>,
+    /// Those of them that are told apart by their own shapes, and may not touch.
+    by_shells: Vec<[usize; 2]>,
+    /// Of each link in such a pair.
+    shells: BTreeMap<usize, Shell>,
 }
 
 impl Joined {
@@ -71,7 +81,7 @@ impl Joined {
         let mut joined = Joined::default();
         for (i, (a, pose_a, shape_a)) in shapes.iter().enumerate() {
             for (b, pose_b, shape_b) in &shapes[..i] {
-                let touch = contact(pose_a, &**shape_a, pose_b, &**shape_b, 0.0).ok().flatten();
+                let touch = meeting(&convex(&**shape_a, pose_a), &convex(&**shape_b, pose_b), 0.0);
                 if a == b || above(robot, *a) == Some(*b) || touch.is_some() || is_covered(robot, *a, *b) {
                     joined.links.insert([*b.min(a), *b.max(a)]);
                 }
@@ -84,7 +94,26 @@ impl Joined {
                 joined.on_floor.insert(*a);
             }
         }
+        joined.add_shells(robot, &robot.poses(&home));
         joined
+    }
+
+    /// Finds the links that are told apart by their own shapes, but those of which one hangs on the other, and what touches in a posture.
+    fn add_shells(&mut self, robot: &Robot, poses: &[Pose]) {
+        let links = &robot.model.links;
+        let all = (0..links.len()).flat_map(|b| (0..b).map(move |a| [a, b]));
+        let hang = |a: usize, b: usize| {
+            let next = above(robot, b).filter(|_| turns_in_itself(robot, b)).and_then(|between| above(robot, between));
+            above(robot, b) == Some(a) || next == Some(a)
+        };
+        for [a, b] in all.filter(|[a, b]| is_covered(robot, *a, *b) && !hang(*a, *b)) {
+            for link in [a, b] {
+                self.shells.entry(link).or_insert_with(|| Shell::of(&links[link]));
+            }
+            if self.shells[&a].meeting(poses[a], &self.shells[&b], poses[b], 0.0).is_none() {
+                self.by_shells.push([a, b]);
+            }
+        }
     }
 
     fn has(&self, a: usize, b: usize) -> bool {
@@ -92,7 +121,7 @@ impl Joined {
     }
 }
 
-/// Whether spheres that stand for meshes say nothing of two links. The controllers look at the meshes.
+/// Whether spheres that stand for meshes say nothing of two links.
 fn is_covered(robot: &Robot, a: usize, b: usize) -> bool {
     robot.model.is_by_shapes(a, b) && [a, b].iter().any(|link| robot.model.links[*link].covers > 0)
 }
@@ -148,6 +177,18 @@ struct Part<'a> {
     aabb: Aabb,
 }
 
+impl Part<'_> {
+    fn convex(&self) -> Convex {
+        convex(self.collider.shape(), &self.place)
+    }
+}
+
+/// A shape of a body in its place.
+pub(super) fn convex(shape: &dyn Shape, place: &Pose32) -> Convex {
+    #[expect(clippy::expect_used, reason = "links, furniture and objects have no other shapes: `Geometry::shape`")]
+    Convex::of(shape, place).expect("bodies are made of balls, boxes, cylinders and capsules")
+}
+
 impl Environment {
     /// What touches what, after the last step: all pairs of a link, or of a carried object, with anything else, but those that the robot
     /// is built to have in contact. Of two bodies the deepest place.
@@ -160,7 +201,7 @@ impl Environment {
         let around: Vec<Option<Aabb>> = objects.iter().map(|parts| around(parts)).collect();
         let near = |part: &Part<'_>, object: usize| around[object].is_some_and(|aabb| aabb.intersects(&part.aabb));
 
-        let mut found = Vec::new();
+        let mut found: Vec<Touch> = self.touches_of_shells().collect();
         let mut look = |a: &Part<'_>, b: &Part<'_>, things: &dyn Fn() -> [Thing; 2]| {
             if a.aabb.intersects(&b.aabb) {
                 found.extend(touch(a, b).map(|touch| Touch { things: things(), ..touch }));
@@ -197,6 +238,18 @@ impl Environment {
         deepest(found)
     }
 
+    /// Which links touch of those that are told apart by their own shapes.
+    fn touches_of_shells(&self) -> impl Iterator<Item = Touch> {
+        let Joined { by_shells, shells, .. } = self.joined();
+        by_shells.iter().filter_map(|pair| {
+            let [at, its] = pair.map(|link| self.link_pose(link));
+            let met = shells[&pair[0]].meeting(at, &shells[&pair[1]], its, NEAR_M)?;
+            let speeds = pair.map(|link| self.link_body(link).map(Speed::of).unwrap_or_default());
+            let things = pair.map(|link| Thing::Link(self.link_name(link).to_owned()));
+            Some(Touch { things, ..touched(&met, speeds) })
+        })
+    }
+
     /// What an object stands on: all that touches it from below.
     pub fn supports_of(&self, object: usize) -> Vec<Thing> {
         let mine: Vec<Part<'_>> = self.object_colliders(object).map(|c| self.part(c)).collect();
@@ -207,11 +260,11 @@ impl Environment {
         let all = self.link_colliders().map(link).chain(self.fixed_colliders().map(fixed)).chain(others);
         let bears = |(_, collider): &(Thing, ColliderHandle)| {
             let below = self.part(*collider);
-            let found = |part: &Part<'_>| {
-                contact(&below.place, below.collider.shape(), &part.place, part.collider.shape(), TOUCH_M)
+            let is_above = |part: &Part<'_>| {
+                let found = meeting(&below.convex(), &part.convex(), TOUCH_M);
+                found.is_some_and(|found| found.normal.0[2] >= LEVEL)
             };
-            let up = |part: &Part<'_>| found(part).ok().flatten().is_some_and(|found| found.normal1.z >= LEVEL);
-            mine.iter().any(up)
+            mine.iter().any(is_above)
         };
         let mut found: Vec<Thing> = all.filter(bears).map(|(thing, _)| thing).collect();
         found.dedup();
@@ -231,16 +284,20 @@ impl Environment {
 
 /// Where two parts touch.
 fn touch(a: &Part<'_>, b: &Part<'_>) -> Option<Touch> {
-    let found = contact(&a.place, a.collider.shape(), &b.place, b.collider.shape(), NEAR_M as f32).ok().flatten()?;
-    let at = (found.point1 + found.point2) * 0.5;
-    let [va, vb] = [a, b].map(|part| part.speed.at(at));
-    Some(Touch {
+    Some(touched(&meeting(&a.convex(), &b.convex(), NEAR_M)?, [a.speed, b.speed]))
+}
+
+/// The same of what moves so.
+fn touched(met: &Meeting, speeds: [Speed; 2]) -> Touch {
+    let at = Vector::from_array(met.at.0.map(|c| c as f32));
+    let [va, vb] = speeds.map(|speed| speed.at(at));
+    Touch {
         things: [Thing::Object(0), Thing::Object(0)],
-        depth_m: f64::from(-found.dist),
-        at: at.to_array().map(f64::from),
-        normal: found.normal1.to_array().map(f64::from),
+        depth_m: met.depth_m,
+        at: met.at.0,
+        normal: met.normal.0,
         speed_m_s: f64::from((va - vb).length()),
-    })
+    }
 }
 
 /// One touch of each two things.

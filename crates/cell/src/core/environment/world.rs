@@ -1,10 +1,11 @@
 //! The bodies and their steps.
 
+use super::convex::Convex;
 use super::object::{Kind, Model};
+use super::overlap::meeting;
 use super::riding::Riding;
-use super::touch::{Joined, Speed};
+use super::touch::{Joined, Speed, convex};
 use rapier3d::math::{Pose as Pose32, Vector};
-use rapier3d::parry::query::contact;
 use rapier3d::prelude::{
     BroadPhaseBvh, CCDSolver, Collider, ColliderBuilder, ColliderHandle, ColliderSet, Group, ImpulseJointSet,
     IntegrationParameters, InteractionGroups, InteractionTestMode, IslandManager, MultibodyJointSet, NarrowPhase,
@@ -31,9 +32,9 @@ const LENGTH_UNIT_M: f32 = 0.1;
 /// What moves slower than a twentieth of the length unit a second for so long stands still.
 const STILL_S: f32 = 0.3;
 /// How near something must be to what it rests on, in metres.
-pub(super) const TOUCH_M: f32 = 0.003;
+pub(super) const TOUCH_M: f64 = 0.003;
 /// How steep a support may be: the least upward part of its normal.
-pub(super) const LEVEL: f32 = 0.7;
+pub(super) const LEVEL: f64 = 0.7;
 /// What fell out of the world is not followed any farther, in metres below the floor.
 pub(super) const LOST_M: f32 = -5.0;
 /// How much fingers and links rub.
@@ -107,7 +108,9 @@ pub struct Environment {
     fingers_solid: Vec<bool>,
     objects: Vec<Body>,
     pub(super) riding: Riding,
-    /// The names of the robot's links, and which of them are made to touch.
+    /// Where the robot's links came to in the last step.
+    link_poses: Vec<Pose>,
+    /// Their names, and which of them are made to touch.
     link_names: Vec<String>,
     joined: Joined,
     /// How what is left to itself moved before the last step.
@@ -199,6 +202,7 @@ impl Environment {
             fingers_solid: vec![true; robot.arm_names().count()],
             objects: Vec::new(),
             riding: Riding::restored(riders(saved)),
+            link_poses: robot.poses(configuration),
             link_names: robot.model.links.iter().map(|link| link.name.clone()).collect(),
             joined,
             speeds_before: Vec::new(),
@@ -277,6 +281,7 @@ impl Environment {
             }
             (link.at, link.stands) = (pose, stands);
         }
+        self.link_poses = poses;
         let left = self.objects.iter().map(|object| (object.body, &self.bodies[object.body]));
         self.speeds_before =
             left.filter(|(_, body)| body.is_dynamic()).map(|(handle, body)| (handle, Speed::of(body))).collect();
@@ -380,15 +385,13 @@ impl Environment {
         let others = self.objects.iter().enumerate().filter(|(i, _)| *i != object);
         let others = others.flat_map(|(i, o)| o.parts.iter().map(move |part| (*part, Support::Object(i))));
         let fixed = self.supports.iter().map(|(collider, name)| (*collider, Support::Named(name)));
-        let mut best: Option<(f32, Support<'_>)> = None;
+        let mut best: Option<(f64, Support<'_>)> = None;
         for (collider, support) in fixed.chain(others) {
-            let below = &self.colliders[collider];
+            let below = self.convex(collider);
             for part in &mine.parts {
-                let part = &self.colliders[*part];
-                let (a, b) = (self.place(part), self.place(below));
-                let Ok(Some(touch)) = contact(&a, part.shape(), &b, below.shape(), TOUCH_M) else { continue };
-                if touch.normal2.z >= LEVEL && best.is_none_or(|(dist, _)| touch.dist < dist) {
-                    best = Some((touch.dist, support));
+                let Some(touch) = meeting(&below, &self.convex(*part), TOUCH_M) else { continue };
+                if touch.normal.0[2] >= LEVEL && best.is_none_or(|(deepest, _)| touch.depth_m > deepest) {
+                    best = Some((touch.depth_m, support));
                 }
             }
         }
@@ -441,6 +444,16 @@ impl Environment {
         self.objects[object].parts.iter().copied()
     }
 
+    /// Where a link is.
+    pub(super) fn link_pose(&self, link: usize) -> Pose {
+        self.link_poses[link]
+    }
+
+    /// A body of a link.
+    pub(super) fn link_body(&self, link: usize) -> Option<&RigidBody> {
+        self.links.iter().find(|body| body.link == link).map(|body| &self.bodies[body.body])
+    }
+
     /// The name of a link.
     pub(super) fn link_name(&self, link: usize) -> &str {
         &self.link_names[link]
@@ -455,6 +468,11 @@ impl Environment {
     pub(super) fn placed(&self, collider: ColliderHandle) -> (&Collider, Option<&RigidBody>, Pose32) {
         let collider = &self.colliders[collider];
         (collider, collider.parent().map(|body| &self.bodies[body]), self.place(collider))
+    }
+
+    fn convex(&self, collider: ColliderHandle) -> Convex {
+        let collider = &self.colliders[collider];
+        convex(collider.shape(), &self.place(collider))
     }
 
     /// A collider's place; its body's, since the last step, may be newer than its own.
