@@ -165,7 +165,7 @@ mod tests {
     #[test]
     fn corners_are_where_they_are_in_the_mesh() {
         let mesh = Mesh::new(vec![[[1.0, -2.0, 0.5], [1.5, -2.0, 0.5], [1.0, 4.0, 0.5]]]).unwrap();
-        let packed = packed(&[mesh.clone()]).pop().unwrap();
+        let packed = packed(std::slice::from_ref(&mesh)).pop().unwrap();
         assert_eq!((packed.centre, packed.size), ([1.25, 1.0, 0.5], [0.5, 6.0, 0.0]));
         for ((at, normal), expected) in corners(&packed).into_iter().zip(mesh.triangles().iter().flatten()) {
             assert!(minus(at, *expected).iter().all(|off| off.abs() < 1e-4), "{at:?} is not {expected:?}");

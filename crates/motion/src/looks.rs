@@ -128,10 +128,15 @@ fn proper(colour: Colour) -> Colour {
     colour.map(|part| if part.is_nan() { 0.0 } else { part.clamp(0.0, 1.0) })
 }
 
+/// What came of a file: its meshes by their numbers, with their colours, or why there are none.
+type FileRead = Result<Vec<(usize, Option<Colour>)>, String>;
+/// The corners of a triangle.
+type Corners = [[f64; 3]; 3];
+
 struct Reader<'l> {
     load: &'l mut dyn FnMut(&str) -> Result<Vec<u8>, MeshError>,
     /// By name and scale, the numbers of the meshes of a file with their colours, or why there are none.
-    files: BTreeMap<(String, [u64; 3]), Result<Vec<(usize, Option<Colour>)>, String>>,
+    files: BTreeMap<(String, [u64; 3]), FileRead>,
     /// Of all meshes so far.
     triangles: usize,
     looks: Looks,
@@ -185,7 +190,7 @@ impl Reader<'_> {
             ));
         }
         // Triangles of one colour are one mesh, wherever they stand.
-        let mut by_colour: Vec<(Option<Colour>, Vec<[[f64; 3]; 3]>)> = Vec::new();
+        let mut by_colour: Vec<(Option<Colour>, Vec<Corners>)> = Vec::new();
         for mut part in parts {
             let known = by_colour.iter().position(|(colour, _)| *colour == part.colour);
             match known.or((by_colour.len() == MAX_COLOURS).then_some(MAX_COLOURS - 1)) {
