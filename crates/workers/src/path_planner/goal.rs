@@ -24,7 +24,7 @@ use std::sync::Arc;
 const DEFAULT_SPEED: f64 = 0.3;
 
 /// A planner is not kept for longer by one goal, in the robot's seconds.
-const MOST_BUDGET_S: f64 = 3_600.0;
+const MOST_BUDGET_S: f64 = 86_400.0;
 
 /// The radius of the ball about a point that was seen, in metres, where the goal says none.
 const POINT_RADIUS_M: f64 = 0.01;
