@@ -433,7 +433,7 @@ async fn an_action_whose_resource_is_not_watched_refuses_its_goals_and_says_why(
 }
 
 #[tokio::test]
-async fn a_goal_says_that_it_pauses_and_why_and_that_it_goes_on() {
+async fn a_goal_says_that_a_hold_is_in_force_and_when_it_is_over() {
     let follow = Motion::of("follow", ARM);
     let cell = cell(&[&follow], ActionServerBuilder::one_at_a_time).await;
     cell.holds(&[7], &[]);
@@ -453,10 +453,10 @@ async fn a_goal_says_that_it_pauses_and_why_and_that_it_goes_on() {
     };
     hear("moving").await;
     cell.safety.hold("a look").await.unwrap();
-    hear("pauses, held: a look").await;
+    hear("a hold is in force: a look").await;
     cell.safety.go_on().await.unwrap();
     hear("goes on").await;
     follow.let_end.add_permits(1);
     assert!(moving.await.unwrap().unwrap().is_success());
-    assert_eq!(*all.borrow(), ["moving", "pauses, held: a look", "goes on"]);
+    assert_eq!(*all.borrow(), ["moving", "a hold is in force: a look", "goes on"]);
 }

@@ -78,7 +78,7 @@ impl Action for Segment {
     }
 
     fn checked_by(&self) -> Option<Signature> {
-        Signature::bundled("detector", self.name())
+        Signature::bundled("Detector", self.name())
     }
 
     fn description(&self) -> &str {
@@ -126,7 +126,7 @@ impl Action for Locate {
     }
 
     fn checked_by(&self) -> Option<Signature> {
-        Signature::bundled("detector", self.name())
+        Signature::bundled("Detector", self.name())
     }
 
     fn description(&self) -> &str {

@@ -60,7 +60,7 @@ impl Action for PlanAction {
     }
 
     fn checked_by(&self) -> Option<Signature> {
-        Signature::bundled("path_planner", self.name())
+        Signature::bundled("PathPlanner", self.name())
     }
 
     fn description(&self) -> &str {

@@ -62,15 +62,8 @@ pub(crate) fn server(
         if resources.is_empty() {
             continue;
         }
-        let provider = match kind {
-            Module::Base => "base",
-            Module::Arm(_) => "arm",
-            Module::Gripper(_) => "gripper",
-            Module::PanTilt => "pan_tilt",
-            Module::Camera => "camera",
-        };
         builder = builder.action(ModuleAction {
-            provider,
+            kind: kind.kind(),
             name,
             description,
             performers: resources,
@@ -140,8 +133,8 @@ struct Performer {
 }
 
 struct ModuleAction {
-    /// In the bundled catalogue.
-    provider: &'static str,
+    /// The kind of resource that performs it.
+    kind: &'static str,
     name: &'static str,
     description: &'static str,
     /// The modules that can do it, at least one: of a robot with several arms one for each.
@@ -164,7 +157,7 @@ impl Action for ModuleAction {
     }
 
     fn checked_by(&self) -> Option<Signature> {
-        Signature::bundled(self.provider, self.name)
+        Signature::bundled(self.kind, self.name)
     }
 
     fn resource(&self) -> Option<&str> {

@@ -151,7 +151,7 @@ impl Status {
         let mut lines = Vec::new();
         let section = |lines: &mut Vec<String>, head: &str, rows| section(lines, head, rows, most);
         let rows = self.drivers.iter().map(|one| [one.endpoint.clone(), format!("{}: {}", one.state, one.reason)]);
-        section(&mut lines, &colours.yellow("drivers that do not simply go on"), rows.collect());
+        section(&mut lines, &colours.yellow("drivers that are held, stopped or silent"), rows.collect());
         if self.runs.is_empty() && self.elsewhere.is_empty() {
             lines.push(format!("no run is under way in {}", directory.display()));
         }
@@ -262,7 +262,7 @@ mod tests {
             free: vec!["arm@sim".to_owned(), "base@sim".to_owned()],
         };
         assert_snapshot!(status.text(Path::new("/run/ratn"), Colours::default(), MOST_LINES), @r"
-        drivers that do not simply go on:
+        drivers that are held, stopped or silent:
           unix:cell.sock  held: a look
         sort_boxes in CDTN mode: 12.3 s, paused; 3 states have ended
         share 2.5, due in 90 s

@@ -111,16 +111,18 @@ pub(super) async fn run(
     entry.returned.cancel();
 }
 
-/// Says of a goal that it pauses, and why, and that it goes on: else nobody who waits for it would know.
+/// Says of a goal that a hold is in force or that it is suspended, and when that is over: else nobody who waits for it would know.
 async fn tell_pauses(entry: &GoalEntry, safety: &Safety) -> Infallible {
     let (mut state, mut suspended) = (safety.watch(), entry.suspension());
     let mut told = None;
     loop {
         let pauses = match &*state.borrow_and_update() {
-            SafetyState::Held { reason } => Some(format!("pauses, held: {reason}")),
+            SafetyState::Held { reason } => Some(format!("a hold is in force: {reason}")),
             // It ends, and its end says so.
             SafetyState::Stopped { .. } => told.clone(),
-            _ => suspended.borrow_and_update().then(|| "pauses: the resource manager is not heard".to_owned()),
+            SafetyState::Ready => {
+                suspended.borrow_and_update().then(|| "stands still: the resource manager is not heard".to_owned())
+            }
         };
         if pauses != told {
             let message = pauses.clone().unwrap_or_else(|| "goes on".to_owned());

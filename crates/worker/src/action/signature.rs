@@ -71,10 +71,12 @@ impl Signature {
         Signature::default()
     }
 
-    /// That of an action of the bundled system, as its catalogue (`deploy/catalogue.toml`) says it; `None` for one that is not there.
-    pub fn bundled(provider: &str, action: &str) -> Option<Signature> {
+    /// That of an action of the bundled system which resources of this kind perform, as its catalogue (`deploy/catalogue.toml`) says it; `None`
+    /// for one that is not there.
+    pub fn bundled(kind: &str, action: &str) -> Option<Signature> {
         static STANDARD: LazyLock<Catalogue> = LazyLock::new(Catalogue::standard);
-        let said = STANDARD.action(provider, action)?.clone();
+        let provider = STANDARD.providers.values().find(|provider| provider.resource == kind)?;
+        let said = provider.actions.get(action)?.clone();
         Some(Signature { said, defaults: BTreeMap::new() })
     }
 

@@ -38,7 +38,7 @@ impl Action for DriveAction {
     }
 
     fn checked_by(&self) -> Option<Signature> {
-        Signature::bundled("path_planner", self.name())
+        Signature::bundled("PathPlanner", self.name())
     }
 
     fn description(&self) -> &str {
