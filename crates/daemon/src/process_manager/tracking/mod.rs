@@ -176,16 +176,16 @@ impl Tracker {
         entries.filter(|entry| entry.file_type().is_ok_and(|is| is.is_dir())).map(|entry| entry.path())
     }
 
-    /// Kills until nobody is left who could have started more; how many there were.
+    /// Kills until nobody is left who could have started more, nor anybody of whom it cannot be said; how many there were.
     fn end_marked(&self, of: impl Fn(&str) -> bool) -> usize {
         let (begin, mut ended) = (Instant::now(), BTreeSet::new());
         loop {
-            let found = marker::carriers(&self.instance, &self.users, &of);
-            if found.is_empty() {
+            let marker::Carriers { found, unknown } = marker::carriers(&self.instance, &self.users, &of);
+            if found.is_empty() && unknown.is_empty() {
                 return ended.len();
             }
             if begin.elapsed() > KILL_PATIENCE {
-                tracing::error!(pids = ?found, "processes of workers do not end");
+                tracing::error!(pids = ?found, ?unknown, "processes of workers do not end, or do not show whose they are");
                 return ended.len();
             }
             for pid in found {
