@@ -906,6 +906,8 @@ async function annotations() {
   await page.locator('[data-key="undo"]').press("Enter");
   await page.locator('[data-key="again"]').press("Enter");
   await page.locator('[data-key="state plan"]').press("Enter");
+  // What was read has no conditions any more.
+  await page.waitForSelector('[data-key="requires 0"]', { state: "detached" });
   writeFileSync(file, `${text}# by somebody else\n`);
   await page.locator('[data-key="duration 0"]').fill("5");
   await page.waitForFunction(() => document.querySelector("main [role=alert]")?.textContent.includes("has changed on the disk"));
