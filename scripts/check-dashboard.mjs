@@ -877,12 +877,15 @@ async function annotations() {
   await page.locator('[data-key="save"]').press("Enter");
   await page.locator("dialog button[value=yes]").press("Enter");
   await until("it is written, too", () => readFileSync(file, "utf8").includes("exceptional: [aborted], duration: 7 }"));
+  // The page has read what it wrote: there is nothing to undo.
+  await page.waitForFunction(() => document.querySelector('[data-key="undo"]')?.disabled === true);
   step("what is typed while a change is saved is not lost");
 
   // A file that is refused already can be mended from here, step by step, and a text over several lines keeps its lines.
   const refused = text.replace("duration: 2 # s", "duration: no.where\n      requires:\n        - |-\n          exists on(cup,\n          table)\n        - no.where.either");
   writeFileSync(file, refused);
   await page.locator('[data-key="again"]').press("Enter");
+  await page.waitForFunction(() => document.querySelector('[data-key="state plan"]')?.parentElement.textContent.includes("says requires"));
   await page.locator('[data-key="state plan"]').press("Enter");
   await page.waitForSelector("#findings-duration .bad");
   const long = page.locator('textarea[data-key="requires 0"]');
