@@ -872,6 +872,10 @@ async function annotations() {
   await page.waitForFunction(() => document.querySelector('[data-key="state open"]')?.parentElement.textContent.includes("duration"));
   await page.waitForFunction(() => document.querySelector("pre")?.textContent.includes("duration: 7"));
   assert.equal(await page.locator('[data-key="duration 0"]').inputValue(), "7");
+  // And goes on where it was.
+  await page.keyboard.type("5");
+  assert.equal(await page.locator('[data-key="duration 0"]').inputValue(), "75");
+  await page.keyboard.press("Backspace");
   await page.unroute("**/api/annotations/save*", late);
   await page.waitForFunction(() => document.querySelector('[data-key="save"]')?.disabled === false);
   await page.locator('[data-key="save"]').press("Enter");

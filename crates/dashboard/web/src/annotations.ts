@@ -214,6 +214,8 @@ export function annotationsPage(desk: Desk): Page {
   /** Answers to questions before the last one do not count. */
   let question = 0;
   let loading = false;
+  /** Somebody asked for it to be read while it was being read. */
+  let askedAgain = false;
 
   const notice = h("div", { role: "alert", class: "problem", hidden: true });
   const head = h("p", {});
@@ -247,7 +249,10 @@ export function annotationsPage(desk: Desk): Page {
 
   /** Reads the file. `sent` was written into it: what was typed since then, or for another state, stays. */
   async function load(sent?: Proposal): Promise<void> {
-    if (loading) return;
+    if (loading) {
+      askedAgain ||= sent === undefined;
+      return;
+    }
     loading = true;
     try {
       const read = await api.annotations();
@@ -263,6 +268,10 @@ export function annotationsPage(desk: Desk): Page {
       failed(error);
     } finally {
       loading = false;
+      if (askedAgain) {
+        askedAgain = false;
+        void load();
+      }
     }
   }
 

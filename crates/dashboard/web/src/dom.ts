@@ -26,19 +26,25 @@ export function append(element: Element, children: Child[]): void {
   }
 }
 
-/** Replaces the children, and keeps the focus where an element of the same `data-key` has it. */
+/** What one types into. */
+function isTyped(element: Element): element is HTMLInputElement | HTMLTextAreaElement {
+  return element instanceof HTMLTextAreaElement || (element instanceof HTMLInputElement && element.type === "text");
+}
+
+/** Replaces the children. Where an element of the same `data-key` has the focus it keeps it, with the place that is typed at. */
 export function fill(element: Element, ...children: Child[]): void {
   const active = document.activeElement;
   const key = active instanceof HTMLElement && element.contains(active) ? active.dataset["key"] : undefined;
+  const place = active !== null && isTyped(active) ? ([active.selectionStart, active.selectionEnd] as const) : null;
   const { scrollTop, scrollLeft } = element;
   element.replaceChildren();
   append(element, children);
   [element.scrollTop, element.scrollLeft] = [scrollTop, scrollLeft];
-  if (key !== undefined) {
-    for (const one of element.querySelectorAll<HTMLElement>("[data-key]")) {
-      if (one.dataset["key"] === key) one.focus({ preventScroll: true });
-    }
-  }
+  if (key === undefined) return;
+  const same = [...element.querySelectorAll<HTMLElement>("[data-key]")].find((one) => one.dataset["key"] === key);
+  if (same === undefined) return;
+  same.focus({ preventScroll: true });
+  if (place !== null && isTyped(same)) same.setSelectionRange(...place);
 }
 
 /** A drawn sample for a legend: a box of a colour or a line. */
