@@ -430,6 +430,40 @@ def test_a_system_whose_worker_cannot_be_loaded_says_why_and_is_not_waited_for(p
     assert "Traceback" in place.logs()
 
 
+STUBBORN = """
+import time
+import ratn
+
+w = ratn.Worker("stubborn", kind="Stubborn")
+
+
+@w.action(computes=True, reads=[])
+def endless(goal: ratn.Goal) -> dict:
+    while True:
+        time.sleep(0.01)
+
+
+@w.action(computes=True, reads=[])
+def quick(goal: ratn.Goal) -> dict:
+    return {}
+
+
+w.run()
+"""
+
+
+def test_a_worker_that_does_not_stop_is_replaced(place: Place) -> None:
+    place.write("stubborn.py", STUBBORN)
+    pool = template("stubborn", "Stubborn", python="stubborn.py", interpreter=PYTHON, min=1, max=1, stuck_timeout_s=1)
+    with place.up(place.write("system.toml", NO_CATALOGUE + pool), "--speed", "1"):
+        more = "computes: true, reads: [], timeout: 0.5"
+        endless = place.run(place.write("endless.yaml", task("endless", state("it", "stubborn/endless", "Stubborn", more=more))))
+        assert endless["outcome"] == "aborted", endless
+        quick = place.run(place.write("quick.yaml", task("quick", state("it", "stubborn/quick", "Stubborn"))))
+        assert quick["outcome"] == "success", f"{quick['reason']}\n{place.logs()}"
+        assert "of endless was told to stop 4 s ago, and still runs" in place.logs()
+
+
 def test_a_task_is_checked_against_what_workers_say_of_themselves(tester: Place) -> None:
     @ratn.task
     def halves() -> dict:

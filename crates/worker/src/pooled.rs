@@ -1,5 +1,5 @@
 //! The environment variables that a process manager sets for its workers: where leases are confirmed, which session offers the worker's
-//! resource, within which time the worker has to stand still, and where it listens unless its arguments say that.
+//! resource, within which time the worker has to stand still, when it is stuck, and where it listens unless its arguments say that.
 
 use crate::endpoint::{Endpoint, EndpointError};
 use crate::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
@@ -12,6 +12,11 @@ pub const PROVIDER_SESSION_VARIABLE: &str = "RATN_PROVIDER_SESSION";
 /// The environment variable with the `standstill_ms` that the worker's resource is offered with.
 pub const STANDSTILL_VARIABLE: &str = "RATN_STANDSTILL_MS";
 
+/// The environment variable with the milliseconds that a goal of a worker that moves nothing may run on behind
+/// [`STOP_GRACE`](crate::action::STOP_GRACE) when it was told to stop: then the worker ends itself, for another one to be started. Without it none
+/// does.
+pub const STUCK_VARIABLE: &str = "RATN_STUCK_TIMEOUT_MS";
+
 /// The environment variable with where the worker listens unless it is told otherwise: a Unix socket, where its process manager and the
 /// resource manager are reached by Unix sockets of the runtime directory alone.
 pub const LISTEN_VARIABLE: &str = "RATN_WORKER_LISTEN";
@@ -20,6 +25,11 @@ pub const LISTEN_VARIABLE: &str = "RATN_WORKER_LISTEN";
 pub fn listen() -> Endpoint {
     let said = std::env::var(LISTEN_VARIABLE).ok().and_then(|said| said.parse().ok());
     said.unwrap_or_else(Endpoint::loopback)
+}
+
+/// What [`STUCK_VARIABLE`] says.
+pub(crate) fn stuck_after() -> Result<Option<Duration>, PooledError> {
+    milliseconds(STUCK_VARIABLE, "stuck_timeout_s", &std::env::var(STUCK_VARIABLE).unwrap_or_default())
 }
 
 /// See the module.
@@ -37,11 +47,15 @@ pub enum PooledError {
     /// What it says of the resource manager is no location.
     #[error("{RESOURCE_MANAGER_VARIABLE}")]
     Location(#[source] EndpointError),
-    /// What it says of the standstill is no time.
+    /// What it says of a time is none.
     #[error(
-        "{STANDSTILL_VARIABLE} is `{said}`: it has to be a whole number of milliseconds, as `standstill_ms` of the worker's template is"
+        "{variable} is `{said}`: it has to be a whole number of milliseconds; it comes from `{key}` of the worker's template"
     )]
-    Standstill {
+    Time {
+        /// The variable.
+        variable: &'static str,
+        /// The key of the template that it comes from.
+        key: &'static str,
         /// What it says.
         said: String,
     },
@@ -54,7 +68,7 @@ impl Pooled {
             return Ok(None);
         };
         let said = |name| std::env::var(name).unwrap_or_default();
-        let standstill = standstill(&said(STANDSTILL_VARIABLE))?;
+        let standstill = milliseconds(STANDSTILL_VARIABLE, "standstill_ms", &said(STANDSTILL_VARIABLE))?;
         Ok(Some(Pooled { manager, provider_session: said(PROVIDER_SESSION_VARIABLE), standstill }))
     }
 
@@ -64,9 +78,10 @@ impl Pooled {
     }
 }
 
-fn standstill(said: &str) -> Result<Option<Duration>, PooledError> {
+/// What a variable says that comes from this key.
+fn milliseconds(variable: &'static str, key: &'static str, said: &str) -> Result<Option<Duration>, PooledError> {
     let milliseconds = (!said.is_empty()).then(|| said.parse().map(Duration::from_millis));
-    milliseconds.transpose().map_err(|_| PooledError::Standstill { said: said.to_owned() })
+    milliseconds.transpose().map_err(|_| PooledError::Time { variable, key, said: said.to_owned() })
 }
 
 #[cfg(test)]
@@ -77,6 +92,7 @@ mod tests {
     #[test]
     fn what_moves_is_pooled_only_within_a_bound_for_its_standstill() {
         let needed = Duration::from_secs(6);
+        let standstill = |said| milliseconds(STANDSTILL_VARIABLE, "standstill_ms", said);
         for (said, allowed) in [("", false), ("0", false), ("5999", false), ("6000", true), ("60000", true)] {
             let (manager, provider_session) = ("http://127.0.0.1:1".parse().unwrap(), "session-1".to_owned());
             let pooled = Pooled { manager, provider_session, standstill: standstill(said).unwrap() };

@@ -13,7 +13,7 @@ use crate::client::{CallError, Channels, chain};
 use crate::endpoint::Endpoint;
 use crate::lease_watch::{LeaseWatch, RESOURCE_MANAGER_VARIABLE};
 use crate::panic::exit_on_panic;
-use crate::pooled::{PROVIDER_SESSION_VARIABLE, Pooled, PooledError};
+use crate::pooled::{PROVIDER_SESSION_VARIABLE, Pooled, PooledError, stuck_after};
 use crate::provider::{Provider, standstill_bound};
 use crate::runtime_directory::publish_file;
 use crate::safety::Safety;
@@ -21,7 +21,7 @@ use crate::server::{BindError, Exposure, ServeError, Services, Serving, bind_as}
 use crate::session::{DEFAULT_TTL, Session};
 use crate::shutdown;
 use crate::tls::{ClientTls, TlsError};
-use crate::vitals::Vitals;
+use crate::vitals::{EXIT_CODE_PANICKED, Vitals};
 use ratn_model::catalogue::DescriptionError;
 use ratn_model::resource::ResourceClass;
 use ratn_proto::types::Resource;
@@ -325,6 +325,11 @@ impl Worker {
             true => None,
             false => Some(pooled(&options.id, standstill.filter(|_| safety.is_some()))?),
         };
+        // What moves is not given up: its goal may be what holds it.
+        let stuck_after = if safety.is_none() { stuck_after()? } else { None };
+        if let Some(patience) = stuck_after {
+            actions = actions.stuck_after(patience);
+        }
         actions = match asked {
             Leases::Believed => actions.dangerously_believe_every_lease(),
             Leases::Confirmed | Leases::NotAsked => actions.leases(&leases),
@@ -396,7 +401,14 @@ impl Worker {
                 None => break,
             }
         }
-        shutdown.cancelled().await;
+        tokio::select! {
+            () = shutdown.cancelled() => {}
+            why = server.stuck(), if stuck_after.is_some() => {
+                tracing::error!(id = %options.id, "the worker ends itself, for another one to be started: {why}");
+                // What is stuck would keep a process alive that ends in order, and for other goals its end is a crash in any case.
+                std::process::exit(EXIT_CODE_PANICKED.into());
+            }
+        }
         drop(published);
         // What the goals move stays this worker's until nothing moves any more.
         let (served, stopped) =

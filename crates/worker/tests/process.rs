@@ -6,8 +6,10 @@ mod common;
 use common::{Wait, goal};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
+use ratn_worker::action::{Action, ActionResult, GoalContext, STOP_GRACE};
 use ratn_worker::client::{ActionClient, Channels, wait_until_serving};
 use ratn_worker::endpoint::Endpoint;
+use ratn_worker::pooled::STUCK_VARIABLE;
 use ratn_worker::shutdown::{EXIT_GRACE, exit_with_parent, on_signals_within};
 use ratn_worker::tls::ClientTls;
 use ratn_worker::worker::{Worker, WorkerOptions};
@@ -49,13 +51,38 @@ fn child() {
         ..WorkerOptions::default()
     };
     let wait = Wait { name: "wait", abandon: true, ended: Notify::new().into() };
-    runtime.block_on(Worker::new(options).dangerously_believe_every_lease().action(wait).run()).unwrap();
+    let worker = Worker::new(options).dangerously_believe_every_lease().action(wait).action(Endless);
+    runtime.block_on(worker.run()).unwrap();
+}
+
+/// `endless`: computes in a thread of its own and hears nothing.
+struct Endless;
+
+#[tonic::async_trait]
+impl Action for Endless {
+    fn name(&self) -> &str {
+        "endless"
+    }
+
+    async fn execute(&self, goal: GoalContext) -> ActionResult {
+        goal.progress("computes");
+        let computes = || loop {
+            std::thread::sleep(LONG);
+        };
+        tokio::task::spawn_blocking(computes).await?
+    }
 }
 
 fn spawn(socket: &Path) -> Child {
+    spawn_pooled(socket, "")
+}
+
+/// As a process manager would that says so of goals that do not stop.
+fn spawn_pooled(socket: &Path, stuck_timeout_ms: &str) -> Child {
     Command::new(std::env::current_exe().unwrap())
         .args(["--exact", "child", "--nocapture"])
         .env(SOCKET, socket)
+        .env(STUCK_VARIABLE, stuck_timeout_ms)
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .spawn()
@@ -112,4 +139,27 @@ async fn a_killed_worker_is_a_crash_of_its_goal() {
     let killed = client.execute(&endpoint, goal("a", "wait", 1), |_, _| child.kill().unwrap()).await.unwrap_err();
     assert!(killed.is_crash(), "{killed}");
     assert!(!exit_of(child).await.success());
+}
+
+#[tokio::test]
+async fn a_worker_ends_itself_when_a_goal_that_was_told_to_stop_does_not() {
+    let directory = tempfile::tempdir().unwrap();
+    let socket = directory.path().join("one.sock");
+    let mut child = spawn_pooled(&socket, "500");
+    // Its parent lives on.
+    let _input = child.stdin.take();
+    let endpoint = Endpoint::Unix(socket);
+    wait_until_serving(&endpoint, &ClientTls::none(), LONG).await.unwrap();
+    let client = ActionClient::new(Channels::new(&ClientTls::none()));
+    // One that stops in time does not end it.
+    let told = Instant::now();
+    let in_time =
+        client.execute(&endpoint, ratn_proto::types::Goal { deadline_ms: 1, ..goal("a", "wait", 1) }, |_, _| ());
+    assert_eq!(in_time.await.unwrap().outcome, "preempted");
+    let endless = ratn_proto::types::Goal { deadline_ms: 1, ..goal("b", "endless", 1) };
+    let told_of = client.execute(&endpoint, endless, |_, _| ()).await.unwrap();
+    assert!(told_of.reason.ends_with("it did not stop within 3 s"), "{told_of:?}");
+    assert_eq!(exit_of(child).await.code(), Some(70));
+    let lasted = told.elapsed();
+    assert!((STOP_GRACE + Duration::from_millis(500)..LONG).contains(&lasted), "{lasted:?}");
 }

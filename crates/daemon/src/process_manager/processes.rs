@@ -22,7 +22,7 @@ use ratn_worker::adoption;
 use ratn_worker::endpoint::Endpoint;
 use ratn_worker::lease_watch::{ManagerLocation, RESOURCE_MANAGER_VARIABLE};
 use ratn_worker::panic::{exit_on_panic, exit_on_panic_blocking};
-use ratn_worker::pooled::{LISTEN_VARIABLE, PROVIDER_SESSION_VARIABLE, STANDSTILL_VARIABLE};
+use ratn_worker::pooled::{LISTEN_VARIABLE, PROVIDER_SESSION_VARIABLE, STANDSTILL_VARIABLE, STUCK_VARIABLE};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::tls::ClientTls;
 use ratn_worker::unix_socket::SocketAccess;
@@ -219,6 +219,8 @@ impl Processes {
         // What this process has of it, if anything, is another's.
         env.remove(OsStr::new(STANDSTILL_VARIABLE));
         env.extend(template.standstill_ms.map(|bound| (STANDSTILL_VARIABLE.into(), bound.to_string().into())));
+        env.remove(OsStr::new(STUCK_VARIABLE));
+        env.extend(template.stuck_timeout().map(|bound| (STUCK_VARIABLE.into(), bound.as_millis().to_string().into())));
         env.extend(self.worker_environment.iter().map(|(name, file)| ((*name).into(), file.into())));
         env.remove(OsStr::new(LISTEN_VARIABLE));
         let listen = account.is_none().then(|| self.socket_for(id, &directory)).flatten();

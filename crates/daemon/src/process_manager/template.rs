@@ -102,6 +102,10 @@ pub struct Template {
     /// A worker that nobody has adopted after this long ends, in seconds.
     #[serde(default = "ten")]
     pub adopt_grace_s: f64,
+    /// A worker that moves nothing ends itself, for another one to be started, when a goal that was told to stop still runs this long behind the
+    /// 3 s that it has for that, in seconds; 0: never.
+    #[serde(default = "minute")]
+    pub stuck_timeout_s: f64,
     /// A worker that has not ended this long after SIGTERM is killed, in seconds.
     #[serde(default = "two")]
     pub stop_timeout_s: f64,
@@ -233,6 +237,7 @@ impl Template {
             drain_s: half_a_minute(),
             adopt: false,
             adopt_grace_s: ten(),
+            stuck_timeout_s: minute(),
             stop_timeout_s: two(),
             backoff_ms: backoff(),
             max_backoff_ms: max_backoff(),
@@ -267,6 +272,12 @@ impl Template {
         self.standstill_ms.map(Duration::from_millis)
     }
 
+    /// How long a worker's goal that was told to stop may run on; nothing where that is for ever, as of what moves.
+    pub(crate) fn stuck_timeout(&self) -> Option<Duration> {
+        let is_ended = self.stuck_timeout_s > 0.0 && self.standstill_ms.is_none();
+        is_ended.then(|| Duration::from_secs_f64(self.stuck_timeout_s))
+    }
+
     pub(crate) fn stable(&self) -> Duration {
         Duration::from_secs_f64(self.stable_s)
     }
@@ -295,6 +306,7 @@ impl Template {
             readiness: template.readiness.clone(),
             adopt: template.adopt,
             adopt_grace_s: template.adopt_grace_s,
+            stuck_timeout_s: template.stuck_timeout_s,
             ..Template::new("", "")
         };
         of_the_process(self) == of_the_process(other)
@@ -350,6 +362,8 @@ impl Template {
         ] {
             rule(key(name), (0.001..=86_400.0).contains(&seconds), "from 0.001 s to a day")?;
         }
+        let stuck = self.stuck_timeout_s == 0.0 || (0.001..=86_400.0).contains(&self.stuck_timeout_s);
+        rule(key("stuck_timeout_s"), stuck, "0, which is never, or from 0.001 s to a day")?;
         let standstill = self.standstill_ms.is_none_or(|ms| (1..=LONGEST_STANDSTILL_MS).contains(&ms));
         rule(key("standstill_ms"), standstill, format!("from 1 to {LONGEST_STANDSTILL_MS} ms"))?;
         let one = self.standstill_ms.is_none() || max == 1;
@@ -466,5 +480,17 @@ mod tests {
         assert!(
             refused.is_err_and(|why| why.contains("templates[0].max") && why.contains("1 where standstill_ms is set"))
         );
+    }
+    #[test]
+    fn a_worker_that_moves_nothing_ends_itself_when_it_is_stuck_unless_its_template_says_never() {
+        let after = |stuck_timeout_s, standstill_ms| {
+            let template = Template { stuck_timeout_s, standstill_ms, ..Template::new("planner", "PathPlanner") };
+            template.check("templates[0]").map(|()| template.stuck_timeout()).map_err(|error| error.to_string())
+        };
+        assert_eq!(after(60.0, None), Ok(Some(Duration::from_secs(60))));
+        assert_eq!([after(0.0, None), after(60.0, Some(6_000))], [Ok(None), Ok(None)]);
+        for none in [-1.0, f64::NAN, 1e300] {
+            assert!(after(none, None).is_err_and(|why| why.contains("templates[0].stuck_timeout_s")), "{none}");
+        }
     }
 }

@@ -40,7 +40,7 @@ _LOOK_S = 0.02
 _LOOK_AT_WORKERS_S = 0.2
 _WORKERS_AGAIN = 3
 #: What a process manager tells the workers of its pools. A worker of steps is in none, also where the program that runs the task is.
-_OF_POOLED = ("RATN_PROVIDER_SESSION", "RATN_RESOURCE_MANAGER", "RATN_STANDSTILL_MS", "RATN_WORKER_LISTEN")
+_OF_POOLED = ("RATN_PROVIDER_SESSION", "RATN_RESOURCE_MANAGER", "RATN_STANDSTILL_MS", "RATN_STUCK_TIMEOUT_MS", "RATN_WORKER_LISTEN")
 
 
 def _program() -> str:

@@ -3,6 +3,7 @@
 //! ```text
 //! begun ─ the action returns ─────────────────→ result told, place free
 //!    └─ told to stop ─ it does not for a grace ─→ result told ─ the action returns ─→ place free
+//!                                                      └─ it does not for much longer ─→ the server is stuck
 //! ```
 //! A goal has its resource until its action has returned, whatever was told of it before.
 
@@ -104,7 +105,14 @@ pub(super) async fn run(
         let grace_s = STOP_GRACE.as_secs();
         tracing::error!(%goal, %action, %resource, grace_s, "a goal that was told to stop still runs: nothing begins beside it");
         // Not torn down: what it does in threads or on a device would go on unseen.
-        let _ = performing.await;
+        let patience = server.stuck_after.unwrap_or(Duration::MAX);
+        if tokio::time::timeout(patience, &mut performing).await.is_err() {
+            let told_s = (STOP_GRACE + patience).as_secs();
+            server
+                .stuck
+                .send_replace(Some(format!("goal {goal} of {action} was told to stop {told_s} s ago, and still runs")));
+            let _ = performing.await;
+        }
         tracing::warn!(%goal, %action, %resource, "the goal that was told to stop has ended after all");
         server.state().end(&entry, server.limits.results_kept);
     }

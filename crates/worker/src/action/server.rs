@@ -21,6 +21,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::future::pending;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::time::Duration;
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
@@ -47,6 +48,7 @@ pub struct ActionServerBuilder {
     one_at_a_time: bool,
     results_kept: Option<usize>,
     goals_per_lease: Option<usize>,
+    stuck_after: Option<Duration>,
     channels: Channels,
     safety: Safety,
     authority: Authority,
@@ -58,6 +60,10 @@ pub(super) struct Inner {
     pub(super) kind: String,
     pub(super) actions: BTreeMap<String, Arc<dyn Action>>,
     pub(super) limits: Limits,
+    /// A goal that was told to stop makes the server stuck when it runs for so long behind its grace; nothing where none does.
+    pub(super) stuck_after: Option<Duration>,
+    /// Why the server is stuck, once it is.
+    pub(super) stuck: watch::Sender<Option<String>>,
     pub(super) channels: Channels,
     pub(super) safety: Safety,
     pub(super) authority: Authority,
@@ -129,6 +135,13 @@ impl ActionServerBuilder {
         self
     }
 
+    /// Sets how long a goal that was told to stop, and has not within [`STOP_GRACE`](super::STOP_GRACE), may run on before the server is [stuck](ActionServer::stuck).
+    #[must_use]
+    pub fn stuck_after(mut self, patience: Duration) -> ActionServerBuilder {
+        self.stuck_after = Some(patience);
+        self
+    }
+
     /// Sets the watch by which the resource manager confirms leases; goals end with their lease. Without it every goal that needs a lease is
     /// refused.
     #[must_use]
@@ -184,6 +197,8 @@ impl ActionServerBuilder {
                 results_kept: self.results_kept.unwrap_or(RESULTS_KEPT),
                 goals_per_lease: self.goals_per_lease.unwrap_or(GOALS_PER_LEASE),
             },
+            stuck_after: self.stuck_after,
+            stuck: watch::Sender::default(),
             channels: self.channels,
             safety: self.safety,
             authority: self.authority,
@@ -210,6 +225,7 @@ impl ActionServer {
             one_at_a_time: false,
             results_kept: None,
             goals_per_lease: None,
+            stuck_after: None,
             channels: Channels::new(&ClientTls::none()),
             safety: Safety::default(),
             authority: Authority::default(),
@@ -224,6 +240,15 @@ impl ActionServer {
         for goal in running {
             goal.returned.cancelled().await;
         }
+    }
+
+    /// Resolves, with the reason for people, when a goal that was told to stop still runs after [`ActionServerBuilder::stuck_after`]. Only the
+    /// end of the process ends it.
+    pub async fn stuck(&self) -> String {
+        let mut stuck = self.inner.stuck.subscribe();
+        let why = stuck.wait_for(Option::is_some).await.ok().and_then(|why| why.clone());
+        // The sender is this server's.
+        why.unwrap_or_default()
     }
 
     /// Tells a goal to stop, also one that waits to begin. False where there is no such goal.
