@@ -2,6 +2,7 @@
 //!
 //! A thread, not a task: checking a trajectory takes milliseconds, and a motion has to stop on time whatever the runtime does.
 
+use super::attention::{Attention, Seen};
 use super::recorder::Recorder;
 use crate::config::Goods;
 use crate::core::cell::Cell;
@@ -26,7 +27,7 @@ use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
 use crate::core::objects::TrueObject;
@@ -81,6 +82,8 @@ struct Optics {
 struct Holds {
     safety: SafetyState,
     suspended: BTreeSet<Ticket>,
+    /// The cell has missed too much.
+    rests: bool,
 }
 
 /// The handle does not take the message.
@@ -269,86 +272,142 @@ impl Holds {
             SafetyState::Ready if !self.suspended.is_empty() => {
                 SafetyState::Held { reason: "the resource manager is not heard".to_owned() }
             }
+            SafetyState::Ready if self.rests => SafetyState::Held { reason: "the cell was not running".to_owned() },
             state => state.clone(),
         }
     }
 }
 
-fn keep(mut cell: Cell, mut recorder: Recorder, clock: RobotClock, inbox: &Receiver<QueuedMessage>, vitals: &Vitals) {
-    let mut waiting: BTreeMap<Ticket, oneshot::Sender<Ending>> = BTreeMap::new();
-    let mut holds = Holds::default();
-    // Who waits until what was told to stand stands.
-    let mut applying: Vec<oneshot::Sender<()>> = Vec::new();
+fn keep(cell: Cell, recorder: Recorder, clock: RobotClock, inbox: &Receiver<QueuedMessage>, vitals: &Vitals) {
+    let mut keeper = Keeper::begin(cell, recorder, Instant::now(), clock.now());
     loop {
         vitals.beat();
         panic_point("cell-core");
-        let most = if cell.is_restless() { RESTLESS_SLEEP } else { MAX_SLEEP };
-        let sleep = cell.next_wake().map_or(most, |moment| clock.until(moment).min(most));
+        let sleep = keeper.sleep(&clock);
         let message = match inbox.recv_timeout(sleep) {
             Ok(queued) => Some(queued.message),
             Err(RecvTimeoutError::Timeout) => None,
             Err(RecvTimeoutError::Disconnected) => return,
         };
-        let now = clock.now();
-        let (mut safety, mut saving) = (None, None);
-        let (event, asked) = match message {
-            None => (Event::Tick, None),
+        keeper.turn(Instant::now(), clock.now(), sleep, message);
+    }
+}
+
+/// The core with whoever waits for what it does.
+struct Keeper {
+    cell: Cell,
+    recorder: Recorder,
+    waiting: BTreeMap<Ticket, oneshot::Sender<Ending>>,
+    holds: Holds,
+    /// Who waits until what was told to stand stands.
+    applying: Vec<oneshot::Sender<()>>,
+    attention: Attention,
+}
+
+impl Keeper {
+    /// Begins at this moment, in wall time and in the robot's.
+    fn begin(cell: Cell, recorder: Recorder, at: Instant, now: Timestamp) -> Keeper {
+        let attention = Attention::begins(at, now);
+        let (waiting, holds, applying) = Default::default();
+        Keeper { cell, recorder, waiting, holds, applying, attention }
+    }
+
+    /// How long it may be left alone, in wall time.
+    fn sleep(&self, clock: &RobotClock) -> Duration {
+        let is_restless = self.cell.is_restless() || self.attention.rests();
+        let most = if is_restless { RESTLESS_SLEEP } else { MAX_SLEEP };
+        self.cell.next_wake().map_or(most, |moment| clock.until(moment).min(most))
+    }
+
+    /// A message, or that it is time to look at the clock, at this moment of wall time and of the robot's; `slept` is how long it meant to sleep.
+    fn turn(&mut self, at: Instant, now: Timestamp, slept: Duration, message: Option<Message>) {
+        match self.attention.looks(at, now, slept) {
+            Seen::Nothing => {}
+            Seen::Missed(since) => {
+                tracing::warn!(
+                    missed_s = now.since(since).as_secs(),
+                    "the cell was not running: what moved has stood still since, until it is known who holds it"
+                );
+                self.holds.rests = true;
+                self.give(since, Event::Safety { state: self.holds.state() });
+            }
+            Seen::Rested => {
+                self.holds.rests = false;
+                self.give(now, Event::Safety { state: self.holds.state() });
+            }
+        }
+        let (mut safety, mut saving, mut asked) = (None, None, None);
+        let event = match message {
+            None => Event::Tick,
             Some(Message::Safety { state, applied }) => {
                 safety = Some(applied);
-                holds.safety = state;
-                (Event::Safety { state: holds.state() }, None)
+                self.holds.safety = state;
+                Event::Safety { state: self.holds.state() }
             }
             Some(Message::Suspend { ticket, suspended }) => {
-                holds.suspend(ticket, suspended);
-                (Event::Safety { state: holds.state() }, None)
+                self.holds.suspend(ticket, suspended);
+                Event::Safety { state: self.holds.state() }
             }
             Some(Message::Start { ticket, arm, request, ended }) => {
-                waiting.insert(ticket, ended);
-                (Event::Start { ticket, arm, request }, None)
+                self.waiting.insert(ticket, ended);
+                Event::Start { ticket, arm, request }
             }
-            Some(Message::Happened(event)) => (event, None),
-            Some(Message::Reset { seed, goods, state }) => (Event::Reset { seed, goods }, Some(state)),
-            Some(Message::State(state)) => (Event::Tick, Some(state)),
+            Some(Message::Happened(event)) => event,
+            Some(Message::Reset { seed, goods, state }) => {
+                asked = Some(state);
+                Event::Reset { seed, goods }
+            }
+            Some(Message::State(state)) => {
+                asked = Some(state);
+                Event::Tick
+            }
             Some(Message::Save(snapshot)) => {
                 saving = Some(snapshot);
-                (Event::Save, None)
+                Event::Save
             }
             Some(Message::Fault { fault, taken }) => {
-                let _ = taken.send(cell.faults_to_come() < MAX_FAULTS);
-                (Event::Fault { fault }, None)
+                let _ = taken.send(self.cell.faults_to_come() < MAX_FAULTS);
+                Event::Fault { fault }
             }
         };
-        let recorded = recorder.is_on().then(|| event.clone());
-        let commands = cell.handle(now, event);
-        if let Some(event) = recorded {
-            recorder.write(&Line::of_step(now, event, &commands, &cell));
+        let saved = self.give(now, event);
+        // Whoever asked may be gone.
+        if let Some((saving, snapshot)) = saving.zip(saved) {
+            let _ = saving.send(snapshot);
         }
-        for command in commands {
-            // Whoever asked may be gone.
-            match command {
-                Command::Ended { ticket, ending, .. } => {
-                    if let Some(ended) = waiting.remove(&ticket) {
-                        let _ = ended.send(ending);
-                    }
-                }
-                Command::Saved { snapshot } => {
-                    if let Some(saving) = saving.take() {
-                        let _ = saving.send(snapshot);
-                    }
-                }
-                Command::Touched { contact } => tracing::warn!(%contact, "bodies touched that should not have"),
-                Command::Missed { reason } => tracing::info!("the fingers hold nothing: {reason}"),
-            }
-        }
-        applying.extend(safety);
-        if cell.stands() || holds.state() == SafetyState::Ready {
-            applying.drain(..).for_each(|applied| {
+        self.applying.extend(safety);
+        if self.cell.stands() || self.holds.state() == SafetyState::Ready {
+            self.applying.drain(..).for_each(|applied| {
                 let _ = applied.send(());
             });
         }
         if let Some(state) = asked {
-            let _ = state.send(state_of(&cell, now));
+            let _ = state.send(state_of(&self.cell, now));
         }
+    }
+
+    /// Gives the core an event, and tells what comes of it. What it has saved, where that was asked for.
+    fn give(&mut self, now: Timestamp, event: Event) -> Option<Box<Snapshot>> {
+        let recorded = self.recorder.is_on().then(|| event.clone());
+        let commands = self.cell.handle(now, event);
+        if let Some(event) = recorded {
+            self.recorder.write(&Line::of_step(now, event, &commands, &self.cell));
+        }
+        let mut saved = None;
+        for command in commands {
+            match command {
+                Command::Ended { ticket, ending, .. } => {
+                    if let Some(ended) = self.waiting.remove(&ticket) {
+                        // Whoever asked may be gone.
+                        let _ = ended.send(ending);
+                    }
+                }
+                Command::Saved { snapshot } => saved = Some(snapshot),
+                Command::Touched { contact } => tracing::warn!(%contact, "bodies touched that should not have"),
+                Command::Missed { reason } => tracing::info!("the fingers hold nothing: {reason}"),
+            }
+        }
+        saved
     }
 }
 
@@ -391,6 +450,37 @@ mod tests {
             assert!((confirmed.arm[0] - told.arm[0]).abs() > 1e-3, "{state:?}");
             drop(motion);
         }
+    }
+
+    #[test]
+    fn what_moved_has_stood_still_while_the_cell_was_suspended_and_goes_on_when_it_is_known_who_holds_it() {
+        let (begin, robot) = (Instant::now(), |ms: u64| Timestamp(0) + Duration::from_millis(ms));
+        let mut keeper = Keeper::begin(Cell::new(CellConfig::default()).unwrap(), Recorder::none(), begin, robot(0));
+        let request = Request::MoveTo { joints: aimm::OBSERVATION, speed: 0.5 };
+        let (ended, mut ending) = oneshot::channel();
+        let mut start = Some(Message::Start { ticket: Ticket(1), arm: 0, request, ended });
+        let mut turn = |keeper: &mut Keeper, ms: u64| {
+            keeper.turn(begin + Duration::from_millis(ms), robot(ms), RESTLESS_SLEEP, start.take());
+            keeper.cell.configuration().arm
+        };
+        let before = turn(&mut keeper, 0);
+        for ms in (5..500).step_by(5) {
+            turn(&mut keeper, ms);
+        }
+        let suspended = turn(&mut keeper, 500);
+        // Time enough to come to the end.
+        let continued = turn(&mut keeper, 30_000);
+        let way = |from: JointVector, to: JointVector| (to[0] - from[0]).abs();
+        assert!(way(before, suspended) > 1e-3 && way(suspended, continued) < 0.2 && keeper.cell.stands());
+        assert!(way(continued, aimm::OBSERVATION) > 0.5);
+        for ms in (30_005..31_000).step_by(5) {
+            assert_eq!(turn(&mut keeper, ms), continued);
+        }
+        for ms in (31_000..60_000).step_by(5) {
+            turn(&mut keeper, ms);
+        }
+        assert!(way(keeper.cell.configuration().arm, aimm::OBSERVATION) < 1e-6);
+        assert!(matches!(ending.try_recv(), Ok(Ending::Done(_))));
     }
 
     #[tokio::test]

@@ -8,6 +8,7 @@
 //! The handle's thread owns the core; everything else sends it messages.
 
 mod actions;
+mod attention;
 mod cell_actor;
 pub(crate) mod link;
 #[cfg(test)]
