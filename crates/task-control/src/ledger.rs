@@ -56,6 +56,8 @@ pub(super) struct Ledger {
     pub(super) held: BTreeSet<LeaseId>,
     /// The last leases that were to go back. Whether they have is not known.
     pub(super) returned: Vec<LeaseId>,
+    /// Which of them were to go back behind which commit: without those that are confirmed.
+    pub(super) went_back: Vec<WentBack>,
     /// What acquires, and operations that were forgotten, have used up for the rest of the run.
     pub(super) consumed: Vec<Requirement>,
     /// Projections that were asked for.
@@ -85,6 +87,15 @@ pub(super) struct Began {
     pub(super) knows: Revision,
     /// Up to this revision it held what it works with, where the run has lost that since; where it has not, nobody else changes what it changes.
     pub(super) held_until: Option<Revision>,
+}
+
+/// A lease that was to go back, while a commit may have been on its way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct WentBack {
+    pub(super) lease: LeaseId,
+    /// The run's own number of its last commit.
+    pub(super) decided: Revision,
+    pub(super) at: Timestamp,
 }
 
 /// How far the daemons have confirmed what the run has decided, which they do in order.
@@ -171,6 +182,8 @@ impl Ledger {
             Event::Granted { instance, lease } => {
                 self.begins(*instance);
                 self.held.insert(lease.id);
+                // The run has handed it over itself.
+                self.went_back.retain(|one| one.lease != lease.id);
                 if let Some(asked) = self.waiting.remove(instance) {
                     let used_up = |r: &Requirement| r.operation == ResourceOperation::Consume;
                     self.consumed.extend(asked.requirements.into_iter().filter(used_up));
@@ -236,6 +249,9 @@ impl Ledger {
                 if let Some(lease) = lease.filter(|lease| self.held.remove(lease)) {
                     self.returned.push(lease);
                     self.returned.drain(..self.returned.len().saturating_sub(KEPT_RETURNED));
+                    let decided = self.commits.last().map(|decided| decided.revision);
+                    let at = self.last;
+                    self.went_back.extend(decided.map(|decided| WentBack { lease, decided, at }));
                 }
             }
             Command::Commit { instance, writer, changes, evidence, revision } => {
@@ -244,7 +260,8 @@ impl Ledger {
                 let now = || Began { knows: self.knows, held_until: None };
                 let (began, behind) = (self.began.get(&instance).copied().unwrap_or_else(now), self.operations);
                 if self.failed.is_none() {
-                    self.commits.push(Decided { instance, writer, changes, evidence, revision, began, behind });
+                    let knew = self.knows;
+                    self.commits.push(Decided { instance, writer, changes, evidence, revision, began, knew, behind });
                 }
             }
             Command::Operate { instance, operations } => {
@@ -323,6 +340,7 @@ impl Ledger {
         let commits = commits.saturating_sub(kept);
         self.commits.drain(..commits);
         self.forgotten += commits as u64;
+        self.went_back.retain(|one| one.decided > confirmed.commit);
 
         let operated = self.operated.iter().take_while(|(number, ..)| *number <= confirmed.operation).count();
         let mut used_up = Vec::new();

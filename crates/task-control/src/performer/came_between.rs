@@ -21,7 +21,7 @@ use ratn_worker::session::Trust;
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// The world pool does not keep a revision any more.
 const FORGOTTEN: &str = "REVISION_FORGOTTEN";
@@ -205,29 +205,45 @@ pub(crate) struct Untouched {
     late: Option<(Left, Revision)>,
 }
 
-/// Since when others may not wait any more for what a run had decided when it gave something back. Clones share it.
+/// From when on others may not wait any more for what a run had decided when it gave something back. Clones share it.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Left(Arc<Mutex<VecDeque<(Revision, Instant)>>>);
 
 impl Left {
     /// Something goes back while the commits up to `decided`, but for those up to `made`, are on their way.
     pub(super) fn goes_back(&self, decided: Revision, made: Revision, at: Instant) {
+        self.is_waited_for(decided, made, at + PENDING_PATIENCE);
+    }
+
+    /// The same went back so long ago, before its run was taken up; in the order in which that was.
+    pub(super) fn went_back(&self, decided: Revision, made: Revision, ago: Duration) {
+        self.is_waited_for(decided, made, Instant::now() + PENDING_PATIENCE.saturating_sub(ago));
+    }
+
+    fn is_waited_for(&self, decided: Revision, made: Revision, until: Instant) {
         let mut left = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         while left.front().is_some_and(|(number, _)| *number <= made) {
             left.pop_front();
         }
         let is_known = left.back().is_some_and(|(number, _)| *number >= decided);
         if decided > made && !is_known {
-            left.push_back((decided, at));
+            left.push_back((decided, until));
         }
     }
 
     /// Whether whoever holds now what the run held when it decided this commit may have gone on without it.
-    fn is_late(&self, commit: Revision) -> bool {
+    pub(super) fn is_late(&self, commit: Revision) -> bool {
         let left = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         // In the order of numbers, and of time.
         let first = left.iter().find(|(number, _)| *number >= commit);
-        first.is_some_and(|(_, at)| at.elapsed() >= PENDING_PATIENCE)
+        first.is_some_and(|(_, until)| Instant::now() >= *until)
+    }
+
+    /// Nobody waits for anything any more.
+    #[cfg(test)]
+    pub(super) fn all_is_late(&self) {
+        let mut left = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        left.iter_mut().for_each(|(_, until)| *until = Instant::now());
     }
 }
 

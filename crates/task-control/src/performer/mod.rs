@@ -486,9 +486,9 @@ impl Performer {
                 self.release(instance, lease, projection, safe);
             }
             Command::Commit { instance, writer, changes, evidence, revision } => {
-                let began = Began { knows: self.told.revision(), held_until: None };
-                let behind = self.operations;
-                let decided = Decided { instance, writer, changes, evidence, revision, began, behind };
+                let (knew, behind) = (self.told.revision(), self.operations);
+                let began = Began { knows: knew, held_until: None };
+                let decided = Decided { instance, writer, changes, evidence, revision, began, knew, behind };
                 let lost = match &self.came_between {
                     Some(between) => between.check(&decided)?,
                     None => None,
