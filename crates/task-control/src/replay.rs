@@ -242,7 +242,7 @@ pub(super) mod tests {
     use ratn_simulation::timed::TimedProviders;
     use std::time::Duration;
 
-    fn program(text: &str) -> Arc<Program> {
+    pub(crate) fn program(text: &str) -> Arc<Program> {
         Arc::new(task_for_tests::program(text))
     }
 

@@ -249,10 +249,10 @@ impl Performer {
             made += 1;
         }
         let (revision, facts) = self.root().await?;
-        if let Some(since) = ledger.lost().map(|(_, behind)| behind).min() {
+        if let Some(since) = ledger.beginnings.others_count() {
             // What ended well meanwhile, and was not heard of, is to stand the same test.
             let changed = self.changed_by_others(since, revision).await?;
-            self.came_between = CameBetween::new(program, &self.run, ledger, changed);
+            self.came_between = Some(CameBetween::new(program, &self.run, ledger, changed));
         }
         let commit = ledger.commits[..there + made].last().map(|decided| decided.revision).unwrap_or_default();
         // All of it is in the root that was read.

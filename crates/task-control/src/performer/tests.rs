@@ -7,10 +7,10 @@ use crate::task_for_tests::{FETCH_BOXES, program};
 use anyhow::Context;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
-use ratn_executive::protocol::{Origin, Unmade};
+use ratn_executive::protocol::{Learned, Mode, Natures, Origin, Unmade};
 use ratn_model::catalogue::Provider;
 use ratn_model::fact::{Change, Footprint};
-use ratn_model::id::{FencingToken, ProjectionId};
+use ratn_model::id::{FencingToken, ProjectionId, StateId};
 use ratn_model::program::SUCCESS;
 use ratn_model::resource::{Lease, ResourceClass};
 use ratn_model::time::Timestamp;
@@ -1357,6 +1357,90 @@ async fn what_others_change_when_a_run_has_come_back_stands_against_what_it_bega
     let refused = bench.performer.perform(commits(1, 2));
     assert!(refused.is_err_and(|error| error.to_string().contains("others have changed done")));
     bench.performer.closed().await
+}
+
+/// What a composite state changes when it is left, as HSM mode commits it.
+fn leaves(path: &str, number: u64) -> Command {
+    let (instance, evidence, revision) = (InstanceId(0), Vec::new(), Revision(number));
+    Command::Commit { instance, writer: path.to_owned(), changes: done(), evidence, revision }
+}
+
+#[tokio::test]
+async fn what_others_change_stands_against_the_effects_of_a_composite_state_whose_parts_began_before()
+-> anyhow::Result<()> {
+    let note = |instance: u64, path: &str| {
+        let (instance, state, path) = (InstanceId(instance), StateId(1), path.to_owned());
+        Command::Note(Note::Expanded { instance, state, path, speculative: false })
+    };
+    let running = |instance: u64| Command::Note(Note::Running { instance: InstanceId(instance), attempt: 1 });
+    let begun = [
+        note(1, "part/move"),
+        start(InstanceId(1), 1, "work", LeaseId(1), ""),
+        note(2, "routine"),
+        running(2),
+        note(3, "routine/move"),
+        start(InstanceId(3), 1, "work", LeaseId(1), ""),
+    ];
+    let (part, routine) = (leaves("part", 2), leaves("routine", 2));
+    // The run had decided before it was killed, or decides when it has been taken up; a part may begin anew in between.
+    for (by_another, again, left, is_made) in [
+        ("other", None, None, true),
+        ("done", None, None, false),
+        ("other", None, Some(&part), true),
+        ("done", None, Some(&part), false),
+        ("done", Some(1), Some(&part), true),
+        ("other", None, Some(&routine), true),
+        ("done", None, Some(&routine), false),
+        ("done", Some(3), Some(&routine), false),
+    ] {
+        let bench = Bench::new().await?;
+        let run = bench.performer.run.clone();
+        let mut ledger = Ledger { session: bench.performer.number, ..Ledger::default() };
+        ledger.origin.run = run;
+        let natures = Natures { changes_at_exit: vec!["part".into(), "routine".into()], ..Natures::default() };
+        let origin = Box::new(Origin { natures, ..ledger.origin.clone() });
+        ledger.event(Timestamp(0), &started(origin));
+        begun.iter().for_each(|command| ledger.command(command));
+        bench.performer.world.commit("other/i1/1", by_others(by_another), None).await?;
+        // It hears of that during its motion.
+        let heard = Event::WorldChanged { revision: Revision(1), facts: Vec::new() };
+        ledger.event(Timestamp(0), &heard);
+        if left.is_none() {
+            ledger.command(&part);
+        }
+        let mut bench = bench.comes_back(false).await?;
+        let mut done = bench.takes_up(ledger, &World::default()).await.map(|_| ());
+        if let Some(instance) = again {
+            let held = Event::Granted {
+                instance: InstanceId(instance),
+                lease: Lease { id: LeaseId(2), token: FencingToken(0), resources: Vec::new() },
+            };
+            bench.performer.accept(held.into(), &World::default());
+            bench.performer.perform(start(InstanceId(instance), 2, "work", LeaseId(2), ""))?;
+        }
+        if let Some(left) = left {
+            done = bench.performer.perform(left.clone());
+        }
+        let case = format!("by another: {by_another}, again: {again:?}, {left:?}, {done:?}");
+        assert_eq!((done.is_ok(), is_refused(done)), (is_made, !is_made), "{case}");
+    }
+    Ok(())
+}
+
+fn started(origin: Box<Origin>) -> Event {
+    Event::Started {
+        task: String::new(),
+        digest: String::new(),
+        mode: Mode::Hsm,
+        parameters: BTreeMap::new(),
+        seed: 0,
+        world: Vec::new(),
+        revision: Revision(0),
+        capacity: BTreeMap::new(),
+        learned: Learned::default(),
+        breakpoints: Box::default(),
+        origin,
+    }
 }
 
 /// A run that was killed during two motions and has lost its session; others have changed what the first motion changes. It was taken up once, and
