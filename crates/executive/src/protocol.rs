@@ -456,6 +456,11 @@ pub enum Note {
         /// Its id.
         instance: InstanceId,
     },
+    /// It was part of a routine that works on a projection, and has ended: what it came to is the routine's, and no more is said of it.
+    Merged {
+        /// Its id.
+        instance: InstanceId,
+    },
     /// Its result, or what it is at, was made of something that came out otherwise: it is computed again.
     Invalidated {
         /// Its id.

@@ -95,7 +95,7 @@ impl Beginnings {
             }
             Command::Note(Note::Running { instance, .. }) => self.routine_begins(*instance, knows),
             Command::Note(Note::Retired { instance }) => self.ends(*instance, true),
-            Command::Note(Note::Squashed { instance }) => self.ends(*instance, false),
+            Command::Note(Note::Squashed { instance } | Note::Merged { instance }) => self.ends(*instance, false),
             _ => {}
         }
     }

@@ -413,7 +413,7 @@ impl Performer {
                 Command::Note(Note::Expanded { instance, path, .. }) => {
                     self.paths.insert(*instance, path.clone());
                 }
-                Command::Note(Note::Retired { instance } | Note::Squashed { instance }) => {
+                Command::Note(Note::Retired { instance } | Note::Squashed { instance } | Note::Merged { instance }) => {
                     self.paths.remove(instance);
                     self.waiting_since.remove(instance);
                 }
