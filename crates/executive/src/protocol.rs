@@ -65,12 +65,12 @@ pub struct Origin {
     /// Its share of what several runs need, where that is not the usual one, 1; until it is resumed with another one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub share: Option<f64>,
-    /// What its actions are, so that a log can be read without the task. Nothing in logs of earlier versions.
+    /// What its states are, so that a log can be read without the task. Nothing in logs of earlier versions.
     #[serde(default)]
     pub natures: Natures,
 }
 
-/// What the actions of a run are.
+/// What the states of a run are.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Natures {
     /// Paths (without visits) of the actions that only compute.
@@ -82,6 +82,9 @@ pub struct Natures {
     /// The kinds of resources that move the robot.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub actuating: Vec<String>,
+    /// Paths (without visits) of the composite states that change the world when they are left.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub changes_at_exit: Vec<String>,
 }
 
 /// What happened.
@@ -450,6 +453,11 @@ pub enum Note {
     },
     /// Its result is real.
     Retired {
+        /// Its id.
+        instance: InstanceId,
+    },
+    /// It was part of a routine that works on a projection, and has ended: what it came to is the routine's, and no more is said of it.
+    Merged {
         /// Its id.
         instance: InstanceId,
     },

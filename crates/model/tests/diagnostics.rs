@@ -59,6 +59,36 @@ fn an_expression_that_a_comma_cut_off_wants_quotes() {
 }
 
 #[test]
+fn of_joints_of_the_wrong_number_in_the_default_of_a_parameter_it_is_warned() {
+    let check_with = |default: &str, states: &str| {
+        let parameters =
+            "home: { type: joints, default: \"DEFAULT\" }, all: { type: list<joints>, default: \"[DEFAULT]\" }";
+        let parameters = parameters.replace("DEFAULT", default);
+        let states = states.replace("GO", "action: arm/move_to, resources: [{block: Arm}]");
+        check(&format!("task: t\nparameters: {{ {parameters} }}\nstates:\n{states}\n"))
+    };
+    let (six, seven) = ("joints(0, 0, 0, 0, 0, 0)", "joints(0, 0, 0, 0, 0, 0, 0)");
+    for input in ["$home", "$all[0]"] {
+        let go = format!("  - go: {{ GO, in: {{ joints: \"{input}\" }} }}");
+        let told = check_with(six, &go);
+        let words = format!(
+            "warning[invalid-constant] in go: `{input}`, with what parameters are by default: `arm` has 7 joints, and these are the \
+             positions of 6. help: write a default that fits, or give the run another value (`--set`)"
+        );
+        assert!(told.lines().count() == 1 && told.ends_with(&words), "{told}");
+        assert_eq!(check_with(seven, &go), "fine");
+    }
+    // It is another variable.
+    let looped = format!("  - for: home in [\"{seven}\"]\n    do:\n      - go: {{ GO, in: {{ joints: $home }} }}");
+    assert!(!check_with(six, &looped).contains("joints, and these"), "{}", check_with(six, &looped));
+    // It may be another value by then.
+    let assigned = format!(
+        "  - get: {{ GO, in: {{ joints: \"{seven}\" }}, assign: {{ home: end }} }}\n  - go: {{ GO, in: {{ joints: $home }} }}"
+    );
+    assert!(!check_with(six, &assigned).contains("joints, and these"), "{}", check_with(six, &assigned));
+}
+
+#[test]
 fn what_is_created_over_and_over_is_enough_for_any_number() {
     let make = "{ action: gripper/release, resources: [Gripper, { create: Token, class: task }] }";
     let wanted = "  - use: { action: gripper/release, resources: [Gripper, { consume: Token, count: 3 }] }\n";

@@ -101,7 +101,7 @@ fn transcript(run: &Run, script: &Script) -> String {
                     let until = until.map_or_else(String::new, |until| format!(", until {}", until.seconds()));
                     Some(("wait", format!("{} for {awaited}{until}", path(instance))))
                 }
-                Note::Running { .. } | Note::Finished { .. } => None,
+                Note::Running { .. } | Note::Finished { .. } | Note::Merged { .. } => None,
             },
             LogEntry::Command(Command::Start { instance, goal, .. }) => {
                 let given = if script.inputs { format!(" {}", inputs(&goal.inputs)) } else { String::new() };

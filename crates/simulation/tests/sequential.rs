@@ -218,3 +218,39 @@ states:
     let said = makespan_s(&program, &catalogue(), &assumptions, 2_000, &|| true).unwrap_err().to_string();
     assert!(said.contains("no end after 40000 lines of its event log"), "{said}");
 }
+
+#[test]
+fn a_timeout_or_an_answer_that_is_planned_for_in_vain_could_be_exceptional() {
+    let think = |name: &str, input: &str| {
+        format!(
+            "  - {name}: {{ action: brain/think, in: {{ a: {input} }}, computes: true, reads: [], \
+             resources: [{{ block: Brain }}], duration: 8 }}\n"
+        )
+    };
+    let task = |wait: &str, outcome: &str, marked: &str| {
+        format!(
+            "task: t\nstates:\n  - look: {{ action: eye/look, computes: true, reads: [], resources: [{{ block: Eye }}], duration: 2 }}\n  \
+             - go: {{ {wait}, duration: 10, transitions: {{ {outcome}: rescue }}{marked} }}\n{}{}{}{}",
+            think("next", "look.list"),
+            "  - come: { action: arm/move, in: { a: next.x }, pia: true, reads: [], effects: [], resources: [{ block: Arm }], \
+             duration: 1, transitions: { success: success } }\n",
+            think("rescue", "3"),
+            "  - home: { action: arm/move, in: { a: rescue.x }, pia: true, reads: [], effects: [], resources: [{ block: Arm }], \
+             duration: 20 }\n"
+        )
+    };
+    let question = "ask: { question: On?, choices: [now, never] }";
+    for (wait, outcome) in [("wait: { signal: on, timeout: 60 }", "timeout"), (question, "never")] {
+        let found = check_with_brains(&task(wait, outcome, ""), 1).unwrap();
+        let gains: Vec<_> = found.exceptional.iter().map(|gain| (gain.path.as_str(), gain.alone_s)).collect();
+        let key = format!("exceptional: [{outcome}]");
+        let marked = check_with_brains(&task(wait, outcome, &format!(", {key}")), 1).unwrap();
+        assert!(marked.exceptional.is_empty(), "{:?}", marked.exceptional);
+        assert!(found.cdtn_s > marked.cdtn_s, "{wait}: {} {}", found.cdtn_s, marked.cdtn_s);
+        assert_eq!(gains, [("go", found.cdtn_s - marked.cdtn_s)], "{wait}");
+        assert_eq!(found.exceptional[0].missing, [key.as_str()]);
+    }
+    // An answer that is assumed is not seldom.
+    let assumed = check_with_brains(&task(question, "now", ""), 1).unwrap();
+    assert!(assumed.exceptional.is_empty(), "{:?}", assumed.exceptional);
+}

@@ -1,8 +1,12 @@
 //! What a run has asked for and has not been answered yet, folded from its events and commands: what has to be asked again when
 //! task control was killed. A pure fold; what is done with it is [`super::resume`]'s.
 
+mod beginnings;
+
+pub(super) use beginnings::{Began, Beginnings};
+
 use super::record::Decided;
-use ratn_executive::protocol::{Command, Event, Goal, Note, Origin, Unmade};
+use ratn_executive::protocol::{Command, Event, Goal, Origin, Unmade};
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision};
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
@@ -33,7 +37,7 @@ pub(super) struct Ledger {
     /// The root's revision of which the run has heard last: what others had made up to it is in its world.
     pub(super) knows: Revision,
     /// How what is under way began.
-    pub(super) began: BTreeMap<InstanceId, Began>,
+    pub(super) beginnings: Beginnings,
     /// The first operation that failed, by its number: neither that one nor anything behind it is made.
     pub(super) failed: Option<u64>,
     /// The number of the run's session: what it has made and holds is in that one. A session of its id that has another number was opened by
@@ -56,6 +60,8 @@ pub(super) struct Ledger {
     pub(super) held: BTreeSet<LeaseId>,
     /// The last leases that were to go back. Whether they have is not known.
     pub(super) returned: Vec<LeaseId>,
+    /// Which of them were to go back behind which commit: without those that are confirmed.
+    pub(super) went_back: Vec<WentBack>,
     /// What acquires, and operations that were forgotten, have used up for the rest of the run.
     pub(super) consumed: Vec<Requirement>,
     /// Projections that were asked for.
@@ -78,13 +84,13 @@ pub(super) struct Ledger {
     pub(super) ended: Option<String>,
 }
 
-/// The beginning of an instance: it was granted what it holds, or its last goal was given.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Began {
-    /// The revision that the run had heard of then.
-    pub(super) knows: Revision,
-    /// Up to this revision it held what it works with, where the run has lost that since; where it has not, nobody else changes what it changes.
-    pub(super) held_until: Option<Revision>,
+/// A lease that was to go back, while a commit may have been on its way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct WentBack {
+    pub(super) lease: LeaseId,
+    /// The run's own number of its last commit.
+    pub(super) decided: Revision,
+    pub(super) at: Timestamp,
 }
 
 /// How far the daemons have confirmed what the run has decided, which they do in order.
@@ -135,18 +141,11 @@ pub(super) fn operation_request(run: &str, instance: InstanceId, number: u64, in
     format!("{run}/{instance}/operate-{number}.{index}")
 }
 
-impl Began {
-    /// Behind which revision others' changes count, where they do: what the run had heard of, it knew, and what they changed while it held what it
-    /// worked with, they did not change with that.
-    pub(super) fn others_count(&self) -> Option<Revision> {
-        self.held_until.map(|held| held.max(self.knows))
-    }
-}
-
 impl Ledger {
     /// An event that the executive was given.
     pub(super) fn event(&mut self, at: Timestamp, event: &Event) {
         self.last = self.last.max(at);
+        self.beginnings.event(event, self.knows);
         match event {
             Event::Started { origin, revision, .. } => {
                 self.origin = (**origin).clone();
@@ -169,8 +168,9 @@ impl Ledger {
             }
             Event::Woken => self.wakes = self.wakes.split_off(&Timestamp(at.0.saturating_add(1))),
             Event::Granted { instance, lease } => {
-                self.begins(*instance);
                 self.held.insert(lease.id);
+                // The run has handed it over itself.
+                self.went_back.retain(|one| one.lease != lease.id);
                 if let Some(asked) = self.waiting.remove(instance) {
                     let used_up = |r: &Requirement| r.operation == ResourceOperation::Consume;
                     self.consumed.extend(asked.requirements.into_iter().filter(used_up));
@@ -223,7 +223,6 @@ impl Ledger {
                 self.projecting.insert(*instance, asked);
             }
             Command::Start { instance, attempt, goal } => {
-                self.begins(*instance);
                 self.goals.insert(*instance, (*attempt, (**goal).clone()));
             }
             Command::Cancel { instance, attempt } => {
@@ -236,15 +235,19 @@ impl Ledger {
                 if let Some(lease) = lease.filter(|lease| self.held.remove(lease)) {
                     self.returned.push(lease);
                     self.returned.drain(..self.returned.len().saturating_sub(KEPT_RETURNED));
+                    let decided = self.commits.last().map(|decided| decided.revision);
+                    let at = self.last;
+                    self.went_back.extend(decided.map(|decided| WentBack { lease, decided, at }));
                 }
             }
             Command::Commit { instance, writer, changes, evidence, revision } => {
                 let (instance, revision, writer) = (*instance, *revision, writer.clone());
                 let (changes, evidence) = (changes.clone(), evidence.clone());
-                let now = || Began { knows: self.knows, held_until: None };
-                let (began, behind) = (self.began.get(&instance).copied().unwrap_or_else(now), self.operations);
+                let (knew, behind) = (self.knows, self.operations);
+                let now = Began { knows: knew, held_until: None };
+                let began = self.beginnings.of(instance, &writer).unwrap_or(now);
                 if self.failed.is_none() {
-                    self.commits.push(Decided { instance, writer, changes, evidence, revision, began, behind });
+                    self.commits.push(Decided { instance, writer, changes, evidence, revision, began, knew, behind });
                 }
             }
             Command::Operate { instance, operations } => {
@@ -257,29 +260,16 @@ impl Ledger {
                 self.wakes.insert(*at);
             }
             Command::End { outcome, .. } => self.ended = Some(outcome.clone()),
-            Command::Note(Note::Retired { instance } | Note::Squashed { instance }) => {
-                self.began.remove(instance);
-            }
             Command::Note(_) => {}
         }
-    }
-
-    /// It works from now on with what the run holds.
-    fn begins(&mut self, instance: InstanceId) {
-        self.began.insert(instance, Began { knows: self.knows, held_until: None });
+        self.beginnings.command(command, self.knows);
     }
 
     /// What the run held is gone. Of what was lost before, others' changes count since then.
     fn lose(&mut self, held_until: Revision) {
-        let decided = self.commits.iter_mut().map(|decided| &mut decided.began);
-        for began in self.began.values_mut().chain(decided) {
-            began.held_until.get_or_insert(held_until);
+        for decided in &mut self.commits {
+            decided.began.held_until.get_or_insert(held_until);
         }
-    }
-
-    /// What is under way with what the run has lost, and behind which revision others' changes count against it.
-    pub(super) fn lost(&self) -> impl Iterator<Item = (InstanceId, Revision)> {
-        self.began.iter().filter_map(|(instance, began)| Some((*instance, began.others_count()?)))
     }
 
     /// What an instance had decided was not made, and so is nothing behind it: the recorder makes neither. A commit that failed may be made all the
@@ -323,6 +313,7 @@ impl Ledger {
         let commits = commits.saturating_sub(kept);
         self.commits.drain(..commits);
         self.forgotten += commits as u64;
+        self.went_back.retain(|one| one.decided > confirmed.commit);
 
         let operated = self.operated.iter().take_while(|(number, ..)| *number <= confirmed.operation).count();
         let mut used_up = Vec::new();
@@ -411,6 +402,7 @@ fn delete(left: &mut Vec<Requirement>, deletion: &Requirement) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ratn_executive::protocol::Note;
     use ratn_model::resource::Lease;
 
     fn requirement(operation: ResourceOperation, kind: &str, count: u32) -> Requirement {
@@ -567,7 +559,7 @@ mod tests {
         assert_eq!(ledger.commits.iter().map(|decided| decided.began.knows.0).collect::<Vec<_>>(), [4, 10, 12]);
         ledger.command(&Command::Note(Note::Retired { instance: motion }));
         ledger.command(&Command::Note(Note::Squashed { instance: other }));
-        assert!(ledger.began.is_empty());
+        assert!(ledger.beginnings.is_empty());
     }
 
     #[test]
@@ -580,7 +572,11 @@ mod tests {
         let heard = |ledger: &mut Ledger, revision: u64| {
             ledger.event(Timestamp(1), &Event::WorldChanged { revision: Revision(revision), facts: Vec::new() });
         };
-        let lost = |ledger: &Ledger| ledger.lost().map(|(instance, behind)| (instance.0, behind.0)).collect::<Vec<_>>();
+        let lost = |ledger: &Ledger| {
+            let behind = |instance| ledger.beginnings.of(instance, "").and_then(|began| began.others_count());
+            let lost = [motion, other].into_iter().filter_map(|instance| Some((instance.0, behind(instance)?.0)));
+            lost.collect::<Vec<_>>()
+        };
         starts(&mut ledger, motion);
         heard(&mut ledger, 5);
         starts(&mut ledger, other);

@@ -102,7 +102,8 @@ mod tests {
             let revision = self.mirror.apply(changes).unwrap_or_default();
             let (instance, writer) = (InstanceId(self.commits), String::new());
             let (changes_made, evidence, began) = (changes.to_vec(), Vec::new(), Began::default());
-            let decided = Decided { instance, writer, changes: changes_made, evidence, revision, began, behind: 0 };
+            let (knew, behind) = (Revision::default(), 0);
+            let decided = Decided { instance, writer, changes: changes_made, evidence, revision, began, knew, behind };
             self.outside.decided("run", &decided);
             (decided.id("run"), changes.to_vec())
         }

@@ -163,7 +163,9 @@ impl Progress {
     /// Of an instance that has left the window only a failure to make it real can still be told.
     fn forget<'a>(&mut self, commands: impl Iterator<Item = &'a Command>) {
         for command in commands {
-            if let Command::Note(Note::Retired { instance } | Note::Squashed { instance }) = command {
+            if let Command::Note(Note::Retired { instance } | Note::Squashed { instance } | Note::Merged { instance }) =
+                command
+            {
                 self.ends(*instance);
                 self.retired += u64::from(matches!(command, Command::Note(Note::Retired { .. })));
                 self.gone.push_back(*instance);

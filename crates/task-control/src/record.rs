@@ -101,6 +101,8 @@ pub(super) struct Decided {
     pub(super) revision: Revision,
     /// How what led to that began.
     pub(super) began: Began,
+    /// The pool's revision that the run had heard of when it was decided.
+    pub(super) knew: Revision,
     /// How many operations were decided before it: it is made behind them.
     pub(super) behind: u64,
 }

@@ -186,7 +186,7 @@ pub(super) fn follow(states: &mut BTreeMap<InstanceId, StateId>, command: &Comma
         Command::Note(Note::Expanded { instance, state, .. }) => {
             states.insert(*instance, *state);
         }
-        Command::Note(Note::Retired { instance } | Note::Squashed { instance }) => {
+        Command::Note(Note::Retired { instance } | Note::Squashed { instance } | Note::Merged { instance }) => {
             states.remove(instance);
         }
         _ => {}
@@ -242,7 +242,7 @@ pub(super) mod tests {
     use ratn_simulation::timed::TimedProviders;
     use std::time::Duration;
 
-    fn program(text: &str) -> Arc<Program> {
+    pub(crate) fn program(text: &str) -> Arc<Program> {
         Arc::new(task_for_tests::program(text))
     }
 
@@ -295,6 +295,45 @@ pub(super) mod tests {
             assert_eq!(whole.ended.map(|ended| ended.outcome).as_deref(), Some("success"));
             let decided = lines.iter().filter(|line| matches!(line.entry, LogEntry::Command(Command::Commit { .. })));
             assert_eq!(whole.standing.ledger.commits.len(), decided.count());
+        }
+    }
+
+    const COMPUTING: &str = r#"
+task: computing
+parameters: { boxes: { type: int, default: 2 } }
+variables: { last: 0 }
+outputs: { last: $last }
+states:
+  - routine:
+      routine: true
+      states:
+        - loop:
+            for: turn in range(1, 400)
+            do:
+              - plan:
+                  action: path_planner/plan
+                  in: { start: "joints(0, 0, 0, 0, 0, 0, 0)", goal: "joints(1, 0, 0, 0, 0, 0, 0)" }
+                  assign: { last: turn }
+"#;
+
+    #[test]
+    fn what_is_kept_of_a_routine_does_not_grow_with_the_parts_that_have_ended() {
+        let program = program(COMPUTING);
+        for mode in [Mode::Hsm, Mode::Cdtn] {
+            let mut lines = log(&program, mode);
+            let LogEntry::Event(Event::Started { origin, .. }) = &mut lines[0].entry else { panic!("no start") };
+            origin.natures.changes_at_exit = vec!["routine".to_owned()];
+            let starts = |line: &&LogLine| matches!(line.entry, LogEntry::Command(Command::Start { .. }));
+            assert_eq!(lines.iter().filter(starts).count(), 399);
+            let kept = |cut: usize| {
+                let ReplayedState { ledger, states, .. } = replay(&program, &lines[..cut]).unwrap().standing;
+                let Ledger { beginnings, goals, projecting, .. } = ledger;
+                let text = serde_json::to_string(&(beginnings, goals, projecting, &states)).unwrap();
+                (states.len(), text.len())
+            };
+            let ((early, early_bytes), (late, late_bytes)) = (kept(lines.len() / 4), kept(lines.len() - 20));
+            assert!(late <= early.max(4) && late < 8, "{mode:?}: {early}, then {late} instances");
+            assert!(late_bytes <= early_bytes + 200, "{mode:?}: {early_bytes}, then {late_bytes} bytes");
         }
     }
 

@@ -684,7 +684,7 @@ fn advisor_of(mode: Mode, seed: u64) -> Option<Advisor> {
     }
 }
 
-/// What the actions of a program are, by path, and which kinds of resources move the robot.
+/// What the states of a program are, by path, and which kinds of resources move the robot.
 fn natures(program: &Program, catalogue: &Catalogue) -> Natures {
     let is_action = |state: &&State| matches!(state.kind, StateKind::Action { .. });
     let actions = |is_meant: fn(&Nature) -> bool| {
@@ -695,7 +695,15 @@ fn natures(program: &Program, catalogue: &Catalogue) -> Natures {
         computes: actions(|nature| *nature == Nature::Computes),
         senses: actions(|nature| matches!(nature, Nature::Senses(_))),
         actuating: catalogue.resources.iter().filter(|r| r.1.actuates).map(|r| r.0.clone()).collect(),
+        changes_at_exit: changes_at_exit(program),
     }
+}
+
+/// The composite states that declare effects.
+pub(crate) fn changes_at_exit(program: &Program) -> Vec<String> {
+    let composites = program.states.iter().filter(|state| !matches!(state.kind, StateKind::Action { .. }));
+    let changing = composites.filter(|state| state.annotations.effects.values().any(|effects| !effects.is_empty()));
+    changing.map(|state| state.path.clone()).collect()
 }
 
 /// Where the program lets younger PIAs run beside one that might still fail.

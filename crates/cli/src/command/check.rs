@@ -199,7 +199,9 @@ fn report(sequential: &Sequential) -> String {
         lines.push(format!("{began_s:>9.1} – {ended_s:>7.1} s  {path:<width$}  {because}"));
     }
     if !sequential.exceptional.is_empty() {
-        lines.push("\nwhat not computing ahead for a failure would gain, if it is seldom:".to_owned());
+        lines.push(
+            "\nwhat not computing ahead for a failure, a timeout or an answer would gain, if it is seldom:".to_owned(),
+        );
         lines.extend(gains(&sequential.exceptional));
     }
     if sequential.gains.is_empty() {

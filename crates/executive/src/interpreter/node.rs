@@ -9,7 +9,7 @@ use crate::protocol::{Command, Goal, Note};
 use crate::span::span;
 use ratn_model::expression::FactExpr;
 use ratn_model::fact::{FactKey, Footprint};
-use ratn_model::id::StateId;
+use ratn_model::id::{InstanceId, StateId};
 use ratn_model::measurement::Evidence;
 use ratn_model::program::{ABORTED, PREEMPTED, STOPPED, SUCCESS, StateKind, WORLD_MODEL, is_failure};
 use ratn_model::resource::Lease;
@@ -255,9 +255,7 @@ impl Interpreter {
         let Some(current) = self.threads.get_mut(&thread).and_then(|thread| thread.current.take()) else { return };
         context.note(Note::Finished { instance: current.instance, outcome: outcome.into() });
         self.give_back(context, &current);
-        if matches!(self.target, Target::Actual) {
-            context.note(Note::Retired { instance: current.instance });
-        }
+        self.leaves(context, current.instance);
         self.ended(thread, current.state, outcome, format!("{}: {reason}", current.path));
     }
 
@@ -316,9 +314,7 @@ impl Interpreter {
             self.assign(thread, assigned);
         }
         self.give_back(context, &current);
-        if matches!(self.target, Target::Actual) {
-            context.note(Note::Retired { instance });
-        }
+        self.leaves(context, instance);
         let reason = match reason.as_str() {
             _ if outcome == SUCCESS => String::new(),
             // Its worker gave none.
@@ -326,6 +322,14 @@ impl Interpreter {
             reason => format!("{}: {reason}", current.path),
         };
         self.ended(thread, id, outcome, reason);
+    }
+
+    /// Nothing more comes of it.
+    fn leaves(&self, context: &mut Context<'_>, instance: InstanceId) {
+        context.note(match self.target {
+            Target::Actual => Note::Retired { instance },
+            Target::Projection { .. } => Note::Merged { instance },
+        });
     }
 
     pub(super) fn give_back(&self, context: &mut Context<'_>, current: &Current) {

@@ -4,31 +4,38 @@ use super::{Subject, named};
 use crate::catalogue::JointChain;
 use crate::diagnostic::Findings;
 use crate::expression::scope::NothingKnown;
-use crate::expression::{EvaluateError, Expr, FactExpr, Function};
+use crate::expression::{EvaluateError, Expr, FactExpr, Function, Scope};
 use crate::program::{State, StateKind};
 use crate::slot::Slot;
 use crate::value::Value;
+use std::borrow::Cow;
 
 pub(crate) const RULE: &str = "invalid-constant";
 pub(crate) const HELP: &str = "it fails whenever it is evaluated: write a value that there is";
 
+const HELP_WITH_DEFAULTS: &str = "write a default that fits, or give the run another value (`--set`)";
+
 pub(super) fn check(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: &Expr, findings: &mut Findings) {
     let problem = match problem(expr) {
         Some(EvaluateError::Wrong { problem, .. }) => Some(problem),
-        Some(EvaluateError::NotYetKnown { .. }) | None => joints(subject, state, slot, expr),
+        Some(EvaluateError::NotYetKnown { .. }) | None => joints(subject, state, slot, expr, &NothingKnown),
     };
     if let Some(problem) = problem {
         let message = format!("`{}`: {problem}", named(subject.program, expr));
         findings.error(RULE, subject.place_of(state, slot), &state.path, message, HELP);
+    } else if let Some(problem) = joints(subject, state, slot, expr, &Defaults { subject, state }) {
+        // Another value may be given to the run.
+        let message = format!("`{}`, with what parameters are by default: {problem}", named(subject.program, expr));
+        findings.warning(RULE, subject.place_of(state, slot), &state.path, message, HELP_WITH_DEFAULTS);
     }
 }
 
 /// Joint positions of another number than the provider's.
-fn joints(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: &Expr) -> Option<String> {
+fn joints(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: &Expr, scope: &dyn Scope) -> Option<String> {
     let StateKind::Action { provider, .. } = &state.kind else { return None };
     let known = subject.catalogue.providers.get(provider)?;
     let wanted = known.joints?;
-    let Ok(Value::Joints(found)) = expr.evaluate(&NothingKnown) else { return None };
+    let Ok(Value::Joints(found)) = expr.evaluate(scope) else { return None };
     let fits = !matches!(slot, Slot::Input(_)) || usize::try_from(wanted).is_ok_and(|wanted| wanted == found.len());
     (!fits).then(|| {
         let count = found.len();
@@ -40,6 +47,32 @@ fn joints(subject: &Subject<'_>, state: &State, slot: Slot<'_>, expr: &Expr) -> 
             ),
         }
     })
+}
+
+/// The parameters of the task in a state, as they are where the run is given no others: those that nothing assigns to, and that are not hidden by a
+/// variable of the same name.
+struct Defaults<'a> {
+    subject: &'a Subject<'a>,
+    state: &'a State,
+}
+
+impl Scope for Defaults<'_> {
+    fn variable(&self, name: &str) -> Option<Cow<'_, Value>> {
+        let program = self.subject.program;
+        let is_assigned = program.states.iter().any(|state| state.assign.iter().any(|(to, _)| to == name));
+        let is_hidden = self.subject.around(self.state.id).any(|around| binds(around, name));
+        let default = program.parameters.iter().find(|parameter| parameter.name == name)?.default.as_ref();
+        default.filter(|_| !is_assigned && !is_hidden).map(Cow::Borrowed)
+    }
+}
+
+/// Whether a state has a variable of this name.
+fn binds(state: &State, name: &str) -> bool {
+    let of_loop = match &state.kind {
+        StateKind::ForEach { variable, index, .. } => variable == name || index.as_deref() == Some(name),
+        _ => false,
+    };
+    of_loop || state.variables.iter().any(|(own, _)| own == name)
 }
 
 /// What is wrong with the first part that is a constant and has no value. A part that may be passed over (the branches of an `if`, the

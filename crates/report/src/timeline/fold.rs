@@ -292,6 +292,7 @@ impl Timeline {
             | Note::Awaiting { instance, .. }
             | Note::Finished { instance, .. }
             | Note::Retired { instance }
+            | Note::Merged { instance }
             | Note::Invalidated { instance, .. }
             | Note::Preempted { instance, .. }
             | Note::Reused { instance }
@@ -335,6 +336,10 @@ impl Timeline {
                 self.count.retired += usize::from(!self.known(id, at).has_left());
                 self.known(id, at).retired = true;
                 self.leaves(id, Stage::Retired, at);
+            }
+            Note::Merged { .. } => {
+                self.known(id, at);
+                self.left.add(id);
             }
             Note::Squashed { .. } => {
                 self.improvements.is_gone(id);

@@ -17,11 +17,13 @@ use ratn_executive::protocol::{Command, LogEntry};
 use ratn_executive::protocol::{Mode, Note};
 use ratn_model::catalogue::{Catalogue, ResourceOffer};
 use ratn_model::id::StateId;
-use ratn_model::program::{ABORTED, Program, SUCCESS};
+use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
+use ratn_model::wait::Wait;
 use serde::Serialize;
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
@@ -64,7 +66,7 @@ pub struct Sequential {
     /// As a dataflow network if all of these were annotated, in seconds; `None` where that cannot be simulated.
     pub annotated_s: Option<f64>,
     /// The states whose failure is handled, and what `exceptional: [aborted]` would gain: what follows a failure would not be computed
-    /// ahead. Only those that gain something.
+    /// ahead. The same of the timeout of a wait, and of the answers to a question that are not assumed. Only those that gain something.
     pub exceptional: Vec<Gain>,
     /// The actions whose duration nobody knows: a second is assumed.
     pub unknown_durations: Vec<String>,
@@ -76,7 +78,7 @@ pub struct Gain {
     /// The state.
     pub path: String,
     /// What it does not say: `reads`, `effects`, `computes`.
-    pub missing: Vec<&'static str>,
+    pub missing: Vec<Cow<'static, str>>,
     /// Seconds by which the task is shorter, if only this state is annotated.
     pub alone_s: f64,
     /// The same, in percent.
@@ -130,7 +132,7 @@ pub fn sequential(program: &Program, catalogue: &Catalogue, assumptions: &Assump
             let last_s = ends_s(&others).zip(annotated_s).map_or(0.0, |(without_s, with_s)| without_s - with_s);
             Some(Gain {
                 path: program.state(*id).path.clone(),
-                missing: missing(program, catalogue, *id),
+                missing: missing(program, catalogue, *id).into_iter().map(Cow::Borrowed).collect(),
                 alone_s: rounded(alone_s),
                 alone_percent: if cdtn.end_s > 0.0 { 100.0 * rounded(alone_s) / cdtn.end_s } else { 0.0 },
                 last_s: rounded(last_s),
@@ -168,26 +170,30 @@ pub fn makespan_s(
     simulate_within(bound, program, catalogue, assumptions, Mode::Cdtn, &mut BTreeSet::new()).map(|run| run.end_s)
 }
 
-/// The states whose failure is handled and could be exceptional, with what that gains.
+/// The states of which outcomes that are handled could be exceptional, with what that gains.
 fn exceptional(program: &Program, run: &Run, mut ends_s: impl FnMut(&Program) -> Option<f64>) -> Vec<Gain> {
-    let handled = executed(run, |id| !program.is_exceptional(id, ABORTED));
-    let mut gain_s = |ids: &[StateId]| {
+    let came = outcomes(run);
+    let is_meant = |id: StateId| !seldom(program, &came, id).is_empty();
+    let handled: Vec<(StateId, Vec<String>)> =
+        executed(run, is_meant).into_iter().map(|id| (id, seldom(program, &came, id))).collect();
+    let mut gain_s = |meant: &[&(StateId, Vec<String>)]| {
         let mut marked = program.clone();
-        for id in ids {
-            marked.states[id.0 as usize].annotations.exceptional.push(ABORTED.to_owned());
+        for (id, outcomes) in meant {
+            marked.states[id.0 as usize].annotations.exceptional.extend(outcomes.iter().cloned());
         }
         ends_s(&marked).map(|end_s| rounded(run.end_s - end_s))
     };
-    let Some(all_s) = gain_s(&handled).filter(|gain_s| *gain_s > 0.0) else { return Vec::new() };
+    let all: Vec<_> = handled.iter().collect();
+    let Some(all_s) = gain_s(&all).filter(|gain_s| *gain_s > 0.0) else { return Vec::new() };
     let mut gains = Vec::new();
-    for id in &handled {
-        let others: Vec<StateId> = handled.iter().copied().filter(|other| other != id).collect();
-        let alone_s = gain_s(&[*id]).unwrap_or(0.0);
+    for one in &handled {
+        let others: Vec<_> = handled.iter().filter(|other| other.0 != one.0).collect();
+        let alone_s = gain_s(&[one]).unwrap_or(0.0);
         let last_s = gain_s(&others).map_or(0.0, |without_s| rounded(all_s - without_s));
         if alone_s > 0.0 || last_s > 0.0 {
             gains.push(Gain {
-                path: program.state(*id).path.clone(),
-                missing: vec!["exceptional: [aborted]"],
+                path: program.state(one.0).path.clone(),
+                missing: vec![format!("exceptional: [{}]", one.1.join(", ")).into()],
                 alone_s,
                 alone_percent: 100.0 * alone_s / run.end_s,
                 last_s,
@@ -196,6 +202,33 @@ fn exceptional(program: &Program, run: &Run, mut ends_s: impl FnMut(&Program) ->
     }
     gains.sort_by(|a, b| b.alone_s.total_cmp(&a.alone_s).then(b.last_s.total_cmp(&a.last_s)));
     gains
+}
+
+/// The outcomes of a state whose handlers are computed ahead, and that may be seldom: a failure; of a state that waits the time that is over, and the
+/// answers that are not assumed.
+fn seldom(program: &Program, came: &BTreeSet<(StateId, &str)>, id: StateId) -> Vec<String> {
+    let waits = matches!(program.state(id).wait(), Some(Wait::Condition(_) | Wait::Signal(_) | Wait::Answer(_)));
+    let may_be = |outcome: &&str| *outcome == ABORTED || (waits && ![SUCCESS, PREEMPTED].contains(outcome));
+    let outcomes = program.outcomes(id).filter(may_be);
+    let handled = outcomes.filter(|outcome| !program.is_exceptional(id, outcome) && !came.contains(&(id, *outcome)));
+    handled.map(str::to_owned).collect()
+}
+
+/// By which outcomes states have ended.
+fn outcomes(run: &Run) -> BTreeSet<(StateId, &str)> {
+    let (mut states, mut came) = (BTreeMap::new(), BTreeSet::new());
+    for line in &run.log {
+        match &line.entry {
+            LogEntry::Command(Command::Note(Note::Expanded { instance, state, .. })) => {
+                states.insert(*instance, *state);
+            }
+            LogEntry::Command(Command::Note(Note::Finished { instance, outcome })) => {
+                came.extend(states.get(instance).map(|state| (*state, &**outcome)));
+            }
+            _ => {}
+        }
+    }
+    came
 }
 
 /// A gain to the microsecond.

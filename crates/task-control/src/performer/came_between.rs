@@ -8,12 +8,12 @@
 
 use super::told::{PENDING_PATIENCE, maker};
 use crate::decided::{Unanswered, Undone, insist};
-use crate::ledger::Ledger;
-use crate::record::Decided;
+use crate::ledger::{Beginnings, Ledger};
 use anyhow::bail;
+use ratn_executive::protocol::{Command, Event};
 use ratn_executive::was_overtaken;
 use ratn_model::fact::{Change, FactKey};
-use ratn_model::id::{InstanceId, Revision};
+use ratn_model::id::Revision;
 use ratn_model::program::Program;
 use ratn_proto::types::{WorldChange, WorldUpdate};
 use ratn_worker::client::{CallError, WorldClient};
@@ -21,7 +21,7 @@ use ratn_worker::session::Trust;
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// The world pool does not keep a revision any more.
 const FORGOTTEN: &str = "REVISION_FORGOTTEN";
@@ -141,22 +141,16 @@ impl ChangedByOthers {
 pub(super) struct CameBetween {
     program: Arc<Program>,
     run: String,
-    /// Behind which revision others' changes count, of what had begun before.
-    behind: BTreeMap<InstanceId, Revision>,
+    /// What has begun, before and since.
+    beginnings: Beginnings,
     changed: ChangedByOthers,
 }
 
 impl CameBetween {
-    /// By the log, and what others have changed; nothing where nothing is under way that was begun with what the run has lost.
-    pub(super) fn new(
-        program: &Arc<Program>,
-        run: &str,
-        ledger: &Ledger,
-        changed: ChangedByOthers,
-    ) -> Option<CameBetween> {
-        let behind: BTreeMap<InstanceId, Revision> = ledger.lost().collect();
-        let (program, run) = (Arc::clone(program), run.to_owned());
-        (!behind.is_empty()).then_some(CameBetween { program, run, behind, changed })
+    /// By the log, and what others have changed.
+    pub(super) fn new(program: &Arc<Program>, run: &str, ledger: &Ledger, changed: ChangedByOthers) -> CameBetween {
+        let beginnings = ledger.beginnings.clone();
+        CameBetween { program: Arc::clone(program), run: run.to_owned(), beginnings, changed }
     }
 
     /// The root has this revision, too.
@@ -164,24 +158,31 @@ impl CameBetween {
         self.changed.add(&self.run, change);
     }
 
-    /// An instance holds again what it works with, or has come to its end.
-    pub(super) fn forget(&mut self, instance: InstanceId) {
-        self.behind.remove(&instance);
+    /// An event that the run is given, which knows of this revision.
+    pub(super) fn event(&mut self, event: &Event, knows: Revision) {
+        self.beginnings.event(event, knows);
+    }
+
+    /// A command that it performs. Of a commit [`CameBetween::check`] is asked before.
+    pub(super) fn command(&mut self, command: &Command, knows: Revision) {
+        self.beginnings.command(command, knows);
     }
 
     /// Whether nothing is left of which it could say anything.
     pub(super) fn is_over(&self) -> bool {
-        self.behind.is_empty()
+        self.beginnings.others_count().is_none()
     }
 
-    /// Under which condition a commit is made, where it is of what had begun before.
+    /// Under which condition a commit is made, where the command is one of what had begun before.
     ///
     /// # Errors
     /// With what others have changed, as far as that was told.
-    pub(super) fn check(&self, decided: &Decided) -> anyhow::Result<Option<Untouched>> {
-        let Some(behind) = self.behind.get(&decided.instance) else { return Ok(None) };
-        match self.changed.overtakes(&self.program, &decided.writer, &decided.changes, *behind) {
-            Some(overtaken) => refuse(&decided.writer, &overtaken),
+    pub(super) fn check(&self, command: &Command) -> anyhow::Result<Option<Untouched>> {
+        let Command::Commit { instance, writer, changes, .. } = command else { return Ok(None) };
+        let began = self.beginnings.of(*instance, writer);
+        let Some(behind) = began.and_then(|began| began.others_count()) else { return Ok(None) };
+        match self.changed.overtakes(&self.program, writer, changes, behind) {
+            Some(overtaken) => refuse(writer, &overtaken),
             None => Ok(Some(Untouched::behind(&self.program, &self.run, self.changed.up_to))),
         }
     }
@@ -205,29 +206,45 @@ pub(crate) struct Untouched {
     late: Option<(Left, Revision)>,
 }
 
-/// Since when others may not wait any more for what a run had decided when it gave something back. Clones share it.
+/// From when on others may not wait any more for what a run had decided when it gave something back. Clones share it.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Left(Arc<Mutex<VecDeque<(Revision, Instant)>>>);
 
 impl Left {
     /// Something goes back while the commits up to `decided`, but for those up to `made`, are on their way.
     pub(super) fn goes_back(&self, decided: Revision, made: Revision, at: Instant) {
+        self.is_waited_for(decided, made, at + PENDING_PATIENCE);
+    }
+
+    /// The same went back so long ago, before its run was taken up; in the order in which that was.
+    pub(super) fn went_back(&self, decided: Revision, made: Revision, ago: Duration) {
+        self.is_waited_for(decided, made, Instant::now() + PENDING_PATIENCE.saturating_sub(ago));
+    }
+
+    fn is_waited_for(&self, decided: Revision, made: Revision, until: Instant) {
         let mut left = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         while left.front().is_some_and(|(number, _)| *number <= made) {
             left.pop_front();
         }
         let is_known = left.back().is_some_and(|(number, _)| *number >= decided);
         if decided > made && !is_known {
-            left.push_back((decided, at));
+            left.push_back((decided, until));
         }
     }
 
     /// Whether whoever holds now what the run held when it decided this commit may have gone on without it.
-    fn is_late(&self, commit: Revision) -> bool {
+    pub(super) fn is_late(&self, commit: Revision) -> bool {
         let left = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         // In the order of numbers, and of time.
         let first = left.iter().find(|(number, _)| *number >= commit);
-        first.is_some_and(|(_, at)| at.elapsed() >= PENDING_PATIENCE)
+        first.is_some_and(|(_, until)| Instant::now() >= *until)
+    }
+
+    /// Nobody waits for anything any more.
+    #[cfg(test)]
+    pub(super) fn all_is_late(&self) {
+        let mut left = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        left.iter_mut().for_each(|(_, until)| *until = Instant::now());
     }
 }
 

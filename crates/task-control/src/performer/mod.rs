@@ -413,7 +413,7 @@ impl Performer {
                 Command::Note(Note::Expanded { instance, path, .. }) => {
                     self.paths.insert(*instance, path.clone());
                 }
-                Command::Note(Note::Retired { instance } | Note::Squashed { instance }) => {
+                Command::Note(Note::Retired { instance } | Note::Squashed { instance } | Note::Merged { instance }) => {
                     self.paths.remove(instance);
                     self.waiting_since.remove(instance);
                 }
@@ -452,9 +452,9 @@ impl Performer {
     /// Begins to perform a command, where it cannot be undone when everything before it is safe.
     pub(super) fn perform_when(&mut self, safe: Option<Mark>, command: Command) -> anyhow::Result<()> {
         while self.giving_back.try_join_next().is_some() {}
+        let untouched = self.follow_what_was_lost(&command)?;
         match command {
             // Waking is the shell's: it has the clock.
-            Command::Note(Note::Retired { instance } | Note::Squashed { instance }) => self.is_its_own(instance),
             Command::Note(_) | Command::End { .. } | Command::Wake { .. } => {}
             Command::Acquire { instance, requirements, priority } => {
                 self.acquires += 1;
@@ -471,7 +471,6 @@ impl Performer {
                 self.project(instance, asked)?;
             }
             Command::Start { instance, attempt, goal } => {
-                self.is_its_own(instance);
                 self.start(instance, attempt, *goal, Given::Now, safe);
             }
             Command::Cancel { instance, attempt } => match self.jobs.get(&instance) {
@@ -486,17 +485,12 @@ impl Performer {
                 self.release(instance, lease, projection, safe);
             }
             Command::Commit { instance, writer, changes, evidence, revision } => {
-                let began = Began { knows: self.told.revision(), held_until: None };
-                let behind = self.operations;
-                let decided = Decided { instance, writer, changes, evidence, revision, began, behind };
-                let lost = match &self.came_between {
-                    Some(between) => between.check(&decided)?,
-                    None => None,
-                };
+                let (knew, behind) = (self.told.revision(), self.operations);
+                let began = Began { knows: knew, held_until: None };
+                let decided = Decided { instance, writer, changes, evidence, revision, began, knew, behind };
                 let late =
                     || Untouched::behind(&self.program, &self.run, self.root.get()).when_late(&self.left, revision);
-                let untouched = Some(lost.unwrap_or_else(late));
-                self.commit(decided, untouched, safe)?;
+                self.commit(decided, Some(untouched.unwrap_or_else(late)), safe)?;
             }
             Command::Operate { instance, operations } => {
                 self.operations += 1;
@@ -574,12 +568,14 @@ impl Performer {
         Ok(())
     }
 
-    /// What an instance does from now on it does with what the run holds, or it does nothing more.
-    fn is_its_own(&mut self, instance: InstanceId) {
-        if let Some(between) = &mut self.came_between {
-            between.forget(instance);
-        }
+    /// Of a run that came back without what it held: under which condition a commit is made that is of what had begun before; and what begins from now
+    /// on begins with what the run holds.
+    fn follow_what_was_lost(&mut self, command: &Command) -> anyhow::Result<Option<Untouched>> {
+        let Some(between) = &mut self.came_between else { return Ok(None) };
+        let untouched = between.check(command)?;
+        between.command(command, self.told.revision());
         self.came_between.take_if(|between| between.is_over());
+        Ok(untouched)
     }
 
     fn commit(&mut self, decided: Decided, untouched: Option<Untouched>, safe: Option<Mark>) -> anyhow::Result<()> {
@@ -722,7 +718,9 @@ impl Performer {
                 if let Event::Granted { instance, .. } | Event::Refused { instance, .. } = &event {
                     let asked = self.asking.remove(*instance);
                     self.waiting_since.remove(instance);
-                    self.is_its_own(*instance);
+                    if let Some(between) = &mut self.came_between {
+                        between.event(&event, self.told.revision());
+                    }
                     if let (Event::Granted { lease, .. }, Some(asked)) = (&event, asked) {
                         self.leases.granted(*instance, lease, (asked.requirements, asked.priority), Instant::now());
                         self.holds.set(self.leases.has_speculative());

@@ -15,7 +15,7 @@ use super::acquiring::late_request;
 use super::came_between::{CameBetween, ChangedByOthers, Untouched, refuse};
 use super::goal::Given;
 use crate::decided::{Unanswered, Undone, insist};
-use crate::ledger::{Confirmed, Ledger, operation_request};
+use crate::ledger::{Confirmed, Ledger, WentBack, operation_request};
 use crate::outside;
 use crate::record::{Decided, Named, Record, commit_next, operate_once, said};
 use crate::shell::Place;
@@ -26,6 +26,7 @@ use ratn_model::fact::FactKey;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::program::Program;
 use ratn_model::resource::{Requirement, ResourceOperation};
+use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_proto::types::{Resource, WorldUpdate};
 use ratn_worker::client::retry_unanswered;
@@ -36,6 +37,7 @@ use std::borrow::Cow;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+use std::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 /// So many withdrawals of before are under way at once.
@@ -140,8 +142,8 @@ impl Performer {
         Ok(Some(Event::SessionLost { held_until }))
     }
 
-    /// Takes up everything that is open, in the order in which it was decided. What the executive is to be told: that all of it is so in a new
-    /// session, and what has changed from outside meanwhile.
+    /// Takes up everything that is open, in the order in which it was decided; `now` is the time of the run. What the executive is to be told: that all
+    /// of it is so in a new session, and what has changed from outside meanwhile.
     ///
     /// # Errors
     /// Where the run cannot go on.
@@ -150,8 +152,9 @@ impl Performer {
         program: &Arc<Program>,
         mut ledger: Ledger,
         mirror: &World,
+        now: Timestamp,
     ) -> anyhow::Result<Vec<Event>> {
-        let (missing, revision, facts) = self.commit_again(program, &ledger).await?;
+        let (missing, revision, facts) = self.commit_again(program, &ledger, now).await?;
         let mut root = World::from_facts(facts, revision);
         for decided in &missing.behind {
             // What cannot be made of what others have left there is refused when it is its turn.
@@ -192,7 +195,7 @@ impl Performer {
     }
 
     /// Does what a run that has ended had decided and may not have done: its commits, and its operations. Where its session has ended these are what
-    /// takes away: what it had created is gone with that. So many of each.
+    /// takes away: what it had created is gone with that. So many of each. `now` is the time of the run.
     ///
     /// # Errors
     /// Where the commits cannot be made.
@@ -200,8 +203,9 @@ impl Performer {
         &mut self,
         program: &Arc<Program>,
         mut ledger: Ledger,
+        now: Timestamp,
     ) -> anyhow::Result<(usize, usize)> {
-        let (missing, ..) = self.commit_again(program, &ledger).await?;
+        let (missing, ..) = self.commit_again(program, &ledger, now).await?;
         let commits = missing.made + missing.behind.len();
         if !self.is_own {
             let removed = self.remove_again(&ledger, &ledger.created()).await?;
@@ -222,18 +226,22 @@ impl Performer {
         &mut self,
         program: &Arc<Program>,
         ledger: &Ledger,
+        now: Timestamp,
     ) -> anyhow::Result<(Missing, Revision, Vec<(FactKey, Value)>)> {
         (self.acquires, self.operations, self.resumptions) = (ledger.acquires, ledger.operations, ledger.resumptions);
         let (seen, _) = retry_unanswered(|| self.world.root()).await?;
         let mut root = seen;
         let there = self.commits_there(ledger, root).await?;
+        if self.is_own {
+            self.knows_what_went_back(ledger, there, now);
+        }
         self.refuse_what_came_between(program, &ledger.commits[there..], root).await?;
         let first = ledger.open_operations().next().map_or(u64::MAX, |(number, ..)| *number);
         let (missing, mut made) = (&ledger.commits[there..], 0);
         for decided in missing.iter().take_while(|decided| decided.behind < first) {
-            let untouched = decided.began.held_until.map(|_| Untouched::behind(program, &self.run, seen));
+            let untouched = self.untouched(program, decided, seen);
             let commit = decided.clone().commit(&self.run);
-            match commit_next(&self.world, &self.trust, root, commit, untouched).await {
+            match commit_next(&self.world, &self.trust, root, commit, Some(untouched)).await {
                 Ok(revision) => root = revision,
                 Err(Undone::Overtaken(overtaken)) => return refuse(&decided.writer, &overtaken),
                 Err(undone) => bail!("the world pool does not take what the run had decided: {undone}"),
@@ -241,10 +249,10 @@ impl Performer {
             made += 1;
         }
         let (revision, facts) = self.root().await?;
-        if let Some(since) = ledger.lost().map(|(_, behind)| behind).min() {
+        if let Some(since) = ledger.beginnings.others_count() {
             // What ended well meanwhile, and was not heard of, is to stand the same test.
             let changed = self.changed_by_others(since, revision).await?;
-            self.came_between = CameBetween::new(program, &self.run, ledger, changed);
+            self.came_between = Some(CameBetween::new(program, &self.run, ledger, changed));
         }
         let commit = ledger.commits[..there + made].last().map(|decided| decided.revision).unwrap_or_default();
         // All of it is in the root that was read.
@@ -254,6 +262,24 @@ impl Performer {
         let operation = if self.is_own { ledger.recorded } else { 0 };
         self.confirm(Confirmed { commit, operation, failed: None });
         Ok((Missing { made, behind: missing[made..].to_vec(), seen }, revision, facts))
+    }
+
+    /// What the run had given back while commits were on their way that are not there yet, and how long ago.
+    fn knows_what_went_back(&self, ledger: &Ledger, there: usize, now: Timestamp) {
+        let made = ledger.commits[..there].last().map(|decided| decided.revision).unwrap_or_default();
+        for WentBack { decided, at, .. } in &ledger.went_back {
+            let ago = now.since(*at).div_f64(self.speed);
+            self.left.went_back(*decided, made, ago);
+        }
+    }
+
+    /// Under which condition a commit of before is made, against which nothing stands up to a revision: others have not changed the same since, where the
+    /// run has lost what it held; where it has not, they have not since it was decided, as soon as nobody waits for it any more.
+    fn untouched(&self, program: &Arc<Program>, decided: &Decided, seen: Revision) -> Untouched {
+        match decided.began.held_until {
+            Some(_) => Untouched::behind(program, &self.run, seen),
+            None => Untouched::behind(program, &self.run, decided.knew).when_late(&self.left, decided.revision),
+        }
     }
 
     /// Tells goals to stop that may not have heard of it.
@@ -266,32 +292,34 @@ impl Performer {
     /// Does the operations that may not be done, under their ids, where the session is the run's; and the commits behind them, all in the order in
     /// which they were decided. How many operations.
     fn go_on_recording(&mut self, program: &Arc<Program>, ledger: &Ledger, missing: Missing) -> anyhow::Result<usize> {
-        let (run, seen) = (self.run.clone(), missing.seen);
-        let untouched = |decided: &Decided| decided.began.held_until.map(|_| Untouched::behind(program, &run, seen));
+        let seen = missing.seen;
         let open: Vec<_> = if self.is_own { ledger.open_operations().cloned().collect() } else { Vec::new() };
         let (operations, mut behind) = (open.len(), missing.behind.into_iter().peekable());
         for (number, instance, operations) in open {
             while let Some(decided) = behind.next_if(|decided| decided.behind < number) {
-                let untouched = untouched(&decided);
-                self.commit(decided, untouched, None)?;
+                let untouched = self.untouched(program, &decided, seen);
+                self.commit(decided, Some(untouched), None)?;
             }
             self.operate(instance, number, operations, None)?;
         }
         behind.try_for_each(|decided| {
-            let untouched = untouched(&decided);
-            self.commit(decided, untouched, None)
+            let untouched = self.untouched(program, &decided, seen);
+            self.commit(decided, Some(untouched), None)
         })?;
         Ok(operations)
     }
 
-    /// Of what was lost before it was committed: where others have changed since what that changes or is made of, it is not true any more.
+    /// Of what was lost before it was committed, and of what nobody waits for any more: where others have changed since what that changes or is made of,
+    /// it is not true any more.
     async fn refuse_what_came_between(
         &self,
         program: &Program,
         missing: &[Decided],
         root: Revision,
     ) -> anyhow::Result<()> {
-        let lost = || missing.iter().filter_map(|decided| Some((decided, decided.began.others_count()?)));
+        let late = |decided: &Decided| self.left.is_late(decided.revision).then_some(decided.knew);
+        let behind = |decided: &Decided| decided.began.others_count().or_else(|| late(decided));
+        let lost = || missing.iter().filter_map(|decided| Some((decided, behind(decided)?)));
         let Some(since) = lost().map(|(_, behind)| behind).min() else { return Ok(()) };
         let changed = self.changed_by_others(since, root).await?;
         let overtaken = lost().find_map(|(decided, behind)| {
@@ -350,6 +378,7 @@ impl Performer {
         for lease in known {
             let (resources, trust) = (self.resources.clone(), self.trust.clone());
             let note = self.told.left(self.decided).to_string();
+            self.left.goes_back(self.decided, self.confirmed().commit, Instant::now());
             let (idle, returns) = (self.stopping.under(lease), self.order.returning.begin());
             self.giving_back.spawn(async move {
                 for goal in idle {

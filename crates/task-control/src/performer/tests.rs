@@ -7,10 +7,10 @@ use crate::task_for_tests::{FETCH_BOXES, program};
 use anyhow::Context;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
-use ratn_executive::protocol::{Origin, Unmade};
+use ratn_executive::protocol::{Learned, Mode, Natures, Origin, Unmade};
 use ratn_model::catalogue::Provider;
 use ratn_model::fact::{Change, Footprint};
-use ratn_model::id::{FencingToken, ProjectionId};
+use ratn_model::id::{FencingToken, ProjectionId, StateId};
 use ratn_model::program::SUCCESS;
 use ratn_model::resource::{Lease, ResourceClass};
 use ratn_model::time::Timestamp;
@@ -185,13 +185,15 @@ impl Bench {
     /// Takes up what its log says, as a resumption does: that it has lost what it held is in the log before.
     async fn takes_up(&mut self, mut ledger: Ledger, mirror: &World) -> anyhow::Result<Vec<Event>> {
         self.loses(&mut ledger).await?;
-        self.performer.take_up(&fetch_boxes(), ledger, mirror).await
+        let now = ledger.last;
+        self.performer.take_up(&fetch_boxes(), ledger, mirror, now).await
     }
 
     /// Does what a run that has ended had decided.
     async fn finishes(&mut self, mut ledger: Ledger) -> anyhow::Result<(usize, usize)> {
         self.loses(&mut ledger).await?;
-        self.performer.finish(&fetch_boxes(), ledger).await
+        let now = ledger.last;
+        self.performer.finish(&fetch_boxes(), ledger, now).await
     }
 
     async fn loses(&self, ledger: &mut Ledger) -> anyhow::Result<()> {
@@ -1357,6 +1359,90 @@ async fn what_others_change_when_a_run_has_come_back_stands_against_what_it_bega
     bench.performer.closed().await
 }
 
+/// What a composite state changes when it is left, as HSM mode commits it.
+fn leaves(path: &str, number: u64) -> Command {
+    let (instance, evidence, revision) = (InstanceId(0), Vec::new(), Revision(number));
+    Command::Commit { instance, writer: path.to_owned(), changes: done(), evidence, revision }
+}
+
+#[tokio::test]
+async fn what_others_change_stands_against_the_effects_of_a_composite_state_whose_parts_began_before()
+-> anyhow::Result<()> {
+    let note = |instance: u64, path: &str| {
+        let (instance, state, path) = (InstanceId(instance), StateId(1), path.to_owned());
+        Command::Note(Note::Expanded { instance, state, path, speculative: false })
+    };
+    let running = |instance: u64| Command::Note(Note::Running { instance: InstanceId(instance), attempt: 1 });
+    let begun = [
+        note(1, "part/move"),
+        start(InstanceId(1), 1, "work", LeaseId(1), ""),
+        note(2, "routine"),
+        running(2),
+        note(3, "routine/move"),
+        start(InstanceId(3), 1, "work", LeaseId(1), ""),
+    ];
+    let (part, routine) = (leaves("part", 2), leaves("routine", 2));
+    // The run had decided before it was killed, or decides when it has been taken up; a part may begin anew in between.
+    for (by_another, again, left, is_made) in [
+        ("other", None, None, true),
+        ("done", None, None, false),
+        ("other", None, Some(&part), true),
+        ("done", None, Some(&part), false),
+        ("done", Some(1), Some(&part), true),
+        ("other", None, Some(&routine), true),
+        ("done", None, Some(&routine), false),
+        ("done", Some(3), Some(&routine), false),
+    ] {
+        let bench = Bench::new().await?;
+        let run = bench.performer.run.clone();
+        let mut ledger = Ledger { session: bench.performer.number, ..Ledger::default() };
+        ledger.origin.run = run;
+        let natures = Natures { changes_at_exit: vec!["part".into(), "routine".into()], ..Natures::default() };
+        let origin = Box::new(Origin { natures, ..ledger.origin.clone() });
+        ledger.event(Timestamp(0), &started(origin));
+        begun.iter().for_each(|command| ledger.command(command));
+        bench.performer.world.commit("other/i1/1", by_others(by_another), None).await?;
+        // It hears of that during its motion.
+        let heard = Event::WorldChanged { revision: Revision(1), facts: Vec::new() };
+        ledger.event(Timestamp(0), &heard);
+        if left.is_none() {
+            ledger.command(&part);
+        }
+        let mut bench = bench.comes_back(false).await?;
+        let mut done = bench.takes_up(ledger, &World::default()).await.map(|_| ());
+        if let Some(instance) = again {
+            let held = Event::Granted {
+                instance: InstanceId(instance),
+                lease: Lease { id: LeaseId(2), token: FencingToken(0), resources: Vec::new() },
+            };
+            bench.performer.accept(held.into(), &World::default());
+            bench.performer.perform(start(InstanceId(instance), 2, "work", LeaseId(2), ""))?;
+        }
+        if let Some(left) = left {
+            done = bench.performer.perform(left.clone());
+        }
+        let case = format!("by another: {by_another}, again: {again:?}, {left:?}, {done:?}");
+        assert_eq!((done.is_ok(), is_refused(done)), (is_made, !is_made), "{case}");
+    }
+    Ok(())
+}
+
+fn started(origin: Box<Origin>) -> Event {
+    Event::Started {
+        task: String::new(),
+        digest: String::new(),
+        mode: Mode::Hsm,
+        parameters: BTreeMap::new(),
+        seed: 0,
+        world: Vec::new(),
+        revision: Revision(0),
+        capacity: BTreeMap::new(),
+        learned: Learned::default(),
+        breakpoints: Box::default(),
+        origin,
+    }
+}
+
 /// A run that was killed during two motions and has lost its session; others have changed what the first motion changes. It was taken up once, and
 /// has committed since what the second one led to. Its log, and the number of the session that it has now.
 async fn taken_up_once() -> anyhow::Result<(Bench, Ledger, u64)> {
@@ -1367,7 +1453,7 @@ async fn taken_up_once() -> anyhow::Result<(Bench, Ledger, u64)> {
     bench.performer.world.commit("other/i1/1", by_others("done"), None).await?;
     let mut bench = bench.comes_back(false).await?;
     bench.loses(&mut ledger).await?;
-    let told = bench.performer.take_up(&fetch_boxes(), ledger.clone(), &World::default()).await?;
+    let told = bench.performer.take_up(&fetch_boxes(), ledger.clone(), &World::default(), Timestamp(0)).await?;
     told.iter().for_each(|event| ledger.event(Timestamp(0), event));
     let again = start(InstanceId(2), 2, "work", LeaseId(2), "");
     for command in [again, commits_what(2, 2, by_others("tidy"))] {
@@ -1481,6 +1567,103 @@ async fn a_commit_that_others_do_not_wait_for_any_more_is_made_where_they_have_n
     Ok(())
 }
 
+/// A run that has heard of what others had made up to then, has decided a commit, and has given back behind it what that was made with; so long
+/// later others have changed a fact. It is killed, and its session lives.
+async fn gave_back_and_was_killed(
+    behind: &[Command],
+    passed: Duration,
+    by_another: &str,
+) -> anyhow::Result<(Bench, Ledger)> {
+    let mut bench = Bench::new().await?;
+    let (run, instance) = (bench.performer.run.clone(), InstanceId(1));
+    bench.performer.world.commit("other/i1/1", by_others("done"), None).await?;
+    bench.ask(instance)?;
+    let lease = bench.granted(instance).await?;
+    let mut ledger = Ledger { session: bench.performer.number, ..ledger(&run, &[]) };
+    let held = Lease { id: lease, token: FencingToken(0), resources: Vec::new() };
+    ledger.event(Timestamp(0), &Event::Granted { instance, lease: held });
+    let facts = vec![(FactKey { predicate: "done".to_owned(), arguments: Vec::new() }, Some(Value::Int(7)))];
+    ledger.event(Timestamp(0), &Event::WorldChanged { revision: Revision(1), facts });
+    behind.iter().for_each(|command| ledger.command(command));
+    let release = Command::Release { instance, lease: Some(lease), projection: None };
+    for command in [commits(1, 2), release.clone()] {
+        ledger.command(&command);
+    }
+    bench.performer.perform(release)?;
+    while !living(&bench).await?.is_empty() {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    bench.performer.world.commit("other/i1/2", by_others(by_another), None).await?;
+    let mut bench = bench.comes_back(true).await?;
+    bench.performer.speed = 10.0;
+    let event = Event::Resumed { share: None };
+    ledger.event(Timestamp::from_seconds(passed.as_secs_f64() * 10.0), &event);
+    Ok((bench, ledger))
+}
+
+/// What is held of the arm.
+async fn living(bench: &Bench) -> anyhow::Result<Vec<LeaseId>> {
+    let arms = bench.performer.resources.list(&["Arm"]).await?;
+    Ok(arms.iter().flat_map(|arm| &arm.holdings).map(|holding| holding.lease).collect())
+}
+
+#[tokio::test]
+async fn a_commit_that_was_on_its_way_for_long_is_made_by_who_comes_back_where_others_have_not_changed_what_it_is_made_of()
+-> anyhow::Result<()> {
+    let (soon, late) = (told::PENDING_PATIENCE / 2, told::PENDING_PATIENCE + Duration::from_secs(1));
+    for (passed, by_another, is_made) in [(soon, "done", true), (late, "other", true), (late, "done", false)] {
+        for ends in [false, true] {
+            let (mut bench, ledger) = gave_back_and_was_killed(&[], passed, by_another).await?;
+            assert!(bench.performer.is_own);
+            let done = if ends {
+                bench.finishes(ledger).await.map(|_| ())
+            } else {
+                bench.takes_up(ledger, &World::default()).await.map(|_| ())
+            };
+            let case = format!("{passed:?}, by another: {by_another}, ends: {ends}, {done:?}");
+            assert_eq!((done.is_ok(), is_refused(done)), (is_made, !is_made), "{case}");
+            assert_eq!(bench.performer.world.root().await?.0, Revision(if is_made { 3 } else { 2 }), "{case}");
+        }
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn what_was_not_late_when_its_run_was_taken_up_is_refused_where_it_is_when_its_turn_comes() -> anyhow::Result<()>
+{
+    // It is behind an operation.
+    let before = [operate(9, create("Box", 1))];
+    for (goes_late, is_made) in [(false, true), (true, false)] {
+        let (mut bench, ledger) = gave_back_and_was_killed(&before, Duration::ZERO, "done").await?;
+        bench.takes_up(ledger, &World::default()).await?;
+        if goes_late {
+            bench.performer.left.all_is_late();
+        }
+        let closed = bench.performer.closed().await;
+        assert_eq!(closed.is_ok(), is_made, "{closed:?}");
+        assert!(is_made || is_refused(closed));
+    }
+    Ok(())
+}
+
+#[test]
+fn what_was_handed_over_did_not_go_back() {
+    let mut ledger = Ledger::default();
+    let lease = |id: u64| Lease { id: LeaseId(id), token: FencingToken(id), resources: Vec::new() };
+    for id in [7, 8] {
+        ledger.event(Timestamp(0), &Event::Granted { instance: InstanceId(id), lease: lease(id) });
+    }
+    ledger.command(&commits(1, 2));
+    for id in [7, 8] {
+        let release = Command::Release { instance: InstanceId(id), lease: Some(LeaseId(id)), projection: None };
+        ledger.command(&release);
+    }
+    ledger.event(Timestamp(0), &Event::Granted { instance: InstanceId(3), lease: lease(7) });
+    assert_eq!(ledger.went_back.iter().map(|one| one.lease).collect::<Vec<_>>(), [LeaseId(8)]);
+    ledger.forget(Confirmed { commit: Revision(2), ..Confirmed::default() });
+    assert!(ledger.went_back.is_empty(), "nobody waits for what is there");
+}
+
 #[tokio::test]
 async fn a_commit_is_refused_where_the_world_pool_does_not_go_back_to_where_its_run_had_what_it_held()
 -> anyhow::Result<()> {
@@ -1558,7 +1741,7 @@ async fn behind_what_had_failed_nothing_is_made_by_who_comes_back() -> anyhow::R
     assert_eq!((missing_commits(&place, &ledger).await?, ledger.open_operations().count()), (Some(0), 0));
     let (events, _answers) = mpsc::channel(8);
     let mut late = connect_as(&bench.endpoints, &run, None, "task", events).await?;
-    assert_eq!(late.finish(&fetch_boxes(), ledger).await?, (0, 0));
+    assert_eq!(late.finish(&fetch_boxes(), ledger, Timestamp(0)).await?, (0, 0));
     assert_eq!(late.root().await?.0, Revision(1));
     late.closed().await?;
     bench.performer.closed().await
@@ -1636,7 +1819,7 @@ async fn of_a_run_that_has_ended_what_was_not_recorded_is_made_and_nothing_else(
     // Its session is over, and with it what it had created.
     let (events, _answers) = mpsc::channel(1);
     let mut late = connect_as(&bench.endpoints, &run, Some(session), "task", events).await?;
-    assert_eq!(late.finish(&fetch_boxes(), ledger.clone()).await?, (0, 0));
+    assert_eq!(late.finish(&fetch_boxes(), ledger.clone(), Timestamp(0)).await?, (0, 0));
     assert!(late.resources.list(&["Box"]).await?.is_empty());
     late.closed().await?;
     let other = Ledger { first_revision: Revision(9), ..ledger };
@@ -1978,6 +2161,7 @@ async fn a_projection_behind_a_commit_that_waits_for_the_disk_leaves_with_it_and
         evidence: Vec::new(),
         revision: Revision(1),
         began: Began::default(),
+        knew: Revision::default(),
         behind: 0,
     };
     records.send(Record::Commit { decided, untouched: None, safe: Some(slow) }).await?;

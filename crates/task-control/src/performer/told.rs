@@ -352,6 +352,7 @@ mod tests {
             evidence: Vec::new(),
             revision: Revision(12),
             began: Began::default(),
+            knew: Revision::default(),
             behind: 0,
         };
         assert_eq!(maker(&decided.id("run-1")), Some(("run-1".to_owned(), Revision(12))));

@@ -155,7 +155,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         }
         shell.log.make_durable()?;
         shell.performer.know(shell.progress.paths());
-        let told = shell.performer.take_up(&Arc::clone(&shell.program), ledger, &mirror).await?;
+        let told = shell.performer.take_up(&Arc::clone(&shell.program), ledger, &mirror, now).await?;
         // Commits are there by now.
         let missing = missing.into_iter().filter(|command| !matches!(command, Command::Commit { .. }));
         let mut ended = shell.perform(now, missing.chain(commands), None)?;
@@ -202,7 +202,8 @@ async fn finish(resumption: Resumption, ended: Ended, place: &Place) -> anyhow::
         log.make_durable()?;
         ledger.event(at, &lost);
     }
-    let finished = performer.finish(&program, ledger).await;
+    let now = replay::now(&ledger, unix_ms(), place.speed);
+    let finished = performer.finish(&program, ledger, now).await;
     let (done, closed) = performer.close().await;
     done.iter().try_for_each(|event| log.append(at, event, &[]))?;
     let (commits, operations) = finished?;

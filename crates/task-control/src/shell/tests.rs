@@ -303,6 +303,51 @@ states:
 }
 
 #[tokio::test]
+async fn what_is_due_when_a_resumption_says_that_the_session_is_lost_is_done() -> anyhow::Result<()> {
+    const MOMENTS: &str = "
+task: moments
+states:
+  - first: { wait: { seconds: 100 } }
+  - second: { effects: [noted(desk)], states: [{ moment: { wait: { seconds: 1 } } }] }
+  - third: { wait: { seconds: 1 } }
+";
+    let bench = Bench::new(|moments| *moments = program(MOMENTS)).await?;
+    let (_asks, interrupt) = Interrupt::new();
+    tokio::select! {
+        ended = run(bench.run.clone(), &bench.place, &interrupt) => panic!("it ended: {ended:?}"),
+        () = waits(&bench.place, "first") => {}
+    }
+    // A resource manager that has never heard of its session.
+    let runtime = RuntimeDirectory::create(bench.directory.path().join("other"))?;
+    let shutdown = CancellationToken::new();
+    tokio::spawn(resource_manager::run(ResourceManagerConfig::default(), runtime.clone(), shutdown.clone()));
+    let _shutdown = shutdown.drop_guard();
+    let resource_manager = runtime.wait_for(resource_manager::ROLE, READY).await?;
+    let endpoints = Endpoints { resource_manager, ..bench.place.endpoints.clone() };
+    // While the world pool is asked what it has of the run, many of these seconds pass.
+    let place = &Place { endpoints, speed: 1e5, ..bench.place.clone() };
+    let resumed = Box::pin(resume(resumption_of(&bench.run).await?, place, &interrupt));
+    let resumed = tokio::time::timeout(READY, resumed).await;
+    let lines = bench.lines()?;
+    let is_lost = |line: &LogLine| matches!(line.entry, LogEntry::Event(Event::SessionLost { .. }));
+    let behind = lines.iter().skip_while(|line| !is_lost(line)).skip(1);
+    let commands = behind.map_while(|line| match &line.entry {
+        LogEntry::Command(command) => Some(command),
+        LogEntry::Event(_) => None,
+    });
+    assert!(
+        commands.into_iter().any(|command| matches!(command, Command::Commit { .. })),
+        "nothing became due meanwhile"
+    );
+    assert_eq!(resumed.context("it waits for a timer that nobody has set")??.outcome, SUCCESS);
+    let channels = ratn_worker::client::Channels::new(&place.tls);
+    let world = ratn_worker::client::WorldClient::new(&channels, &place.endpoints.world_pool)?;
+    let (_, facts) = world.root().await?;
+    assert_eq!(facts.iter().map(|fact| fact.key.to_string()).collect::<Vec<_>>(), ["noted(desk)"]);
+    Ok(())
+}
+
+#[tokio::test]
 async fn a_run_that_waits_has_what_it_was_sent_also_after_it_was_killed() -> anyhow::Result<()> {
     let mut bench = Bench::new(|waiting| *waiting = program(WAITING)).await?;
     bench.run.checkpoint_every = 1;

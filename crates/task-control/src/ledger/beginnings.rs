@@ -1,0 +1,403 @@
+//! With what a run has begun what it commits: how much of what others had made it knew then, and whether it has lost since what it held. A pure
+//! fold, of the log in the ledger, and of the commands of a run that came back.
+//!
+//! ```text
+//! an action           counts from when it was granted what it holds, or its last goal was given
+//! a routine           from when it began: what it holds it holds to its end
+//! another composite   from when the first of its parts began; where what that held is lost, from when the first one began since
+//! anything else       from now: it holds nothing
+//! ```
+//!
+//! Only composite states are followed that change the world when they are left. They have no instances that the log tells of, but for routines: they
+//! are known by their paths, as their commits name them. A routine inside of a routine is part of that, and counts as any other composite state.
+
+use ratn_event_log::without_visits;
+use ratn_executive::protocol::{Command, Event, Note};
+use ratn_model::id::{InstanceId, Revision};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// So many composite states are followed that have not been left; of more the one that began first is forgotten. One that is left by an outcome for
+/// which it declares no effects stays until then.
+const MOST_ENTERED: usize = 1024;
+
+/// A beginning.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Began {
+    /// The revision of the root that the run had heard of then.
+    pub(crate) knows: Revision,
+    /// Up to this revision it held what it works with, where the run has lost that since; where it has not, nobody else changes what it changes.
+    pub(crate) held_until: Option<Revision>,
+}
+
+impl Began {
+    /// Behind which revision others' changes count, where they do: what the run had heard of, it knew, and what they changed while it held what it
+    /// worked with, they did not change with that.
+    pub(crate) fn others_count(&self) -> Option<Revision> {
+        self.held_until.map(|held| held.max(self.knows))
+    }
+}
+
+/// A composite state that has begun, and has not been left.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Entered {
+    began: Began,
+    /// The instance of a routine.
+    routine: Option<InstanceId>,
+    /// Its parts that have begun and not come to their ends.
+    parts: BTreeSet<InstanceId>,
+    /// Whether the result of a part is real. Until one is, the state may only be expected.
+    is_real: bool,
+}
+
+/// Where an instance is among the composite states that are followed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Inside {
+    /// The innermost first, by path.
+    states: Vec<String>,
+    /// Whether the first of them is its own: it is a routine's.
+    is_routine: bool,
+}
+
+/// What has begun and has not come to its end.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Beginnings {
+    /// Paths (without visits) of the composite states that change the world when they are left.
+    composites: Vec<String>,
+    instances: BTreeMap<InstanceId, Began>,
+    /// By path.
+    entered: BTreeMap<String, Entered>,
+    /// The instances in such states.
+    inside: BTreeMap<InstanceId, Inside>,
+}
+
+impl Beginnings {
+    /// An event of a run that knows of this revision.
+    pub(crate) fn event(&mut self, event: &Event, knows: Revision) {
+        match event {
+            Event::Started { origin, .. } => self.composites.clone_from(&origin.natures.changes_at_exit),
+            Event::Granted { instance, .. } => self.begins(*instance, knows),
+            Event::SessionLost { held_until } => self.lose(*held_until),
+            _ => {}
+        }
+    }
+
+    /// A command of a run that knows of this revision. [`Beginnings::of`] says what a commit is made of before that is followed.
+    pub(crate) fn command(&mut self, command: &Command, knows: Revision) {
+        match command {
+            Command::Start { instance, .. } => self.begins(*instance, knows),
+            Command::Commit { writer, .. } => drop(self.entered.remove(writer)),
+            Command::Note(Note::Expanded { instance, path, .. }) => {
+                let inside = self.inside_of(path);
+                if !inside.states.is_empty() {
+                    self.inside.insert(*instance, inside);
+                }
+            }
+            Command::Note(Note::Running { instance, .. }) => self.routine_begins(*instance, knows),
+            Command::Note(Note::Retired { instance }) => self.ends(*instance, true),
+            Command::Note(Note::Squashed { instance } | Note::Merged { instance }) => self.ends(*instance, false),
+            _ => {}
+        }
+    }
+
+    /// The beginning of what a commit is made of; `None` where nothing of that is known to have begun.
+    pub(crate) fn of(&self, instance: InstanceId, writer: &str) -> Option<Began> {
+        let composite = self.entered.get(writer).map(|entered| entered.began);
+        composite.or_else(|| self.instances.get(&instance).copied())
+    }
+
+    /// Behind which revision others' changes count at the earliest, where anything is under way that has lost what it held.
+    pub(crate) fn others_count(&self) -> Option<Revision> {
+        let composites = self.entered.values().map(|entered| &entered.began);
+        self.instances.values().chain(composites).filter_map(Began::others_count).min()
+    }
+
+    /// Whether nothing is under way.
+    #[cfg(test)]
+    pub(crate) fn is_empty(&self) -> bool {
+        self.instances.is_empty() && self.entered.is_empty() && self.inside.is_empty()
+    }
+
+    /// It works from now on with what the run holds.
+    fn begins(&mut self, instance: InstanceId, knows: Revision) {
+        let began = Began { knows, held_until: None };
+        self.instances.insert(instance, began);
+        self.enters(instance, 0, began);
+    }
+
+    /// An instance begins a routine: that is made of what it knows now, whatever its parts begin with.
+    fn routine_begins(&mut self, instance: InstanceId, knows: Revision) {
+        let Some(inside) = self.inside.get(&instance).filter(|inside| inside.is_routine) else { return };
+        let began = Began { knows, held_until: None };
+        let routine = Entered { began, routine: Some(instance), parts: BTreeSet::new(), is_real: false };
+        self.entered.insert(inside.states[0].clone(), routine);
+        self.enters(instance, 1, began);
+    }
+
+    /// What an instance begins, the states around it have begun, from so many of the innermost on.
+    fn enters(&mut self, instance: InstanceId, from: usize, began: Began) {
+        let Some(inside) = self.inside.get(&instance) else { return };
+        for path in inside.states.iter().skip(from) {
+            let new = || Entered { began, routine: None, parts: BTreeSet::new(), is_real: false };
+            let entered = self.entered.entry(path.clone()).or_insert_with(new);
+            entered.parts.insert(instance);
+            if entered.began.held_until.is_some() && entered.routine.is_none() {
+                entered.began = began;
+            }
+        }
+        if self.entered.len() > MOST_ENTERED
+            && let Some(first) = self.entered.iter().min_by_key(|(_, entered)| entered.began.knows)
+        {
+            let first = first.0.clone();
+            self.entered.remove(&first);
+        }
+    }
+
+    fn ends(&mut self, instance: InstanceId, is_real: bool) {
+        self.instances.remove(&instance);
+        let Some(inside) = self.inside.remove(&instance) else { return };
+        for path in inside.states {
+            let Some(entered) = self.entered.get_mut(&path) else { continue };
+            entered.parts.remove(&instance);
+            entered.is_real |= is_real;
+            let was_expected_only = entered.parts.is_empty() && !entered.is_real;
+            if entered.routine.map_or(was_expected_only, |routine| routine == instance) {
+                self.entered.remove(&path);
+            }
+        }
+    }
+
+    /// What the run held is gone. Of what was lost before, others' changes count since then.
+    fn lose(&mut self, held_until: Revision) {
+        let composites = self.entered.values_mut().map(|entered| &mut entered.began);
+        for began in self.instances.values_mut().chain(composites) {
+            began.held_until.get_or_insert(held_until);
+        }
+    }
+
+    /// Which composite states are around an instance of this path.
+    fn inside_of(&self, path: &str) -> Inside {
+        let is_followed = |path: &&str| {
+            let state = without_visits(path);
+            self.composites.contains(&state)
+        };
+        let own = Some(path).filter(is_followed);
+        let around = path.rmatch_indices('/').map(|(at, _)| without_iteration(&path[..at]));
+        let root = Some("").filter(|root| *root != path);
+        let states: Vec<String> =
+            own.into_iter().chain(around.chain(root).filter(is_followed)).map(str::to_owned).collect();
+        Inside { states, is_routine: own.is_some() }
+    }
+}
+
+/// The path of a state, by that of what its list is in: of a loop that has the number of the iteration.
+fn without_iteration(path: &str) -> &str {
+    let number = path.strip_suffix(']').and_then(|path| path.rsplit_once('['));
+    number.map_or(path, |(state, _)| state)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+    use super::*;
+    use crate::ledger::Ledger;
+    use crate::replay;
+    use crate::shell::changes_at_exit;
+    use ratn_executive::protocol::{LogEntry, LogLine, Mode, Natures, Origin};
+    use ratn_model::fact::Change;
+    use ratn_model::id::{FencingToken, LeaseId, StateId};
+    use ratn_model::resource::Lease;
+
+    /// A run that follows these states, and knows more with each step.
+    struct Bench {
+        beginnings: Beginnings,
+        knows: u64,
+    }
+
+    impl Bench {
+        fn new(composites: &[&str]) -> Bench {
+            let composites = composites.iter().map(|path| (*path).to_owned()).collect();
+            Bench { beginnings: Beginnings { composites, ..Beginnings::default() }, knows: 0 }
+        }
+
+        fn command(&mut self, command: Command) {
+            self.knows += 1;
+            self.beginnings.command(&command, Revision(self.knows));
+        }
+
+        fn expanded(&mut self, instance: u64, path: &str) {
+            let (instance, state, path) = (InstanceId(instance), StateId(1), path.to_owned());
+            self.command(Command::Note(Note::Expanded { instance, state, path, speculative: true }));
+        }
+
+        fn granted(&mut self, instance: u64) {
+            self.knows += 1;
+            let lease = Lease { id: LeaseId(1), token: FencingToken(1), resources: Vec::new() };
+            self.beginnings.event(&Event::Granted { instance: InstanceId(instance), lease }, Revision(self.knows));
+        }
+
+        fn begins(&mut self, instance: u64, path: &str) -> u64 {
+            self.expanded(instance, path);
+            self.granted(instance);
+            self.knows
+        }
+
+        fn note(&mut self, note: impl FnOnce(InstanceId) -> Note, instance: u64) {
+            self.command(Command::Note(note(InstanceId(instance))));
+        }
+
+        fn retired(&mut self, instance: u64) {
+            self.note(|instance| Note::Retired { instance }, instance);
+        }
+
+        fn squashed(&mut self, instance: u64) {
+            self.note(|instance| Note::Squashed { instance }, instance);
+        }
+
+        fn running(&mut self, instance: u64) -> u64 {
+            self.note(|instance| Note::Running { instance, attempt: 1 }, instance);
+            self.knows
+        }
+
+        fn loses(&mut self) {
+            self.beginnings.event(&Event::SessionLost { held_until: Revision(0) }, Revision(self.knows));
+        }
+
+        /// What a commit of a composite state knows, and whether that is lost.
+        fn of(&self, writer: &str) -> Option<(u64, bool)> {
+            let began = self.beginnings.of(InstanceId(0), writer)?;
+            Some((began.knows.0, began.held_until.is_some()))
+        }
+
+        fn commits(&mut self, writer: &str) {
+            let (instance, changes, evidence) = (InstanceId(0), Vec::<Change>::new(), Vec::new());
+            let revision = Revision(1);
+            self.command(Command::Commit { instance, writer: writer.to_owned(), changes, evidence, revision });
+        }
+    }
+
+    #[test]
+    fn a_composite_state_counts_from_the_beginning_of_its_first_part_until_it_is_left() {
+        let mut bench = Bench::new(&["part", "loop", "loop/inner", ""]);
+        let first = bench.begins(1, "part#2/move");
+        bench.retired(1);
+        bench.begins(2, "part#2/again");
+        bench.retired(2);
+        let second = bench.begins(3, "loop[1]/inner/move");
+        bench.begins(4, "loop[12]/inner/move");
+        assert_eq!([bench.of("part#2"), bench.of("part")], [Some((first, false)), None]);
+        assert_eq!([bench.of("loop"), bench.of("loop[1]/inner")], [Some((second, false)); 2]);
+        assert_eq!(bench.of(""), Some((first, false)), "the task itself");
+        bench.retired(3);
+        bench.retired(4);
+        for left in ["part#2", "loop[1]/inner", "loop[12]/inner", "loop", ""] {
+            bench.commits(left);
+        }
+        assert!(bench.beginnings.is_empty());
+    }
+
+    #[test]
+    fn what_was_only_expected_has_not_begun() {
+        let mut bench = Bench::new(&["part"]);
+        bench.begins(1, "part/move");
+        bench.begins(2, "part/other");
+        bench.squashed(1);
+        assert!(bench.of("part").is_some(), "a part of it goes on");
+        bench.squashed(2);
+        assert!(bench.beginnings.is_empty());
+        bench.begins(3, "part/move");
+        bench.begins(4, "part/other");
+        bench.retired(3);
+        bench.squashed(4);
+        assert!(bench.of("part").is_some(), "it is real");
+    }
+
+    #[test]
+    fn of_what_is_lost_a_composite_state_counts_anew_when_a_part_begins_since_and_a_routine_does_not() {
+        let mut bench = Bench::new(&["part", "routine"]);
+        let part = bench.begins(1, "part/move");
+        bench.retired(1);
+        bench.begins(2, "routine");
+        let routine = bench.running(2);
+        bench.expanded(3, "routine/move");
+        bench.running(3);
+        bench.loses();
+        assert_eq!([bench.of("part"), bench.of("routine")], [Some((part, true)), Some((routine, true))]);
+        let anew = bench.begins(4, "part/again");
+        // The routine has what it needs anew, and one of its parts is tried again.
+        bench.granted(2);
+        bench.running(3);
+        assert_eq!([bench.of("part"), bench.of("routine")], [Some((anew, false)), Some((routine, true))]);
+        assert_eq!(bench.beginnings.others_count(), Some(Revision(routine)));
+        // What it had computed is not true any more: all of it is done anew.
+        let anew = bench.running(2);
+        assert_eq!(bench.of("routine"), Some((anew, false)));
+        bench.retired(2);
+        assert_eq!(bench.of("routine"), None, "it is left, whatever it has committed");
+    }
+
+    #[test]
+    fn composite_states_that_are_never_left_are_not_followed_for_ever() {
+        let mut bench = Bench::new(&["loop/part"]);
+        let total = 2 * MOST_ENTERED as u64;
+        for number in 1..=total {
+            bench.begins(number, &format!("loop[{number}]/part/move"));
+            bench.retired(number);
+        }
+        assert_eq!(bench.beginnings.entered.len(), MOST_ENTERED);
+        assert!(bench.of(&format!("loop[{total}]/part")).is_some(), "the first ones are forgotten");
+    }
+
+    const COMPOSITES: &str = r#"
+task: composites
+parameters: { boxes: { type: int, default: 3 } }
+states:
+  - turns:
+      effects: ["turns(table) = 3"]
+      states:
+        - loop:
+            for: turn in range(1, 4)
+            do:
+              - part:
+                  effects: ["seen(table) = turn"]
+                  states:
+                    - opens: { action: gripper/release, pia: true, effects: ["open(gripper) = turn"], resources: [{ block: Gripper }] }
+              - held:
+                  routine: true
+                  effects: ["held(table) = turn"]
+                  states:
+                    - opens: { action: gripper/release, pia: true, effects: [], resources: [{ block: Gripper }] }
+"#;
+
+    #[test]
+    fn in_both_modes_the_commit_of_a_composite_state_is_of_what_its_parts_began_with() {
+        let program = replay::tests::program(COMPOSITES);
+        for mode in [Mode::Hsm, Mode::Cdtn] {
+            let mut lines = replay::tests::log(&program, mode);
+            let LogEntry::Event(Event::Started { origin, .. }) = &mut lines[0].entry else { panic!("no start") };
+            let natures = Natures { changes_at_exit: changes_at_exit(&program), ..Natures::default() };
+            **origin = Origin { natures, ..(**origin).clone() };
+            let mut ledger = Ledger::default();
+            for (number, LogLine { at, entry }) in (1..).zip(&lines) {
+                match entry {
+                    LogEntry::Event(event) => {
+                        // Others change something all the time.
+                        let revision = Revision(number);
+                        ledger.event(*at, &Event::WorldChanged { revision, facts: Vec::new() });
+                        ledger.event(*at, event);
+                    }
+                    LogEntry::Command(command) => ledger.command(command),
+                }
+            }
+            let composites =
+                |writer: &str| ["turns", "turns/loop/part", "turns/loop/held"].contains(&&*without_visits(writer));
+            let of: Vec<_> = ledger.commits.iter().filter(|decided| composites(&decided.writer)).collect();
+            assert_eq!(of.len(), 7, "{mode:?}");
+            for decided in of {
+                assert!(decided.began.knows < decided.knew, "{mode:?}: {decided:?}");
+            }
+            assert!(ledger.beginnings.is_empty(), "{mode:?}: {:?}", ledger.beginnings);
+        }
+    }
+}
