@@ -1,6 +1,7 @@
 //! RRT-Connect: two trees, one from the start and one from the goals, each growing towards samples and then towards the other
 //! (Kuffner and LaValle, ICRA 2000), with the trees kept balanced (Kuffner and LaValle 2005) and nodes that only take samples
-//! near them once an extension failed (dynamic domain, Yershova et al., ICRA 2005), and make shorter motions now and then. A robot with several
+//! near them once an extension failed (dynamic domain, Yershova et al., ICRA 2005), and make shorter motions now and then. A tree most of whose
+//! extensions fail goes on where one does not and comes nearer to the other tree. A robot with several
 //! arms moves one after the other first (`branches`).
 //!
 //! The same space, ends, seed and budget give the same path. The caller is asked every `POLL` iterations whether to go on.
@@ -38,6 +39,10 @@ const DOMAIN_CHANGE: f32 = 1e-4;
 /// A tree grows until the other has less than this part of its nodes; then the other one grows. Where trees take turns at every sample until one is
 /// twice as large, a shut-in tree gets half of the samples that it needs. From 0.3 to 0.8 the times differ little.
 const BALANCE: f32 = 0.67;
+
+/// A tree is shut in where so many times as many of its motions failed as it has nodes. What gets out then goes on towards its sample, as long as the
+/// way is free and nearer to the other tree than before: the next motion out would take as many attempts. Elsewhere that finds little, and makes paths longer.
+const SHUT_IN: usize = 8;
 
 /// After so many samples, each so many extensions of nodes that have failed before one is shorter, by this factor: what is shut in finds its way
 /// out by short motions, which elsewhere only take time.
@@ -345,6 +350,40 @@ pub(crate) fn grow(
     grow_by(space, start, ends, (iterations, range), sample, control)
 }
 
+/// What came of growing towards another tree.
+struct Joining {
+    /// How far the trees were apart.
+    gap: f32,
+    /// The last new node and the one of the other tree that it is next to, where the way between them is free.
+    met: Option<(usize, usize)>,
+}
+
+/// Grows a tree from a node towards the nearest one of another, as far as the way is free.
+fn join(space: &mut Space, tree: &mut Tree, other: &Tree, mut node: usize, range: f32) -> Joining {
+    let from = tree.states[node];
+    let (meeting, gap) = other.nearest(&from);
+    let goal = other.states[meeting];
+    let steps = (gap / range).ceil().max(1.0) as usize;
+    let mut reached = from;
+    for step in 1..=steps {
+        let next = if step == steps { goal } else { between(&from, &goal, step as f32 / steps as f32) };
+        if !space.is_free_motion(&reached, &next) {
+            return Joining { gap, met: None };
+        }
+        if step < steps {
+            node = tree.push(next, node);
+            reached = next;
+        }
+    }
+    Joining { gap, met: Some((node, meeting)) }
+}
+
+/// The posture at most so far from another on the straight way to a third.
+fn towards(from: &State, to: &State, at_most: f32) -> State {
+    let far = distance(from, to);
+    if far <= at_most { *to } else { between(from, to, at_most / far) }
+}
+
 /// Grows a tree from the start and one from all ends, which are free, until they meet; gives the path and the iterations.
 fn grow_by(
     space: &mut Space,
@@ -363,8 +402,8 @@ fn grow_by(
     let first_range = self::range(space, RANGES[0]);
     let apart = self::range(space, 1.0) * (joints as f32).sqrt();
     let (domain, least_domain) = (DOMAIN * apart, LEAST_DOMAIN * first_range);
-    // Which tree grows towards the sample.
-    let mut growing = 1;
+    // Which tree grows towards the sample, and how many of its motions failed.
+    let (mut growing, mut failed) = (1, [0, 0]);
     // Where nothing may be left between postures, an iteration takes as long as many others.
     let poll = if space.is_swept() { 1 } else { POLL };
     for iteration in 1..=iterations {
@@ -386,8 +425,9 @@ fn grow_by(
         let may_be_short = iteration > SHORT_FROM && iteration.is_multiple_of(SHORT_EVERY);
         let is_short = may_be_short && tree.radii[near].is_finite();
         let step = if is_short { SHORT * range } else { range };
-        let to = if far <= step { sample } else { between(&from, &sample, step / far) };
+        let mut to = if far <= step { sample } else { between(&from, &sample, step / far) };
         if !space.is_free_motion(&from, &to) {
+            failed[growing] += 1;
             let radius = &mut tree.radii[near];
             *radius = if radius.is_infinite() { domain } else { (*radius * (1.0 - DOMAIN_CHANGE)).max(least_domain) };
             continue;
@@ -396,20 +436,26 @@ fn grow_by(
         if tree.radii[near].is_finite() {
             tree.radii[near] *= 1.0 + DOMAIN_CHANGE;
         }
-        let (meeting, gap) = other.nearest(&to);
-        let goal = other.states[meeting];
-        let steps = (gap / range).ceil().max(1.0) as usize;
-        let mut reached = to;
-        let joined = (1..=steps).all(|step| {
-            let next = if step == steps { goal } else { between(&to, &goal, step as f32 / steps as f32) };
-            let free = space.is_free_motion(&reached, &next);
-            if free && step < steps {
-                node = tree.push(next, node);
-                reached = next;
+        let is_shut_in = failed[growing] >= SHUT_IN * tree.len();
+        // No gap is less than none.
+        let mut least_gap = if is_shut_in { other.nearest(&from).1 } else { 0.0 };
+        let joined = loop {
+            let joining = join(space, tree, other, node, range);
+            if joining.met.is_some() {
+                break joining.met;
             }
-            free
-        });
-        if joined {
+            if joining.gap >= least_gap || distance(&to, &sample) == 0.0 {
+                break None;
+            }
+            least_gap = joining.gap;
+            let next = towards(&to, &sample, step);
+            if !space.is_free_motion(&to, &next) {
+                break None;
+            }
+            node = tree.push(next, node);
+            to = next;
+        };
+        if let Some((node, meeting)) = joined {
             let (mut path, rest) = (tree.branch(node), other.branch(meeting));
             path.reverse();
             path.extend(rest);
