@@ -333,7 +333,36 @@ def test_what_cannot_be_traced_is_refused_with_its_line_and_what_to_write_instea
     def unnamed(n: int) -> None:
         print(ratn.variable(0))
 
+    def returned(n: int) -> object:
+        with ratn.when(n > 2):
+            return {"early": "yes"}
+        gripper.release()
+        return {"early": "no"}
+
+    def skipped(n: list) -> None:
+        for one in ratn.each(n):
+            with ratn.when(one > 2):
+                if n is not None:
+                    continue
+            gripper.release()
+
+    def left(n: int) -> None:
+        for _ in (1, 2, 3):
+            with ratn.when(n > 2):
+                gripper.release()
+            with ratn.otherwise():
+                break
+            gripper.release()
+
+    def handled(n: int) -> None:
+        try:
+            gripper.release()
+        except (ValueError, ratn.Aborted):
+            gripper.grasp("cup")
+
     expected = {
+        returned: ("this `return` leaves a block that is done only sometimes", 2), skipped: ("this `continue`", 4), left: ("this `break`", 5),
+        handled: ("`except ratn.Aborted` around a state", 3),
         if_: ("with ratn.when(condition)", 2), while_: ("with ratn.while_(condition)", 1), and_: ("`(a) & (b)`", 1), not_: ("`~(a)`", 1),
         chained: ("(a < b) & (b < c)", 1), ternary: ("fn.if_(", 1), in_: ("ratn.isin(", 1), for_: ("for x in ratn.each(list)", 1),
         range_: ("ratn.each(fn.range(n))", 1), comprehension: ("fn.map(", 1), filtered: ("fn.filter(", 1), length: ("fn.len(", 1), whole: ("fn.floor", 1),
@@ -343,6 +372,29 @@ def test_what_cannot_be_traced_is_refused_with_its_line_and_what_to_write_instea
     for function, (part, line) in expected.items():
         message, said = refused(function)
         assert part in message and said == line, f"{function.__name__}: line {said}: {message}"
+
+
+def test_what_is_left_as_in_python_is_traced() -> None:
+    @ratn.task
+    def left(n: int) -> object:
+        with ratn.when(n > 2):
+            for number in (1, 2, 3):
+                if number == 2:
+                    break
+                gripper.release(name=f"release_{number}")
+
+            def never() -> int:
+                return 1
+        try:
+            gripper.release(name="again")
+        except ValueError:
+            pass
+        with ratn.retry(2):
+            gripper.release(name="last")
+            return {"n": n}
+
+    written = left.to_yaml()
+    assert [name in written for name in ("release_1", "release_2", "again", "last")] == [True, False, True, True], written
 
 
 def test_a_call_outside_of_a_task_and_a_wrong_port_are_refused() -> None:

@@ -17,11 +17,11 @@ import os
 import re
 import sys
 import types
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 from ratn import _ratn
-from ratn._ratn import Error, Joints, Pose
+from ratn._ratn import Aborted, Cancelled, Error, Joints, Lost, Pose
 
 _PACKAGE = os.path.dirname(os.path.abspath(__file__)) + os.sep
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
@@ -79,6 +79,54 @@ def statements_at_work(file: str, line: int) -> list[ast.AST]:
         if isinstance(node, (ast.stmt, ast.expr, ast.comprehension)) and _begins(node) <= line <= _ends(node)
     ]
     found.sort(key=lambda node: _ends(node) - _begins(node))
+    return found
+
+
+def jump_out_of_with(file: str, line: int) -> tuple[str, int] | None:
+    """The first ``return``, ``break`` or ``continue`` that leaves the body of the ``with`` statement that begins at a line, and its line."""
+    for node in statements_at_work(file, line):
+        if isinstance(node, (ast.With, ast.AsyncWith)) and any(_begins(item.context_expr) <= line <= _ends(item.context_expr) for item in node.items):
+            return _jump(node.body, False)
+    return None
+
+
+def _jump(body: Sequence[ast.AST], is_in_loop: bool) -> tuple[str, int] | None:
+    for node in body:
+        if isinstance(node, ast.Return):
+            return "return", node.lineno
+        if isinstance(node, (ast.Break, ast.Continue)) and not is_in_loop:
+            return type(node).__name__.lower(), node.lineno
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.expr)):
+            continue
+        is_loop = isinstance(node, (ast.For, ast.AsyncFor, ast.While))
+        for name, part in ast.iter_fields(node):
+            if isinstance(part, list) and part and isinstance(part[0], ast.AST):
+                # Behind a loop's `else` it is left as well.
+                found = _jump(part, (is_loop and name == "body") or is_in_loop)
+                if found is not None:
+                    return found
+    return None
+
+
+def handler_of(file: str, line: int, names: Mapping[str, object]) -> tuple[str, int] | None:
+    """What an ``except`` around a line catches of the exceptions that end an action (``ratn.Aborted``), and its line; ``names`` are those known there."""
+    for node in statements_at_work(file, line):
+        if isinstance(node, ast.Try) and any(_begins(one) <= line <= _ends(one) for one in node.body):
+            for handler in node.handlers:
+                for one in handler.type.elts if isinstance(handler.type, ast.Tuple) else [handler.type]:
+                    text = "" if one is None else ast.unparse(one)
+                    kind = _named(text, names)
+                    if kind in (Aborted, Cancelled, Lost):
+                        return text, handler.lineno
+    return None
+
+
+def _named(text: str, names: Mapping[str, object]) -> object:
+    """What a name with attributes is."""
+    first, *rest = text.split(".")
+    found = names.get(first)
+    for name in rest:
+        found = getattr(found, name, None)
     return found
 
 

@@ -9,7 +9,7 @@ import typing
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from ratn._expression import KEYWORDS, Binding, Value, Within, expression, literal, refuse, scope_of_function, statements_at_work, user_line
+from ratn._expression import KEYWORDS, Binding, Value, Within, expression, handler_of, jump_out_of_with, literal, refuse, scope_of_function, statements_at_work, user_frame, user_line
 from ratn._source import WORDS_OF_FORMS
 from ratn._yaml import Body
 
@@ -147,6 +147,15 @@ class Trace:
         """A further state; `implied` is what it is called where nobody has said a name."""
         siblings, owner = self.open[-1]
         at = at or user_line()
+        frame = user_frame()
+        handler = handler_of(*at, {**frame.f_globals, **frame.f_locals})
+        if handler is not None:
+            kind, line = handler
+            refuse(
+                f"`except {kind}` around a state catches nothing: a state that fails is known only while the task runs",
+                "lead on from how it ends (`transitions={\"aborted\": state}`), or write `with ratn.retry(3):`",
+                (at[0], line),
+            )
         if name is not None:
             name = literal(name, "a name")
             if name in _NO_NAMES:
@@ -242,6 +251,16 @@ class Trace:
         )
 
     def enter(self, node: Node, branch: str) -> None:
+        file, line = user_line()
+        # What is always done is left by them as in Python.
+        jump = None if branch == "states" else jump_out_of_with(file, line)
+        if jump is not None:
+            word, at = jump
+            refuse(
+                f"this `{word}` leaves a block that is done only sometimes, and is done always when the task is traced",
+                "write what follows in `with ratn.otherwise():`, or lead out with a transition or `ratn.leave(outcome)`",
+                (file, at),
+            )
         node.is_open = True
         self.open.append((node.branches.setdefault(branch, []), node))
 
