@@ -17,8 +17,8 @@ use ratn_model::id::{InstanceId, Revision};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// So many composite states are followed that have not been left; of more the one that began first is forgotten. One that is left by an outcome for
-/// which it declares no effects stays until then.
+/// So many composite states are followed; of more one is forgotten of which nothing is under way, the one that began first. One that is left by an
+/// outcome for which it declares no effects stays until then, and so does one that was only expected.
 const MOST_ENTERED: usize = 1024;
 
 /// A beginning.
@@ -48,6 +48,18 @@ struct Entered {
     parts: BTreeSet<InstanceId>,
     /// Whether the result of a part is real. Until one is, the state may only be expected.
     is_real: bool,
+}
+
+impl Entered {
+    /// Whether all that has begun of it was discarded. It was only expected, unless its commit follows: its first part was cut short then.
+    fn is_discarded(&self) -> bool {
+        self.parts.is_empty() && !self.is_real && self.routine.is_none()
+    }
+
+    /// Whether something of it is under way.
+    fn is_open(&self) -> bool {
+        !self.parts.is_empty() || self.routine.is_some()
+    }
 }
 
 /// Where an instance is among the composite states that are followed.
@@ -140,15 +152,16 @@ impl Beginnings {
         for path in inside.states.iter().skip(from) {
             let new = || Entered { began, routine: None, parts: BTreeSet::new(), is_real: false };
             let entered = self.entered.entry(path.clone()).or_insert_with(new);
-            entered.parts.insert(instance);
-            if entered.began.held_until.is_some() && entered.routine.is_none() {
+            let is_lost = entered.began.held_until.is_some() && entered.routine.is_none();
+            if is_lost || entered.is_discarded() {
                 entered.began = began;
             }
+            entered.parts.insert(instance);
         }
-        if self.entered.len() > MOST_ENTERED
-            && let Some(first) = self.entered.iter().min_by_key(|(_, entered)| entered.began.knows)
-        {
-            let first = first.0.clone();
+        while self.entered.len() > MOST_ENTERED {
+            let order = |entered: &Entered| (entered.is_open(), !entered.is_discarded(), entered.began.knows);
+            let Some((first, _)) = self.entered.iter().min_by_key(|(_, entered)| order(entered)) else { return };
+            let first = first.clone();
             self.entered.remove(&first);
         }
     }
@@ -160,8 +173,7 @@ impl Beginnings {
             let Some(entered) = self.entered.get_mut(&path) else { continue };
             entered.parts.remove(&instance);
             entered.is_real |= is_real;
-            let was_expected_only = entered.parts.is_empty() && !entered.is_real;
-            if entered.routine.map_or(was_expected_only, |routine| routine == instance) {
+            if entered.routine == Some(instance) {
                 self.entered.remove(&path);
             }
         }
@@ -177,6 +189,9 @@ impl Beginnings {
 
     /// Which composite states are around an instance of this path.
     fn inside_of(&self, path: &str) -> Inside {
+        if self.composites.is_empty() {
+            return Inside { states: Vec::new(), is_routine: false };
+        }
         let is_followed = |path: &&str| {
             let state = without_visits(path);
             self.composites.contains(&state)
@@ -298,19 +313,45 @@ mod tests {
     }
 
     #[test]
-    fn what_was_only_expected_has_not_begun() {
+    fn what_was_only_expected_counts_from_when_it_begins_anew() {
         let mut bench = Bench::new(&["part"]);
-        bench.begins(1, "part/move");
+        let expected = bench.begins(1, "part/move");
         bench.begins(2, "part/other");
         bench.squashed(1);
-        assert!(bench.of("part").is_some(), "a part of it goes on");
+        assert_eq!(bench.of("part"), Some((expected, false)), "a part of it goes on");
         bench.squashed(2);
-        assert!(bench.beginnings.is_empty());
-        bench.begins(3, "part/move");
+        let anew = bench.begins(3, "part/move");
         bench.begins(4, "part/other");
+        assert_eq!(bench.of("part"), Some((anew, false)));
         bench.retired(3);
         bench.squashed(4);
-        assert!(bench.of("part").is_some(), "it is real");
+        bench.begins(5, "part/last");
+        assert_eq!(bench.of("part"), Some((anew, false)), "it is real");
+    }
+
+    #[test]
+    fn a_composite_state_whose_first_part_is_cut_short_is_made_of_what_that_began_with() {
+        let mut bench = Bench::new(&["part"]);
+        let part = bench.begins(1, "part/move");
+        bench.loses();
+        bench.squashed(1);
+        assert_eq!(bench.of("part"), Some((part, true)));
+        assert!(bench.beginnings.others_count().is_some());
+        bench.commits("part");
+        assert!(bench.beginnings.is_empty() && bench.beginnings.others_count().is_none());
+    }
+
+    #[test]
+    fn of_more_than_are_followed_those_that_are_open_stay_however_many_begin_at_once() {
+        let mut bench = Bench::new(&["a", "a/loop", "a/loop/part", "a/loop/part/inner"]);
+        bench.begins(1, "a/first");
+        let begun = bench.of("a").unwrap();
+        for number in 2..2 * MOST_ENTERED as u64 {
+            bench.begins(number, &format!("a/loop#{number}[1]/part/inner/move"));
+            assert!(bench.beginnings.entered.len() <= MOST_ENTERED);
+            bench.retired(number);
+        }
+        assert_eq!(bench.of("a"), Some(begun));
     }
 
     #[test]
