@@ -1,10 +1,12 @@
 //! Whether what a run has decided, and has not committed yet, is still true when it comes back without what it held.
 
 use ratn_model::expression::EffectExpr;
+use ratn_model::expression::scope::NothingKnown;
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::program::Program;
 
-/// Whether somebody else has changed, in this fact, what changes of a state overwrite or are made of. `writer` is its path, with visits.
+/// Whether somebody else has changed, in this fact, what changes of a state overwrite or are made of. `writer` is its path, with visits. What the state
+/// looks up under an argument that only the run knew is any fact of that predicate.
 #[must_use]
 pub fn was_overtaken(program: &Program, writer: &str, changes: &[Change], key: &FactKey) -> bool {
     let parts = writer.split('/').map(|part| part.split(['[', '#']).next().unwrap_or(part));
@@ -12,7 +14,8 @@ pub fn was_overtaken(program: &Program, writer: &str, changes: &[Change], key: &
     let state = program.states.iter().find(|state| state.path == path);
     let effects = state.into_iter().flat_map(|state| state.annotations.effects.values());
     let mut looked_up = effects.flat_map(|effects| EffectExpr::fact_expressions(effects));
-    changes.iter().any(|change| change.pattern().matches(key)) || looked_up.any(|fact| fact.predicate == key.predicate)
+    changes.iter().any(|change| change.pattern().matches(key))
+        || looked_up.any(|fact| fact.pattern(&NothingKnown).matches(key))
 }
 
 #[cfg(test)]
@@ -33,13 +36,17 @@ states:
   - part:
       states:
         - count: { action: gripper/release, pia: true, effects: ["tools(rack) = boxes(rack) + 1"], resources: [{ block: Gripper }] }
+        - each: { for: place in [rack], do: [write: { action: gripper/release, pia: true, effects: ["tools(rack) = boxes(place)"], resources: [{ block: Gripper }] }] }
         - other: { action: gripper/release, pia: true, effects: ["tools(rack) = cups(rack)"], resources: [{ block: Gripper }] }
 "#;
         let program = ratn_model::load::load(text, "count.yaml", &Catalogue::standard()).unwrap().program;
-        let fact = |name: &str| FactKey { predicate: name.to_owned(), arguments: vec![Term::Name("rack".to_owned())] };
-        let changes = [Change::Set { fact: fact("tools"), value: Value::Int(3) }];
-        let overtaken = |name: &str| was_overtaken(&program, "part#2/count", &changes, &fact(name));
-        assert!(overtaken("tools") && overtaken("boxes"));
-        assert!(!overtaken("cups") && !overtaken("hand_empty"));
+        let fact =
+            |name: &str, of: &str| FactKey { predicate: name.to_owned(), arguments: vec![Term::Name(of.to_owned())] };
+        let changes = [Change::Set { fact: fact("tools", "rack"), value: Value::Int(3) }];
+        let overtaken = |name: &str, of| was_overtaken(&program, "part#2/count", &changes, &fact(name, of));
+        assert!(overtaken("tools", "rack") && overtaken("boxes", "rack"));
+        assert!(!overtaken("cups", "rack") && !overtaken("tools", "deck") && !overtaken("boxes", "deck"));
+        // Which place it is was known to the run alone.
+        assert!(was_overtaken(&program, "part#2/each[0]/write", &changes, &fact("boxes", "deck")));
     }
 }

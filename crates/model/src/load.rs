@@ -19,6 +19,7 @@
 mod action;
 mod advice;
 mod allowed;
+mod begin_at;
 mod document;
 pub mod edit;
 mod effects;
@@ -203,7 +204,7 @@ fn read(source: &str, loading: &Loading<'_>, out: &mut Output, of_libraries: &mu
     {
         written_out::write_out(&mut states.value, &mut out.findings);
         if let Some(from) = loading.from {
-            written_out::begin_at(&mut states.value, from, &mut out.findings);
+            begin_at::begin_at(&mut states.value, from, &mut out.findings);
         }
     }
     let outline = outline::outline(&name, &root, &mut out.findings);

@@ -5,6 +5,7 @@
 mod support;
 
 use ratn_model::catalogue::Catalogue;
+use ratn_model::diagnostic::Diagnostic;
 use ratn_model::expression::Expr;
 use ratn_model::id::StateId;
 use ratn_model::load::{Files, Loaded, load_beginning, load_with};
@@ -262,4 +263,50 @@ states:
     assert!(begins("any").unwrap_err().contains("`begin.pan` is not there: the run begins behind `begin`"));
     assert!(begins("lst").unwrap_err().contains("no state `lst` in its own list"));
     assert_ne!(begins("begin").unwrap().digest, begins("last").unwrap().digest);
+}
+
+#[test]
+fn a_run_may_begin_inside_of_a_state_that_is_begun_once_and_in_one_way() {
+    let task = "
+task: t
+states:
+  - look: { states: [] }
+  - cups:
+      states:
+        - find: { states: [] }
+        - begin:
+            states:
+              - open: { states: [] }
+              - close: { states: [] }
+        - again: { retry: { times: 2 }, states: [pick: { states: [] }] }
+        - each: { for: 'n in [1, 2]', do: [fill: { states: [] }] }
+        - full: { condition: lit(lamp), then: [put: { states: [] }] }
+        - both: { concurrency: barrier, regions: [left: { states: [wash: { states: [] }] }] }
+        - part: { library: part.yaml, with: { what: cup } }
+  - bowls: { states: [stack: { states: [] }] }
+  - back: { condition: lit(lamp), then: [], else: [], outcomes: [more], transitions: { more: bowls } }
+";
+    let begins = |from: &str| {
+        let shelf = Shelf([("part.yaml", PART)].into());
+        let loaded = load_beginning(task, "t.yaml", &Catalogue::standard(), &shelf, Some(from));
+        let texts = |findings: Vec<Diagnostic>| findings.iter().map(ToString::to_string).collect::<String>();
+        loaded.map(|loaded| loaded.program).map_err(texts)
+    };
+    let program = begins("cups/begin/close").unwrap();
+    let added = program.states.iter().filter(|state| state.name == "begin_2");
+    let added: Vec<&str> = added.map(|state| state.path.as_str()).collect();
+    assert_eq!(added, ["begin_2", "cups/begin_2", "cups/begin/begin_2"]);
+    for (from, why) in [
+        ("cups/again/pick", "inside of `cups/again`: it is retried from its own beginning"),
+        ("cups/each/fill", "it is a loop, and which pass is meant is not said"),
+        ("cups/full/put", "only its condition says which way it goes"),
+        ("cups/both/left/wash", "its regions begin all at once"),
+        ("cups/part/a", "what it does stands in another file"),
+        ("cups/find/a", "`cups/find` has no state `a` in its own list"),
+        ("bowls/stack", "a transition leads back to it or before it"),
+        ("cups/lst", "`cups` has no state `lst` in its own list"),
+    ] {
+        let refusal = begins(from).unwrap_err();
+        assert!(refusal.contains(why), "{from}: {refusal}");
+    }
 }

@@ -71,7 +71,7 @@ pub(crate) struct RunArguments {
     /// Pause before this state, or a motion inside of it, begins: its path, `for_box/grasp`; may be repeated
     #[arg(long = "break", value_name = "STATE", conflicts_with = "resume")]
     pub(crate) breakpoints: Vec<String>,
-    /// Begin at this state of the task's own list, in the world as it is: the task's `world` is not written
+    /// Begin at this state of the task's own list, or inside of one (`cups/pick`), in the world as it is: the task's `world` is not written
     #[arg(long, value_name = "STATE", conflicts_with = "resume")]
     pub(crate) from: Option<String>,
     /// Let no other run be under way on the system beside this one

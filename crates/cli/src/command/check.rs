@@ -235,7 +235,7 @@ pub(super) fn refused(findings: &[Diagnostic]) -> Failure {
     Failure::Refused(lines.join("\n"))
 }
 
-/// The program of a task file, which begins at a state of its own list where one is said; warnings go to standard error.
+/// The program of a task file, which begins at another state than its first where one is said; warnings go to standard error.
 pub(crate) fn load(path: &Path, from: Option<&str>, catalogue: &Catalogue) -> Result<Program, Failure> {
     let (text, file) = (read(path)?, path.display().to_string());
     accepted(ratn_model::load::load_beginning(&text, &file, catalogue, &input::Libraries, from))

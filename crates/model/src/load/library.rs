@@ -103,7 +103,7 @@ fn library(path: &str, loading: &Loading<'_>, inner: &mut Vec<Diagnostic>) -> Re
     }
     let mut around = loading.around.clone();
     around.push(loading.file.to_owned());
-    let loaded = match super::load_within(&text, &Loading { file: &name, around, ..*loading }) {
+    let loaded = match super::load_within(&text, &Loading { file: &name, around, from: None, ..*loading }) {
         Ok(loaded) => {
             // What holds before it begins is said where it is used.
             inner.extend(loaded.warnings.into_iter().filter(|warning| !depends_on_use(&warning.rule)));

@@ -16,7 +16,6 @@
 //!   do: […]                        - right: {states: […with right for $arm…]}
 //! ```
 
-use super::suggestion;
 use super::yaml::{Content, Entry, Node};
 use crate::diagnostic::Findings;
 use crate::expression::Comprehension;
@@ -40,30 +39,6 @@ pub(crate) fn write_out(list: &mut Node, findings: &mut Findings) {
     for item in items {
         state(item, "", findings);
     }
-}
-
-/// Puts a state in front that leads to the one at which a run begins.
-pub(crate) fn begin_at(list: &mut Node, from: &str, findings: &mut Findings) {
-    let at = list.at;
-    let Content::List(states) = &mut list.content else { return };
-    let names: Vec<&str> = states.iter().filter_map(named).collect();
-    if !names.contains(&from) {
-        let message = format!("the task has no state `{from}` in its own list, at which it could begin");
-        return findings.error(
-            "invalid-state",
-            at,
-            "",
-            message,
-            suggestion(from, names.into_iter(), "", "its states have no names"),
-        );
-    }
-    let name = (1..).map(|n| if n == 1 { "begin".to_owned() } else { format!("begin_{n}") });
-    let name = name.into_iter().find(|name| !names.contains(&name.as_str())).unwrap_or_default();
-    let node = |content: Content| Node { at, offset: None, content };
-    let entry = |key: &str, content: Content| Entry { key: key.to_owned(), at, value: node(content) };
-    let leads = vec![entry(SUCCESS, Content::Text(from.to_owned()))];
-    let keys = vec![entry("states", Content::List(Vec::new())), entry("transitions", Content::Map(leads))];
-    states.insert(0, node(Content::Map(vec![entry(&name, Content::Map(keys))])));
 }
 
 /// A state: a mapping with its keys, or one of its name to that.
@@ -344,7 +319,7 @@ fn replaced(old: &str, variable: &str, text: &str) -> String {
 }
 
 /// The name of a state of a list, where it has one.
-fn named(item: &Node) -> Option<&str> {
+pub(super) fn named(item: &Node) -> Option<&str> {
     match item.entries() {
         [entry] if matches!(entry.value.content, Content::Map(_)) => Some(&entry.key),
         _ => None,
