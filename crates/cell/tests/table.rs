@@ -288,7 +288,7 @@ fn fingers_from_above_slide_off_the_rim_of_a_plate() {
     // The robot feels that something slipped away, and no more.
     let felt = |why: &str| why.contains("mm wide slipped out of the fingers") && !why.contains("rim");
     assert!(matches!(&grasped, Ending::Aborted(why) if felt(why)), "{grasped:?}");
-    assert!(bench.missed[0].contains("the fingers slide off it"), "{:?}", bench.missed);
+    assert!(bench.noted[0].contains("the fingers slide off it"), "{:?}", bench.noted);
 }
 
 #[test]

@@ -31,6 +31,9 @@ pub const PADDING_M: f64 = crate::arm::OVERHANG_M;
 /// measured, the arm is compliant.
 pub const CONTACT_TOLERANCE_M: f64 = 0.012;
 
+/// Shapes for which spheres stand that meet are no farther apart, in metres, than is worth telling.
+const FAR_M: f64 = 1.0;
+
 /// How far a point may move between two checked postures when there is no padding, in metres.
 const UNPADDED_STEP_M: f64 = 0.005;
 
@@ -133,18 +136,20 @@ pub struct Collision {
     pub moving: String,
     /// What it meets: an object, or a link.
     pub other: String,
-    /// How deep, in metres; negative: how far apart, where that is less than the padding.
+    /// How deep, in metres; negative: how far apart, where that is less than the padding, or [`by_spheres`](Collision::by_spheres).
     pub depth_m: f64,
+    /// The shapes are farther apart than the padding, but the spheres that stand for meshes are not.
+    pub by_spheres: bool,
 }
 
 impl fmt::Display for Collision {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let millimetres = self.depth_m.abs() * 1000.0;
         if self.depth_m > 0.0 {
-            write!(f, "{} is {millimetres:.0} mm inside {}", self.moving, self.other)
-        } else {
-            write!(f, "{} is only {millimetres:.0} mm away from {}", self.moving, self.other)
+            return write!(f, "{} is {millimetres:.0} mm inside {}", self.moving, self.other);
         }
+        write!(f, "{} is only {millimetres:.0} mm away from {}", self.moving, self.other)?;
+        if self.by_spheres { f.write_str(", and touches it by the spheres that stand for meshes") } else { Ok(()) }
     }
 }
 
@@ -360,13 +365,14 @@ impl<'a> Checker<'a> {
     /// What a posture touches first, if anything.
     pub fn collision(&mut self, arm: &JointVector, contact: Contact) -> Option<Collision> {
         let (i, other) = self.hit(arm, contact)?;
-        let depth = self.depth(i, other).unwrap_or(-self.padding);
+        let depth_m = self.depth_of_shapes(i, other).or_else(|| self.depth(i, other)).unwrap_or(-self.padding);
+        let by_spheres = depth_m < -self.padding;
         let other = match other {
             Other::Obstacle(o) => self.obstacles[o].name.clone(),
             Other::Moving(j) => self.moving[j].name.clone(),
             Other::Cloud => self.cloud.as_ref().map(|cloud| cloud.name.clone()).unwrap_or_default(),
         };
-        Some(Collision { moving: self.moving[i].name.clone(), other, depth_m: depth })
+        Some(Collision { moving: self.moving[i].name.clone(), other, depth_m, by_spheres })
     }
 
     /// Whether something meets what stands that moves with the tool alone: then every posture of that pose of the tool does.
@@ -547,6 +553,32 @@ impl<'a> Checker<'a> {
             _ => self.apart_m(i, other, near),
         };
         (apart <= near).then_some(-apart)
+    }
+
+    /// The same by the meshes themselves where spheres stand for them, however far apart; `None` where they do for neither.
+    fn depth_of_shapes(&self, i: usize, other: Other) -> Option<f64> {
+        let (form, link) = match other {
+            Other::Obstacle(o) => (self.obstacles[o].form, self.obstacles[o].link),
+            Other::Moving(j) => (self.moving[j].form, Some(self.moving[j].link)),
+            Other::Cloud => return None,
+        };
+        if ![self.moving[i].form, form].contains(&Form::Cover) {
+            return None;
+        }
+        let is_of = |k: &usize, link: usize| self.moving[*k].link == link && self.moving[*k].form.counts(true);
+        let stands = |o: &Obstacle| o.link == link && o.form.counts(true);
+        let others: Vec<Other> = match (other, link) {
+            (Other::Moving(_), Some(link)) => {
+                (0..self.moving.len()).filter(|k| is_of(k, link)).map(Other::Moving).collect()
+            }
+            (Other::Obstacle(_), Some(_)) => {
+                (0..self.obstacles.len()).filter(|o| stands(&self.obstacles[*o])).map(Other::Obstacle).collect()
+            }
+            _ => vec![other],
+        };
+        let own = (0..self.moving.len()).filter(|k| is_of(k, self.moving[i].link));
+        let apart = own.flat_map(|k| others.iter().map(move |other| self.apart_m(k, *other, FAR_M)));
+        apart.reduce(f64::min).map(|apart_m| -apart_m)
     }
 
     /// A moving shape as it is checked beside one of that form: with the padding, except where two links are told apart by their meshes. Such links may be

@@ -9,6 +9,7 @@ use crate::problems::Problem;
 use crate::robot_model::{Joint, Link};
 use crate::space::ROUNDING_M;
 use crate::spheres::Sphere;
+use crate::surroundings::Surroundings;
 use ratn_model::pose::Pose;
 
 /// What a posture breaks; `which` of the problem's ends it is begins each line.
@@ -27,23 +28,47 @@ pub(crate) fn diagnosis(mechanism: &Mechanism, problem: &Problem, positions: &[f
 /// What the spheres of the robot touch; they alone, and with as much as the search takes meshes larger.
 fn by_spheres(mechanism: &Mechanism, problem: &Problem, positions: &[f64], which: &str) -> Vec<String> {
     let overhang_m = problem.meshes.iter().map(|mesh| mesh.overhang_m).fold(0.0, f64::max);
-    let touches = [ROUNDING_M, ROUNDING_M + overhang_m].into_iter().find_map(|larger_m| {
-        let coarse = of_spheres(mechanism, larger_m);
-        let touches = Exact::new(&coarse, problem.surroundings()).touches(positions);
+    let touches = [0.0, overhang_m].into_iter().find_map(|larger_m| {
+        let touches = sphere_touches(mechanism, problem.surroundings(), positions, larger_m);
         (!touches.is_empty()).then_some(touches)
     });
-    let line = |Touch { link, other, depth_m }: &Touch| {
-        let of_link = if mechanism.link(other).is_some() { "those of " } else { "" };
-        format!(
-            "{which}: the shapes are apart, but the search takes spheres for them: those of {link} are {:.1} mm inside {of_link}{other}; leave \
-             that much more room",
-            depth_m * 1e3
-        )
-    };
     match touches {
-        Some(touches) => touches.iter().map(line).collect(),
+        Some(touches) => touches
+            .iter()
+            .map(|touch| format!("{which}: {}", crowding(mechanism, mechanism.links.len(), touch)))
+            .collect(),
         None => vec![format!("{which}: the shapes are apart by no more than rounding; leave a millimetre of room")],
     }
+}
+
+/// What is too near for the search though it does not touch, and what to do; the first `own` links are those of the URDF.
+pub(crate) fn crowding(mechanism: &Mechanism, own: usize, Touch { link, other, depth_m }: &Touch) -> String {
+    let index = |name: &str| mechanism.link(name);
+    let is_own = |name: &str| index(name).is_some_and(|index| index < own);
+    let of_link =
+        if index(other).is_some_and(|index| !mechanism.links[index].spheres.is_empty()) { "those of " } else { "" };
+    let what = if is_own(link) && is_own(other) {
+        format!(
+            "if the two never touch, say so in the SRDF: <disable_collisions link1=\"{link}\" link2=\"{other}\" reason=\"Never\"/>"
+        )
+    } else {
+        "leave that much more room".to_owned()
+    };
+    let mm = depth_m * 1e3;
+    format!(
+        "the shapes are apart, but the search takes spheres for them: those of {link} are {mm:.1} mm inside {of_link}{other}; {what}"
+    )
+}
+
+/// What the spheres touch that the search takes for a robot, each so much larger, the deepest first.
+pub(crate) fn sphere_touches(
+    mechanism: &Mechanism,
+    surroundings: Surroundings<'_>,
+    positions: &[f64],
+    larger_m: f64,
+) -> Vec<Touch> {
+    let coarse = of_spheres(mechanism, ROUNDING_M + larger_m);
+    Exact::new(&coarse, surroundings).touches(positions)
 }
 
 /// A robot that has its spheres for shapes, each so much larger, in the checks of the search.

@@ -24,7 +24,7 @@ use crate::connect::{Budget, ConnectError};
 use crate::joint_vector::JointVector;
 use crate::pace::{Control, Pace, Progress};
 pub use crate::request::{Goal, MAX_GOALS, MIN_SPEED, Request};
-use crate::robot::Robot;
+use crate::robot::{Configuration, Robot};
 use crate::simplify::path_length;
 use crate::space::{State, state};
 use arm_in_scene::ArmInScene;
@@ -82,7 +82,7 @@ pub fn plan(
         return plan_straight(&mut arm, way, &depart, &mut pace);
     }
     let start = depart[depart.len() - 1];
-    let door = arm.door(&start).ok_or_else(|| no_room(&mut arm, &start))?;
+    let door = door(&mut arm, &start)?;
     let way_out_rad = if door == state(&start) { 0.0 } else { distance(&start, &arm.joints(&door)) };
     let before_rad = length(&depart) + way_out_rad;
     arm.pad_at_least_tightly();
@@ -122,8 +122,22 @@ fn first_way(
     }
 }
 
-fn no_room(arm: &mut ArmInScene<'_>, posture: &JointVector) -> PlanError {
-    let collision = arm.collision(posture, Contact::None);
-    let reason = collision.map_or_else(|| "there is too little room to move".to_owned(), |c| c.to_string());
-    PlanError::NoRoom { reason }
+/// Whether motions can begin in a posture that touches nothing.
+///
+/// # Errors
+/// [`PlanError::NoRoom`] names what is close.
+pub(crate) fn has_room(robot: &Robot, scene: &Scene, start: &Configuration) -> Result<(), PlanError> {
+    let request = Request::new(*start, vec![Goal::Joints(start.arm)]);
+    door(&mut ArmInScene::new(robot, scene, &request)?, &start.arm).map(drop)
+}
+
+fn door(arm: &mut ArmInScene<'_>, posture: &JointVector) -> Result<State, PlanError> {
+    if let Some(door) = arm.door(posture) {
+        return Ok(door);
+    }
+    let reason = match arm.collision(posture, Contact::None) {
+        Some(collision) => collision.to_string(),
+        None => arm.crowding(posture).unwrap_or_else(|| "there is too little room to move".to_owned()),
+    };
+    Err(PlanError::NoRoom { reason })
 }

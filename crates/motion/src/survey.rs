@@ -4,8 +4,9 @@
 use crate::arm::{self, line};
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Contact, PADDING_M};
 use crate::joint_vector::JointVector;
+use crate::plan::has_room;
 use crate::reach::Target;
-use crate::robot::{Joint, Robot};
+use crate::robot::{Configuration, Joint, Robot};
 use crate::top_grasp::{APPROACH_M, grasp_poses};
 use crate::workplace::{Boxes, HOME, Surface, Workplace};
 use rand::{RngExt, SeedableRng};
@@ -111,15 +112,20 @@ impl Survey {
     }
 
     /// Where the postures of that arm bring its tool, and whether they collide with the table or the robot itself, whose other arms stand in
-    /// their postures `home`.
+    /// their postures `home`, or leave the planner no room.
     fn add_postures(&mut self, robot: &Robot, scene: &Scene, whose: &str) {
         let mut checker = Checker::new(robot, scene, &arm::assumed(robot, scene), PADDING_M);
         for (name, posture) in robot.postures() {
             let [x, y, z] = arm::reach(robot).pose(posture).position;
             let touch = checker.collision(posture, Contact::None);
-            let state = touch.as_ref().map_or_else(|| "free".to_owned(), |touch| format!("COLLIDES: {touch}"));
+            let start = Configuration { arm: *posture, ..arm::assumed(robot, scene) };
+            let (state, fault) = match (touch, has_room(robot, scene, &start)) {
+                (Some(touch), _) => (format!("COLLIDES: {touch}"), Some(format!("collides: {touch}"))),
+                (None, Err(error)) => (format!("NO ROOM: {error}"), Some(format!("leaves no room: {error}"))),
+                (None, Ok(())) => ("free".to_owned(), None),
+            };
             self.lines.push(format!("posture   {name}: {state}; the tool is at ({x:.3}, {y:.3}, {z:.3})"));
-            self.faults.extend(touch.map(|touch| format!("the posture `{name}`{whose} collides: {touch}")));
+            self.faults.extend(fault.map(|fault| format!("the posture `{name}`{whose} {fault}")));
         }
     }
 }

@@ -404,7 +404,7 @@ impl Cell {
                 Ending::Done(Product::Looking { pan, tilt })
             }
             Kind::Capture { camera, exposures, .. } => {
-                match self.spoilt_picture(activity.started + self.now.since(self.motion_time)) {
+                match self.spoilt_picture(activity.started + self.now.since(self.motion_time), out) {
                     Some(reason) => Ending::Aborted(reason.to_owned()),
                     None => Ending::Done(Product::Captured { camera, exposures }),
                 }

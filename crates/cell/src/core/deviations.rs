@@ -30,7 +30,7 @@ impl Cell {
                 Kind::GraspSlips => {
                     self.arms.held_mut().for_each(|held| held.set_friction(SLIPPERY));
                 }
-                Kind::ObjectMoved => self.move_something(),
+                Kind::ObjectMoved => self.move_something(out),
                 Kind::SensorDropout => self.blind_until = self.now + seconds(OUTAGE_S),
                 Kind::LocalisationLost => {
                     self.lost_until = self.now + seconds(OUTAGE_S);
@@ -42,7 +42,7 @@ impl Cell {
     }
 
     /// What is wrong with a picture that was taken since `started`.
-    pub(super) fn spoilt_picture(&mut self, started: Timestamp) -> Option<&'static str> {
+    pub(super) fn spoilt_picture(&mut self, started: Timestamp, out: &mut Vec<Command>) -> Option<&'static str> {
         if self.faults.occurs(Kind::SensorDropout).is_some() {
             self.blind_until = self.now;
         }
@@ -58,7 +58,7 @@ impl Cell {
             None
         };
         if self.faults.occurs(Kind::ObjectMoved).is_some() {
-            self.move_something();
+            self.move_something(out);
         }
         spoilt
     }
@@ -93,7 +93,7 @@ impl Cell {
     }
 
     /// Somebody takes an object that is still to be fetched and puts it down elsewhere on what it stands on, where it stands apart.
-    fn move_something(&mut self) {
+    fn move_something(&mut self, out: &mut Vec<Command>) {
         let (support, height, regions) = match self.config.scene {
             Setting::Boxes => {
                 let workplace = placement::workplace(&self.robot);
@@ -135,6 +135,11 @@ impl Cell {
             free.then(|| Pose::from_rpy([x, y, height], 0.0, 0.0, yaw))
         });
         if let Some(pose) = place {
+            let from = self.environment.state(object).pose;
+            let ([x, y, _], by_mm) = (pose.position, 1e3 * pose.distance(&from));
+            let (id, at_s) = (&self.ids[object], self.now.seconds());
+            let what = format!("at {at_s:.2} s somebody moves {id} by {by_mm:.0} mm, to ({x:.3}, {y:.3})");
+            out.push(Command::Noted { what });
             self.contacts.put(object);
             self.environment.put(object, &pose);
         }

@@ -97,7 +97,7 @@ impl Cell {
 
     /// The fingers of an arm have closed from `from` metres on each side of the middle. The goal's result says what fingers can measure: how wide
     /// the thing was that stopped them, and whether it still does. Why they hold nothing only the cell knows: that is a
-    /// [`Command::Missed`].
+    /// [`Command::Noted`].
     pub(super) fn close(
         &mut self,
         arm: usize,
@@ -140,7 +140,7 @@ impl Cell {
                 let felt = stopped.map_or("nothing stopped the fingers".to_owned(), |width| {
                     format!("something {:.0} mm wide slipped out of the fingers", width * 1e3)
                 });
-                out.push(Command::Missed { reason });
+                out.push(Command::Noted { what: format!("the fingers hold nothing: {reason}") });
                 return Ending::Aborted(format!("{object} is not grasped: {felt}, they are closed fully"));
             }
         };

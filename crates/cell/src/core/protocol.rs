@@ -139,10 +139,10 @@ pub enum Command {
         /// The two bodies, how deep they were in each other, and how they moved.
         contact: Contact,
     },
-    /// The fingers closed and hold nothing: the reason, which only the cell knows. For the cell's log, not for the task.
-    Missed {
-        /// Why they hold nothing.
-        reason: String,
+    /// What only the cell knows: why the fingers hold nothing, what somebody has moved. For the cell's log, not for the task.
+    Noted {
+        /// A sentence without a full stop.
+        what: String,
     },
 }
 

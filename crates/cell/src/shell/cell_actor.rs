@@ -404,7 +404,7 @@ impl Keeper {
                 }
                 Command::Saved { snapshot } => saved = Some(snapshot),
                 Command::Touched { contact } => tracing::warn!(%contact, "bodies touched that should not have"),
-                Command::Missed { reason } => tracing::info!("the fingers hold nothing: {reason}"),
+                Command::Noted { what } => tracing::info!("{what}"),
             }
         }
         saved

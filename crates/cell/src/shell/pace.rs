@@ -67,7 +67,7 @@ async fn a_cell_at_fifty_times_and_one_as_fast_as_possible_come_to_the_same_to_t
         if let Line::Event { at, event } = serde_json::from_str(line).unwrap() {
             let saved = cell.handle(at, event).into_iter().find_map(|command| match command {
                 Command::Saved { snapshot } => Some(snapshot.to_json()),
-                Command::Ended { .. } | Command::Touched { .. } | Command::Missed { .. } => None,
+                Command::Ended { .. } | Command::Touched { .. } | Command::Noted { .. } => None,
             });
             as_fast = saved.or(as_fast);
         }

@@ -27,7 +27,7 @@ pub(crate) struct Bench {
     /// What happened.
     pub(crate) lines: Vec<Line>,
     /// Why fingers hold nothing of what they closed around.
-    pub(crate) missed: Vec<String>,
+    pub(crate) noted: Vec<String>,
 }
 
 impl Bench {
@@ -37,7 +37,7 @@ impl Bench {
 
     pub(crate) fn of(config: CellConfig) -> Bench {
         let cell = Cell::new(config).unwrap();
-        Bench { cell, now: Timestamp::default(), tickets: 0, tick: None, lines: Vec::new(), missed: Vec::new() }
+        Bench { cell, now: Timestamp::default(), tickets: 0, tick: None, lines: Vec::new(), noted: Vec::new() }
     }
 
     pub(crate) fn start(&mut self, request: Request) -> (Ticket, Vec<Command>) {
@@ -65,11 +65,11 @@ impl Bench {
         let mut commands = self.cell.handle(self.now, event.clone());
         self.lines.extend(Line::of_step(self.now, event, &commands, &self.cell));
         // They stay with the cell.
-        self.missed.extend(commands.iter().filter_map(|command| match command {
-            Command::Missed { reason } => Some(reason.clone()),
+        self.noted.extend(commands.iter().filter_map(|command| match command {
+            Command::Noted { what } => Some(what.clone()),
             _ => None,
         }));
-        commands.retain(|command| !matches!(command, Command::Touched { .. } | Command::Missed { .. }));
+        commands.retain(|command| !matches!(command, Command::Touched { .. } | Command::Noted { .. }));
         commands
     }
 

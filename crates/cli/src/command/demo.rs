@@ -36,7 +36,9 @@ const FETCH: (&str, &str) = ("fetch_boxes.yaml", include_str!("../../../../examp
 /// The same for a robot without base and head, behind a table.
 const FETCH_ON_TABLE: (&str, &str) =
     ("fetch_boxes_table.yaml", include_str!("../../../../examples/fetch_boxes_table.yaml"));
-/// The one for a cell in which something goes wrong, which uses the other.
+/// The one for a cell in which something goes wrong, and what it uses: the first one with a look beside each approach.
+const FETCH_WATCHED: (&str, &str) =
+    ("fetch_boxes_watched.yaml", include_str!("../../../../examples/fetch_boxes_watched.yaml"));
 const RECOVERING: (&str, &str) =
     ("fetch_boxes_recovering.yaml", include_str!("../../../../examples/fetch_boxes_recovering.yaml"));
 /// The second experiment: what is used by the task that looks first.
@@ -63,7 +65,8 @@ struct BuiltIn;
 
 impl Files for BuiltIn {
     fn read(&self, _using: &str, path: &str) -> Result<(String, String), String> {
-        let (name, text) = [FETCH, SET].into_iter().find(|(name, _)| path == *name).ok_or("it is not built in")?;
+        let (name, text) =
+            [FETCH, FETCH_WATCHED, SET].into_iter().find(|(name, _)| path == *name).ok_or("it is not built in")?;
         Ok((name.to_owned(), text.to_owned()))
     }
 }

@@ -10,6 +10,7 @@ use crate::cloud::Cloud;
 use crate::collision::{Checker, Collision, Contact, PADDING_M};
 use crate::connect::{Budget, ConnectError, Route, connect};
 use crate::constrained::{self, Constraint};
+use crate::diagnosis::{crowding, sphere_touches};
 use crate::joint_vector::JointVector;
 use crate::keep::{KeptAxis, timed_keeping};
 use crate::ladder;
@@ -313,6 +314,18 @@ impl<'a> ArmInScene<'a> {
                 && self.checker.edge_is_free(posture, &joints(self.robot, &door), Contact::None);
             free.then_some(door)
         })
+    }
+
+    /// What is so near in a posture that touches nothing that the vector checks find no room.
+    pub(super) fn crowding(&self, posture: &JointVector) -> Option<String> {
+        let (mechanism, obstacles) = arm::in_scene(self.robot, self.scene, &self.here);
+        let mut touch = sphere_touches(&mechanism, Surroundings::from(&obstacles), posture, 0.0).into_iter().next()?;
+        // What stands of the robot is an obstacle there, with a number behind its name.
+        let standing = touch.other.strip_prefix("link ").and_then(|name| name.rsplit_once(' '));
+        if let Some((link, _)) = standing.filter(|(link, _)| mechanism.link(link).is_some()) {
+            touch.other = link.to_owned();
+        }
+        Some(crowding(&mechanism, self.robot.model.links.len(), &touch))
     }
 
     /// About how long a motion along postures takes, in seconds.
