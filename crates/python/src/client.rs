@@ -1,6 +1,8 @@
 //! A client of a running system: its resources and its world. Sessions are kept alive in a thread of their own, whatever Python does.
 
 use crate::error::{Error, Unavailable, line, of_call};
+use crate::patience::patience;
+use crate::process::Process;
 use crate::value::{Fact, from_python};
 use pyo3::exceptions::{PyKeyboardInterrupt, PyValueError};
 use pyo3::prelude::*;
@@ -17,6 +19,7 @@ use ratn_worker::runtime_directory::RuntimeDirectory;
 use ratn_worker::session::{DEFAULT_TTL, Session, SessionError};
 use ratn_worker::tls::ClientTls;
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::runtime::{Builder, Runtime};
@@ -28,7 +31,8 @@ const SESSION_PATIENCE: Duration = Duration::from_secs(5);
 const SIGNALS: Duration = Duration::from_millis(100);
 /// The kind of the room for a projection.
 const WORLD_MODEL: &str = "WorldModel";
-const MAX_WAIT_S: f64 = 1e9;
+/// What the resource manager is told where nobody says how long to wait: thirty years.
+const FOR_EVER: Duration = Duration::from_secs(1_000_000_000);
 /// Revisions that Python has not asked for yet; more wait in the world pool.
 const MAX_UPDATES: usize = 64;
 
@@ -41,35 +45,30 @@ pub(crate) struct Client {
     world: WorldClient,
     /// Waited for only without Python's lock: whoever has it waits for Python's lock.
     session: AsyncMutex<Option<Arc<Held>>>,
+    is_closed: AtomicBool,
 }
 
-/// A runtime, which works in the process that made it only: the threads are not there in a fork of that.
+/// A runtime, which works in the process that made it only.
 struct OwnRuntime {
     /// Until this is dropped.
     runtime: Option<Runtime>,
-    process: u32,
+    process: Process,
 }
 
 impl OwnRuntime {
-    fn is_here(&self) -> bool {
-        self.process == std::process::id()
+    fn new(runtime: Runtime) -> OwnRuntime {
+        OwnRuntime { runtime: Some(runtime), process: Process::of_runtime() }
     }
 
     fn here(&self) -> PyResult<&Runtime> {
-        if let Some(runtime) = self.runtime.as_ref().filter(|_| self.is_here()) {
-            return Ok(runtime);
-        }
-        Err(Error::new_err(format!(
-            "this system was opened by process {}, of which this one ({}) is a fork: open it here, `ratn.System(runtime_dir=system.runtime_dir)`",
-            self.process,
-            std::process::id()
-        )))
+        self.process.check("this system", "open it here, `ratn.System(runtime_dir=system.runtime_dir)`")?;
+        self.runtime.as_ref().ok_or_else(|| Error::new_err("this system has ended"))
     }
 }
 
 impl Drop for OwnRuntime {
     fn drop(&mut self) {
-        if !self.is_here() {
+        if !self.process.is_here() {
             // A fork would wait for threads that it does not have.
             std::mem::forget(self.runtime.take());
         }
@@ -89,6 +88,14 @@ enum NoSession {
 }
 
 impl Client {
+    /// As long as it is not closed.
+    fn open(&self) -> PyResult<&OwnRuntime> {
+        match self.is_closed.load(Ordering::Relaxed) {
+            true => Err(Error::new_err("this system is closed: open one with `ratn.System(…)`")),
+            false => Ok(&self.runtime),
+        }
+    }
+
     /// The session of the process, which the first who asks for it opens; whoever asks meanwhile waits.
     fn held(&self, py: Python<'_>) -> PyResult<Arc<Held>> {
         let opened = async {
@@ -103,7 +110,7 @@ impl Client {
             let client = client.map_err(NoSession::Refused)?;
             Ok(Arc::clone(kept.insert(Arc::new(Held { session, client }))))
         };
-        wait(py, &self.runtime, opened)?.map_err(|error| match error {
+        wait(py, self.open()?, opened)?.map_err(|error| match error {
             NoSession::Silent(error) => Unavailable::new_err(line(&error)),
             NoSession::Refused(error) => of_call(&error),
         })
@@ -179,8 +186,14 @@ impl Client {
         let channels = Channels::new(&tls);
         let world = py.detach(|| runtime.block_on(async { WorldClient::new(&channels, &world_pool) }));
         let world = world.map_err(|error| of_call(&error))?;
-        let runtime = Arc::new(OwnRuntime { runtime: Some(runtime), process: std::process::id() });
-        Ok(Client { runtime, channels, resource_manager, world, session: AsyncMutex::default() })
+        let runtime = Arc::new(OwnRuntime::new(runtime));
+        let (session, is_closed) = (AsyncMutex::default(), AtomicBool::new(false));
+        Ok(Client { runtime, channels, resource_manager, world, session, is_closed })
+    }
+
+    /// Raises `ratn.Error` where it is closed.
+    fn check_open(&self) -> PyResult<()> {
+        self.open().map(drop)
     }
 
     /// Waits until one of each of the kinds is free, and takes them under one lease.
@@ -193,8 +206,7 @@ impl Client {
         timeout_s: Option<f64>,
         holder: &str,
     ) -> PyResult<Lease> {
-        let deadline = Duration::try_from_secs_f64(timeout_s.unwrap_or(MAX_WAIT_S))
-            .map_err(|_| PyValueError::new_err("timeout_s: is no time to wait"))?;
+        let deadline = patience("timeout_s", timeout_s)?.unwrap_or(FOR_EVER);
         let held = self.held(py)?;
         let requirements = kinds.iter().map(|kind| Requirement::new(ResourceOperation::Block, kind)).collect();
         let options = AcquireOptions {
@@ -204,7 +216,7 @@ impl Client {
             holder: holder.to_owned(),
             ..AcquireOptions::default()
         };
-        let granted = wait_for(py, &self.runtime, held.client.acquire(requirements, options))?;
+        let granted = wait_for(py, self.open()?, held.client.acquire(requirements, options))?;
         let generation = held.session.state().borrow().generation;
         Ok(Lease { granted, held, generation, runtime: Arc::clone(&self.runtime) })
     }
@@ -213,11 +225,11 @@ impl Client {
     #[pyo3(signature = (*kinds))]
     fn resources<'py>(&self, py: Python<'py>, kinds: Vec<String>) -> PyResult<Vec<Bound<'py, PyDict>>> {
         let client = {
-            let _within = self.runtime.here()?.enter();
+            let _within = self.open()?.here()?.enter();
             ResourceClient::new(&self.channels, &self.resource_manager, "").map_err(|error| of_call(&error))?
         };
         let kinds: Vec<&str> = kinds.iter().map(String::as_str).collect();
-        let found = wait_for(py, &self.runtime, client.list(&kinds))?;
+        let found = wait_for(py, self.open()?, client.list(&kinds))?;
         let shown = found.iter().map(|resource| {
             let shown = PyDict::new(py);
             shown.set_item("id", &resource.id)?;
@@ -235,13 +247,13 @@ impl Client {
     #[pyo3(signature = (*patterns))]
     fn query(&self, py: Python<'_>, patterns: Vec<String>) -> PyResult<Vec<Fact>> {
         let patterns = patterns_of(&patterns)?;
-        Ok(Fact::all(wait_for(py, &self.runtime, self.world.root_at(None, &patterns))?.1))
+        Ok(Fact::all(wait_for(py, self.open()?, self.world.root_at(None, &patterns))?.1))
     }
 
     /// Writes a fact to the root world; the world's revision with it. `None` deletes it.
     fn set(&self, py: Python<'_>, fact_text: &str, value: &Bound<'_, PyAny>) -> PyResult<u64> {
         let (commit, change) = (fresh_id("python"), change(fact_text, value)?);
-        Ok(wait_for(py, &self.runtime, self.world.commit(&commit, vec![change], None))?.0)
+        Ok(wait_for(py, self.open()?, self.world.commit(&commit, vec![change], None))?.0)
     }
 
     /// A projection: the world as it is now with changes, a fact and its value each, of which nobody else sees anything. `None` deletes. It
@@ -258,7 +270,7 @@ impl Client {
         let made = || {
             // A pattern that nothing matches: only the revision is asked for.
             let nothing = [FactPattern { predicate: "ratn_nothing".to_owned(), arguments: Vec::new() }];
-            let base = wait_for(py, &self.runtime, self.world.root_at(None, &nothing))?.0;
+            let base = wait_for(py, self.open()?, self.world.root_at(None, &nothing))?.0;
             let projection = Projection {
                 request: fresh_id("python"),
                 base,
@@ -267,7 +279,7 @@ impl Client {
                 reads: Footprint::Everything,
                 lease: Some((lease.granted.id, lease.granted.token)),
             };
-            Ok((base, wait_for(py, &self.runtime, self.world.project(projection))?))
+            Ok((base, wait_for(py, self.open()?, self.world.project(projection))?))
         };
         match made() {
             Ok((base, id)) => Ok(Projected { base: base.0, id, lease, world: self.world.clone() }),
@@ -283,9 +295,9 @@ impl Client {
     #[pyo3(signature = (*patterns))]
     fn watch(&self, py: Python<'_>, patterns: Vec<String>) -> PyResult<WorldWatch> {
         let patterns = patterns_of(&patterns)?;
-        let mut watch = wait_for(py, &self.runtime, self.world.watch(None, &patterns))?;
+        let mut watch = wait_for(py, self.open()?, self.world.watch(None, &patterns))?;
         let (tell, updates) = mpsc::channel(MAX_UPDATES);
-        self.runtime.here()?.spawn(async move {
+        self.open()?.here()?.spawn(async move {
             loop {
                 let update = tokio::select! {
                     // Nobody iterates over it any more, and it may be long until the next change.
@@ -304,6 +316,7 @@ impl Client {
     /// Ends the session, with all that it holds. A fork of the process that opened it ends nothing.
     fn close(&self, py: Python<'_>) {
         let Ok(runtime) = self.runtime.here() else { return };
+        self.is_closed.store(true, Ordering::Relaxed);
         let closed = async {
             // Where a lease is still in use, its last user ends it.
             if let Some(held) = self.session.lock().await.take().and_then(Arc::into_inner) {

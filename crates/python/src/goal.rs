@@ -2,6 +2,8 @@
 
 use crate::error::{line, of_failure, of_world};
 use crate::numbers;
+use crate::patience::patience;
+use crate::process::Process;
 use crate::value::{Fact, fields_from_python, fields_to_python, from_python};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -15,15 +17,16 @@ use ratn_worker::action::{ActionFailure, CallFailure, GoalContext, MAX_PROGRESS_
 use ratn_worker::client::{fact, pattern};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
 use tokio::runtime::Handle;
 use tokio::task::AbortHandle;
 
 /// A goal under way: what is to be done, and what may be done with it.
 #[pyclass(frozen, module = "ratn")]
 pub(crate) struct Goal {
-    pub(crate) context: Arc<GoalContext>,
-    pub(crate) runtime: Handle,
+    context: Arc<GoalContext>,
+    runtime: Handle,
+    /// Of the worker: a fork of it hears nothing of the goal, and nobody hears what it tells.
+    process: Process,
     measured: Mutex<Vec<(FactKey, Value, Measurement)>>,
     /// What waits for the goal being told to stop; nothing where it is over.
     watching: Mutex<Option<Vec<AbortHandle>>>,
@@ -36,10 +39,16 @@ impl Goal {
         Goal {
             context,
             runtime,
+            process: Process::new(),
             measured: Mutex::default(),
             watching: Mutex::new(Some(Vec::new())),
             over: Arc::default(),
         }
+    }
+
+    /// The goal, in the process that performs it.
+    fn here(&self) -> PyResult<&GoalContext> {
+        self.process.check("this goal", "ask and tell in the action itself").map(|()| &*self.context)
     }
 
     /// Nothing is called any more when it shall stop.
@@ -82,35 +91,41 @@ impl Goal {
 
     /// Whether the goal shall stop.
     #[getter]
-    fn cancelled(&self) -> bool {
-        self.context.cancelled.is_cancelled()
+    fn cancelled(&self) -> PyResult<bool> {
+        Ok(self.here()?.cancelled.is_cancelled())
     }
 
     /// Goes on unless the goal shall stop: then it raises `ratn.Cancelled`. Often enough is ten times a second.
     fn checkpoint(&self) -> PyResult<()> {
-        self.context.checkpoint().map_err(of_failure)
+        self.here()?.checkpoint().map_err(of_failure)
     }
 
     /// Waits so many seconds of wall time; raises `ratn.Cancelled` as soon as the goal shall stop.
     fn sleep(&self, py: Python<'_>, seconds: f64) -> PyResult<()> {
-        let pause = Duration::try_from_secs_f64(seconds)
-            .map_err(|_| PyValueError::new_err(format!("seconds: {seconds} is no time to wait")))?;
-        let slept = async { self.context.unless_cancelled(tokio::time::sleep(pause)).await };
+        let (goal, pause) = (self.here()?, patience("seconds", Some(seconds))?);
+        let slept = async {
+            match pause {
+                Some(pause) => goal.unless_cancelled(tokio::time::sleep(pause)).await,
+                None => goal.unless_cancelled(std::future::pending()).await,
+            }
+        };
         py.detach(|| self.runtime.block_on(slept)).map_err(of_failure)
     }
 
     /// Waits while a hold is in force at the driver, or the goal is suspended; raises `ratn.Cancelled` as soon as the goal shall stop. What
     /// moves something calls it between two steps.
     fn while_held(&self, py: Python<'_>) -> PyResult<()> {
-        py.detach(|| self.runtime.block_on(self.context.while_held())).map_err(of_failure)
+        let goal = self.here()?;
+        py.detach(|| self.runtime.block_on(goal.while_held())).map_err(of_failure)
     }
 
     /// The facts of the goal's world that match any of the patterns: `goal.facts("at(?)", "on(?, table)")`.
     #[pyo3(signature = (*patterns))]
     fn facts(&self, py: Python<'_>, patterns: Vec<String>) -> PyResult<Vec<Fact>> {
+        let goal = self.here()?;
         let patterns = patterns.iter().map(|text| pattern(text)).collect::<Result<Vec<_>, _>>();
         let patterns = patterns.map_err(PyValueError::new_err)?;
-        let asked = async { self.context.unless_cancelled(self.context.facts(&patterns)).await };
+        let asked = async { goal.unless_cancelled(goal.facts(&patterns)).await };
         let facts = py.detach(|| self.runtime.block_on(asked)).map_err(of_failure)?;
         Ok(Fact::all(facts.map_err(of_world)?))
     }
@@ -119,6 +134,7 @@ impl Goal {
     /// (`ValueError`); what comes more than 100 times a second is not told.
     #[pyo3(signature = (message, /, **figures))]
     fn progress(&self, message: String, figures: Option<&Bound<'_, PyDict>>) -> PyResult<()> {
+        let goal = self.here()?;
         let figures = figures.map(fields_from_python).transpose()?.unwrap_or_default();
         let bytes = message.len() + ports_bytes(&wire_ports(figures.clone()));
         if bytes > MAX_PROGRESS_BYTES {
@@ -127,7 +143,7 @@ impl Goal {
             );
             return Err(PyValueError::new_err(said));
         }
-        self.context.progress_with(message, figures);
+        goal.progress_with(message, figures);
         Ok(())
     }
 
@@ -143,7 +159,7 @@ impl Goal {
     /// then the last one that was given counts.
     #[pyo3(signature = (outputs, *, cost_s))]
     fn improved(&self, outputs: &Bound<'_, PyDict>, cost_s: f64) -> PyResult<()> {
-        self.context.improved(fields_from_python(outputs)?, cost_s).map_err(of_failure)
+        self.here()?.improved(fields_from_python(outputs)?, cost_s).map_err(of_failure)
     }
 
     /// A fact as measured, `goal.measured("at(box_1)", pose, covariance=…)`: it is told with the outcome. `covariance` is a square matrix,
@@ -157,6 +173,7 @@ impl Goal {
         confidence: Option<f64>,
         source: String,
     ) -> PyResult<()> {
+        self.here()?;
         let key = fact(fact_text).map_err(PyValueError::new_err)?;
         let value = from_python(value)?;
         let no_matrix = || PyValueError::new_err("covariance: expected a square matrix of numbers");
@@ -180,20 +197,21 @@ impl Goal {
         action: &str,
         inputs: Option<&Bound<'py, PyDict>>,
     ) -> PyResult<Bound<'py, PyDict>> {
+        let goal = self.here()?;
         let inputs = inputs.map(fields_from_python).transpose()?.unwrap_or_default();
-        let called = py.detach(|| self.runtime.block_on(self.context.call(kind, action, inputs)));
+        let called = py.detach(|| self.runtime.block_on(goal.call(kind, action, inputs)));
         let failure = |error| match error {
-            CallFailure::Cancelled { .. } => self.context.stopped(),
+            CallFailure::Cancelled { .. } => goal.stopped(),
             error => ActionFailure::from(error),
         };
         fields_to_python(py, called.map_err(|error| of_failure(failure(error)))?)
     }
 
     /// Calls `back` without arguments, in another thread, when the goal shall stop. After the goal's end it is not called any more.
-    fn on_cancel(&self, back: Py<PyAny>) {
-        let cancelled = self.context.cancelled.clone();
+    fn on_cancel(&self, back: Py<PyAny>) -> PyResult<()> {
+        let cancelled = self.here()?.cancelled.clone();
         let mut watching = self.watching.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(watching) = watching.as_mut() else { return };
+        let Some(watching) = watching.as_mut() else { return Ok(()) };
         let over = Arc::clone(&self.over);
         let task = self.runtime.spawn(async move {
             cancelled.cancelled().await;
@@ -207,6 +225,7 @@ impl Goal {
             }
         });
         watching.push(task.abort_handle());
+        Ok(())
     }
 
     fn __repr__(&self) -> String {

@@ -9,6 +9,8 @@ mod error;
 mod goal;
 mod log;
 mod numbers;
+mod patience;
+mod process;
 mod task;
 mod threads;
 mod value;
@@ -30,6 +32,8 @@ fn _ratn(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<client::WorldWatch>()?;
     module.add_class::<client::Projected>()?;
     module.add_class::<log::Log>()?;
+    module.add_class::<process::Process>()?;
+    module.add_function(wrap_pyfunction!(patience::patience_s, module)?)?;
     module.add_function(wrap_pyfunction!(worker::serve, module)?)?;
     module.add_function(wrap_pyfunction!(task::read_yaml, module)?)?;
     module.add_function(wrap_pyfunction!(task::check_task, module)?)?;

@@ -23,6 +23,8 @@ use std::sync::{Arc, OnceLock};
 
 /// Lists within lists, and the like: no deeper.
 const MAX_DEPTH: usize = 32;
+/// A quaternion whose length differs from 1 by less than this has that length.
+const UNIT: f64 = 1e-12;
 
 /// A rigid pose: a position in metres, and an orientation as a unit quaternion (x, y, z, w).
 #[pyclass(frozen, from_py_object, module = "ratn")]
@@ -43,6 +45,8 @@ impl Pose {
         if !(length.is_finite() && length > 1e-9) {
             return Err(PyValueError::new_err("quaternion: has no length; expected (x, y, z, w)"));
         }
+        // One of length 1, but for rounding, stays as it is: a pose that was pickled or printed is the same again.
+        let length = if (length - 1.0).abs() < UNIT { 1.0 } else { length };
         let quaternion_xyzw = quaternion.map(|part| part / length);
         Ok(Pose(pose::Pose { position: [x, y, z], quaternion_xyzw }))
     }
@@ -103,6 +107,16 @@ impl Pose {
         self.0 == other.0
     }
 
+    fn __hash__(&self, py: Python<'_>) -> PyResult<isize> {
+        hash(py, &[self.0.position.as_slice(), &self.0.quaternion_xyzw].concat())
+    }
+
+    fn __getnewargs_ex__<'py>(&self, py: Python<'py>) -> PyResult<((f64, f64, f64), Bound<'py, PyDict>)> {
+        let named = PyDict::new(py);
+        named.set_item("quaternion", self.quaternion())?;
+        Ok((self.position(), named))
+    }
+
     fn __repr__(&self) -> String {
         let ([x, y, z], [a, b, c, d]) = (self.0.position, self.0.quaternion_xyzw);
         match [a, b, c, d] == pose::Pose::IDENTITY.quaternion_xyzw {
@@ -146,6 +160,14 @@ impl Joints {
 
     fn __eq__(&self, other: &Joints) -> bool {
         self.0[..] == other.0[..]
+    }
+
+    fn __hash__(&self, py: Python<'_>) -> PyResult<isize> {
+        hash(py, &self.0)
+    }
+
+    fn __getnewargs__(&self) -> (Vec<f64>,) {
+        (self.tolist(),)
     }
 
     fn __repr__(&self) -> String {
@@ -197,10 +219,16 @@ impl Trajectory {
         })
     }
 
-    /// Points of as many joints, from rows that lie one after the other.
-    fn of_columns(joints: Vec<String>, times_s: &[f64], rows: [Vec<f64>; 2]) -> PyResult<Trajectory> {
+    /// Points of as many joints, from rows that lie one after the other; without velocities where there are none.
+    fn of_columns(
+        joints: Vec<String>,
+        times_s: &[f64],
+        positions: Vec<f64>,
+        velocities: Option<Vec<f64>>,
+    ) -> PyResult<Trajectory> {
         let width = joints.len();
-        for (name, row) in ["positions", "velocities"].iter().zip(&rows) {
+        for (name, row) in [("positions", Some(&positions)), ("velocities", velocities.as_ref())] {
+            let Some(row) = row else { continue };
             if row.len() != width * times_s.len() {
                 let (points, numbers) = (times_s.len(), row.len());
                 let wrong = format!(
@@ -212,8 +240,8 @@ impl Trajectory {
         let row = |rows: &[f64], number: usize| rows[number * width..(number + 1) * width].to_vec();
         let point = |(number, time_s): (usize, &f64)| TrajectoryPoint {
             time_s: *time_s,
-            positions: row(&rows[0], number),
-            velocities: row(&rows[1], number),
+            positions: row(&positions, number),
+            velocities: velocities.as_ref().map(|velocities| row(velocities, number)).unwrap_or_default(),
         };
         let points = times_s.iter().enumerate().map(point).collect();
         Ok(value::Trajectory { joints, points }.into())
@@ -223,7 +251,7 @@ impl Trajectory {
 #[pymethods]
 impl Trajectory {
     /// `Trajectory(joints, [(time_s, positions, velocities), …])`, or `Trajectory(joints, times_s=…, positions=…, velocities=…)` with arrays or lists: a
-    /// row for each point, a column for each joint.
+    /// row for each point, a column for each joint. Velocities may be left out (of a point: `[]`).
     #[new]
     #[pyo3(signature = (joints, points=None, *, times_s=None, positions=None, velocities=None))]
     fn new(
@@ -235,17 +263,23 @@ impl Trajectory {
     ) -> PyResult<Trajectory> {
         let points = match (points, times_s, positions, velocities) {
             (Some(points), None, None, None) => points,
-            (None, Some(times_s), Some(positions), Some(velocities)) => {
-                let rows = [numbers::taken(positions)?, numbers::taken(velocities)?];
-                return Trajectory::of_columns(joints, &numbers::taken(times_s)?, rows);
+            (None, Some(times_s), Some(positions), velocities) => {
+                let (times_s, positions) = (numbers::taken(times_s)?, numbers::taken(positions)?);
+                return Trajectory::of_columns(
+                    joints,
+                    &times_s,
+                    positions,
+                    velocities.map(numbers::taken).transpose()?,
+                );
             }
-            _ => return Err(PyTypeError::new_err("say `points`, or `times_s`, `positions` and `velocities`")),
+            _ => return Err(PyTypeError::new_err("say `points`, or `times_s`, `positions` and perhaps `velocities`")),
         };
         let width = joints.len();
         let mut taken = Vec::with_capacity(points.len());
         for (number, (time_s, positions, velocities)) in points.into_iter().enumerate() {
-            if positions.len() != width || velocities.len() != width {
-                let wrong = format!("points[{number}]: {width} joints need as many positions and velocities");
+            if positions.len() != width || (velocities.len() != width && !velocities.is_empty()) {
+                let wrong =
+                    format!("points[{number}]: {width} joints need as many positions, and as many velocities or none");
                 return Err(PyValueError::new_err(wrong));
             }
             taken.push(TrajectoryPoint { time_s, positions, velocities });
@@ -292,6 +326,14 @@ impl Trajectory {
 
     fn __eq__(&self, other: &Trajectory) -> bool {
         self.value == other.value
+    }
+
+    fn __hash__(&self, py: Python<'_>) -> PyResult<isize> {
+        hash(py, &self.columns().times_s)
+    }
+
+    fn __getnewargs__(&self) -> (Vec<String>, Vec<Point>) {
+        (self.joints(), self.points())
     }
 
     fn __repr__(&self) -> String {
@@ -436,6 +478,11 @@ pub(crate) fn inputs_to_python<'py>(
         }
     }
     Ok(taken)
+}
+
+/// As Python hashes numbers, of which 0 and -0 are the same.
+fn hash(py: Python<'_>, numbers: &[f64]) -> PyResult<isize> {
+    PyTuple::new(py, numbers)?.hash()
 }
 
 /// What Python gives as a value.

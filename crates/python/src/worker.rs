@@ -3,6 +3,8 @@
 
 use crate::error::{Aborted, Cancelled, Error, Lost, line};
 use crate::goal::Goal;
+use crate::patience::patience;
+use crate::process::Process;
 use crate::threads::Threads;
 use crate::value::{fields_from_python, from_python, inputs_to_python};
 use pyo3::exceptions::PyValueError;
@@ -79,6 +81,7 @@ pub(crate) fn serve(
     without_leases: bool,
     driven: Option<Driven>,
 ) -> PyResult<()> {
+    Process::check_signals("this worker")?;
     let pooled = std::env::var_os("RATN_PROVIDER_SESSION").is_some_and(|session| !session.is_empty());
     let arguments = Arguments::of(arguments, pooled).and_then(Arguments::worker);
     let mut worker = arguments.map_err(|error| PyValueError::new_err(line(&error)))?.provides(provider, kind);
@@ -94,9 +97,8 @@ pub(crate) fn serve(
     let _ = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(false).try_init();
     let standstill = driven.as_ref().and_then(|driven| driven.standstill_s);
     if let Some(seconds) = standstill {
-        let bound = Duration::try_from_secs_f64(seconds);
-        let bound = bound.map_err(|_| PyValueError::new_err(format!("standstill_s: {seconds} is no time to wait")))?;
-        worker = worker.standstill(bound);
+        let bound = patience("standstill_s", Some(seconds))?;
+        worker = worker.standstill(bound.ok_or_else(|| PyValueError::new_err("standstill_s: has an end"))?);
     }
     let ended = py.detach(|| {
         // More than one would wake each other for every goal, and have nothing to do.

@@ -274,7 +274,7 @@ def test_an_f_string_that_is_no_annotation_is_refused() -> None:
     def assigned(n: int) -> None:
         said = ratn.variable("")
         gripper.release(assign={"said": f"{n} boxes"})
-        assert said is not None
+        assert isinstance(said, ratn.Value)
 
     def expression(n: int) -> None:
         look(fn.concat(f"{n}"))
@@ -580,3 +580,123 @@ def test_descriptions_survive_a_catalogue_and_stubs(text: str) -> None:
     assert "def look(" in stubs and "3d_scan" not in stubs and "odd" not in stubs.partition("class _Odometry")[0]
 
 
+
+
+@ratn.function
+def near(a: object, b: object) -> object:
+    return fn.distance(a, b) < 0.5
+
+
+def test_a_comparison_that_python_decides_alone_is_refused() -> None:
+    def given(n: int) -> None:
+        if n is None:
+            pan_tilt.look_at(target=REGION["pose"])
+
+    def turned(n: int = 3) -> None:
+        assert None is not n
+
+    def output() -> None:
+        seen = other = detector.segment(region=REGION)
+        if seen.boxes[0].size is not None:
+            find()
+
+    def named() -> None:
+        seen = detector.segment(region=REGION)
+        boxes = fn.filter(seen.boxes, lambda box: box.size[0] > 0.1)
+        first = boxes[0].pose @ ratn.Pose()
+        print(first is None)
+
+    def both(n: int, m: int) -> None:
+        more = n
+        more = more + m
+        print(more is None)
+
+    def looped() -> None:
+        seen = detector.segment(region=REGION)
+        for number, box in ratn.each(seen.boxes, index=True):
+            print(0 if box.pose is None else number)
+
+    def waited() -> None:
+        order = ratn.wait(signal="order")
+        if order.value is True:
+            find()
+
+    def false(n: bool) -> None:
+        print(n is not False)
+
+    def of_elements(n: list) -> None:
+        fn.filter(n, lambda x: x is not None)
+
+    def of_function(n: ratn.Pose) -> None:
+        print(near(n, n) is None)
+
+    def matched(n: int) -> None:
+        match n:
+            case None:
+                find()
+
+    expected = {
+        given: "ratn.when(n == None)", turned: "n != None", output: "seen.boxes[0].size != None", named: "first == None", both: "more == None",
+        looped: "box.pose == None", waited: "ratn.when(order.value)", false: "ratn.when(n)", of_elements: "x != None", of_function: "near(n, n) == None",
+        matched: "`case None` is decided by Python now",
+    }
+    for function, part in expected.items():
+        refused(function, "is decided by Python now", part)
+    with pytest.raises(ratn.Untraceable, match="a != None"):
+
+        @ratn.function
+        def there(a: object) -> object:
+            return a is not None
+
+
+def perhaps(what: object = None) -> object:
+    """What Python may compare with `None`: whether something was given."""
+    return 1 if what is None else what
+
+
+def test_a_comparison_of_what_python_knows_is_traced() -> None:
+    @ratn.task
+    def plain(n: int, m: int = 2) -> object:
+        before = None
+        for at in (REGION["pose"], None):
+            if at is None:
+                continue
+            seen = detector.segment(region=REGION, resources=["Detector", "Camera"])
+            if before is not None:
+                look(before.boxes[0].pose)
+            before = seen
+        found = perhaps(n)
+        if found is None or before is None or perhaps() is None or seen is None:
+            raise AssertionError
+        m = perhaps()
+        if m is None:
+            raise AssertionError
+        return {"found": found, "given": [1 if each is None else 2 for each in (n, None)]}
+
+    assert plain.document["outputs"] == {"found": "$n", "given": [2, 1]} and len(plain.document["states"]) == 1
+    # Without its source nothing is refused.
+    module: dict[str, object] = {"__name__": "typed"}
+    exec("def typed(n):\n    return {'given': n is not None}", module)
+    assert ratn.task(module["typed"]).document["outputs"] == {"given": True}
+
+
+@pytest.mark.parametrize("decorated", [int, 3, "look", ratn.Pose()])
+def test_what_is_no_function_is_no_task(decorated: object) -> None:
+    with pytest.raises(TypeError, match="`ratn.task` takes a function, and is given the"):
+        ratn.task(decorated)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ({"ü": 1, "a b": [2, None], "not": True}, '{"ü": 1, "a b": [2, null], not: true}'),
+        ('two\n"words"\t\\ \r', '"two\\n\\"words\\"\\t\\\\ \r"'),
+        ({1: -(2**63), "": 2**63 - 1}, '{"1": (-9223372036854775807 - 1), "": 9223372036854775807}'),
+    ],
+)
+def test_a_value_is_written_in_the_words_of_the_language(value: object, text: str) -> None:
+    from ratn._expression import expression
+
+    assert expression(value) == text
+    with pytest.raises(ratn.Untraceable, match="64 bits"):
+        expression(2**63)

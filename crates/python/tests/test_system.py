@@ -255,6 +255,45 @@ def test_two_threads_open_the_session_of_a_system_together(system: ratn.System) 
     assert told.stdout == "both\n", told.stderr
 
 
+FORK_OF_A_RUN = """
+import asyncio, os, signal, sys, ratn
+
+@ratn.task
+def waits() -> None:
+    ratn.wait(signal="go")
+
+with ratn.System(runtime_dir=sys.argv[1]) as system:
+    run, watch = system.run(waits), system.watch()
+    assert next(watch) and run.id
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)
+
+        async def events():
+            async for _ in run: ...
+
+        for ask in (lambda: run.under_way, run.result, lambda: list(run), lambda: asyncio.run(events()), lambda: next(watch)):
+            try:
+                ask()
+                os._exit(1)
+            except ratn.Error as refused:
+                if "is a fork" not in str(refused) or "spawn" not in str(refused):
+                    os._exit(2)
+        if "of another process" not in repr(run) or not run.id:
+            os._exit(3)
+        # The program speaks for itself.
+        run.signal("go")
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert run.result(60).is_success
+"""
+
+
+def test_a_run_is_looked_at_in_no_fork_of_its_process(system: ratn.System) -> None:
+    told = subprocess.run([sys.executable, "-c", FORK_OF_A_RUN, str(system.runtime_dir)], capture_output=True, text=True, timeout=60)
+    assert told.returncode == 0, told.stderr
+
+
 FORK = """
 import os, signal, sys, ratn
 
@@ -281,6 +320,84 @@ with ratn.System(runtime_dir=sys.argv[1]) as system:
 def test_a_fork_of_a_process_neither_waits_for_its_threads_nor_ends_what_it_has(system: ratn.System) -> None:
     told = subprocess.run([sys.executable, "-c", FORK, str(system.runtime_dir)], capture_output=True, text=True, timeout=60)
     assert told.returncode == 0, told.stderr
+
+
+@ratn.task
+def orders() -> dict:
+    order = ratn.wait(signal="order")
+    return {"order": order.value}
+
+
+@pytest.mark.parametrize(
+    "value",
+    [{"ü": 1, "a b": [1, {"x": None, "not": False}], "2": -2}, 'two "words"\n\t\r\\ü', "null", "find", "-x", -5, -(2**63), 1e300, 2**63 - 1, [], {}, [[{}]], False],
+    ids=str,
+)
+def test_a_signal_has_any_value(system: ratn.System, value: object) -> None:
+    run = system.run(orders)
+    run.signal("order", value)
+    got = run.result(60).outputs["order"]
+    assert got == value and isinstance(got, bool) == isinstance(value, bool)
+
+
+def test_a_value_that_is_none_is_refused_with_what_is_one(system: ratn.System) -> None:
+    run = system.run(orders)
+    for value, said in ((2**63, "64 bits"), (float("nan"), "finite"), (b"x", "a bytes is no value"), ("x\0", "NUL"), ("\ud800", "surrogate"), ("x" * 20_000, "10000")):
+        with pytest.raises((ratn.Error, ValueError), match=said):
+            run.signal("order", value)
+    run.abort()
+    run.result(60)
+
+
+def test_a_time_to_wait_means_the_same_everywhere(system: ratn.System) -> None:
+    run = system.run(orders)
+    with system.acquire("Camera"):
+        waits = (run.result, lambda timeout_s: system.acquire("Camera", timeout_s=timeout_s), lambda timeout_s: system.project({}, timeout_s=timeout_s))
+        for wait in waits:
+            for wrong in (float("nan"), -0.5, float("-inf")):
+                with pytest.raises(ValueError, match="timeout_s is .*: say seconds, 0 or more, or None"):
+                    wait(wrong)
+    with pytest.raises(TimeoutError):
+        run.result(0)
+    run.signal("order")
+    assert run.result(float("inf")).is_success
+    for long in (float("inf"), 1e300):
+        assert system.acquire("Camera", timeout_s=long).release()
+
+
+def test_what_has_ended_says_so(system: ratn.System) -> None:
+    run = system.run(orders)
+    run.signal("order")
+    run.result(60)
+    for tell in (run.pause, run.abort, lambda: run.signal("order"), lambda: run.answer("yes")):
+        with pytest.raises(ratn.Error, match="the run has ended"):
+            tell()
+    found = ratn.System(runtime_dir=system.runtime_dir)
+    found.close()
+    for ask in (found.query, found.resources, found.watch, found.pools, lambda: found.set("at(probe)", 1), lambda: found.acquire("Camera"), lambda: found.run(orders), lambda: found.project({})):
+        with pytest.raises(ratn.Error, match="this system is closed"):
+            ask()
+
+
+WHO_RUNS_IT = """
+import pathlib, sys, ratn
+
+with ratn.System(pathlib.Path(sys.argv[1]), speed=50) as system:
+    (pool,) = [pool for pool in system.pools() if pool["kind"] == "Late"]
+    print(pathlib.Path(f"/proc/{pool['workers'][0]['pid']}/cmdline").read_bytes().split(b"\\0")[0].decode())
+"""
+
+
+@pytest.mark.skipif(sys.prefix == sys.base_prefix, reason="this interpreter is in no virtual environment")
+def test_workers_are_run_by_the_environment_of_the_program_that_starts_them(place: Place) -> None:
+    place.write("late.py", "import ratn\nworker = ratn.Worker()\n\n@worker.action\ndef late(goal: ratn.Goal) -> None: ...\n\nworker.run()\n")
+    config = place.write(
+        "system.toml",
+        'catalogues = ["built-in"]\n[process-manager]\nhost = "compute"\n[[process-manager.template]]\nname = "late"\nkind = "Late"\npython = "late.py"\nmin = 1\n',
+    )
+    environment = {key: value for key, value in os.environ.items() if key not in ("VIRTUAL_ENV", "RATN_RUNTIME_DIR")}
+    told = subprocess.run([sys.executable, "-c", WHO_RUNS_IT, str(config)], env=environment, capture_output=True, text=True, timeout=100)
+    assert told.stdout.strip() == str(pathlib.Path(sys.prefix) / "bin" / "python"), told.stderr
 
 
 def test_the_log_of_a_run_under_way_outlives_its_object(system: ratn.System) -> None:

@@ -342,7 +342,7 @@ def test_what_cannot_be_traced_is_refused_with_its_line_and_what_to_write_instea
     def skipped(n: list) -> None:
         for one in ratn.each(n):
             with ratn.when(one > 2):
-                if n is not None:
+                if True:
                     continue
             gripper.release()
 
@@ -354,6 +354,10 @@ def test_what_cannot_be_traced_is_refused_with_its_line_and_what_to_write_instea
                 break
             gripper.release()
 
+    def endless(n: int) -> None:
+        ratn.wait(seconds=1)
+        ratn.wait(signal="go", timeout=float("inf"))
+
     def handled(n: int) -> None:
         try:
             gripper.release()
@@ -362,7 +366,7 @@ def test_what_cannot_be_traced_is_refused_with_its_line_and_what_to_write_instea
 
     expected = {
         returned: ("this `return` leaves a block that is done only sometimes", 2), skipped: ("this `continue`", 4), left: ("this `break`", 5),
-        handled: ("`except ratn.Aborted` around a state", 3),
+        handled: ("`except ratn.Aborted` around a state", 3), endless: ("inf is no number of a task", 2),
         if_: ("with ratn.when(condition)", 2), while_: ("with ratn.while_(condition)", 1), and_: ("`(a) & (b)`", 1), not_: ("`~(a)`", 1),
         chained: ("(a < b) & (b < c)", 1), ternary: ("fn.if_(", 1), in_: ("ratn.isin(", 1), for_: ("for x in ratn.each(list)", 1),
         range_: ("ratn.each(fn.range(n))", 1), comprehension: ("fn.map(", 1), filtered: ("fn.filter(", 1), length: ("fn.len(", 1), whole: ("fn.floor", 1),
@@ -483,17 +487,20 @@ def test_stubs_have_the_actions_of_the_catalogue_and_type_checkers_refuse_what_i
     subprocess.run([sys.executable, "-m", "ratn", "stubs", "--catalogue", str(catalogue), str(tmp_path / "robot.py")], check=True)
     good = "import ratn\nfrom robot import eye, gripper\n\n@ratn.task\ndef t() -> None:\n    look = eye.look(at=ratn.Pose(1, 2, 3), computes=True)\n"
     good += "    with ratn.when(look.seen):\n        gripper.grasp(object='cup')\n"
+    good += "\n@ratn.step\ndef one() -> None: ...\n\n@ratn.step(reads=[])\ndef two() -> None: ...\n\nkinds: list[str] = [one.kind, two.kind, t.name]\n"
     (tmp_path / "good.py").write_text(good + "\n\nt.check()\nprint(t.to_yaml())\n")
     told = subprocess.run([sys.executable, "good.py"], cwd=tmp_path, capture_output=True, text=True)
     assert "action: eye/look" in told.stdout and "resources: [Eye, world_model]" in told.stdout, told.stderr
     if sys.version_info < (3, 12):
         return  # One interpreter is enough for mypy, which is slow.
     pytest.importorskip("mypy")
-    wrong = good.replace("ratn.Pose(1, 2, 3)", "3.5").replace("object=", "thing=").replace("look.seen", "look.sean")
+    wrong = good.replace("ratn.Pose(1, 2, 3)", "3.5").replace("object=", "thing=").replace("look.seen", "look.sean").replace("one.kind, two.kind, t.name", "one.kid, two.kid, t.nam")
     (tmp_path / "wrong.py").write_text(wrong)
     command = [sys.executable, "-m", "mypy", "--cache-dir", str(tmp_path / "mypy"), "good.py", "wrong.py"]
     told = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     for part in ('wrong.py:6: error: Argument "at"', 'wrong.py:7: error: "_Eye_Look" has no attribute "sean"', 'wrong.py:8: error: Unexpected keyword argument "thing"'):
+        assert part in told.stdout, told.stdout
+    for part in ('"Step" has no attribute "kid"', '"Task" has no attribute "nam"'):
         assert part in told.stdout, told.stdout
     assert "good.py" not in told.stdout, told.stdout
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import pathlib
+import pickle
 import shutil
 import subprocess
 import sys
@@ -121,6 +123,20 @@ def test_what_an_action_says_of_itself_is_what_the_native_part_is_told(monkeypat
     assert scanned.computes and not unsaid.computes
 
 
+VALUES = [
+    ratn.Pose(1, 2, 3, 0.1, 0.2, 0.3), ratn.Pose(-0.0), ratn.Pose(quaternion=(1, 1, 1, 3)), ratn.Joints([1, 2.5]), ratn.Joints([]),
+    ratn.Trajectory(["a"], [(0, [1], [2]), (1, [3], [4])]), ratn.Trajectory(["a", "b"], [(0, [1, 2], [])]),
+]
+
+
+@pytest.mark.parametrize("value", VALUES, ids=repr)
+def test_a_value_is_copied_pickled_and_a_key(value: ratn.Pose | ratn.Joints | ratn.Trajectory) -> None:
+    for again in (copy.copy(value), copy.deepcopy(value), *(pickle.loads(pickle.dumps(value, protocol)) for protocol in range(2, 6))):
+        assert again == value and hash(again) == hash(value) and {value: "there"}[again] == "there"
+    assert len(set(VALUES)) == len(VALUES)
+    assert hash(ratn.Pose(0.0)) == hash(ratn.Pose(-0.0))
+
+
 def test_an_outcome_of_its_own_is_followed(tester: Place) -> None:
     text = (
         "task: odd\nstates:\n  - it:\n      action: tester/halve\n      in: { number: 7 }\n      computes: true\n      reads: []\n"
@@ -183,6 +199,67 @@ def test_an_unusual_exception_is_a_reason_like_others(tester: Place, how: str, r
     ended = tester.run(tester.write(f"unusual_{how}.yaml", task(f"unusual_{how}", state("it", "tester/unusual", "Tester", f"{{ how: {how} }}"))))
     assert ended["outcome"] == "aborted" and reason in ended["reason"] and len(ended["reason"]) < 20_000, ended["reason"][:2_000]
     assert performed(tester, f"after_unusual_{how}", "echo", "{ value: 3 }", "echo") == 3
+
+
+def test_a_goal_is_asked_in_no_fork_of_its_worker(tester: Place) -> None:
+    text = task("asks", state("it", "tester/asks_in_a_fork", "Tester, world_model", more="computes: true, reads: ['at(?)']"), "outputs:\n  out: { type: any, value: it.refused }\n")
+    ended = tester.run(tester.write("asks.yaml", text))
+    refused = ended["outputs"]["out"]
+    assert [said.split(":")[0] for said in refused] == [
+        "cancelled", "checkpoint", "sleep", "while_held", "facts", "progress", "improved", "measured", "call", "on_cancel",
+    ], ended
+    assert all("is a fork" in said and 'multiprocessing.get_context("spawn")' in said for said in refused), refused
+
+
+SERVE_IN_A_FORK = """
+import os, sys, ratn
+
+system = ratn.System(runtime_dir=sys.argv[1])
+child = os.fork()
+if child == 0:
+    worker = ratn.Worker("late")
+
+    @worker.action
+    def late(goal: ratn.Goal) -> None: ...
+
+    try:
+        worker.run(["--id", "late", "--endpoint-file", sys.argv[1] + "/late.endpoint"])
+    except ratn.Error as refused:
+        os._exit(7 if "is a fork" in str(refused) else 1)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+def test_a_fork_of_a_process_with_a_system_is_no_worker(tester: Place) -> None:
+    told = subprocess.run([sys.executable, "-c", SERVE_IN_A_FORK, str(tester.runtime)], capture_output=True, text=True, timeout=60)
+    assert told.returncode == 7, told.stderr
+
+
+def test_a_state_by_the_name_of_its_action_blocks_what_performs_it(tester: Place) -> None:
+    from ratn._resources import of_system
+
+    @ratn.task(world=["at(cup) = pose(1, 0, 0)", "at(plate) = pose(0.2, 0, 0)"])
+    def near() -> dict:
+        it = ratn.action("nearest/nearest", {"start": ratn.Pose(0.9)}, computes=True, reads=["at(?)"], name="it")
+        with ratn.sequence("held", resources=["Nearest"], routine=True):
+            ratn.action("nearest/nearest", {"start": ratn.Pose(0.9)}, effects=[], name="inside")
+        return {"object": it.object}
+
+    system = ratn.System(runtime_dir=tester.runtime)
+    assert [found for found in near.check(system=system) if found.severity == "error"] == []
+    document = near._knowing(lambda: of_system(tester.runtime)).document
+    first, routine = document["states"]
+    assert first["it"]["resources"] == ["Nearest", "world_model"] and "resources" not in routine["held"]["states"][0]["inside"], document
+    assert "resources" not in near.document["states"][0]["it"]
+    result = system.run(near).result(60)
+    assert result.outputs == {"object": "cup"}, result
+
+    @ratn.task
+    def unknown() -> None:
+        ratn.action("nearest/farthest")
+
+    with pytest.raises(ratn.Error, match=r'nobody in the system offers the action `nearest/farthest`.*say `resources=\["Kind"\]`'):
+        system.run(unknown)
 
 
 def test_a_process_that_an_action_forks_leaves_the_goal_to_it(tester: Place) -> None:
@@ -382,6 +459,8 @@ def test_arrays_of_a_trajectory_share_its_memory_and_make_one() -> None:
         ratn.Trajectory(["a", "b"], times_s=[0, 1, 2], positions=[[1, 2]], velocities=positions)
     with pytest.raises(TypeError, match="times_s"):
         ratn.Trajectory(["a", "b"], times_s=[0, 1, 2])
+    still = ratn.Trajectory(["a", "b"], times_s=[0, 1, 2.5], positions=positions)
+    assert still.velocities is None and still == ratn.Trajectory(["a", "b"], still.points)
 
 
 def test_numbers_are_rows_and_need_no_numpy() -> None:

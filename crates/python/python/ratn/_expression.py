@@ -10,7 +10,6 @@ from __future__ import annotations
 import ast
 import contextlib
 import contextvars
-import json
 import linecache
 import math
 import os
@@ -80,6 +79,15 @@ def statements_at_work(file: str, line: int) -> list[ast.AST]:
     ]
     found.sort(key=lambda node: _ends(node) - _begins(node))
     return found
+
+
+def function_at(file: str, line: int, name: str) -> ast.FunctionDef | None:
+    """The function of a name that begins at a line, with its decorators."""
+    tree = _tree(file)
+    for node in () if tree is None else ast.walk(tree):
+        if isinstance(node, ast.FunctionDef) and node.name == name and min(map(_begins, [node, *node.decorator_list])) == line:
+            return node
+    return None
 
 
 def jump_out_of_with(file: str, line: int) -> tuple[str, int] | None:
@@ -230,6 +238,17 @@ def literal(text: str, what: str = "a text") -> str:
         )
     # What a member of an enumeration says of itself is another text than its value.
     return str.__str__(text)
+
+
+def _quoted(text: str) -> str:
+    """A text as an expression has it, which knows fewer escapes than JSON: what else there is stands for itself."""
+    for sign, escaped in (("\\", "\\\\"), ('"', '\\"'), ("\n", "\\n"), ("\t", "\\t")):
+        text = text.replace(sign, escaped)
+    return f'"{text}"'
+
+
+def _field(name: str) -> str:
+    return name if _WORD.match(name) else _quoted(name)
 
 
 def key_of(name: object, what: str = "a name") -> str:
@@ -525,13 +544,13 @@ def written(value: object) -> object:
         refuse("a state is no value", "name one of its outputs, `look.boxes`")
     if isinstance(value, str):
         value = literal(value)
-        return value if _WORD.match(value) and value not in KEYWORDS else json.dumps(value, ensure_ascii=False)
+        return value if _WORD.match(value) and value not in KEYWORDS else _quoted(value)
     if isinstance(value, range) and value.step == 1:
         return f"range({value.start}, {value.stop})" if value.start else f"range({value.stop})"
     if isinstance(value, (list, tuple)):
         return Value("[", *_joined(written(item) for item in value), "]")
     if isinstance(value, dict):
-        pairs = (Value(f"{key_of(name)}: ", written(item)) for name, item in value.items())
+        pairs = (Value(f"{_field(key_of(name))}: ", written(item)) for name, item in value.items())
         return Value("{", *_joined(pairs), "}")
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
@@ -541,12 +560,21 @@ def written(value: object) -> object:
     if isinstance(value, Joints):
         return f"joints({', '.join(_number(number) for number in value)})"
     if isinstance(value, (int, float)) and not hasattr(value, "tolist"):
+        if isinstance(value, int):
+            return _whole_number(value)
         if not math.isfinite(value):
             refuse(f"{value} is no number of a task", "use finite numbers")
-        return int.__repr__(value) if isinstance(value, int) else float.__repr__(value)
+        return float.__repr__(value)
     if hasattr(value, "tolist"):
         return written(value.tolist())
     refuse(f"a {type(value).__name__} is no value of a task", "use numbers, texts, lists, dicts, ratn.Pose, ratn.Joints, or values of the task")
+
+
+def _whole_number(number: int) -> str:
+    if not -(2**63) <= number < 2**63:
+        refuse(f"{number} is no number of a task", "use whole numbers of at most 64 bits, or floats")
+    # What stands behind the sign would be too large by itself.
+    return int.__repr__(number) if number > -(2**63) else f"({number + 1} - 1)"
 
 
 def _number(number: float) -> str:

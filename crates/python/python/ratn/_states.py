@@ -11,6 +11,7 @@ from typing import Any
 
 from ratn._annotations import ANNOTATIONS, annotate, entry
 from ratn._expression import Binding, TaskFunctionScope, Value, Variable, binding, call, expression, literal, plain, refuse, user_line, words
+from ratn._resources import resources
 from ratn._trace import AnyState, State, Trace, assigned_name
 
 
@@ -27,8 +28,7 @@ def perform(
         node.body["in"] = {port: entry(value) for port, value in inputs.items()}
     annotate(node.body, annotations)
     if kind is not None and "resources" not in annotations:
-        reads_world = node.body.get("computes") is True and node.body.get("reads", True) != []
-        node.body["resources"] = [kind, "world_model"] if reads_world else [kind]
+        node.body["resources"] = resources(kind, node.body)
     return AnyState(node)
 
 
@@ -72,7 +72,11 @@ class Provider:
 
 
 def action(name: str, /, inputs: dict[str, Any] | None = None, **annotations: Any) -> AnyState:
-    """A state that performs an action by its name, ``ratn.action("arm/follow", {"trajectory": plan.trajectory}, pia=True)``."""
+    """A state that performs an action by its name, ``ratn.action("arm/follow", {"trajectory": plan.trajectory}, pia=True)``.
+
+    Where nobody says its ``resources``, it blocks what performs it: a run, and ``task.check(system=…)``, ask the system for what is in no catalogue. In a task file
+    (``task.to_yaml()``) they have to be said.
+    """
     state_name = annotations.pop("name", None)
     return perform(name, inputs or {}, annotations, name=state_name)
 
@@ -190,6 +194,9 @@ class TaskFunction:
 
 def function(function: Callable[..., Any]) -> TaskFunction:
     """Makes a function one of the task file: written once, used in expressions, ``near(box.pose, table)``. It sees its parameters and facts only."""
+    from ratn._identity import refuse_identity
+
+    refuse_identity(function)
     return TaskFunction(function)
 
 

@@ -64,7 +64,7 @@ class Step:
         function = self.function
         if not self.takes_goal:
             function = _without_goal(function)
-        worker.action(function, name=self.name, **self.said)
+        worker.action(name=self.name, **self.said)(function)
         return worker._actions[self.name]
 
     def __call__(self, *positional: Any, **given: Any) -> Any:
@@ -115,6 +115,20 @@ def _without_goal(function: Callable[..., Any]) -> Callable[..., Any]:
     return called
 
 
+@typing.overload
+def step(function: Callable[..., Any], /) -> Step: ...
+@typing.overload
+def step(
+    *,
+    name: str | None = None,
+    outputs: dict[str, Any] | None = None,
+    outcomes: Iterable[str] = (),
+    computes: bool | None = None,
+    reads: Iterable[str] = (),
+    senses: Iterable[str] = (),
+    requires: Iterable[str] = (),
+    effects: Iterable[str] = (),
+) -> Callable[[Callable[..., Any]], Step]: ...
 def step(
     function: Callable[..., Any] | None = None,
     *,
@@ -126,7 +140,7 @@ def step(
     senses: Iterable[str] = (),
     requires: Iterable[str] = (),
     effects: Iterable[str] = (),
-) -> Any:
+) -> Step | Callable[[Callable[..., Any]], Step]:
     """Makes a function a step: in a task, its call is a state that a worker of the run performs.
 
     It is as ``Worker.action``, but for the goal, which it may do without. Its file is run by the worker: what shall happen only in the

@@ -26,7 +26,7 @@ from collections.abc import AsyncIterator, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ratn import _ratn, _views
+from ratn import _ratn, _resources, _views
 from ratn._expression import expression, literal
 from ratn._ratn import Error, Fact, Lease, Projected, WorldWatch
 from ratn._step import kind_of, refuse_while_read
@@ -58,14 +58,20 @@ def _told(words: list[str]) -> subprocess.CompletedProcess[str]:
     return subprocess.run([_program(), *words], capture_output=True, text=True, encoding="utf-8", errors="replace")
 
 
+def _environment() -> dict[str, str]:
+    """Of the daemons: those workers in Python that say no interpreter are run by the one of this virtual environment, whether it is active or not."""
+    own = {"VIRTUAL_ENV": sys.prefix} if sys.prefix != sys.base_prefix else {}
+    return {**os.environ, **own}
+
+
 def _text_of(file: pathlib.Path) -> str:
     """What a process has written, as far as that is text."""
     return file.read_text(encoding="utf-8", errors="replace")
 
 
-def _remove(folder: str, maker: int, processes: list[subprocess.Popen[Any]]) -> None:
+def _remove(folder: str, maker: _ratn.Process, processes: list[subprocess.Popen[Any]]) -> None:
     """Removes a folder, unless a process still writes into it. A fork of the process that made it leaves it alone."""
-    if os.getpid() == maker and all(process.poll() is not None for process in processes):
+    if maker.is_here and all(process.poll() is not None for process in processes):
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -119,7 +125,7 @@ class System:
         refuse_while_read("it would start a system")
         self._process: subprocess.Popen[str] | None = None
         self._clean: weakref.finalize[..., System] | None = None
-        self._maker = os.getpid()
+        self._maker = _ratn.Process()
         directory = pathlib.Path(runtime_dir) if runtime_dir is not None else _default_directory()
         if config is None and not options and (directory / "resource-manager.endpoint").exists():
             self.runtime_dir = directory
@@ -145,7 +151,7 @@ class System:
             # A group of its own: Ctrl-C is for this process, which then ends the system in order. The pipe ends with this process,
             # however that ended, and the system with it.
             self._process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, text=True, start_new_session=True
+                command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, text=True, start_new_session=True, env=_environment()
             )
         until = time.monotonic() + _READY_WITHIN_S
         try:
@@ -176,7 +182,7 @@ class System:
             self._end()
 
     def _end(self) -> None:
-        if os.getpid() != self._maker:
+        if not self._maker.is_here:
             return
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
@@ -211,6 +217,7 @@ class System:
 
         It goes beside other runs of the system, unless it or one of them is to be ``alone``; ``urgency`` (``low``, ``normal``, ``high``) says whose needs come first. ``share`` (0.01 to 100) is how much it has of what several runs need, beside the shares of the others. ``due`` says when it is to have ended: seconds from its start or a ``timedelta``, a ``datetime`` (local time where it names no zone), or a text as ``ratn run --due`` has it (``"15m"``); of what several runs need at about the same time, the run that is due first comes first. The steps of a task (``@ratn.step``) are performed by workers that are the run's own and live as long as it: ``step_workers`` processes for each file. The run's log is in a temporary folder unless ``log`` says where; that goes with the ``Run``, unless the run is under way then.
         """
+        self._client.check_open()
         given = {**(parameters or {}), **others}
         if twice := set(parameters or {}) & set(others):
             raise TypeError(f"parameter `{min(twice)}` is given twice, by its name and in `parameters`")
@@ -221,7 +228,7 @@ class System:
     ) -> Lease:
         """Waits until one resource of each kind is free and takes all of them: ``with system.acquire("PathPlanner") as lease:``.
 
-        Raises ``ratn.DeadlineExceeded`` after ``timeout_s`` seconds of wall time.
+        Raises ``ratn.DeadlineExceeded`` after ``timeout_s`` seconds of wall time; ``None`` and infinity are for ever.
         """
         return self._client.acquire(list(kinds), priority=priority, timeout_s=timeout_s, holder=holder)
 
@@ -231,6 +238,7 @@ class System:
 
     def pools(self) -> list[dict[str, Any]]:
         """The pools of worker processes of all hosts, as ``ratn ps --json`` has them."""
+        self._client.check_open()
         told = _told(["ps", "--json", "--runtime-dir", str(self.runtime_dir)])
         if not told.stdout.strip():
             raise Error(told.stderr.strip() or f"`ratn ps` has ended with code {told.returncode}")
@@ -267,6 +275,22 @@ class _OfSteps:
     said: pathlib.Path
 
 
+class _Child(subprocess.Popen[Any]):
+    """A process that is waited for by the one that started it. In a fork of that it would count as ended."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        self._maker = _ratn.Process()
+        super().__init__(*given, **named)
+
+    def poll(self) -> int | None:
+        self._maker.check("this run", "ask for its `id` and its `log`, and start `ratn control` or `ratn report`")
+        return super().poll()
+
+    def wait(self, timeout: float | None = None) -> int:
+        self.poll()
+        return super().wait(timeout)
+
+
 class Run:
     """A run under way. Iterating over it (``for`` or ``async for``) gives the events of its log as dicts, until it has ended."""
 
@@ -287,7 +311,8 @@ class Run:
         self._system = system
         folder = pathlib.Path(tempfile.mkdtemp(prefix="ratn-run-"))
         self._processes: list[subprocess.Popen[Any]] = []
-        weakref.finalize(self, _remove, str(folder), os.getpid(), self._processes)
+        self._maker = _ratn.Process()
+        weakref.finalize(self, _remove, str(folder), self._maker, self._processes)
         #: The event log, which ``ratn report`` reads.
         self.log = pathlib.Path(log) if log is not None else folder / "run.jsonl"
         self._workers: list[subprocess.Popen[bytes]] = []
@@ -295,6 +320,7 @@ class Run:
         self._begun, self._lost = 0, ""
         steps: dict[str, str] = {}
         if isinstance(task, Task):
+            task = task._knowing(lambda: _resources.of_system(system.runtime_dir))
             # Steps are done by workers of this run alone: another one may have other workers of the same file.
             token = secrets.token_hex(4)
             providers = {provider: f"{provider}_{token}" for provider in task._step_files()}
@@ -314,7 +340,7 @@ class Run:
         self._start_steps(steps, step_workers, folder)
         try:
             with self._said.open("w") as output, self._told.open("w") as messages:
-                self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=messages, start_new_session=True)
+                self._process = _Child(command, stdin=subprocess.DEVNULL, stdout=output, stderr=messages, start_new_session=True)
         except BaseException:
             self._end_steps()
             raise
@@ -422,7 +448,8 @@ class Run:
                 worker.wait()
 
     def __repr__(self) -> str:
-        return f"<Run {'under way' if self._process.poll() is None else 'ended'}, log {self.log}>"
+        stage = "of another process" if not self._maker.is_here else "under way" if self.under_way else "ended"
+        return f"<Run {stage}, log {self.log}>"
 
     @property
     def under_way(self) -> bool:
@@ -465,9 +492,9 @@ class Run:
             yield []
 
     def result(self, timeout_s: float | None = None) -> Result:
-        """Waits for the end. A run that ends badly is no exception: its outcome says so. One that cannot begin is a ``ratn.Error``."""
+        """Waits for the end; for ``timeout_s`` seconds (``TimeoutError``) where that is neither ``None`` nor infinite. A run that ends badly is no exception: its outcome says so. One that cannot begin is a ``ratn.Error``."""
         try:
-            self._process.wait(timeout_s)
+            self._process.wait(_ratn.patience_s("timeout_s", timeout_s))
         except subprocess.TimeoutExpired:
             raise TimeoutError(f"the run has not ended within {timeout_s} s") from None
         try:
@@ -491,12 +518,17 @@ class Run:
     def _tell(self, words: list[str]) -> str:
         told = _told([*words, "--runtime-dir", str(self._system.runtime_dir)])
         if told.returncode != 0:
+            if self._maker.is_here and not self.under_way:
+                raise Error(f"the run has ended, so `{words[0]}` comes too late; `result()` says how it ended")
             raise Error(told.stderr.strip() or f"`ratn {words[0]}` has ended with code {told.returncode}")
         return told.stdout.strip()
 
     def signal(self, name: str, value: Any = None) -> None:
         """Sends a signal, which a state of the task waits for (``ratn.wait(signal="order")``), with a value. It is kept until one does."""
-        self._tell(["signal", self.id, name, *([] if value is None else [expression(value)])])
+        said = [] if value is None else [expression(value)]
+        if any("\0" in text for text in said):
+            raise ValueError("a text with NUL in it cannot be sent")
+        self._tell(["signal", self.id, name, *said])
 
     def answer(self, choice: str, *, state: str | None = None) -> None:
         """Answers the question of a state (``ratn.ask``); where several ask, of that of this path."""

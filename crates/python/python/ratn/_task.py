@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 import os
 import pathlib
 import tempfile
@@ -18,9 +19,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
-from ratn import _ports, _ratn, _source, _yaml
+from ratn import _ports, _ratn, _resources, _source, _yaml
 from ratn._annotations import VALUES, Output, entry, outputs_said, raw
 from ratn._expression import Binding, Untraceable, Value, Variable, literal, refuse, user_frame
+from ratn._identity import refuse_identity
 from ratn._ratn import Error, InvalidTask
 from ratn._step import kind_of
 from ratn._trace import Trace, tracing
@@ -57,13 +59,14 @@ class Task:
         catalogues: Iterable[str] = (),
         steps: dict[str, Any] | None = None,
         source: str | None = None,
+        is_traced: bool = False,
     ) -> None:
         #: The tree, as dicts and lists.
         self.document = document
         #: What the paths of libraries and the ontology are relative to.
         self.folder = folder
         self._file, self._catalogues, self._steps = file, list(catalogues), dict(steps or {})
-        self._source = source
+        self._source, self._is_traced = source, is_traced
 
     @property
     def name(self) -> str:
@@ -148,6 +151,30 @@ class Task:
         steps = {actions[name]: step for name, step in self._steps.items()}
         return Task(document, folder=self.folder, file=self._file, catalogues=self._catalogues, steps=steps)
 
+    def _knowing(self, offered: Callable[[], _resources.Offers] | None = None) -> Task:
+        """The same, whose states that say no resources block what performs them; `offered` are those of a system, which is asked where that is in no catalogue. A
+        task file says all itself."""
+        if not self._is_traced:
+            return self
+        known = _resources.of_catalogues(*self._all_catalogues())
+        asked: list[_resources.Offers] = []
+
+        def offer(action: str) -> dict[str, Any] | None:
+            if action in known or offered is None:
+                return known.get(action)
+            if not asked:
+                asked.append(offered())
+            if action not in asked[0]:
+                raise Error(
+                    f"nobody in the system offers the action `{action}`, and so nobody knows what performs it: say `resources=[\"Kind\"]` at it, or see `ratn actions`"
+                )
+            return asked[0][action]
+
+        # A copy.
+        states = _changed(self.document.get("states") or [], lambda _: None)
+        _resources.block_what_performs(states, offer)
+        return Task({**self.document, "states": states}, folder=self.folder, file=self._file, catalogues=self._catalogues, steps=self._steps)
+
     def _standing_alone(self) -> _yaml.Lines:
         document = dict(self.document)
         if isinstance(document.get("ontology"), str):
@@ -164,7 +191,7 @@ class Task:
         return [*self._catalogues, *(step.catalogue(name.rpartition("/")[0]) for name, step in self._steps.items())]
 
     def _read(self) -> tuple[list[Finding], dict[str, Any] | None]:
-        lines = self._lines()
+        lines = self._knowing()._lines()
         catalogues = self._all_catalogues()
         said, model = _ratn.check_task("\n".join(lines.text) + "\n", str(self.folder / pathlib.Path(self._file).name), catalogues)
         findings = [self._finding(one, lines) for one, _ in json.loads(said)]
@@ -193,7 +220,8 @@ class Task:
         """As ``ratn check`` does it, which knows what a system is."""
         from ratn._system import _told
 
-        lines = self._standing_alone()
+        runtime_dir = getattr(system, "runtime_dir", system)
+        lines = self._knowing(lambda: _resources.of_system(runtime_dir, config))._standing_alone()
         with tempfile.TemporaryDirectory(prefix="ratn-check-") as folder:
             file = pathlib.Path(folder) / pathlib.Path(self._file).with_suffix(".yaml").name
             file.write_text("\n".join(lines.text) + "\n", encoding="utf-8")
@@ -202,7 +230,7 @@ class Task:
                 (pathlib.Path(folder) / f"{number}.toml").write_text(catalogue, encoding="utf-8")
                 command += ["--catalogue", str(pathlib.Path(folder) / f"{number}.toml")]
             command += ["--config", os.fspath(config)] if config is not None else []
-            command += ["--runtime-dir", str(getattr(system, "runtime_dir", system))] if system is not None else []
+            command += ["--runtime-dir", str(runtime_dir)] if runtime_dir is not None else []
             told = _told(command)
         if not told.stdout.strip():
             raise Error(told.stderr.strip() or f"`ratn check` has ended with code {told.returncode}")
@@ -268,12 +296,16 @@ def invalid(findings: list[Finding]) -> InvalidTask:
     return raised
 
 
+@typing.overload
+def task(function: Callable[..., Any], /) -> Task: ...
+@typing.overload
+def task(*, name: str | None = None, **said: Any) -> Callable[[Callable[..., Any]], Task]: ...
 def task(
     function: Callable[..., Any] | None = None,
     *,
     name: str | None = None,
     **said: Any,
-) -> Any:
+) -> Task | Callable[[Callable[..., Any]], Task]:
     """Makes a function a task: it is called once, now, and what it does is what the task does.
 
     Its parameters are the task's, typed by their annotations (a default makes one optional); the dict that it returns is the task's outputs; the
@@ -281,21 +313,25 @@ def task(
     ``deadline``, ``exceptions``, ``ontology``, ``tolerance``, ``world``, ``outcomes``, ``variables``, ``functions``, ``description``.
     """
     if function is None:
-        return lambda function: task(function, name=name, **said)
-    return _traced(function, name or function.__name__, said)
+        return lambda function: _traced(function, name, said)
+    return _traced(function, name, said)
 
 
 _TASK_KEYS = ("description", "horizon", "speculation_width", "deadline", "exceptions", "ontology", "tolerance", "world", "outcomes", "variables", "functions")
 
 
-def _traced(function: Callable[..., Any], name: str, said: dict[str, Any]) -> Task:
+def _traced(function: Callable[..., Any], name: str | None, said: dict[str, Any]) -> Task:
+    if not isinstance(function, types.FunctionType):
+        kind = "class" if isinstance(function, type) else type(function).__name__
+        raise TypeError(f"`ratn.task` takes a function, and is given the {kind} `{getattr(function, '__name__', function)}`: write `@ratn.task` above a `def`")
+    name, said = name or function.__name__, dict(said)
     unknown = [key for key in said if key not in _TASK_KEYS]
     if unknown:
         raise TypeError(f"`@ratn.task` has no `{unknown[0]}`; it has {', '.join(('name', *_TASK_KEYS))}")
     if tracing.get() is not None:
         refuse("a task within a task", "call a plain function, which is traced as if it stood here, or use `ratn.library(file)`")
     file = function.__code__.co_filename
-    if not isinstance(function, types.FunctionType) or inspect.iscoroutinefunction(function) or inspect.isgeneratorfunction(function):
+    if inspect.iscoroutinefunction(function) or inspect.isgeneratorfunction(function):
         refuse("a task is a plain function", "write `def`, without `async` and `yield`", (file, function.__code__.co_firstlineno))
     trace = Trace(file)
     document = Body({"task": name})
@@ -306,6 +342,7 @@ def _traced(function: Callable[..., Any], name: str, said: dict[str, Any]) -> Ta
     # Annotations may be texts, and name what stands beside the function within another one.
     hints = typing.get_type_hints(function, localns={**user_frame().f_locals}, include_extras=True)
     parameters, given = _parameters(function, hints, trace)
+    refuse_identity(function)
     token = tracing.set(trace)
     try:
         returned = function(**given)
@@ -328,18 +365,21 @@ def _traced(function: Callable[..., Any], name: str, said: dict[str, Any]) -> Ta
         tracing.reset(token)
     path = pathlib.Path(file)
     folder = path.resolve().parent if path.exists() else pathlib.Path.cwd()
-    return Task(document, folder=folder, file=file, catalogues=trace.catalogues, steps=trace.steps)
+    return Task(document, folder=folder, file=file, catalogues=trace.catalogues, steps=trace.steps, is_traced=True)
 
 
-def _whole(value: Any) -> None:
-    """Refuses a text that is no expression and has a value in it, wherever it has come to."""
+def _whole(value: Any, at: tuple[str, int] | None = None) -> None:
+    """Refuses a text that is no expression and has a value in it, and a number without an end, wherever they have come to."""
     if isinstance(value, dict):
+        at = getattr(value, "line", None) or at
         for key, item in value.items():
-            _whole(key)
-            _whole(item)
+            _whole(key, at)
+            _whole(item, at)
     elif isinstance(value, (list, tuple)):
         for item in value:
-            _whole(item)
+            _whole(item, at)
+    elif isinstance(value, float) and not math.isfinite(value):
+        refuse(f"{value} is no number of a task", "say a finite one; without a `timeout` nothing ends the wait", at)
     elif isinstance(value, str):
         literal(value)
 

@@ -9,6 +9,7 @@ import logging
 import os
 import pathlib
 import sys
+import typing
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, NoReturn, TypeVar
@@ -40,6 +41,25 @@ class Worker:
         self.kind = kind
         self._actions: dict[str, _ports.Action] = {}
 
+    @typing.overload
+    def action(self, function: _Function, /) -> _Function: ...
+    @typing.overload
+    def action(
+        self,
+        *,
+        name: str | None = None,
+        outputs: dict[str, Any] | None = None,
+        outcomes: Iterable[str] = (),
+        computes: bool | None = None,
+        reads: Iterable[str] | None = None,
+        senses: Iterable[str] = (),
+        requires: Iterable[str] = (),
+        effects: Iterable[str] | None = None,
+        blocks: Iterable[str] = (),
+        takes: float | str | None = None,
+        suspends: bool = False,
+        anytime: bool = False,
+    ) -> Callable[[_Function], _Function]: ...
     def action(
         self,
         function: _Function | None = None,

@@ -1,10 +1,13 @@
 """Actions that do what tests need."""
 
 import asyncio
+import contextlib
 import contextvars
 import logging
+import multiprocessing
 import os
 import pathlib
+import signal
 import sys
 import threading
 import time
@@ -145,6 +148,38 @@ def forks(goal: ratn.Goal) -> dict:
             return {"codes": []}
         codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
     return {"codes": codes}
+
+
+@w.action(outputs={"refused": list[str]}, reads=["at(?)"], effects=[])
+def asks_in_a_fork(goal: ratn.Goal) -> dict:
+    """What a child of `multiprocessing`, which forks, is told of everything that it asks the goal."""
+    fork = multiprocessing.get_context("fork")
+    said, own = fork.Pipe(duplex=False)
+
+    def ask() -> None:
+        # Whoever waits for ever is ended.
+        signal.alarm(20)
+        asked = {
+            "cancelled": lambda: goal.cancelled, "checkpoint": goal.checkpoint, "sleep": lambda: goal.sleep(0), "while_held": goal.while_held, "facts": lambda: goal.facts("at(?)"),
+            "progress": lambda: goal.progress("on"), "improved": lambda: goal.improved({}, cost_s=1), "measured": lambda: goal.measured("at(ball)", 1),
+            "call": lambda: goal.call("Nearest", "nearest"), "on_cancel": lambda: goal.on_cancel(print),
+        }
+        for name, one in asked.items():
+            try:
+                one()
+            except ratn.Error as refused:
+                own.send(f"{name}: {refused}")
+
+    child = fork.Process(target=ask)
+    child.start()
+    own.close()
+    refused = []
+    with contextlib.suppress(EOFError):
+        while True:
+            refused.append(said.recv())
+    child.join()
+    goal.facts("at(?)")
+    return {"refused": refused}
 
 
 class Unprintable(Exception):
