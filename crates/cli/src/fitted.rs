@@ -1,18 +1,40 @@
-//! How much of a text there is room for on a terminal, which breaks lines that are too long. What colours a line takes no room.
+//! How much of a text there is room for on a terminal, which breaks lines that are too long. What colours a line takes no room, and characters
+//! of some languages that of two.
 
-/// How many characters of a line are seen.
+use unicode_width::{UnicodeWidthChar, UnicodeWidthStr};
+
+/// How many columns a line takes.
 pub(crate) fn visible(line: &str) -> usize {
-    let mut is_colour = false;
-    let seen = line.chars().filter(|c| {
-        is_colour |= *c == '\x1b';
-        let is_seen = !is_colour;
-        is_colour &= *c != 'm';
-        is_seen
-    });
-    seen.count()
+    // A colour is `ESC [ … m`.
+    let mut parts = line.split('\x1b');
+    let first = parts.next().map_or(0, UnicodeWidthStr::width);
+    first + parts.map(|part| part.split_once('m').map_or(0, |(_, seen)| seen.width())).sum::<usize>()
 }
 
-/// How many rows a line of so many characters takes.
+/// A text with spaces behind it up to so many columns; one that takes more stays as it is.
+pub(crate) fn padded(text: &str, columns: usize) -> String {
+    format!("{text}{}", " ".repeat(columns.saturating_sub(visible(text))))
+}
+
+/// The beginning of a text without colours, in at most so many columns.
+pub(crate) fn cut(text: &str, columns: usize) -> String {
+    if text.width() <= columns {
+        return text.to_owned();
+    }
+    let mut room = columns;
+    let fits = |c: &char| {
+        // The last column is the ellipsis'.
+        let taken = c.width().unwrap_or(0);
+        let fits = taken < room;
+        room = room.saturating_sub(taken);
+        fits
+    };
+    let mut short: String = text.chars().take_while(fits).collect();
+    short.extend((columns > 0).then_some('…'));
+    short
+}
+
+/// How many rows a line of so many columns takes.
 pub(crate) fn rows(length: usize, width: usize) -> usize {
     length.div_ceil(width.max(1)).max(1)
 }
@@ -60,6 +82,23 @@ mod tests {
         assert_eq!((rows(10, 80), rows(0, 80), rows(25, 10), rows(3, 0)), (1, 1, 3, 3));
         let coloured = "\x1b[32mruns  plan\x1b[0m";
         assert_eq!(fitted(coloured, 10, 2), coloured);
+    }
+
+    #[test]
+    fn wide_characters_take_two_columns_and_are_not_cut_in_half() {
+        assert_eq!(
+            (visible("\x1b[1m漢字\x1b[0m!"), padded("漢", 4).as_str(), padded("漢字漢", 4).as_str()),
+            (5, "漢  ", "漢字漢")
+        );
+        for columns in 0..8 {
+            let (wide, narrow) = (cut("漢字漢字", columns), cut("a漢b字", columns));
+            assert!(visible(&wide) <= columns && visible(&narrow) <= columns, "{columns}: {wide} {narrow}");
+            assert_eq!(wide.ends_with('…'), columns > 0);
+        }
+        assert_eq!(
+            (cut("漢字漢字", 8).as_str(), cut("漢字漢字", 6).as_str(), cut("abc", 2).as_str()),
+            ("漢字漢字", "漢字…", "a…")
+        );
     }
 
     #[test]

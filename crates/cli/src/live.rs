@@ -7,10 +7,12 @@
 mod answers;
 
 use crate::colour::Colours;
+use crate::fitted;
 use crate::output;
 use answers::Questions;
 use ratn_event_log::Tail;
 use ratn_executive::protocol::LogLine;
+use ratn_model::readable::in_line;
 use ratn_report::statistics::mode_name;
 use ratn_report::timeline::{Instance, Speculation, Stage, Timeline};
 use std::io::IsTerminal;
@@ -26,6 +28,8 @@ const KEPT: usize = 64;
 const MOST_RUNNING: usize = 8;
 const MOST_WAITING: usize = 6;
 const BAR: usize = 20;
+/// No terminal has so many columns.
+const MOST_CHARACTERS: usize = 4_096;
 
 /// What is done with a log that grows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -143,14 +147,14 @@ fn page(run: &Timeline, width: usize, height: usize, colours: Colours) -> Vec<St
         let text = format!("  runs   {} for {:.1} s{on}", instance.path, (run.end_s - job.from_s).max(0.0));
         lines.push(colours.green(&cut(&text, width)));
     }
-    lines.extend(more(running.len(), runs, "run"));
+    lines.extend(more(running.len(), runs, "run").map(|line| cut(&line, width)));
     // Who has asked for resources has a cause that can be seen; the others stand behind those.
     let mut waiting: Vec<&Instance> = run.waiting().collect();
     waiting.sort_by_key(|one| (one.stage != Stage::Asking, one.id));
     for sentence in waiting.iter().take(waits).filter_map(|one| run.explain(one.id)) {
         lines.push(colours.yellow(&cut(&format!("  waits  {sentence}"), width)));
     }
-    lines.extend(more(waiting.len(), waits, "wait"));
+    lines.extend(more(waiting.len(), waits, "wait").map(|line| cut(&line, width)));
     lines
 }
 
@@ -176,13 +180,11 @@ fn more(all: usize, shown: usize, what: &str) -> Option<String> {
     (all > shown).then(|| format!("  and {} more {what}", all - shown))
 }
 
-/// At most so many characters: a line that is broken would not be painted over.
+/// In fewer than so many columns: a line that is broken would not be painted over.
 fn cut(text: &str, width: usize) -> String {
-    let plain: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
-    if plain.chars().count() < width {
-        return plain;
-    }
-    plain.chars().take(width.saturating_sub(2)).chain(['…']).collect()
+    // Of a longer text no more is seen, however wide the terminal is.
+    let end = text.char_indices().nth(MOST_CHARACTERS).map_or(text.len(), |(end, _)| end);
+    fitted::cut(&in_line(&text[..end].replace(['\n', '\t'], " ")), width.saturating_sub(1))
 }
 
 #[cfg(test)]
@@ -220,15 +222,16 @@ mod tests {
 
     #[test]
     fn a_small_terminal_has_fewer_and_shorter_lines() {
-        for (width, height) in [(30, 6), (10, 3), (1, 1)] {
+        for (width, height) in [(30, 6), (10, 3), (2, 2), (1, 1)] {
             let lines = page(&sort(), width, height, Colours::default());
             assert!(lines.len() < height.max(6), "{lines:?}");
-            assert!(lines.iter().take(2).all(|line| line.chars().count() <= width), "{lines:?}");
+            assert!(lines.iter().all(|line| fitted::visible(line) < width), "{lines:?}");
         }
     }
 
     #[test]
     fn what_a_name_contains_does_nothing_to_the_terminal() {
-        assert_eq!(cut("a\u{1b}[2Jb\nc", 80), "a [2Jb c");
+        assert_eq!(cut("a\u{1b}[2Jb\nc\u{202e}", 80), "a\\u{1b}[2Jb c\\u{202e}");
+        assert_eq!(cut(&"漢".repeat(10_000), 20), format!("{}…", "漢".repeat(9)));
     }
 }

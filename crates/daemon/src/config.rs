@@ -189,7 +189,7 @@ pub fn state_directory(runtime_directory: &Path) -> PathBuf {
 /// [`ConfigError`] of what is wrong with it.
 pub fn load<C: DeserializeOwned + Check>(file: &Path) -> Result<C, ConfigError> {
     let unreadable = |source| ConfigError::Unreadable { file: file.to_owned(), source };
-    let text = std::fs::read_to_string(file).map_err(unreadable)?;
+    let text = ratn_regular_file::read_text(file, ratn_regular_file::USUAL).map_err(unreadable)?;
     let config: C = toml::from_str(&text).map_err(|error| ConfigError::Malformed {
         file: file.to_owned(),
         problem: error.to_string().trim_end().to_owned(),

@@ -231,7 +231,10 @@ impl Gate for NotTheLeader {
 
 /// The log of a role in etcd.
 pub(crate) fn etcd(config: &StorageConfig, role: &str, address: &str, mark: Option<PathBuf>) -> anyhow::Result<Etcd> {
-    let read = |file: &Path| std::fs::read(file).with_context(|| format!("cannot read {}", file.display()));
+    let read = |file: &Path| {
+        ratn_regular_file::read(file, ratn_regular_file::USUAL)
+            .with_context(|| format!("cannot read {}", file.display()))
+    };
     let mut tls = ClientTlsConfig::new();
     if let Some(ca) = &config.ca {
         tls = tls.ca_certificate(Certificate::from_pem(read(ca)?));

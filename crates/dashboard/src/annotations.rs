@@ -344,12 +344,18 @@ fn item(text: &str) -> Result<Document, String> {
     if edit::has_anchor(text) {
         return Err("an anchor or an alias (`&`, `*`) stands in it: write out what it stands for".to_owned());
     }
+    if edit::has_tag(text) {
+        return Err("a tag (`!`) stands in it: leave it out, or put a text with it in quotes".to_owned());
+    }
     let as_yaml = || Document::read(text, "").map_err(|finding| finding.message.clone());
     if text.starts_with(['{', '[', '"', '\'']) {
         return as_yaml();
     }
     match as_yaml() {
-        Ok(read @ (Document::Bool(_) | Document::Int(_) | Document::Float(_) | Document::Null)) if !text.is_empty() => {
+        // In YAML a comment would begin at `#`, which nobody types here.
+        Ok(read @ (Document::Bool(_) | Document::Int(_) | Document::Float(_) | Document::Null))
+            if !text.is_empty() && !text.contains('#') =>
+        {
             Ok(read)
         }
         _ if text.is_empty() => Err("it is empty: write something, or leave the line out".to_owned()),

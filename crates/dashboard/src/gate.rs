@@ -80,8 +80,9 @@ pub(crate) fn asks_here(headers: &HeaderMap) -> Result<&str, Refused> {
         return Err(Refused::Host);
     }
     let foreign = |value: &HeaderValue| value.as_bytes() != format!("http://{host}").as_bytes();
-    let site = headers.get("sec-fetch-site").is_some_and(|site| site != "same-origin" && site != "none");
-    if headers.get_all(ORIGIN).iter().any(foreign) || site {
+    let elsewhere = |site: &HeaderValue| site != "same-origin" && site != "none";
+    let is_elsewhere = headers.get_all("sec-fetch-site").iter().any(elsewhere);
+    if headers.get_all(ORIGIN).iter().any(foreign) || is_elsewhere {
         return Err(Refused::Origin);
     }
     Ok(host)
@@ -141,6 +142,8 @@ mod tests {
         let site = |site: &str| asks_here(&headers(&[("host", "localhost:80"), ("sec-fetch-site", site)])).map(drop);
         assert_eq!((site("same-origin"), site("none")), (Ok(()), Ok(())));
         assert_eq!((site("cross-site"), site("same-site")), (Err(Refused::Origin), Err(Refused::Origin)));
+        let twice = [("host", "localhost:80"), ("sec-fetch-site", "none"), ("sec-fetch-site", "cross-site")];
+        assert_eq!(asks_here(&headers(&twice)).map(drop), Err(Refused::Origin));
     }
 
     #[test]

@@ -204,7 +204,13 @@ impl Logs {
         let mut all = self.lock();
         let All { logs, numbers, replays } = &mut *all;
         let one = logs.iter_mut().find(|one| one.id == id).ok_or(NotTold::Unknown(id))?;
-        one.look()?;
+        let looked = one.look();
+        if !matches!(looked, Ok(true)) {
+            // Another log has its name now, or none.
+            one.live = None;
+            replays.retain(|replay| replay.log != id);
+        }
+        looked?;
         match asked.at_s {
             None => {
                 let there = one.follow(numbers)?;
@@ -279,22 +285,22 @@ impl Followed {
         self.heard.as_ref().filter(|(heard, _)| heard.elapsed() < HEARD_WITHIN).map(|(_, status)| status)
     }
 
-    /// How long the log is by now.
-    fn look(&mut self) -> Result<(), LogError> {
-        match &mut self.parts {
-            Some(_) if self.looked.is_some_and(|looked| looked.elapsed() < LOOK_INTERVAL) => return Ok(()),
-            Some(parts) => {
-                let before = parts.length();
-                parts.look()?;
-                if parts.length() < before {
-                    // Another log has its name now.
-                    self.live = None;
-                }
+    /// How long the log is by now. Whether it is still the log that it was.
+    fn look(&mut self) -> Result<bool, LogError> {
+        let mut is_same = true;
+        self.parts = Some(match self.parts.take() {
+            Some(parts) if self.looked.is_some_and(|looked| looked.elapsed() < LOOK_INTERVAL) => parts,
+            Some(mut parts) => {
+                is_same = parts.look()?;
+                self.looked = Some(Instant::now());
+                parts
             }
-            None => self.parts = Some(Parts::of(&self.path)?),
-        }
-        self.looked = Some(Instant::now());
-        Ok(())
+            None => {
+                self.looked = Some(Instant::now());
+                Parts::of(&self.path)?
+            }
+        });
+        Ok(is_same)
     }
 
     /// Where reading begins for a moment.

@@ -262,12 +262,6 @@ impl Dashboard {
         let mut paths: Vec<PathBuf> = Vec::new();
         for path in &logs {
             let path = absolute(path).map_err(|source| DashboardError::NoLog { path: path.clone(), source })?;
-            let is = std::fs::metadata(&path).map_err(|source| DashboardError::NoLog { path: path.clone(), source })?;
-            // Opening a pipe would wait for whoever writes it.
-            if !is.is_file() {
-                let source = io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file");
-                return Err(DashboardError::NoLog { path, source });
-            }
             ratn_event_log::first(&path)?;
             if !paths.contains(&path) {
                 paths.push(path);

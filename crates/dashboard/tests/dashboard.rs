@@ -233,6 +233,55 @@ async fn a_log_that_grows_is_followed_and_tells_only_what_is_new() {
 }
 
 #[tokio::test]
+async fn a_log_that_a_pipe_takes_the_place_of_is_refused_and_shown_again_when_it_is_back() {
+    let place = tempfile::tempdir().unwrap();
+    let (path, away) = (place.path().join("run.jsonl"), place.path().join("away.jsonl"));
+    std::fs::write(&path, format!("{}\n", started("good"))).unwrap();
+    let served = serve(&[&path], false).await;
+    let question = format!("/api/run?log={}", served.log().await);
+    assert_eq!(served.get(&question).await.json()["run"]["task"], "good");
+    std::fs::rename(&path, &away).unwrap();
+    assert!(std::process::Command::new("mkfifo").arg(&path).status().unwrap().success());
+    for _ in 0..2 * MAX_LOGS {
+        let refused = tokio::time::timeout(Duration::from_secs(20), served.get(&question)).await.expect("it hangs");
+        assert!(refused.status == 422 && refused.body.contains("not a regular file"), "{}", refused.body);
+    }
+    std::fs::rename(&away, &path).unwrap();
+    assert_eq!(served.get(&question).await.json()["run"]["task"], "good");
+}
+
+#[tokio::test]
+async fn another_log_that_takes_the_place_of_one_is_read_anew() {
+    let place = tempfile::tempdir().unwrap();
+    let path = place.path().join("run.jsonl");
+    let log = |task: &str, visits: u64| {
+        let lines: Vec<String> = [vec![started(task)], (1..=visits).flat_map(visit).collect()].concat();
+        lines.join("\n") + "\n"
+    };
+    std::fs::write(&path, log("one", 2)).unwrap();
+    let served = serve(&[&path], false).await;
+    let id = served.log().await;
+    let (mut known, mut at) = (String::new(), String::new());
+    // By another file of this name, in the same file, and of the same length.
+    for (task, visits, by_name) in [("one", 2, true), ("two", 3, true), ("six", 3, false), ("ten", 9, false)] {
+        match by_name {
+            true => {
+                std::fs::write(place.path().join("other"), log(task, visits)).unwrap();
+                std::fs::rename(place.path().join("other"), &path).unwrap();
+            }
+            false => std::fs::write(&path, log(task, visits)).unwrap(),
+        }
+        tokio::time::sleep(Duration::from_millis(60)).await;
+        for (moment, asked, instances) in [("", &mut known, visits), ("&at=2.6", &mut at, 2)] {
+            let frame = served.get(&format!("/api/run?log={id}{moment}{asked}")).await.json();
+            let told = frame["instances"].as_array().unwrap().len() as u64;
+            assert_eq!((frame["run"]["task"].as_str(), told, &frame["fresh"]), (Some(task), instances, &true.into()));
+            *asked = format!("&epoch={}&version={}", frame["epoch"], frame["version"]);
+        }
+    }
+}
+
+#[tokio::test]
 async fn a_moment_is_shown_as_it_was_then_and_goes_on_from_there() {
     let lines: Vec<String> = [vec![started("replayed")], (1..=20).flat_map(visit).collect()].concat();
     let file = log_of(&lines);
@@ -656,8 +705,9 @@ async fn a_pipe_is_no_log_and_is_not_waited_for() {
     let pipe = place.path().join("pipe.jsonl");
     assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
     let refused = Dashboard::bind(options(&[&pipe], place.path())).await.unwrap_err();
-    let DashboardError::NoLog { source, .. } = refused else { panic!("{refused}") };
-    assert_eq!(source.to_string(), "it is no regular file");
+    let DashboardError::Log(refused) = refused else { panic!("{refused}") };
+    let why = std::error::Error::source(&refused).unwrap().to_string();
+    assert!(why.starts_with("not a regular file"), "{why}");
 }
 
 #[tokio::test]

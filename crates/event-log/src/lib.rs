@@ -383,7 +383,7 @@ impl Lines {
 
     fn open(path: &Path, bytes: u64, before: usize) -> Result<Lines, LogError> {
         let io = |source| LogError::Io { what: "read", path: path.to_owned(), source };
-        let mut file = File::open(path).map_err(io)?;
+        let mut file = ratn_regular_file::open(path).map_err(io)?;
         if bytes > 0 {
             file.seek(SeekFrom::Start(bytes)).map_err(io)?;
         }

@@ -1,19 +1,23 @@
 //! Where in a long log which moment is: of every 4 MiB the first whole line, and when that was.
 //!
 //! It reads one line of each part and the end of the log, so a log of 1 GiB is indexed by reading a few hundred lines. It keeps an
-//! offset and a moment of each part and nothing of the lines.
+//! offset and a moment of each part and nothing of the lines, except how the first one ends: it says which run the log is of, so another log
+//! that takes the place of this one is known as another.
 
 use crate::{LogError, MAX_LINE_BYTES};
 use ratn_model::time::Timestamp;
 use serde::Deserialize;
-use std::fs::File;
+use std::fs::{File, Metadata};
 use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
+use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
 /// How much of a log a part is.
 const PART_BYTES: u64 = 4 << 20;
 /// So much of the end of a log is looked at first for its last line.
 const END_BYTES: u64 = 64 << 10;
+/// So much of the end of the first line is kept: the id of the run stands there.
+const MARK_BYTES: u64 = 1 << 10;
 
 /// The parts of a log, as far as it was written when it was looked at.
 #[derive(Debug)]
@@ -24,6 +28,34 @@ pub struct Parts {
     begin: Vec<(u64, Timestamp)>,
     length: u64,
     last: Timestamp,
+    mark: Option<Mark>,
+}
+
+/// What a log is known by while it grows: its file, and how its first line ends.
+#[derive(Debug)]
+struct Mark {
+    device: u64,
+    inode: u64,
+    offset: u64,
+    end: Vec<u8>,
+}
+
+impl Mark {
+    /// Of a log whose first line has so many bytes.
+    fn of(file: &File, is: &Metadata, first: u64) -> std::io::Result<Mark> {
+        let length = first.min(MARK_BYTES);
+        let mut mark =
+            Mark { device: is.dev(), inode: is.ino(), offset: first - length, end: vec![0; length as usize] };
+        file.read_exact_at(&mut mark.end, mark.offset)?;
+        Ok(mark)
+    }
+
+    fn is_of(&self, file: &File, is: &Metadata) -> bool {
+        let mut end = vec![0; self.end.len()];
+        (self.device, self.inode) == (is.dev(), is.ino())
+            && file.read_exact_at(&mut end, self.offset).is_ok()
+            && end == self.end
+    }
 }
 
 /// Of a line only when it was.
@@ -42,23 +74,34 @@ impl Parts {
     }
 
     fn of_size(path: &Path, part_bytes: u64) -> Result<Parts, LogError> {
-        let (path, last) = (path.to_owned(), Timestamp(0));
-        let mut parts = Parts { path, part_bytes, begin: Vec::new(), length: 0, last };
+        let mut parts = Parts::unread(path.to_owned(), part_bytes);
         parts.look()?;
         Ok(parts)
     }
 
-    /// Looks at what was written since. A log that is shorter than it was is indexed anew.
+    fn unread(path: PathBuf, part_bytes: u64) -> Parts {
+        Parts { path, part_bytes, begin: Vec::new(), length: 0, last: Timestamp(0), mark: None }
+    }
+
+    /// Looks at what was written since. Whether it is the same log as before: one that is shorter than it was, and another one that has its name now,
+    /// is indexed anew.
     ///
     /// # Errors
     /// As [`Parts::of`].
-    pub fn look(&mut self) -> Result<(), LogError> {
-        let mut file = File::open(&self.path).map_err(|source| self.io(source))?;
-        let length = file.metadata().map_err(|source| self.io(source))?.len();
-        if length < self.length {
-            (self.begin, self.last) = (Vec::new(), Timestamp(0));
+    pub fn look(&mut self) -> Result<bool, LogError> {
+        let mut file = ratn_regular_file::open(&self.path).map_err(|source| self.io(source))?;
+        let is = file.metadata().map_err(|source| self.io(source))?;
+        let length = is.len();
+        let is_same = length >= self.length && self.mark.as_ref().is_none_or(|mark| mark.is_of(&file, &is));
+        if !is_same {
+            *self = Parts::unread(std::mem::take(&mut self.path), self.part_bytes);
         } else if length == self.length {
-            return Ok(());
+            return Ok(true);
+        }
+        if self.mark.is_none() {
+            let line = self.line(&mut BufReader::new(&file))?;
+            let mark = line.map(|line| Mark::of(&file, &is, line.len() as u64)).transpose();
+            self.mark = mark.map_err(|source| self.io(source))?;
         }
         while self.begin.len() as u64 * self.part_bytes < length {
             let from = self.begin.len() as u64 * self.part_bytes;
@@ -67,7 +110,7 @@ impl Parts {
         }
         self.last = self.last_of(&mut file, length)?.unwrap_or(self.last);
         self.length = length;
-        Ok(())
+        Ok(is_same)
     }
 
     /// How many bytes it has, a torn line at its end included.
@@ -206,6 +249,28 @@ mod tests {
         file.flush().unwrap();
         parts.look().unwrap();
         assert_eq!(parts.last(), Timestamp::from_seconds(4.0));
+    }
+
+    #[test]
+    fn another_log_of_this_name_is_known_as_another_and_indexed_anew() {
+        let mut file = log(3);
+        let mut parts = Parts::of_size(file.path(), 64).unwrap();
+        writeln!(file, r#"{{"at":4000000000,"event":"woken"}}"#).unwrap();
+        assert!(parts.look().unwrap() && parts.look().unwrap());
+        // In the same file, of the same length.
+        let other = std::fs::read_to_string(file.path())
+            .unwrap()
+            .replace("\"seed\":1", "\"seed\":2")
+            .replace("at\":4", "at\":9");
+        std::fs::write(file.path(), &other).unwrap();
+        assert_eq!((parts.look().unwrap(), parts.last()), (false, Timestamp::from_seconds(9.0)));
+        // The same in another file, and then less of it.
+        let copy = file.path().with_extension("copy");
+        std::fs::write(&copy, &other).unwrap();
+        std::fs::rename(copy, file.path()).unwrap();
+        assert!(!parts.look().unwrap() && parts.look().unwrap());
+        std::fs::write(file.path(), format!("{STARTED}\n")).unwrap();
+        assert_eq!((parts.look().unwrap(), parts.last()), (false, Timestamp(0)));
     }
 
     #[test]

@@ -7,6 +7,7 @@ use super::Writer;
 use ratn_event_log::without_visits;
 use ratn_executive::protocol::{Command, LogEntry, LogLine};
 use ratn_model::id::InstanceId;
+use ratn_model::readable::readable;
 use ratn_report::timeline::{Activity, Cause, Changed, Instance, Timeline};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -265,23 +266,25 @@ fn placed(language: Language, path: &str, node: &Node) -> String {
     }
     let style = if node.is_dashed { "rounded,filled,dashed" } else { "rounded,filled" };
     let colours = if node.is_faded { ", fontcolor=\"#8a93a3\", color=\"#b8bfca\"" } else { "" };
-    let mut text = format!(
-        "{} [label={}, fillcolor=\"{}\", style=\"{style}\"{colours}];",
+    let (mut clusters, mut cluster, mut depth) = ("  ".to_owned(), FNV_BASIS, 0);
+    for parent in path.rsplit_once('/').into_iter().flat_map(|(parents, _)| parents.split('/')) {
+        cluster =
+            parent.bytes().chain([b'/']).fold(cluster, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(FNV_PRIME));
+        depth += 1;
+        _ = write!(clusters, "subgraph cluster_{cluster:016x} {{ label={}; ", dot_text(parent));
+    }
+    format!(
+        "{clusters}{} [label={}, fillcolor=\"{}\", style=\"{style}\"{colours}];{}",
         node.name,
         dot_text(&node.label),
-        node.fill
-    );
-    let parents: Vec<&str> = path.split('/').collect();
-    for depth in (1..parents.len()).rev() {
-        let cluster = parents[..depth].join("/");
-        text = format!(
-            "subgraph {} {{ label={}; {text} }}",
-            dot_text(&format!("cluster_{cluster}")),
-            dot_text(parents[depth - 1])
-        );
-    }
-    format!("  {text}")
+        node.fill,
+        " }".repeat(depth)
+    )
 }
+
+/// A cluster is known by a number that follows from its path (FNV-1a): the paths themselves would take the square of their depth.
+const FNV_BASIS: u64 = 0xcbf2_9ce4_8422_2325;
+const FNV_PRIME: u64 = 0x0100_0000_01b3;
 
 fn edge(language: Language, from: &str, to: &str, bond: Bond, label: &str) -> String {
     match (language, bond) {
@@ -301,13 +304,13 @@ fn edge(language: Language, from: &str, to: &str, bond: Bond, label: &str) -> St
 
 /// A quoted string of Graphviz's language. Only the quote and the backslash mean something in it.
 fn dot_text(text: &str) -> String {
-    format!("\"{}\"", text.replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n"))
+    format!("\"{}\"", readable(text).replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n"))
 }
 
 /// What stands in quotes in Mermaid: characters that mean something there, and those of HTML, as numbers.
 fn mermaid_text(text: &str) -> String {
     let mut out = String::new();
-    for c in text.chars() {
+    for c in readable(text).chars() {
         match c {
             '\n' => out.push_str("<br/>"),
             '"' | '#' | '<' | '>' | '&' | ';' | '`' => _ = write!(out, "#{};", u32::from(c)),
@@ -325,5 +328,26 @@ mod tests {
     fn names_of_users_do_nothing_in_a_graph() {
         assert_eq!(dot_text("a\"];b -> c\\"), r#""a\"];b -> c\\""#);
         assert_eq!(mermaid_text("a\"]\n<script>"), "a#34;]<br/>#60;script#62;");
+        assert_eq!(dot_text("\u{1b}[2J\u{202e}"), r#""\\u{1b}[2J\\u{202e}""#);
+        assert_eq!(mermaid_text("\u{1b}[2J\u{202e}"), r"\u{1b}[2J\u{202e}");
+    }
+
+    #[test]
+    fn a_deep_path_takes_room_for_each_of_its_names_once() {
+        let node =
+            Node { name: "n".to_owned(), label: "n".to_owned(), fill: "#eee", is_dashed: false, is_faded: false };
+        let drawn = |depth: usize| placed(Language::Dot, &vec!["a"; depth].join("/"), &node);
+        assert!(drawn(20_000).len() < 20_000 * 60);
+        // What is in the same state is in the same cluster, and only that.
+        let (one, other) = (placed(Language::Dot, "a/b/x", &node), placed(Language::Dot, "a/c/x", &node));
+        let clusters = |text: &str| {
+            text.split(' ').filter(|word| word.starts_with("cluster_")).map(str::to_owned).collect::<Vec<_>>()
+        };
+        let (one, other) = (clusters(&one), clusters(&other));
+        assert!(one.len() == 2 && one[0] == other[0] && one[1] != other[1], "{one:?} {other:?}");
+        assert_ne!(
+            clusters(&placed(Language::Dot, "ab/x", &node)),
+            clusters(&placed(Language::Dot, "a/b/x", &node))[1..]
+        );
     }
 }

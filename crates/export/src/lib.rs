@@ -7,7 +7,6 @@
 
 mod csv;
 mod graph;
-mod lanes;
 pub mod live;
 mod mcap;
 mod otlp;

@@ -1,10 +1,9 @@
 //! A trace of track events for ui.perfetto.dev: a track for each resource, on it who holds it and what is done with it; one more for
-//! waits. A flow leads from each result to what had waited for it.
+//! waits. A flow leads from each result to what had waited for it, and ends at once where that was discarded before it ran.
 //!
 //! Where several hold a resource at once it has a track for each. The parts of a trace are behind each other in the file, so it is
 //! written as it comes; a reader sorts it by time.
 
-use super::lanes::Lanes;
 use super::wire::perfetto::track_event::Type;
 use super::wire::perfetto::{DebugAnnotation, ProcessDescriptor, Trace, TracePacket, TrackDescriptor, TrackEvent};
 use super::{Writer, unix_ns};
@@ -13,8 +12,9 @@ use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_model::id::InstanceId;
 use ratn_model::program::SUCCESS;
 use ratn_otlp::ids::number_of;
+use ratn_report::lanes::Lanes;
 use ratn_report::statistics::mode_name;
-use ratn_report::timeline::{Cause, Changed, Ending, Holding, Stage, Timeline};
+use ratn_report::timeline::{Cause, Changed, Ending, Holding, Instance, Stage, Timeline};
 use std::collections::BTreeMap;
 use std::io::{self, Write};
 use std::sync::Arc;
@@ -36,8 +36,8 @@ pub(crate) struct Perfetto<W> {
     at_work: BTreeMap<InstanceId, Work>,
     ends: Option<Ends>,
     flows: u64,
-    /// Flows that end where an instance begins to run.
-    arriving: BTreeMap<InstanceId, Vec<u64>>,
+    /// Flows that end where an instance begins to run, each with the track on which it begins.
+    arriving: BTreeMap<InstanceId, (u64, u64)>,
 }
 
 /// A slice of work that is open.
@@ -157,8 +157,8 @@ impl<W: Write> Perfetto<W> {
         let mut said = vec![note("attempt", &job.attempt.to_string())];
         said.extend(instance.speculative.then(|| note("speculative", "a condition on its path is open")));
         said.extend(job.ahead_of_time.then(|| note("ahead of time", "something older has not ended")));
-        let arriving = self.arriving.remove(&id).unwrap_or_default();
-        let event = TrackEvent { debug_annotations: said, terminating_flow_ids: arriving, ..named(&name, "work") };
+        let terminating_flow_ids = self.arriving.remove(&id).into_iter().map(|(flow, _)| flow).collect();
+        let event = TrackEvent { debug_annotations: said, terminating_flow_ids, ..named(&name, "work") };
         self.event(run, at_s, Type::SliceBegin, track, event)
     }
 
@@ -191,10 +191,23 @@ impl<W: Write> Perfetto<W> {
             return Ok(());
         }
         self.flows += 1;
-        self.arriving.insert(id, vec![self.flows]);
+        self.arriving.insert(id, (self.flows, track));
         let name = format!("result of {path}");
         let event = TrackEvent { flow_ids: vec![self.flows], ..named(&name, "result") };
         self.event(run, at_s, Type::Instant, track, event)
+    }
+
+    /// What a flow would have led to does not begin any more.
+    fn leads_nowhere(&mut self, run: &Timeline, one: &Instance) -> io::Result<()> {
+        let Some((flow, track)) = self.arriving.remove(&one.id) else { return Ok(()) };
+        let name = format!("{} was not begun", one.path);
+        self.event(
+            run,
+            run.end_s,
+            Type::Instant,
+            track,
+            TrackEvent { terminating_flow_ids: vec![flow], ..named(&name, "result") },
+        )
     }
 
     fn waited(&mut self, run: &Timeline, id: InstanceId) -> io::Result<()> {
@@ -248,9 +261,7 @@ impl<W: Write> Writer for Perfetto<W> {
             }
             self.gives_back(run, holding)?;
         }
-        for instance in &changed.left {
-            self.arriving.remove(&instance.id);
-        }
+        changed.left.iter().try_for_each(|one| self.leads_nowhere(run, one))?;
         changed.granted.iter().try_for_each(|holding| self.takes(run, holding))
     }
 
@@ -261,6 +272,7 @@ impl<W: Write> Writer for Perfetto<W> {
         for id in left.map(|one| one.id).collect::<Vec<_>>() {
             self.ends_work(run, id, run.end_s, vec![note("outcome", "open: the log ends before it")])?;
         }
+        changed.left.iter().try_for_each(|one| self.leads_nowhere(run, one))?;
         changed.released.iter().try_for_each(|holding| self.gives_back(run, holding))
     }
 }

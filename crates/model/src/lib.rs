@@ -21,6 +21,7 @@ pub mod ontology;
 pub mod parameters;
 pub mod pose;
 pub mod program;
+pub mod readable;
 pub mod resource;
 pub mod slot;
 pub mod time;

@@ -157,9 +157,6 @@ pub enum DescriptionError {
     },
 }
 
-/// The most of a file that is read, in bytes.
-const MAX_BYTES: u64 = 16 << 20;
-
 impl DescriptionError {
     /// Whether a file is missing or cannot be read, a mesh included; else a file says something wrong.
     pub fn is_unreadable(&self) -> bool {
@@ -271,10 +268,6 @@ fn line_of(text: &str, name: &str) -> Option<usize> {
 }
 
 fn read_text(file: &Path) -> Result<String, DescriptionError> {
-    let failed = |reason: String| DescriptionError::Read { file: file.to_owned(), reason };
-    let size = std::fs::metadata(file).map_err(|error| failed(error.to_string()))?.len();
-    if size > MAX_BYTES {
-        return Err(failed(format!("it has {size} bytes: at most {MAX_BYTES} are read")));
-    }
-    std::fs::read_to_string(file).map_err(|error| failed(error.to_string()))
+    ratn_regular_file::read_text(file, ratn_regular_file::USUAL)
+        .map_err(|error| DescriptionError::Read { file: file.to_owned(), reason: error.to_string() })
 }

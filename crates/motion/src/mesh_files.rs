@@ -2,12 +2,10 @@
 //! folder of the URDF.
 
 use crate::mesh::MeshError;
-use std::fs::File;
-use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Longest file of a mesh, in bytes.
-const MAX_FILE: u64 = 64 << 20;
+const MAX_FILE: usize = 64 << 20;
 
 /// Folders to look in.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -54,16 +52,7 @@ impl MeshFiles {
     /// [`MeshError::Read`] says what is in the way.
     pub fn read(&self, name: &str) -> Result<Vec<u8>, MeshError> {
         let path = self.path(name)?;
-        let failed = |reason: String| MeshError::Read { reason: format!("{}: {reason}", path.display()) };
-        read_up_to(&path).map_err(|error| failed(error.to_string())).and_then(|bytes| {
-            let fits = bytes.len() as u64 <= MAX_FILE;
-            if fits { Ok(bytes) } else { Err(failed(format!("longer than {MAX_FILE} bytes"))) }
-        })
+        ratn_regular_file::read(&path, MAX_FILE)
+            .map_err(|error| MeshError::Read { reason: format!("{}: {error}", path.display()) })
     }
-}
-
-fn read_up_to(path: &Path) -> std::io::Result<Vec<u8>> {
-    let mut bytes = Vec::new();
-    File::open(path)?.take(MAX_FILE + 1).read_to_end(&mut bytes)?;
-    Ok(bytes)
 }

@@ -200,3 +200,18 @@ fn the_base_drives_where_both_its_joints_and_its_area_allow() {
     let aimm = Robot::aimm().drive_area();
     assert_eq!(aimm, Some(([[-4.5, 4.5]; 2], None)));
 }
+
+#[test]
+fn a_pipe_in_the_place_of_a_file_is_not_waited_for() {
+    let folder = std::env::temp_dir().join(format!("ratn-robot-of-pipes-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    let (toml, urdf) = (folder.join("robot.toml"), folder.join("two.urdf"));
+    std::fs::write(&toml, TOML).unwrap();
+    assert!(std::process::Command::new("mkfifo").arg(&urdf).status().unwrap().success());
+    let refused = Robot::from_file(&toml).unwrap_err();
+    assert!(
+        refused.is_unreadable() && refused.to_string().contains("two.urdf: cannot be read: not a regular file"),
+        "{refused}"
+    );
+    std::fs::remove_dir_all(&folder).unwrap();
+}

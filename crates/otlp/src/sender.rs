@@ -7,7 +7,7 @@ use super::post::{PostError, post};
 use super::span::Span;
 use super::wire;
 use std::fmt;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot};
@@ -15,6 +15,8 @@ use tokio::time::Instant;
 
 /// Spans that were not sent yet.
 const QUEUE: usize = 4_096;
+/// … of at most so many bytes together.
+const QUEUE_BYTES: usize = 16 << 20;
 /// As many spans are one request, …
 const BATCH: usize = 512;
 /// … or as many as have so many bytes: collectors take 4 MiB, unless somebody tells them otherwise, …
@@ -34,6 +36,8 @@ static SENDER: OnceLock<Sender> = OnceLock::new();
 #[derive(Debug, Clone)]
 pub struct Sender {
     queue: mpsc::Sender<Message>,
+    /// How many bytes are in the queue.
+    bytes: Arc<AtomicUsize>,
     counts: Counts,
     trouble: Arc<Trouble>,
 }
@@ -124,9 +128,9 @@ impl Sender {
         let (queue, spans) = mpsc::channel(QUEUE);
         let trouble =
             Trouble { collector: target.uri.to_string(), is_said: AtomicBool::new(false), say: Box::new(say) };
-        let sender = Sender { queue, counts: Counts::default(), trouble: Arc::new(trouble) };
-        let (counts, trouble) = (sender.counts.clone(), Arc::clone(&sender.trouble));
-        let work = Work { target, timeout_ms, resource, counts, trouble };
+        let sender = Sender { queue, bytes: Arc::default(), counts: Counts::default(), trouble: Arc::new(trouble) };
+        let (queued, counts, trouble) = (Arc::clone(&sender.bytes), sender.counts.clone(), Arc::clone(&sender.trouble));
+        let work = Work { target, timeout_ms, resource, queued, counts, trouble };
         let sending = move || match tokio::runtime::Builder::new_current_thread().enable_all().build() {
             Ok(runtime) => runtime.block_on(work.send_all(spans)),
             Err(error) => work.trouble.say(&format_args!("this process cannot send any: {error}")),
@@ -138,9 +142,15 @@ impl Sender {
 
     /// Takes a span, or drops it where there is no room; never waits.
     pub fn record(&self, span: Span) {
-        if self.queue.try_send(Message::Span(Box::new(span.cut()))).is_err() {
+        let span = span.cut();
+        let bytes = span.bytes();
+        let has_room = self.bytes.fetch_add(bytes, Ordering::Relaxed) + bytes <= QUEUE_BYTES;
+        if !has_room || self.queue.try_send(Message::Span(Box::new(span))).is_err() {
+            self.bytes.fetch_sub(bytes, Ordering::Relaxed);
             self.counts.add(0, 1);
-            self.trouble.say(&format_args!("{QUEUE} wait to be sent, and more come than it takes"));
+            self.trouble.say(&format_args!(
+                "{QUEUE} of them, or {QUEUE_BYTES} bytes, wait to be sent, and more come than it takes"
+            ));
         }
     }
 
@@ -168,6 +178,8 @@ struct Work {
     target: Target,
     timeout_ms: u64,
     resource: Vec<(&'static str, String)>,
+    /// How many bytes are in the queue.
+    queued: Arc<AtomicUsize>,
     counts: Counts,
     trouble: Arc<Trouble>,
 }
@@ -175,22 +187,21 @@ struct Work {
 impl Work {
     async fn send_all(self, mut queue: mpsc::Receiver<Message>) {
         let mut batch = Vec::with_capacity(BATCH);
+        let take = |batch: &mut Vec<Span>, span: Box<Span>| {
+            let bytes = span.bytes();
+            self.queued.fetch_sub(bytes, Ordering::Relaxed);
+            batch.push(*span);
+            bytes
+        };
         while let Some(first) = queue.recv().await {
-            let mut flushed = match first {
-                Message::Flush(done) => Some(done),
-                Message::Span(span) => {
-                    batch.push(*span);
-                    None
-                }
+            let (mut flushed, mut bytes) = match first {
+                Message::Flush(done) => (Some(done), 0),
+                Message::Span(span) => (None, take(&mut batch, span)),
             };
             let until = Instant::now() + PAUSE;
-            let mut bytes: usize = batch.iter().map(Span::bytes).sum();
             while flushed.is_none() && batch.len() < BATCH && bytes < BATCH_BYTES {
                 match tokio::time::timeout_at(until, queue.recv()).await {
-                    Ok(Some(Message::Span(span))) => {
-                        bytes += span.bytes();
-                        batch.push(*span);
-                    }
+                    Ok(Some(Message::Span(span))) => bytes += take(&mut batch, span),
                     Ok(Some(Message::Flush(done))) => flushed = Some(done),
                     Ok(None) | Err(_) => break,
                 }
@@ -340,7 +351,61 @@ mod tests {
         assert!((patience..patience * 10).contains(&began.elapsed()), "{:?}", began.elapsed());
         assert_eq!(sender.counts().sent(), 0);
         let heard = heard.lock().unwrap();
-        assert!(heard.len() == 1 && heard[0].contains("4096 wait to be sent"), "{heard:?}");
+        assert!(heard.len() == 1 && heard[0].contains("4096 of them, or 16777216 bytes, wait to be sent"), "{heard:?}");
+    }
+
+    #[tokio::test]
+    async fn long_spans_that_nobody_takes_have_a_bound_in_bytes_and_there_is_room_again_once_they_are_taken() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let (sender, _) = to(listener.local_addr().unwrap().port(), 60_000);
+        let attributes: Vec<_> = (0..16).map(|_| ("said", "ä".repeat(10_000))).collect();
+        let long = |id| Span { attributes: attributes.clone(), ..span(id) };
+        let most = QUEUE_BYTES / long(1).cut().bytes();
+        (0..2 * most as u64).for_each(|id| sender.record(long(id)));
+        let dropped = sender.counts().dropped();
+        // What is on its way is no longer in the queue.
+        assert!(dropped + 40 >= most as u64 && dropped <= most as u64, "{dropped} of {most}");
+        let flushing = {
+            let sender = sender.clone();
+            tokio::spawn(async move { sender.flush(Duration::from_secs(60)).await })
+        };
+        while !flushing.is_finished() {
+            tokio::select! {
+                _ = answer(&listener, "200 OK") => {}
+                () = tokio::time::sleep(Duration::from_millis(20)) => {}
+            }
+        }
+        assert_eq!(sender.bytes.load(Ordering::Relaxed), 0);
+    }
+
+    #[tokio::test]
+    async fn one_that_answers_what_is_no_answer_or_does_not_end_is_given_up_in_time() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        for (begins, goes_on) in [
+            ("SSH-2.0-x\r\n", "garbage\r\n"),
+            ("HTTP/1.1 200 OK\r\n", "x: y\r\n"),
+            ("", "HTTP/1.1 100 Continue\r\n\r\n"),
+            ("", ""),
+        ] {
+            let (sender, _) = to(listener.local_addr().unwrap().port(), 300);
+            sender.record(span(1));
+            let chatter = async {
+                let (mut connection, _) = listener.accept().await.unwrap();
+                let mut said = connection.write_all(begins.as_bytes()).await;
+                while said.is_ok() {
+                    said = connection.write_all(goes_on.as_bytes()).await;
+                    tokio::task::yield_now().await;
+                }
+            };
+            let patience = Duration::from_secs(30);
+            let began = Instant::now();
+            tokio::select! {
+                () = async { chatter.await; std::future::pending().await } => {}
+                () = sender.flush(patience) => {}
+            }
+            assert!(began.elapsed() < patience, "{begins}{goes_on}");
+            assert_eq!((sender.counts().sent(), sender.counts().dropped()), (0, 1), "{begins}{goes_on}");
+        }
     }
 
     #[tokio::test]

@@ -10,8 +10,6 @@ use ratn_model::catalogue::Catalogue;
 use ratn_model::diagnostic::Diagnostic;
 use ratn_model::expression::Function;
 use ratn_model::load::{Document, Files, MAX_SOURCE, load_with};
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 
 /// The tree of a task file, of dicts, lists, texts, numbers and booleans. What is no YAML raises `ratn.InvalidTask`.
@@ -105,13 +103,5 @@ impl Files for Beside {
 }
 
 fn read(file: &Path) -> std::io::Result<String> {
-    if !std::fs::metadata(file)?.is_file() {
-        return Err(std::io::Error::other("not a regular file"));
-    }
-    let mut text = String::new();
-    File::open(file)?.take(MAX_SOURCE as u64 + 1).read_to_string(&mut text)?;
-    if text.len() > MAX_SOURCE {
-        return Err(std::io::Error::other(format!("longer than {MAX_SOURCE} bytes")));
-    }
-    Ok(text)
+    ratn_regular_file::read_text(file, MAX_SOURCE)
 }

@@ -4,6 +4,7 @@
 //! for a condition, a time, a signal or an answer is on it for as long as it waited.
 //! The links lie behind each other in time, and what is between two of them is what the parts of the system took.
 
+use super::names::{Names, shown};
 use super::timeline::{Behind, Cause, Instance, Phase, Stage, Timeline};
 use ratn_model::id::InstanceId;
 use serde::Serialize;
@@ -78,7 +79,8 @@ fn step<'r>(
             }
         },
         Stage::Asking => {
-            let wait = instance.waits.iter().find(|wait| wait.to_s == phase.to_s);
+            let wait = instance.waits.get(instance.waits.partition_point(|wait| wait.to_s < phase.to_s));
+            let wait = wait.filter(|wait| wait.to_s == phase.to_s);
             let freed = wait.and_then(|wait| {
                 let released = wait.behind.iter().filter(|one| one.released && one.instance != instance.id);
                 released.max_by(|a, b| a.to_s.total_cmp(&b.to_s))
@@ -113,7 +115,8 @@ fn began_on(instance: &Instance, index: usize) -> String {
 fn last_phase(run: &Timeline, id: InstanceId, to_s: f64) -> Option<Place<'_>> {
     let instance = run.instance(id)?;
     let is_work = |phase: &&Phase| phase.stage != Stage::Finished;
-    let index = instance.phases.iter().rposition(|phase| phase.to_s <= to_s && is_work(&phase))?;
+    let ended = instance.phases.partition_point(|phase| phase.to_s <= to_s);
+    let index = instance.phases[..ended].iter().rposition(|phase| is_work(&phase))?;
     Some((instance, index))
 }
 
@@ -129,11 +132,13 @@ pub fn table(links: &[Link]) -> String {
     if links.is_empty() {
         return text;
     }
-    let width = links.iter().map(|link| link.path.chars().count()).max().unwrap_or(0).max(22);
+    let names = Names::of(links.iter().map(|link| link.path.as_str()), 22);
+    let width = names.width;
     let _ = writeln!(text, "\n{:<w$}  from s    to s  length  was          began on", "critical path", w = width + 2);
-    let shown = |link: &&Link| link.to_s - link.from_s >= SHORTEST_S;
-    for Link { from_s, to_s, path, stage, waited_for } in links.iter().filter(shown) {
-        let length = to_s - from_s;
+    let is_long = |link: &Link| link.to_s - link.from_s >= SHORTEST_S;
+    for (path, link) in names.iter().zip(links).filter(|(_, link)| is_long(link)) {
+        let Link { from_s, to_s, stage, waited_for, .. } = link;
+        let (length, waited_for) = (to_s - from_s, shown(waited_for));
         let _ = writeln!(
             text,
             "  {path:<width$} {from_s:>7.1} {to_s:>7.1} {length:>7.1}  {:<11}  {waited_for}",
@@ -141,7 +146,7 @@ pub fn table(links: &[Link]) -> String {
         );
     }
     let along: f64 = links.iter().map(|link| link.to_s - link.from_s).fold(0.0, |all, one| all + one);
-    let short = links.len() - links.iter().filter(shown).count();
+    let short = links.iter().filter(|link| !is_long(link)).count();
     let _ = writeln!(
         text,
         "  {along:.1} s in {} links, {short} of them shorter than {SHORTEST_S} s and not shown",

@@ -5,9 +5,12 @@
 //! told apart. Hatched strips below the bars are waits: instances that had asked for the resource and did not have it yet.
 //! The same timeline gives the same bytes. SVG when the file is named so, else HTML with the statistics below the chart.
 
+use super::lanes::Lanes;
 use super::statistics::{Statistics, mode_name};
 use super::timeline::{Activity, Ending, Instance, Job, Span, Timeline, Wait};
 use ratn_event_log::without_visits;
+use ratn_model::readable::readable;
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
 
@@ -228,7 +231,7 @@ fn rows(run: &Timeline, by: By) -> Vec<Row<'_>> {
 
 /// What moves first, then what looks, then what plans; within these by name.
 fn by_resource(run: &Timeline) -> Vec<Row<'_>> {
-    let mut rows: Vec<Row<'_>> = Vec::new();
+    let mut rows: BTreeMap<&str, Row<'_>> = BTreeMap::new();
     for (instance, job) in run.jobs() {
         for resource in &job.resources {
             row_of(&mut rows, resource).jobs.push((instance, job));
@@ -242,41 +245,38 @@ fn by_resource(run: &Timeline) -> Vec<Row<'_>> {
             row_of(&mut rows, resource).waits.push((instance, wait.from_s, wait.to_s));
         }
     }
+    let mut rows: Vec<Row<'_>> = rows.into_values().collect();
     let rank = |row: &Row<'_>| row.jobs.iter().map(|(_, job)| job.activity).min();
-    rows.sort_by(|a, b| (a.name == ELSEWHERE, rank(a), &a.name).cmp(&(b.name == ELSEWHERE, rank(b), &b.name)));
+    rows.sort_by_cached_key(|row| (row.name == ELSEWHERE, rank(row), row.name.clone()));
     rows
 }
 
 /// In the order in which the states were first visited.
 fn by_node(run: &Timeline) -> Vec<Row<'_>> {
-    let mut rows: Vec<(String, Vec<Row<'_>>)> = Vec::new();
+    let mut states: Vec<(Lanes, Vec<Row<'_>>)> = Vec::new();
+    let mut places: BTreeMap<String, usize> = BTreeMap::new();
     for instance in run.instances().filter(|one| !one.jobs.is_empty()) {
         let state = without_visits(&instance.path);
-        let at = rows.iter().position(|(name, _)| *name == state).unwrap_or_else(|| {
-            rows.push((state.clone(), Vec::new()));
-            rows.len() - 1
-        });
-        let lanes = &mut rows[at].1;
-        let begins_s = instance.jobs[0].from_s;
-        let is_free = |row: &Row<'_>| row.jobs.iter().all(|(_, job)| job.to_s <= begins_s);
-        let lane = lanes.iter().position(is_free).unwrap_or_else(|| {
-            let name = if lanes.is_empty() { state } else { format!("{state} ({})", lanes.len() + 1) };
-            lanes.push(Row { name, jobs: vec![], waits: vec![] });
-            lanes.len() - 1
-        });
-        lanes[lane].jobs.extend(instance.jobs.iter().map(|job| (instance, job)));
+        let at = *places.entry(state.clone()).or_insert(states.len());
+        if at == states.len() {
+            states.push(Default::default());
+        }
+        let (lanes, rows) = &mut states[at];
+        let ends_s = instance.jobs.iter().map(|job| job.to_s).fold(0.0, f64::max);
+        let (lane, is_new) = lanes.take(instance.jobs[0].from_s, ends_s);
+        if is_new {
+            let name = if lane == 0 { state } else { format!("{state} ({})", lane + 1) };
+            rows.push(Row { name, jobs: vec![], waits: vec![] });
+        }
+        rows[lane].jobs.extend(instance.jobs.iter().map(|job| (instance, job)));
         let waits = instance.waits.iter().filter(|wait| wait.to_s - wait.from_s >= SHORTEST_WAIT_S);
-        lanes[lane].waits.extend(waits.map(|wait| (instance, wait.from_s, wait.to_s)));
+        rows[lane].waits.extend(waits.map(|wait| (instance, wait.from_s, wait.to_s)));
     }
-    rows.into_iter().flat_map(|(_, lanes)| lanes).collect()
+    states.into_iter().flat_map(|(_, rows)| rows).collect()
 }
 
-fn row_of<'r, 'a>(rows: &'r mut Vec<Row<'a>>, name: &str) -> &'r mut Row<'a> {
-    let at = rows.iter().position(|row| row.name == name).unwrap_or_else(|| {
-        rows.push(Row { name: name.to_owned(), jobs: vec![], waits: vec![] });
-        rows.len() - 1
-    });
-    &mut rows[at]
+fn row_of<'r, 'a, 'n>(rows: &'r mut BTreeMap<&'n str, Row<'a>>, name: &'n str) -> &'r mut Row<'a> {
+    rows.entry(name).or_insert_with(|| Row { name: name.to_owned(), jobs: vec![], waits: vec![] })
 }
 
 fn long_waits(run: &Timeline) -> impl Iterator<Item = (&Instance, &Wait)> {
@@ -404,6 +404,8 @@ fn shortened(text: &str, characters: usize) -> String {
     text.chars().take(characters.saturating_sub(1)).chain(['…']).collect()
 }
 
+/// A text in XML, which allows neither control characters nor the last two of the plane.
 fn escaped(text: &str) -> String {
+    let text = readable(text).replace(['\u{fffe}', '\u{ffff}'], "\u{fffd}");
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

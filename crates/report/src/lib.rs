@@ -2,13 +2,17 @@
 //!
 //! It owns the fold of a log's lines into what each instance did when and why ([`timeline`]), the figures made of that ([`statistics`]),
 //! what the run waited for ([`critical`], [`waiting`]), what several runs have in common ([`report`]) and the chart drawn of them
-//! ([`gantt`]); which motions there were ([`motions`]) and what the world was believed to be ([`believed`]). It needs no task file, no system that runs and no network, and prints nothing: the same
+//! ([`gantt`]), where spans that overlap stand in [`lanes`]; which motions there were ([`motions`]) and what the world was believed to be ([`believed`]). It needs no task file, no system that runs and no network, and prints nothing: the same
 //! lines give the same bytes. Reading the lines from a file is `ratn_event_log`'s.
 
 pub mod believed;
+#[cfg(test)]
+mod cost;
 pub mod critical;
 pub mod gantt;
+pub mod lanes;
 pub mod motions;
+mod names;
 pub mod report;
 pub mod statistics;
 pub mod timeline;
@@ -210,6 +214,22 @@ mod tests {
           the result of look                 1      2.0       2.0
           Arm, from the resource manager     1      0.2       0.2
         ");
+    }
+
+    /// A log whose names steer a terminal, turn the text around them, are markup, and are too long for a table.
+    #[test]
+    fn names_of_a_hostile_log_do_nothing_and_leave_a_table_readable() {
+        let evil = "\u{1b}[2J\r\u{202e}\u{7}\u{ffff}<b>";
+        let long = "a/".repeat(33_000);
+        let lines = WITH_A_LABEL.replace("\"read\"", &serde_json::to_string(&format!("{long}{evil}")).unwrap());
+        let lines = lines.replace("arm@sim", &serde_json::to_string(evil).unwrap().trim_matches('"').to_owned());
+        let run = told(&lines.replace("\"task\":\"t\"", &format!("\"task\":{}", serde_json::to_string(evil).unwrap())));
+        let is_obeyed = |c: char| (c.is_control() && c != '\n') || c == '\u{202e}';
+        let (text, chart) = (Report::of(&run).to_string(), gantt::stacked(&[&run], By::Node, None));
+        assert!(text.contains("\\u{1b}[2J") && !text.contains(is_obeyed), "{text}");
+        assert!(text.lines().all(|line| line.chars().count() < 300), "{text}");
+        assert!(chart.contains("&lt;b&gt;") && !chart.contains(|c| is_obeyed(c) || c == '\u{ffff}'));
+        assert!(!report::table(&report::repeated(&[run])).contains(is_obeyed));
     }
 
     #[test]

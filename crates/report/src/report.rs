@@ -1,6 +1,7 @@
 //! All that is said of one run, and what several runs have in common.
 
 use super::critical::{self, Link};
+use super::names::{Names, shown};
 use super::statistics::{Statistics, mode_name};
 use super::timeline::{Improvement, Speculation, Timeline};
 use super::waiting::{self, Waiting};
@@ -155,18 +156,19 @@ impl Repeated {
 
 /// As a table for people, with how much shorter CDTN is where there are both.
 pub fn table(all: &[Repeated]) -> String {
-    let width = all.iter().map(|one| one.name().chars().count()).max().unwrap_or(0).max(10);
+    let whole: Vec<String> = all.iter().map(Repeated::name).collect();
+    let names = Names::of(whole.iter().map(String::as_str), 10);
+    let width = names.width;
     let spread = |spread: Spread| format!("{:.1} ± {:.1}", spread.mean, spread.deviation);
     let mut text = format!(
         "{:<width$} mode  runs  makespan s        least  largest  two at once s   planning awaited s\n",
         "task"
     );
-    for one in all {
+    for (name, one) in names.iter().zip(all) {
         let runs =
             if one.successes == one.runs { one.runs.to_string() } else { format!("{}/{}", one.successes, one.runs) };
         text.push_str(&format!(
-            "{:<width$} {:<4} {runs:>5}  {:<15} {:>7.1} {:>8.1}  {:<14}  {}\n",
-            one.name(),
+            "{name:<width$} {:<4} {runs:>5}  {:<15} {:>7.1} {:>8.1}  {:<14}  {}\n",
             mode_name(one.mode),
             spread(one.makespan_s),
             one.makespan_s.least,
@@ -179,7 +181,7 @@ pub fn table(all: &[Repeated]) -> String {
         let hsm = all.iter().find(|one| one.mode == Mode::Hsm && one.name() == cdtn.name() && one.successes > 0);
         if let Some(hsm) = hsm.filter(|hsm| hsm.makespan_s.mean > 0.0) {
             let shorter = 100.0 * (1.0 - cdtn.makespan_s.mean / hsm.makespan_s.mean);
-            text.push_str(&format!("{}: CDTN is {shorter:.1} % shorter than HSM\n", cdtn.name()));
+            text.push_str(&format!("{}: CDTN is {shorter:.1} % shorter than HSM\n", shown(&cdtn.name())));
         }
     }
     text

@@ -3,9 +3,11 @@
 //! Every moment of a run counts once in [`Shares`]: to motion if anything moves, else to detection, else to other work, else to planning
 //! that everything waits for, else to idleness; they add up to the makespan.
 
+use super::names::{Names, shown};
 use super::timeline::{Activity, Ending, Job, Span, Timeline};
 use ratn_event_log::without_visits;
 use ratn_executive::protocol::Mode;
+use ratn_model::readable::{in_line, readable};
 use ratn_model::value::Value;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -191,25 +193,32 @@ impl Statistics {
 
 /// Sweeps over the ends of all jobs; between two of them nothing changes.
 fn divide(end_s: f64, jobs: &[&Job]) -> (Shares, f64) {
-    let mut edges: Vec<f64> = jobs.iter().flat_map(|job| [job.from_s, job.to_s]).chain([0.0, end_s]).collect();
-    edges.sort_by(f64::total_cmp);
-    edges.dedup();
-    let (mut shares, mut overlap_s) = (Shares::default(), 0.0);
-    for pair in edges.windows(2) {
-        let (from, length) = (pair[0], pair[1] - pair[0]);
-        let running = || jobs.iter().filter(|job| job.from_s <= from && job.to_s > from);
-        *match running().map(|job| job.activity).min() {
-            Some(Activity::Motion) => &mut shares.motion_s,
-            Some(Activity::Detection) => &mut shares.detection_s,
-            Some(Activity::Other) => &mut shares.other_s,
-            Some(Activity::Planning) => &mut shares.planning_waited_for_s,
-            None => &mut shares.idle_s,
-        } += length;
-        if running().count() > 1 {
+    let lasting = jobs.iter().filter(|job| job.to_s > job.from_s);
+    let mut edges: Vec<(f64, Option<(usize, bool)>)> = lasting
+        .flat_map(|job| {
+            [(job.from_s, true), (job.to_s, false)].map(|(at, begins)| (at, Some((job.activity as usize, begins))))
+        })
+        .chain([(end_s, None)])
+        .collect();
+    edges.sort_by(|a, b| a.0.total_cmp(&b.0));
+    // How many run, and how long the first one of those that do did, by activity; behind these what goes on without any.
+    let (mut running, mut spent_s) = ([0_usize; 4], [0.0; 5]);
+    let (mut from_s, mut overlap_s) = (0.0, 0.0);
+    for (at_s, edge) in edges {
+        let length = at_s - from_s;
+        spent_s[running.iter().position(|count| *count > 0).unwrap_or(running.len())] += length;
+        if running.iter().sum::<usize>() > 1 {
             overlap_s += length;
         }
+        from_s = at_s;
+        match edge {
+            Some((activity, true)) => running[activity] += 1,
+            Some((activity, false)) => running[activity] -= 1,
+            None => {}
+        }
     }
-    (shares, overlap_s)
+    let [motion_s, detection_s, other_s, planning_waited_for_s, idle_s] = spent_s;
+    (Shares { motion_s, detection_s, other_s, planning_waited_for_s, idle_s }, overlap_s)
 }
 
 fn ahead_of_time(run: &Timeline) -> AheadOfTime {
@@ -243,9 +252,11 @@ fn busy(run: &Timeline) -> Vec<Busy> {
 
 fn states(run: &Timeline) -> Vec<StateTime> {
     let mut order: Vec<StateTime> = Vec::new();
+    let mut places: BTreeMap<String, usize> = BTreeMap::new();
     for instance in run.instances().filter(|i| !i.jobs.is_empty()) {
         let state = without_visits(&instance.path);
-        let at = order.iter().position(|s| s.state == state).unwrap_or_else(|| {
+        let at = *places.entry(state).or_insert_with_key(|state| {
+            let state = state.clone();
             order.push(StateTime { state, runs: 0, total_s: 0.0, longest_s: 0.0, waited_s: 0.0 });
             order.len() - 1
         });
@@ -284,10 +295,10 @@ pub fn mode_name(mode: Mode) -> &'static str {
 
 impl fmt::Display for Statistics {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let outcome = self.outcome.as_deref().unwrap_or("unfinished");
-        writeln!(f, "{} in {} mode: {outcome} after {:.1} s", self.task, mode_name(self.mode), self.makespan_s)?;
+        let (task, outcome) = (shown(&self.task), shown(self.outcome.as_deref().unwrap_or("unfinished")));
+        writeln!(f, "{task} in {} mode: {outcome} after {:.1} s", mode_name(self.mode), self.makespan_s)?;
         if !self.reason.is_empty() {
-            writeln!(f, "  because {}", self.reason)?;
+            writeln!(f, "  because {}", readable(&self.reason))?;
         }
         let percent = |seconds: f64| if self.makespan_s > 0.0 { 100.0 * seconds / self.makespan_s } else { 0.0 };
         writeln!(f, "\nwhere the time went            s      %")?;
@@ -319,19 +330,17 @@ impl fmt::Display for Statistics {
             self.instances.crashed_attempts
         )?;
         self.incidents(f)?;
-        let width = self.resources.iter().map(|r| r.resource.chars().count()).max().unwrap_or(0).max(22);
+        let names = Names::of(self.resources.iter().map(|r| r.resource.as_str()), 22);
+        let width = names.width;
         writeln!(f, "\n{:<w$} busy s      %", "resource", w = width + 2)?;
-        for r in &self.resources {
-            writeln!(f, "  {:<width$} {:>7.1} {:>6.1}", r.resource, r.busy_s, 100.0 * r.share)?;
+        for (name, r) in names.iter().zip(&self.resources) {
+            writeln!(f, "  {name:<width$} {:>7.1} {:>6.1}", r.busy_s, 100.0 * r.share)?;
         }
-        let width = self.states.iter().map(|s| s.state.chars().count()).max().unwrap_or(0).max(22);
+        let names = Names::of(self.states.iter().map(|s| s.state.as_str()), 22);
+        let width = names.width;
         writeln!(f, "\n{:<w$} runs  total s longest s  waited s", "state", w = width + 2)?;
-        for s in &self.states {
-            writeln!(
-                f,
-                "  {:<width$} {:>4} {:>8.1} {:>9.1} {:>9.1}",
-                s.state, s.runs, s.total_s, s.longest_s, s.waited_s
-            )?;
+        for (name, s) in names.iter().zip(&self.states) {
+            writeln!(f, "  {name:<width$} {:>4} {:>8.1} {:>9.1} {:>9.1}", s.runs, s.total_s, s.longest_s, s.waited_s)?;
         }
         f.write_str(&plan_table(&self.plans))
     }
@@ -351,7 +360,7 @@ impl Statistics {
             writeln!(f, "  task control was gone for {:.1} s", self.away_s)?;
         }
         if let Some(ImpreciseOverlap { older, younger }) = self.imprecise.first() {
-            let all = self.imprecise.len();
+            let (all, younger, older) = (self.imprecise.len(), in_line(younger), in_line(older));
             writeln!(
                 f,
                 "  exceptions were imprecise: {younger} began beside {older}, which might have failed ({all} in all)"
@@ -367,13 +376,14 @@ pub fn plan_table(plans: &[Plan]) -> String {
     if plans.is_empty() {
         return text;
     }
-    let width = plans.iter().map(|p| p.instance.chars().count()).max().unwrap_or(0).max(22);
+    let names = Names::of(plans.iter().map(|p| p.instance.as_str()), 22);
+    let width = names.width;
     let _ = writeln!(text, "\n{:<w$} first path s  planned s  first rad  final rad  shortened", "plan", w = width + 2);
-    for p in plans {
+    for (name, p) in names.iter().zip(plans) {
         let _ = writeln!(
             text,
-            "  {:<width$} {:>12.3} {:>10.1} {:>10.2} {:>10.2} {:>9.1}%",
-            p.instance, p.first_path_s, p.planning_s, p.first_length_rad, p.length_rad, p.shortened_percent
+            "  {name:<width$} {:>12.3} {:>10.1} {:>10.2} {:>10.2} {:>9.1}%",
+            p.first_path_s, p.planning_s, p.first_length_rad, p.length_rad, p.shortened_percent
         );
     }
     text

@@ -1,5 +1,6 @@
 //! What instances waited for, by cause: resources by who held them, results by whose, and the rest.
 
+use super::names::Names;
 use super::timeline::{Cause, Phase, Stage, Timeline};
 use ratn_event_log::without_visits;
 use serde::Serialize;
@@ -69,10 +70,11 @@ pub fn table(all: &[Waiting]) -> String {
         return text;
     }
     let shown = &all[..all.len().min(MOST_SHOWN)];
-    let width = shown.iter().map(|one| one.cause.chars().count()).max().unwrap_or(0).max(22);
+    let names = Names::of(shown.iter().map(|one| one.cause.as_str()), 22);
+    let width = names.width;
     let _ = writeln!(text, "\n{:<w$} times  total s longest s", "waited for", w = width + 2);
-    for one in shown {
-        let _ = writeln!(text, "  {:<width$} {:>5} {:>8.1} {:>9.1}", one.cause, one.times, one.total_s, one.longest_s);
+    for (name, one) in names.iter().zip(shown) {
+        let _ = writeln!(text, "  {name:<width$} {:>5} {:>8.1} {:>9.1}", one.times, one.total_s, one.longest_s);
     }
     if all.len() > MOST_SHOWN {
         let _ = writeln!(text, "  and {} more causes", all.len() - MOST_SHOWN);

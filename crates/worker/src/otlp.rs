@@ -23,7 +23,7 @@ pub(crate) fn start(config: Option<&Path>, id: &str) {
     let from_environment = || std::env::var_os(ACCESS_VARIABLE).filter(|value| !value.is_empty()).map(PathBuf::from);
     let Some(file) = config.map(Path::to_owned).or_else(from_environment) else { return };
     // A file that cannot be read is refused for its roles.
-    let Ok(text) = std::fs::read_to_string(&file) else { return };
+    let Ok(text) = ratn_regular_file::read_text(&file, ratn_regular_file::USUAL) else { return };
     let file = file.display();
     let config = match toml::from_str::<SystemFile>(&text) {
         Ok(system) => system.service.otlp,

@@ -128,7 +128,8 @@ fn authority(directory: &Path, now: OffsetDateTime) -> anyhow::Result<Issuer<'st
             Ok(Issuer::new(params, pair))
         }
         (true, true) => {
-            let text = fs::read_to_string(&key).with_context(|| format!("cannot read {}", key.display()))?;
+            let text = ratn_regular_file::read_text(&key, ratn_regular_file::USUAL)
+                .with_context(|| format!("cannot read {}", key.display()))?;
             let pair = KeyPair::from_pem(&text).with_context(|| format!("{} is no private key", key.display()))?;
             let there = CertificateDer::from_pem_file(&cert)
                 .with_context(|| format!("{} is no certificate in PEM", cert.display()))?;

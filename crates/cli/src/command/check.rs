@@ -5,6 +5,7 @@ mod annotations;
 use super::blocking_here;
 use super::tables::improvement;
 use crate::arguments::CheckArguments;
+use crate::columns::aligned;
 use crate::failure::Failure;
 use crate::system::config::SystemConfig;
 use crate::system::{DIRECTORY_VARIABLE, System, catalogue, public_directory};
@@ -191,13 +192,14 @@ fn report(sequential: &Sequential) -> String {
     }
     lines.push("\nthe longest chain:".to_owned());
     let hidden = sequential.chain.len().saturating_sub(MAX_LINKS);
-    let width = sequential.chain.iter().skip(hidden).map(|link| link.path.len()).max().unwrap_or(0);
     if hidden > 0 {
         lines.push(format!("  … {hidden} states before"));
     }
-    for Link { path, began_s, ended_s, because } in sequential.chain.iter().skip(hidden) {
-        lines.push(format!("{began_s:>9.1} – {ended_s:>7.1} s  {path:<width$}  {because}"));
-    }
+    let shown = sequential.chain.iter().skip(hidden);
+    let row = |Link { path, began_s, ended_s, because }: &Link| {
+        [format!("{began_s:>9.1} – {ended_s:>7.1} s"), path.to_string(), because.to_string()]
+    };
+    lines.extend(aligned(&shown.map(row).collect::<Vec<_>>()));
     if !sequential.exceptional.is_empty() {
         lines.push(
             "\nwhat not computing ahead for a failure, a timeout or an answer would gain, if it is seldom:".to_owned(),

@@ -14,6 +14,7 @@ use ratn_model::load::load_with;
 use ratn_model::program::{Location, Program};
 use ratn_model::resource::Quantity;
 use ratn_model::value::Value;
+use ratn_motion::description::DescriptionError;
 use ratn_motion::looks::Looks;
 use ratn_motion::robot::Robot;
 use ratn_simulation::sequential::{Assumptions, makespan_s};
@@ -126,24 +127,32 @@ fn robots(directory: PathBuf, named: Option<String>) -> Robots {
         if !of_log.is_empty() {
             let needs =
                 |why| format!("the log is of the robot {of_log}: {why}; --robot names another description of it");
-            return robot(of_log, "as the log says".to_owned()).map_err(needs);
+            return robot_of_log(of_log).map_err(needs);
         }
-        let (robot_of, whence) = match own() {
+        let (own, whence) = match own() {
             Some(own) => (own, format!("the robot of the system in {}", directory.display())),
             None => (SystemConfig::default().robot, "the built-in robot".to_owned()),
         };
-        robot(&robot_of, format!("{whence}: the log does not say which one, --robot names another one"))
+        robot(&own, format!("{whence}: the log does not say which one, --robot names another one"))
     })
 }
 
 /// A built-in robot, or one that a file describes.
 fn robot(named: &str, whence: String) -> Result<Known, String> {
-    // A log may name anything: opening a pipe would wait for whoever writes it.
-    let is_other = |file: &Path| std::fs::metadata(file).is_ok_and(|is| !is.is_file());
-    if Robot::built_in(named).is_none() && is_other(Path::new(named)) {
-        return Err(format!("the robot {named} is not known: it is no regular file"));
-    }
-    let robot = Robot::named_or_file(named).map_err(|error| format!("the robot {named} is not known: {error}"))?;
+    known(named, whence, |error| error.to_string())
+}
+
+/// The robot that a log names. It may name any file: what stands in one that describes no robot is not shown.
+fn robot_of_log(named: &str) -> Result<Known, String> {
+    known(named, "as the log says".to_owned(), |error| match error {
+        DescriptionError::Form { file, .. } => format!("{} describes no robot", file.display()),
+        other => other.to_string(),
+    })
+}
+
+fn known(named: &str, whence: String, why: impl Fn(DescriptionError) -> String) -> Result<Known, String> {
+    let robot =
+        Robot::named_or_file(named).map_err(|error| format!("the robot {named} is not known: {}", why(error)))?;
     Ok(Known { robot, looks: Looks::named_or_file(named), whence })
 }
 
@@ -168,5 +177,22 @@ fn refused(error: DashboardError) -> Failure {
     match error {
         DashboardError::Exposed { .. } | DashboardError::TooMany { .. } => Failure::Refused(format!("ratn: {error}")),
         other => Failure::Failed(other.into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_of_a_file_that_a_log_names_as_its_robot_is_shown() -> anyhow::Result<()> {
+        let file = tempfile::NamedTempFile::new()?;
+        std::fs::write(file.path(), "root:x:0:0:secret\n")?;
+        let named = file.path().display().to_string();
+        let refused = robot_of_log(&named).err().unwrap_or_default();
+        assert!(refused.ends_with("describes no robot") && !refused.contains("secret"), "{refused}");
+        // Who names it is told what is wrong with it.
+        assert!(robot(&named, String::new()).err().unwrap_or_default().contains("secret"));
+        Ok(())
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::arguments::PlanArguments;
 use crate::failure::Failure;
-use crate::{input, output};
+use crate::output;
 use ratn_motion::connect::{Budget, ConnectError};
 use ratn_motion::mechanism::Mechanism;
 use ratn_motion::mesh_files::MeshFiles;
@@ -168,7 +168,8 @@ fn verdict(classes: &[Class]) -> Result<(), Failure> {
 }
 
 fn read(path: &Path) -> Result<String, Failure> {
-    input::read_up_to(path, MAX_FILE).map_err(|error| refused(path, anyhow::anyhow!("cannot be read: {error}")))
+    ratn_regular_file::read_text(path, MAX_FILE)
+        .map_err(|error| refused(path, anyhow::anyhow!("cannot be read: {error}")))
 }
 
 fn refused(path: &Path, error: impl Into<anyhow::Error>) -> Failure {

@@ -27,7 +27,6 @@ use ratn_worker::tls::ClientTls;
 use ratn_worker::vitals::CoreFailure;
 use ratn_worker::worker::WorkerOptions;
 use ratn_worker::{shutdown, tls};
-use std::fs::File;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -135,7 +134,7 @@ pub(super) fn cell(arguments: &CellArguments, tls: &ClientTls) -> Result<(), Fai
 
 /// `ratn cell --replay FILE`
 fn replay(file: &Path) -> Result<(), Failure> {
-    let opened = File::open(file).with_context(|| format!("cannot read {}", file.display()))?;
+    let opened = ratn_regular_file::open(file).with_context(|| format!("cannot read {}", file.display()))?;
     let replayed = recording::replay(BufReader::new(opened).lines());
     let Replayed { events, goals, end_s, tracking } = replayed.with_context(|| file.display().to_string())?;
     output::result(format_args!(

@@ -13,6 +13,7 @@ use crate::system::drivers::{self, Answers};
 use crate::system::public_directory;
 use ratn_daemon::resource_manager;
 use ratn_model::program::WORLD_MODEL;
+use ratn_model::readable::in_line;
 use ratn_model::resource::Quantity;
 use ratn_proto::types::{Resource, WaitingAcquire};
 use ratn_report::statistics::mode_name;
@@ -159,13 +160,13 @@ impl Status {
             let RunStatus { task, mode, at_s, ended, log, .. } = run;
             let paused = if run.paused { format!(", {}", colours.yellow("paused")) } else { String::new() };
             let states = if *ended == 1 { "state has" } else { "states have" };
-            let head = colours.bold(task);
+            let head = colours.bold(&in_line(task));
             lines.push(format!("{head} in {} mode: {at_s:.1} s{paused}; {ended} {states} ended", mode_name(*mode)));
             if self.runs.len() > 1 {
                 lines.push(format!("run: {}", run.run));
             }
             lines.extend(beside(run, self.runs.len() + self.elsewhere.len()));
-            lines.push(format!("event log: {}", log.display()));
+            lines.push(format!("event log: {}", in_line(&log.display().to_string())));
             let rows = run.under_way.iter().map(|one| [one.path.clone(), one.text()]);
             section(&mut lines, &colours.green("under way"), rows.collect());
             let until = |one: &Awaiting| one.until_s.map_or_else(String::new, |until| format!(", until {until:.1} s"));

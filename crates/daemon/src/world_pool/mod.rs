@@ -146,12 +146,13 @@ fn open(config: &WorldPoolConfig, store: Arc<dyn Store>) -> Result<(History, Jou
 
 fn ontology(file: &Path) -> anyhow::Result<Ontology> {
     let place = file.display();
-    let text = std::fs::read_to_string(file).with_context(|| format!("cannot read the ontology {place}"))?;
+    let text = ratn_regular_file::read_text(file, ratn_regular_file::USUAL)
+        .with_context(|| format!("cannot read the ontology {place}"))?;
     let beside = |using: &str, path: &str| {
         let other = Path::new(using).parent().unwrap_or(Path::new("")).join(path);
         // By its own name it is known again.
         let other = other.canonicalize().map_err(|error| error.to_string())?;
-        let text = std::fs::read_to_string(&other).map_err(|error| error.to_string())?;
+        let text = ratn_regular_file::read_text(&other, ratn_regular_file::USUAL).map_err(|error| error.to_string())?;
         Ok((other.display().to_string(), text))
     };
     let name = file.canonicalize().unwrap_or_else(|_| file.to_owned());

@@ -3,7 +3,7 @@
 use super::attributes;
 use ring::digest::{SHA256, digest as hashed};
 use std::fs::{File, OpenOptions, Permissions};
-use std::io::{self, ErrorKind, Read, Write};
+use std::io::{self, ErrorKind, Write};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
@@ -33,18 +33,8 @@ pub(crate) enum FileError {
 
 /// The text of a regular file of bounded length.
 pub(super) fn read(path: &Path, most: usize) -> Result<String, FileError> {
-    let refused = |why: String| FileError::Read { path: path.to_owned(), why };
-    let failed = |error: io::Error| refused(error.to_string());
-    // Asked before it is opened: opening a pipe waits for its writer.
-    if !std::fs::metadata(path).map_err(failed)?.is_file() {
-        return Err(refused("it is no regular file".to_owned()));
-    }
-    let mut bytes = Vec::new();
-    File::open(path).map_err(failed)?.take(most as u64 + 1).read_to_end(&mut bytes).map_err(failed)?;
-    if bytes.len() > most {
-        return Err(refused(format!("it is longer than {most} bytes")));
-    }
-    String::from_utf8(bytes).map_err(|_| refused("it is not UTF-8".to_owned()))
+    ratn_regular_file::read_text(path, most)
+        .map_err(|error| FileError::Read { path: path.to_owned(), why: error.to_string() })
 }
 
 /// What a text is known by.

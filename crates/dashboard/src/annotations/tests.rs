@@ -341,3 +341,13 @@ async fn a_simulation_for_which_nobody_waits_any_more_ends_its_thread() {
     assert_eq!(going_on.load(Ordering::SeqCst), 0);
     drop(place);
 }
+
+#[test]
+fn a_hash_that_is_typed_is_no_comment_and_tags_are_refused() {
+    let text = |text: &str| Ok(Document::Text(text.to_owned()));
+    assert_eq!((item("#"), item("2 # two"), item("\"!x\"")), (text("#"), text("2 # two"), text("!x")));
+    assert_eq!((item("2"), item("~")), (Ok(Document::Int(2)), Ok(Document::Null)));
+    for tagged in ["!!int 3", "!x", "[!!binary aGk=]", "{ a: !!float 1 }"] {
+        assert!(item(tagged).unwrap_err().contains("a tag"), "{tagged}");
+    }
+}

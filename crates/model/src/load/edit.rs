@@ -14,8 +14,8 @@ use super::yaml::{self, Content, Entry, Node};
 use super::{state, written_out};
 use crate::diagnostic::Findings;
 use crate::program::Location;
-pub use scan::has_anchor;
 use scan::{Lines, comments, flow_end, has_hidden_comment};
+pub use scan::{has_anchor, has_tag};
 use std::collections::BTreeMap;
 
 /// The annotations that can be changed.

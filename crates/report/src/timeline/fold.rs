@@ -371,7 +371,9 @@ impl Timeline {
         if matches!(activity, Activity::Motion | Activity::Other) {
             self.begins_beside(id, &path);
         }
-        self.known(id, at).jobs.push(Job::begun(at, attempt, goal, activity, ahead_of_time));
+        let instance = self.known(id, at);
+        instance.jobs.push(Job::begun(at, attempt, goal, activity, ahead_of_time));
+        instance.open_jobs += 1;
         self.enter(id, Stage::Running, at);
         self.at_work.insert(id);
     }
@@ -400,7 +402,8 @@ impl Timeline {
             if keeps_outputs {
                 job.outputs.clone_from(outputs);
             }
-            if !instance.jobs.iter().any(|job| job.ending == Ending::Open) {
+            instance.open_jobs -= 1;
+            if instance.open_jobs == 0 {
                 self.at_work.remove(&id);
             }
             if with_result {

@@ -150,6 +150,8 @@ pub struct Instance {
     pub waits: Vec<Wait>,
     /// What was done for it, by attempts.
     pub jobs: Vec<Job>,
+    /// How many of them have not ended.
+    pub(super) open_jobs: usize,
     /// Whether it has an outcome.
     pub finished: bool,
     /// Its outcome.
@@ -183,6 +185,7 @@ impl Instance {
             writers: Vec::new(),
             waits: Vec::new(),
             jobs: Vec::new(),
+            open_jobs: 0,
             finished: false,
             outcome: None,
             retired: false,

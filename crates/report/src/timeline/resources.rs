@@ -7,10 +7,10 @@ use super::instance::{Behind, Wait};
 use ratn_model::id::{InstanceId, LeaseId};
 use ratn_model::program::WORLD_MODEL;
 use ratn_model::resource::{Lease, LeasedResource, Quantity, Requirement, ResourceOperation};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
-/// Of a kind so many holders are kept for those who wait, the last ones, beside those that still hold.
+/// Of a kind so many holders are looked at for those who wait: the last that gave back, and the first of those that still hold.
 const MOST_BEHIND: usize = 64;
 
 /// A resource in the hands of an instance.
@@ -52,31 +52,34 @@ pub struct Asked {
     pub kinds: Vec<String>,
 }
 
-/// Who has held resources of one kind, in the order of their grants.
+/// Who holds resources of one kind, and who gave them back last.
 #[derive(Debug, Clone, Default)]
-struct History(Vec<(Holding, Released)>);
-
-type Released = bool;
+struct History {
+    held: BTreeMap<(InstanceId, Arc<str>), Holding>,
+    released: VecDeque<Holding>,
+}
 
 impl History {
     fn takes(&mut self, holding: Holding) {
-        if self.0.len() >= MOST_BEHIND
-            && let Some(oldest) = self.0.iter().position(|(_, released)| *released)
-        {
-            self.0.remove(oldest);
-        }
-        self.0.push((holding, false));
+        self.held.insert((holding.instance, holding.resource.clone()), holding);
     }
 
     fn releases(&mut self, over: &Holding) {
-        let is_it = |one: &Holding| one.instance == over.instance && one.resource == over.resource;
-        if let Some((one, released)) = self.0.iter_mut().rev().find(|(one, released)| !released && is_it(one)) {
-            (one.to_s, *released) = (over.to_s, true);
+        let Some(one) = self.held.remove(&(over.instance, over.resource.clone())) else { return };
+        if self.released.len() == MOST_BEHIND {
+            self.released.pop_front();
         }
+        self.released.push_back(Holding { to_s: over.to_s, ..one });
     }
 
     fn is_a(&self, kind: &str) -> bool {
-        self.0.first().is_some_and(|(one, _)| one.is_a(kind))
+        self.looked_at().next().is_some_and(|(one, _)| one.is_a(kind))
+    }
+
+    /// Holders, and whether they have given back.
+    fn looked_at(&self) -> impl Iterator<Item = (&Holding, bool)> {
+        let held = self.held.values().take(MOST_BEHIND).map(|one| (one, false));
+        self.released.iter().map(|one| (one, true)).chain(held)
     }
 }
 
@@ -189,13 +192,13 @@ impl Resources {
     /// How an instance waited that has what it asked for, and for whom: those first who kept it waiting longest.
     fn wait(&self, asked: Asked, at_s: f64, granted: &[LeasedResource]) -> Wait {
         let wanted = self.history.values().filter(|history| asked.kinds.iter().any(|kind| history.is_a(kind)));
-        let behind = wanted.flat_map(|history| &history.0).map(|(one, released)| Behind {
+        let behind = wanted.flat_map(History::looked_at).map(|(one, released)| Behind {
             instance: one.instance,
             holder: one.holder.clone(),
             resource: one.resource.clone(),
             from_s: one.from_s,
             to_s: one.to_s.min(at_s),
-            released: *released,
+            released,
         });
         // Whoever gave it back before it was asked for, or at that moment, kept nobody waiting.
         let mut behind: Vec<Behind> = behind.filter(|one| one.to_s > asked.from_s).collect();

@@ -153,7 +153,7 @@ impl Checkpoint {
 /// # Errors
 /// Why it is not used.
 pub(crate) fn find(log: &Path, origin: &Origin, digest: &str) -> Result<Option<Checkpoint>, FileError> {
-    let file = match File::open(path_of(log)) {
+    let file = match ratn_regular_file::open(&path_of(log)) {
         Ok(file) => file,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(error.into()),

@@ -133,7 +133,8 @@ fn version(path: &Path) -> Option<SystemTime> {
 
 fn read(path: &Path) -> Result<AccessConfig, AccessError> {
     let failed = |problem: String| AccessError { file: path.to_owned(), problem };
-    let text = std::fs::read_to_string(path).map_err(|error| failed(error.to_string()))?;
+    let text =
+        ratn_regular_file::read_text(path, ratn_regular_file::USUAL).map_err(|error| failed(error.to_string()))?;
     let file: SystemFile = toml::from_str(&text).map_err(|error| failed(error.to_string()))?;
     match file.service.access.fault() {
         Some((key, rule)) => Err(failed(format!("`{key}`: {rule}"))),

@@ -285,7 +285,11 @@ fn certificates(file: &Path, what: &'static str) -> Result<Vec<CertificateDer<'s
 }
 
 fn read(file: &Path, what: &'static str) -> Result<Vec<u8>, TlsError> {
-    std::fs::read(file).map_err(|source| TlsError { file: file.to_owned(), what, source })
+    ratn_regular_file::read(file, ratn_regular_file::USUAL).map_err(|source| TlsError {
+        file: file.to_owned(),
+        what,
+        source,
+    })
 }
 
 fn unusable(file: &Path, what: &'static str, why: &dyn fmt::Display) -> TlsError {

@@ -157,7 +157,7 @@ fn read(findings: &mut Findings, about: &str, file: &Path) -> Option<Certificate
 
 fn private_key(findings: &mut Findings, about: &str, file: &Path) -> Option<KeyPair> {
     let at = format!("{about} {}", file.display());
-    let text = match std::fs::read_to_string(file) {
+    let text = match ratn_regular_file::read_text(file, ratn_regular_file::USUAL) {
         Ok(text) => text,
         Err(error) => {
             findings.problem(at, format!("is not read: {error}"), "it has to be readable by who runs the daemon");

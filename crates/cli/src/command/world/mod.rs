@@ -15,9 +15,9 @@ pub(crate) use arguments::WorldArguments;
 
 use super::{blocking_on, unanswered};
 use crate::failure::Failure;
+use crate::output;
 use crate::repainting::{self, json_text};
 use crate::system::public_directory;
-use crate::{input, output};
 use anyhow::Context;
 use arguments::{Format, WorldCommand};
 use ratn_model::fact::{Change, FactPattern};
@@ -157,7 +157,7 @@ impl Asking {
     async fn load(&self, file: &Path, replace: bool) -> Result<(), Failure> {
         let name = file.display();
         let refused = |error: &dyn std::fmt::Display| Failure::Refused(format!("ratn: {name}: {error}"));
-        let text = input::read_up_to(file, MAX_DUMP).map_err(|error| refused(&error))?;
+        let text = ratn_regular_file::read_text(file, MAX_DUMP).map_err(|error| refused(&error))?;
         let is_turtle = file.extension().is_some_and(|extension| extension == "ttl");
         let read = if is_turtle { turtle::read(&text) } else { dump::read(&text) };
         let facts = read.map_err(|error| refused(&format!("{error:#}")))?;

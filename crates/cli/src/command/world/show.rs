@@ -1,7 +1,7 @@
 //! Facts, differences and histories as tables for people and as JSON for programs.
 
 use super::{dump, task_text};
-use crate::columns::columns;
+use crate::columns::{aligned, columns};
 use ratn_model::fact::FactKey;
 use ratn_model::id::Revision;
 use ratn_model::measurement::{Certainty, Measurement};
@@ -123,18 +123,8 @@ pub(super) fn rows(rows: &Rows) -> String {
 
 /// What variables are in each row; `more` says that there are more rows.
 pub(super) fn table(variables: &[String], rows: Vec<Vec<String>>, more: bool) -> String {
-    let widths: Vec<usize> = (0..variables.len())
-        .map(|i| {
-            let cells = rows.iter().map(|row| row[i].chars().count());
-            cells.chain([variables[i].chars().count() + 1]).max().unwrap_or(0)
-        })
-        .collect();
-    let line = |cells: Vec<String>| {
-        let cells: Vec<String> = cells.iter().zip(&widths).map(|(cell, width)| format!("{cell:<width$}")).collect();
-        cells.join("  ").trim_end().to_owned()
-    };
-    let mut lines = vec![line(variables.iter().map(|name| format!("?{name}")).collect())];
-    lines.extend(rows.into_iter().map(line));
+    let head: Vec<String> = variables.iter().map(|name| format!("?{name}")).collect();
+    let mut lines = aligned(&[vec![head], rows].concat());
     if more {
         lines.push("(there are more: --limit)".to_owned());
     }

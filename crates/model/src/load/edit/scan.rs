@@ -179,6 +179,11 @@ pub fn has_anchor(text: &str) -> bool {
     begins_with(text, ['&', '*'])
 }
 
+/// Whether a tag begins somewhere in it.
+pub fn has_tag(text: &str) -> bool {
+    begins_with(text, ['!'; 2])
+}
+
 /// Whether a text over several lines, with `|` or `>` before it, begins somewhere in it, and a quote in it may hide a comment: what is in such a
 /// text are no quotes, which this file does not know.
 pub(super) fn has_hidden_comment(text: &str) -> bool {

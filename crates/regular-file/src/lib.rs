@@ -1,0 +1,81 @@
+//! Reading a file that somebody names: on the command line, in a log, in the file of a robot.
+//!
+//! Only a regular file is opened. A named pipe would make its reader wait for a writer, a device may never end, and opening one may already do
+//! something. What has the name may be another file a moment later, so it is looked at before it is opened and once it is open, and it is opened
+//! without waiting.
+
+use nix::fcntl::OFlag;
+use std::fs::File;
+use std::io::{Error, ErrorKind, Read, Result};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+
+/// More bytes than a config, a certificate, an ontology or the description of a robot has.
+pub const USUAL: usize = 16 << 20;
+
+/// Opens a regular file to read it. It never waits for anybody.
+///
+/// # Errors
+/// What the system says; where something else has the name, [`ErrorKind::InvalidInput`].
+pub fn open(path: &Path) -> Result<File> {
+    regular(std::fs::metadata(path)?.is_file())?;
+    let flags = OFlag::O_NONBLOCK | OFlag::O_NOCTTY;
+    let file = File::options().read(true).custom_flags(flags.bits()).open(path)?;
+    regular(file.metadata()?.is_file())?;
+    Ok(file)
+}
+
+/// What is in a regular file of at most `most` bytes.
+///
+/// # Errors
+/// As [`open`]; where it is longer, [`ErrorKind::FileTooLarge`].
+pub fn read(path: &Path, most: usize) -> Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open(path)?.take(most as u64 + 1).read_to_end(&mut bytes)?;
+    match bytes.len() <= most {
+        true => Ok(bytes),
+        false => Err(Error::new(ErrorKind::FileTooLarge, format!("longer than {most} bytes"))),
+    }
+}
+
+/// The text of a regular file of at most `most` bytes.
+///
+/// # Errors
+/// As [`read`]; where it is no UTF-8, [`ErrorKind::InvalidData`].
+pub fn read_text(path: &Path, most: usize) -> Result<String> {
+    String::from_utf8(read(path, most)?).map_err(|error| Error::new(ErrorKind::InvalidData, error))
+}
+
+fn regular(is_file: bool) -> Result<()> {
+    let problem = "not a regular file: what comes from a pipe or a device has to be written to a file first";
+    if is_file { Ok(()) } else { Err(Error::new(ErrorKind::InvalidInput, problem)) }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    #[test]
+    fn what_is_no_regular_file_is_refused_at_once() {
+        let place = tempfile::tempdir().unwrap();
+        let pipe = place.path().join("pipe");
+        nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).unwrap();
+        for other in [Path::new("/dev/zero"), place.path(), &pipe] {
+            let refused = open(other).unwrap_err();
+            assert_eq!(refused.kind(), ErrorKind::InvalidInput);
+            assert!(refused.to_string().starts_with("not a regular file"), "{refused}");
+        }
+    }
+
+    #[test]
+    fn a_file_of_the_bound_is_read_and_a_longer_one_is_refused() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), "five!").unwrap();
+        assert_eq!(read_text(file.path(), 5).unwrap(), "five!");
+        let refused = read_text(file.path(), 4).unwrap_err();
+        assert_eq!((refused.kind(), refused.to_string().as_str()), (ErrorKind::FileTooLarge, "longer than 4 bytes"));
+        std::fs::write(file.path(), b"\xff").unwrap();
+        assert_eq!(read_text(file.path(), 5).unwrap_err().kind(), ErrorKind::InvalidData);
+    }
+}
