@@ -76,7 +76,7 @@ pub(super) fn replace(path: &Path, old: &str, new: &str, most: usize) -> Result<
         }
         file.set_permissions(Permissions::from_mode(there.mode() & 0o7777)).map_err(failed)?;
         // Behind the mode, of which the list of who may do what is a part.
-        attributes::keep(&File::open(&path).map_err(failed)?, &file).map_err(|why| refused(&why))?;
+        attributes::keep(&ratn_regular_file::open(&path).map_err(failed)?, &file).map_err(|why| refused(&why))?;
         file.sync_all().map_err(failed)?;
         // As late as can be: whoever writes it in an editor meanwhile is not overwritten.
         if read(&path, most)? != old {
