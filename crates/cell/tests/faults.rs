@@ -85,7 +85,7 @@ fn an_object_that_somebody_moved_stands_elsewhere_on_the_table_and_only_that_one
     assert!(after.iter().all(|b| b.on == "table"), "{after:?}");
     let gap = after[0].pose.distance(&after[1].pose);
     assert!(gap > 0.1, "{gap}");
-    assert!(matches!(&bench.noted[..], [what] if what.contains("somebody moves box_")), "{:?}", bench.noted);
+    assert!(matches!(&bench.noted[..], [what] if what.contains("somebody moves slc_")), "{:?}", bench.noted);
 }
 
 #[test]

@@ -66,7 +66,7 @@ struct BuiltIn;
 impl Files for BuiltIn {
     fn read(&self, _using: &str, path: &str) -> Result<(String, String), String> {
         let (name, text) =
-            [FETCH, FETCH_WATCHED, SET].into_iter().find(|(name, _)| path == *name).ok_or("it is not built in")?;
+            [FETCH_WATCHED, SET].into_iter().find(|(name, _)| path == *name).ok_or("it is not built in")?;
         Ok((name.to_owned(), text.to_owned()))
     }
 }
