@@ -1,7 +1,7 @@
 //! Looks for a better order of what is ready, in one thread, while something runs: what the window still has to do goes in, and an
 //! advice comes out as an event where one was found. What is advised is in the log, so a replay needs no search.
 //!
-//! Bounded: one thread; a question replaces the one before it; each is thought about for [`THINKING`] at the most, and at most
+//! Bounded: one thread; a question replaces the one before it; each is thought about for [`THINKING`] at the most, where more than that can be gained, and at most
 //! one is asked per [`PAUSE`], when enough has changed ([`ratn_executive::lookahead::Lookout`]). Each goes on with the good orders that were
 //! found for the one before, so that a long run is thought about for long.
 
@@ -111,6 +111,9 @@ impl TurnContext {
         let mut search = Search::remembering(problem, seed, memory)
             .inspect_err(|error| tracing::debug!(%error, "no look ahead"))
             .ok()?;
+        if !is_worthwhile(search.bound_s(), search.plain_s()) {
+            return None;
+        }
         let begun = Instant::now();
         while !search.is_over() && begun.elapsed() < THINKING {
             search.step(ORDERS);
@@ -122,9 +125,15 @@ impl TurnContext {
         let best = search.best();
         // What is no number would not read back from a log.
         let is_usable = best.urgency_s.iter().all(|(_, seconds)| seconds.is_finite());
-        let is_worthwhile = is_usable && best.end_s < best.plain_s * (1.0 - WORTHWHILE) && !best.urgency_s.is_empty();
-        is_worthwhile.then_some(Event::Advised { urgency_s: best.urgency_s, held: best.held })
+        let is_told = is_usable && is_worthwhile(best.end_s, best.plain_s) && !best.urgency_s.is_empty();
+        is_told.then_some(Event::Advised { urgency_s: best.urgency_s, held: best.held })
     }
+}
+
+/// Whether an end, in seconds from now, is earlier than the present one by more than it costs to find and tell it. Of many goals of a millisecond
+/// no order is.
+fn is_worthwhile(end_s: f64, plain_s: f64) -> bool {
+    plain_s - end_s > (plain_s * WORTHWHILE).max(THINKING.as_secs_f64())
 }
 
 /// Whether there is something to be gained: something runs, and two others want one kind of which there is a bounded number.
@@ -177,6 +186,18 @@ mod tests {
         let Event::Advised { urgency_s, .. } = advisor.told().await else { anyhow::bail!("no advice") };
         let urgency = |id| urgency_s.iter().find(|(instance, _)| *instance == InstanceId(id)).map(|(_, s)| *s);
         assert!(urgency(2) > urgency(1), "{urgency_s:?}");
+        Ok(())
+    }
+
+    #[test]
+    fn what_gains_less_than_it_costs_is_not_thought_about() -> anyhow::Result<()> {
+        let capacity = [("Worker".to_owned(), 2.into())].into();
+        let many = Problem { tasks: (0..101).map(|id| task(id, 0.0003, "Worker", &[])).collect(), capacity };
+        for (problem, is_thought_about) in [(many, false), (problem(), true)] {
+            let search = Search::new(&problem, 1)?;
+            assert!(is_worth_asking(&problem) && !search.is_over());
+            assert_eq!(is_worthwhile(search.bound_s(), search.plain_s()), is_thought_about);
+        }
         Ok(())
     }
 

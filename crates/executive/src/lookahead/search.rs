@@ -197,6 +197,16 @@ impl Search {
         self.best_end <= self.bound || self.best.len() < 2
     }
 
+    /// When everything has ended as it is served now, in seconds from now.
+    pub fn plain_s(&self) -> f64 {
+        self.plain_end as f64 / NANOSECONDS
+    }
+
+    /// No order ends earlier than this, in seconds from now.
+    pub fn bound_s(&self) -> f64 {
+        self.bound as f64 / NANOSECONDS
+    }
+
     /// The best plan so far.
     pub fn best(&mut self) -> Advice {
         self.tried.copy_from_slice(&self.best);
@@ -225,7 +235,7 @@ impl Search {
             at_most_s: GIVES_UP_AFTER * self.rollout.began[*place as usize] as f64 / NANOSECONDS,
         });
         let held = held.collect();
-        Advice { end_s, plain_s: self.plain_end as f64 / NANOSECONDS, urgency_s, held }
+        Advice { end_s, plain_s: self.plain_s(), urgency_s, held }
     }
 
     /// Simulates another order; it is kept if it ends earlier.
