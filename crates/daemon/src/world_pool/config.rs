@@ -3,6 +3,7 @@
 use super::in_memory::Most;
 use super::memory::Bounds;
 use crate::config::{Check, ConfigError, StorageConfig, rule};
+use ratn_model::name::{KIND_RULE, is_kind};
 use ratn_proto::MAX_PAGE_BYTES;
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
@@ -110,7 +111,7 @@ impl WorldPoolConfig {
 impl Check for WorldPoolConfig {
     fn check(&self) -> Result<(), ConfigError> {
         rule("host", !self.host.is_empty(), "is not empty")?;
-        rule("kind", !self.kind.is_empty(), "is not empty")?;
+        rule("kind", is_kind(&self.kind), KIND_RULE)?;
         rule("session_ttl_ms", self.session_ttl_ms >= 100, "at least 100 ms")?;
         rule("capacity", self.capacity >= 1, "at least 1")?;
         rule("revisions_kept", self.revisions_kept >= 1, "at least 1")?;
