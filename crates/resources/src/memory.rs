@@ -3,6 +3,9 @@
 //! Bounded by number and by age, and for each caller by number and bytes. A caller's own oldest answers are forgotten first; where all
 //! callers together have too many, those of the caller with the most. So nobody's requests make the manager forget the answers of a caller
 //! with fewer. An answer is durable together with its effect; waiting requests are not.
+//!
+//! What was done for a session and ended with it (a lease, what it created or consumed of what is renewable) is the answer of that [`Life`]
+//! alone: a session that is opened anew under the same id has it done anew. What outlasts a session is done once for all of them.
 
 use crate::error::PoolError;
 use crate::fingerprint::Fingerprint;
@@ -35,6 +38,9 @@ pub(crate) enum Remembered {
     Touched(Vec<String>),
     Done,
 }
+
+/// Which of the sessions that had one id: its number; 0 is any of them, or none.
+pub(crate) type Life = u64;
 
 /// What a request id leads to.
 #[derive(Debug, Clone, PartialEq)]
@@ -71,6 +77,8 @@ struct Answer {
     id: Arc<str>,
     fingerprint: Fingerprint,
     reply: Remembered,
+    /// With which it ended.
+    life: Life,
 }
 
 impl RequestId {
@@ -97,6 +105,11 @@ impl Answer {
     fn bytes(&self) -> usize {
         OVERHEAD + 2 * self.id.len() + self.reply.bytes()
     }
+
+    /// Whether it is one for a session of this life.
+    fn is_of(&self, life: Life) -> bool {
+        self.life == 0 || life == 0 || self.life == life
+    }
 }
 
 impl OfCaller {
@@ -119,12 +132,17 @@ impl OfCaller {
 }
 
 impl RequestMemory {
-    /// What this request led to before. An answer to nobody knows whom is that of whoever asks the same.
-    pub(crate) fn recall(&self, id: &RequestId, fingerprint: Fingerprint) -> Result<Option<Recalled>, PoolError> {
+    /// What this request of a life led to before. An answer to nobody knows whom is that of whoever asks the same.
+    pub(crate) fn recall(
+        &self,
+        id: &RequestId,
+        fingerprint: Fingerprint,
+        life: Life,
+    ) -> Result<Option<Recalled>, PoolError> {
         if let Some((print, waiter)) = self.waiting.get(id) {
             return same(id, *print, fingerprint).map(|()| Some(Recalled::Waiting(*waiter)));
         }
-        if let Some(answer) = self.answer(id) {
+        if let Some(answer) = self.answer(id, life) {
             let recalled = Recalled::Answered(answer.reply.clone());
             return same(id, answer.fingerprint, fingerprint).map(|()| Some(recalled));
         }
@@ -133,9 +151,9 @@ impl RequestMemory {
     }
 
     /// The same, whatever the request was.
-    pub(crate) fn reply(&self, id: &RequestId) -> Option<Recalled> {
+    pub(crate) fn reply(&self, id: &RequestId, life: Life) -> Option<Recalled> {
         let waiting = self.waiting.get(id).map(|(_, waiter)| Recalled::Waiting(*waiter));
-        let answer = || self.answer(id).or_else(|| self.unknown(id));
+        let answer = || self.answer(id, life).or_else(|| self.unknown(id));
         waiting.or_else(|| answer().map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 
@@ -206,7 +224,14 @@ impl RequestMemory {
         }
     }
 
-    pub(crate) fn remember(&mut self, id: RequestId, fingerprint: Fingerprint, reply: Remembered, now: Timestamp) {
+    pub(crate) fn remember(
+        &mut self,
+        id: RequestId,
+        fingerprint: Fingerprint,
+        reply: Remembered,
+        life: Life,
+        now: Timestamp,
+    ) {
         if let Some(before) = self.callers.get(&id.caller).and_then(|known| known.numbers.get(&id.id)).copied() {
             self.remove(&id.caller, before);
         }
@@ -216,7 +241,7 @@ impl RequestMemory {
             self.grants.insert(lease, (id.caller.clone(), number));
         }
         self.order.insert(number, (now, id.caller.clone()));
-        self.callers.entry(id.caller).or_default().insert(number, Answer { id: id.id, fingerprint, reply });
+        self.callers.entry(id.caller).or_default().insert(number, Answer { id: id.id, fingerprint, reply, life });
     }
 
     /// The request that led to this lease is as if it had never been asked; its id.
@@ -239,8 +264,8 @@ impl RequestMemory {
         answer.map(|answer| answer.id)
     }
 
-    fn answer(&self, id: &RequestId) -> Option<&Answer> {
-        self.callers.get(&id.caller)?.get(&id.id)
+    fn answer(&self, id: &RequestId, life: Life) -> Option<&Answer> {
+        self.callers.get(&id.caller)?.get(&id.id).filter(|answer| answer.is_of(life))
     }
 
     /// What nobody knows whom was answered under this id.
@@ -248,11 +273,11 @@ impl RequestMemory {
         self.callers.get("")?.get(&id.id)
     }
 
-    /// The answers with whom they were given to, the oldest first.
-    pub(crate) fn iter(&self) -> impl Iterator<Item = (&Arc<str>, &Arc<str>, Fingerprint, &Remembered)> {
+    /// The answers with whom they were given to and the life with which each ended, the oldest first.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (&Arc<str>, &Arc<str>, Fingerprint, &Remembered, Life)> {
         self.order.iter().filter_map(|(number, (_, caller))| {
             let answer = self.callers.get(caller)?.answers.get(number)?;
-            Some((caller, &answer.id, answer.fingerprint, &answer.reply))
+            Some((caller, &answer.id, answer.fingerprint, &answer.reply, answer.life))
         })
     }
 

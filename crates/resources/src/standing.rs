@@ -62,7 +62,7 @@ impl Pool {
         }
         let session = self.sessions.get(&request.session).filter(|_| !request.instead_of.is_empty())?;
         let replaced = RequestId::new(&session.opened_by, &request.instead_of);
-        if let Some(Recalled::Waiting(waiter)) = self.memory.reply(&replaced)
+        if let Some(Recalled::Waiting(waiter)) = self.memory.reply(&replaced, session.number)
             && self.queue.get(waiter).is_some_and(|waiter| waiter.request.session == request.session)
         {
             self.refuse(waiter, Refusal::Cancelled);
