@@ -39,7 +39,7 @@ pub(crate) enum Remembered {
     Done,
 }
 
-/// Which of the sessions that had one id: its number; 0 is any of them, or none.
+/// Which of all sessions, also of those that had one id: its number; 0 is none.
 pub(crate) type Life = u64;
 
 /// What a request id leads to.
@@ -105,11 +105,6 @@ impl Answer {
     fn bytes(&self) -> usize {
         OVERHEAD + 2 * self.id.len() + self.reply.bytes()
     }
-
-    /// Whether it is one for a session of this life.
-    fn is_of(&self, life: Life) -> bool {
-        self.life == 0 || life == 0 || self.life == life
-    }
 }
 
 impl OfCaller {
@@ -132,17 +127,17 @@ impl OfCaller {
 }
 
 impl RequestMemory {
-    /// What this request of a life led to before. An answer to nobody knows whom is that of whoever asks the same.
+    /// What this request led to before, unless that ended with a life that is over. An answer to nobody knows whom is that of whoever asks the same.
     pub(crate) fn recall(
         &self,
         id: &RequestId,
         fingerprint: Fingerprint,
-        life: Life,
+        is_over: impl Fn(Life) -> bool,
     ) -> Result<Option<Recalled>, PoolError> {
         if let Some((print, waiter)) = self.waiting.get(id) {
             return same(id, *print, fingerprint).map(|()| Some(Recalled::Waiting(*waiter)));
         }
-        if let Some(answer) = self.answer(id, life) {
+        if let Some(answer) = self.answer(id).filter(|answer| !is_over(answer.life)) {
             let recalled = Recalled::Answered(answer.reply.clone());
             return same(id, answer.fingerprint, fingerprint).map(|()| Some(recalled));
         }
@@ -151,9 +146,10 @@ impl RequestMemory {
     }
 
     /// The same, whatever the request was.
-    pub(crate) fn reply(&self, id: &RequestId, life: Life) -> Option<Recalled> {
+    pub(crate) fn reply(&self, id: &RequestId, is_over: impl Fn(Life) -> bool) -> Option<Recalled> {
         let waiting = self.waiting.get(id).map(|(_, waiter)| Recalled::Waiting(*waiter));
-        let answer = || self.answer(id, life).or_else(|| self.unknown(id));
+        let own = || self.answer(id).filter(|answer| !is_over(answer.life));
+        let answer = || own().or_else(|| self.unknown(id));
         waiting.or_else(|| answer().map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 
@@ -264,8 +260,8 @@ impl RequestMemory {
         answer.map(|answer| answer.id)
     }
 
-    fn answer(&self, id: &RequestId, life: Life) -> Option<&Answer> {
-        self.callers.get(&id.caller)?.get(&id.id).filter(|answer| answer.is_of(life))
+    fn answer(&self, id: &RequestId) -> Option<&Answer> {
+        self.callers.get(&id.caller)?.get(&id.id)
     }
 
     /// What nobody knows whom was answered under this id.

@@ -167,7 +167,7 @@ impl Pool {
         let id = RequestId::new(self.caller_of(request.session(), speaker), request_id);
         let fingerprint = Fingerprint::of(&request);
         let life = self.life(request.session());
-        match self.memory.recall(&id, fingerprint, life)? {
+        match self.memory.recall(&id, fingerprint, self.is_over(life))? {
             Some(Recalled::Waiting(waiter)) => Ok(Reply::Queued(waiter)),
             Some(Recalled::Answered(Remembered::Granted(lease))) => {
                 // Of another session: only the id is known of what an earlier version remembers.
@@ -319,6 +319,12 @@ impl Pool {
     /// Which life of a session it is now; 0 where it is not there.
     pub(crate) fn life(&self, session: Option<&SessionId>) -> Life {
         session.and_then(|session| self.session_number(session)).unwrap_or(0)
+    }
+
+    /// Whether a life is over, for who asks in a session of this life; for who asks in none that is there none is.
+    pub(crate) fn is_over(&self, asks: Life) -> impl Fn(Life) -> bool {
+        let lives = |life| self.sessions.values().any(|session| session.number == life && session.ending.is_none());
+        move |life| ![0, asks].contains(&life) && asks != 0 && !lives(life)
     }
 
     /// Keeps the answer to a request id, together with its effect, which ends with a life unless that is 0.
