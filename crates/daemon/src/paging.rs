@@ -108,13 +108,38 @@ pub(crate) fn place(token: &str) -> Result<Option<(u64, usize)>, Status> {
         return Ok(None);
     }
     let read = || token.split_once(':').and_then(|(at, seen)| Some((at.parse().ok()?, seen.parse().ok()?)));
-    let message = "page_token: is none of a page of this answer: begin with an empty one";
-    read().map(Some).ok_or_else(|| status(Code::InvalidArgument, "MALFORMED", message))
+    read().map(Some).ok_or_else(no_token)
 }
 
 /// The token of the page behind, where there is one.
 pub(crate) fn token(more: bool, revision: u64, seen: usize) -> String {
     if more { format!("{revision}:{seen}") } else { String::new() }
+}
+
+/// The token of the page behind the one that ends with this id, where there is one. Only a call that asks for the same goes on with it: `asked` is
+/// the request without what it says of pages.
+pub(crate) fn token_behind(last: Option<&str>, asked: &impl Message) -> String {
+    last.map_or_else(String::new, |last| format!("{:016x}:{last}", seal(last, asked)))
+}
+
+/// The id behind which a token goes on; empty for the first page.
+pub(crate) fn behind<'a>(token: &'a str, asked: &impl Message) -> Result<&'a str, Status> {
+    if token.is_empty() {
+        return Ok("");
+    }
+    let own = token.split_once(':').filter(|(sealed, last)| *sealed == format!("{:016x}", seal(last, asked)));
+    own.map(|(_, last)| last).ok_or_else(no_token)
+}
+
+/// FNV-1a of what is asked and an id: it tells a token of ours from another text, and protects nothing.
+fn seal(last: &str, asked: &impl Message) -> u64 {
+    let bytes = asked.encode_to_vec().into_iter().chain([0]).chain(last.bytes());
+    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3))
+}
+
+fn no_token() -> Status {
+    let message = "page_token: is none of a page of this answer: begin with an empty one";
+    status(Code::InvalidArgument, "MALFORMED", message)
 }
 
 /// An answer that does not fit into one message.

@@ -71,7 +71,7 @@ async fn attributes_larger_than_a_resource_may_be_are_refused_and_all_that_are_a
     assert!(plain.list(of_kind).await.unwrap().into_inner().resources.is_empty());
     let first = v1::ListRequest { page_bytes: 200_000, ..Default::default() };
     let first = plain.list(first).await.unwrap().into_inner();
-    assert_eq!((first.resources.len(), first.next_page_token.as_str()), (3, "map-002"));
+    assert!(first.resources.len() == 3 && first.next_page_token.ends_with(":map-002"), "{}", first.next_page_token);
     a.resources.create(Resource::new("arm", ResourceClass::Module, "Arm")).await.unwrap();
     let event = in_time(watch.next()).await.unwrap().unwrap();
     assert!(matches!(event, ResourceUpdate::Event(event) if event.resource.id == "arm"), "and the watch goes on");

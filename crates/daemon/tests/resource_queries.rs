@@ -306,3 +306,71 @@ async fn only_who_is_asked_for_a_kind_says_that_there_is_no_more_of_it() {
     drop(watch);
     a.resources.report_shortage("PathPlanner", 0, "").await.unwrap();
 }
+
+#[tokio::test]
+async fn demand_is_told_to_sessions_that_are_there_and_to_no_other_one() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    let channel = system.channels.get(&manager.endpoint).unwrap();
+    let mut plain = ResourceServiceClient::new(channel);
+    let of = |session_id: &str| v1::WatchDemandRequest { session_id: session_id.to_owned(), ..Default::default() };
+    let refused = plain.watch_demand(of("nobody")).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition, "{refused}");
+    assert_eq!(refused.get_error_details().error_info().unwrap().reason, "SESSION_UNKNOWN");
+    plain.watch_demand(of(a.session.id())).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_list_goes_on_with_the_tokens_that_it_gave_and_with_no_other_ones() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    for id in ["one", "three", "two"] {
+        a.resources.create(gripper(id, 1.0)).await.unwrap();
+    }
+    let channel = system.channels.get(&manager.endpoint).unwrap();
+    let mut plain = ResourceServiceClient::new(channel);
+    let page = |kinds: &[&str], token: &str| v1::ListRequest {
+        kinds: kinds.iter().map(|kind| (*kind).to_owned()).collect(),
+        page_bytes: 1,
+        page_token: token.to_owned(),
+        ..Default::default()
+    };
+    let (mut ids, mut token) = (Vec::new(), String::new());
+    loop {
+        let next = plain.list(page(&["Gripper"], &token)).await.unwrap().into_inner();
+        ids.extend(next.resources.into_iter().map(|resource| resource.id));
+        if next.next_page_token.is_empty() {
+            break;
+        }
+        token = next.next_page_token;
+    }
+    assert_eq!(ids, ["one", "three", "two"]);
+    for (kinds, token) in
+        [(&["Gripper"][..], "one"), (&["Gripper"], "zzz"), (&["Gripper"], "0:one"), (&["Arm"], &token)]
+    {
+        let refused = plain.list(page(kinds, token)).await.unwrap_err();
+        assert_eq!(refused.code(), Code::InvalidArgument, "{token}: {refused}");
+        assert!(refused.message().contains("page_token"), "{refused}");
+    }
+    let sessions = v1::ListSessionsRequest { page_bytes: 1, page_token: "a".to_owned() };
+    assert_eq!(plain.list_sessions(sessions).await.unwrap_err().code(), Code::InvalidArgument);
+}
+
+#[tokio::test]
+async fn a_kind_is_a_letter_then_letters_digits_underscores_and_hyphens_whoever_says_it() {
+    let system = TestSystem::new();
+    let manager = system.resource_manager().await;
+    let a = system.client(&manager, "a").await;
+    a.resources.create(Resource::new("ok", ResourceClass::Module, "Arm-2_left")).await.unwrap();
+    a.resources.acquire(vec![block("Arm-2_left")], AcquireOptions::default()).await.unwrap();
+    for kind in ["2Arm", "_Arm", "Arm left", "Arm.left", "Größe", "Arm/left", "-"] {
+        let created = a.resources.create(Resource::new("odd", ResourceClass::Module, kind)).await.unwrap_err();
+        let blocked = a.resources.acquire(vec![block(kind)], AcquireOptions::default()).await.unwrap_err();
+        for refused in [created, blocked] {
+            assert_eq!(refused.code(), Some(Code::InvalidArgument), "{kind}: {refused}");
+            assert!(refused.to_string().contains("a letter, then letters, digits, `_` and `-`"), "{refused}");
+        }
+    }
+}

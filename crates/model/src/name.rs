@@ -41,6 +41,15 @@ pub fn is_unseen(character: char) -> bool {
     character.is_control() || UNSEEN.iter().any(|range| range.contains(&character))
 }
 
+/// What a kind of resource is called, in words: see [`is_kind`].
+pub const KIND_RULE: &str = "a letter, then letters, digits, `_` and `-`";
+
+/// Whether a text is the name of a kind of resource: a letter, then letters, digits, `_` and `-`, all of ASCII.
+pub fn is_kind(text: &str) -> bool {
+    text.starts_with(|first: char| first.is_ascii_alphabetic())
+        && text.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-'))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -56,5 +65,15 @@ mod tests {
             assert!(!is_unseen(seen), "{seen:?}");
         }
         assert!(UNSEEN.windows(2).all(|two| two[0].end() < two[1].start()), "in order");
+    }
+
+    #[test]
+    fn a_kind_is_a_letter_then_letters_digits_underscores_and_hyphens() {
+        for kind in ["A", "PathPlanner", "arm_2-left", "not"] {
+            assert!(is_kind(kind), "{kind}");
+        }
+        for other in ["", "2Arm", "_Arm", "-", "Arm left", "Arm.left", "Gr\u{f6}\u{df}e", "Arm\u{200b}"] {
+            assert!(!is_kind(other), "{other:?}");
+        }
     }
 }

@@ -15,6 +15,10 @@
 //! Nothing happens by itself: an account is settled when its session gets or gives back. To compare takes a look at each session there, once
 //! for all that are compared at a moment.
 //!
+//! The shares of a caller's sessions that hold or wait count as its bound together where they are more (`share_per_caller`): as if each were so
+//! many times smaller, time for time. What such a caller's session owes is then as many times longer at the most, and goes to the next session of
+//! the caller where it ends, so that nobody has more by opening sessions.
+//!
 //! From: start-time fair queueing (Goyal, Vin, Cheng 1996), with a bound on how far apart accounts are.
 
 use crate::id::{SessionId, WaiterId};
@@ -56,6 +60,25 @@ struct FamilyAccounts {
     active: usize,
     /// Those who need something for certain at a moment, as long as nothing of it has changed.
     rivals: Option<(Timestamp, Rivals)>,
+    /// Those whose sessions have a bound together and hold or wait.
+    callers: BTreeMap<Arc<str>, OfCaller>,
+}
+
+/// What the sessions of a caller are together.
+#[derive(Debug, Clone, Default)]
+struct OfCaller {
+    /// The sum of the shares of those that hold or wait, in thousandths.
+    shares: u64,
+    beyond: Beyond,
+    /// What sessions had that have ended while the shares were beyond the bound, the most last.
+    left: Vec<Service>,
+}
+
+/// How far shares are beyond their bound: as many times as `shares` is `bound`, which is never less than once.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Beyond {
+    shares: u64,
+    bound: u64,
 }
 
 /// What a session has and had of a family.
@@ -66,6 +89,10 @@ struct Account {
     settled: Timestamp,
     held: Quantity,
     share: Share,
+    /// Whose it is, and what of its share is in the sum of that caller, in thousandths.
+    caller: Arc<str>,
+    counted: u64,
+    beyond: Beyond,
     /// Its requests that wait and for which what exists would do.
     waiting: BTreeSet<OwnPlace>,
     /// When the last one was served that was the first of them.
@@ -78,6 +105,10 @@ pub(crate) struct Within<'a> {
     pub(crate) session: &'a SessionId,
     pub(crate) family: &'a str,
     pub(crate) share: Share,
+    /// Who opened the session.
+    pub(crate) caller: &'a Arc<str>,
+    /// What the shares of all sessions of that caller are together at the most, in thousandths; none where it has no bound.
+    pub(crate) bound: Option<u64>,
     pub(crate) now: Timestamp,
 }
 
@@ -109,6 +140,36 @@ struct Beside {
     shares: u128,
     /// The same, one unit at the least.
     held: u128,
+    beyond: Beyond,
+}
+
+impl Default for Beyond {
+    fn default() -> Beyond {
+        Beyond { shares: 1, bound: 1 }
+    }
+}
+
+impl Beyond {
+    fn of(shares: u64, bound: Option<u64>) -> Beyond {
+        match bound {
+            Some(bound) if shares > bound => Beyond { shares, bound: bound.max(1) },
+            _ => Beyond::default(),
+        }
+    }
+
+    fn is_some(self) -> bool {
+        self != Beyond::default()
+    }
+
+    /// So many times as much.
+    fn more(self, amount: u128) -> u128 {
+        amount.saturating_mul(self.shares.into()) / u128::from(self.bound)
+    }
+
+    /// So many times less, as a share: never nothing.
+    fn less(self, share: Share) -> u128 {
+        (u128::from(share.thousandths()) * u128::from(self.bound) / u128::from(self.shares)).max(1)
+    }
 }
 
 impl Account {
@@ -125,12 +186,12 @@ impl Account {
         let passed = u128::from(now.0.saturating_sub(self.settled.0));
         // Below 2^64 × 2^42, and thousandths by thousandths.
         let cost = passed * u128::from(self.held.thousandths()) / u128::from(self.share.thousandths());
-        self.service.saturating_add(cost)
+        self.service.saturating_add(self.beyond.more(cost))
     }
 
     /// Nothing where it needs nothing for certain.
     fn as_rival(&self, now: Timestamp) -> Option<Rival> {
-        let (share, held) = (self.share.thousandths().into(), self.held.thousandths().into());
+        let (share, held) = (self.beyond.less(self.share), self.held.thousandths().into());
         self.needs_some().then(|| Rival { service: self.service_at(now), share, held })
     }
 
@@ -145,7 +206,8 @@ impl Beside {
     fn ahead(&self) -> Duration {
         let Some(least) = self.least else { return Duration::ZERO };
         let nanoseconds = self.service.saturating_sub(least).saturating_mul(self.shares) / self.held;
-        Duration::from_nanos(u64::try_from(nanoseconds).unwrap_or(u64::MAX)).min(AHEAD)
+        let most = self.beyond.more(AHEAD.as_nanos());
+        Duration::from_nanos(u64::try_from(nanoseconds.min(most)).unwrap_or(u64::MAX))
     }
 
     /// The service that is [`AHEAD`] long.
@@ -200,18 +262,45 @@ impl FamilyAccounts {
             account => self.level.max(account.map_or(0, |account| account.service)),
         };
         let others = rivals.least.iter().flatten().find(|(_, session)| session != within.session);
+        let beyond = self.callers.get(within.caller).map_or_else(Beyond::default, |of| of.beyond);
         let (mut shares, mut held) = (rivals.shares, rivals.held);
         if !account.is_some_and(Account::needs_some) {
-            shares += u128::from(within.share.thousandths());
+            shares += beyond.less(within.share);
             held += account.map_or(0, |account| account.held.thousandths().into());
         }
         let one = u128::from(Quantity::ONE.thousandths());
-        Beside { service, least: others.map(|(service, _)| *service), shares, held: held.max(one) }
+        Beside { service, least: others.map(|(service, _)| *service), shares, held: held.max(one), beyond }
+    }
+
+    /// What is counted of an account for its caller is another amount, and may put all accounts of that caller further beyond their bound, or
+    /// less far; at how many accounts was looked for that.
+    fn count(&mut self, within: &Within<'_>, before: u64, after: u64) -> usize {
+        if before == after {
+            return 0;
+        }
+        let of = self.callers.entry(within.caller.clone()).or_default();
+        of.shares = of.shares.saturating_sub(before) + after;
+        let beyond = Beyond::of(of.shares, within.bound);
+        let has_changed = of.beyond != beyond;
+        of.beyond = beyond;
+        if of.shares == 0 {
+            self.callers.remove(within.caller);
+        }
+        if !has_changed {
+            return 0;
+        }
+        for account in self.accounts.values_mut().filter(|account| account.caller == *within.caller) {
+            account.settle(within.now);
+            account.beyond = beyond;
+        }
+        self.rivals = None;
+        self.accounts.len()
     }
 }
 
 impl Accounts {
-    /// By how much a session is ahead of its rivals in a family, as time; [`AHEAD`] at the most.
+    /// By how much a session is ahead of its rivals in a family, as time; [`AHEAD`] at the most, and as many times that as the shares of
+    /// its caller are beyond their bound.
     pub(crate) fn ahead(&mut self, within: &Within<'_>) -> Duration {
         self.beside(within).map_or(Duration::ZERO, |beside| beside.ahead())
     }
@@ -225,7 +314,8 @@ impl Accounts {
         account.settle(within.now);
         if let Some(least) = beside.least {
             let most = beside.most();
-            account.service = account.service.clamp(least.saturating_sub(most), least.saturating_add(most));
+            let owed = least.saturating_add(beside.beyond.more(most));
+            account.service = account.service.clamp(least.saturating_sub(most), owed);
         }
         let least = beside.least.map_or(account.service, |least| least.min(account.service));
         family.level = family.level.max(least);
@@ -319,10 +409,10 @@ impl Accounts {
         self.change(within, |account| account.held = account.held.saturating_sub(amount));
     }
 
-    /// It has another share from now on.
-    pub(crate) fn has_share(&mut self, session: &SessionId, share: Share, now: Timestamp) {
-        for family in self.sessions.get(session).map(|of| of.families.clone()).unwrap_or_default() {
-            self.change(&Within { session, family: &family, share, now }, |_| {});
+    /// It has another share from now on, in every family.
+    pub(crate) fn has_share(&mut self, within: &Within<'_>) {
+        for family in self.sessions.get(within.session).map(|of| of.families.clone()).unwrap_or_default() {
+            self.change(&Within { family: &family, ..within.clone() }, |_| {});
         }
     }
 
@@ -331,10 +421,16 @@ impl Accounts {
         for name in self.sessions.remove(session).unwrap_or_default().families {
             let Some(family) = self.families.get_mut(&name) else { continue };
             let left = family.accounts.remove(session);
-            let is_active = left.is_some_and(|left| left.is_active());
+            let is_active = left.as_ref().is_some_and(Account::is_active);
             debug_assert!(!is_active, "{session} has ended and is active");
             family.active -= usize::from(is_active);
             family.rivals = None;
+            let owed = left.filter(|left| left.service > family.level);
+            let of_caller = owed.as_ref().and_then(|left| family.callers.get_mut(&left.caller));
+            if let Some((left, of)) = owed.as_ref().zip(of_caller.filter(|of| of.beyond.is_some())) {
+                let at = of.left.partition_point(|service| *service <= left.service);
+                of.left.insert(at, left.service);
+            }
             if family.accounts.is_empty() {
                 self.families.remove(&name);
             }
@@ -342,12 +438,15 @@ impl Accounts {
     }
 
     fn change(&mut self, within: &Within<'_>, change: impl FnOnce(&mut Account)) {
-        let Within { session, family, share, now } = within;
+        let Within { session, family, share, caller, bound, now } = within;
         let known = self.families.get_key_value(*family);
         let name: Arc<str> = known.map_or_else(|| (*family).into(), |(name, _)| name.clone());
         let family = self.families.entry(name.clone()).or_default();
-        if !family.accounts.contains_key(*session) {
-            family.accounts.insert((*session).clone(), Account { settled: *now, ..Account::default() });
+        let is_new = !family.accounts.contains_key(*session);
+        if is_new {
+            let beyond = family.callers.get(*caller).map_or_else(Beyond::default, |of| of.beyond);
+            let account = Account { settled: *now, caller: (*caller).clone(), beyond, ..Account::default() };
+            family.accounts.insert((*session).clone(), account);
             self.sessions.entry((*session).clone()).or_default().families.insert(name.clone());
         }
         let Some(account) = family.accounts.get_mut(*session) else { return };
@@ -358,9 +457,16 @@ impl Accounts {
         }
         account.share = *share;
         change(account);
+        if is_new && account.beyond.is_some() && !account.waiting.is_empty() {
+            let owed = family.callers.get_mut(*caller).and_then(|of| of.left.pop());
+            account.service = account.service.max(owed.unwrap_or_default());
+        }
         let (is_active, service, after) = (account.is_active(), account.service, account.as_rival(*now));
+        let counted = if is_active && bound.is_some() { share.thousandths() } else { 0 };
+        let counted_before = std::mem::replace(&mut account.counted, counted);
         family.active = family.active + usize::from(is_active) - usize::from(was_active);
         family.rival_changes(session, *now, before, after);
+        self.looked_at += family.count(within, counted_before, counted);
         if is_active {
             return;
         }
@@ -388,6 +494,13 @@ impl Accounts {
     pub(crate) fn agree(&self, has: &BTreeMap<(SessionId, Arc<str>), (Quantity, usize)>) -> Result<(), String> {
         let mut active = 0;
         for (name, family) in &self.families {
+            let mut shares = BTreeMap::<_, u64>::new();
+            for account in family.accounts.values().filter(|account| account.counted > 0) {
+                *shares.entry(&account.caller).or_default() += account.counted;
+            }
+            if !shares.into_iter().eq(family.callers.iter().map(|(caller, of)| (caller, of.shares))) {
+                return Err(format!("the shares of callers of {name} are not the sum of those of their sessions"));
+            }
             for (session, account) in &family.accounts {
                 if !self.sessions.get(session).is_some_and(|of| of.families.contains(name)) {
                     return Err(format!("{session} does not know of its account of {name}"));
@@ -447,7 +560,9 @@ mod tests {
 
         fn when<T>(&mut self, seconds: u64, who: usize, what: impl FnOnce(&mut Accounts, &Within<'_>) -> T) -> T {
             let (session, share) = (&self.sessions[who], self.shares[who]);
-            what(&mut self.accounts, &Within { session, family: "Arm", share, now: at(seconds) })
+            let within =
+                Within { session, family: "Arm", share, caller: &Arc::default(), bound: None, now: at(seconds) };
+            what(&mut self.accounts, &within)
         }
 
         fn ahead(&mut self, seconds: u64, who: usize) -> u64 {
@@ -508,9 +623,8 @@ mod tests {
         let mut bench = Bench::new([1.0, 1.0, 1.0]);
         bench.when(0, 1, |accounts, within| accounts.waits(within, own(1)));
         bench.when(0, 0, |accounts, within| accounts.holds(within, Quantity::ONE));
-        let (session, share) = (bench.sessions[0].clone(), Share::new(3.0).unwrap());
-        bench.accounts.has_share(&session, share, at(4));
-        bench.shares[0] = share;
+        bench.shares[0] = Share::new(3.0).unwrap();
+        bench.when(4, 0, |accounts, within| accounts.has_share(within));
         // 4 s at a share of 1, then 3 s at 3, of 4 in all.
         assert_eq!(bench.ahead(7, 0), 20);
     }

@@ -52,7 +52,7 @@ impl Pool {
         let undone = self.undo(now, caller, request_id)?;
         if let Some(session) = self.sessions.get(caller).filter(|_| !undone) {
             let id = RequestId::new(&session.opened_by, request_id);
-            if self.memory.reply(&id).is_none() {
+            if self.memory.reply(&id, self.is_over(session.number)).is_none() {
                 self.withdrawals.withdrawn(self.now, &self.limits, id, caller);
             }
         }
@@ -66,7 +66,7 @@ impl Pool {
     pub fn undo(&mut self, now: Timestamp, caller: &SessionId, request_id: &str) -> Result<bool, PoolError> {
         self.begin(now);
         let Some(session) = self.sessions.get(caller) else { return Ok(false) };
-        match self.memory.reply(&RequestId::new(&session.opened_by, request_id)) {
+        match self.memory.reply(&RequestId::new(&session.opened_by, request_id), self.is_over(session.number)) {
             Some(Recalled::Waiting(id)) => {
                 let Some(waiter) = self.queue.get(id) else { return Ok(false) };
                 check_owner(|| id.to_string(), &waiter.request.session, caller)?;
@@ -338,6 +338,7 @@ impl Pool {
         }
         held.shrink_to_fit();
         let (lease, token) = (LeaseId(self.last_lease + 1), FencingToken(self.last_token + 1));
+        let life = self.life(Some(&request.session));
         let granted = LeaseRecord {
             token,
             session: request.session,
@@ -349,7 +350,7 @@ impl Pool {
             expires: None,
         };
         self.commit(Effect::LeaseGranted { lease, granted });
-        self.remember(request_id, fingerprint, Remembered::Granted(lease));
+        self.remember(request_id, fingerprint, Remembered::Granted(lease), life);
         if let Some(lease) = self.lease(lease) {
             self.notices.push(Notice::Granted { waiter: place.1, lease });
         }

@@ -7,11 +7,12 @@ use crate::accounts::{Accounts, Within};
 use crate::event::EndReason;
 use crate::event::{Change, Notice, WatchEvent};
 use crate::expiry::Timer;
+use crate::fingerprint::Fingerprint;
 use crate::group::Seen;
 use crate::history::History;
 use crate::id::{SessionId, Slot};
 use crate::lease::{Bound, EndingLease, LeaseRecord};
-use crate::memory::RequestId;
+use crate::memory::{Forgotten, Life, Remembered, RequestId};
 use crate::pool::Pool;
 use crate::record::{Effect, Record};
 use crate::resource::{Resource, ResourceView, add_to, remove_from, take_from};
@@ -226,16 +227,30 @@ impl Pool {
             Effect::Answered { request_id, fingerprint, reply, forget } => {
                 self.memory.forget_oldest(*forget);
                 let id = RequestId::new(&Arc::default(), request_id);
-                self.memory.remember(id, *fingerprint, reply.clone(), self.now);
+                self.memory.remember(id, *fingerprint, reply.clone(), 0, self.now);
                 Ok(())
             }
             Effect::AnsweredTo { caller, request_id, fingerprint, reply, forget } => {
-                self.memory.forget(forget);
-                let id = RequestId { id: request_id.clone(), caller: caller.clone() };
-                self.memory.remember(id, *fingerprint, reply.clone(), self.now);
+                self.answered((caller, request_id), (*fingerprint, reply), forget, 0);
+                Ok(())
+            }
+            Effect::AnsweredForLife { caller, request_id, fingerprint, reply, forget, life } => {
+                self.answered((caller, request_id), (*fingerprint, reply), forget, *life);
                 Ok(())
             }
         }
+    }
+
+    fn answered(
+        &mut self,
+        (caller, id): (&Arc<str>, &Arc<str>),
+        (fingerprint, reply): (Fingerprint, &Remembered),
+        forget: &Forgotten,
+        life: Life,
+    ) {
+        self.memory.forget(forget);
+        let id = RequestId { id: id.clone(), caller: caller.clone() };
+        self.memory.remember(id, fingerprint, reply.clone(), life, self.now);
     }
 
     /// What a session has consumed of these returns, and no undone grant returns it again.

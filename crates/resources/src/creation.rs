@@ -103,6 +103,16 @@ impl Pool {
         session: &SessionId,
         requirement: &Requirement,
     ) -> Result<Vec<String>, PoolError> {
+        self.take_units(now, session, requirement).map(|(touched, _)| touched)
+    }
+
+    /// The same, and whether all of it was the session's own.
+    pub(crate) fn take_units(
+        &mut self,
+        now: Timestamp,
+        session: &SessionId,
+        requirement: &Requirement,
+    ) -> Result<(Vec<String>, bool), PoolError> {
         self.begin(now);
         self.session(session)?;
         self.check_requirements(std::slice::from_ref(requirement), &[ResourceOperation::Delete])?;
@@ -127,7 +137,7 @@ impl Pool {
         if found < wanted {
             return Err(of_others.unwrap_or(PoolError::NotEnough { wanted: requirement.to_string(), found }));
         }
-        let mut touched = Vec::new();
+        let (mut touched, mut are_own) = (Vec::new(), true);
         for (slot, free) in free {
             let amount = free.min(wanted);
             if amount.is_zero() {
@@ -135,10 +145,11 @@ impl Pool {
             }
             wanted = wanted.saturating_sub(amount);
             touched.extend(self.id_of(slot));
+            are_own &= self.resources.get(slot).is_some_and(|one| one.owner.as_ref() == Some(session));
             self.shrink(slot, amount);
         }
         self.schedule();
-        Ok(touched)
+        Ok((touched, are_own))
     }
 
     fn shrink(&mut self, slot: Slot, amount: Quantity) {
@@ -193,7 +204,7 @@ impl Pool {
     }
 
     fn check_spec(&self, spec: &ResourceSpec) -> Result<(), PoolError> {
-        self.check_name("kind", &spec.kind)?;
+        self.check_kind(&spec.kind)?;
         if let Some(id) = &spec.id {
             self.check_name("resource id", id)?;
         }

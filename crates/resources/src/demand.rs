@@ -127,7 +127,7 @@ impl Pool {
     ) -> Result<(), PoolError> {
         self.begin(now);
         self.session(session)?;
-        self.check_name("kind", kind)?;
+        self.check_kind(kind)?;
         if reason.is_empty() {
             let of_session = self.shortages.get_mut(session);
             of_session.map(|kinds| kinds.remove(kind));

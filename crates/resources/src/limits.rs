@@ -19,6 +19,9 @@ pub struct Limits {
     pub sessions_per_caller: usize,
     /// Of all sessions, so many are only for operators.
     pub sessions_for_operators: usize,
+    /// What the shares of those sessions of one caller that is no operator are together at the most which hold or wait for something of the same
+    /// kinds: where they are more, each counts as so many times less. The usual share of one session is 1.
+    pub share_per_caller: u32,
     /// Ids of sessions that have ended, which are kept for their openers: of the caller with the most, the oldest is given up first.
     pub kept_session_ids: usize,
     /// Of these, those of one caller: the caller's own oldest is given up first.
@@ -90,6 +93,7 @@ impl Default for Limits {
             sessions: 10_000,
             sessions_per_caller: 2_500,
             sessions_for_operators: 500,
+            share_per_caller: 100,
             kept_session_ids: 10_000,
             kept_session_ids_per_caller: 2_500,
             keep_session_ids_for_ms: 604_800_000,

@@ -3,6 +3,9 @@
 //! Bounded by number and by age, and for each caller by number and bytes. A caller's own oldest answers are forgotten first; where all
 //! callers together have too many, those of the caller with the most. So nobody's requests make the manager forget the answers of a caller
 //! with fewer. An answer is durable together with its effect; waiting requests are not.
+//!
+//! What was done for a session and ended with it (a lease, what it created or consumed of what is renewable) is the answer of that [`Life`]
+//! alone: a session that is opened anew under the same id has it done anew. What outlasts a session is done once for all of them.
 
 use crate::error::PoolError;
 use crate::fingerprint::Fingerprint;
@@ -35,6 +38,9 @@ pub(crate) enum Remembered {
     Touched(Vec<String>),
     Done,
 }
+
+/// Which of all sessions, also of those that had one id: its number; 0 is none.
+pub(crate) type Life = u64;
 
 /// What a request id leads to.
 #[derive(Debug, Clone, PartialEq)]
@@ -71,6 +77,8 @@ struct Answer {
     id: Arc<str>,
     fingerprint: Fingerprint,
     reply: Remembered,
+    /// With which it ended.
+    life: Life,
 }
 
 impl RequestId {
@@ -119,12 +127,17 @@ impl OfCaller {
 }
 
 impl RequestMemory {
-    /// What this request led to before. An answer to nobody knows whom is that of whoever asks the same.
-    pub(crate) fn recall(&self, id: &RequestId, fingerprint: Fingerprint) -> Result<Option<Recalled>, PoolError> {
+    /// What this request led to before, unless that ended with a life that is over. An answer to nobody knows whom is that of whoever asks the same.
+    pub(crate) fn recall(
+        &self,
+        id: &RequestId,
+        fingerprint: Fingerprint,
+        is_over: impl Fn(Life) -> bool,
+    ) -> Result<Option<Recalled>, PoolError> {
         if let Some((print, waiter)) = self.waiting.get(id) {
             return same(id, *print, fingerprint).map(|()| Some(Recalled::Waiting(*waiter)));
         }
-        if let Some(answer) = self.answer(id) {
+        if let Some(answer) = self.answer(id).filter(|answer| !is_over(answer.life)) {
             let recalled = Recalled::Answered(answer.reply.clone());
             return same(id, answer.fingerprint, fingerprint).map(|()| Some(recalled));
         }
@@ -133,9 +146,10 @@ impl RequestMemory {
     }
 
     /// The same, whatever the request was.
-    pub(crate) fn reply(&self, id: &RequestId) -> Option<Recalled> {
+    pub(crate) fn reply(&self, id: &RequestId, is_over: impl Fn(Life) -> bool) -> Option<Recalled> {
         let waiting = self.waiting.get(id).map(|(_, waiter)| Recalled::Waiting(*waiter));
-        let answer = || self.answer(id).or_else(|| self.unknown(id));
+        let own = || self.answer(id).filter(|answer| !is_over(answer.life));
+        let answer = || own().or_else(|| self.unknown(id));
         waiting.or_else(|| answer().map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 
@@ -206,7 +220,14 @@ impl RequestMemory {
         }
     }
 
-    pub(crate) fn remember(&mut self, id: RequestId, fingerprint: Fingerprint, reply: Remembered, now: Timestamp) {
+    pub(crate) fn remember(
+        &mut self,
+        id: RequestId,
+        fingerprint: Fingerprint,
+        reply: Remembered,
+        life: Life,
+        now: Timestamp,
+    ) {
         if let Some(before) = self.callers.get(&id.caller).and_then(|known| known.numbers.get(&id.id)).copied() {
             self.remove(&id.caller, before);
         }
@@ -216,7 +237,7 @@ impl RequestMemory {
             self.grants.insert(lease, (id.caller.clone(), number));
         }
         self.order.insert(number, (now, id.caller.clone()));
-        self.callers.entry(id.caller).or_default().insert(number, Answer { id: id.id, fingerprint, reply });
+        self.callers.entry(id.caller).or_default().insert(number, Answer { id: id.id, fingerprint, reply, life });
     }
 
     /// The request that led to this lease is as if it had never been asked; its id.
@@ -248,11 +269,11 @@ impl RequestMemory {
         self.callers.get("")?.get(&id.id)
     }
 
-    /// The answers with whom they were given to, the oldest first.
-    pub(crate) fn iter(&self) -> impl Iterator<Item = (&Arc<str>, &Arc<str>, Fingerprint, &Remembered)> {
+    /// The answers with whom they were given to and the life with which each ended, the oldest first.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (&Arc<str>, &Arc<str>, Fingerprint, &Remembered, Life)> {
         self.order.iter().filter_map(|(number, (_, caller))| {
             let answer = self.callers.get(caller)?.answers.get(number)?;
-            Some((caller, &answer.id, answer.fingerprint, &answer.reply))
+            Some((caller, &answer.id, answer.fingerprint, &answer.reply, answer.life))
         })
     }
 

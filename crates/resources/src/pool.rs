@@ -13,7 +13,7 @@ use crate::kept_ids::KeptIds;
 use crate::kinds::Kinds;
 use crate::lease::{EndingLeases, LeaseView, Leases};
 use crate::limits::Limits;
-use crate::memory::{Recalled, Remembered, RequestId, RequestMemory};
+use crate::memory::{Life, Recalled, Remembered, RequestId, RequestMemory};
 use crate::pace::Pace;
 use crate::queue::{AcquireRequest, Queue};
 use crate::record::{Effect, Record};
@@ -147,7 +147,7 @@ impl Pool {
 
     /// Performs a mutation that a speaker asks for who may speak for its session ([`Pool::check_speaker`]). With a request id, an equal
     /// request of that id answered before is not performed again: its answer is given once more. Request ids are of who opened the
-    /// session, or of the speaker where it is not there.
+    /// session, or of the speaker where it is not there. What ended with a session is performed anew for one that was opened anew under its id.
     ///
     /// # Errors
     /// As the method of the same name; nothing has changed then, and the id is not used up.
@@ -160,12 +160,14 @@ impl Pool {
     ) -> Result<Reply, PoolError> {
         self.begin(now);
         if request_id.is_empty() {
-            return self.perform(now, speaker, RequestId::default(), Fingerprint::UNKNOWN, request);
+            let done = self.perform(now, speaker, RequestId::default(), Fingerprint::UNKNOWN, request);
+            return done.map(|(reply, _)| reply);
         }
         self.check_name("request id", request_id)?;
         let id = RequestId::new(self.caller_of(request.session(), speaker), request_id);
         let fingerprint = Fingerprint::of(&request);
-        match self.memory.recall(&id, fingerprint)? {
+        let life = self.life(request.session());
+        match self.memory.recall(&id, fingerprint, self.is_over(life))? {
             Some(Recalled::Waiting(waiter)) => Ok(Reply::Queued(waiter)),
             Some(Recalled::Answered(Remembered::Granted(lease))) => {
                 // Of another session: only the id is known of what an earlier version remembers.
@@ -188,7 +190,7 @@ impl Pool {
                 if reply.is_err() && is_acquire {
                     self.withdrawals.heard_of(self.now, &self.limits, id.clone());
                 }
-                let reply = reply?;
+                let (reply, ends) = reply?;
                 let remembered = match &reply {
                     // Remembered by the grant, which may be long after this or was within it.
                     Reply::Queued(_) | Reply::Granted(_) => return Ok(reply),
@@ -198,7 +200,7 @@ impl Pool {
                     Reply::Touched(ids) => Remembered::Touched(ids.clone()),
                     Reply::Done => Remembered::Done,
                 };
-                self.remember(id, fingerprint, remembered);
+                self.remember(id, fingerprint, remembered, if ends { life } else { 0 });
                 Ok(reply)
             }
         }
@@ -314,15 +316,30 @@ impl Pool {
         self.resources.get(slot).map(|resource| resource.description.id.clone())
     }
 
-    /// Keeps the answer to a request id, together with its effect.
-    pub(crate) fn remember(&mut self, id: RequestId, fingerprint: Fingerprint, reply: Remembered) {
+    /// Which life of a session it is now; 0 where it is not there.
+    pub(crate) fn life(&self, session: Option<&SessionId>) -> Life {
+        session.and_then(|session| self.session_number(session)).unwrap_or(0)
+    }
+
+    /// Whether a life is over, for who asks in a session of this life; for who asks in none that is there none is.
+    pub(crate) fn is_over(&self, asks: Life) -> impl Fn(Life) -> bool {
+        let lives = |life| self.sessions.values().any(|session| session.number == life && session.ending.is_none());
+        move |life| ![0, asks].contains(&life) && asks != 0 && !lives(life)
+    }
+
+    /// Keeps the answer to a request id, together with its effect, which ends with a life unless that is 0.
+    pub(crate) fn remember(&mut self, id: RequestId, fingerprint: Fingerprint, reply: Remembered, life: Life) {
         if !id.is_empty() {
             let forget = self.memory.too_many(self.now, &self.limits, &id, &reply);
             let RequestId { id: request_id, caller } = id;
-            self.commit(Effect::AnsweredTo { caller, request_id, fingerprint, reply, forget });
+            self.commit(match life {
+                0 => Effect::AnsweredTo { caller, request_id, fingerprint, reply, forget },
+                _ => Effect::AnsweredForLife { caller, request_id, fingerprint, reply, forget, life },
+            });
         }
     }
 
+    /// The reply, and whether what was done ends with the session that it was done for.
     fn perform(
         &mut self,
         now: Timestamp,
@@ -330,29 +347,39 @@ impl Pool {
         id: RequestId,
         print: Fingerprint,
         request: Request,
-    ) -> Result<Reply, PoolError> {
+    ) -> Result<(Reply, bool), PoolError> {
         Ok(match request {
             Request::Create { session, spec } => {
                 let ResourceView { description, revision, .. } = self.create(now, session.as_ref(), spec)?;
-                Reply::Created { id: description.id.clone(), revision }
+                (Reply::Created { id: description.id.clone(), revision }, session.is_some())
             }
-            Request::Delete { session, id } => self.delete(now, session.as_ref(), &id).map(|()| Reply::Done)?,
+            Request::Delete { session, id } => {
+                let is_own = session.is_some() && self.get(&id).is_some_and(|known| known.owner == session);
+                self.delete(now, session.as_ref(), &id)?;
+                (Reply::Done, is_own)
+            }
             Request::DeleteUnits { session, requirement } => {
-                Reply::Touched(self.delete_units(now, &session, &requirement)?)
+                let (touched, are_own) = self.take_units(now, &session, &requirement)?;
+                (Reply::Touched(touched), are_own)
             }
-            Request::Consume { session, requirement } => Reply::Touched(self.consume(now, &session, &requirement)?),
-            Request::Acquire(request) => Reply::Queued(self.enqueue(request, id, print)?),
-            Request::Release { session, lease } => self.release(now, session.as_ref(), lease).map(|()| Reply::Done)?,
+            Request::Consume { session, requirement } => {
+                let touched = self.consume(now, &session, &requirement)?;
+                let returns = |id: &String| self.resources.find(id).and_then(|slot| self.resources.get(slot));
+                let returns = touched.iter().filter_map(returns).any(|resource| resource.description.renewable);
+                (Reply::Touched(touched), returns)
+            }
+            Request::Acquire(request) => (Reply::Queued(self.enqueue(request, id, print)?), false),
+            Request::Release { session, lease } => {
+                self.release(now, session.as_ref(), lease)?;
+                (Reply::Done, false)
+            }
             Request::ConfirmStandstill { session, lease, resource } => {
                 let freed = self.confirm_standstill_as(now, speaker, session.as_ref(), lease, &resource)?;
-                Reply::Touched(freed.then_some(resource).into_iter().collect())
+                (Reply::Touched(freed.then_some(resource).into_iter().collect()), false)
             }
             Request::EndTask { session } => {
-                if self.end_task(now, &session)? {
-                    Reply::Done
-                } else {
-                    Reply::Unfinished
-                }
+                let reply = if self.end_task(now, &session)? { Reply::Done } else { Reply::Unfinished };
+                (reply, true)
             }
         })
     }

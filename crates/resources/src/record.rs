@@ -9,7 +9,7 @@ use crate::event::EndReason;
 use crate::fingerprint::Fingerprint;
 use crate::id::{SessionId, Slot};
 use crate::lease::LeaseRecord;
-use crate::memory::{Forgotten, Remembered};
+use crate::memory::{Forgotten, Life, Remembered};
 use crate::resource::Description;
 use ratn_model::id::{LeaseId, Revision};
 use ratn_model::resource::Quantity;
@@ -20,7 +20,7 @@ use std::time::Duration;
 
 /// The version that [`encode`] writes, its first byte. Every new variant at the end takes a new number, so that an older program
 /// refuses what it does not know by its version; records since [`OLDEST_FORMAT`] are read as they are.
-pub const FORMAT: u8 = 10;
+pub const FORMAT: u8 = 11;
 /// The oldest version that [`decode`] reads: it has no `Effect::SessionOpened`, as none before this one has `Effect::UnitsFreed`.
 pub const OLDEST_FORMAT: u8 = 2;
 /// The newest version whose fingerprints are of how requests were written then, which says nothing to a later one.
@@ -72,6 +72,15 @@ pub(crate) enum Effect {
     SomeReturned { session: SessionId, resources: usize },
     /// Revisions go on from here: those before it may have meant something else.
     RevisionsLeapt { revision: Revision },
+    /// As `AnsweredTo`, of what ends with the session of this number.
+    AnsweredForLife {
+        caller: Arc<str>,
+        request_id: Arc<str>,
+        fingerprint: Fingerprint,
+        reply: Remembered,
+        forget: Forgotten,
+        life: Life,
+    },
 }
 
 /// What its bytes are, in messages.

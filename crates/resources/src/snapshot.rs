@@ -11,7 +11,7 @@ use crate::fingerprint::Fingerprint;
 use crate::id::{SessionId, Slot};
 use crate::lease::{Bound, EndingLease, LeaseRecord};
 use crate::limits::Limits;
-use crate::memory::{Remembered, RequestId};
+use crate::memory::{Life, Remembered, RequestId};
 use crate::pool::Pool;
 use crate::record::{FORMAT, OLDEST_FORMAT, Record, knows_fingerprints};
 use crate::resource::Resource;
@@ -24,8 +24,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// The last versions without ids that are kept, without numbers of sessions, without callers of answers and openers of leases that end, without leases that end, and
+/// The last versions without the lives of answers, without ids that are kept, without numbers of sessions, without callers of answers and openers of leases that end, without leases that end, and
 /// without openers of sessions.
+const WITHOUT_LIVES: u8 = 10;
 const WITHOUT_KEPT_IDS: u8 = 9;
 const WITHOUT_NUMBERS: u8 = 6;
 const WITHOUT_CALLERS: u8 = 5;
@@ -59,6 +60,8 @@ pub struct Snapshot {
     last_session: u64,
     /// For whom the ids of sessions that have ended are kept, the oldest first.
     kept_ids: Vec<(SessionId, Arc<str>)>,
+    /// The numbers of the sessions with which what was answered ended, in the order of the answers; 0 where it did not, or they are not here.
+    lives: Vec<Life>,
 }
 
 /// A snapshot or a record that does not fit: the log has a gap, or is of another pool.
@@ -101,9 +104,10 @@ impl Snapshot {
             + without(WITHOUT_ENDING, 1)
             + without(WITHOUT_CALLERS, 2)
             + without(WITHOUT_NUMBERS, 2)
-            + without(WITHOUT_KEPT_IDS, 1);
+            + without(WITHOUT_KEPT_IDS, 1)
+            + without(WITHOUT_LIVES, 1);
         // An empty list, or 0, for each that is missing, as postcard writes it.
-        let mut snapshot: Snapshot = versioned::decode(version, SNAPSHOT, &[bytes, &[0; 7][..missing]].concat())?;
+        let mut snapshot: Snapshot = versioned::decode(version, SNAPSHOT, &[bytes, &[0; 8][..missing]].concat())?;
         if !knows_fingerprints(version) {
             snapshot.answers.iter_mut().for_each(|(_, fingerprint, _)| *fingerprint = Fingerprint::UNKNOWN);
         }
@@ -131,7 +135,11 @@ impl Pool {
                 .iter()
                 .map(|(id, lease)| (*id, LeaseRecord { expires: None, opened_by: Arc::default(), ..lease.clone() }))
                 .collect(),
-            answers: self.memory.iter().map(|(_, id, print, reply)| (id.to_string(), print, reply.clone())).collect(),
+            answers: self
+                .memory
+                .iter()
+                .map(|(_, id, print, reply, _)| (id.to_string(), print, reply.clone()))
+                .collect(),
             openers: self.sessions.iter().map(|(id, session)| (id.clone(), session.opened_by.clone())).collect(),
             ending: self.ending.iter().map(|(id, ending)| (*id, ending.without_bounds())).collect(),
             answered: self.memory.iter().map(|(caller, ..)| caller.clone()).collect(),
@@ -139,6 +147,7 @@ impl Pool {
             numbers: self.sessions.values().map(|session| session.number).collect(),
             last_session: self.last_session,
             kept_ids: self.kept_ids.iter().map(|(id, opened_by)| (id.clone(), opened_by.clone())).collect(),
+            lives: self.memory.iter().map(|(.., life)| life).collect(),
         }
     }
 
@@ -220,10 +229,10 @@ impl Pool {
         self.open_accounts();
         self.gather_crowds();
         self.callers = Callers::of(&self.sessions, &self.ending, &self.queue);
-        let mut answered = snapshot.answered.into_iter();
+        let (mut answered, mut lives) = (snapshot.answered.into_iter(), snapshot.lives.into_iter());
         for (id, fingerprint, reply) in snapshot.answers {
             let id = RequestId::new(&answered.next().unwrap_or_default(), &id);
-            self.memory.remember(id, fingerprint, reply, self.now);
+            self.memory.remember(id, fingerprint, reply, lives.next().unwrap_or(0), self.now);
         }
         Ok(())
     }

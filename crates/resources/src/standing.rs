@@ -10,7 +10,7 @@ use crate::own_order::{Families, OwnPlace, Settled};
 use crate::pool::Pool;
 use crate::queue::AcquireRequest;
 use crate::replaced::Earlier;
-use crate::turn::{Share, Standing, Turn, step};
+use crate::turn::{AHEAD, Share, Standing, Turn, step};
 use ratn_model::resource::{Quantity, Requirement};
 use ratn_model::time::Timestamp;
 use std::cmp::Reverse;
@@ -35,7 +35,11 @@ impl Pool {
             (_, due) => due,
         };
         if standing.share != before.share {
-            self.accounts.has_share(id, standing.share, self.now);
+            let (caller, bound) = self.bound_of(id);
+            let within =
+                Within { session: id, family: "", share: standing.share, caller: &caller, bound, now: self.now };
+            self.accounts.has_share(&within);
+            self.worked += self.accounts.take_looks();
         }
         let Some(session) = self.sessions.get_mut(id) else { return Ok(()) };
         session.standing = Standing { due, ..standing };
@@ -62,7 +66,7 @@ impl Pool {
         }
         let session = self.sessions.get(&request.session).filter(|_| !request.instead_of.is_empty())?;
         let replaced = RequestId::new(&session.opened_by, &request.instead_of);
-        if let Some(Recalled::Waiting(waiter)) = self.memory.reply(&replaced)
+        if let Some(Recalled::Waiting(waiter)) = self.memory.reply(&replaced, self.is_over(session.number))
             && self.queue.get(waiter).is_some_and(|waiter| waiter.request.session == request.session)
         {
             self.refuse(waiter, Refusal::Cancelled);
@@ -102,6 +106,8 @@ impl Pool {
         let (due, mut ahead) = (self.standing(&request.session).due, Duration::ZERO);
         self.in_accounts(request, |accounts, within| ahead = ahead.max(accounts.ahead(within)));
         self.worked += self.accounts.take_looks();
+        // More than that only where the shares of its caller are beyond their bound.
+        let since = since + ahead.saturating_sub(AHEAD);
         Turn::of(request.speculative, step(since, ahead), due, request.priority)
     }
 
@@ -184,18 +190,27 @@ impl Pool {
     /// Does something in the accounts that the session of a request has of the families that it takes something of.
     fn in_accounts(&mut self, request: &AcquireRequest, mut act: impl FnMut(&mut Accounts, &Within<'_>)) {
         let (session, Standing { share, .. }) = (&request.session, self.standing(&request.session));
+        let (caller, bound) = self.bound_of(session);
         let families: BTreeSet<&str> =
             kinds_taken(&request.requirements).map(|kind| self.resources.family(kind)).collect();
         for family in families {
-            act(&mut self.accounts, &Within { session, family, share, now: self.now });
+            act(&mut self.accounts, &Within { session, family, share, caller: &caller, bound, now: self.now });
         }
     }
 
     /// Does something in the account that a session has of the family of a kind.
     pub(crate) fn in_account(&mut self, session: &SessionId, kind: &str, act: impl FnOnce(&mut Accounts, &Within<'_>)) {
         let Standing { share, .. } = self.standing(session);
+        let (caller, bound) = self.bound_of(session);
         let family = self.resources.family(kind);
-        act(&mut self.accounts, &Within { session, family, share, now: self.now });
+        act(&mut self.accounts, &Within { session, family, share, caller: &caller, bound, now: self.now });
+    }
+
+    /// Whose a session is, and the bound on the shares of all of that caller's sessions, in thousandths; operators have none.
+    fn bound_of(&self, session: &SessionId) -> (Arc<str>, Option<u64>) {
+        let known = self.sessions.get(session).filter(|known| !known.is_operators());
+        let bound = u64::from(self.limits.share_per_caller) * Share::ONE.thousandths();
+        known.map_or_else(Default::default, |known| (known.opened_by.clone(), Some(bound)))
     }
 
     /// The accounts of those who hold something, from now on. Nobody waits.

@@ -19,7 +19,7 @@
 //! ```
 //!
 //! So of what is needed for certain and a first one of its session, nobody is passed by a request of another session that is due `AHEAD + LEAD`
-//! later, whatever its priority, share or due time. A request may keep the time of another one of its session that it replaces (`replaced.rs`);
+//! later, whatever its priority, share or due time. (Where the shares of its caller are beyond their bound, `AHEAD` is as many times longer for it.) A request may keep the time of another one of its session that it replaces (`replaced.rs`);
 //! one that becomes certain so keeps [`LEAD`] of it at the most. It passes nobody who was due [`BOUND`] before it became certain.
 
 use ratn_model::time::Timestamp;

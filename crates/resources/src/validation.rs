@@ -4,7 +4,7 @@ use crate::assignment::selects_the_same;
 use crate::error::{PoolError, malformed};
 use crate::pool::Pool;
 use crate::resource::{ENDPOINT_ATTRIBUTE, ResourceSpec};
-use ratn_model::name::is_unseen;
+use ratn_model::name::{KIND_RULE, is_kind, is_unseen};
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use ratn_model::value::Value;
 use ratn_model::versioned;
@@ -33,7 +33,7 @@ impl Pool {
                 let names: Vec<String> = allowed.iter().map(ToString::to_string).collect();
                 return Err(malformed(&requirement.to_string(), &format!("only {} here", names.join(", "))));
             }
-            self.check_name("kind", &requirement.kind)?;
+            self.check_kind(&requirement.kind)?;
             if requirement.count.is_zero() || requirement.count > Quantity::whole(self.limits.units) {
                 return Err(malformed(
                     &requirement.to_string(),
@@ -96,6 +96,11 @@ impl Pool {
             return Err(malformed(&format!("{} attributes", names.len()), &rule));
         }
         names.try_for_each(|name| self.check_name("attribute name", name))
+    }
+
+    pub(crate) fn check_kind(&self, kind: &str) -> Result<(), PoolError> {
+        self.check_name("kind", kind)?;
+        if is_kind(kind) { Ok(()) } else { Err(malformed(&format!("kind `{kind}`"), KIND_RULE)) }
     }
 
     pub(crate) fn check_name(&self, what: &str, name: &str) -> Result<(), PoolError> {

@@ -314,7 +314,8 @@ fn rows() -> Vec<(&'static str, Limits, Act, &'static str)> {
 
 #[test]
 fn every_bound_at_its_edge_and_one_past_it() {
-    // A new bound belongs into the table (those of bytes are below, `overtaken` is measured by `against_model.rs`).
+    // A new bound belongs into the table (those of bytes are below, `overtaken` is measured by `against_model.rs`, `share_per_caller` by
+    // `turns.rs`).
     let Limits {
         resources: _,
         resources_per_caller: _,
@@ -322,6 +323,7 @@ fn every_bound_at_its_edge_and_one_past_it() {
         sessions: _,
         sessions_per_caller: _,
         sessions_for_operators: _,
+        share_per_caller: _,
         kept_session_ids: _,
         kept_session_ids_per_caller: _,
         keep_session_ids_for_ms: _,

@@ -1,7 +1,7 @@
 //! Requests that are repeated: which answers are remembered, for whom, and for how many requests of others.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
-use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
+use ratn_model::resource::{Quantity, Requirement, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_resources::{
     AcquireRequest, Limits, Pool, PoolError, Reply, Request, ResourceSpec, SessionId, Snapshot, Speaker, decode, encode,
@@ -162,5 +162,89 @@ fn a_lease_that_was_undone_is_acquired_anew_after_a_restart_too() {
         let mut pool = restarted(pool, &limits, records);
         assert!(matches!(pool.handle_as(NOW, &speaker("adam"), "r1", acquire("adam", "Arm")), Ok(Reply::Queued(_))));
         assert!(pool.leases().remove(0).token > first.token);
+    }
+}
+
+/// One session of adam's that lives again under its id, and between that lives another restart, if at all.
+fn reopened(mut pool: Pool, limits: &Limits, restart: Option<bool>) -> Pool {
+    pool.close_session(NOW, &SessionId::from("adam")).unwrap();
+    let mut pool = restart.into_iter().fold(pool, |pool, records| restarted(pool, limits, records));
+    open(&mut pool, "adam");
+    pool
+}
+
+#[test]
+fn what_ended_with_an_earlier_life_of_a_session_is_done_anew_for_the_next_one() {
+    for restart in [None, Some(false), Some(true)] {
+        let limits = Limits::default();
+        let mut pool = pool_of(limits.clone(), &["adam"]);
+        let renewable = ResourceSpec::new(ResourceClass::Module, "Power");
+        let powered = pool.create(NOW, None, renewable).unwrap().description.id.clone();
+        for kind in ["Arm", "Hand"] {
+            pool.create(NOW, None, ResourceSpec::new(ResourceClass::Module, kind)).unwrap();
+        }
+        let requirement = Requirement::new(ResourceOperation::Consume, "Power");
+        let consume = Request::Consume { session: SessionId::from("adam"), requirement: requirement.clone() };
+        let ask = |pool: &mut Pool, id: &str, request: Request| pool.handle_as(NOW, &speaker("adam"), id, request);
+        let touched = Ok(Reply::Touched(vec![powered.clone()]));
+        assert_eq!(ask(&mut pool, "consume", consume.clone()), touched);
+        assert_eq!(ask(&mut pool, "consume", consume.clone()), touched, "once: there is one of it");
+        let tool = created(&mut pool, "adam", "create");
+        let Ok(Reply::Queued(_)) = ask(&mut pool, "acquire", acquire("adam", "Arm")) else { panic!() };
+        let Ok(Reply::Granted(lease)) = ask(&mut pool, "acquire", acquire("adam", "Arm")) else { panic!() };
+        ask(&mut pool, "late", acquire("adam", "Hand")).unwrap();
+        let mut pool = reopened(pool, &limits, restart);
+        assert_eq!(pool.exists(&requirement), Quantity::ONE, "it came back");
+        assert_eq!(ask(&mut pool, "consume", consume.clone()), touched);
+        assert!(pool.exists(&requirement).is_zero(), "and is consumed: {restart:?}");
+        assert_ne!(created(&mut pool, "adam", "create"), tool);
+        assert!(!pool.withdraw(NOW, &SessionId::from("adam"), "late").unwrap());
+        let late = ask(&mut pool, "late", acquire("adam", "Hand"));
+        assert!(matches!(late, Err(PoolError::Withdrawn { .. })), "it was on its way: {late:?} {restart:?}");
+        let Ok(Reply::Queued(_)) = ask(&mut pool, "acquire", acquire("adam", "Arm")) else { panic!() };
+        let Ok(Reply::Granted(anew)) = ask(&mut pool, "acquire", acquire("adam", "Arm")) else { panic!() };
+        assert!(anew.id > lease.id);
+        // Also the end of the task is one of this life.
+        assert_eq!(ask(&mut pool, "end", Request::EndTask { session: SessionId::from("adam") }), Ok(Reply::Done));
+        let mut pool = reopened(pool, &limits, None);
+        assert_eq!(ask(&mut pool, "consume", consume), touched);
+        assert_eq!(ask(&mut pool, "end", Request::EndTask { session: SessionId::from("adam") }), Ok(Reply::Done));
+        assert_eq!(pool.exists(&requirement), Quantity::ONE, "{restart:?}");
+        pool.check_invariants().unwrap();
+    }
+}
+
+#[test]
+fn what_outlasts_a_session_is_done_once_for_all_its_lives() {
+    for restart in [None, Some(false), Some(true)] {
+        let limits = Limits::default();
+        let mut pool = pool_of(limits.clone(), &["adam"]);
+        for _ in 0..4 {
+            pool.create(NOW, None, ResourceSpec::new(ResourceClass::Module, "Screw").non_renewable()).unwrap();
+        }
+        let of = |operation| Requirement::new(operation, "Screw");
+        let session = SessionId::from("adam");
+        let consume = Request::Consume { session: session.clone(), requirement: of(ResourceOperation::Consume) };
+        let delete = Request::DeleteUnits { session, requirement: of(ResourceOperation::Delete) };
+        let ask = |pool: &mut Pool, id: &str, request| pool.handle_as(NOW, &speaker("adam"), id, request).unwrap();
+        let first = (ask(&mut pool, "c", consume.clone()), ask(&mut pool, "d", delete.clone()));
+        let mut pool = reopened(pool, &limits, restart);
+        assert_eq!((ask(&mut pool, "c", consume), ask(&mut pool, "d", delete)), first, "{restart:?}");
+        assert_eq!(pool.exists(&of(ResourceOperation::Exists)), Quantity::whole(2), "one used up, one deleted");
+    }
+}
+
+#[test]
+fn what_a_session_deletes_of_its_own_is_of_its_life_and_is_deleted_anew_in_the_next() {
+    let mut pool = pool_of(Limits::default(), &["adam"]);
+    let delete = Request::DeleteUnits {
+        session: SessionId::from("adam"),
+        requirement: Requirement::new(ResourceOperation::Delete, "Tool"),
+    };
+    for _ in 0..2 {
+        created(&mut pool, "adam", "create");
+        pool.handle_as(NOW, &speaker("adam"), "delete", delete.clone()).unwrap();
+        assert!(pool.list().is_empty());
+        pool = reopened(pool, &Limits::default(), None);
     }
 }

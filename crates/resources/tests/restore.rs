@@ -298,6 +298,34 @@ fn bytes_of_another_version_or_cut_short_are_refused() {
     assert!(matches!(decode(&other), Err(DecodeError::Version { found, known: FORMAT, .. }) if found == FORMAT + 1));
 }
 
+/// A snapshot without the list of lives at its end, which versions up to 10 do not have.
+fn without_lives(bytes: &[u8], lives: &[u8]) -> Vec<u8> {
+    bytes.strip_suffix(lives).unwrap().to_vec()
+}
+
+#[test]
+fn an_answer_that_the_version_before_remembers_is_given_to_every_life_of_its_session() {
+    let (now, id) = (Timestamp(0), SessionId::from("s"));
+    let speaker = Speaker { name: "a".into(), for_anybody: false };
+    let open = |pool: &mut Pool| pool.keep_alive_as(now, &speaker, &id, "s", Duration::from_secs(10)).unwrap();
+    let spec = ResourceSpec::new(ResourceClass::Module, "Arm");
+    let create = || Request::Create { session: Some(id.clone()), spec: spec.clone() };
+    let mut pool = Pool::new(Limits::default());
+    open(&mut pool);
+    let first = pool.handle_as(now, &speaker, "r1", create()).unwrap();
+    let mut bytes = without_lives(&pool.snapshot().encode(), &[1, 1]);
+    bytes[0] = 10;
+    for (bytes, as_then) in [(bytes, true), (pool.snapshot().encode(), false)] {
+        let kept = Snapshot::decode(&bytes).unwrap();
+        let mut again = Pool::restore(Limits::default(), now, Some(kept), []).unwrap();
+        again.close_session(now, &id).unwrap();
+        open(&mut again);
+        let answered = again.handle_as(now, &speaker, "r1", create()).unwrap();
+        assert_eq!(answered == first, as_then, "{answered:?}");
+        again.check_invariants().unwrap();
+    }
+}
+
 #[test]
 fn who_opened_a_session_is_known_from_records_and_from_a_snapshot_and_not_of_one_that_an_earlier_version_wrote() {
     let (now, id) = (Timestamp(0), SessionId::from("s"));
@@ -322,7 +350,7 @@ fn who_opened_a_session_is_known_from_records_and_from_a_snapshot_and_not_of_one
     }
     // The snapshot of an earlier version has no openers: it ends where their list would begin. Three more lists follow that, all empty, and
     // the numbers of sessions.
-    let bytes = snapshot.encode();
+    let bytes = without_lives(&snapshot.encode(), &[0]);
     let openers = [postcard_list(&[("s", "a")]), vec![0; 3], ONE_NUMBERED.to_vec()].concat();
     let mut earlier = bytes.strip_suffix(openers.as_slice()).unwrap().to_vec();
     earlier[0] = 2;
@@ -348,7 +376,7 @@ fn answers_that_an_earlier_version_remembers_for_nobody_knows_whom_are_given_to_
     let mut pool = Pool::new(Limits::default());
     pool.keep_alive_as(now, &speaker("a"), &id, "s", Duration::from_secs(10)).unwrap();
     let first = pool.handle_as(now, &speaker("a"), "r1", create("Arm")).unwrap();
-    let bytes = pool.snapshot().encode();
+    let bytes = without_lives(&pool.snapshot().encode(), &[1, 0]);
     // It ends where the callers of the answers would follow, and the openers of leases that end, of which there are none.
     let mut earlier = bytes.strip_suffix(&[&[1, 1, b'a', 0][..], &ONE_NUMBERED].concat()[..]).unwrap().to_vec();
     earlier[0] = 5;
@@ -366,7 +394,7 @@ fn answers_that_an_earlier_version_remembers_for_nobody_knows_whom_are_given_to_
     pool.handle_as(now, &speaker("a"), "", create("Arm")).unwrap();
     let acquire = AcquireRequest::new(id.clone(), vec![requirement(ResourceOperation::Block, 0, 1)]);
     pool.handle_as(now, &speaker("a"), "q1", Request::Acquire(acquire)).unwrap();
-    let bytes = pool.snapshot().encode();
+    let bytes = without_lives(&pool.snapshot().encode(), &[1, 1]);
     let mut earlier = bytes.strip_suffix(&[&[1, 1, b'a', 0][..], &ONE_NUMBERED].concat()[..]).unwrap().to_vec();
     earlier[0] = 5;
     let earlier = Snapshot::decode(&earlier).unwrap();

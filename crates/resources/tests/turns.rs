@@ -9,7 +9,7 @@ use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_resources::{
     AHEAD, AcquireRequest, BOUND, LEAD, Limits, Notice, Pool, Quantity, Reply, Request, ResourceSpec, SessionId, Share,
-    Standing, WaiterId,
+    Speaker, Standing, WaiterId,
 };
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -747,4 +747,81 @@ fn a_large_request_is_kept_what_becomes_free_once_all_that_may_pass_it_is_served
         }
         assert!(now < 600_000, "the large request is never served");
     }
+}
+
+/// Two callers who always want one arm: adam in one session, eve in several, each of which she may end with its lease and open anew.
+struct TwoCallers {
+    bound: u32,
+    adams_share: f64,
+    eves_share: f64,
+    eves_sessions: usize,
+    opens_anew: bool,
+}
+
+impl TwoCallers {
+    /// How much of the time adam has the arm, in hundredths.
+    fn adams_part(&self, seed: u64) -> u64 {
+        const LENGTH_MS: u64 = 3_600_000;
+        let limits = Limits { share_per_caller: self.bound, ..Limits::default() };
+        let (mut pool, mut dice, mut now) = (Pool::new(limits), Dice(seed), 0);
+        pool.create(at(0), None, ResourceSpec::new(ResourceClass::Module, "Arm")).unwrap();
+        let ask = |pool: &mut Pool, now: u64, number: usize| {
+            pool.acquire(at(now), AcquireRequest::new(run(number), vec![block("Arm", 1)])).unwrap();
+        };
+        let open = |pool: &mut Pool, now: u64, number: usize| {
+            let (name, share) = if number == 0 { ("adam", self.adams_share) } else { ("eve", self.eves_share) };
+            let speaker = Speaker { name: name.into(), for_anybody: false };
+            pool.keep_alive_as(at(now), &speaker, &run(number), name, 100 * HOUR).unwrap();
+            pool.set_standing(at(now), &run(number), Standing::of(Share::new(share).unwrap())).unwrap();
+        };
+        let mut last = self.eves_sessions;
+        for number in 0..=last {
+            open(&mut pool, now, number);
+            ask(&mut pool, now, number);
+        }
+        let (mut adams, mut turns) = (0, 0);
+        while now < LENGTH_MS {
+            let held = pool.leases().remove(0);
+            let time = dice.between(900, 1_100);
+            now += time;
+            let is_adams = held.session == run(0);
+            adams += if is_adams { time } else { 0 };
+            if self.opens_anew && !is_adams {
+                last += 1;
+                open(&mut pool, now, last);
+                ask(&mut pool, now, last);
+                pool.close_session(at(now), &held.session).unwrap();
+            } else {
+                let number = held.session.as_str().strip_prefix("run-").unwrap();
+                ask(&mut pool, now, number.parse().unwrap());
+                pool.release(at(now), Some(&held.session), held.id).unwrap();
+            }
+            turns += 1;
+            if turns % 64 == 0 {
+                pool.check_invariants().unwrap();
+            }
+        }
+        (100 * adams + now / 2) / now
+    }
+}
+
+#[test]
+fn sessions_of_one_caller_have_no_more_together_than_its_bound_also_where_they_are_opened_anew() {
+    for (bound, adams_share, eves_share) in [(2, 2.0, 1.0), (1, 1.0, 100.0), (4, 2.0, 4.0)] {
+        let expected = (100.0 * adams_share / (adams_share + f64::from(bound))) as u64;
+        for (eves_sessions, opens_anew) in [(8, false), (8, true), (30, false), (30, true)] {
+            let callers = TwoCallers { bound, adams_share, eves_share, eves_sessions, opens_anew };
+            let part = callers.adams_part(u64::from(bound));
+            let what = format!("{part} % and {expected} %: {eves_sessions} sessions, {bound}, {opens_anew}");
+            assert!(part + 5 >= expected, "{what}");
+            assert!(part <= expected + 5 || opens_anew, "and eve has her bound: {what}");
+        }
+    }
+}
+
+#[test]
+fn within_the_bound_of_its_caller_a_session_has_its_share() {
+    let callers = TwoCallers { bound: 4, adams_share: 1.0, eves_share: 1.0, eves_sessions: 4, opens_anew: false };
+    let part = callers.adams_part(3);
+    assert!(part.abs_diff(20) <= 3, "{part} % of five alike");
 }

@@ -228,8 +228,22 @@ impl World {
     /// # Errors
     /// As [`World::apply`].
     pub fn project_as(&self, writers: &[Arc<str>], changes: &[Change]) -> Result<World, ChangeError> {
+        self.project_looking(writers, changes, |_| {})
+    }
+
+    /// As [`World::project_as`]; `look` sees what the changes write.
+    ///
+    /// # Errors
+    /// As [`World::apply`].
+    pub fn project_looking(
+        &self,
+        writers: &[Arc<str>],
+        changes: &[Change],
+        look: impl FnOnce(&Written),
+    ) -> Result<World, ChangeError> {
         let writer = |place: usize| writers.get(place).filter(|writer| !writer.is_empty());
         let mut world = self.changed(writer, changes)?;
+        look(&world.overlay);
         if world.overlay.len() > OVERLAY_LIMIT {
             world.store_overlay();
         }

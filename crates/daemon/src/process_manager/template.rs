@@ -9,6 +9,7 @@ use super::python::{self, Interpreter};
 use super::readiness::Readiness;
 use crate::config::{ConfigError, rule};
 use nix::unistd::{AccessFlags, access};
+use ratn_model::name::{KIND_RULE, is_kind};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -341,6 +342,7 @@ impl Template {
         let key = |name: &str| format!("{at}.{name}");
         check_name(&key("name"), &self.name)?;
         check_name(&key("kind"), &self.kind)?;
+        rule(key("kind"), is_kind(&self.kind), format!("`{}` has to be {KIND_RULE}", self.kind))?;
         let one_of_both = self.python.is_none() || self.program.is_none();
         rule(key("python"), one_of_both, "instead of `program`, not beside it: `interpreter` is what runs the script")?;
         let runs_something = self.interpreter.is_none() || self.python.is_some();

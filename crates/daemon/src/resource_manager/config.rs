@@ -1,6 +1,7 @@
 //! The resource manager's config.
 
 use crate::config::{Check, ConfigError, StorageConfig, rule};
+use ratn_model::name::{KIND_RULE, is_kind};
 use ratn_resources::{Kinds, Limits};
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
@@ -77,6 +78,15 @@ impl Check for ResourceManagerConfig {
         rule("max_watchers", self.max_watchers >= 1, "at least 1")?;
         rule("provider_patience_ms", self.provider_patience_ms >= 1, "at least 1 ms")?;
         rule("grow_after_ms", self.grow_after_ms >= 10, "at least 10 ms")?;
+        rule(
+            "limits.share_per_caller",
+            self.limits.share_per_caller >= 1,
+            "at least 1, the usual share of one session",
+        )?;
+        let named = self.kinds.iter().flat_map(|(kind, above)| above.iter().chain([kind]));
+        for kind in named.filter(|kind| !is_kind(kind)) {
+            rule("kinds", false, format!("`{kind}` has to be {KIND_RULE}"))?;
+        }
         let kinds = Kinds::new(&self.kinds).map(drop).map_err(|cyclic| cyclic.to_string());
         rule("kinds", kinds.is_ok(), kinds.err().unwrap_or_default())?;
         self.storage.check()

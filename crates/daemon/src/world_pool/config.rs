@@ -1,7 +1,9 @@
 //! The world pool's config.
 
+use super::in_memory::Most;
 use super::memory::Bounds;
 use crate::config::{Check, ConfigError, StorageConfig, rule};
+use ratn_model::name::{KIND_RULE, is_kind};
 use ratn_proto::MAX_PAGE_BYTES;
 use ratn_worker::endpoint::Endpoint;
 use serde::{Deserialize, Serialize};
@@ -11,6 +13,8 @@ use std::path::PathBuf;
 
 /// How long a fact may live.
 const TTLS_S: RangeInclusive<f64> = 0.001..=1e9;
+
+const MIB: usize = 1 << 20;
 
 /// All keys are optional.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -32,12 +36,18 @@ pub struct WorldPoolConfig {
     pub revisions_kept: usize,
     /// And at most so many that have written so many facts together; the root itself is always kept.
     pub changes_kept: usize,
+    /// And at most so many as take so many bytes of memory besides the root, about.
+    pub revision_bytes: usize,
     /// Projections at once in all, those without a lease included.
     pub max_projections: usize,
     /// Of those, projections of one caller that is no operator.
     pub projections_per_caller: usize,
     /// Of `max_projections`, so many are only for operators, but never more than half.
     pub projections_for_operators: usize,
+    /// Bytes of memory of all projections, about, with what of forgotten revisions is there for them alone; a quarter is only for operators.
+    pub projection_bytes: usize,
+    /// Of those, bytes of the projections of one caller that is no operator.
+    pub projection_bytes_per_caller: usize,
     /// A projection whose lease holds no resource ends after this long, in seconds.
     pub unbound_ttl_s: f64,
     /// Clients that watch at the same time.
@@ -69,9 +79,12 @@ impl Default for WorldPoolConfig {
             capacity: 64,
             revisions_kept: 4_096,
             changes_kept: 1_000_000,
+            revision_bytes: 256 * MIB,
             max_projections: 4_096,
             projections_per_caller: 1_024,
             projections_for_operators: 256,
+            projection_bytes: 768 * MIB,
+            projection_bytes_per_caller: 256 * MIB,
             unbound_ttl_s: 600.0,
             max_watchers: 1_024,
             fact_bytes: 1 << 20,
@@ -86,6 +99,10 @@ impl Default for WorldPoolConfig {
 }
 
 impl WorldPoolConfig {
+    pub(super) fn most_in_memory(&self) -> Most {
+        Most { in_all: self.projection_bytes, per_caller: self.projection_bytes_per_caller }
+    }
+
     pub(super) fn remembered(&self) -> Bounds {
         Bounds { in_all: self.remembered_requests, per_caller: self.remembered_per_caller }
     }
@@ -94,7 +111,7 @@ impl WorldPoolConfig {
 impl Check for WorldPoolConfig {
     fn check(&self) -> Result<(), ConfigError> {
         rule("host", !self.host.is_empty(), "is not empty")?;
-        rule("kind", !self.kind.is_empty(), "is not empty")?;
+        rule("kind", is_kind(&self.kind), KIND_RULE)?;
         rule("session_ttl_ms", self.session_ttl_ms >= 100, "at least 100 ms")?;
         rule("capacity", self.capacity >= 1, "at least 1")?;
         rule("revisions_kept", self.revisions_kept >= 1, "at least 1")?;
@@ -105,6 +122,16 @@ impl Check for WorldPoolConfig {
         rule("max_watchers", self.max_watchers >= 1, "at least 1")?;
         rule("fact_bytes", (64..=self.commit_bytes).contains(&self.fact_bytes), "from 64 bytes to commit_bytes")?;
         rule("commit_bytes", self.commit_bytes <= MAX_PAGE_BYTES, "at most 8 MiB: a message has to have room for it")?;
+        let holds = self.revision_bytes >= self.commit_bytes;
+        rule("revision_bytes", holds, "at least commit_bytes: the revision before a large commit is kept, too")?;
+        let holds = self.projection_bytes_per_caller >= 4 * self.commit_bytes;
+        rule(
+            "projection_bytes_per_caller",
+            holds,
+            "at least four times commit_bytes: a large projection has its changes twice",
+        )?;
+        let holds = self.projection_bytes >= self.projection_bytes_per_caller;
+        rule("projection_bytes", holds, "at least projection_bytes_per_caller")?;
         let lasting = self.ttl_s.values().all(|ttl_s| TTLS_S.contains(ttl_s));
         rule("ttl_s", lasting, "from 0.001 s to 1,000,000,000 s each")?;
         rule("remembered_requests", self.remembered_requests >= 1, "at least 1")?;

@@ -8,10 +8,12 @@ use super::WorldPoolConfig;
 use super::expiry::Expiry;
 use super::fingerprint::Fingerprint;
 use super::history::{Commit, CommitError, History, RevisionError};
+use super::in_memory::{InMemory, NoRoom};
 use super::memory::{Memory, Reused};
 use super::promised::Promised;
 use super::query::View;
 use super::scenes::{Scenes, moves};
+use super::size;
 use crate::access::Caller;
 use ratn_model::fact::{Change, FactPattern, Footprint};
 use ratn_model::id::{LeaseId, ProjectionId, Revision};
@@ -43,8 +45,8 @@ pub(super) struct WorldPool {
     contradictions: Vec<Contradiction>,
     projected: Memory<ProjectionId>,
     by_lease: BTreeMap<LeaseId, BTreeSet<ProjectionId>>,
-    /// How many each caller made that are there.
-    made: BTreeMap<Arc<str>, usize>,
+    /// What each caller has of them.
+    in_memory: InMemory,
     last_projection: u64,
     promised: Promised,
 }
@@ -59,6 +61,8 @@ pub(super) struct Projection {
     held_by: HeldBy,
     made_by: Arc<str>,
     request_id: String,
+    /// What it takes of its own.
+    bytes: usize,
     /// The first that there was.
     contradiction: Option<Contradiction>,
 }
@@ -118,6 +122,20 @@ pub(super) enum ProjectError {
     KeptForOperators { limit: usize },
     #[error("projections of {whose}: the quota of {limit} is reached (projections_per_caller): release some")]
     Quota { whose: Arc<str>, limit: usize },
+    #[error(
+        "projections of {whose} would have more than {limit} bytes (projection_bytes_per_caller): release some, those of the oldest \
+         revisions first, or change less in one"
+    )]
+    QuotaOfBytes { whose: Arc<str>, limit: usize },
+    #[error(
+        "all projections would have more than {limit} bytes (projection_bytes): release some, or change less in one"
+    )]
+    TooManyBytes { limit: usize },
+    #[error(
+        "all projections would have more than {limit} bytes, and the rest of projection_bytes is kept for operators: release some, or \
+         change less in one"
+    )]
+    BytesKeptForOperators { limit: usize },
     #[error("the projection of request `{request_id}` has ended; ask with another request id")]
     Ended { request_id: String },
     #[error("{id} is not promised to {caller}, or not any more: ask without an id (projection_id: 0)")]
@@ -169,7 +187,7 @@ impl WorldPool {
             scenes: Scenes::default(),
             projected: Memory::new(config.remembered()),
             by_lease: BTreeMap::new(),
-            made: BTreeMap::new(),
+            in_memory: InMemory::default(),
             last_projection: floor,
             promised: Promised::default(),
             config,
@@ -186,6 +204,9 @@ impl WorldPool {
     pub(super) fn commit(&mut self, now: Timestamp, commit: &Commit) -> Result<Revision, CommitError> {
         let before = self.root().clone();
         let revision = self.history.commit(commit, self.ontology.as_ref())?;
+        for (forgotten, next) in self.history.take_forgotten() {
+            self.in_memory.forgotten(&forgotten, &next);
+        }
         // An answer of before has written nothing now.
         if let Some(kept) = self.history.newest().filter(|kept| kept.world.revision() > before.revision()) {
             self.expiry.written(now, &kept.written);
@@ -350,7 +371,15 @@ impl WorldPool {
             let missing = || ProjectError::NoSuchCommit { id: id.clone(), caller: request.by.name.clone() };
             request.base = made.ok_or_else(missing)?.max(request.base);
         }
-        let world = self.history.at(request.base)?.project_as(&request.writers, &request.changes)?;
+        let moves = moves(&request.changes);
+        // The changes are there once more for what a commit contradicts, the reads for who is asked then.
+        let mut bytes =
+            size::of_changes(&request.changes) + size::of_changes(&moves) + 3 * size::of_footprint(&request.reads);
+        let base = self.history.at(request.base)?;
+        let world = base.project_looking(&request.writers, &request.changes, |written| {
+            bytes += size::of_written(written);
+        })?;
+        self.check_bytes(&request.by, bytes)?;
         let id = request.id.unwrap_or_else(|| {
             self.last_projection += 1;
             ProjectionId(self.last_projection)
@@ -361,15 +390,16 @@ impl WorldPool {
             self.by_lease.entry(lease).or_default().insert(id);
         }
         self.projected.insert(&request.by.name, &request.request_id, fingerprint, id);
-        *self.made.entry(request.by.name.clone()).or_default() += 1;
+        self.in_memory.begin(&request.by.name, request.base, bytes);
         let projection = Projection {
             world,
             base: request.base,
-            moves: moves(&request.changes),
+            moves,
             reads: request.reads,
             held_by: request.held_by,
             made_by: request.by.name,
             request_id: request.request_id,
+            bytes,
             contradiction,
         };
         self.projections.insert(id, projection);
@@ -385,7 +415,7 @@ impl WorldPool {
         if caller.is_operator() {
             return Ok(());
         }
-        if self.made.get(&caller.name).is_some_and(|made| *made >= projections_per_caller) {
+        if self.in_memory.projections(&caller.name) >= projections_per_caller {
             return Err(ProjectError::Quota { whose: caller.name.clone(), limit: projections_per_caller });
         }
         let limit = max_projections - projections_for_operators.min(max_projections / 2);
@@ -393,6 +423,17 @@ impl WorldPool {
             return Err(ProjectError::KeptForOperators { limit });
         }
         Ok(())
+    }
+
+    /// Whether a caller may make one of so many bytes more.
+    fn check_bytes(&self, caller: &Caller, bytes: usize) -> Result<(), ProjectError> {
+        let most = self.config.most_in_memory();
+        let room = self.in_memory.check(&caller.name, caller.is_operator(), bytes, most);
+        room.map_err(|no_room| match no_room {
+            NoRoom::OfCaller => ProjectError::QuotaOfBytes { whose: caller.name.clone(), limit: most.per_caller },
+            NoRoom::InAll => ProjectError::TooManyBytes { limit: most.in_all },
+            NoRoom::ForOperators => ProjectError::BytesKeptForOperators { limit: most.for_all() },
+        })
     }
 
     /// What a query of these patterns looks at: the root (now or at a revision) or a projection, and what that shows.
@@ -445,12 +486,7 @@ impl WorldPool {
     pub(super) fn release(&mut self, id: ProjectionId) -> bool {
         let Some(projection) = self.projections.remove(&id) else { return false };
         self.live.remove(id);
-        if let Some(made) = self.made.get_mut(&projection.made_by) {
-            *made -= 1;
-            if *made == 0 {
-                self.made.remove(&projection.made_by);
-            }
-        }
+        self.in_memory.end(&projection.made_by, projection.base, projection.bytes);
         tracing::trace!(%id, request = projection.request_id, "projection ended");
         if let HeldBy::Lease(lease) = projection.held_by
             && let Some(ids) = self.by_lease.get_mut(&lease)

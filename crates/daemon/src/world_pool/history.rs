@@ -7,6 +7,7 @@ use super::WorldPoolConfig;
 use super::fingerprint::Fingerprint;
 use super::memory::{Memory, Reused};
 use super::record::{CommitRecord, EntryRecord, FactRecord, Names, PatternRecord, SnapshotRecord, encode, writer_name};
+use super::size;
 use crate::access::Caller;
 use crate::durable_actor::Journaled;
 use bytes::Bytes;
@@ -27,13 +28,18 @@ pub(super) struct History {
     revisions: VecDeque<Arc<Kept>>,
     /// How many facts the kept revisions wrote, the oldest not counted.
     written: usize,
+    /// What they take besides the root, in bytes; the oldest not counted.
+    bytes: usize,
     commits: Memory<Revision>,
     /// Commits since the journal took the last.
     records: EntryRecord,
     /// Revisions since [`History::take_news`].
     news: Vec<Arc<Kept>>,
+    /// Revisions that are not kept any more since [`History::take_forgotten`].
+    forgotten: Vec<Arc<Kept>>,
     revisions_kept: usize,
     changes_kept: usize,
+    revision_bytes: usize,
 }
 
 /// What is to become the next revision.
@@ -93,12 +99,14 @@ pub(super) struct Kept {
     /// The node that made it.
     pub(super) writer: Option<Arc<str>>,
     pub(super) written: Written,
+    /// What it takes to keep the revision before, too: the keys that were written, and what they said before.
+    bytes: usize,
 }
 
 impl Kept {
     /// A revision that is as it is for reasons that are not kept.
     fn given(world: World) -> Arc<Kept> {
-        Arc::new(Kept { world, commit: Arc::default(), writer: None, written: Written::new() })
+        Arc::new(Kept { world, commit: Arc::default(), writer: None, written: Written::new(), bytes: 0 })
     }
 }
 
@@ -149,11 +157,14 @@ impl History {
         History {
             revisions: VecDeque::from([Kept::given(world)]),
             written: 0,
+            bytes: 0,
             commits: Memory::new(config.remembered()),
             records: EntryRecord::default(),
             news: Vec::new(),
+            forgotten: Vec::new(),
             revisions_kept: config.revisions_kept,
             changes_kept: config.changes_kept,
+            revision_bytes: config.revision_bytes,
         }
     }
 
@@ -211,7 +222,7 @@ impl History {
     fn go_on_from(&mut self, revision: Revision) {
         let world = self.root().clone().numbered(revision);
         self.revisions = VecDeque::from([Kept::given(world)]);
-        self.written = 0;
+        (self.written, self.bytes) = (0, 0);
     }
 
     pub(super) fn root(&self) -> &World {
@@ -255,10 +266,18 @@ impl History {
         };
         let writer = writer.as_deref().map(Arc::<str>::from);
         self.put_down(&by.name, writer.as_ref(), record);
-        let revision = self.push(id, writer, written);
+        let forgotten = self.push(id, writer, written);
+        self.forgotten.extend(forgotten);
         self.news.extend(self.revisions.back().cloned());
-        self.commits.insert(&by.name, id, fingerprint, revision);
-        Ok(revision)
+        self.commits.insert(&by.name, id, fingerprint, Revision(next));
+        Ok(Revision(next))
+    }
+
+    /// The revisions that commits since the last call have pushed out, the oldest first, each with the one behind it.
+    pub(super) fn take_forgotten(&mut self) -> Vec<(Arc<Kept>, Arc<Kept>)> {
+        let forgotten = std::mem::take(&mut self.forgotten);
+        let behind = forgotten.iter().skip(1).chain(self.revisions.front()).cloned().collect::<Vec<_>>();
+        forgotten.into_iter().zip(behind).collect()
     }
 
     /// The revision that a commit of this caller has made, as long as that is remembered.
@@ -317,19 +336,27 @@ impl History {
         (written.chain(before).take(limit).collect(), oldest.revision())
     }
 
-    fn push(&mut self, commit: &str, writer: Option<Arc<str>>, written: Written) -> Revision {
+    /// The revisions that are not kept any more for a new one, the oldest first.
+    fn push(&mut self, commit: &str, writer: Option<Arc<str>>, written: Written) -> Vec<Arc<Kept>> {
         let mut world = self.root().clone();
-        let revision = world.write(&written);
+        let was = |key: &FactKey| world.fact(key).map_or_else(|| size::of_key(key), |fact| size::of_fact(key, fact));
+        let bytes = written.keys().map(|key| was(key)).sum();
+        world.write(&written);
         self.written += written.len();
-        self.revisions.push_back(Arc::new(Kept { world, commit: Arc::from(commit), writer, written }));
+        self.bytes += bytes;
+        self.revisions.push_back(Arc::new(Kept { world, commit: Arc::from(commit), writer, written, bytes }));
         let too_much = |history: &History| {
-            history.revisions.len() > history.revisions_kept || history.written > history.changes_kept
+            history.revisions.len() > history.revisions_kept
+                || history.written > history.changes_kept
+                || history.bytes > history.revision_bytes
         };
+        let mut forgotten = Vec::new();
         while self.revisions.len() > 1 && too_much(self) {
-            self.revisions.pop_front();
+            forgotten.extend(self.revisions.pop_front());
             self.written -= self.revisions[0].written.len();
+            self.bytes -= self.revisions[0].bytes;
         }
-        revision
+        forgotten
     }
 
     fn make_again(
@@ -502,8 +529,9 @@ mod tests {
                 }
                 prop_assert_eq!(history.root(), &worlds[worlds.len() - 1]);
                 prop_assert!(history.revisions.len() <= 5 && (history.written <= 12 || history.revisions.len() == 1));
-                let counted: usize = history.revisions.iter().skip(1).map(|kept| kept.written.len()).sum();
-                prop_assert_eq!(history.written, counted);
+                let later = || history.revisions.iter().skip(1);
+                prop_assert_eq!(history.written, later().map(|kept| kept.written.len()).sum::<usize>());
+                prop_assert_eq!(history.bytes, later().map(|kept| kept.bytes).sum::<usize>());
                 for kept in &history.revisions {
                     let revision = kept.world.revision();
                     prop_assert_eq!(history.at(revision).unwrap(), &worlds[revision.0 as usize]);
@@ -537,6 +565,37 @@ mod tests {
             let _ = History::restore(Kept { entries: vec![entry.clone()], snapshot: None }.recovered(), &config());
             let _ = History::restore(Kept { entries: Vec::new(), snapshot: Some(entry) }.recovered(), &config());
         }
+    }
+
+    #[test]
+    fn revisions_are_forgotten_for_the_bytes_that_they_take_besides_the_root() {
+        const MIB: usize = 1 << 20;
+        let config = WorldPoolConfig { revision_bytes: 4 * MIB, ..WorldPoolConfig::default() };
+        let large = |n: i64| [Change::Set { fact: key(n), value: Value::Bytes(vec![n as u8; MIB]) }];
+        let mut history = History::new(&config);
+        for n in 0..9 {
+            history.commit(&commit(&format!("new-{n}"), &large(n)), None).unwrap();
+        }
+        assert_eq!(history.revisions.len(), 10, "all of it is in the root: an older one takes nothing besides");
+        let mut kept = Kept::default();
+        for round in 0..20 {
+            history.commit(&commit(&format!("over-{round}"), &large(0)), None).unwrap();
+            assert!(history.bytes <= 4 * MIB);
+        }
+        assert_eq!(history.revisions.len(), 4, "three values of before, and a little for each");
+        history.commit(&commit("small", &[Change::Set { fact: key(1), value: Value::Null }]), None).unwrap();
+        assert_eq!(history.revisions.len(), 4, "what was replaced counts, not what replaces it");
+        // And so it is after a restart.
+        kept.entries.extend(history.take_entry());
+        let again = History::restore(kept.recovered(), &config).unwrap();
+        assert_eq!((again.revisions.len(), again.bytes), (history.revisions.len(), history.bytes));
+        // What does not fit at all is made all the same.
+        let none = WorldPoolConfig { revision_bytes: 0, ..WorldPoolConfig::default() };
+        let mut history = History::new(&none);
+        for n in 0..3 {
+            history.commit(&commit(&n.to_string(), &large(0)), None).unwrap();
+        }
+        assert_eq!((history.revisions.len(), history.root().revision()), (1, Revision(3)));
     }
 
     #[test]

@@ -14,6 +14,7 @@ mod core;
 mod expiry;
 mod fingerprint;
 mod history;
+mod in_memory;
 mod leases;
 mod memory;
 mod parked;
@@ -22,6 +23,7 @@ mod query;
 mod record;
 mod scenes;
 mod service;
+mod size;
 mod status;
 mod stream;
 

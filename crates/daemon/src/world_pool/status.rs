@@ -44,10 +44,13 @@ pub(super) fn of_project(error: &ProjectError) -> Status {
         ProjectError::Ended { .. } => (Code::FailedPrecondition, "PROJECTION_ENDED"),
         ProjectError::NotPromised { .. } => (Code::FailedPrecondition, "NOT_PROMISED"),
         ProjectError::NoSuchCommit { .. } => (Code::FailedPrecondition, "NO_SUCH_COMMIT"),
-        ProjectError::Quota { .. } => {
+        ProjectError::Quota { .. } | ProjectError::QuotaOfBytes { .. } => {
             return retry_later(Code::ResourceExhausted, "QUOTA", error.to_string(), RETRY_DELAY);
         }
-        ProjectError::TooMany { .. } | ProjectError::KeptForOperators { .. } => {
+        ProjectError::TooMany { .. }
+        | ProjectError::KeptForOperators { .. }
+        | ProjectError::TooManyBytes { .. }
+        | ProjectError::BytesKeptForOperators { .. } => {
             return retry_later(Code::ResourceExhausted, "TOO_MANY", error.to_string(), RETRY_DELAY);
         }
     };

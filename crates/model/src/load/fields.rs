@@ -7,6 +7,7 @@ use crate::expression::parse::{Names, ParseError, parse_effect, parse_expression
 use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::guard::Guard;
 use crate::id::StateId;
+use crate::name::{KIND_RULE, is_kind};
 use crate::program::Location;
 use crate::resource::Quantity;
 use crate::value::Value;
@@ -221,6 +222,17 @@ impl<'t, 'a> Fields<'t, 'a> {
             Content::Text(text) if crate::expression::display::is_word(text) => Some(text),
             _ => {
                 self.error("invalid-name", node.at, format!("expected {what}, a name, found {}", node.described()), "");
+                None
+            }
+        }
+    }
+
+    pub(crate) fn resource_kind<'n>(&mut self, node: &'n Node) -> Option<&'n str> {
+        match &node.content {
+            Content::Text(text) if is_kind(text) => Some(text),
+            _ => {
+                let message = format!("expected a kind of resource, {KIND_RULE}, found {}", node.described());
+                self.error("invalid-name", node.at, message, "");
                 None
             }
         }

@@ -37,7 +37,7 @@ pub(crate) fn list(fields: &mut Fields<'_, '_>, node: &Node) -> Vec<ResourceExpr
 
 fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
     if matches!(item.content, Content::Text(_)) {
-        let word = fields.word(item, "a kind of resource")?;
+        let word = fields.resource_kind(item)?;
         let kind = if word == "world_model" { WORLD_MODEL } else { word }.to_owned();
         return Some(ResourceExpr::new(ResourceOperation::Block, kind));
     }
@@ -78,7 +78,7 @@ fn resource(fields: &mut Fields<'_, '_>, item: &Node) -> Option<ResourceExpr> {
             fields.error("conflicting-annotations", node.at, format!("`{key}` is said of a `block`"), help);
         }
     }
-    let kind = fields.word(&entry.value, "a kind of resource")?.to_owned();
+    let kind = fields.resource_kind(&entry.value)?.to_owned();
     let count = item.get("count").map_or(Some(Quantity::ONE), |node| fields.quantity(node, "count"))?;
     let divisible = item.get("divisible").is_some_and(|node| fields.flag(node));
     let class = match item.get("class") {

@@ -3,6 +3,7 @@
 use crate::failure::Failure;
 use clap::{Args, Subcommand};
 use ratn_model::condition::Condition;
+use ratn_model::name::{KIND_RULE, is_kind};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::value::Value;
 use ratn_worker::endpoint::Endpoint;
@@ -167,15 +168,8 @@ fn amount(text: &str) -> Result<Quantity, String> {
     }
 }
 
-/// What a task can name.
 fn kind(text: &str) -> Result<String, String> {
-    let names = |c: char| c.is_alphanumeric() || c == '_' || c == '-';
-    let first = text.chars().next().is_some_and(char::is_alphabetic);
-    if first && text.chars().all(names) {
-        Ok(text.to_owned())
-    } else {
-        Err("expected a letter, then letters, digits, `_` and `-`".to_owned())
-    }
+    if is_kind(text) { Ok(text.to_owned()) } else { Err(format!("expected {KIND_RULE}")) }
 }
 
 /// The attributes; a name that is given twice is refused.

@@ -6,7 +6,7 @@ use super::{ResourceCore, ResourceTurn};
 use crate::details::{retry_later, status};
 use ratn_model::time::Timestamp;
 use ratn_proto::types::Demand;
-use ratn_resources::SessionId;
+use ratn_resources::{PoolError, SessionId};
 use std::time::Duration;
 use tokio::sync::watch;
 use tonic::{Code, Status};
@@ -17,6 +17,9 @@ impl ResourceCore {
         session: SessionId,
         provisions: Provisions,
     ) -> Result<watch::Receiver<Vec<Demand>>, Status> {
+        if !self.pool.has_session(&session) {
+            return Err(of_error(&PoolError::UnknownSession { session }));
+        }
         self.providers.join(session, provisions, self.config.max_watchers).map_err(|there| {
             let message = format!("{there} providers watch already");
             retry_later(Code::ResourceExhausted, "TOO_MANY", message, Duration::from_secs(1))

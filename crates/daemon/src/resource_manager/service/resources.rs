@@ -3,11 +3,11 @@
 use super::requests::{Requests, odd_reply, optional_session, session};
 use crate::access::Caller;
 use crate::details::status;
-use crate::paging::{Filled, Page};
+use crate::paging::{self, Filled, Page};
 use crate::resource_manager::actor::Message;
 use crate::resource_manager::wire;
 use ratn_model::resource::{Requirement, ResourceClass};
-use ratn_proto::convert::{label, name, required};
+use ratn_proto::convert::{name, required};
 use ratn_proto::types::{ENDPOINT_ATTRIBUTE, Resource, ResourceFilter};
 use ratn_proto::v1;
 use ratn_resources::{Reply, Request, ResourceSpec, Search};
@@ -125,11 +125,10 @@ pub(super) async fn get(
     Ok(v1::ResourceServiceGetResponse { resource: Some(wire::resource(&view).into()) })
 }
 
-pub(super) async fn list(requests: &Requests, request: v1::ListRequest) -> Result<v1::ListResponse, Status> {
-    label(&request.page_token, "page_token")?;
-    let page = Page::of(request.page_bytes, &request.page_token);
-    // The token is the id of the last on the page before.
-    let mut after = request.page_token.clone();
+pub(super) async fn list(requests: &Requests, mut request: v1::ListRequest) -> Result<v1::ListResponse, Status> {
+    let (bytes, token) = (std::mem::take(&mut request.page_bytes), std::mem::take(&mut request.page_token));
+    let (page, asked) = (Page::of(bytes, &token), request.clone());
+    let mut after = paging::behind(&token, &asked)?.to_owned();
     let filter = ResourceFilter::try_from(request)?;
     let (mut filled, mut first) = (Filled::default(), None);
     loop {
@@ -139,11 +138,12 @@ pub(super) async fn list(requests: &Requests, request: v1::ListRequest) -> Resul
         let revision = *first.get_or_insert(revision);
         let passing = views.iter().filter(|view| wire::passes(view, &filter));
         let more = page.fill(passing.map(|view| wire::resource(view).into()), &mut filled)?;
-        let full = filled.items.last().filter(|_| more).map(|last: &v1::Resource| last.id.clone());
         match views.last().filter(|_| views.len() == LISTED_AT_ONCE) {
             Some(last) if !more => after.clone_from(&last.id),
             _ => {
-                let (resources, next_page_token) = (filled.items, full.unwrap_or_default());
+                let last = filled.items.last().filter(|_| more).map(|last: &v1::Resource| last.id.as_str());
+                let next_page_token = paging::token_behind(last, &asked);
+                let resources = filled.items;
                 return Ok(v1::ListResponse { resources, revision: revision.0, next_page_token });
             }
         }

@@ -4,7 +4,7 @@ use super::Streamed;
 use super::requests::{Requests, session};
 use crate::access::{Caller, speaker};
 use crate::audit::{self, Mutation};
-use crate::paging::{Filled, Page};
+use crate::paging::{self, Filled, Page};
 use crate::quota::Quotas;
 use crate::resource_manager::actor::{Claim, Message};
 use ratn_proto::convert::{Malformed, label};
@@ -92,21 +92,20 @@ pub(super) async fn list(
     request: v1::ListSessionsRequest,
 ) -> Result<v1::ListSessionsResponse, Status> {
     let v1::ListSessionsRequest { page_bytes, page_token } = request;
-    label(&page_token, "page_token")?;
-    let page = Page::of(page_bytes, &page_token);
+    let (page, asked) = (Page::of(page_bytes, &page_token), v1::ListSessionsRequest::default());
     let mut filled = Filled::default();
-    // The token is the id of the last on the page before.
-    let mut after = page_token;
+    let mut after = paging::behind(&page_token, &asked)?.to_owned();
     loop {
         let from = after.clone();
         let sessions = requests.actor().ask(|answer| Message::Sessions { after: from, answer }).await?;
         let last = sessions.last().map(|session| session.id.clone());
         let full = page.fill(sessions.into_iter().map(v1::SessionStatus::from), &mut filled)?;
-        let told = filled.items.last().filter(|_| full).map(|session| session.session_id.clone());
         match last {
             Some(last) if !full => after = last,
             _ => {
-                let next_page_token = told.unwrap_or_default();
+                let last =
+                    filled.items.last().filter(|_| full).map(|last: &v1::SessionStatus| last.session_id.as_str());
+                let next_page_token = paging::token_behind(last, &asked);
                 return Ok(v1::ListSessionsResponse { sessions: filled.items, next_page_token });
             }
         }

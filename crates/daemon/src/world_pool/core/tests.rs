@@ -392,8 +392,143 @@ fn one_caller_makes_so_many_projections_and_the_last_ones_of_all_are_operators()
     assert_eq!(project_as(&mut pool, &operator(), "2"), Err(ProjectError::TooMany { limit: 6 }));
     // What time has ended counts no more.
     pool.expire(Timestamp(5));
-    assert_eq!((pool.projections(), pool.made.len()), (0, 0));
+    assert!(pool.projections() == 0 && pool.in_memory.is_empty());
     project_as(&mut pool, &adam, "4").unwrap();
+}
+
+/// With so many bytes of its own, at least.
+fn project_large(
+    pool: &mut WorldPool,
+    caller: &Caller,
+    request: &str,
+    bytes: usize,
+) -> Result<ProjectionId, ProjectError> {
+    pool.project(ProjectRequest {
+        by: caller.clone(),
+        request_id: request.to_owned(),
+        id: None,
+        after: None,
+        base: pool.root().revision(),
+        changes: vec![Change::Set { fact: key(request), value: Value::Bytes(vec![7; bytes]) }],
+        writers: Vec::new(),
+        reads: Footprint::Everything,
+        held_by: HeldBy::Until(Timestamp(5)),
+    })
+}
+
+#[test]
+fn projections_are_bounded_by_their_bytes_for_each_caller_and_in_all() {
+    const MIB: usize = 1 << 20;
+    let config = WorldPoolConfig {
+        projection_bytes: 40 * MIB,
+        projection_bytes_per_caller: 13 * MIB,
+        ..WorldPoolConfig::default()
+    };
+    let mut pool = WorldPool::new(config.clone(), None, History::new(&config), 0);
+    let [adam, eve, cain] = ["adam", "eve", "cain"].map(task);
+    // Each has its value in what it shows, in what moves in the scene, and in what its commit is compared with.
+    let first = project_large(&mut pool, &adam, "1", 2 * MIB).unwrap();
+    project_large(&mut pool, &adam, "2", 2 * MIB).unwrap();
+    let quota = ProjectError::QuotaOfBytes { whose: "adam".into(), limit: 13 * MIB };
+    assert!(quota.to_string().contains("(projection_bytes_per_caller): release some"), "{quota}");
+    assert_eq!(project_large(&mut pool, &adam, "3", 2 * MIB), Err(quota));
+    assert_eq!(project_large(&mut pool, &adam, "1", 2 * MIB), Ok(first), "asked for again it is no other");
+    pool.release(first);
+    project_large(&mut pool, &adam, "3", 2 * MIB).unwrap();
+    for request in ["1", "2"] {
+        project_large(&mut pool, &eve, request, 2 * MIB).unwrap();
+    }
+    project_large(&mut pool, &cain, "1", MIB).unwrap();
+    let kept = ProjectError::BytesKeptForOperators { limit: 30 * MIB };
+    assert_eq!(project_large(&mut pool, &cain, "2", 2 * MIB), Err(kept));
+    project_large(&mut pool, &operator(), "1", 2 * MIB).unwrap();
+    let beyond = ProjectError::TooManyBytes { limit: 40 * MIB };
+    assert_eq!(project_large(&mut pool, &operator(), "2", 3 * MIB), Err(beyond));
+    pool.expire(Timestamp(5));
+    assert!(pool.in_memory.is_empty());
+    // A pattern that deletes much is small on the wire, and not here.
+    let many: Vec<Change> = (0..60_000).map(|n| set(&format!("{n}"), n)).collect();
+    commit(&mut pool, "many", &many, None).unwrap();
+    let all = FactPattern { predicate: "at".to_owned(), arguments: vec![None] };
+    let delete =
+        ProjectRequest { by: adam, changes: vec![Change::Delete { pattern: all }], ..promised("all", None, None) };
+    let refused = pool.project(ProjectRequest { base: Revision(1), ..delete }).unwrap_err();
+    assert!(matches!(refused, ProjectError::QuotaOfBytes { .. }), "{refused}");
+}
+
+#[test]
+fn who_projects_from_revisions_that_are_forgotten_is_counted_for_what_of_them_is_kept_alone() {
+    const MIB: usize = 1 << 20;
+    let config = WorldPoolConfig {
+        revision_bytes: 2 * MIB,
+        projection_bytes_per_caller: 10 * MIB,
+        ..WorldPoolConfig::default()
+    };
+    let mut pool = WorldPool::new(config.clone(), None, History::new(&config), 0);
+    let (adam, eve) = (task("adam"), task("eve"));
+    let mut made = Vec::new();
+    let refused = loop {
+        let large = Change::Set { fact: key("cloud"), value: Value::Bytes(vec![0; MIB]) };
+        commit(&mut pool, &format!("{}", made.len()), &[large], None).unwrap();
+        match project_large(&mut pool, &eve, &format!("p{}", made.len()), 0) {
+            Ok(id) => made.push(id),
+            Err(refused) => break refused,
+        }
+        assert!(made.len() < 20, "each keeps a value of a MiB that nobody else does");
+    };
+    assert!(matches!(refused, ProjectError::QuotaOfBytes { .. }), "{refused}");
+    assert!(made.len() > 8, "those of kept revisions take nothing: {}", made.len());
+    project_large(&mut pool, &adam, "p", 0).unwrap();
+    pool.release(made[0]);
+    project_large(&mut pool, &eve, "more", 0).unwrap();
+}
+
+mod kept_for_projections {
+    use super::*;
+    use proptest::collection::vec;
+    use proptest::prelude::*;
+
+    proptest! {
+        #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
+
+        /// By looking at every fact of every base and of every revision that is kept.
+        #[test]
+        fn what_is_kept_for_projections_alone_is_counted_once(steps in vec((0..4_u8, 0..6_i64, 0..8_usize), 1..60)) {
+            let config = WorldPoolConfig { revisions_kept: 3, ..WorldPoolConfig::default() };
+            let mut pool = WorldPool::new(config.clone(), None, History::new(&config), 0);
+            let (mut worlds, mut live) = (vec![pool.root().clone()], Vec::new());
+            for (number, (what, fact, other)) in steps.into_iter().enumerate() {
+                match what {
+                    0 | 1 => {
+                        let change = match what {
+                            0 => set(&format!("{fact}"), number as i64),
+                            _ => Change::Delete { pattern: FactPattern::of(&key(&format!("{fact}"))) },
+                        };
+                        commit(&mut pool, &format!("{number}"), &[change, set("often", 1)], None).unwrap();
+                        worlds.push(pool.root().clone());
+                    }
+                    2 => live.push(project_large(&mut pool, &task("adam"), &format!("{number}"), 0).unwrap()),
+                    _ if live.is_empty() => {}
+                    _ => drop(pool.release(live.swap_remove(other % live.len()))),
+                }
+                let root = worlds.len() - 1;
+                let facts = |world: &World| -> BTreeMap<(FactKey, Revision), usize> {
+                    world.iter().map(|(key, fact)| ((key.clone(), fact.revision), size::of_fact(key, fact))).collect()
+                };
+                let mut expected = BTreeMap::new();
+                for projection in pool.projections.values() {
+                    expected.extend(facts(&worlds[projection.base.0 as usize]));
+                }
+                for world in &worlds[root.saturating_sub(2)..] {
+                    expected.retain(|fact, _| !facts(world).contains_key(fact));
+                }
+                let own: usize = pool.projections.values().map(|projection| projection.bytes).sum();
+                prop_assert_eq!(pool.in_memory.bytes(), own + expected.values().sum::<usize>());
+            }
+            live.into_iter().for_each(|id| drop(pool.release(id)));
+            prop_assert!(pool.in_memory.is_empty());
+        }
+    }
 }
 
 #[test]
