@@ -1,7 +1,7 @@
 //! The event log: one JSON object per line, every event that the executive was given and every command that it gave.
 //!
-//! It is the single source of Gantt charts, statistics, replay and resume, so each line is on its way to the file before the
-//! commands of its event are performed, and on the disk where they cannot be undone. Its writer holds a lock on it: nobody else
+//! It is the single source of Gantt charts, statistics, replay and resume, so each line is on its way to the file before anything of the
+//! commands of its event leaves the process, and on the disk where they cannot be undone. Its writer holds a lock on it: nobody else
 //! writes it meanwhile. Reading says which line is wrong and why; a torn last line (the writer was killed) is left out and named.
 
 mod parts;
@@ -12,7 +12,7 @@ use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_model::time::Timestamp;
 use serde::Serialize;
 use std::fs::{File, OpenOptions, TryLockError};
-use std::io::{BufRead, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 /// A longer line is not written by any task; whoever wrote it is not `ratn`.
@@ -99,15 +99,17 @@ pub enum LogError {
 #[derive(Debug)]
 pub struct LogWriter {
     path: PathBuf,
-    file: BufWriter<File>,
+    file: File,
     /// How many bytes and lines are written.
     written: u64,
     lines: usize,
+    /// How many lines are noted, and not yet written.
+    noted: usize,
     /// It is on a disk, so that it can be made safe there.
     on_disk: bool,
     /// What was behind the last whole line is away.
     is_cut: bool,
-    /// Room for the next lines.
+    /// What is noted.
     text: Vec<u8>,
 }
 
@@ -123,7 +125,7 @@ impl LogWriter {
     /// Creates the file; one with something in it stays as it is.
     pub fn create(path: &Path) -> Result<Self, LogError> {
         let mut writer = LogWriter::open(path, OpenOptions::new().write(true).create(true).truncate(false), "create")?;
-        let length = writer.file.get_ref().metadata().map_err(|source| writer.io(source))?.len();
+        let length = writer.file.metadata().map_err(|source| writer.io(source))?.len();
         if writer.on_disk && length > 0 {
             return Err(LogError::There { path: path.to_owned() });
         }
@@ -139,7 +141,7 @@ impl LogWriter {
     /// For a log that is gone on with: from here on nobody else is its writer. [`LogWriter::go_on_behind`] says where.
     pub fn go_on(path: &Path) -> Result<Self, LogError> {
         let mut writer = LogWriter::open(path, OpenOptions::new().append(true), "go on with")?;
-        writer.written = writer.file.get_ref().metadata().map_err(|source| writer.io(source))?.len();
+        writer.written = writer.file.metadata().map_err(|source| writer.io(source))?.len();
         Ok(writer)
     }
 
@@ -180,9 +182,10 @@ impl LogWriter {
         }
         Ok(LogWriter {
             path: path.to_owned(),
-            file: BufWriter::new(file),
+            file,
             written: 0,
             lines: 0,
+            noted: 0,
             on_disk,
             is_cut: false,
             text: Vec::new(),
@@ -191,7 +194,7 @@ impl LogWriter {
 
     fn cut(&mut self) -> Result<(), LogError> {
         if self.on_disk && !self.is_cut {
-            self.file.get_ref().set_len(self.written).map_err(|source| self.io(source))?;
+            self.file.set_len(self.written).map_err(|source| self.io(source))?;
         }
         self.is_cut = true;
         Ok(())
@@ -200,21 +203,36 @@ impl LogWriter {
     /// Writes what happened and what was decided then, and hands it to the operating system. Where it cannot be written so that it reads
     /// again, nothing of it is written.
     pub fn append(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Result<(), LogError> {
-        self.begin();
-        self.add(&Written { at, entry: event })?;
-        self.add_commands(at, commands)?;
-        self.write(1 + commands.len())
+        self.note(at, event, commands)?;
+        self.write()
     }
 
     /// Writes what was decided on the last event, as [`LogWriter::append`] does.
     pub fn append_commands(&mut self, at: Timestamp, commands: &[Command]) -> Result<(), LogError> {
-        self.begin();
-        self.add_commands(at, commands)?;
-        self.write(commands.len())
+        self.add(at, None, commands)?;
+        self.write()
     }
 
-    fn add_commands(&mut self, at: Timestamp, commands: &[Command]) -> Result<(), LogError> {
-        commands.iter().try_for_each(|command| self.add(&Written { at, entry: command }))
+    /// As [`LogWriter::append`], and keeps it until [`LogWriter::write`] hands it over with what was noted before and after it.
+    pub fn note(&mut self, at: Timestamp, event: &Event, commands: &[Command]) -> Result<(), LogError> {
+        self.add(at, Some(event), commands)
+    }
+
+    fn add(&mut self, at: Timestamp, event: Option<&Event>, commands: &[Command]) -> Result<(), LogError> {
+        let before = self.text.len();
+        let added = event.map_or(Ok(()), |event| self.add_line(&Written { at, entry: event }));
+        let added = added.and_then(|()| {
+            commands.iter().try_for_each(|command| self.add_line(&Written { at, entry: command }))?;
+            if self.written + self.text.len() as u64 > MAX_LOG_BYTES {
+                return Err(LogError::TooLong { path: self.path.clone() });
+            }
+            Ok(())
+        });
+        match &added {
+            Ok(()) => self.noted += usize::from(event.is_some()) + commands.len(),
+            Err(_) => self.text.truncate(before),
+        }
+        added
     }
 
     /// The file, to make safe what was written while more is written; `None` where it is on no disk.
@@ -222,24 +240,19 @@ impl LogWriter {
     /// # Errors
     /// Where the system has no room for one more open file.
     pub fn handle(&self) -> Result<Option<File>, LogError> {
-        let handle = || self.file.get_ref().try_clone().map_err(|source| self.io(source));
+        let handle = || self.file.try_clone().map_err(|source| self.io(source));
         self.on_disk.then(handle).transpose()
     }
 
     /// Returns once everything written so far outlives a loss of power.
     pub fn make_durable(&mut self) -> Result<(), LogError> {
         if self.on_disk {
-            self.file.get_ref().sync_data().map_err(|source| self.io(source))?;
+            self.file.sync_data().map_err(|source| self.io(source))?;
         }
         Ok(())
     }
 
-    fn begin(&mut self) {
-        self.text.clear();
-        self.text.shrink_to(USUAL_BYTES);
-    }
-
-    fn add(&mut self, line: &Written<impl Serialize>) -> Result<(), LogError> {
+    fn add_line(&mut self, line: &Written<impl Serialize>) -> Result<(), LogError> {
         let begins = self.text.len();
         serde_json::to_writer(&mut self.text, line).map_err(|source| self.io(source.into()))?;
         let bytes = self.text.len() - begins;
@@ -250,15 +263,17 @@ impl LogWriter {
         Ok(())
     }
 
-    /// Writes the lines that were added.
-    fn write(&mut self, lines: usize) -> Result<(), LogError> {
-        if self.written + self.text.len() as u64 > MAX_LOG_BYTES {
-            return Err(LogError::TooLong { path: self.path.clone() });
+    /// Hands to the operating system what was noted.
+    pub fn write(&mut self) -> Result<(), LogError> {
+        if self.noted == 0 {
+            return Ok(());
         }
         self.cut()?;
         self.written += self.text.len() as u64;
-        self.lines += lines;
-        let written = self.file.write_all(&self.text).and_then(|()| self.file.flush());
+        self.lines += std::mem::take(&mut self.noted);
+        let written = self.file.write_all(&self.text);
+        self.text.clear();
+        self.text.shrink_to(USUAL_BYTES);
         written.map_err(|source| self.io(source))
     }
 
@@ -522,6 +537,23 @@ mod tests {
         let written = std::fs::read_to_string(file.path()).unwrap();
         let of_lines: String = lines.iter().map(|line| format!("{}\n", serde_json::to_string(line).unwrap())).collect();
         assert_eq!(written, of_lines);
+    }
+
+    #[test]
+    fn what_is_noted_is_written_together_and_what_is_refused_of_it_leaves_the_rest() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let mut log = LogWriter::create(file.path()).unwrap();
+        log.note(Timestamp(0), &started(), &[Command::Wake { at: Timestamp(7) }]).unwrap();
+        assert_eq!((log.written(), log.lines(), std::fs::read(file.path()).unwrap().len()), (0, 0, 0));
+        let value = ratn_model::value::Value::Null;
+        let long = Event::Signalled { signal: "x".repeat(MAX_LINE_BYTES), value };
+        assert!(matches!(log.note(Timestamp(1), &long, &[]), Err(LogError::LineTooLong { .. })));
+        log.note(Timestamp(2), &Event::Woken, &[]).unwrap();
+        log.write().unwrap();
+        log.write().unwrap();
+        let Log { lines, whole, .. } = read(file.path()).unwrap();
+        assert_eq!((lines.len(), lines[2].at), (3, Timestamp(2)));
+        assert_eq!((log.lines(), log.written()), (3, whole));
     }
 
     #[test]

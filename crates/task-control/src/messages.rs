@@ -3,12 +3,12 @@
 use std::fmt::{self, Display};
 use std::sync::Arc;
 
-/// Takes lines for people: a terminal, a window, or nobody. Nothing depends on them.
+/// Takes lines for people, one or several at once: a terminal, a window, or nobody. Nothing depends on them.
 #[derive(Clone)]
 pub struct Messages(Arc<dyn Fn(&str) + Send + Sync>);
 
 impl Messages {
-    /// Gives each line to `take`, from any thread.
+    /// Gives what is said to `take`, from any thread: a line, or several with line breaks between them.
     pub fn to(take: impl Fn(&str) + Send + Sync + 'static) -> Messages {
         Messages(Arc::new(take))
     }

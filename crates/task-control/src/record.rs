@@ -301,11 +301,15 @@ impl Recorder {
             promises: self.promises.clone(),
         };
         let (own, events) = (self.of(instance), self.events.clone());
-        tokio::spawn(trace::within(own, async move {
+        let mut making = Box::pin(trace::within(own, async move {
             if let Some(event) = making.make().await {
                 let _ = events.send(event.into()).await;
             }
         }));
+        // It is asked for here, so that it goes with the commit before it.
+        if making.as_mut().now_or_never().is_none() {
+            tokio::spawn(making);
+        }
     }
 
     async fn commit(&self, instance: InstanceId, commit: Commit, untouched: Option<Untouched>) -> Option<Event> {

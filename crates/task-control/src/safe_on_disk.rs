@@ -1,8 +1,10 @@
 //! What was written of a run is made safe on the disk beside everything else: only what cannot be undone waits for that.
 //!
 //! A thread makes the event log safe when it is asked to; everything that was written before one look at the disk is safe after it, so many marks
-//! that come meanwhile cost one more look.
+//! that come meanwhile cost one more look. Its word goes to one task of the run, and from there to all that wait: each that the thread told itself would
+//! cost it a system call, and they would not go on together.
 
+use ratn_worker::panic::exit_on_panic;
 use std::fs::File;
 use std::io;
 use std::sync::Arc;
@@ -19,6 +21,8 @@ pub(super) struct Syncer {
     /// Why no more will be.
     failure: watch::Receiver<Option<Arc<str>>>,
     last: u64,
+    /// The last mark that the thread was asked for.
+    asked: u64,
 }
 
 /// A place in the log: what cannot be undone waits until everything before it is safe.
@@ -36,31 +40,43 @@ struct Tell {
 }
 
 impl Syncer {
-    /// Of a file that others write; `None`: it is on no disk.
+    /// Of a file that others write; `None`: it is on no disk. Within a tokio runtime.
     ///
     /// # Errors
     /// Where the thread cannot be started.
     pub(super) fn start(file: Option<File>) -> io::Result<Syncer> {
         let Some(file) = file else { return Ok(Syncer::telling().0) };
-        let ((syncer, tell), (wanted, marks)) = (Syncer::telling(), channel());
-        let sync = move || file.sync_data();
+        Syncer::of(move || file.sync_data())
+    }
+
+    fn of(sync: impl Fn() -> io::Result<()> + Send + 'static) -> io::Result<Syncer> {
+        let ((mut syncer, tell), (wanted, marks)) = (Syncer::telling(), channel());
         std::thread::Builder::new().name("event-log".to_owned()).spawn(move || work(&marks, &tell, sync))?;
+        let (pass_on, safe) = watch::channel(0);
+        let told = std::mem::replace(&mut syncer.safe, safe);
+        tokio::spawn(exit_on_panic("what passes on what is safe on the disk", pass(told, pass_on)));
         Ok(Syncer { wanted: Some(wanted), ..syncer })
     }
 
     fn telling() -> (Syncer, Tell) {
         let ((safe, is_safe), (failure, has_failed)) = (watch::channel(0), watch::channel(None));
-        (Syncer { wanted: None, safe: is_safe, failure: has_failed, last: 0 }, Tell { safe, failure })
+        let syncer = Syncer { wanted: None, safe: is_safe, failure: has_failed, last: 0, asked: 0 };
+        (syncer, Tell { safe, failure })
     }
 
-    /// Everything that was written so far, which is made safe as soon as possible.
+    /// Everything that is noted so far, which is to be made safe once it is written ([`Syncer::written`]).
     pub(super) fn mark(&mut self) -> Mark {
-        if let Some(wanted) = &self.wanted {
-            self.last += 1;
+        self.last += u64::from(self.wanted.is_some());
+        self.marked()
+    }
+
+    /// Everything that was marked is written: it is made safe as soon as possible.
+    pub(super) fn written(&mut self) {
+        if let Some(wanted) = self.wanted.as_ref().filter(|_| self.asked < self.last) {
+            self.asked = self.last;
             // Where the thread is gone it has said why.
             let _ = wanted.send(self.last);
         }
-        self.marked()
     }
 
     /// Everything that was marked so far.
@@ -98,6 +114,14 @@ impl Mark {
     }
 }
 
+/// Until no more is said.
+async fn pass(mut told: watch::Receiver<u64>, on: watch::Sender<u64>) {
+    while told.changed().await.is_ok() {
+        let through = *told.borrow_and_update();
+        on.send_replace(through);
+    }
+}
+
 fn work(marks: &Receiver<u64>, tell: &Tell, sync: impl Fn() -> io::Result<()>) {
     while let Ok(mark) = marks.recv() {
         let through = marks.try_iter().last().unwrap_or(mark);
@@ -118,24 +142,27 @@ mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
     use std::time::Duration;
 
-    fn started(sync: impl Fn() -> io::Result<()> + Send + 'static) -> Syncer {
-        let ((syncer, tell), (wanted, marks)) = (Syncer::telling(), channel());
-        std::thread::spawn(move || work(&marks, &tell, sync));
-        Syncer { wanted: Some(wanted), ..syncer }
+    impl Syncer {
+        fn marked_and_written(&mut self) -> Mark {
+            let mark = self.mark();
+            self.written();
+            mark
+        }
     }
 
     #[tokio::test]
     async fn marks_that_come_while_the_disk_is_slow_are_safe_together() {
         let count = Arc::new(AtomicUsize::new(0));
         let counted = count.clone();
-        let mut syncer = started(move || {
+        let mut syncer = Syncer::of(move || {
             std::thread::sleep(Duration::from_millis(50));
             counted.fetch_add(1, Ordering::SeqCst);
             Ok(())
-        });
-        let first = syncer.mark();
+        })
+        .expect("a thread");
+        let first = syncer.marked_and_written();
         tokio::time::sleep(Duration::from_millis(10)).await;
-        let others: Vec<Mark> = (0..10).map(|_| syncer.mark()).collect();
+        let others: Vec<Mark> = (0..10).map(|_| syncer.marked_and_written()).collect();
         assert!(first.safe().await);
         for mark in others {
             assert!(mark.safe().await);
@@ -146,21 +173,22 @@ mod tests {
     #[tokio::test]
     async fn nothing_is_safe_behind_a_failure_and_it_is_told() {
         let looks = AtomicUsize::new(0);
-        let mut syncer = started(move || match looks.fetch_add(1, Ordering::SeqCst) {
+        let mut syncer = Syncer::of(move || match looks.fetch_add(1, Ordering::SeqCst) {
             0 => Ok(()),
             _ => Err(io::Error::other("the disk is gone")),
-        });
-        let first = syncer.mark();
+        })
+        .expect("a thread");
+        let first = syncer.marked_and_written();
         assert!(first.clone().safe().await);
-        assert!(!syncer.mark().safe().await);
+        assert!(!syncer.marked_and_written().safe().await);
         assert_eq!(&*syncer.failed().await, "the disk is gone");
         assert!(first.safe().await, "what was safe stays so");
-        assert!(!syncer.mark().safe().await);
+        assert!(!syncer.marked_and_written().safe().await);
     }
 
     #[tokio::test]
     async fn without_a_disk_nobody_waits() {
         let mut syncer = Syncer::start(None).expect("no thread is needed");
-        assert!(syncer.mark().safe().await);
+        assert!(syncer.marked_and_written().safe().await);
     }
 }

@@ -2,6 +2,9 @@
 //!
 //! Nothing is decided here. Whatever a command leads to comes back as an event through one bounded queue, so the event log is
 //! the whole story of the run, and a run whose task control was killed goes on from it ([`resume`]).
+//!
+//! What is performed leaves the process when other tasks have their turn, so the events that have come by then are handled first, and the log has
+//! one write for all of them: a node that starts when another has ended has three events, two of which come of themselves.
 
 mod resume;
 
@@ -47,6 +50,9 @@ use tokio::sync::{mpsc, oneshot};
 
 /// Answers that the executive has not been given yet.
 pub(super) const MAX_PENDING_EVENTS: usize = 1024;
+
+/// So many events are handled before what they lead to leaves, at the most.
+const MOST_AT_ONCE: u32 = 16;
 
 /// How often a run says what it waits for, at the most.
 const LOOK: Duration = Duration::from_secs(5);
@@ -152,6 +158,8 @@ pub async fn run(run: Run, place: &Place, interrupt: &Interrupt) -> anyhow::Resu
         timers: BTreeSet::new(),
         progress: Progress::new(run.quiet),
         messages: place.messages.clone(),
+        lines: String::new(),
+        at_once: 0,
         program: run.program.clone(),
         syncer: syncer_of(&log)?,
         log,
@@ -252,6 +260,10 @@ struct Shell {
     checkpointer: Option<Checkpointer>,
     progress: Progress,
     messages: Messages,
+    /// What is said when the log is written.
+    lines: String,
+    /// How many events were handled since.
+    at_once: u32,
     clock: RobotClock,
     control: Option<Control>,
     /// None in HSM mode, which has one order only.
@@ -282,6 +294,9 @@ impl Shell {
         interrupt: &Interrupt,
     ) -> anyhow::Result<Ended> {
         let ended = self.until_ended(begin, interrupt).await;
+        // Also what a failure came of.
+        let handed_over = self.hand_over();
+        let ended = ended.and_then(|ended| handed_over.map(|()| ended));
         let spans = self.spans.take();
         self.performer.begin_no_more();
         self.all_is_safe().await;
@@ -309,7 +324,9 @@ impl Shell {
 
     /// Waits until the event log is safe on its disk, or never will be: what the run has decided is not given up because that is slow.
     async fn all_is_safe(&mut self) {
-        let mut safe = std::pin::pin!(self.syncer.mark().safe());
+        let mark = self.syncer.mark();
+        self.syncer.written();
+        let mut safe = std::pin::pin!(mark.safe());
         if tokio::time::timeout(SLOW_DISK, &mut safe).await.is_err() {
             self.messages.say(format_args!("{} is being made safe on its disk", self.log.path().display()));
             safe.await;
@@ -325,6 +342,7 @@ impl Shell {
         let mut asked = Asks::default();
         loop {
             if let Some(ended) = ended {
+                self.hand_over()?;
                 self.checkpointer.take().into_iter().for_each(Checkpointer::end);
                 return Ok(ended);
             }
@@ -349,7 +367,7 @@ impl Shell {
         }
         let commands = self.executive.handle(now, event.clone());
         commands.iter().for_each(|command| replay::follow(&mut self.states, command));
-        self.log.append(now, event, &commands)?;
+        self.log.note(now, event, &commands)?;
         for (say, said) in std::mem::take(&mut self.confirm) {
             let safe = self.syncer.mark();
             tokio::spawn(async move {
@@ -366,13 +384,34 @@ impl Shell {
             spans.follow(now, event, &commands);
         }
         for line in self.progress.follow(now, event, &commands) {
-            self.messages.say(line);
+            self.say(&line);
         }
         self.lookout.observe(now, &commands);
         if self.lookout.is_due() || self.lookout.is_surprised() {
             self.ask_at.get_or_insert_with(|| Instant::now() + advisor::PAUSE);
         }
         Ok((now, commands))
+    }
+
+    /// Of what is said together each line but the last ends with a line break.
+    fn say(&mut self, line: &str) {
+        if !self.lines.is_empty() {
+            self.lines.push('\n');
+        }
+        self.lines.push_str(line);
+    }
+
+    /// Hands what is noted to the operating system, before anything that it led to leaves the process, and has it made safe where something waits
+    /// for that.
+    fn hand_over(&mut self) -> anyhow::Result<()> {
+        self.at_once = 0;
+        self.log.write()?;
+        self.syncer.written();
+        if !self.lines.is_empty() {
+            self.messages.say(&self.lines);
+            self.lines.clear();
+        }
+        Ok(())
     }
 
     /// What cannot be undone is done when what led to it is safe on the disk, and so is what others may then do; all else at once.
@@ -562,6 +601,16 @@ impl Shell {
     /// The next event that the executive has to know of.
     async fn next(&mut self, interrupt: &Interrupt, asked: &mut Asks) -> anyhow::Result<Event> {
         loop {
+            if self.at_once < MOST_AT_ONCE
+                && let Ok(answer) = self.answers.try_recv()
+            {
+                self.at_once += 1;
+                match self.performer.accept(answer, self.executive.root()) {
+                    Some(event) => return Ok(event),
+                    None => continue,
+                }
+            }
+            self.hand_over()?;
             let (due, at) = self.next_due();
             self.alarm.set(at);
             let advised = async {

@@ -5,6 +5,7 @@ use crate::leader::LeaderConnector;
 use crate::tls::ClientTls;
 use crate::tls::connect::Connector;
 use crate::trace::Traced;
+use crate::unix_stream::UnixConnector;
 use hyper_util::client::legacy::connect::HttpConnector;
 use serde::{Deserialize, Serialize};
 use std::error::Error;
@@ -202,10 +203,10 @@ pub(crate) fn connect_lazily_as(
         Watched::BySystem => unwatched(endpoint)?,
     };
     Ok(Traced::new(match connector_of(endpoint, tls) {
-        Some(By::Tls(connector)) => configured.connect_with_connector_lazy(connector),
-        Some(By::Leader(connector)) => configured.connect_with_connector_lazy(connector),
-        Some(By::Tcp(connector)) => configured.connect_with_connector_lazy(connector),
-        None => configured.connect_lazy(),
+        By::Tls(connector) => configured.connect_with_connector_lazy(connector),
+        By::Leader(connector) => configured.connect_with_connector_lazy(connector),
+        By::Tcp(connector) => configured.connect_with_connector_lazy(connector),
+        By::Unix(connector) => configured.connect_with_connector_lazy(connector),
     }))
 }
 
@@ -255,10 +256,10 @@ async fn connected(
     configured: tonic::transport::Endpoint,
 ) -> Result<Traced, ConnectError> {
     let connected = match connector_of(endpoint, tls) {
-        Some(By::Tls(connector)) => configured.connect_with_connector(connector).await,
-        Some(By::Leader(connector)) => configured.connect_with_connector(connector).await,
-        Some(By::Tcp(connector)) => configured.connect_with_connector(connector).await,
-        None => configured.connect().await,
+        By::Tls(connector) => configured.connect_with_connector(connector).await,
+        By::Leader(connector) => configured.connect_with_connector(connector).await,
+        By::Tcp(connector) => configured.connect_with_connector(connector).await,
+        By::Unix(connector) => configured.connect_with_connector(connector).await,
     };
     connected.map(Traced::new).map_err(|source| ConnectError { endpoint: endpoint.clone(), source })
 }
@@ -270,14 +271,16 @@ enum By {
     Leader(LeaderConnector),
     /// Tonic's own does not bound what is not acknowledged.
     Tcp(HttpConnector),
+    /// Tonic's own is woken by everything that the other side reads.
+    Unix(UnixConnector),
 }
 
-fn connector_of(endpoint: &Endpoint, tls: &ClientTls) -> Option<By> {
+fn connector_of(endpoint: &Endpoint, tls: &ClientTls) -> By {
     match endpoint {
-        Endpoint::Tls { host, .. } => Some(By::Tls(Connector::to(host, tls))),
-        Endpoint::AnyOf(members) => Some(By::Leader(LeaderConnector::among(members, tls))),
-        Endpoint::Tcp { .. } => Some(By::Tcp(over_tcp())),
-        Endpoint::Unix(_) => None,
+        Endpoint::Tls { host, .. } => By::Tls(Connector::to(host, tls)),
+        Endpoint::AnyOf(members) => By::Leader(LeaderConnector::among(members, tls)),
+        Endpoint::Tcp { .. } => By::Tcp(over_tcp()),
+        Endpoint::Unix(path) => By::Unix(UnixConnector(path.clone())),
     }
 }
 

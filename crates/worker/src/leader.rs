@@ -13,6 +13,7 @@ use crate::panic::exit_on_panic;
 use crate::tls::ClientTls;
 use crate::tls::connect::Connector;
 use crate::trace::Traced;
+use crate::unix_stream::UnixStream;
 use futures::StreamExt;
 use futures::stream::FuturesUnordered;
 use hyper_util::rt::TokioIo;
@@ -25,7 +26,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::{TcpStream, UnixStream};
+use tokio::net::TcpStream;
 use tokio_util::sync::{CancellationToken, DropGuard, WaitForCancellationFutureOwned};
 use tonic::codegen::{Service, StdError, http::Uri};
 use tonic_health::pb::HealthCheckRequest;
@@ -210,7 +211,7 @@ async fn open(endpoint: &Endpoint, tls: &ClientTls) -> Result<Box<dyn Stream>, S
             let address = Endpoint::Tcp { host: host.clone(), port: *port }.to_string().parse()?;
             Box::new(Connector::to(host, tls).call(address).await?.into_inner())
         }
-        Endpoint::Unix(path) => Box::new(UnixStream::connect(path).await?),
+        Endpoint::Unix(path) => Box::new(UnixStream::connect(path.clone()).await?),
         Endpoint::AnyOf(_) => return Err("a server of several is one server".into()),
     })
 }

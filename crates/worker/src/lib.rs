@@ -63,5 +63,6 @@ pub mod token_bucket;
 pub mod trace;
 mod under_way;
 pub mod unix_socket;
+mod unix_stream;
 pub mod vitals;
 pub mod worker;

@@ -6,8 +6,11 @@ use crate::decided::{REFUSED_PATIENCE, Unanswered, insist};
 use crate::performer::told::Told;
 use crate::record::said;
 use ratn_executive::protocol::{CERTAIN, Event};
+use ratn_model::catalogue::Catalogue;
+use ratn_model::condition::Condition;
 use ratn_model::id::{InstanceId, LeaseId};
-use ratn_model::resource::{Lease, Requirement};
+use ratn_model::resource::{Lease, Requirement, ResourceOperation};
+use ratn_proto::types::ENDPOINT_ATTRIBUTE;
 use ratn_proto::v1::HolderNote;
 use ratn_worker::client::retry_until_answered;
 use ratn_worker::client::{AcquireOptions, CallError, ResourceClient};
@@ -106,10 +109,19 @@ pub(super) fn late_request(request: &str) -> String {
     format!("{request}/late")
 }
 
+/// What performs goals says where it is: a resource of that kind that does not is nobody's to give a goal to, whoever made it.
+fn of_performers(catalogue: &Catalogue, requirement: &mut Requirement) {
+    let performs = catalogue.providers.values().any(|provider| provider.resource == requirement.kind);
+    if performs && requirement.operation == ResourceOperation::Block {
+        requirement.conditions.push(Condition::has(ENDPOINT_ATTRIBUTE));
+    }
+}
+
 /// One acquire's way.
 pub(super) struct Acquiring {
     pub(super) instance: InstanceId,
     pub(super) requirements: Vec<Requirement>,
+    pub(super) catalogue: Arc<Catalogue>,
     pub(super) options: AcquireOptions,
     /// So long its instance has waited before, with other priorities.
     pub(super) waited: Duration,
@@ -139,6 +151,7 @@ impl Acquiring {
             self.tell(Event::Granted { instance: self.instance, lease }, &events).await;
             return;
         }
+        self.requirements.iter_mut().for_each(|one| of_performers(&self.catalogue, one));
         if !self.operations_are_done().await {
             // It has not asked yet. What was handed to it before it was withdrawn goes back.
             self.handed.close();

@@ -185,7 +185,7 @@ impl Performing {
                 event = &mut ending => return event,
                 () = self.is_in_the_way() => {}
             }
-            let _ = self.actions.cancel(endpoint, &self.goal.id).await;
+            let _ = Box::pin(self.actions.cancel(endpoint, &self.goal.id)).await;
             ending.await
         };
         let mut ending = std::pin::pin!(ending);
@@ -197,7 +197,7 @@ impl Performing {
                 let stopping = async {
                     tokio::select! {
                         _ = &mut ending => {}
-                        () = self.tell_to_stop(endpoint) => drop(ending.await),
+                        () = Box::pin(self.tell_to_stop(endpoint)) => drop(ending.await),
                     }
                 };
                 let _ = tokio::time::timeout(CANCEL_DEADLINE, stopping).await;
@@ -228,10 +228,16 @@ impl Performing {
         }
     }
 
+    /// What most goals do not come to is apart, on the heap, so that the future of a goal is small: it is copied some ten times on its way
+    /// through the runtime.
     async fn ending(&self, endpoint: &Endpoint, given: Given) -> Event {
-        if given == Given::Now {
-            return self.given(endpoint).await;
+        match given {
+            Given::Now => self.given(endpoint).await,
+            Given::Before | Given::ToStop => Box::pin(self.found(endpoint)).await,
         }
+    }
+
+    async fn found(&self, endpoint: &Endpoint) -> Event {
         match self.actions.attach_hearing(endpoint, self.goal.clone(), |said| self.said(said)).await {
             Ok(fate) if fate.orphaned => {
                 self.unknown(format!("it was stopped while task control was gone: {}", fate.outcome.reason))
@@ -261,10 +267,10 @@ impl Performing {
             // What was wrong with the goal is wrong with it the next time, too.
             Err(error) if error.code() == Some(tonic::Code::InvalidArgument) => self.aborted(said(&error)),
             // Nor is what it has answered better the next time.
-            Err(error) if error.is_unreadable() => self.unreadable(endpoint, &error).await,
+            Err(error) if error.is_unreadable() => Box::pin(self.unreadable(endpoint, &error)).await,
             // Only the connection may have broken; the goal is still there then.
-            Err(error @ CallError::Broken { .. }) => self.attached(endpoint, &error).await,
-            Err(error) => self.lost(endpoint, &error).await,
+            Err(error @ CallError::Broken { .. }) => Box::pin(self.attached(endpoint, &error)).await,
+            Err(error) => Box::pin(self.lost(endpoint, &error)).await,
         }
     }
 
@@ -573,6 +579,14 @@ mod tests {
                 Answer::World(_) | Answer::Wanted(_) => None,
             }
         }
+    }
+
+    #[tokio::test]
+    async fn the_future_of_a_goal_is_small() -> anyhow::Result<()> {
+        let bench = Bench::new().await?;
+        let bytes = size_of_val(&bench.performing("work", None, 0).perform(Given::Now));
+        assert!(bytes <= 8 << 10, "{bytes} bytes are copied again and again");
+        Ok(())
     }
 
     #[tokio::test]

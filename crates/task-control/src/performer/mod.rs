@@ -37,15 +37,14 @@ use handover::{Handover, Leases};
 use order::Operations;
 use ratn_executive::protocol::{CERTAIN, Command, Event, Goal, Note};
 use ratn_model::catalogue::Catalogue;
-use ratn_model::condition::Condition;
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, LeaseId, Revision};
 use ratn_model::program::Program;
-use ratn_model::resource::{LeasedResource, Requirement, ResourceOperation};
+use ratn_model::resource::{LeasedResource, Requirement};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_otlp::ids;
-use ratn_proto::types::{self, ENDPOINT_ATTRIBUTE, WorldChange};
+use ratn_proto::types::{self, WorldChange};
 use ratn_worker::client::retry_unanswered;
 use ratn_worker::client::{AcquireOptions, ActionClient, Channels, ResourceClient, WorldClient};
 use ratn_worker::session::{DEFAULT_TTL, Session, SessionState, Standing, Trust};
@@ -626,7 +625,7 @@ impl Performer {
             deadline: ACQUIRE_DEADLINE,
             holder: holder(&self.program.name, self.paths.get(&instance).map_or(&instance.to_string(), |path| path)),
         };
-        let asked = requirements.iter().map(|one| self.of_performers(one.clone())).collect();
+        let asked = requirements.clone();
         let (hand, withdrawal) = (Some(hand), withdrawn.clone());
         self.asking.insert(instance, Asking { request, number, priority, requirements, since, withdrawn, over, hand });
         if let Some(handover) = self.handover.as_ref().filter(|one| one.to == instance && !one.waits) {
@@ -635,6 +634,7 @@ impl Performer {
         let acquiring = Acquiring {
             instance,
             requirements: asked,
+            catalogue: self.catalogue.clone(),
             options,
             waited,
             after: self.order.operating.all(),
@@ -824,15 +824,6 @@ impl Performer {
         let provider = self.catalogue.providers.get(&*goal.provider);
         let action = provider.and_then(|provider| provider.actions.get(&*goal.action));
         action.map(|action| action.outputs.keys().cloned().collect()).unwrap_or_default()
-    }
-
-    /// What performs goals says where it is: a resource of that kind that does not is nobody's to give a goal to, whoever made it.
-    fn of_performers(&self, mut requirement: Requirement) -> Requirement {
-        let performs = self.catalogue.providers.values().any(|provider| provider.resource == requirement.kind);
-        if performs && requirement.operation == ResourceOperation::Block {
-            requirement.conditions.push(Condition::has(ENDPOINT_ATTRIBUTE));
-        }
-        requirement
     }
 
     /// The provider of a goal: the leased resource of its kind.

@@ -12,7 +12,7 @@ use ratn_model::catalogue::Provider;
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{FencingToken, ProjectionId, StateId};
 use ratn_model::program::SUCCESS;
-use ratn_model::resource::{Lease, ResourceClass};
+use ratn_model::resource::{Lease, ResourceClass, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_proto::types::{GoalOutcome, Resource};
 use ratn_worker::action::{Action, ActionResult, ActionServer, GoalContext};
@@ -513,6 +513,7 @@ async fn what_may_not_be_needed_is_not_refused_for_how_long_it_waits() -> anyhow
         let acquiring = Acquiring {
             instance,
             requirements: arm(),
+            catalogue: performer.catalogue.clone(),
             options: AcquireOptions { request, speculative, deadline, ..AcquireOptions::default() },
             waited: Duration::ZERO,
             after: Vec::new(),

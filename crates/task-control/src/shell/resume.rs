@@ -119,6 +119,8 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         timers: std::mem::take(&mut ledger.wakes),
         progress,
         messages: place.messages.clone(),
+        lines: String::new(),
+        at_once: 0,
         program,
         syncer: syncer_of(&log)?,
         log,
@@ -145,6 +147,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         let resumed = Event::Resumed { share: another_share(&ledger, place.standing) };
         let (mut now, mut commands) = shell.decide(&resumed)?;
         ledger.event(now, &resumed);
+        shell.hand_over()?;
         let lost = shell.performer.session_lost(&ledger).await?;
         if let Some(lost) = &lost {
             // Time has passed: what was due meanwhile leads to commands, too.
@@ -153,6 +156,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
             now = later;
             commands.extend(more);
         }
+        shell.hand_over()?;
         shell.log.make_durable()?;
         shell.performer.know(shell.progress.paths());
         let told = shell.performer.take_up(&Arc::clone(&shell.program), ledger, &mirror, now).await?;

@@ -117,10 +117,11 @@ impl ActionClient {
         mut on_said: impl FnMut(Said),
     ) -> Result<GoalOutcome, CallError> {
         let question = v1::ExecuteRequest { goal: Some(goal.into()), known_only: false };
-        for _ in 1..TRIES {
+        let mut tries = 1;
+        loop {
             match self.listen(endpoint, question.clone(), &mut on_said).await {
                 // It has begun nothing.
-                Err(error) if error.is_unconfirmed() => {
+                Err(error) if error.is_unconfirmed() && tries < TRIES => {
                     tokio::time::sleep(PAUSE).await;
                     if !wanted() {
                         return Err(error);
@@ -128,8 +129,8 @@ impl ActionClient {
                 }
                 ended => return ended.map(|fate| fate.outcome),
             }
+            tries += 1;
         }
-        self.listen(endpoint, question, on_said).await.map(|fate| fate.outcome)
     }
 
     /// Waits for the end of a goal that was given before, by this client or by an earlier one. Never begins the goal.
@@ -205,7 +206,7 @@ impl ActionClient {
             }
         };
         let answer = if alone {
-            self.execute_alone(endpoint, question, heard).await
+            Box::pin(self.execute_alone(endpoint, question, heard)).await
         } else {
             let mut client = self.client(endpoint)?;
             let open = |questions| async move { client.perform(questions).await };
@@ -213,7 +214,7 @@ impl ActionClient {
             match stream.call_with_progress(open, Asked::Execute(question.clone()), &mut heard).await {
                 // Its author has implemented only what is needed for one goal.
                 Err(status) if status.code() == Code::Unimplemented => {
-                    self.execute_alone(endpoint, question, heard).await
+                    Box::pin(self.execute_alone(endpoint, question, heard)).await
                 }
                 answer => answer,
             }

@@ -340,8 +340,12 @@ impl WorldClient {
                 answer => return answer.map_err(|status| self.failed(&status)),
             }
         }
+        Box::pin(self.ask_alone(call)).await.map_err(|status| self.failed(&status))
+    }
+
+    async fn ask_alone(&self, call: Asked) -> Result<Answered, Status> {
         let mut client = self.client.clone();
-        let answer = match call {
+        match call {
             Asked::Commit(commit) => client.commit(commit).await.map(|answer| Answered::Commit(answer.into_inner())),
             Asked::Project(project) => {
                 client.project(project).await.map(|answer| Answered::Project(answer.into_inner()))
@@ -349,8 +353,7 @@ impl WorldClient {
             Asked::Release(release) => {
                 client.release(release).await.map(|answer| Answered::Release(answer.into_inner()))
             }
-        };
-        answer.map_err(|status| self.failed(&status))
+        }
     }
 
     /// A message that is too large would end the stream, and every other call on it.

@@ -10,15 +10,16 @@ use super::rates::Rates;
 use super::{ConnectionLimits, Origin, OutOfConnections, Peer};
 use crate::gate::{Gate, Identity};
 use crate::panic::exit_on_panic;
+use crate::unix_stream::UnixStream;
 use std::collections::VecDeque;
 use std::future::Future;
-use std::io;
+use std::io::{self, Read, Write};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
+use tokio::net::{TcpListener, TcpStream, UnixListener};
 use tokio::sync::mpsc;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
@@ -208,13 +209,13 @@ impl Listen for UnixListener {
     }
 
     async fn accept(&self) -> io::Result<UnixStream> {
-        UnixListener::accept(self).await.map(|(stream, _)| stream)
+        UnixListener::accept(self).await.and_then(|(stream, _)| UnixStream::of(stream))
     }
 
     fn identity(stream: &UnixStream) -> Identity {
-        match stream.peer_cred() {
-            Ok(peer) => Identity::User { uid: peer.uid(), pid: peer.pid() },
-            Err(_) => Identity::Anonymous,
+        match stream.peer().peer_cred {
+            Some(peer) => Identity::User { uid: peer.uid(), pid: peer.pid() },
+            None => Identity::Anonymous,
         }
     }
 
@@ -254,19 +255,19 @@ impl Goodbye for UnixStream {
     type Detached = std::os::unix::net::UnixStream;
 
     fn detach(self) -> io::Result<Self::Detached> {
-        self.into_std()
+        Ok(self.into_std())
     }
 
     fn attach(detached: Self::Detached) -> io::Result<Self> {
-        UnixStream::from_std(detached)
+        UnixStream::of(tokio::net::UnixStream::from_std(detached)?)
     }
 
     fn try_read(&self, buffer: &mut [u8]) -> io::Result<usize> {
-        UnixStream::try_read(self, buffer)
+        self.socket().read(buffer)
     }
 
     fn try_write(&self, bytes: &[u8]) -> io::Result<usize> {
-        UnixStream::try_write(self, bytes)
+        self.socket().write(bytes)
     }
 }
 
