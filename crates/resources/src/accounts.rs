@@ -619,6 +619,26 @@ mod tests {
     }
 
     #[test]
+    fn a_caller_that_turns_out_to_be_an_operator_has_no_bound_from_then_on() {
+        let (mut accounts, caller) = (Accounts::default(), Arc::from("root"));
+        let sessions = ["a", "b"].map(SessionId::from);
+        let each = |accounts: &mut Accounts, seconds, bound, act: &dyn Fn(&mut Accounts, &Within<'_>)| {
+            for session in &sessions {
+                let within =
+                    Within { session, family: "Arm", share: Share::ONE, caller: &caller, bound, now: at(seconds) };
+                act(accounts, &within);
+            }
+            accounts.families.get("Arm").map(|family| family.callers.get("root").map(|of| (of.shares, of.beyond)))
+        };
+        let waits = |accounts: &mut Accounts, within: &Within<'_>| accounts.waits(within, own(1));
+        let beyond = Beyond { shares: 2_000, bound: 1_000 };
+        assert_eq!(each(&mut accounts, 0, Some(1_000), &waits), Some(Some((2_000, beyond))));
+        let says_again = |accounts: &mut Accounts, within: &Within<'_>| accounts.has_share(within);
+        assert_eq!(each(&mut accounts, 1, None, &says_again), Some(None));
+        assert!(accounts.families["Arm"].accounts.values().all(|account| !account.beyond.is_some()));
+    }
+
+    #[test]
     fn another_share_counts_from_when_it_is_said() {
         let mut bench = Bench::new([1.0, 1.0, 1.0]);
         bench.when(0, 1, |accounts, within| accounts.waits(within, own(1)));

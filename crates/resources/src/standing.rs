@@ -208,9 +208,9 @@ impl Pool {
 
     /// Whose a session is, and the bound on the shares of all of that caller's sessions, in thousandths; operators have none.
     fn bound_of(&self, session: &SessionId) -> (Arc<str>, Option<u64>) {
-        let known = self.sessions.get(session).filter(|known| !known.is_operators());
+        let Some(known) = self.sessions.get(session) else { return Default::default() };
         let bound = u64::from(self.limits.share_per_caller) * Share::ONE.thousandths();
-        known.map_or_else(Default::default, |known| (known.opened_by.clone(), Some(bound)))
+        (known.opened_by.clone(), (!known.is_operators()).then_some(bound))
     }
 
     /// The accounts of those who hold something, from now on. Nobody waits.
