@@ -14,8 +14,7 @@ use tokio::sync::watch;
 /// Makes the log safe. Ends its thread when it is dropped.
 #[derive(Debug)]
 pub(super) struct Syncer {
-    /// `None` where there is no disk.
-    wanted: Option<Sender<u64>>,
+    asks: Asks,
     /// Through which mark it is safe. Closed when no more will be.
     safe: watch::Receiver<u64>,
     /// Why no more will be.
@@ -32,6 +31,17 @@ pub(super) struct Mark {
     safe: watch::Receiver<u64>,
 }
 
+/// Who is asked to make the log safe.
+#[derive(Debug)]
+enum Asks {
+    /// The thread.
+    Thread(Sender<u64>),
+    /// Nobody: it is on no disk, and what is written is as safe as it will be.
+    Nobody(watch::Sender<u64>),
+    /// Nobody any more: it could not be written.
+    GivenUp,
+}
+
 /// What the thread tells.
 #[derive(Debug)]
 struct Tell {
@@ -45,38 +55,48 @@ impl Syncer {
     /// # Errors
     /// Where the thread cannot be started.
     pub(super) fn start(file: Option<File>) -> io::Result<Syncer> {
-        let Some(file) = file else { return Ok(Syncer::telling().0) };
-        Syncer::of(move || file.sync_data())
+        match file {
+            Some(file) => Syncer::of(move || file.sync_data()),
+            None => {
+                let (told, safe) = watch::channel(0);
+                Ok(Syncer { asks: Asks::Nobody(told), safe, failure: watch::channel(None).1, last: 0, asked: 0 })
+            }
+        }
     }
 
     fn of(sync: impl Fn() -> io::Result<()> + Send + 'static) -> io::Result<Syncer> {
-        let ((mut syncer, tell), (wanted, marks)) = (Syncer::telling(), channel());
+        let ((tell_safe, told), (tell_failure, failure)) = (watch::channel(0), watch::channel(None));
+        let (wanted, marks) = channel();
+        let tell = Tell { safe: tell_safe, failure: tell_failure };
         std::thread::Builder::new().name("event-log".to_owned()).spawn(move || work(&marks, &tell, sync))?;
         let (pass_on, safe) = watch::channel(0);
-        let told = std::mem::replace(&mut syncer.safe, safe);
         tokio::spawn(exit_on_panic("what passes on what is safe on the disk", pass(told, pass_on)));
-        Ok(Syncer { wanted: Some(wanted), ..syncer })
-    }
-
-    fn telling() -> (Syncer, Tell) {
-        let ((safe, is_safe), (failure, has_failed)) = (watch::channel(0), watch::channel(None));
-        let syncer = Syncer { wanted: None, safe: is_safe, failure: has_failed, last: 0, asked: 0 };
-        (syncer, Tell { safe, failure })
+        Ok(Syncer { asks: Asks::Thread(wanted), safe, failure, last: 0, asked: 0 })
     }
 
     /// Everything that is noted so far, which is to be made safe once it is written ([`Syncer::written`]).
     pub(super) fn mark(&mut self) -> Mark {
-        self.last += u64::from(self.wanted.is_some());
+        self.last += 1;
         self.marked()
     }
 
     /// Everything that was marked is written: it is made safe as soon as possible.
     pub(super) fn written(&mut self) {
-        if let Some(wanted) = self.wanted.as_ref().filter(|_| self.asked < self.last) {
-            self.asked = self.last;
-            // Where the thread is gone it has said why.
-            let _ = wanted.send(self.last);
+        if self.asked == self.last {
+            return;
         }
+        self.asked = self.last;
+        match &self.asks {
+            // Where the thread is gone it has said why.
+            Asks::Thread(wanted) => drop(wanted.send(self.last)),
+            Asks::Nobody(safe) => drop(safe.send_replace(self.last)),
+            Asks::GivenUp => {}
+        }
+    }
+
+    /// What is noted cannot be written: it is never safe, nor is anything behind it.
+    pub(super) fn give_up(&mut self) {
+        self.asks = Asks::GivenUp;
     }
 
     /// Everything that was marked so far.
@@ -184,6 +204,21 @@ mod tests {
         assert_eq!(&*syncer.failed().await, "the disk is gone");
         assert!(first.safe().await, "what was safe stays so");
         assert!(!syncer.marked_and_written().safe().await);
+    }
+
+    #[tokio::test]
+    async fn nothing_is_safe_that_could_not_be_written() {
+        for is_on_disk in [true, false] {
+            let syncer = if is_on_disk { Syncer::of(|| Ok(())) } else { Syncer::start(None) };
+            let mut syncer = syncer.expect("a thread");
+            let first = syncer.marked_and_written();
+            assert!(first.clone().safe().await);
+            let noted = syncer.mark();
+            syncer.give_up();
+            syncer.written();
+            assert!(!noted.safe().await && !syncer.marked().safe().await && !syncer.marked_and_written().safe().await);
+            assert!(first.safe().await, "what was safe stays so");
+        }
     }
 
     #[tokio::test]

@@ -46,6 +46,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use tokio::runtime::{Handle, RuntimeFlavor};
 use tokio::sync::{mpsc, oneshot};
 
 /// Answers that the executive has not been given yet.
@@ -53,6 +54,12 @@ pub(super) const MAX_PENDING_EVENTS: usize = 1024;
 
 /// So many events are handled before what they lead to leaves, at the most.
 const MOST_AT_ONCE: u32 = 16;
+
+/// The same in this runtime: where tasks have other threads, what is performed leaves at once.
+fn most_at_once() -> u32 {
+    let is_one_thread = Handle::current().runtime_flavor() == RuntimeFlavor::CurrentThread;
+    if is_one_thread { MOST_AT_ONCE } else { 0 }
+}
 
 /// How often a run says what it waits for, at the most.
 const LOOK: Duration = Duration::from_secs(5);
@@ -405,7 +412,8 @@ impl Shell {
     /// for that.
     fn hand_over(&mut self) -> anyhow::Result<()> {
         self.at_once = 0;
-        self.log.write()?;
+        // Nothing may then be done that waits for what was noted.
+        self.log.write().inspect_err(|_| self.syncer.give_up())?;
         self.syncer.written();
         if !self.lines.is_empty() {
             self.messages.say(&self.lines);
@@ -601,7 +609,7 @@ impl Shell {
     /// The next event that the executive has to know of.
     async fn next(&mut self, interrupt: &Interrupt, asked: &mut Asks) -> anyhow::Result<Event> {
         loop {
-            if self.at_once < MOST_AT_ONCE
+            if self.at_once < most_at_once()
                 && let Ok(answer) = self.answers.try_recv()
             {
                 self.at_once += 1;

@@ -77,6 +77,18 @@ async fn a_task_ends_at_its_deadline_although_nobody_answers() -> anyhow::Result
 }
 
 #[tokio::test]
+async fn what_the_log_has_no_room_for_is_not_done() -> anyhow::Result<()> {
+    let mut bench = Bench::new(|_| {}).await?;
+    bench.run.log = "/dev/full".into();
+    let failed = run(bench.run.clone(), &bench.place, &Interrupt::new().1).await.expect_err("it has no log");
+    assert!(format!("{failed:#}").contains("No space left"), "{failed:#}");
+    let channels = ratn_worker::client::Channels::new(&bench.place.tls);
+    let world = ratn_worker::client::WorldClient::new(&channels, &bench.place.endpoints.world_pool)?;
+    assert!(world.root().await?.1.is_empty(), "its initial world was written all the same");
+    Ok(())
+}
+
+#[tokio::test]
 async fn a_run_is_told_to_end_over_its_socket() -> anyhow::Result<()> {
     use crate::control::{Word, tell};
     let bench = Bench::new(|_| {}).await?;
