@@ -70,7 +70,7 @@ use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use results::Results;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use waits::{Timer, Wait, Waits};
 
 /// How a run ended.
@@ -107,6 +107,9 @@ pub(crate) struct Window {
     /// The root has changed or a signal has come since the waits under way were looked at.
     #[serde(skip)]
     may_end_waits: bool,
+    /// What these assign is otherwise since the event came.
+    #[serde(skip)]
+    assigned_again: BTreeSet<InstanceId>,
     /// So many commands of the event have been looked through for commits.
     #[serde(skip)]
     followed: usize,
@@ -135,6 +138,7 @@ impl Window {
             end: None,
             is_ending: false,
             may_end_waits: false,
+            assigned_again: BTreeSet::new(),
             followed: 0,
         }
     }
