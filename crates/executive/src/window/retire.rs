@@ -88,10 +88,16 @@ impl Window {
             self.wait(id, Wait::Data(beside));
             return false;
         }
-        let (role, line, position) = (instance.role(), instance.line, instance.position);
-        if self.goes_in_circles(context, id) {
-            return true;
+        if !self.goes_in_circles(context, id) {
+            self.retire_now(context, id);
         }
+        true
+    }
+
+    /// The oldest instance of a line becomes real.
+    pub(super) fn retire_now(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.graph.get(id) else { return };
+        let (role, line, position) = (instance.role(), instance.line, instance.position);
         let real = self.make_real(context, id);
         let news = self.news_of_real(context, id, &real);
         self.correct(context, id, &real);
@@ -110,7 +116,6 @@ impl Window {
         // Nothing younger may become real that was made of what came out otherwise.
         self.tell_news(context, id, &news);
         self.revise(context);
-        true
     }
 
     /// Whether a line has gone on for too long without an action; then the run has ended.
