@@ -344,7 +344,7 @@ fn most_urgent_first(commands: Vec<Command>) -> Vec<Command> {
     let mut needed = needed.into_iter();
     let mut ordered = commands;
     ordered.retain(|_| needed.next().unwrap_or(true));
-    let removes = ordered.iter().any(is_removal);
+    let removes = ordered.iter().any(|command| removed(command).next().is_some());
     ordered.sort_by_key(|command| match command {
         Command::Release { .. } if removes => (1, Reverse(0)),
         Command::Operate { .. } if removes => (2, Reverse(0)),
@@ -356,10 +356,13 @@ fn most_urgent_first(commands: Vec<Command>) -> Vec<Command> {
     ordered
 }
 
-fn is_removal(command: &Command) -> bool {
-    let Command::Operate { operations, .. } = command else { return false };
-    let removes = |one: &Requirement| matches!(one.operation, ResourceOperation::Delete | ResourceOperation::Consume);
-    operations.iter().any(removes)
+/// What a command deletes or uses up.
+pub(crate) fn removed(command: &Command) -> impl Iterator<Item = &Requirement> {
+    let operations = match command {
+        Command::Operate { operations, .. } => operations.as_slice(),
+        _ => &[],
+    };
+    operations.iter().filter(|one| matches!(one.operation, ResourceOperation::Delete | ResourceOperation::Consume))
 }
 
 fn commit_initial(context: &mut Context<'_>, parameters: &BTreeMap<String, Value>) -> Result<(), String> {

@@ -200,7 +200,9 @@ impl Window {
             | Event::SessionLost { .. }
             | Event::Resumed { .. } => {}
         }
-        self.go_on(context)
+        let end = self.go_on(context);
+        self.harvest_what_is_removed(context);
+        end
     }
 
     /// Looks, retires, revises and grows until nothing changes.
