@@ -263,13 +263,22 @@ impl Executive {
             signals: &mut self.signals,
             commands,
         };
+        // An event that comes when the run has been over its deadline comes after that.
+        let mut after = None;
         let end = match &mut self.state {
             State::Fresh | State::Ended => None,
-            State::Cdtn(window) => window.handle(&mut context, event),
+            State::Cdtn(window) => match window.before(&mut context, &event) {
+                None => window.handle(&mut context, event),
+                end => {
+                    after = Some(event);
+                    end
+                }
+            },
             State::Leaving(leaving) => leaving.handle(&mut context, event),
             State::Hsm(interpreter) if self.deadline.is_some_and(|deadline| deadline <= now) => {
                 let limit = program.deadline_s.unwrap_or_default();
                 let reason = format!("the task took longer than its deadline of {limit} s");
+                after = Some(event);
                 Some(cut_short(&mut context, interpreter, ABORTED, reason))
             }
             State::Hsm(interpreter) => match event {
@@ -292,9 +301,10 @@ impl Executive {
         };
         let end = match end {
             Some(end) if !end.way_out.is_empty() => match Leaving::begin(&mut context, end) {
-                Ok(leaving) => {
+                Ok(mut leaving) => {
+                    let end = after.and_then(|event| leaving.handle(&mut context, event));
                     self.state = State::Leaving(Box::new(leaving));
-                    None
+                    end
                 }
                 Err(end) => Some(*end),
             },

@@ -151,14 +151,20 @@ impl Window {
         self.go_on(context)
     }
 
-    /// Takes an event; the end of the run, when this was it.
-    pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Option<End> {
+    /// What is due happens, before an event is taken; the end of the run, when this was it: the event then comes after that.
+    pub(crate) fn before(&mut self, context: &mut Context<'_>, event: &Event) -> Option<End> {
         self.followed = 0;
+        self.assigned_again.clear();
         // An operator was told that his answer has come: the time that is up at this very moment does not throw it away.
-        if let Event::Answered { instance, choice } = &event {
+        if let Event::Answered { instance, choice } = event {
             self.answer(context, *instance, choice);
         }
         self.fire(context);
+        self.end.take()
+    }
+
+    /// Takes an event; the end of the run, when this was it.
+    pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Option<End> {
         match event {
             Event::Granted { .. } | Event::Refused { .. } | Event::Projected { .. } => self.answered(context, event),
             Event::Finished { .. } | Event::Crashed { .. } => self.attempt_ended(context, event),
