@@ -263,13 +263,22 @@ impl Executive {
             signals: &mut self.signals,
             commands,
         };
+        // An event that comes when the run has been over its deadline comes after that.
+        let mut after = None;
         let end = match &mut self.state {
             State::Fresh | State::Ended => None,
-            State::Cdtn(window) => window.handle(&mut context, event),
+            State::Cdtn(window) => match window.before(&mut context, &event) {
+                None => window.handle(&mut context, event),
+                end => {
+                    after = Some(event);
+                    end
+                }
+            },
             State::Leaving(leaving) => leaving.handle(&mut context, event),
             State::Hsm(interpreter) if self.deadline.is_some_and(|deadline| deadline <= now) => {
                 let limit = program.deadline_s.unwrap_or_default();
                 let reason = format!("the task took longer than its deadline of {limit} s");
+                after = Some(event);
                 Some(cut_short(&mut context, interpreter, ABORTED, reason))
             }
             State::Hsm(interpreter) => match event {
@@ -292,9 +301,10 @@ impl Executive {
         };
         let end = match end {
             Some(end) if !end.way_out.is_empty() => match Leaving::begin(&mut context, end) {
-                Ok(leaving) => {
+                Ok(mut leaving) => {
+                    let end = after.and_then(|event| leaving.handle(&mut context, event));
                     self.state = State::Leaving(Box::new(leaving));
-                    None
+                    end
                 }
                 Err(end) => Some(*end),
             },
@@ -344,7 +354,7 @@ fn most_urgent_first(commands: Vec<Command>) -> Vec<Command> {
     let mut needed = needed.into_iter();
     let mut ordered = commands;
     ordered.retain(|_| needed.next().unwrap_or(true));
-    let removes = ordered.iter().any(is_removal);
+    let removes = ordered.iter().any(|command| removed(command).next().is_some());
     ordered.sort_by_key(|command| match command {
         Command::Release { .. } if removes => (1, Reverse(0)),
         Command::Operate { .. } if removes => (2, Reverse(0)),
@@ -356,10 +366,13 @@ fn most_urgent_first(commands: Vec<Command>) -> Vec<Command> {
     ordered
 }
 
-fn is_removal(command: &Command) -> bool {
-    let Command::Operate { operations, .. } = command else { return false };
-    let removes = |one: &Requirement| matches!(one.operation, ResourceOperation::Delete | ResourceOperation::Consume);
-    operations.iter().any(removes)
+/// What a command deletes or uses up.
+pub(crate) fn removed(command: &Command) -> impl Iterator<Item = &Requirement> {
+    let operations = match command {
+        Command::Operate { operations, .. } => operations.as_slice(),
+        _ => &[],
+    };
+    operations.iter().filter(|one| matches!(one.operation, ResourceOperation::Delete | ResourceOperation::Consume))
 }
 
 fn commit_initial(context: &mut Context<'_>, parameters: &BTreeMap<String, Value>) -> Result<(), String> {

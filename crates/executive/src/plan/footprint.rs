@@ -124,6 +124,28 @@ pub(super) fn senses(subject: &Subject<'_>) -> Vec<FactExpr> {
     subject.contained.iter().flat_map(|state| state.annotations.senses()).cloned().collect()
 }
 
+/// The facts by which a node is exact. An action forgives what is tolerated, and so does one inside of a routine; what it assigns is made of the
+/// facts as they came out, and of a routine that is all that it does itself. What the node requires is looked at when it becomes real.
+pub(super) fn exact(subject: &Subject<'_>) -> Vec<FactExpr> {
+    let is_exact = |state: &State, slot: Slot<'_>| match slot {
+        Slot::Assign(_) => true,
+        Slot::Input(_) | Slot::Duration | Slot::Reads | Slot::Senses | Slot::Shared | Slot::Resource(..) => false,
+        Slot::Requires(_) => state.id != subject.state.id,
+        _ => subject.is_routine(),
+    };
+    let mut all: Vec<FactExpr> = Vec::new();
+    for state in &subject.contained {
+        for (_, expression) in state.expressions().into_iter().filter(|(slot, _)| is_exact(state, *slot)) {
+            all.extend(expression.fact_expressions().into_iter().cloned());
+        }
+    }
+    if subject.is_routine() {
+        let inside = Inside::of(subject);
+        all.iter_mut().for_each(|fact| inside.hide(fact));
+    }
+    all
+}
+
 /// The facts that the effects of a state look up, whatever its outcome.
 pub(super) fn effect_lookups(state: &State) -> Vec<FactExpr> {
     state.annotations.effects.values().flat_map(|effects| EffectExpr::fact_expressions(effects)).cloned().collect()

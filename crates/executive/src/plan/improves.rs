@@ -26,8 +26,11 @@ pub(super) fn of(program: &Program, plan: &Plan) -> BTreeMap<StateId, Box<[Strin
                 Use::Ahead => &mut kept,
             };
             expression.visit(&mut |part| {
-                if let Expr::Port { state, port } = part {
-                    ports.insert((*state, port));
+                match part {
+                    Expr::Port { state, port } => drop(ports.insert((*state, port))),
+                    // Its own, in what it assigns.
+                    Expr::Output(port) => drop(ports.insert((state.id, port))),
+                    _ => {}
                 }
             });
         }

@@ -107,6 +107,9 @@ pub(crate) struct StatePlan {
     pub(crate) reads: Option<Vec<FactExpr>>,
     /// The facts that it senses, with those of what it contains.
     pub(crate) senses: Vec<FactExpr>,
+    /// Of a node: the facts that its result says or is decided by, which it does not take as they were predicted where they came out otherwise,
+    /// be it within the tolerance.
+    pub(crate) exact: Vec<FactExpr>,
     /// The facts that its effects look up, whatever its outcome.
     pub(crate) effect_lookups: Vec<FactExpr>,
     /// The effects that it may have, with those of what it contains, if it does not end by a failure that nothing handles. `None`:
@@ -246,6 +249,7 @@ impl StatePlan {
             operated: resources.operated,
             reads: footprint::reads(subject, &resources.requirements),
             senses: footprint::senses(subject),
+            exact: footprint::exact(subject),
             effect_lookups: footprint::effect_lookups(state),
             may_write,
             awaited,

@@ -2,7 +2,7 @@
 
 use super::Window;
 use super::graph::Pruned;
-use super::graph::instance::{Role, Status};
+use super::graph::instance::{Instance, Node, Role, Status};
 use super::growth::environment::{Binding, Environment, assigned};
 use super::memory::Sight;
 use crate::binding::Outputs;
@@ -77,8 +77,30 @@ impl Window {
         self.memory.unmark(id);
     }
 
-    /// Discards everything that is in the window: the run ends.
+    /// The run ends where it is: what motions have done is real, and everything else in the window is discarded.
     pub(super) fn stop(&mut self, context: &mut Context<'_>, outcome: &str, reason: String) {
+        self.make_done_real(context);
+        self.discard_all(context, outcome, reason);
+    }
+
+    /// Motions that have ended, and could not become real before older ones beside them did, do so; their lines go on behind them.
+    fn make_done_real(&mut self, context: &mut Context<'_>) {
+        let program = context.program;
+        let is_done = |head: &&Instance| {
+            let has_acted = |node: &Node| node.has_acted && matches!(node.status, Status::Finished(_));
+            head.is_pia() && !program.state(head.state).is_pause() && head.node().is_some_and(has_acted)
+        };
+        let mut any = false;
+        while let Some(id) = self.graph.active_heads().filter(is_done).map(|head| head.id).min() {
+            self.retire_now(context, id);
+            any = true;
+        }
+        if any {
+            self.grow(context);
+        }
+    }
+
+    fn discard_all(&mut self, context: &mut Context<'_>, outcome: &str, reason: String) {
         self.is_ending = true;
         let all: Vec<InstanceId> = self.graph.iter().map(|instance| instance.id).collect();
         for id in all.into_iter().rev() {
@@ -91,8 +113,9 @@ impl Window {
 
     /// The same, and what is to be done on the way out of the states in which it is.
     pub(super) fn cut_short(&mut self, context: &mut Context<'_>, outcome: &str, reason: String) {
+        self.make_done_real(context);
         let way_out = self.way_out(context);
-        self.stop(context, outcome, reason);
+        self.discard_all(context, outcome, reason);
         if let Some(end) = &mut self.end {
             end.way_out = way_out;
         }

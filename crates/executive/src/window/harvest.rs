@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! goal ── first result ── better ── better ──┬─ a motion begins that uses it        ┐
-//!           │ finished: whoever             ├─ somebody wants what it holds         ├─ harvested: the best counts, what it
+//!           │ finished: whoever             ├─ what it holds is wanted, or deleted  ├─ harvested: the best counts, what it
 //!           ▼ computes with it goes on      ├─ it is discarded, or made again       │  held is given back
 //!                                           ├─ a motion begins that it would see     │
 //!                                           └─ its provider has no better one       ┘
@@ -16,10 +16,12 @@ use super::improving::Improvement;
 use super::waits::Timer;
 use crate::binding::{self, Outputs};
 use crate::context::Context;
+use crate::executive::removed;
 use crate::protocol::Command;
 use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{SUCCESS, StateKind};
+use std::collections::BTreeSet;
 
 /// So long somebody waits for what is held only to improve a result, where it was not known that there is too little for both, in seconds.
 const PATIENCE_S: f64 = 0.1;
@@ -126,6 +128,21 @@ impl Window {
         }
         let writes = self.writes(context, instance);
         looking.filter(|(_, improvement)| improvement.senses.overlaps(&writes)).map(|(id, _)| id).collect()
+    }
+
+    /// What is deleted or used up now nobody holds any more only to improve a result.
+    pub(super) fn harvest_what_is_removed(&mut self, context: &mut Context<'_>) {
+        if self.improving.is_empty() {
+            return;
+        }
+        let removed: BTreeSet<String> = context.commands.iter().flat_map(removed).map(|one| one.kind.clone()).collect();
+        let holds = |improvement: &Improvement| {
+            let held = &context.plan.state(improvement.state).requirements;
+            held.iter().any(|held| removed.contains(&held.kind))
+        };
+        let holders = self.improving.iter().filter(|(_, improvement)| holds(improvement));
+        let holders: Vec<InstanceId> = holders.map(|(id, _)| id).collect();
+        holders.into_iter().for_each(|id| self.harvest(context, id));
     }
 
     /// The run is over.

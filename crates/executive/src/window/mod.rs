@@ -70,7 +70,7 @@ use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use results::Results;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use waits::{Timer, Wait, Waits};
 
 /// How a run ended.
@@ -107,6 +107,9 @@ pub(crate) struct Window {
     /// The root has changed or a signal has come since the waits under way were looked at.
     #[serde(skip)]
     may_end_waits: bool,
+    /// What these assign is otherwise since the event came.
+    #[serde(skip)]
+    assigned_again: BTreeSet<InstanceId>,
     /// So many commands of the event have been looked through for commits.
     #[serde(skip)]
     followed: usize,
@@ -135,6 +138,7 @@ impl Window {
             end: None,
             is_ending: false,
             may_end_waits: false,
+            assigned_again: BTreeSet::new(),
             followed: 0,
         }
     }
@@ -147,14 +151,20 @@ impl Window {
         self.go_on(context)
     }
 
-    /// Takes an event; the end of the run, when this was it.
-    pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Option<End> {
+    /// What is due happens, before an event is taken; the end of the run, when this was it: the event then comes after that.
+    pub(crate) fn before(&mut self, context: &mut Context<'_>, event: &Event) -> Option<End> {
         self.followed = 0;
+        self.assigned_again.clear();
         // An operator was told that his answer has come: the time that is up at this very moment does not throw it away.
-        if let Event::Answered { instance, choice } = &event {
+        if let Event::Answered { instance, choice } = event {
             self.answer(context, *instance, choice);
         }
         self.fire(context);
+        self.end.take()
+    }
+
+    /// Takes an event; the end of the run, when this was it.
+    pub(crate) fn handle(&mut self, context: &mut Context<'_>, event: Event) -> Option<End> {
         match event {
             Event::Granted { .. } | Event::Refused { .. } | Event::Projected { .. } => self.answered(context, event),
             Event::Finished { .. } | Event::Crashed { .. } => self.attempt_ended(context, event),
@@ -196,7 +206,9 @@ impl Window {
             | Event::SessionLost { .. }
             | Event::Resumed { .. } => {}
         }
-        self.go_on(context)
+        let end = self.go_on(context);
+        self.harvest_what_is_removed(context);
+        end
     }
 
     /// Looks, retires, revises and grows until nothing changes.

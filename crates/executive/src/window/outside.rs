@@ -8,7 +8,7 @@
 use super::Window;
 use super::decide::names_of;
 use super::graph::instance::{Instance, Role};
-use super::memory::facts_of;
+use super::memory::{Looked, facts_of};
 use crate::context::Context;
 use ratn_model::expression::Expr;
 use ratn_model::fact::{FactKey, FactPattern, Footprint};
@@ -38,11 +38,14 @@ impl Window {
         for id in &all {
             // What it changes may be made of these facts.
             self.memory.mark(*id);
-            // Actions forgive what is tolerated; the window's own computations are exact.
-            let forgives = self.graph.get(*id).is_some_and(|instance| instance.role().is_none());
-            let patterns = if forgives { &news.otherwise } else { &news.changed };
-            if let Some(pattern) = self.has_seen(context, *id, patterns) {
-                self.invalidate(context, *id, format!("{pattern} was changed from outside"));
+            let Some(instance) = self.graph.get(*id) else { continue };
+            let exact = self.exact(context, instance);
+            let is_exact = |pattern: &&FactPattern| Looked::at(&exact).overlaps(pattern);
+            let otherwise = self.has_seen(context, *id, news.otherwise.iter());
+            let seen = otherwise.map(|pattern| (pattern, false));
+            let tolerated = || Some((self.has_seen(context, *id, news.changed.iter().filter(is_exact))?, true));
+            if let Some((pattern, is_tolerated)) = seen.or_else(tolerated) {
+                self.came_otherwise(context, *id, is_tolerated, format!("{pattern} was changed from outside"));
             }
         }
         self.revise(context);
@@ -60,10 +63,10 @@ impl Window {
         &self,
         context: &Context<'_>,
         id: InstanceId,
-        patterns: &'p [FactPattern],
+        patterns: impl Iterator<Item = &'p FactPattern>,
     ) -> Option<&'p FactPattern> {
         let seen = self.graph.get(id)?.seen()?;
-        let mut looked_at = patterns.iter().filter(|pattern| seen.overlaps(pattern));
+        let mut looked_at = patterns.filter(|pattern| seen.overlaps(pattern));
         looked_at.find(|pattern| {
             let pattern = std::slice::from_ref(*pattern);
             self.look(context, id, None, |_, view| view.is_visible(InstanceId(0), pattern)).unwrap_or(false)
@@ -86,7 +89,8 @@ impl Window {
             return false;
         }
         let decides = self.look(context, id, None, |instance, view| {
-            let made_again = |id: InstanceId| self.graph.get(id).is_some_and(|producer| producer.ended().is_none());
+            let is_open = |id: InstanceId| self.graph.get(id).is_some_and(|producer| producer.ended().is_none());
+            let made_again = |id: InstanceId| is_open(id) || self.assigned_again.contains(&id);
             if view.sight.producers_of(view.instance).any(made_again) {
                 return true;
             }

@@ -7,8 +7,8 @@ use super::memory::{Blocked, Looked, Seen, Sight, View, facts_of};
 use super::waits::Wait;
 use crate::binding::{self, BindError, Outputs};
 use crate::context::Context;
-use crate::plan::{MAX_OUTCOMES, NodeNature, WAITS};
-use ratn_model::expression::FactExpr;
+use crate::plan::{Effects, MAX_OUTCOMES, NodeNature, WAITS};
+use ratn_model::expression::{EffectExpr, FactExpr};
 use ratn_model::fact::Footprint;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::StateKind;
@@ -157,11 +157,32 @@ impl Window {
         if self.graph.detached().is_empty() || context.program.state(instance.state).is_pause() {
             return None;
         }
-        let mine = self.touches(context, instance);
+        let own = context.plan.state(instance.state);
+        let mut mine = self.touches(context, instance);
+        if own.imprecise && instance.is_pia() && instance.ended().is_none() {
+            // It retires as soon as it ends, whatever its outcome.
+            let writes = self.look(context, instance.id, None, |_, view| {
+                let declared = own.effects.iter().filter_map(|effects| match effects {
+                    Effects::Declared(declared) => Some(EffectExpr::footprint(declared, view)),
+                    Effects::Unknown => None,
+                });
+                declared.fold(Footprint::NOTHING, Footprint::union)
+            });
+            mine.writes = mine.writes.union(writes.unwrap_or(Footprint::NOTHING));
+        }
+        // What it deletes or uses up at its end may be held beside it.
+        let operates = matches!(instance.role(), None | Some(Role::Exit));
+        let uses = |other: &Instance| {
+            let kinds = &context.plan.state(other.state).kinds;
+            operates && own.operated.iter().any(|kind| kinds.contains(kind))
+        };
         self.graph.detached().iter().copied().filter(|id| *id < instance.id).find(|id| {
             let Some(other) = self.graph.get(*id) else { return false };
             let its = self.touches(context, other);
-            its.writes.overlaps(&mine.reads) || its.writes.overlaps(&mine.writes) || its.reads.overlaps(&mine.writes)
+            its.writes.overlaps(&mine.reads)
+                || its.writes.overlaps(&mine.writes)
+                || its.reads.overlaps(&mine.writes)
+                || uses(other)
         })
     }
 

@@ -32,6 +32,13 @@ struct Real {
     before: BTreeMap<FactKey, Option<Value>>,
 }
 
+impl Real {
+    /// Whether a result came to nothing when it was to become real.
+    fn is_other_than(&self, ended: &Ended) -> bool {
+        (&self.outcome, &self.reason) != (&ended.outcome, &ended.reason)
+    }
+}
+
 /// What the users of an instance that becomes real are to be told.
 struct News {
     users: SmallVec<[User; 2]>,
@@ -88,10 +95,16 @@ impl Window {
             self.wait(id, Wait::Data(beside));
             return false;
         }
-        let (role, line, position) = (instance.role(), instance.line, instance.position);
-        if self.goes_in_circles(context, id) {
-            return true;
+        if !self.goes_in_circles(context, id) {
+            self.retire_now(context, id);
         }
+        true
+    }
+
+    /// The oldest instance of a line becomes real.
+    pub(super) fn retire_now(&mut self, context: &mut Context<'_>, id: InstanceId) {
+        let Some(instance) = self.graph.get(id) else { return };
+        let (role, line, position) = (instance.role(), instance.line, instance.position);
         let real = self.make_real(context, id);
         let news = self.news_of_real(context, id, &real);
         self.correct(context, id, &real);
@@ -110,7 +123,6 @@ impl Window {
         // Nothing younger may become real that was made of what came out otherwise.
         self.tell_news(context, id, &news);
         self.revise(context);
-        true
     }
 
     /// Whether a line has gone on for too long without an action; then the run has ended.
@@ -267,10 +279,7 @@ impl Window {
         let own = context.plan.state(instance.state);
         // What began on a projection had its preconditions checked there, if at all; now the actual world decides.
         let checks = match instance.role() {
-            None => {
-                instance.node().is_some_and(|node| node.nature != NodeNature::Irreversible)
-                    && gives_outputs(&ended.outcome)
-            }
+            None => instance.node().is_some_and(|node| node.nature != NodeNature::Irreversible),
             Some(Role::Entry) => ended.outcome.as_ref() == SUCCESS,
             Some(_) => false,
         };
@@ -337,7 +346,7 @@ impl Window {
                 self.sight(context).compare_with_actual(instance, &real.changes, self.tolerance_of(context), before);
         }
         // A failure that was not computed ahead has no outputs.
-        news.is_open = instance.ended().is_none_or(|ended| ended.outcome != real.outcome);
+        news.is_open = instance.ended().is_none_or(|ended| real.is_other_than(ended));
         news
     }
 
@@ -345,7 +354,7 @@ impl Window {
     /// were.
     fn correct(&mut self, context: &Context<'_>, id: InstanceId, real: &Real) {
         let Some(ended) = self.graph.get(id).and_then(Instance::ended) else { return };
-        if ended.outcome == real.outcome {
+        if !real.is_other_than(ended) {
             return;
         }
         let outputs = self.unassigned(context, id);

@@ -4,10 +4,14 @@
 //! to it, and without recursion. PIAs are never made again: they begin when everything older is real.
 
 use super::graph::instance::{Instance, Role};
-use super::memory::{Deviation, Difference, Purpose, Source, User};
-use super::{Wait, Window};
+use super::growth::environment::ASSIGNED;
+use super::memory::{Deviation, Difference, Looked, Purpose, Source, User};
+use super::{Wait, Window, ready};
 use crate::context::Context;
+use crate::plan::{NodeNature, gives_outputs};
 use crate::protocol::Note;
+use ratn_model::expression::FactExpr;
+use ratn_model::fact::Footprint;
 use ratn_model::id::InstanceId;
 use smallvec::SmallVec;
 
@@ -66,7 +70,7 @@ impl Window {
                 }
                 (Source::World, Purpose::Result) if !difference.is_empty() => {
                     if let Some(deviation) = self.concerns(context, user.id, id, difference) {
-                        self.invalidate(context, user.id, deviation.sentence());
+                        self.came_otherwise(context, user.id, deviation.is_tolerated, deviation.sentence());
                     }
                 }
                 _ => {}
@@ -84,13 +88,75 @@ impl Window {
     ) -> Option<&'d Deviation> {
         let instance = self.graph.get(reader)?;
         let seen = instance.seen()?;
-        // What is tolerated is forgiven by actions, which take their time; the window's own computations are exact.
-        let forgives = instance.role().is_none();
-        let mut looked_at = difference.that_count(forgives).filter(|deviation| seen.overlaps(&deviation.pattern));
-        looked_at.find(|deviation| {
+        let is_seen = |deviation: &&'d Deviation| {
             let pattern = std::slice::from_ref(&deviation.pattern);
-            self.look(context, reader, None, |_, view| view.is_visible(writer, pattern)).unwrap_or(false)
+            seen.overlaps(&deviation.pattern)
+                && self.look(context, reader, None, |_, view| view.is_visible(writer, pattern)).unwrap_or(false)
+        };
+        difference.that_are(false).find(is_seen).or_else(|| {
+            let mut tolerated = difference.that_are(true).peekable();
+            tolerated.peek()?;
+            let exact = self.exact(context, instance);
+            tolerated.find(|deviation| Looked::at(&exact).overlaps(&deviation.pattern) && is_seen(deviation))
         })
+    }
+
+    /// The facts of which an instance does not forgive what is tolerated. Actions do, which take their time; the window's own computations
+    /// are exact.
+    pub(super) fn exact(&self, context: &Context<'_>, instance: &Instance) -> Footprint {
+        if instance.role().is_some() {
+            return Footprint::Everything;
+        }
+        let exact = &context.plan.state(instance.state).exact;
+        let exact = self.look(context, instance.id, None, |_, view| FactExpr::footprint(exact, view));
+        exact.unwrap_or(Footprint::Everything)
+    }
+
+    /// A fact came out otherwise than an instance has taken it to be.
+    pub(super) fn came_otherwise(
+        &mut self,
+        context: &mut Context<'_>,
+        id: InstanceId,
+        is_tolerated: bool,
+        reason: String,
+    ) {
+        let Some(instance) = self.graph.get(id) else { return };
+        let is_forgiven =
+            match (is_tolerated && instance.role().is_none(), context.plan.state(instance.state).is_routine) {
+                (false, _) => false,
+                // Of an action only what it assigns is made of what is tolerated.
+                (true, false) => self.assign_again(context, id),
+                (true, true) => self.sees_the_same(context, instance),
+            };
+        if !is_forgiven {
+            self.invalidate(context, id, reason);
+        }
+    }
+
+    /// Whether a node has seen the facts as they are now: it was made of them since they came out otherwise.
+    fn sees_the_same(&self, context: &Context<'_>, instance: &Instance) -> bool {
+        let now =
+            self.look(context, instance.id, None, |_, view| ready::look(context, view, NodeNature::Computes).ok());
+        now.flatten().is_some_and(|now| instance.seen().is_some_and(|seen| seen.saw_the_same(&now)))
+    }
+
+    /// An action assigns anew, by the facts as they are now, of the result that it has, if it has one; whether that could be done.
+    fn assign_again(&mut self, context: &mut Context<'_>, id: InstanceId) -> bool {
+        let Some(instance) = self.graph.get(id) else { return true };
+        let Some(ended) = instance.ended() else { return true };
+        let mut again = ended.clone();
+        again.outputs.retain(|port, _| !port.starts_with(ASSIGNED));
+        // It may have failed in what it was to assign.
+        if !gives_outputs(&ended.outcome) || self.assign(context, id, &mut again).is_err() {
+            return false;
+        }
+        if again.outputs != ended.outputs {
+            let users = instance.memory.users();
+            self.graph.end(id, again);
+            self.assigned_again.insert(id);
+            self.tell(context, id, &users, &Difference::default(), true, false);
+        }
+        true
     }
 
     /// A result, or what is to become one, is made again.

@@ -29,7 +29,7 @@
 //! [crashes]
 //! plan = 2                                # so many attempts
 //! [[events]]
-//! event = "pause"                         # pause, resume, step, abort
+//! event = "pause"                         # pause, resume, step, abort, "abort at once", "not recorded"
 //! at = 3.0                                # seconds; or starts = "path", ends = "path"
 //! [[events]]
 //! event = "world"                         # somebody else changes the world
@@ -50,7 +50,7 @@
 //! ```
 
 use super::fact;
-use ratn_executive::protocol::{Event, Goal, LogEntry};
+use ratn_executive::protocol::{Event, Goal, LogEntry, Unmade};
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, Revision};
 use ratn_model::pose::Pose;
@@ -202,6 +202,12 @@ impl Outside {
             "step" => Event::StepRequested,
             "break" => Event::BreakpointsSet { states: self.states.clone() },
             "abort" => Event::AbortRequested { reason: "the user wants it so".to_owned(), at_once: false },
+            "abort at once" => Event::AbortRequested { reason: "its session is lost".to_owned(), at_once: true },
+            "not recorded" => Event::RetirementFailed {
+                instance: InstanceId(1),
+                reason: "the world pool is gone".to_owned(),
+                unmade: Unmade::Untried,
+            },
             "world" => {
                 let set = self.facts.iter().map(|(key, v)| (fact(key), Some(value(v))));
                 let facts = set.chain(self.gone.iter().map(|key| (fact(key), None))).collect();
@@ -223,7 +229,7 @@ impl Outside {
                 let instance = holders.find(|instance| paths[instance] == path).unwrap();
                 Event::Crashed { instance, attempt: 1, reason: "its lease was lost".to_owned(), unknown: false }
             }
-            other => panic!("event: pause, resume, step, break, abort, world, signal or lease_lost, not {other}"),
+            other => panic!("event: one of those above, not {other}"),
         }
     }
 }

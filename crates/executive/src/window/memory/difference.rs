@@ -28,19 +28,19 @@ impl Difference {
         self.deviations.is_empty()
     }
 
-    /// The deviations that count for whoever forgives what is tolerated, or does not.
-    pub(crate) fn that_count(&self, forgives: bool) -> impl Iterator<Item = &Deviation> {
-        self.deviations.iter().filter(move |deviation| !(forgives && deviation.is_tolerated))
+    /// The deviations that are within the tolerance, or beyond it.
+    pub(crate) fn that_are(&self, tolerated: bool) -> impl Iterator<Item = &Deviation> {
+        self.deviations.iter().filter(move |deviation| deviation.is_tolerated == tolerated)
     }
 
     /// Whether no deviation is about several facts at once.
     pub(super) fn is_of_single_facts(&self) -> bool {
-        self.that_count(true).all(|deviation| deviation.pattern.arguments.iter().all(Option::is_some))
+        self.that_are(false).all(|deviation| deviation.pattern.arguments.iter().all(Option::is_some))
     }
 
     /// What changes now, but for the facts that differ within the tolerance only: those as they were taken to be.
     pub(super) fn keep_otherwise(&self, was: &[Change], is: &[Change]) -> Vec<Change> {
-        let differs = |key: &FactKey| self.that_count(true).any(|deviation| deviation.pattern.matches(key));
+        let differs = |key: &FactKey| self.that_are(false).any(|deviation| deviation.pattern.matches(key));
         let before = Final::of(was);
         let kept = |change: &Change| match change {
             Change::Set { fact, .. } if !differs(fact) => match before.keys.get(fact) {
@@ -149,7 +149,7 @@ mod tests {
     fn differing(was: &[Change], is: &[Change], number: f64) -> Vec<String> {
         let mut difference = Difference::default();
         difference.add(was, is, |_| Tolerance { number, ..Tolerance::EXACT }, |_| None);
-        difference.that_count(true).map(|deviation| deviation.pattern.to_string()).collect()
+        difference.that_are(false).map(|deviation| deviation.pattern.to_string()).collect()
     }
 
     #[test]
