@@ -79,6 +79,11 @@ impl Syncer {
         }
     }
 
+    /// What was marked and is not written never will be: nothing that waits for it is done.
+    pub(super) fn give_up(&mut self) {
+        self.wanted = None;
+    }
+
     /// Everything that was marked so far.
     pub(super) fn marked(&self) -> Mark {
         Mark { number: self.last, safe: self.safe.clone() }
@@ -184,6 +189,16 @@ mod tests {
         assert_eq!(&*syncer.failed().await, "the disk is gone");
         assert!(first.safe().await, "what was safe stays so");
         assert!(!syncer.marked_and_written().safe().await);
+    }
+
+    #[tokio::test]
+    async fn what_is_marked_and_cannot_be_written_is_never_safe() {
+        let mut syncer = Syncer::of(|| Ok(())).expect("a thread");
+        assert!(syncer.marked_and_written().safe().await);
+        let mark = syncer.mark();
+        syncer.give_up();
+        assert!(!syncer.marked_and_written().safe().await);
+        assert!(!mark.safe().await);
     }
 
     #[tokio::test]

@@ -405,7 +405,7 @@ impl Shell {
     /// for that.
     fn hand_over(&mut self) -> anyhow::Result<()> {
         self.at_once = 0;
-        self.log.write()?;
+        self.log.write().inspect_err(|_| self.syncer.give_up())?;
         self.syncer.written();
         if !self.lines.is_empty() {
             self.messages.say(&self.lines);
