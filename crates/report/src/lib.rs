@@ -222,7 +222,7 @@ mod tests {
         let evil = "\u{1b}[2J\r\u{202e}\u{7}\u{ffff}<b>";
         let long = "a/".repeat(33_000);
         let lines = WITH_A_LABEL.replace("\"read\"", &serde_json::to_string(&format!("{long}{evil}")).unwrap());
-        let lines = lines.replace("arm@sim", &serde_json::to_string(evil).unwrap().trim_matches('"').to_owned());
+        let lines = lines.replace("arm@sim", serde_json::to_string(evil).unwrap().trim_matches('"'));
         let run = told(&lines.replace("\"task\":\"t\"", &format!("\"task\":{}", serde_json::to_string(evil).unwrap())));
         let is_obeyed = |c: char| (c.is_control() && c != '\n') || c == '\u{202e}';
         let (text, chart) = (Report::of(&run).to_string(), gantt::stacked(&[&run], By::Node, None));
