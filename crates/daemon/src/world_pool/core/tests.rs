@@ -525,7 +525,9 @@ mod kept_for_projections {
                 let own: usize = pool.projections.values().map(|projection| projection.bytes).sum();
                 prop_assert_eq!(pool.in_memory.bytes(), own + expected.values().sum::<usize>());
             }
-            live.into_iter().for_each(|id| drop(pool.release(id)));
+            for id in live {
+                let _ = pool.release(id);
+            }
             prop_assert!(pool.in_memory.is_empty());
         }
     }
