@@ -9,6 +9,7 @@ use super::expiry::Expiry;
 use super::fingerprint::Fingerprint;
 use super::history::{Commit, CommitError, History, RevisionError};
 use super::in_memory::{InMemory, NoRoom};
+use super::looks::{self, TooManyLooks};
 use super::memory::{Memory, Reused};
 use super::promised::Promised;
 use super::query::View;
@@ -116,6 +117,8 @@ pub(super) enum ProjectError {
     Reused(#[from] Reused),
     #[error(transparent)]
     Change(#[from] ChangeError),
+    #[error(transparent)]
+    TooManyLooks(#[from] TooManyLooks),
     #[error("{limit} projections exist: release some")]
     TooMany { limit: usize },
     #[error("{limit} projections exist, and the rest is kept for operators: release some")]
@@ -376,6 +379,7 @@ impl WorldPool {
         let mut bytes =
             size::of_changes(&request.changes) + size::of_changes(&moves) + 3 * size::of_footprint(&request.reads);
         let base = self.history.at(request.base)?;
+        looks::check(base, &request.changes)?;
         let world = base.project_looking(&request.writers, &request.changes, |written| {
             bytes += size::of_written(written);
         })?;

@@ -5,6 +5,7 @@
 
 use super::WorldPoolConfig;
 use super::fingerprint::Fingerprint;
+use super::looks::{self, TooManyLooks};
 use super::memory::{Memory, Reused};
 use super::record::{CommitRecord, EntryRecord, FactRecord, Names, PatternRecord, SnapshotRecord, encode, writer_name};
 use super::size;
@@ -123,6 +124,8 @@ pub(super) enum CommitError {
     Evidence { fact: FactKey },
     #[error(transparent)]
     Violation(#[from] Violation),
+    #[error(transparent)]
+    TooManyLooks(#[from] TooManyLooks),
 }
 
 /// A revision that is not kept.
@@ -244,6 +247,7 @@ impl History {
         if let Some(ontology) = ontology {
             ontology.check_changes(changes)?;
         }
+        looks::check(self.root(), changes)?;
         let mut written = self.root().written_by(writer.as_deref(), changes)?;
         for (key, measured) in evidence {
             let fact = written.get_mut(key).and_then(Option::as_mut);

@@ -16,6 +16,7 @@ mod fingerprint;
 mod history;
 mod in_memory;
 mod leases;
+mod looks;
 mod memory;
 mod parked;
 mod promised;

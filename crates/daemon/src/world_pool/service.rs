@@ -25,6 +25,7 @@ use ratn_worker::multiplex::WorldCalls;
 use ratn_worker::multiplex::server::Answers;
 use ratn_world::digest::Digest;
 use ratn_world::world::Fact;
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{Semaphore, watch};
@@ -102,6 +103,9 @@ fn page_of(
     Ok((found == Found::All).then_some((filled.items, more)))
 }
 
+/// The changes of a projection are of so many different writers at the most: each is compared with the others.
+const MOST_WRITERS: usize = 4_096;
+
 /// What is accepted at the most, in bytes.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sizes {
@@ -171,6 +175,11 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         label(&request.after_commit_id, "after_commit_id")?;
         self.sizes.check("changes", &request.changes)?;
         request.writers.iter().try_for_each(|writer| label(writer, "writers"))?;
+        let writers = request.writers.iter().collect::<BTreeSet<_>>().len();
+        if writers > MOST_WRITERS {
+            let rule = format!("are {writers} different ones: at most {MOST_WRITERS} are accepted");
+            return Err(Malformed::new("writers", rule).into());
+        }
         let lease = (request.lease_id != 0).then_some(LeaseId(request.lease_id));
         let projection = NewProjection {
             by: caller.clone(),

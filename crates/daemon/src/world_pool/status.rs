@@ -20,6 +20,7 @@ pub(super) fn of_commit(error: &CommitError) -> Status {
         CommitError::Reused(_) => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
         CommitError::Evidence { .. } => (Code::InvalidArgument, "NOT_WRITTEN"),
         CommitError::Violation(_) => (Code::FailedPrecondition, "OUTSIDE_THE_ONTOLOGY"),
+        CommitError::TooManyLooks(_) => (Code::InvalidArgument, "TOO_MANY_LOOKS"),
     };
     status(code, reason, error.to_string())
 }
@@ -41,6 +42,7 @@ pub(super) fn of_project(error: &ProjectError) -> Status {
         ProjectError::Revision(error) => return of_revision(*error),
         ProjectError::Reused(_) => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
         ProjectError::Change(_) => (Code::FailedPrecondition, "CHANGE_DOES_NOT_APPLY"),
+        ProjectError::TooManyLooks(_) => (Code::InvalidArgument, "TOO_MANY_LOOKS"),
         ProjectError::Ended { .. } => (Code::FailedPrecondition, "PROJECTION_ENDED"),
         ProjectError::NotPromised { .. } => (Code::FailedPrecondition, "NOT_PROMISED"),
         ProjectError::NoSuchCommit { .. } => (Code::FailedPrecondition, "NO_SUCH_COMMIT"),
