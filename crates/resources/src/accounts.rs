@@ -424,7 +424,7 @@ impl Accounts {
         self.change(within, |account| account.held = account.held.saturating_sub(amount));
     }
 
-    /// It has another share from now on, in every family.
+    /// It has another share from now on, in every family, or its caller another bound.
     pub(crate) fn has_share(&mut self, within: &Within<'_>) {
         for family in self.sessions.get(within.session).map(|of| of.families.clone()).unwrap_or_default() {
             self.change(&Within { family: &family, ..within.clone() }, |_| {});
@@ -550,6 +550,12 @@ impl Accounts {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+    use crate::limits::Limits;
+    use crate::pool::Pool;
+    use crate::queue::AcquireRequest;
+    use crate::resource::ResourceSpec;
+    use crate::session::Speaker;
+    use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
     use std::cmp::Reverse;
 
     fn at(seconds: u64) -> Timestamp {
@@ -679,6 +685,35 @@ mod tests {
         let least = 3 * at(ROUNDS + 1 - MOST_LEFT as u64).0;
         assert_eq!((left.len(), left[0] / 1_000), (MOST_LEFT, Service::from(least) / 1_000));
         assert!(left.is_sorted());
+    }
+
+    #[test]
+    fn who_becomes_an_operator_or_is_none_any_more_is_counted_as_that_with_the_next_ping() {
+        let mut pool = Pool::new(Limits { share_per_caller: 1, ..Limits::default() });
+        let sessions = ["a", "b"].map(SessionId::from);
+        let says = |pool: &mut Pool, for_anybody| {
+            let speaker = Speaker { name: "root".into(), for_anybody };
+            for session in &sessions {
+                pool.keep_alive_as(at(0), &speaker, session, "root", Duration::from_secs(9)).unwrap();
+            }
+        };
+        let counted = |pool: &Pool| pool.accounts.families["Arm"].callers.get("root").map(|of| of.shares);
+        pool.create(at(0), None, ResourceSpec::new(ResourceClass::Module, "Arm").capacity(2)).unwrap();
+        says(&mut pool, true);
+        for session in &sessions {
+            let arm = Requirement::new(ResourceOperation::Block, "Arm");
+            pool.acquire(at(0), AcquireRequest::new(session.clone(), vec![arm])).unwrap();
+        }
+        assert_eq!(counted(&pool), None, "an operator has no bound");
+        says(&mut pool, false);
+        assert_eq!(counted(&pool), Some(2_000));
+        // As after a restart: nobody has pinged yet.
+        pool.sessions.values_mut().for_each(|session| session.for_anybody = None);
+        pool.open_accounts();
+        assert_eq!(counted(&pool), Some(2_000));
+        says(&mut pool, true);
+        assert_eq!(counted(&pool), None);
+        pool.check_invariants().unwrap();
     }
 
     #[test]
