@@ -137,19 +137,20 @@ impl RequestMemory {
         if let Some((print, waiter)) = self.waiting.get(id) {
             return same(id, *print, fingerprint).map(|()| Some(Recalled::Waiting(*waiter)));
         }
-        if let Some(answer) = self.answer(id).filter(|answer| !is_over(answer.life)) {
+        let counts = |answer: &&Answer| !is_over(answer.life);
+        if let Some(answer) = self.answer(id).filter(counts) {
             let recalled = Recalled::Answered(answer.reply.clone());
             return same(id, answer.fingerprint, fingerprint).map(|()| Some(recalled));
         }
-        let unknown = self.unknown(id).filter(|answer| answer.fingerprint.may_be(fingerprint));
+        let unknown = self.unknown(id).filter(counts).filter(|answer| answer.fingerprint.may_be(fingerprint));
         Ok(unknown.map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 
     /// The same, whatever the request was.
     pub(crate) fn reply(&self, id: &RequestId, is_over: impl Fn(Life) -> bool) -> Option<Recalled> {
         let waiting = self.waiting.get(id).map(|(_, waiter)| Recalled::Waiting(*waiter));
-        let own = || self.answer(id).filter(|answer| !is_over(answer.life));
-        let answer = || own().or_else(|| self.unknown(id));
+        let counts = |answer: &&Answer| !is_over(answer.life);
+        let answer = || self.answer(id).filter(counts).or_else(|| self.unknown(id).filter(counts));
         waiting.or_else(|| answer().map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 

@@ -248,3 +248,14 @@ fn what_a_session_deletes_of_its_own_is_of_its_life_and_is_deleted_anew_in_the_n
         pool = reopened(pool, &Limits::default(), None);
     }
 }
+
+#[test]
+fn what_ended_with_an_earlier_life_is_done_anew_also_for_whom_nobody_knows() {
+    let (mut pool, session) = (Pool::new(Limits::default()), SessionId::from("adam"));
+    for _ in 0..2 {
+        pool.keep_alive(NOW, &session, "adam", Duration::from_secs(10)).unwrap();
+        pool.handle(NOW, "create", create("adam", "Tool")).unwrap();
+        assert_eq!(pool.list().len(), 1);
+        pool.close_session(NOW, &session).unwrap();
+    }
+}
