@@ -33,6 +33,10 @@ use std::time::Duration;
 /// Nanoseconds, times units, for a share of 1.
 type Service = u128;
 
+/// So much of what ended sessions had is kept for each caller and family, the most of it: more sessions than a caller usually may have
+/// (`sessions_per_caller`).
+const MOST_LEFT: usize = 4_096;
+
 /// See the module.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Accounts {
@@ -70,7 +74,7 @@ struct OfCaller {
     /// The sum of the shares of those that hold or wait, in thousandths.
     shares: u64,
     beyond: Beyond,
-    /// What sessions had that have ended while the shares were beyond the bound, the most last.
+    /// What sessions had that have ended while the shares were beyond the bound, the most last; [`MOST_LEFT`] at the most.
     left: Vec<Service>,
 }
 
@@ -169,6 +173,17 @@ impl Beyond {
     /// So many times less, as a share: never nothing.
     fn less(self, share: Share) -> u128 {
         (u128::from(share.thousandths()) * u128::from(self.bound) / u128::from(self.shares)).max(1)
+    }
+}
+
+impl OfCaller {
+    /// A session has ended that had so much.
+    fn keep(&mut self, service: Service) {
+        let at = self.left.partition_point(|less| *less <= service);
+        self.left.insert(at, service);
+        if self.left.len() > MOST_LEFT {
+            self.left.remove(0);
+        }
     }
 }
 
@@ -409,7 +424,7 @@ impl Accounts {
         self.change(within, |account| account.held = account.held.saturating_sub(amount));
     }
 
-    /// It has another share from now on, in every family.
+    /// It has another share from now on, in every family, or its caller another bound.
     pub(crate) fn has_share(&mut self, within: &Within<'_>) {
         for family in self.sessions.get(within.session).map(|of| of.families.clone()).unwrap_or_default() {
             self.change(&Within { family: &family, ..within.clone() }, |_| {});
@@ -428,8 +443,7 @@ impl Accounts {
             let owed = left.filter(|left| left.service > family.level);
             let of_caller = owed.as_ref().and_then(|left| family.callers.get_mut(&left.caller));
             if let Some((left, of)) = owed.as_ref().zip(of_caller.filter(|of| of.beyond.is_some())) {
-                let at = of.left.partition_point(|service| *service <= left.service);
-                of.left.insert(at, left.service);
+                of.keep(left.service);
             }
             if family.accounts.is_empty() {
                 self.families.remove(&name);
@@ -536,6 +550,12 @@ impl Accounts {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+    use crate::limits::Limits;
+    use crate::pool::Pool;
+    use crate::queue::AcquireRequest;
+    use crate::resource::ResourceSpec;
+    use crate::session::Speaker;
+    use ratn_model::resource::{Requirement, ResourceClass, ResourceOperation};
     use std::cmp::Reverse;
 
     fn at(seconds: u64) -> Timestamp {
@@ -636,6 +656,64 @@ mod tests {
         let says_again = |accounts: &mut Accounts, within: &Within<'_>| accounts.has_share(within);
         assert_eq!(each(&mut accounts, 1, None, &says_again), Some(None));
         assert!(accounts.families["Arm"].accounts.values().all(|account| !account.beyond.is_some()));
+    }
+
+    #[test]
+    fn what_sessions_had_that_have_ended_is_kept_of_those_that_had_the_most() {
+        const ROUNDS: u64 = 5_000;
+        let (mut accounts, caller) = (Accounts::default(), Arc::from("adam"));
+        let adams = |accounts: &mut Accounts,
+                     session: &SessionId,
+                     seconds: u64,
+                     act: fn(&mut Accounts, &Within<'_>, Quantity)| {
+            let (family, share, bound) = ("Arm", Share::ONE, Some(1_000));
+            act(accounts, &Within { session, family, share, caller: &caller, bound, now: at(seconds) }, Quantity::ONE);
+        };
+        for session in &["a", "b"].map(SessionId::from) {
+            adams(&mut accounts, session, 0, Accounts::holds);
+        }
+        let mut now = 0;
+        for round in 1..=ROUNDS {
+            let session = SessionId::from(format!("s-{round}").as_str());
+            adams(&mut accounts, &session, now, Accounts::holds);
+            now += round;
+            adams(&mut accounts, &session, now, Accounts::holds_no_more);
+            accounts.forget(&session);
+        }
+        let left = &accounts.families["Arm"].callers["adam"].left;
+        // Three of them count as a third each.
+        let least = 3 * at(ROUNDS + 1 - MOST_LEFT as u64).0;
+        assert_eq!((left.len(), left[0] / 1_000), (MOST_LEFT, Service::from(least) / 1_000));
+        assert!(left.is_sorted());
+    }
+
+    #[test]
+    fn who_becomes_an_operator_or_is_none_any_more_is_counted_as_that_with_the_next_ping() {
+        let mut pool = Pool::new(Limits { share_per_caller: 1, ..Limits::default() });
+        let sessions = ["a", "b"].map(SessionId::from);
+        let says = |pool: &mut Pool, for_anybody| {
+            let speaker = Speaker { name: "root".into(), for_anybody };
+            for session in &sessions {
+                pool.keep_alive_as(at(0), &speaker, session, "root", Duration::from_secs(9)).unwrap();
+            }
+        };
+        let counted = |pool: &Pool| pool.accounts.families["Arm"].callers.get("root").map(|of| of.shares);
+        pool.create(at(0), None, ResourceSpec::new(ResourceClass::Module, "Arm").capacity(2)).unwrap();
+        says(&mut pool, true);
+        for session in &sessions {
+            let arm = Requirement::new(ResourceOperation::Block, "Arm");
+            pool.acquire(at(0), AcquireRequest::new(session.clone(), vec![arm])).unwrap();
+        }
+        assert_eq!(counted(&pool), None, "an operator has no bound");
+        says(&mut pool, false);
+        assert_eq!(counted(&pool), Some(2_000));
+        // As after a restart: nobody has pinged yet.
+        pool.sessions.values_mut().for_each(|session| session.for_anybody = None);
+        pool.open_accounts();
+        assert_eq!(counted(&pool), Some(2_000));
+        says(&mut pool, true);
+        assert_eq!(counted(&pool), None);
+        pool.check_invariants().unwrap();
     }
 
     #[test]

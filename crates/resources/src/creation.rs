@@ -106,13 +106,13 @@ impl Pool {
         self.take_units(now, session, requirement).map(|(touched, _)| touched)
     }
 
-    /// The same, and whether all of it was the session's own.
+    /// The same, and of each whether it was the session's own.
     pub(crate) fn take_units(
         &mut self,
         now: Timestamp,
         session: &SessionId,
         requirement: &Requirement,
-    ) -> Result<(Vec<String>, bool), PoolError> {
+    ) -> Result<(Vec<String>, Vec<bool>), PoolError> {
         self.begin(now);
         self.session(session)?;
         self.check_requirements(std::slice::from_ref(requirement), &[ResourceOperation::Delete])?;
@@ -137,7 +137,7 @@ impl Pool {
         if found < wanted {
             return Err(of_others.unwrap_or(PoolError::NotEnough { wanted: requirement.to_string(), found }));
         }
-        let (mut touched, mut are_own) = (Vec::new(), true);
+        let (mut touched, mut own) = (Vec::new(), Vec::new());
         for (slot, free) in free {
             let amount = free.min(wanted);
             if amount.is_zero() {
@@ -145,11 +145,11 @@ impl Pool {
             }
             wanted = wanted.saturating_sub(amount);
             touched.extend(self.id_of(slot));
-            are_own &= self.resources.get(slot).is_some_and(|one| one.owner.as_ref() == Some(session));
+            own.extend(self.resources.get(slot).map(|one| one.owner.as_ref() == Some(session)));
             self.shrink(slot, amount);
         }
         self.schedule();
-        Ok((touched, are_own))
+        Ok((touched, own))
     }
 
     fn shrink(&mut self, slot: Slot, amount: Quantity) {

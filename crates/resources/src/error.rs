@@ -131,6 +131,15 @@ pub enum PoolError {
         /// Which.
         id: String,
     },
+    /// A request that was done in an earlier session of this id, of which only a part ended with that.
+    #[error(
+        "request id `{id}` was done in an earlier session of this id, and only a part of it ended with that session: ask with another request \
+         id for what is missing"
+    )]
+    DoneInPart {
+        /// Which.
+        id: String,
+    },
 }
 
 fn owner_of(opened_by: &str) -> &str {

@@ -4,8 +4,9 @@
 //! callers together have too many, those of the caller with the most. So nobody's requests make the manager forget the answers of a caller
 //! with fewer. An answer is durable together with its effect; waiting requests are not.
 //!
-//! What was done for a session and ended with it (a lease, what it created or consumed of what is renewable) is the answer of that [`Life`]
-//! alone: a session that is opened anew under the same id has it done anew. What outlasts a session is done once for all of them.
+//! What was done for a session and ended with it (a lease, what it created, what it took of that or consumed of what is renewable) is the answer
+//! of that [`Life`] alone: a session that is opened anew under the same id has it done anew. What outlasts a session is done once for all of
+//! them. What ended in part is refused then: neither would be right.
 
 use crate::error::PoolError;
 use crate::fingerprint::Fingerprint;
@@ -33,10 +34,23 @@ pub(crate) struct RequestId {
 /// An answer as it is kept: small, with ids instead of what they name.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Remembered {
-    Created { id: String, revision: Revision },
+    Created {
+        id: String,
+        revision: Revision,
+    },
     Granted(LeaseId),
     Touched(Vec<String>),
     Done,
+    /// As [`Remembered::Touched`], where some of it ends with the life and some does not.
+    InPart(Vec<String>),
+}
+
+/// What ends with the session that a request was done for, of what the request did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Ends {
+    Nothing,
+    Part,
+    All,
 }
 
 /// Which of all sessions, also of those that had one id: its number; 0 is none.
@@ -91,11 +105,24 @@ impl RequestId {
     }
 }
 
+impl Ends {
+    /// Of several things, whether each ends with the session.
+    pub(crate) fn of(each: &[bool]) -> Ends {
+        match (each.contains(&true), each.contains(&false)) {
+            (true, true) => Ends::Part,
+            (true, false) => Ends::All,
+            (false, _) => Ends::Nothing,
+        }
+    }
+}
+
 impl Remembered {
     fn bytes(&self) -> usize {
         match self {
             Remembered::Created { id, .. } => id.len(),
-            Remembered::Touched(ids) => ids.iter().map(|id| id.len() + size_of::<String>()).sum(),
+            Remembered::Touched(ids) | Remembered::InPart(ids) => {
+                ids.iter().map(|id| id.len() + size_of::<String>()).sum()
+            }
             Remembered::Granted(_) | Remembered::Done => 0,
         }
     }
@@ -128,6 +155,9 @@ impl OfCaller {
 
 impl RequestMemory {
     /// What this request led to before, unless that ended with a life that is over. An answer to nobody knows whom is that of whoever asks the same.
+    ///
+    /// # Errors
+    /// Another request of this id, or one of which only a part ended with a life that is over.
     pub(crate) fn recall(
         &self,
         id: &RequestId,
@@ -137,19 +167,21 @@ impl RequestMemory {
         if let Some((print, waiter)) = self.waiting.get(id) {
             return same(id, *print, fingerprint).map(|()| Some(Recalled::Waiting(*waiter)));
         }
-        if let Some(answer) = self.answer(id).filter(|answer| !is_over(answer.life)) {
-            let recalled = Recalled::Answered(answer.reply.clone());
-            return same(id, answer.fingerprint, fingerprint).map(|()| Some(recalled));
+        let counts = |answer: &&Answer| !is_over(answer.life) || matches!(answer.reply, Remembered::InPart(_));
+        let own = self.answer(id).filter(counts);
+        own.map_or(Ok(()), |answer| same(id, answer.fingerprint, fingerprint))?;
+        let unknown = || self.unknown(id).filter(counts).filter(|answer| answer.fingerprint.may_be(fingerprint));
+        match own.or_else(unknown) {
+            Some(answer) if is_over(answer.life) => Err(PoolError::DoneInPart { id: id.id.to_string() }),
+            answer => Ok(answer.map(|answer| Recalled::Answered(answer.reply.clone()))),
         }
-        let unknown = self.unknown(id).filter(|answer| answer.fingerprint.may_be(fingerprint));
-        Ok(unknown.map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 
     /// The same, whatever the request was.
     pub(crate) fn reply(&self, id: &RequestId, is_over: impl Fn(Life) -> bool) -> Option<Recalled> {
         let waiting = self.waiting.get(id).map(|(_, waiter)| Recalled::Waiting(*waiter));
-        let own = || self.answer(id).filter(|answer| !is_over(answer.life));
-        let answer = || own().or_else(|| self.unknown(id));
+        let counts = |answer: &&Answer| !is_over(answer.life);
+        let answer = || self.answer(id).filter(counts).or_else(|| self.unknown(id).filter(counts));
         waiting.or_else(|| answer().map(|answer| Recalled::Answered(answer.reply.clone())))
     }
 

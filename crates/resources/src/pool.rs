@@ -13,7 +13,7 @@ use crate::kept_ids::KeptIds;
 use crate::kinds::Kinds;
 use crate::lease::{EndingLeases, LeaseView, Leases};
 use crate::limits::Limits;
-use crate::memory::{Life, Recalled, Remembered, RequestId, RequestMemory};
+use crate::memory::{Ends, Life, Recalled, Remembered, RequestId, RequestMemory};
 use crate::pace::Pace;
 use crate::queue::{AcquireRequest, Queue};
 use crate::record::{Effect, Record};
@@ -177,7 +177,7 @@ impl Pool {
                 self.lease(lease).map(Reply::Granted).ok_or(PoolError::UnknownLease { lease })
             }
             Some(Recalled::Answered(Remembered::Created { id, revision })) => Ok(Reply::Created { id, revision }),
-            Some(Recalled::Answered(Remembered::Touched(ids))) => Ok(Reply::Touched(ids)),
+            Some(Recalled::Answered(Remembered::Touched(ids) | Remembered::InPart(ids))) => Ok(Reply::Touched(ids)),
             Some(Recalled::Answered(Remembered::Done)) => Ok(Reply::Done),
             None if let Request::Acquire(acquire) = &request
                 && self.withdrawals.is_withdrawn(&id, &acquire.session) =>
@@ -197,10 +197,11 @@ impl Pool {
                     // By its last part.
                     Reply::Unfinished => return Ok(reply),
                     Reply::Created { id, revision } => Remembered::Created { id: id.clone(), revision: *revision },
+                    Reply::Touched(ids) if ends == Ends::Part => Remembered::InPart(ids.clone()),
                     Reply::Touched(ids) => Remembered::Touched(ids.clone()),
                     Reply::Done => Remembered::Done,
                 };
-                self.remember(id, fingerprint, remembered, if ends { life } else { 0 });
+                self.remember(id, fingerprint, remembered, if ends == Ends::Nothing { 0 } else { life });
                 Ok(reply)
             }
         }
@@ -339,7 +340,7 @@ impl Pool {
         }
     }
 
-    /// The reply, and whether what was done ends with the session that it was done for.
+    /// The reply, and what of what was done ends with the session that it was done for.
     fn perform(
         &mut self,
         now: Timestamp,
@@ -347,39 +348,40 @@ impl Pool {
         id: RequestId,
         print: Fingerprint,
         request: Request,
-    ) -> Result<(Reply, bool), PoolError> {
+    ) -> Result<(Reply, Ends), PoolError> {
         Ok(match request {
             Request::Create { session, spec } => {
                 let ResourceView { description, revision, .. } = self.create(now, session.as_ref(), spec)?;
-                (Reply::Created { id: description.id.clone(), revision }, session.is_some())
+                (Reply::Created { id: description.id.clone(), revision }, Ends::of(&[session.is_some()]))
             }
             Request::Delete { session, id } => {
                 let is_own = session.is_some() && self.get(&id).is_some_and(|known| known.owner == session);
                 self.delete(now, session.as_ref(), &id)?;
-                (Reply::Done, is_own)
+                (Reply::Done, Ends::of(&[is_own]))
             }
             Request::DeleteUnits { session, requirement } => {
-                let (touched, are_own) = self.take_units(now, &session, &requirement)?;
-                (Reply::Touched(touched), are_own)
+                let (touched, own) = self.take_units(now, &session, &requirement)?;
+                (Reply::Touched(touched), Ends::of(&own))
             }
             Request::Consume { session, requirement } => {
                 let touched = self.consume(now, &session, &requirement)?;
-                let returns = |id: &String| self.resources.find(id).and_then(|slot| self.resources.get(slot));
-                let returns = touched.iter().filter_map(returns).any(|resource| resource.description.renewable);
-                (Reply::Touched(touched), returns)
+                let resources = touched.iter().filter_map(|id| self.resources.get(self.resources.find(id)?));
+                let ends = |one: &Resource| one.description.renewable || one.owner.as_ref() == Some(&session);
+                let ends: Vec<bool> = resources.map(ends).collect();
+                (Reply::Touched(touched), Ends::of(&ends))
             }
-            Request::Acquire(request) => (Reply::Queued(self.enqueue(request, id, print)?), false),
+            Request::Acquire(request) => (Reply::Queued(self.enqueue(request, id, print)?), Ends::Nothing),
             Request::Release { session, lease } => {
                 self.release(now, session.as_ref(), lease)?;
-                (Reply::Done, false)
+                (Reply::Done, Ends::Nothing)
             }
             Request::ConfirmStandstill { session, lease, resource } => {
                 let freed = self.confirm_standstill_as(now, speaker, session.as_ref(), lease, &resource)?;
-                (Reply::Touched(freed.then_some(resource).into_iter().collect()), false)
+                (Reply::Touched(freed.then_some(resource).into_iter().collect()), Ends::Nothing)
             }
             Request::EndTask { session } => {
                 let reply = if self.end_task(now, &session)? { Reply::Done } else { Reply::Unfinished };
-                (reply, true)
+                (reply, Ends::All)
             }
         })
     }

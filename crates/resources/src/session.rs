@@ -156,7 +156,11 @@ impl Pool {
         }
         let opened = self.kept_alive(speaker, id, client, ttl)?;
         if let Some(session) = self.sessions.get_mut(id).filter(|session| session.opened_by == speaker.name) {
+            let was_operators = session.is_operators();
             session.for_anybody = Some(speaker.for_anybody);
+            if session.is_operators() != was_operators {
+                self.counts_anew(id);
+            }
         }
         Ok(opened)
     }

@@ -34,17 +34,14 @@ impl Pool {
             (Some(before), Some(due)) if due <= before + SAME_DUE && before <= due + SAME_DUE => Some(before),
             (_, due) => due,
         };
-        if standing.share != before.share {
-            let (caller, bound) = self.bound_of(id);
-            let within =
-                Within { session: id, family: "", share: standing.share, caller: &caller, bound, now: self.now };
-            self.accounts.has_share(&within);
-            self.worked += self.accounts.take_looks();
+        if let Some(session) = self.sessions.get_mut(id) {
+            session.standing = Standing { due, ..standing };
         }
-        let Some(session) = self.sessions.get_mut(id) else { return Ok(()) };
-        session.standing = Standing { due, ..standing };
+        if standing.share != before.share {
+            self.counts_anew(id);
+        }
         if due != before.due {
-            let waiters = session.waiters.clone();
+            let waiters = self.session(id)?.waiters.clone();
             self.worked += waiters.len();
             for waiter in waiters {
                 self.turn_anew(waiter);
@@ -52,6 +49,13 @@ impl Pool {
             self.schedule();
         }
         Ok(())
+    }
+
+    /// From now on what a session has counts by another share, or for a caller with another bound.
+    pub(crate) fn counts_anew(&mut self, session: &SessionId) {
+        let (share, (caller, bound)) = (self.standing(session).share, self.bound_of(session));
+        self.accounts.has_share(&Within { session, family: "", share, caller: &caller, bound, now: self.now });
+        self.worked += self.accounts.take_looks();
     }
 
     /// What a session is beside others; as usual where it is unknown.

@@ -248,3 +248,67 @@ fn what_a_session_deletes_of_its_own_is_of_its_life_and_is_deleted_anew_in_the_n
         pool = reopened(pool, &Limits::default(), None);
     }
 }
+
+#[test]
+fn what_ended_with_an_earlier_life_is_done_anew_also_for_whom_nobody_knows() {
+    let (mut pool, session) = (Pool::new(Limits::default()), SessionId::from("adam"));
+    for _ in 0..2 {
+        pool.keep_alive(NOW, &session, "adam", Duration::from_secs(10)).unwrap();
+        pool.handle(NOW, "create", create("adam", "Tool")).unwrap();
+        assert_eq!(pool.list().len(), 1);
+        pool.close_session(NOW, &session).unwrap();
+    }
+}
+
+/// What takes away two units of a kind.
+fn two(operation: ResourceOperation, kind: &str) -> Request {
+    let requirement = Requirement { count: Quantity::whole(2), ..Requirement::new(operation, kind) };
+    match operation {
+        ResourceOperation::Consume => Request::Consume { session: SessionId::from("adam"), requirement },
+        _ => Request::DeleteUnits { session: SessionId::from("adam"), requirement },
+    }
+}
+
+#[test]
+fn what_a_session_uses_up_of_its_own_is_of_its_life_and_is_used_up_anew_in_the_next() {
+    for restart in [None, Some(false), Some(true)] {
+        let mut pool = pool_of(Limits::default(), &["adam"]);
+        let glue = ResourceSpec::new(ResourceClass::Task, "Glue").non_renewable().capacity(2);
+        let create = Request::Create { session: Some(SessionId::from("adam")), spec: glue };
+        for _ in 0..2 {
+            for (id, request) in [("c", create.clone()), ("u", two(ResourceOperation::Consume, "Glue"))] {
+                pool.handle_as(NOW, &speaker("adam"), id, request).unwrap();
+            }
+            assert!(pool.exists(&Requirement::new(ResourceOperation::Exists, "Glue")).is_zero(), "{restart:?}");
+            pool = reopened(pool, &Limits::default(), restart);
+        }
+    }
+}
+
+#[test]
+fn what_ended_in_part_with_an_earlier_life_is_refused_and_not_done_twice() {
+    for restart in [None, Some(false), Some(true)] {
+        let mut pool = pool_of(Limits::default(), &["adam"]);
+        let spec = |kind| ResourceSpec::new(ResourceClass::Module, kind);
+        for spec in [spec("Power"), spec("Power").non_renewable(), spec("Tool")] {
+            pool.create(NOW, None, spec).unwrap();
+        }
+        created(&mut pool, "adam", "create");
+        let requests = [("u", ResourceOperation::Consume, "Power"), ("d", ResourceOperation::Delete, "Tool")];
+        for (id, operation, kind) in requests {
+            let mut ask = || pool.handle_as(NOW, &speaker("adam"), id, two(operation, kind)).unwrap();
+            assert_eq!(ask(), ask(), "in one life it is done once");
+        }
+        pool = reopened(pool, &Limits::default(), restart);
+        // So that there is enough to take once more.
+        for spec in [spec("Power").non_renewable(), spec("Tool").capacity(2)] {
+            pool.create(NOW, None, spec).unwrap();
+        }
+        for (id, operation, kind) in requests {
+            let again = pool.handle_as(NOW, &speaker("adam"), id, two(operation, kind));
+            assert_eq!(again, Err(PoolError::DoneInPart { id: id.to_owned() }), "{restart:?}");
+            let there = pool.exists(&Requirement::new(ResourceOperation::Exists, kind));
+            assert_eq!(there, Quantity::whole(2), "{kind} {restart:?}");
+        }
+    }
+}

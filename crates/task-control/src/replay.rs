@@ -74,7 +74,7 @@ pub(super) struct Replayed {
     pub(super) executive: Executive,
     pub(super) standing: ReplayedState,
     /// Commands of the last event that are not in the log: its writer was killed among them, and has performed none of them.
-    /// They are to be performed.
+    /// They are to be performed, but those that are recorded: these are in the ledger.
     pub(super) missing: Vec<Command>,
     /// How it has ended, where it has: what it had decided by then may not all be done.
     pub(super) ended: Option<Ended>,
@@ -172,12 +172,16 @@ fn go_on(
         logged.iter().for_each(|command| ledger.command(command));
         progress.catch_up(*at, event, missing.iter());
         missing.drain(..logged.len());
-        // Nothing of these was performed, so they are no open items; what they commit is in the executive's world already.
-        let commits = missing.iter().filter(|command| matches!(command, Command::Commit { .. }));
-        commits.for_each(|command| ledger.command(command));
+        // Nothing of these was performed, so they are no open items. What is recorded is: all of it in order, and behind what is in the log.
+        missing.iter().filter(|command| is_recorded(command)).for_each(|command| ledger.command(command));
         next += logged.len();
     }
     Ok(Replayed { executive, standing, missing, ended, events })
+}
+
+/// Whether a command is one of those that are taken up from the ledger, in order: commits, and operations.
+pub(super) fn is_recorded(command: &Command) -> bool {
+    matches!(command, Command::Commit { .. } | Command::Operate { .. })
 }
 
 /// Keeps in mind which state an instance is of, as long as it matters.
@@ -295,6 +299,27 @@ pub(super) mod tests {
             assert_eq!(whole.ended.map(|ended| ended.outcome).as_deref(), Some("success"));
             let decided = lines.iter().filter(|line| matches!(line.entry, LogEntry::Command(Command::Commit { .. })));
             assert_eq!(whole.standing.ledger.commits.len(), decided.count());
+        }
+    }
+
+    #[test]
+    fn what_is_missing_of_a_step_that_was_cut_is_recorded_in_the_order_in_which_it_was_decided() {
+        let program = fetch_boxes();
+        for mode in [Mode::Hsm, Mode::Cdtn] {
+            let lines = log(&program, mode);
+            let is_event = |line: &LogLine| matches!(line.entry, LogEntry::Event(_));
+            let mut operated = 0;
+            for step in (1..lines.len()).filter(|cut| is_event(&lines[*cut])) {
+                let whole = replay(&program, &lines[..step]).unwrap().standing.ledger;
+                let begins = (0..step).rev().find(|line| is_event(&lines[*line])).unwrap_or_default();
+                for cut in begins + 1..step {
+                    let torn = replay(&program, &lines[..cut]).unwrap().standing.ledger;
+                    assert_eq!(torn.commits, whole.commits, "cut at {cut} of {step}");
+                    assert_eq!((torn.operations, &torn.operated), (whole.operations, &whole.operated));
+                }
+                operated = whole.operations;
+            }
+            assert!(operated > 0);
         }
     }
 

@@ -22,6 +22,7 @@ pub(super) fn of_error(error: &PoolError) -> Status {
         PoolError::Withdrawn { .. } => (Code::Aborted, "WITHDRAWN"),
         PoolError::Malformed { .. } => (Code::InvalidArgument, "MALFORMED"),
         PoolError::RequestIdReused { .. } => (Code::InvalidArgument, "REQUEST_ID_REUSED"),
+        PoolError::DoneInPart { .. } => (Code::FailedPrecondition, "DONE_IN_PART"),
         PoolError::SessionEnding { .. } => {
             return retry_later(Code::Unavailable, "SESSION_ENDING", error.to_string(), RETRY_DELAY);
         }

@@ -101,7 +101,7 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
     let (mode, seed) = history.mode_and_seed();
     // It knows of what is missing before that is written: nothing is kept until it is.
     let mut kept = ledger.clone();
-    let others = missing.iter().filter(|command| !matches!(command, Command::Commit { .. }));
+    let others = missing.iter().filter(|command| !replay::is_recorded(command));
     others.for_each(|command| kept.command(command));
     let checkpointer = Checkpointer::start(&log, &program.digest, checkpoint_every, kept, replayed);
     let (events, answers) = mpsc::channel(MAX_PENDING_EVENTS);
@@ -160,8 +160,8 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         shell.log.make_durable()?;
         shell.performer.know(shell.progress.paths());
         let told = shell.performer.take_up(&Arc::clone(&shell.program), ledger, &mirror, now).await?;
-        // Commits are there by now.
-        let missing = missing.into_iter().filter(|command| !matches!(command, Command::Commit { .. }));
+        // What is recorded was taken up with the ledger.
+        let missing = missing.into_iter().filter(|command| !replay::is_recorded(command));
         let mut ended = shell.perform(now, missing.chain(commands), None)?;
         for event in told {
             if ended.is_none() {
