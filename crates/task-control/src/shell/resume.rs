@@ -15,7 +15,7 @@ use crate::spans::{Before, Spans, trace_of};
 use anyhow::Context;
 use ratn_event_log::{Log, LogWriter};
 use ratn_executive::lookahead::Lookout;
-use ratn_executive::protocol::{Command, Event};
+use ratn_executive::protocol::Event;
 use ratn_model::program::Program;
 use ratn_worker::robot_clock::RobotClock;
 use ratn_worker::session::Standing;
