@@ -315,6 +315,53 @@ states:
 }
 
 #[tokio::test]
+async fn an_operation_in_front_of_which_the_log_was_cut_is_done_once() -> anyhow::Result<()> {
+    const NOTING: &str = "
+task: note
+states:
+  - part: { effects: [noted(desk)], resources: [{ create: Note, class: task }], states: [{ moment: { wait: { seconds: 0.1 } } }] }
+  - next: { wait: { signal: go } }
+  - done: { effects: [noted(chair)], resources: [{ create: Done, class: task }], states: [{ moment: { wait: { seconds: 0.1 } } }] }
+  - last: { wait: { signal: end } }
+";
+    let bench = Bench::new(|note| *note = program(NOTING)).await?;
+    let (place, log, (_asks, interrupt)) = (&bench.place, &bench.run.log, Interrupt::new());
+    let whole = async {
+        waits(place, "next").await;
+        loop {
+            match std::fs::read_to_string(log) {
+                Ok(text) if text.contains("\"operate\"") => break,
+                _ => tokio::task::yield_now().await,
+            }
+        }
+    };
+    tokio::select! {
+        ended = run(bench.run.clone(), place, &interrupt) => panic!("it ended: {ended:?}"),
+        () = whole => {}
+    }
+    // Nobody writes there any more.
+    drop(resumption_of(&bench.run).await?);
+    let text = std::fs::read_to_string(log)?;
+    let cut: String = text.split_inclusive('\n').take_while(|line| !line.contains("\"operate\"")).collect();
+    std::fs::write(log, cut)?;
+    let channels = ratn_worker::client::Channels::new(&place.tls);
+    let resources = ratn_worker::client::ResourceClient::new(&channels, &place.endpoints.resource_manager, "")?;
+    let goes_on = async {
+        sent(place, signal("go", Value::Null)).await.expect("it waits");
+        // What is behind it is done behind it.
+        while resources.list(&["Done"]).await.is_ok_and(|there| there.is_empty()) {
+            tokio::task::yield_now().await;
+        }
+        let notes = resources.list(&["Note"]).await.map(|notes| notes.len());
+        sent(place, signal("end", Value::Null)).await.expect("it waits");
+        notes
+    };
+    let (ended, notes) = tokio::join!(resume(resumption_of(&bench.run).await?, place, &interrupt), goes_on);
+    assert_eq!((ended?.outcome.as_str(), notes?), (SUCCESS, 1));
+    Ok(())
+}
+
+#[tokio::test]
 async fn what_is_due_when_a_resumption_says_that_the_session_is_lost_is_done() -> anyhow::Result<()> {
     const MOMENTS: &str = "
 task: moments
