@@ -127,6 +127,7 @@ pub(crate) fn behind<'a>(token: &'a str, asked: &impl Message) -> Result<&'a str
     if token.is_empty() {
         return Ok("");
     }
+    label(token, "page_token")?;
     let own = token.split_once(':').filter(|(sealed, last)| *sealed == format!("{:016x}", seal(last, asked)));
     own.map(|(_, last)| last).ok_or_else(no_token)
 }

@@ -128,8 +128,8 @@ pub(super) async fn get(
 pub(super) async fn list(requests: &Requests, mut request: v1::ListRequest) -> Result<v1::ListResponse, Status> {
     let (bytes, token) = (std::mem::take(&mut request.page_bytes), std::mem::take(&mut request.page_token));
     let (page, asked) = (Page::of(bytes, &token), request.clone());
-    let mut after = paging::behind(&token, &asked)?.to_owned();
     let filter = ResourceFilter::try_from(request)?;
+    let mut after = paging::behind(&token, &asked)?.to_owned();
     let (mut filled, mut first) = (Filled::default(), None);
     loop {
         let from = after.clone();
