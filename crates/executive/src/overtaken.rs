@@ -36,7 +36,7 @@ states:
   - part:
       states:
         - count: { action: gripper/release, pia: true, effects: ["tools(rack) = boxes(rack) + 1"], resources: [{ block: Gripper }] }
-        - each: { for: 'place in [rack]', do: [write: { action: gripper/release, pia: true, effects: ["tools(rack) = boxes(place)"], resources: [{ block: Gripper }] }] }
+        - each: { for: 'place in [rack]', do: [write: { action: gripper/release, pia: true, effects: ["tools(rack) = boxes($place)"], resources: [{ block: Gripper }] }] }
         - other: { action: gripper/release, pia: true, effects: ["tools(rack) = cups(rack)"], resources: [{ block: Gripper }] }
 "#;
         let program = ratn_model::load::load(text, "count.yaml", &Catalogue::standard()).unwrap().program;
