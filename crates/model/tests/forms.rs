@@ -200,6 +200,17 @@ states:
 }
 
 #[test]
+fn what_computes_and_does_not_say_what_it_reads_may_read_what_another_region_changes() {
+    let said = |reads: &str| {
+        findings(&format!(
+            "task: t\nstates:\n  - both:\n      concurrency: barrier\n      regions:\n        - left: {{ action: pan_tilt/look_at, in: {{ target: \"pose(1, 0, 0)\" }}, pia: true, effects: ['seen() = 1'], resources: [{{ block: PanTilt }}] }}\n        - right: {{ action: eye/look, computes: true{reads}, resources: [world_model] }}\n"
+        ))
+    };
+    assert!(said("").contains("region-conflict"), "{}", said(""));
+    assert!(!said(", reads: ['weight(?)']").contains("region-conflict"), "{}", said(", reads: ['weight(?)']"));
+}
+
+#[test]
 fn a_region_leads_nowhere_and_its_outcome_is_seen_where_all_have_ended() {
     let both = |left: &str, more: &str| {
         let regions = format!("[{{ left: {{ {LOOK}{left} }} }}, {{ right: {{ states: [] }} }}]");

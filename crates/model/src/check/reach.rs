@@ -6,8 +6,9 @@ use super::{Subject, expressions};
 use crate::diagnostic::Findings;
 use crate::expression::scope::NothingKnown;
 use crate::expression::{EffectExpr, FactExpr};
-use crate::fact::Footprint;
+use crate::fact::{FactPattern, Footprint};
 use crate::program::{Nature, Program, State, StateKind};
+use crate::resource::ResourceOperation;
 use std::collections::BTreeSet;
 
 pub(super) fn check(subject: &Subject<'_>, findings: &mut Findings) {
@@ -84,7 +85,11 @@ struct Touched {
     shared: Vec<FactExpr>,
     assigns: BTreeSet<String>,
     uses: BTreeSet<String>,
-    operated: BTreeSet<String>,
+    /// Kinds of resources that it makes, removes or uses up, holds, and asks for.
+    created: BTreeSet<String>,
+    removed: BTreeSet<String>,
+    held: BTreeSet<String>,
+    looked_for: BTreeSet<String>,
     unannotated: Option<String>,
 }
 
@@ -95,7 +100,10 @@ fn touched(program: &Program, region: &State) -> Touched {
         shared: Vec::new(),
         assigns: BTreeSet::new(),
         uses: BTreeSet::new(),
-        operated: BTreeSet::new(),
+        created: BTreeSet::new(),
+        removed: BTreeSet::new(),
+        held: BTreeSet::new(),
+        looked_for: BTreeSet::new(),
         unannotated: None,
     };
     let mut declared: BTreeSet<&String> = BTreeSet::new();
@@ -108,18 +116,25 @@ fn touched(program: &Program, region: &State) -> Touched {
         touched.assigns.extend(state.assign.iter().map(|(name, _)| name.clone()));
         let expressions = expressions(program, state);
         touched.uses.extend(expressions.iter().flat_map(|(_, e)| e.variables()).map(str::to_owned));
-        let operations = annotations.resources.iter().filter(|r| {
-            !matches!(
-                r.operation,
-                crate::resource::ResourceOperation::Block | crate::resource::ResourceOperation::Exists
-            )
-        });
-        touched.operated.extend(operations.map(|r| r.kind.clone()));
+        for line in &annotations.resources {
+            let kinds = match line.operation {
+                ResourceOperation::Create => &mut touched.created,
+                ResourceOperation::Delete | ResourceOperation::Consume => &mut touched.removed,
+                ResourceOperation::Block => &mut touched.held,
+                ResourceOperation::Exists => &mut touched.looked_for,
+            };
+            kinds.insert(line.kind.clone());
+        }
         let is_action = matches!(state.kind, StateKind::Action { .. });
         let looked_up = expressions.iter().flat_map(|(_, e)| e.fact_expressions());
         let named = annotations.reads.iter().flatten().chain(annotations.senses());
         let facts: Vec<FactExpr> = named.chain(looked_up).cloned().collect();
-        let open_reads = is_action && annotations.reads.is_none() && annotations.nature != Nature::Computes;
+        let says_no_reads = is_action && annotations.reads.is_none();
+        let open_reads = says_no_reads && annotations.nature != Nature::Computes;
+        // Who moves without a word of what it reads is warned of below, and is in nobody's way here.
+        if says_no_reads && annotations.nature == Nature::Computes {
+            touched.reads = Footprint::Everything;
+        }
         let open_writes = is_action
             && annotations.nature != Nature::Computes
             && !annotations.effects.contains_key(crate::program::SUCCESS);
@@ -135,6 +150,15 @@ fn touched(program: &Program, region: &State) -> Touched {
     }
     touched.assigns.retain(|name| !declared.contains(name));
     touched
+}
+
+/// A kind of resource that one makes, removes or uses up, and of which the other one sees a difference. Who wants to hold what is made waits for it.
+fn clash<'a>(one: &'a Touched, other: &Touched) -> Option<&'a String> {
+    let meets = |kinds: &'a BTreeSet<String>, seen: &[&BTreeSet<String>]| {
+        kinds.iter().find(|kind| seen.iter().any(|seen| seen.contains(*kind)))
+    };
+    meets(&one.removed, &[&other.removed, &other.created, &other.held, &other.looked_for])
+        .or_else(|| meets(&one.created, &[&other.created, &other.looked_for]))
 }
 
 fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings) {
@@ -153,14 +177,20 @@ fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings)
         for (second, other) in all.iter().zip(regions).skip(i + 1) {
             let shared: Vec<FactExpr> = first.shared.iter().chain(&second.shared).cloned().collect();
             let shared = FactExpr::footprint(&shared, &NothingKnown);
+            let covered = |p: &FactPattern| match &shared {
+                Footprint::Patterns(shared) => shared.iter().any(|s| s.covers(p)),
+                Footprint::Everything => true,
+            };
             let both = |a: &Footprint, b: &Footprint| -> Option<String> {
-                let (Footprint::Patterns(a), Footprint::Patterns(b)) = (a, b) else { return None };
-                let covered = |p: &crate::fact::FactPattern| match &shared {
-                    Footprint::Patterns(shared) => shared.iter().any(|s| s.covers(p)),
-                    Footprint::Everything => true,
+                let pair = match (a, b) {
+                    (Footprint::Patterns(a), Footprint::Patterns(b)) => {
+                        a.iter().find_map(|x| b.iter().find(|y| x.overlaps(y) && !covered(x) && !covered(y)))
+                    }
+                    (Footprint::Patterns(some), Footprint::Everything)
+                    | (Footprint::Everything, Footprint::Patterns(some)) => some.iter().find(|x| !covered(x)),
+                    (Footprint::Everything, Footprint::Everything) => None,
                 };
-                let pair = a.iter().find_map(|x| b.iter().find(|y| x.overlaps(y) && !covered(x) && !covered(y)))?;
-                Some(format!("the fact `{pair}`"))
+                Some(format!("the fact `{}`", pair?))
             };
             let fact = both(&first.writes, &second.writes)
                 .or_else(|| both(&first.writes, &second.reads))
@@ -171,8 +201,8 @@ fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings)
             };
             let variable = touches(first, second).or_else(|| touches(second, first));
             let variable = variable.map(|name| format!("the variable `${name}`"));
-            let resource =
-                first.operated.intersection(&second.operated).next().map(|kind| format!("the task resource {kind}"));
+            let resource = clash(first, second).or_else(|| clash(second, first));
+            let resource = resource.map(|kind| format!("the task resource {kind}"));
             // Who watches a region ends it in the moment in which a fact is written.
             let is_watched = regions[i].is_watch() || other.is_watch();
             let fact = fact.filter(|_| !is_watched);

@@ -33,6 +33,9 @@ const MAX_REGIONS: usize = 64;
 /// Keys of a state below which there are lists of states.
 const LISTS: [&str; 9] = ["states", "do", "then", "else", "regions", "default", "fallback", "before", "finally"];
 
+/// Forms whose `index` is a variable.
+const LOOPS: [&str; 4] = ["for", "while", "do_while", "until"];
+
 /// Writes out what stands in a list of states, and in all lists within.
 pub(crate) fn write_out(list: &mut Node, findings: &mut Findings) {
     let Content::List(items) = &mut list.content else { return };
@@ -270,8 +273,10 @@ fn is_element(text: &str, variable: &str) -> bool {
 
 /// Whether a loop, variables or a comprehension inside bind this name.
 fn binds(node: &Node, variable: &str) -> bool {
+    let is_loop = node.entries().iter().any(|entry| LOOPS.contains(&entry.key.as_str()));
     let by_entry = |Entry { key, value, .. }: &Entry| {
         let is_bound = match (&value.content, key.as_str()) {
+            (Content::Text(name), "index") => is_loop && name.trim() == variable,
             (Content::Text(text), "for") => {
                 text.split_once(" in ").is_some_and(|(names, _)| names.split(',').any(|one| one.trim() == variable))
             }
