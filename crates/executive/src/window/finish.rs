@@ -312,7 +312,9 @@ impl Window {
         let Progress::Ended { outcome, reason } = progress else { return };
         let Some(state) = self.graph.get(id).map(|instance: &Instance| instance.state) else { return };
         let Some(routine) = self.graph.end_routine(id) else { return };
-        let mut outputs = routine.outputs().get(&state).cloned().unwrap_or_default();
+        // Where it gives none, those that it knows of itself are of its visit before.
+        let own = routine.outputs().get(&state).filter(|_| gives_outputs(&outcome));
+        let mut outputs = own.cloned().unwrap_or_default();
         for name in &context.plan.state(state).assigns {
             outputs.extend(routine.variable(name).map(|value| (assigned(name), value.clone())));
         }
