@@ -24,7 +24,7 @@ mod waits;
 mod written;
 
 pub(crate) use nature::NodeNature;
-pub(crate) use outcomes::{ArmPlan, EVERYTHING, Effects, MAX_OUTCOMES, Outcome, Outcomes, gives_outputs};
+pub(crate) use outcomes::{ArmPlan, EVERYTHING, Effects, MAX_OUTCOMES, Outcome, Outcomes, SUCCEEDED, gives_outputs};
 pub(crate) use waits::WAITS;
 pub(crate) use written::{Chain, Written};
 

@@ -12,7 +12,7 @@ use super::waits::Wait;
 use crate::binding;
 use crate::context::{Context, MAX_IDLE_VISITS, Made, in_circles};
 use crate::effects;
-use crate::plan::{Effects, NodeNature, Outcome, gives_outputs};
+use crate::plan::{Effects, NodeNature, Outcome, SUCCEEDED, gives_outputs};
 use crate::protocol::{Command, Note};
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::InstanceId;
@@ -72,12 +72,14 @@ impl Window {
         retired
     }
 
-    /// Whether an imprecise PIA runs and lets younger ones begin.
+    /// Whether an imprecise PIA runs and lets younger ones begin: those of the way of its success. What is on the way of another outcome alone is
+    /// computed ahead, and waits.
     fn passes(&self, context: &Context<'_>, id: InstanceId) -> bool {
         self.graph.get(id).is_some_and(|head| {
             head.is_pia()
                 && head.arms.len() == 1
                 && context.plan.state(head.state).imprecise
+                && head.arm_of(SUCCEEDED).is_some()
                 && head.node().is_some_and(|node| node.status.is_running())
         })
     }
