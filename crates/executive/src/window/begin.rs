@@ -83,11 +83,11 @@ impl Window {
         self.proceed(context, id);
     }
 
-    /// It never began and never will.
+    /// It never began and never will, or not once more.
     pub(super) fn fail(&mut self, context: &mut Context<'_>, id: InstanceId, reason: String) {
         context.note(Note::Finished { instance: id, outcome: ABORTED.into() });
         let outputs = self.unassigned(context, id);
-        self.end_instance(id, Ended { outputs, ..Ended::aborted(reason) });
+        self.end_node(context, id, Ended { outputs, ..Ended::aborted(reason) });
     }
 
     /// A routine that did not run leaves the variables that it would assign as they were.

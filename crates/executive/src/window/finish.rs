@@ -126,13 +126,17 @@ impl Window {
             ended = failed(&ended, problem);
         }
         context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
-        let (has_acted, is_detached) =
-            instance.node().map_or((false, false), |node| (node.status.is_running(), node.is_detached));
+        let has_acted = instance.node().is_some_and(|node| node.status.is_running());
         self.give_back(context, id);
         self.graph.set_acted(id, has_acted);
         self.rest(id);
+        self.end_node(context, id, ended);
+    }
+
+    /// A node has come to its end, and holds nothing any more. One that others were let pass becomes real: nobody of its line comes to it any more.
+    pub(super) fn end_node(&mut self, context: &mut Context<'_>, id: InstanceId, ended: Ended) {
         self.end_instance(id, ended);
-        if is_detached {
+        if self.graph.get(id).is_some_and(Instance::is_detached) {
             self.retire_detached(context, id);
         }
     }
