@@ -232,6 +232,7 @@ impl Window {
                 if !matches!(self.status(id), Some(Status::Acquiring { .. })) {
                     return self.in_routine(context, Event::Granted { instance: id, lease });
                 }
+                self.used_up(context, id);
                 self.graph.grant(id, Some(lease), context.now);
                 self.proceed_unless_held_back(context, id);
             }
@@ -254,6 +255,21 @@ impl Window {
                 self.launch(context, id, None);
             }
             _ => {}
+        }
+    }
+
+    /// What a node uses up is gone when it gets it.
+    fn used_up(&mut self, context: &Context<'_>, id: InstanceId) {
+        let Some(instance) = self.graph.get(id).filter(|instance| context.plan.state(instance.state).uses_up) else {
+            return;
+        };
+        let wanted = &context.plan.state(instance.state).requirements;
+        let bound = self.look(context, id, None, |instance, view| {
+            binding::requirements(context.program.state(instance.state), wanted, view)
+        });
+        if let Some(Ok(mut requirements)) = bound {
+            requirements.retain(|wanted| wanted.operation == ResourceOperation::Consume);
+            self.dispatch.operated(&requirements);
         }
     }
 
@@ -555,7 +571,7 @@ impl Window {
     }
 
     /// A speculative holder gives back what it has and asks again.
-    fn preempt(&mut self, context: &mut Context<'_>, holder: InstanceId, by: Option<InstanceId>) {
+    pub(super) fn preempt(&mut self, context: &mut Context<'_>, holder: InstanceId, by: Option<InstanceId>) {
         context.note(Note::Preempted { instance: holder, by });
         self.step_back(context, holder, Wait::Nothing);
         self.waits.enqueue(&mut self.graph, holder);

@@ -307,7 +307,8 @@ impl Window {
         let progress = interpreter.handle(context, event);
         let asks = interpreter.asks() && !has_asked;
         self.routine_progressed(context, id, progress);
-        if asks {
+        if asks && let Some(instance) = self.graph.get(id) {
+            self.dispatch.asks_again(&self.graph, instance);
             self.make_room(context, id);
         }
     }

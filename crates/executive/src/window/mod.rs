@@ -338,13 +338,17 @@ impl Window {
         move |key| context.program.tolerances.of(&key.predicate, base)
     }
 
-    /// What is known of the root's facts takes the commits into account that were made since.
+    /// What is known of the root's facts, and of how much there is of each kind of resource, takes into account what was done since.
     fn follow_root(&mut self, context: &Context<'_>) {
         let mut has_changed = false;
         for command in &context.commands[self.followed.min(context.commands.len())..] {
-            if let Command::Commit { changes, .. } = command {
-                self.memory.root_changed(context.root, changes.iter().map(Change::pattern));
-                has_changed = true;
+            match command {
+                Command::Commit { changes, .. } => {
+                    self.memory.root_changed(context.root, changes.iter().map(Change::pattern));
+                    has_changed = true;
+                }
+                Command::Operate { operations, .. } => self.dispatch.operated(operations),
+                _ => {}
             }
         }
         if has_changed {
