@@ -304,8 +304,10 @@ impl Window {
     pub(super) fn tell_routine(&mut self, context: &mut Context<'_>, id: InstanceId, event: Event) {
         let Some(interpreter) = self.graph.interpreter(id) else { return };
         let has_asked = interpreter.asks();
+        let before = context.commands.len();
         let progress = interpreter.handle(context, event);
         let asks = interpreter.asks() && !has_asked;
+        self.note_crossings_of_routine(context, id, before);
         self.routine_progressed(context, id, progress);
         if asks && let Some(instance) = self.graph.get(id) {
             self.dispatch.asks_again(&self.graph, instance);
