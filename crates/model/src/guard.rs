@@ -572,12 +572,19 @@ impl Unfolding<'_> {
         }
     }
 
-    /// Which of the states around an old one is meant: the outermost that does not contain where it is named.
+    /// Which of the states around an old one is meant: the outermost that does not contain where it is named, and is not watched there. Inside of
+    /// all of them, and where it is watched, it is the outermost, as it was when it was left the last time: what stands around a state changes
+    /// nothing of what it sees of itself.
     fn seen_from(&self, from: StateId, old: StateId) -> StateId {
         let layers = self.layers(from, old);
         let up = |id: &StateId| self.new[id.0 as usize].parent;
         let contains = |layer: &StateId| std::iter::successors(Some(from), up).any(|id| id == *layer);
-        layers.iter().find(|layer| !contains(layer)).or(layers.last()).copied().unwrap_or(old)
+        let is_beside = |layer: &StateId| {
+            let around = up(layer).filter(|around| layers.contains(around) && contains(around));
+            around.is_some_and(|around| matches!(self.new[around.0 as usize].kind, StateKind::Concurrency { .. }))
+        };
+        let is_outside = |layer: &&StateId| !contains(layer) && !is_beside(layer);
+        layers.iter().find(is_outside).or(layers.first()).copied().unwrap_or(old)
     }
 
     /// Where a transition to an old state leads: to the outermost, with all that stands around it.

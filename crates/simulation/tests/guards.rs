@@ -215,3 +215,19 @@ states:
         assert_eq!((run.outcome.as_str(), run.end_s), ("success", 1.0), "{mode:?}: {}", run.reason);
     }
 }
+
+#[test]
+fn something_is_done_on_the_way_out_of_what_only_a_cut_ends_preempted() {
+    let text = "
+states:
+  - s:
+      states:
+        - a: { MOVE, effects: [], transitions: { preempted: success } }
+      finally:
+        - b: { TURN }
+";
+    for mode in MODES {
+        let run = run_with(text, mode, &|_| ("success", Value::Null));
+        assert_eq!(starts(&run), ["0 s/body/a", "1 s/finally/b"], "{mode:?}");
+    }
+}

@@ -114,6 +114,7 @@ pub fn program(seed: u64, features: &Features) -> Program {
     };
     if features.outputs {
         outputs::add(&mut program, &mut maker.guards, &mut Dice(seed ^ 0x0000_0074_b075));
+        outputs::of_the_iteration_before(&mut program, &mut Dice(seed ^ 0x0000_5e1f_0b5e));
     }
     if features.watched {
         watched::watch(&mut program, &mut maker.guards, &mut Dice(seed ^ 0x0000_3a7c_11ed));

@@ -147,3 +147,10 @@ fn outputs_of_everything_that_contains_states_are_made() {
         assert!(found >= least, "`{kind}` with `{said}` is in {found} of 300 programs");
     }
 }
+
+#[test]
+fn states_of_loops_that_read_what_they_gave_before_are_made() {
+    let made = (0..300).map(|seed| format!("{:?}", program(seed, &Features::OUTPUTS)));
+    let with = made.filter(|program| program.contains("of_the_last_")).count();
+    assert!(with >= 20, "{with} of 300 do");
+}

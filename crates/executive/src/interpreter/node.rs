@@ -50,14 +50,15 @@ impl Interpreter {
 
     /// Begins a try, unless a precondition does not hold or the operator lets nothing begin.
     pub(super) fn try_now(&mut self, context: &mut Context<'_>, thread: u64) {
+        // What it requires is looked at when it may begin.
+        if self.is_held(context, thread) {
+            return self.set_phase(thread, Phase::Held);
+        }
         if !self.may_try(context, thread) {
             return;
         }
         let Some(current) = self.threads.get(&thread).and_then(|thread| thread.current.as_ref()) else { return };
         let (id, instance) = (current.state, current.instance);
-        if self.is_held(context, thread) {
-            return self.set_phase(thread, Phase::Held);
-        }
         if self.routine_of(thread).is_some_and(|r| r.lease.is_none() && !r.requirements.is_empty()) {
             return self.set_phase(thread, Phase::Stalled);
         }
@@ -147,6 +148,9 @@ impl Interpreter {
         }
         if let Some(current) = self.current(thread) {
             current.lease = Some(lease);
+        }
+        if self.is_held(context, thread) {
+            return self.hold_back(context, thread);
         }
         // While it waited for them, somebody else may have changed what it requires.
         if self.may_try(context, thread) {

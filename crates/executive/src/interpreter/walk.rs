@@ -88,16 +88,15 @@ impl Interpreter {
             return;
         }
         self.forget_passed_over(program, thread, Some(id));
-        if let StateKind::Action { .. } = state.kind {
+        // One node: it looks itself at what it requires.
+        let begins_routine = state.is_routine() && self.routine_of(thread).is_none();
+        if begins_routine || matches!(state.kind, StateKind::Action { .. }) {
             return self.begin(context, thread, id, &path);
         }
         match self.with_scope(context, thread, None, |scope| binding::unmet(state, scope)) {
             Ok(None) => {}
             Ok(Some(reason)) => return self.ended(thread, id, ABORTED, format!("{path}: {reason}")),
             Err(error) => return self.ended(thread, id, ABORTED, format!("{path}: {}", error.reason())),
-        }
-        if state.is_routine() && self.routine_of(thread).is_none() {
-            return self.begin(context, thread, id, &path);
         }
         self.enter_composite(context, thread, id, path);
     }

@@ -25,7 +25,7 @@ pub(super) fn start_flows(subject: &Subject<'_>) -> Vec<StateId> {
             }
         });
     }
-    // What an action of a loop reads of itself is of the visit before.
+    // What a state of a loop reads of itself is of the visit before.
     if subject.contains_others() { without_inside(flows, subject) } else { flows.into_iter().collect() }
 }
 
@@ -70,8 +70,10 @@ fn each_executed<'a>(subject: &Subject<'a>, visit: &mut dyn FnMut(&'a Expr)) {
     }
 }
 
+/// What is written inside of a state is there when that runs. What the state itself has written is of its visit before, and comes from outside.
 fn without_inside(mut flows: BTreeSet<StateId>, subject: &Subject<'_>) -> Vec<StateId> {
-    subject.contained.iter().for_each(|state| {
+    let inside = subject.contained.iter().filter(|state| state.id != subject.state.id);
+    inside.for_each(|state| {
         flows.remove(&state.id);
     });
     flows.into_iter().collect()

@@ -24,11 +24,13 @@ mod waits;
 mod written;
 
 pub(crate) use nature::NodeNature;
-pub(crate) use outcomes::{ArmPlan, EVERYTHING, Effects, MAX_OUTCOMES, Outcome, Outcomes, gives_outputs};
+pub(crate) use outcomes::{ArmPlan, EVERYTHING, Effects, MAX_OUTCOMES, Outcome, Outcomes, SUCCEEDED, gives_outputs};
 pub(crate) use waits::WAITS;
 pub(crate) use written::{Chain, Written};
 
+use ratn_model::expression::scope::NothingKnown;
 use ratn_model::expression::{EffectExpr, FactExpr};
+use ratn_model::fact::Footprint;
 use ratn_model::id::StateId;
 use ratn_model::program::{Exceptions, Program, ResourceExpr, State, StateKind, Target, WORLD_MODEL};
 use ratn_model::resource::ResourceOperation;
@@ -43,6 +45,8 @@ pub(crate) type Predicate = usize;
 pub(crate) struct Plan {
     states: Vec<StatePlan>,
     names: Names,
+    /// The facts by which regions may get at each other: those that are `shared`, and any where a region may change any.
+    pub(crate) crossing: Footprint,
     /// How many predicates there are, [`EVERYTHING`] and the kinds of task resources included.
     pub(crate) width: usize,
     /// How many buckets there are for the keys of facts: a power of two.
@@ -147,9 +151,10 @@ impl Plan {
         let operated = resources::operated_anywhere(program);
         let read = flows::read_anywhere(program);
         let of = |state| StatePlan::of(&Subject::of(program, state), &transitions, &operated, &read, &mut names);
-        let states = program.states.iter().map(of).collect();
+        let states: Vec<StatePlan> = program.states.iter().map(of).collect();
+        let crossing = crossing(program, &states);
         let (width, buckets) = (names.numbers.len() + 2, Plan::buckets(program.horizon));
-        let mut plan = Plan { states, width, buckets, names };
+        let mut plan = Plan { states, crossing, width, buckets, names };
         for (id, kept) in improves::of(program, &plan) {
             plan.states[index(id)].improves = Some(kept);
         }
@@ -337,6 +342,14 @@ impl Names {
     fn of_kind(&mut self, kind: &str) -> Predicate {
         self.of_predicate(&format!("#{kind}"))
     }
+}
+
+fn crossing(program: &Program, states: &[StatePlan]) -> Footprint {
+    if states.iter().any(|own| own.is_region && own.may_write.is_none()) {
+        return Footprint::Everything;
+    }
+    let shared = program.states.iter().flat_map(|state| &state.annotations.shared);
+    FactExpr::footprint(&shared.cloned().collect::<Vec<_>>(), &NothingKnown)
 }
 
 fn index(id: StateId) -> usize {

@@ -15,6 +15,9 @@ pub(crate) const EVERYTHING: Predicate = 0;
 /// An outcome of a state: its place in [`super::StatePlan::outcomes`].
 pub(crate) type Outcome = usize;
 
+/// The outcome `success`, which every state has.
+pub(crate) const SUCCEEDED: Outcome = 0;
+
 /// A set of outcomes by bits; a state has at most [`MAX_OUTCOMES`].
 pub(crate) type Outcomes = u64;
 

@@ -83,11 +83,11 @@ impl Window {
         self.proceed(context, id);
     }
 
-    /// It never began and never will.
+    /// It never began and never will, or not once more.
     pub(super) fn fail(&mut self, context: &mut Context<'_>, id: InstanceId, reason: String) {
         context.note(Note::Finished { instance: id, outcome: ABORTED.into() });
         let outputs = self.unassigned(context, id);
-        self.end_instance(id, Ended { outputs, ..Ended::aborted(reason) });
+        self.end_node(context, id, Ended { outputs, ..Ended::aborted(reason) });
     }
 
     /// A routine that did not run leaves the variables that it would assign as they were.
@@ -232,6 +232,7 @@ impl Window {
                 if !matches!(self.status(id), Some(Status::Acquiring { .. })) {
                     return self.in_routine(context, Event::Granted { instance: id, lease });
                 }
+                self.used_up(context, id);
                 self.graph.grant(id, Some(lease), context.now);
                 self.proceed_unless_held_back(context, id);
             }
@@ -254,6 +255,21 @@ impl Window {
                 self.launch(context, id, None);
             }
             _ => {}
+        }
+    }
+
+    /// What a node uses up is gone when it gets it.
+    fn used_up(&mut self, context: &Context<'_>, id: InstanceId) {
+        let Some(instance) = self.graph.get(id).filter(|instance| context.plan.state(instance.state).uses_up) else {
+            return;
+        };
+        let wanted = &context.plan.state(instance.state).requirements;
+        let bound = self.look(context, id, None, |instance, view| {
+            binding::requirements(context.program.state(instance.state), wanted, view)
+        });
+        if let Some(Ok(mut requirements)) = bound {
+            requirements.retain(|wanted| wanted.operation == ResourceOperation::Consume);
+            self.dispatch.operated(&requirements);
         }
     }
 
@@ -474,8 +490,10 @@ impl Window {
         let routine = Routine { requirements, lease, visit: None };
         let mut interpreter = Box::new(Interpreter::of_routine(variables, outputs, routine, target));
         let path = self.path(context.program, id);
+        let before = context.commands.len();
         let progress = interpreter.start(context, state, &path);
         self.graph.run_routine(id, interpreter);
+        self.note_crossings_of_routine(context, id, before);
         self.routine_progressed(context, id, progress);
     }
 
@@ -555,7 +573,7 @@ impl Window {
     }
 
     /// A speculative holder gives back what it has and asks again.
-    fn preempt(&mut self, context: &mut Context<'_>, holder: InstanceId, by: Option<InstanceId>) {
+    pub(super) fn preempt(&mut self, context: &mut Context<'_>, holder: InstanceId, by: Option<InstanceId>) {
         context.note(Note::Preempted { instance: holder, by });
         self.step_back(context, holder, Wait::Nothing);
         self.waits.enqueue(&mut self.graph, holder);

@@ -181,7 +181,11 @@ impl Window {
     }
 
     /// The values of what is computed at a boundary, in order, each under its name; and what they are made of.
-    fn compute_parts(&self, context: &Context<'_>, instance: &Instance) -> (Result<Outputs, Readiness>, Seen) {
+    pub(super) fn compute_parts(
+        &self,
+        context: &Context<'_>,
+        instance: &Instance,
+    ) -> (Result<Outputs, Readiness>, Seen) {
         let state = context.program.state(instance.state);
         let parts = parts_of(context, instance);
         let is_success = |outcome: &str| outcome == SUCCESS;

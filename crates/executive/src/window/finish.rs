@@ -126,13 +126,17 @@ impl Window {
             ended = failed(&ended, problem);
         }
         context.note(Note::Finished { instance: id, outcome: ended.outcome.clone() });
-        let (has_acted, is_detached) =
-            instance.node().map_or((false, false), |node| (node.status.is_running(), node.is_detached));
+        let has_acted = instance.node().is_some_and(|node| node.status.is_running());
         self.give_back(context, id);
         self.graph.set_acted(id, has_acted);
         self.rest(id);
+        self.end_node(context, id, ended);
+    }
+
+    /// A node has come to its end, and holds nothing any more. One that others were let pass becomes real: nobody of its line comes to it any more.
+    pub(super) fn end_node(&mut self, context: &mut Context<'_>, id: InstanceId, ended: Ended) {
         self.end_instance(id, ended);
-        if is_detached {
+        if self.graph.get(id).is_some_and(Instance::is_detached) {
             self.retire_detached(context, id);
         }
     }
@@ -300,10 +304,13 @@ impl Window {
     pub(super) fn tell_routine(&mut self, context: &mut Context<'_>, id: InstanceId, event: Event) {
         let Some(interpreter) = self.graph.interpreter(id) else { return };
         let has_asked = interpreter.asks();
+        let before = context.commands.len();
         let progress = interpreter.handle(context, event);
         let asks = interpreter.asks() && !has_asked;
+        self.note_crossings_of_routine(context, id, before);
         self.routine_progressed(context, id, progress);
-        if asks {
+        if asks && let Some(instance) = self.graph.get(id) {
+            self.dispatch.asks_again(&self.graph, instance);
             self.make_room(context, id);
         }
     }
@@ -312,7 +319,9 @@ impl Window {
         let Progress::Ended { outcome, reason } = progress else { return };
         let Some(state) = self.graph.get(id).map(|instance: &Instance| instance.state) else { return };
         let Some(routine) = self.graph.end_routine(id) else { return };
-        let mut outputs = routine.outputs().get(&state).cloned().unwrap_or_default();
+        // Where it gives none, those that it knows of itself are of its visit before.
+        let own = routine.outputs().get(&state).filter(|_| gives_outputs(&outcome));
+        let mut outputs = own.cloned().unwrap_or_default();
         for name in &context.plan.state(state).assigns {
             outputs.extend(routine.variable(name).map(|value| (assigned(name), value.clone())));
         }

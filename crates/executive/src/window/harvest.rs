@@ -23,7 +23,8 @@ use ratn_model::id::InstanceId;
 use ratn_model::program::{SUCCESS, StateKind};
 use std::collections::BTreeSet;
 
-/// So long somebody waits for what is held only to improve a result, where it was not known that there is too little for both, in seconds.
+/// So long somebody waits for what is held only to improve a result, or is speculative, where it was not known that there is too little for both, in
+/// seconds.
 const PATIENCE_S: f64 = 0.1;
 
 impl Window {
@@ -152,23 +153,25 @@ impl Window {
     }
 
     /// An instance is about to ask for resources. Where there is not enough for it and for what only gets better, the latter gives way; where
-    /// that is not known, it does so after a while.
+    /// that is not known, it does so after a while, and so does what is speculative.
     pub(super) fn make_room(&mut self, context: &mut Context<'_>, id: InstanceId) {
-        if self.improving.is_empty() {
-            return;
+        if !self.improving.is_empty() {
+            let in_the_way = self.dispatch.too_much(&self.graph, context.plan, &self.improving, id);
+            in_the_way.into_iter().for_each(|other| self.harvest(context, other));
         }
-        let in_the_way = self.dispatch.too_much(&self.graph, context.plan, &self.improving, id);
-        in_the_way.into_iter().for_each(|other| self.harvest(context, other));
-        if self.holders_of_what(context, id).next().is_some() {
+        let holds = self.holders_of_what(context, id).next().is_some();
+        if holds || !self.dispatch.perhaps_in_the_way(&self.graph, context.plan, id).is_empty() {
             self.set_timer(context, PATIENCE_S, Timer::Room(id));
         }
     }
 
-    /// An instance has waited for resources for a while: whoever holds such only to improve a result gives way.
+    /// An instance has waited for resources for a while: whoever holds such only to improve a result, or is speculative, gives way.
     pub(super) fn make_way_for(&mut self, context: &mut Context<'_>, id: InstanceId) {
         if self.asks(id) {
             let holders: Vec<InstanceId> = self.holders_of_what(context, id).collect();
             holders.into_iter().for_each(|other| self.harvest(context, other));
+            let speculative = self.dispatch.perhaps_in_the_way(&self.graph, context.plan, id);
+            speculative.into_iter().for_each(|holder| self.preempt(context, holder, Some(id)));
         }
     }
 

@@ -23,6 +23,7 @@
 //! | `retire` | what becomes real, in program order per line |
 //! | `revise` | what was made of something that came out otherwise is made again |
 //! | `outside` | the world changes from outside |
+//! | `beside` | a region changes facts that regions beside it look at |
 //! | `discard` | paths that are not taken |
 //!
 //! Lines retire in program order, so the root world always is the world after a prefix of the program: a failure is precise, and
@@ -30,6 +31,7 @@
 //! flows and projections; *settled* cannot change any more and decides conditions and loops; *retired* is real.
 
 mod begin;
+mod beside;
 mod checkpoint;
 mod decide;
 mod discard;
@@ -55,6 +57,7 @@ use crate::lookahead;
 use crate::plan::Plan;
 use crate::protocol::{Command, Event, Learned};
 use crate::way_out::WayOut;
+use beside::Crossing;
 pub(crate) use checkpoint::Beside;
 use dispatch::Dispatch;
 use graph::Graph;
@@ -110,6 +113,9 @@ pub(crate) struct Window {
     /// What these assign is otherwise since the event came.
     #[serde(skip)]
     assigned_again: BTreeSet<InstanceId>,
+    /// What regions have changed, and those beside them have not been told.
+    #[serde(skip)]
+    crossings: Vec<Crossing>,
     /// So many commands of the event have been looked through for commits.
     #[serde(skip)]
     followed: usize,
@@ -139,6 +145,7 @@ impl Window {
             is_ending: false,
             may_end_waits: false,
             assigned_again: BTreeSet::new(),
+            crossings: Vec::new(),
             followed: 0,
         }
     }
@@ -222,7 +229,11 @@ impl Window {
             if self.end.is_some() {
                 return self.end.take();
             }
-            let changed = self.retire(context) | self.revise(context) | self.grow(context) | self.give_way(context);
+            let changed = self.retire(context)
+                | self.tell_of_crossings(context)
+                | self.revise(context)
+                | self.grow(context)
+                | self.give_way(context);
             if self.end.is_some() {
                 return self.end.take();
             }
@@ -338,13 +349,17 @@ impl Window {
         move |key| context.program.tolerances.of(&key.predicate, base)
     }
 
-    /// What is known of the root's facts takes the commits into account that were made since.
+    /// What is known of the root's facts, and of how much there is of each kind of resource, takes into account what was done since.
     fn follow_root(&mut self, context: &Context<'_>) {
         let mut has_changed = false;
         for command in &context.commands[self.followed.min(context.commands.len())..] {
-            if let Command::Commit { changes, .. } = command {
-                self.memory.root_changed(context.root, changes.iter().map(Change::pattern));
-                has_changed = true;
+            match command {
+                Command::Commit { changes, .. } => {
+                    self.memory.root_changed(context.root, changes.iter().map(Change::pattern));
+                    has_changed = true;
+                }
+                Command::Operate { operations, .. } => self.dispatch.operated(operations),
+                _ => {}
             }
         }
         if has_changed {
@@ -364,6 +379,9 @@ impl Window {
     pub(crate) fn check_invariants(&self) -> Result<(), String> {
         if self.is_ending {
             return Ok(());
+        }
+        if !self.crossings.is_empty() {
+            return Err("a region has changed what others look at, and they were not told".to_owned());
         }
         self.graph.check_invariants()?;
         self.growth.check_invariants(&self.graph)?;

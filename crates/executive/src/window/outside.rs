@@ -49,8 +49,13 @@ impl Window {
             }
         }
         self.revise(context);
+        self.decide_again(context, all, &changed);
+    }
+
+    /// Those among some instances that would not decide so again do, now that these facts are otherwise.
+    pub(super) fn decide_again(&mut self, context: &mut Context<'_>, all: Vec<InstanceId>, changed: &Footprint) {
         for id in &all {
-            if self.may_decide_otherwise(context, *id) || self.decides_otherwise(context, *id, &changed) {
+            if self.may_decide_otherwise(context, *id) || self.decides_otherwise(context, *id, changed) {
                 self.reopen(context, *id);
             }
         }

@@ -1,6 +1,7 @@
 //! Readiness of a node: the first thing that is missing before it may ask for its resources.
 
 use super::Window;
+use super::beside::regions_around;
 use super::graph::instance::{Instance, Role};
 use super::growth::environment::Link;
 use super::memory::{Blocked, Looked, Seen, Sight, View, facts_of};
@@ -10,7 +11,7 @@ use crate::context::Context;
 use crate::plan::{Effects, MAX_OUTCOMES, NodeNature, WAITS};
 use ratn_model::expression::{EffectExpr, FactExpr};
 use ratn_model::fact::Footprint;
-use ratn_model::id::{InstanceId, StateId};
+use ratn_model::id::InstanceId;
 use ratn_model::program::StateKind;
 use ratn_model::resource::Requirement;
 
@@ -188,7 +189,7 @@ impl Window {
 
     /// An older imprecise PIA that still runs, of its line or of one around that. A wait does not begin beside it: a signal that it took
     /// would be lost if that one fails and its path is left.
-    fn older_beside(&self, instance: &Instance) -> Option<InstanceId> {
+    pub(super) fn older_beside(&self, instance: &Instance) -> Option<InstanceId> {
         let is_around = |id: &InstanceId| {
             let other = self.graph.get(*id).filter(|other| other.id < instance.id);
             other.is_some_and(|other| regions_around(instance).starts_with(&regions_around(other)))
@@ -271,19 +272,6 @@ pub(super) fn look(context: &Context<'_>, view: &View<'_>, nature: NodeNature) -
     };
     view.see(reads, &mut seen).map_err(blocked)?;
     Ok(seen)
-}
-
-/// The regions that an instance is in, the outermost first: by fork and state.
-fn regions_around(instance: &Instance) -> Vec<(InstanceId, StateId)> {
-    let mut regions = Vec::new();
-    let mut inner = instance.state;
-    let mut frames = instance.environment.frames.as_deref();
-    while let Some(frame) = frames {
-        regions.extend(frame.fork.map(|fork| (fork, inner)));
-        (inner, frames) = (frame.owner, frame.below.as_deref());
-    }
-    regions.reverse();
-    regions
 }
 
 /// Whether it has its resources and has not ended.

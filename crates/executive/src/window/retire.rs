@@ -12,7 +12,7 @@ use super::waits::Wait;
 use crate::binding;
 use crate::context::{Context, MAX_IDLE_VISITS, Made, in_circles};
 use crate::effects;
-use crate::plan::{Effects, NodeNature, Outcome, gives_outputs};
+use crate::plan::{Effects, NodeNature, Outcome, SUCCEEDED, gives_outputs};
 use crate::protocol::{Command, Note};
 use ratn_model::fact::{Change, FactKey};
 use ratn_model::id::InstanceId;
@@ -54,9 +54,10 @@ impl Window {
         let mut last = None;
         while let Some(line) = self.graph.next_active_line(last) {
             last = Some(line);
-            while self.end.is_none()
-                && let Some(id) = self.graph.head_of(line)
-            {
+            while self.end.is_none() {
+                // Nothing may become real that was decided by what another region has changed since.
+                retired |= self.tell_of_crossings(context);
+                let Some(id) = self.graph.head_of(line) else { break };
                 if self.passes(context, id) {
                     self.graph.pass_over(id);
                     retired = true;
@@ -72,11 +73,13 @@ impl Window {
         retired
     }
 
-    /// Whether an imprecise PIA runs and lets younger ones begin.
+    /// Whether an imprecise PIA runs and lets younger ones begin: those of the way of its success. What is on the way of another outcome alone is
+    /// computed ahead, and waits.
     fn passes(&self, context: &Context<'_>, id: InstanceId) -> bool {
         self.graph.get(id).is_some_and(|head| {
             head.is_pia()
                 && head.arms.len() == 1
+                && head.arm_of(SUCCEEDED).is_some()
                 && context.plan.state(head.state).imprecise
                 && head.node().is_some_and(|node| node.status.is_running())
         })
@@ -236,13 +239,16 @@ impl Window {
                 });
                 real.before = written.map(|fact| (fact.clone(), context.root.get(fact).cloned())).collect();
             }
-            let changes = if has_readers { made.changes.clone() } else { Vec::new() };
+            let changes = made.changes.clone();
             let writer = self.path(context.program, id);
             if let Err(problem) = context.commit(id, writer, made) {
                 real.reason = problem;
                 return real;
             }
-            real.changes = changes;
+            self.note_crossing(context, id, changes.iter());
+            if has_readers {
+                real.changes = changes;
+            }
         }
         if let Some(Changed::Foreseen(changes)) =
             self.graph.get(id).and_then(Instance::ended).map(|ended| &ended.changes)

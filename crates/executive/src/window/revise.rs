@@ -30,7 +30,7 @@ impl Window {
     fn look_again(&mut self, context: &mut Context<'_>, id: InstanceId) {
         let Some(instance) = self.graph.get(id) else { return };
         if !instance.memory.has_users() && instance.waiting.waiters().is_empty() {
-            return;
+            return instance.memory.forget_forecasts();
         }
         let users = instance.memory.users();
         let refreshed = self.sight(context).refresh(id, self.tolerance_of(context));
@@ -133,11 +133,15 @@ impl Window {
         }
     }
 
-    /// Whether a node has seen the facts as they are now: it was made of them since they came out otherwise.
-    fn sees_the_same(&self, context: &Context<'_>, instance: &Instance) -> bool {
-        let now =
-            self.look(context, instance.id, None, |_, view| ready::look(context, view, NodeNature::Computes).ok());
-        now.flatten().is_some_and(|now| instance.seen().is_some_and(|seen| seen.saw_the_same(&now)))
+    /// Whether an instance has seen the facts as they are now: it was made of them since they came out otherwise.
+    pub(super) fn sees_the_same(&self, context: &Context<'_>, instance: &Instance) -> bool {
+        let now = match instance.role() {
+            Some(_) => Some(self.compute_parts(context, instance).1),
+            None => self
+                .look(context, instance.id, None, |_, view| ready::look(context, view, NodeNature::Computes).ok())
+                .flatten(),
+        };
+        now.is_some_and(|now| instance.seen().is_some_and(|seen| seen.saw_the_same(&now)))
     }
 
     /// An action assigns anew, by the facts as they are now, of the result that it has, if it has one; whether that could be done.

@@ -127,7 +127,7 @@ pub(crate) enum Timer {
     Timeout(InstanceId, u32),
     /// It has been held back as long as it may be.
     Hold(InstanceId),
-    /// It has waited long enough for what is held only to improve a result.
+    /// It has waited long enough for what is held only to improve a result, or is speculative.
     Room(InstanceId),
     /// The task has had its time.
     Deadline,

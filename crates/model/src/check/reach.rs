@@ -27,10 +27,16 @@ fn unreachable(subject: &Subject<'_>, findings: &mut Findings) {
     if subject.begins_elsewhere {
         return;
     }
+    // What is done on the way out was written once, for every outcome; and a state that is cut short is left by the one for `preempted`, also where
+    // nothing of it ends so.
+    let finally = |state: &State| {
+        let around = state.parent.and_then(|id| subject.program.state(id).annotations.finally.as_ref());
+        around.is_some_and(|finally| finally.lastly.values().any(|lastly| *lastly == state.id))
+    };
     for state in &subject.program.states {
         let reached = |id| subject.control.is_reached(Point::Begin(id));
         // Of what is inside of an unreachable state nothing more is said.
-        if !reached(state.id) && state.parent.is_none_or(reached) {
+        if !reached(state.id) && state.parent.is_none_or(reached) && !finally(state) {
             let help = "let a transition lead here, or remove it";
             findings.error("unreachable-state", state.location, &state.path, "nothing leads to this state", help);
         }

@@ -50,6 +50,31 @@ pub(super) fn add(program: &mut Program, guards: &mut BTreeMap<StateId, Guard>, 
     }
 }
 
+/// Inside of a state of a loop, what that has put out in the iteration before is used.
+pub(super) fn of_the_iteration_before(program: &mut Program, dice: &mut Dice) {
+    let is_again = |state: &State| around(program, state).skip(1).any(State::is_loop);
+    let gives = |state: &&State| state.outputs().iter().any(|output| output.name == X);
+    let all: Vec<StateId> =
+        program.states.iter().filter(gives).filter(|state| is_again(state)).map(|state| state.id).collect();
+    for id in all {
+        let has_default = program.state(id).defaults.contains_key(X);
+        for inside in (1..program.states.len() as u64).map(StateId) {
+            let is_inside = around(program, program.state(inside)).skip(1).any(|out| out.id == id);
+            if !is_inside || program.state(inside).is_pause() || !dice.percent(30) {
+                continue;
+            }
+            let own = Expr::Port { state: id, port: X.to_owned() };
+            let value = match has_default && dice.percent(50) {
+                true => own,
+                false => Expr::Call(Function::Either, vec![own, Expr::Literal(Value::Int(5))]),
+            };
+            if let StateKind::Action { inputs, .. } = &mut program.states[inside.0 as usize].kind {
+                inputs.push((format!("of_the_last_{}", id.0), value));
+            }
+        }
+    }
+}
+
 /// The states directly inside of one that have an output `x`.
 fn givers(program: &Program, id: StateId) -> Vec<StateId> {
     let gives = |state: &&State| match &state.kind {

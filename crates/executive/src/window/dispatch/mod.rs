@@ -14,7 +14,7 @@ use super::improving::Improving;
 use crate::plan::Plan;
 use crate::protocol::CERTAIN;
 use ratn_model::id::{InstanceId, StateId};
-use ratn_model::program::WORLD_MODEL;
+use ratn_model::program::{ResourceExpr, WORLD_MODEL};
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
@@ -41,8 +41,13 @@ pub(crate) struct DispatchCell {
 /// Who is under way, who leaves room.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct Dispatch {
-    /// How much there is of each kind of resource, where that is known.
+    /// How much there was of each kind of resource when the run began, where that is known.
     capacity: BTreeMap<String, Quantity>,
+    /// What the task has made of each kind since, and what it has removed.
+    #[serde(default)]
+    made: BTreeMap<String, Quantity>,
+    #[serde(default)]
+    removed: BTreeMap<String, Quantity>,
     /// By the path of the state, in seconds.
     learned_s: BTreeMap<String, f64>,
     /// Nodes under way: they have asked for resources, hold some, or run.
@@ -62,8 +67,28 @@ pub(crate) struct Dispatch {
 
 impl Dispatch {
     pub(crate) fn new(capacity: BTreeMap<String, Quantity>, learned_s: BTreeMap<String, f64>) -> Dispatch {
-        let (active, speculative, in_rooms, stalled, holds, asked) = Default::default();
-        Dispatch { capacity, learned_s, active, speculative, in_rooms, stalled, holds, asked }
+        let (made, removed, active, speculative, in_rooms, stalled, holds, asked) = Default::default();
+        Dispatch { capacity, made, removed, learned_s, active, speculative, in_rooms, stalled, holds, asked }
+    }
+
+    /// The task makes resources, or removes them.
+    pub(crate) fn operated(&mut self, operations: &[Requirement]) {
+        for operation in operations {
+            let changed = match operation.operation {
+                ResourceOperation::Create => &mut self.made,
+                ResourceOperation::Delete | ResourceOperation::Consume => &mut self.removed,
+                ResourceOperation::Block | ResourceOperation::Exists => continue,
+            };
+            *changed.entry(operation.kind.clone()).or_default() += operation.count;
+        }
+    }
+
+    /// How much there is of a kind, as far as is known.
+    fn there_is(&self, kind: &str) -> Option<Quantity> {
+        let (offered, made) = (self.capacity.get(kind).copied(), self.made.get(kind).copied());
+        offered.or(made)?;
+        let all = offered.unwrap_or_default() + made.unwrap_or_default();
+        Some(all.saturating_sub(self.removed.get(kind).copied().unwrap_or_default()))
     }
 
     /// Nodes under way, oldest first.
@@ -118,7 +143,7 @@ impl Dispatch {
         self.speculative.remove(&id)
     }
 
-    /// A certain node has asked again.
+    /// A certain node, or a routine that is, has asked again.
     pub(crate) fn asks_again(&mut self, graph: &Graph, instance: &Instance) {
         if !graph.is_speculative(instance.segment) {
             self.asked.push(instance.id);
@@ -211,7 +236,7 @@ impl Dispatch {
         let mut giving_way: BTreeMap<InstanceId, InstanceId> = BTreeMap::new();
         let mut order = Vec::new();
         for (kind, by) in wanted {
-            let Some(capacity) = self.capacity.get(kind).copied() else { continue };
+            let Some(capacity) = self.there_is(kind) else { continue };
             let mut left = taken.get(kind).copied().unwrap_or_default();
             let mut all = holders.remove(kind).unwrap_or_default();
             all.sort_unstable();
@@ -228,6 +253,27 @@ impl Dispatch {
         order
     }
 
+    /// Speculative holders that may keep a certain node from what it has asked for, where counting does not tell: it is not known how much
+    /// there is, or one of them takes only what has certain attributes.
+    pub(crate) fn perhaps_in_the_way(&self, graph: &Graph, plan: &Plan, asks: InstanceId) -> Vec<InstanceId> {
+        let Some(instance) = graph.get(asks).filter(|instance| !graph.is_speculative(instance.segment)) else {
+            return Vec::new();
+        };
+        let blocked = |state: StateId| {
+            plan.state(state).requirements.iter().filter(|wanted| wanted.operation == ResourceOperation::Block)
+        };
+        let is_open = |wanted: &ResourceExpr, held: &ResourceExpr| {
+            let selects = wanted.expressions().chain(held.expressions()).next().is_some();
+            wanted.kind == held.kind && (selects || self.there_is(&wanted.kind).is_none())
+        };
+        let keeps = |holder: &Instance| {
+            holder.node().is_some_and(|node| node.status.since().is_some())
+                && blocked(instance.state).any(|wanted| blocked(holder.state).any(|held| is_open(wanted, held)))
+        };
+        let holders = self.speculative.iter().filter_map(|id| graph.get(*id));
+        holders.filter(|holder| keeps(holder)).map(|holder| holder.id).collect()
+    }
+
     /// Who holds only to improve a result what an instance that asks cannot have beside it, as far as is known how much there is; whoever has
     /// improved for longest first.
     pub(crate) fn too_much(
@@ -240,7 +286,7 @@ impl Dispatch {
         let mut in_the_way = BTreeSet::new();
         let Some(instance) = graph.get(asks) else { return in_the_way };
         for (kind, _) in blocks(plan, instance.state) {
-            let Some(capacity) = self.capacity.get(kind).copied() else { continue };
+            let Some(capacity) = self.there_is(kind) else { continue };
             let of = |state: StateId| {
                 blocks(plan, state).filter(|(other, _)| *other == kind).map(|(_, count)| count).sum::<Quantity>()
             };

@@ -138,6 +138,11 @@ impl MemoryCell {
         self.users.borrow_mut().clear();
     }
 
+    /// What it changes is worked out anew for whoever looks next.
+    pub(crate) fn forget_forecasts(&self) {
+        self.forecasts.borrow_mut().clear();
+    }
+
     fn has_readers(&self) -> bool {
         self.users.borrow().iter().any(|user| user.of == Source::World)
     }
