@@ -152,6 +152,10 @@ impl Listed {
         );
         line("computes", if annotations.computes { "true".to_owned() } else { String::new() });
         annotations.lists().into_iter().for_each(|(key, list)| line(key, list.join("; ")));
+        for (input, said) in &annotations.given {
+            line("given", format!("`{input}`:"));
+            said.lists().into_iter().for_each(|(key, list)| line(key, list.join("; ")));
+        }
         lines.join("\n")
     }
 }
