@@ -140,7 +140,7 @@ impl Listed {
         let mut lines = vec![format!("{} ({}; a state that uses it blocks {})", self.action, self.from, self.resource)];
         let mut line = |head: &str, text: String| {
             if !text.is_empty() {
-                lines.push(format!("  {head:<10}{text}"));
+                lines.push(format!("  {head:<9} {text}"));
             }
         };
         line("does", description.clone());
