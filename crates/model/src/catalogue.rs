@@ -55,8 +55,9 @@ impl Catalogue {
             for (action, signature) in &provider.actions {
                 let wrong = |error| InvalidCatalogue(format!("annotations of {name}/{action}: {error}"));
                 signature.annotations.check(signature).map_err(wrong)?;
-                let blocked = &signature.annotations.resources;
-                if !blocked.is_empty() && !blocked.contains(&provider.resource) {
+                let lacks =
+                    |said: &&Annotations| !said.resources.is_empty() && !said.resources.contains(&provider.resource);
+                if signature.annotations.all().any(|said| lacks(&said)) {
                     let own = &provider.resource;
                     let message =
                         format!("annotations of {name}/{action}: `resources` lacks `{own}`, which performs it; add it");

@@ -23,6 +23,9 @@ fn held(states: &str) -> Vec<(String, &'static str, String)> {
     told.flat_map(|state| state.lines.into_iter().map(move |line| (state.state.clone(), line.key, line.text))).collect()
 }
 
+/// What the catalogue says of a motion of the arm that fails.
+const ARM_UNKNOWN: &str = "aborted: delete arm_at(arm); preempted: delete arm_at(arm)";
+
 const GRASP: &str = "
   - plan: { action: path_planner/plan, in: { start: \"joints(0, 0, 0, 0, 0, 0, 0)\", goal: \"joints(1, 0, 0, 0, 0, 0, 0)\" } }
   - for: name in [box_1]
@@ -72,15 +75,69 @@ fn what_a_state_says_stands_in_place_and_its_effects_are_added() {
     let of =
         |state: &str, key: &str| held.iter().find(|(s, k, _)| s == state && *k == key).map(|(.., text)| text.as_str());
     assert_eq!(of("tuck", "reads"), Some("at(table)"));
-    let added = "set arm_at(arm) = joints(1, 0, 0, 0, 0, 0, 0); set posture(arm) = tucked";
-    assert_eq!(of("tuck", "effects"), Some(added), "a fact of one's own does not hide that the arm has moved");
-    assert_eq!(of("back", "effects"), Some("set arm_at(arm) = home; set posture(arm) = home"));
-    assert_eq!(
-        of("left", "effects"),
-        Some("set arm_at(left) = out; aborted: set posture(arm) = lost"),
-        "of two arms, the one it names"
-    );
+    let added = format!("set arm_at(arm) = joints(1, 0, 0, 0, 0, 0, 0); set posture(arm) = tucked; {ARM_UNKNOWN}");
+    assert_eq!(of("tuck", "effects"), Some(&*added), "a fact of one's own does not hide that the arm has moved");
+    let back = format!("set arm_at(arm) = home; set posture(arm) = home; {ARM_UNKNOWN}");
+    assert_eq!(of("back", "effects"), Some(&*back));
+    let left =
+        "set arm_at(left) = out; aborted: set posture(arm) = lost; delete arm_at(left); preempted: delete arm_at(left)";
+    assert_eq!(of("left", "effects"), Some(left), "of two arms, the one it names");
     assert_eq!(of("left", "resources"), Some("block Arm where arm = left"));
+}
+
+#[test]
+fn where_an_arm_is_after_a_motion_that_failed_is_unknown_unless_the_state_says_it() {
+    let states = "
+  - watched:
+      action: arm/move_to
+      in: { joints: \"joints(0, 0, 0, 0, 0, 0, 0)\" }
+      while: [\"exists at(box_1)\"]
+  - told:
+      action: arm/move_to
+      in: { joints: \"joints(0, 0, 0, 0, 0, 0, 0)\" }
+      effects: { success: [\"arm_at(arm) = home\"], aborted: [\"arm_at(arm) = beside\"] }
+  - nowhere:
+      action: arm/move_to
+      in: { joints: \"joints(0, 0, 0, 0, 0, 0, 0)\" }
+      effects: []
+";
+    let effects = |state: &str| {
+        let program = program(states);
+        let found = program.states.iter().find(|known| known.path == state).unwrap();
+        let texts = |effects: &Vec<_>| effects.iter().map(ToString::to_string).collect::<Vec<String>>();
+        found.annotations.effects.iter().map(|(outcome, effects)| (outcome.clone(), texts(effects))).collect::<Vec<_>>()
+    };
+    let of = |outcome: &str, effect: &str| (outcome.to_owned(), vec![effect.to_owned()]);
+    let deleted = |outcome: &str| of(outcome, "delete arm_at(arm)");
+    let zero = "set arm_at(arm) = joints(0, 0, 0, 0, 0, 0, 0)";
+    assert_eq!(
+        effects("watched"),
+        [deleted("aborted"), deleted("preempted"), of("success", zero), deleted("violated")]
+    );
+    let beside = of("aborted", "set arm_at(arm) = beside");
+    assert_eq!(effects("told"), [beside, deleted("preempted"), of("success", "set arm_at(arm) = home")]);
+    // What success does not change, and so says nothing of: it adds to the action's.
+    assert_eq!(effects("nowhere"), [deleted("aborted"), deleted("preempted"), of("success", zero)]);
+}
+
+#[test]
+fn what_is_said_of_an_input_stands_in_place_where_a_state_gives_it() {
+    let grasp = |hand: &str| {
+        let state = format!(
+            "  - grasp: {{ action: gripper/grasp, in: {{ object: box_1, expected: \"pose(0, 0, 0.02)\"{hand} }} }}\n"
+        );
+        let task = format!("task: t\nworld: [\"hand_empty(right)\", \"hand_empty(gripper)\"]\nstates:\n{state}");
+        let loaded = load(&task, "t.yaml", &Catalogue::standard()).unwrap();
+        assert_eq!(loaded.warnings.len(), 0, "{:#?}", loaded.warnings);
+        let lines = in_force(&loaded.program).remove(0).lines;
+        let of = |key: &str| lines.iter().find(|line| line.key == key).unwrap().text.clone();
+        [of("requires"), of("effects"), of("reads")]
+    };
+    let own = "set in_gripper(box_1) = pose(0, 0, 0.02); delete hand_empty(gripper)";
+    assert_eq!(grasp(""), ["hand_empty(gripper)", own, "at(base); at(box_1)"]);
+    assert_eq!(grasp(", hand: null"), grasp(""));
+    let right = "set in_gripper(box_1, right) = pose(0, 0, 0.02); delete hand_empty(right)";
+    assert_eq!(grasp(", hand: right"), ["hand_empty(right)", right, "at(base); at(box_1)"]);
 }
 
 #[test]
@@ -138,6 +195,10 @@ fn a_catalogue_whose_annotations_do_not_read_is_refused_with_action_key_and_text
     assert!(both.contains("what only computes has no effects"), "{both}");
     let other = refused("resources = [\"Arm\"]");
     assert!(other.contains("lacks `Eye`"), "{other}");
+    let predicate = refused("unknown_after_failure = [\"arm_at(arm)\"]");
+    assert!(predicate.contains("write its name alone"), "{predicate}");
+    let required = refused("given = { at = { reads = [] } }");
+    assert!(required.contains("no optional input"), "{required}");
 }
 
 #[test]

@@ -19,7 +19,7 @@ fn limits<const N: usize>(random: &mut ChaCha8Rng) -> Vec<Joint> {
         let acceleration = random.random_range(1.0..15.0);
         let jerk = acceleration / random.random_range(0.03..0.2);
         let velocity = random.random_range(0.5..3.5);
-        Joint { name: "joint".to_owned(), lower: -9.0, upper: 9.0, velocity, acceleration, jerk }
+        Joint { name: "joint".to_owned(), lower: -9.0, upper: 9.0, endless: false, velocity, acceleration, jerk }
     };
     (0..N).map(|_| one(random)).collect()
 }

@@ -5,6 +5,7 @@
 //! at most [`OVERHANG_M`] and hold them with at least [`CLEARANCE_M`] to spare. So what the exact check with a padding of `OVERHANG_M`
 //! finds clear of obstacles the spheres do too, and what the spheres find free is free by the exact check with `CLEARANCE_M`.
 
+use crate::endless::WithEnds;
 use crate::joint_vector::JointVector;
 use crate::line::{self, LineError};
 use crate::mechanism::Mechanism;
@@ -96,9 +97,11 @@ fn is_unseen(arm: &Mechanism, a: usize, b: usize) -> bool {
     arm.is_by_shapes(a, b) && [a, b].iter().any(|link| arm.links[*link].covers > 0)
 }
 
-/// The tool of the arm in the frame of the base.
+/// The tool of the arm in the frame of the base. Joints that turn without end turn by a whole turn from zero, to either side.
 pub fn reach(robot: &Robot) -> Reach {
-    Reach::new(&robot.arm(&robot.at_zero()), robot.tool, Pose::IDENTITY)
+    let zero = robot.at_zero();
+    let arm = WithEnds::about(robot, &zero.arm).map_or_else(|| robot.arm(&zero), |arm| arm.robot.arm(&zero));
+    Reach::new(&arm, robot.tool, Pose::IDENTITY)
 }
 
 /// What a scene alone leaves to be assumed of the robot: the base stands where the scene has it, the fingers are around what is held, else

@@ -6,7 +6,7 @@ use crate::exact::{Exact, Touch};
 use crate::geometry::{Body, Geometry};
 use crate::mechanism::Mechanism;
 use crate::problems::Problem;
-use crate::robot_model::{Joint, Link};
+use crate::robot_model::Link;
 use crate::space::ROUNDING_M;
 use crate::spheres::Sphere;
 use crate::surroundings::Surroundings;
@@ -14,10 +14,10 @@ use ratn_model::pose::Pose;
 
 /// What a posture breaks; `which` of the problem's ends it is begins each line.
 pub(crate) fn diagnosis(mechanism: &Mechanism, problem: &Problem, positions: &[f64], which: &str) -> Vec<String> {
-    let beyond = mechanism.joints.iter().zip(positions).filter(|(j, q)| !(j.lower..=j.upper).contains(*q));
+    let beyond = mechanism.joints.iter().zip(positions).filter(|(j, q)| !j.allows(**q, 0.0));
     let limits = beyond.map(|(joint, position)| {
-        let by = (position - position.clamp(joint.lower, joint.upper)).abs();
-        let Joint { name, lower, upper, .. } = joint;
+        let by = (position - joint.clamp(*position)).abs();
+        let ([lower, upper], name) = (joint.limits(), &joint.name);
         format!("{which}: {name} is at {position}, outside {lower} to {upper} by {by:.2e}")
     });
     let touches = Exact::new(mechanism, problem.surroundings()).touches(positions);

@@ -87,6 +87,7 @@ impl Vehicle {
             name: name.to_owned(),
             lower,
             upper,
+            endless: false,
             velocity: 1.0,
             acceleration: 1.0,
             jerk: 10.0,

@@ -28,8 +28,6 @@ pub struct Mechanism {
     pub name: String,
     /// What is planned for, in the caller's order.
     pub joints: Vec<Joint>,
-    /// Whether each of them turns without end, so that everything is where it was after a whole turn of it.
-    pub endless: Vec<bool>,
     /// Parents before children.
     pub links: Vec<Link>,
     /// Pairs of links, the lower index first, that are never checked against each other.
@@ -110,8 +108,7 @@ impl Mechanism {
     /// Links moved by the joints that are planned for, of which those pairs are checked.
     pub(crate) fn new(name: &str, joints: Vec<Joint>, links: Vec<Link>, checks: Checks) -> Mechanism {
         let Checks { excepted, by_shapes } = checks;
-        let endless = vec![false; joints.len()];
-        Mechanism { name: name.to_owned(), joints, endless, links, excepted, by_shapes, allowed: BTreeSet::new() }
+        Mechanism { name: name.to_owned(), joints, links, excepted, by_shapes, allowed: BTreeSet::new() }
     }
 
     /// Poses of all links, in their order; `positions` in the order of the joints.
@@ -217,7 +214,7 @@ impl Mechanism {
     pub fn clamped(&self, positions: &[f64]) -> (Vec<f64>, Vec<Beyond>) {
         let mut beyond = Vec::new();
         let clamp = |(joint, position): (&Joint, &f64)| {
-            let limit = position.clamp(joint.lower, joint.upper);
+            let limit = joint.clamp(*position);
             let by = (position - limit).abs();
             if by == 0.0 || by > ROUNDED {
                 return *position;

@@ -21,6 +21,7 @@ mod straight_ways;
 
 use crate::collision::{Contact, distance, length};
 use crate::connect::{Budget, ConnectError};
+use crate::endless::WithEnds;
 use crate::joint_vector::JointVector;
 use crate::pace::{Control, Pace, Progress};
 pub use crate::request::{Goal, MAX_GOALS, MIN_SPEED, Request};
@@ -73,6 +74,28 @@ pub fn plan(
     control: &mut dyn FnMut(Progress<'_>) -> Control,
 ) -> Result<Plan, PlanError> {
     request.check(robot, scene)?;
+    let Some(arm) = WithEnds::about(robot, &request.start.arm) else {
+        return plan_with_ends(robot, scene, request, control);
+    };
+    let mut told = |progress: Progress<'_>| match progress {
+        Progress::Usable(plan) => control(Progress::Usable(&arm.wound(plan.clone()))),
+        other => control(other),
+    };
+    match plan_with_ends(&arm.robot, scene, &arm.request(request), &mut told) {
+        Ok(plan) => Ok(arm.wound(plan)),
+        // The same ones, turned to by other ways.
+        Err(PlanError::NoGoal { reasons, .. }) => Err(PlanError::NoGoal { goals: request.goals.len(), reasons }),
+        Err(error) => Err(error),
+    }
+}
+
+/// The same of an arm all of whose joints have ends.
+fn plan_with_ends(
+    robot: &Robot,
+    scene: &Scene,
+    request: &Request,
+    control: &mut dyn FnMut(Progress<'_>) -> Control,
+) -> Result<Plan, PlanError> {
     let mut pace = Pace::new(control);
     let mut arm = ArmInScene::new(robot, scene, request)?;
     let depart = departure(&mut arm, &mut pace)?;
@@ -127,7 +150,12 @@ fn first_way(
 /// # Errors
 /// [`PlanError::NoRoom`] names what is close.
 pub(crate) fn has_room(robot: &Robot, scene: &Scene, start: &Configuration) -> Result<(), PlanError> {
-    let request = Request::new(*start, vec![Goal::Joints(start.arm)]);
+    let arm = WithEnds::about(robot, &start.arm);
+    let (robot, start) = match &arm {
+        Some(arm) => (&arm.robot, Configuration { arm: arm.start, ..*start }),
+        None => (robot, *start),
+    };
+    let request = Request::new(start, vec![Goal::Joints(start.arm)]);
     door(&mut ArmInScene::new(robot, scene, &request)?, &start.arm).map(drop)
 }
 

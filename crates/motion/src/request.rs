@@ -219,8 +219,9 @@ pub(crate) fn outside_of_limits(robot: &Robot, at: &Configuration) -> Option<Out
 
 fn outside(positions: &[f64], joints: &[Joint], slides: &[bool]) -> Option<Outside> {
     let mut all = positions.iter().zip(joints).zip(slides);
-    let beyond = |(q, joint): (&f64, &Joint)| !(joint.lower - 1e-6..=joint.upper + 1e-6).contains(q);
+    let beyond = |(q, joint): (&f64, &Joint)| !joint.allows(*q, 1e-6);
     let ((position, joint), slides) = all.find(|(held, _)| beyond(*held))?;
-    let range = format!("{:.3} to {:.3} {}", joint.lower, joint.upper, unit(*slides));
+    let [lower, upper] = joint.limits();
+    let range = format!("{lower:.3} to {upper:.3} {}", unit(*slides));
     Some(Outside { joint: joint.name.clone(), position: *position, range })
 }

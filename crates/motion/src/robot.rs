@@ -563,10 +563,10 @@ impl Robot {
             let seen = camera.inverse().transform(target);
             let pan_step = -(seen[0]).atan2((seen[2].powi(2) + seen[1].powi(2)).sqrt());
             let tilt_step = seen[1].atan2(seen[2]);
-            looking.pan = (looking.pan + pan_step).clamp(pan.lower, pan.upper);
-            looking.tilt = (looking.tilt + tilt_step).clamp(tilt.lower, tilt.upper);
+            looking.pan = pan.clamp(looking.pan + pan_step);
+            looking.tilt = tilt.clamp(looking.tilt + tilt_step);
         }
-        (looking.pan, looking.tilt)
+        (pan.counted_from(here.pan, looking.pan), tilt.counted_from(here.tilt, looking.tilt))
     }
 
     /// All that touches by the exact shapes, the deepest first: what stands there and any link, and links of the robot of which the arm moves one
@@ -587,7 +587,7 @@ impl Robot {
     pub fn clamp(&self, arm: &JointVector) -> JointVector {
         let mut clamped = *arm;
         for (q, joint) in clamped.iter_mut().zip(self.arm_joints()) {
-            *q = q.clamp(joint.lower, joint.upper);
+            *q = joint.clamp(*q);
         }
         clamped
     }
@@ -637,10 +637,11 @@ impl Part {
         if values.len() != self.joints.len() {
             return Err(wrong(format!("has {} positions: the arm has {} joints", values.len(), self.joints.len())));
         }
-        let beyond = |(q, joint): &(&f64, &Joint)| !(joint.lower..=joint.upper).contains(*q);
+        let beyond = |(q, joint): &(&f64, &Joint)| !joint.allows(**q, 0.0);
         match values.iter().zip(&self.joints).find(beyond) {
             None => JointVector::read(values).map_err(|error| wrong(error.to_string())),
-            Some((q, Joint { name, lower, upper, .. })) => {
+            Some((q, joint)) => {
+                let ([lower, upper], name) = (joint.limits(), &joint.name);
                 Err(wrong(format!("has {name} at {q}: its limits are {lower} to {upper}")))
             }
         }

@@ -20,9 +20,13 @@ use crate::urdf::{self, Description, Loader, RobotError};
 use crate::urdf_tree::JointText;
 use ratn_model::pose::Pose;
 use std::collections::{BTreeMap, BTreeSet};
+use std::f64::consts::TAU;
 
 /// How far apart the limits of a joint that is planned for may be, in radians (metres for one that slides).
 const WIDEST: f64 = 1e4;
+
+/// How many turns from zero a joint that turns without end may be.
+pub(crate) const MOST_TURNS: f64 = 1e4;
 
 const FOR_ENDLESS: &str = "a joint that turns without end is `continuous`";
 
@@ -37,8 +41,6 @@ pub struct RobotModel {
     pub links: Vec<Link>,
     /// The names of the joints that mimic others.
     pub(crate) mimics: BTreeSet<String>,
-    /// The names of the joints that turn without end: after a whole turn everything is where it was.
-    pub(crate) endless: BTreeSet<String>,
     /// Where its joints are in the URDF.
     pub(crate) texts: BTreeMap<String, JointText>,
     /// What the SRDF says of pairs of links, or, without one, what follows from how they meet ([`pairs`]).
@@ -50,10 +52,12 @@ pub struct RobotModel {
 pub struct Joint {
     /// As in the URDF.
     pub name: String,
-    /// Least position.
+    /// Least position; where the joint turns without end, that is where one turn of it begins, and no limit ([`Joint::limits`]).
     pub lower: f64,
-    /// Greatest position.
+    /// Greatest position, or where that turn ends.
     pub upper: f64,
+    /// Whether it turns without end (`continuous` in the URDF): after a whole turn of it everything is where it was.
+    pub endless: bool,
     /// Greatest speed, per second.
     pub velocity: f64,
     /// Greatest acceleration, per second squared.
@@ -96,6 +100,31 @@ pub struct Drive {
     pub slides: bool,
     /// How far the link moves for one radian (or metre) of the joint: 1 but for a link whose own joint mimics.
     pub factor: f64,
+}
+
+impl Joint {
+    /// The least and the greatest position at which it may be. One that turns without end may be so many turns from zero that numbers still have
+    /// the digits that a path needs.
+    pub fn limits(&self) -> [f64; 2] {
+        if self.endless { [-MOST_TURNS * TAU, MOST_TURNS * TAU] } else { [self.lower, self.upper] }
+    }
+
+    /// Whether it may be at a position, or is beyond its limits by no more than `beyond` there.
+    pub fn allows(&self, position: f64, beyond: f64) -> bool {
+        let [lower, upper] = self.limits();
+        (lower - beyond..=upper + beyond).contains(&position)
+    }
+
+    /// The nearest position at which it may be.
+    pub fn clamp(&self, position: f64) -> f64 {
+        let [lower, upper] = self.limits();
+        position.clamp(lower, upper)
+    }
+
+    /// A position as the joint counts it when it is at another one: in the turn that is nearest, if it turns without end.
+    pub fn counted_from(&self, from: f64, position: f64) -> f64 {
+        if self.endless { position + TAU * ((from - position) / TAU).round() } else { position }
+    }
 }
 
 impl Drive {
@@ -225,9 +254,9 @@ impl RobotModel {
     }
 
     fn of(description: Description, srdf: Option<&str>) -> Result<RobotModel, MechanismError> {
-        let Description { name, joints, links, mimics, endless, texts } = description;
+        let Description { name, joints, links, mimics, texts } = description;
         let excepted = srdf.map(|text| srdf::excepted(text, &links)).transpose()?;
-        let mut model = RobotModel { name, joints, links, mimics, endless, texts, checks: Checks::default() };
+        let mut model = RobotModel { name, joints, links, mimics, texts, checks: Checks::default() };
         model.checks = match excepted {
             Some(excepted) => {
                 let by_shapes = pairs::undecided(&model, &excepted);
@@ -311,10 +340,8 @@ impl RobotModel {
             let (origin, drive) = link.moved_by(planned, positions);
             Link { origin, drive, ..link.clone() }
         };
-        let joints: Vec<Joint> = planned.iter().map(|joint| self.joints[*joint].clone()).collect();
-        let endless = joints.iter().map(|joint| self.endless.contains(&joint.name)).collect();
-        let mechanism = Mechanism::new(&self.name, joints, self.links.iter().map(held).collect(), checks);
-        Mechanism { endless, ..mechanism }
+        let joints = planned.iter().map(|joint| self.joints[*joint].clone()).collect();
+        Mechanism::new(&self.name, joints, self.links.iter().map(held).collect(), checks)
     }
 
     /// The index of a joint that can be planned for.
@@ -329,8 +356,8 @@ impl RobotModel {
         }
         let missing = || RobotError::Missing { what: "joint", name: name.to_owned() };
         let index = self.joint(name).ok_or_else(missing)?;
-        let Joint { lower, upper, .. } = self.joints[index];
-        if lower >= upper && text.is_some_and(|text| !text.has_limit) && !self.endless.contains(name) {
+        let Joint { lower, upper, endless, .. } = self.joints[index];
+        if lower >= upper && text.is_some_and(|text| !text.has_limit) && !endless {
             return refused("it has no `<limit>`; add one with `lower`, `upper` and `velocity`".to_owned());
         }
         if !(lower.is_finite() && upper.is_finite()) {

@@ -56,8 +56,9 @@ impl RobotState {
                 let mimics = model.mimics.contains(name);
                 return Err(if mimics { StateError::Mimics { joint } } else { StateError::Unknown { joint } });
             };
-            let Joint { lower, upper, .. } = model.joints[index];
-            if !position.is_finite() || !(lower..=upper).contains(position) {
+            let joint = &model.joints[index];
+            if !position.is_finite() || !joint.allows(*position, 0.0) {
+                let [lower, upper] = joint.limits();
                 return Err(StateError::Beyond { joint: name.clone(), position: *position, lower, upper });
             }
             self.positions[index] = *position;

@@ -100,6 +100,16 @@ impl Curve {
         Ok(Curve { knots })
     }
 
+    /// The same as joints count it that are at a posture when it begins: those that turn without end may be there in another turn.
+    pub(crate) fn counted_from(mut self, joints: &[Joint], start: &JointVector) -> Curve {
+        let first = self.knots[0].positions;
+        let by = JointVector::from_fn(joints.len(), |j| joints[j].counted_from(start[j], first[j]) - first[j]);
+        for knot in &mut self.knots {
+            knot.positions.iter_mut().zip(&by).for_each(|(position, by)| *position += by);
+        }
+        self
+    }
+
     /// As a trajectory of the task model, with the joints' names.
     pub fn named(&self, joints: &[Joint]) -> Trajectory {
         let point = |knot: &Knot| TrajectoryPoint {

@@ -94,13 +94,11 @@ pub(crate) struct Description {
     pub(crate) links: Vec<Link>,
     /// The names of the joints that mimic others.
     pub(crate) mimics: BTreeSet<String>,
-    /// The names of those that turn without end, and that no other joint mimics.
-    pub(crate) endless: BTreeSet<String>,
     /// Where the joints are in the text.
     pub(crate) texts: BTreeMap<String, JointText>,
 }
 
-/// Limits of a joint that has none, in radians: a whole turn.
+/// Where the one turn begins and ends that a joint without limits has for its range, in radians.
 const ENDLESS_RAD: f64 = std::f64::consts::PI;
 
 /// A mesh of a link that is longer than this has its numbers in millimetres, unless a `scale` says that it has not.
@@ -128,15 +126,15 @@ pub(crate) fn read(text: &str, load: &mut Loader<'_>) -> Result<Description, Rob
             limits.narrow(joint, &followed)?;
         }
     }
-    let joints: Vec<Joint> = driving.iter().map(|(name, limits)| limits.joint(name)).collect();
-    let links = links(&urdf, &joints, load)?;
-    let mimics = urdf.joints.iter().filter(|j| j.mimic.is_some()).map(|j| j.name.clone()).collect();
     // What mimics may not be where it was after a whole turn of what it follows.
     let followed: BTreeSet<&str> = urdf.joints.iter().filter_map(|j| Some(j.mimic.as_ref()?.joint.as_str())).collect();
-    let is_endless = |j: &&urdf_rs::Joint| j.joint_type == urdf_rs::JointType::Continuous && j.mimic.is_none();
-    let endless = urdf.joints.iter().filter(is_endless).map(|j| j.name.clone());
-    let endless = endless.filter(|name| !followed.contains(name.as_str())).collect();
-    Ok(Description { name: urdf.name, joints, links, mimics, endless, texts })
+    let turns_on = |j: &&urdf_rs::Joint| j.joint_type == urdf_rs::JointType::Continuous && !followed.contains(&*j.name);
+    let endless: BTreeSet<&str> = urdf.joints.iter().filter(turns_on).map(|j| j.name.as_str()).collect();
+    let joint = |(name, limits): &(&str, Limits)| Joint { endless: endless.contains(name), ..limits.joint(name) };
+    let joints: Vec<Joint> = driving.iter().map(joint).collect();
+    let links = links(&urdf, &joints, load)?;
+    let mimics = urdf.joints.iter().filter(|j| j.mimic.is_some()).map(|j| j.name.clone()).collect();
+    Ok(Description { name: urdf.name, joints, links, mimics, texts })
 }
 
 /// What a description says of how a joint may move.
@@ -191,7 +189,7 @@ impl Limits {
         let velocity = velocity.unwrap_or(1.0);
         let acceleration = acceleration.unwrap_or(velocity / TIME_TO_SPEED_S);
         let jerk = jerk.unwrap_or(acceleration / TIME_TO_ACCELERATION_S);
-        Joint { name: name.to_owned(), lower, upper, velocity, acceleration, jerk }
+        Joint { name: name.to_owned(), lower, upper, endless: false, velocity, acceleration, jerk }
     }
 }
 

@@ -86,7 +86,7 @@ pub enum Violation {
 }
 
 /// Checks a trajectory for the arm of a robot that is as in `here`, its base where the scene has it, with the `contact` that the motion may
-/// make. Returns it ready to be sampled.
+/// make. Returns it ready to be sampled, from where the arm is: a joint that turns without end may be whole turns from where the trajectory begins.
 ///
 /// # Errors
 /// The first [`Violation`].
@@ -97,7 +97,7 @@ pub fn validate_trajectory(
     trajectory: &Trajectory,
     contact: Contact,
 ) -> Result<Curve, Violation> {
-    let trajectory = Curve::of_arm(robot, trajectory)?;
+    let trajectory = Curve::of_arm(robot, trajectory)?.counted_from(robot.arm_joints(), &here.arm);
     check_start(robot, &here.arm, &trajectory)?;
     check_rest(robot.arm_joints(), &trajectory)?;
     check_limits(robot.arm_joints(), &trajectory)?;
@@ -148,11 +148,11 @@ pub(crate) fn check_limits(joints: &[Joint], trajectory: &Curve) -> Result<(), V
         let time_s = knots[i].time_s;
         for (j, (joint, cubic)) in joints.iter().zip(&cubics).enumerate() {
             let [least, greatest] = cubic.range(0.0, lasts_s);
-            if least < joint.lower - POSITION_TOLERANCE {
-                return exceeded(j, "position", least, joint.lower, time_s);
+            if !joint.allows(least, POSITION_TOLERANCE) {
+                return exceeded(j, "position", least, joint.clamp(least), time_s);
             }
-            if greatest > joint.upper + POSITION_TOLERANCE {
-                return exceeded(j, "position", greatest, joint.upper, time_s);
+            if !joint.allows(greatest, POSITION_TOLERANCE) {
+                return exceeded(j, "position", greatest, joint.clamp(greatest), time_s);
             }
             let step = (cubic.acceleration - before[j]).abs();
             let used = [

@@ -1,18 +1,29 @@
-//! Joints that turn without end go the short way, and the long way where the short one is blocked.
+//! Joints that turn without end go the short way, and the long way where the short one is blocked; in problems of `ratn plan`, and in motions of an
+//! arm.
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use ratn_model::pose::Pose;
+use ratn_model::value::Trajectory;
+use ratn_motion::collision::Contact;
 use ratn_motion::connect::Budget;
+use ratn_motion::description::RobotDescription;
 use ratn_motion::geometry::Geometry;
+use ratn_motion::joint_vector::JointVector;
 use ratn_motion::mechanism::Mechanism;
+use ratn_motion::pace::{Control, Progress};
+use ratn_motion::plan::{Goal, Plan, PlanError, Request, plan};
 use ratn_motion::problems::Problem;
+use ratn_motion::robot::{Configuration, Robot};
 use ratn_motion::space::Obstacle;
 use ratn_motion::trial::{self, Found, Settings};
-use std::f64::consts::TAU;
+use ratn_motion::validate::{Violation, validate_trajectory};
+use ratn_motion::way_points::WayPoints;
+use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
+use std::f64::consts::{PI, TAU};
 
-/// A hand of a clock, and a second one at its end.
-fn clock(kind: &str, beside: &str) -> Mechanism {
+/// A hand of a clock, and a second one at its end: its URDF and SRDF.
+fn clock_texts(kind: &str, beside: &str) -> [String; 2] {
     let hand = |name: &str, parent: &str, x: f64| {
         format!(
             "<link name='{name}'><collision><origin xyz='0.2 0 0'/><geometry><box size='0.36 0.02 0.02'/></geometry></collision></link>\
@@ -25,8 +36,12 @@ fn clock(kind: &str, beside: &str) -> Mechanism {
         hand("first", "foot", 0.0),
         hand("second", "first", 0.4)
     );
-    let excepted = "<robot name='clock'><disable_collisions link1='first' link2='second'/></robot>";
-    Mechanism::read(&urdf, Some(excepted), &["first_turns".to_owned(), "second_turns".to_owned()]).unwrap()
+    [urdf, "<robot name='clock'><disable_collisions link1='first' link2='second'/></robot>".to_owned()]
+}
+
+fn clock(kind: &str, beside: &str) -> Mechanism {
+    let [urdf, srdf] = clock_texts(kind, beside);
+    Mechanism::read(&urdf, Some(&srdf), &["first_turns".to_owned(), "second_turns".to_owned()]).unwrap()
 }
 
 fn solve(mechanism: &Mechanism, start: [f64; 2], goal: [f64; 2], obstacles: &[Obstacle]) -> Option<Found> {
@@ -105,4 +120,165 @@ fn joints_with_limits_and_those_that_others_follow_turn_as_before() {
     check(&solve(&followed, start, goal, &[]).unwrap(), start, goal, 5.9..6.1);
     let (start, goal) = ([0.0, 3.0], [0.0, -3.0]);
     check(&solve(&followed, start, goal, &[]).unwrap(), start, goal, 0.28..0.29);
+}
+
+/// The clock as an arm.
+fn clock_arm(kind: &str) -> Robot {
+    let [urdf, srdf] = clock_texts(kind, "");
+    let description = "name = \"clock\"\nurdf = \"clock.urdf\"\n[arm]\njoints = [\"first_turns\", \"second_turns\"]\ntool = \"second\"\n";
+    let description = RobotDescription::read(description).unwrap();
+    Robot::of(description, &urdf, Some(&srdf), &mut |_| unreachable!("it has no meshes")).unwrap()
+}
+
+fn scene(post: Option<[f64; 3]>) -> Scene {
+    let post = post.map(|[x, y, z]| SceneObject {
+        name: "post".to_owned(),
+        shape: Shape::Box { size: [0.04; 3] },
+        placement: Placement::World(Pose::at(x, y, z)),
+    });
+    Scene { base: Pose::IDENTITY, objects: post.into_iter().collect() }
+}
+
+fn request(robot: &Robot, start: &[f64], goals: Vec<Goal>) -> Request {
+    let start = Configuration { arm: JointVector::read(start).unwrap(), ..robot.at_zero() };
+    Request { seed: 1, improvement_iterations: 50, ..Request::new(start, goals) }
+}
+
+fn planned(robot: &Robot, scene: &Scene, request: &Request) -> Result<Plan, PlanError> {
+    let planned = plan(robot, scene, request, &mut |_| Control::Continue);
+    if let Ok(plan) = &planned {
+        let (first, last) = (&plan.trajectory.points[0], &plan.trajectory.points[plan.trajectory.points.len() - 1]);
+        assert_eq!(plan.end.to_vec(), last.positions);
+        for (j, start) in request.start.arm.iter().enumerate() {
+            assert!((first.positions[j] - start).abs() < 1e-9, "it begins at {:?}", first.positions);
+        }
+        // Without a jump, within all limits, and without touching anything.
+        validate_trajectory(robot, scene, &request.start, &plan.trajectory, Contact::None).unwrap();
+    }
+    planned
+}
+
+#[test]
+fn an_arm_turns_the_short_way_from_any_number_of_turns() {
+    let robot = clock_arm("continuous");
+    for (start, goal, turns) in [
+        ([3.0, 0.0], [-3.0, 0.0], TAU - 6.0),
+        ([3.5, 0.0], [3.0, 0.0], -0.5),
+        ([-7.0, 0.0], [7.0, 0.0], 14.0 - 2.0 * TAU),
+        ([5.0 * TAU + 0.1, 0.0], [-0.1, 0.0], -0.2),
+        ([0.3, 0.0], [0.5 - 1000.0 * TAU, 0.0], 0.2),
+    ] {
+        let goals = vec![Goal::Joints(JointVector::of(goal))];
+        let plan = planned(&robot, &scene(None), &request(&robot, &start, goals)).unwrap();
+        let turned = plan.end[0] - start[0];
+        assert!((turned - turns).abs() < 1e-6, "from {start:?} to {goal:?} it turned by {turned}");
+        assert!((plan.length_rad - turns.abs()).abs() < 1e-3, "{}", plan.length_rad);
+    }
+}
+
+#[test]
+fn an_arm_goes_round_the_other_way_where_the_short_one_is_blocked() {
+    let robot = clock_arm("continuous");
+    let post = scene(Some([-0.3, 0.0, 0.0]));
+    let goals = vec![Goal::Joints(JointVector::of([-2.7, 0.0]))];
+    let plan = planned(&robot, &post, &request(&robot, &[2.7 + TAU, 0.0], goals)).unwrap();
+    assert!((plan.end[0] - (TAU - 2.7)).abs() < 1e-6, "{:?}", plan.end);
+    // Where none goes, the goals are counted that were given.
+    let blocked = scene(Some([0.3 * 2.7_f64.cos(), -0.3 * 2.7_f64.sin(), 0.0]));
+    let goals = vec![Goal::Joints(JointVector::of([-2.7, 0.0]))];
+    let refused = planned(&robot, &blocked, &request(&robot, &[2.7, 0.0], goals)).unwrap_err();
+    assert!(matches!(refused, PlanError::NoGoal { goals: 1, .. }), "{refused}");
+}
+
+#[test]
+fn what_can_be_used_before_the_plan_is_done_begins_where_the_arm_is_too() {
+    let robot = clock_arm("continuous");
+    let goals = vec![Goal::Joints(JointVector::of([-2.0, 1.0]))];
+    let request = request(&robot, &[3.0 + 4.0 * TAU, 0.0], goals);
+    let mut usable: Vec<Plan> = Vec::new();
+    let end = plan(&robot, &scene(None), &request, &mut |progress| {
+        if let Progress::Usable(plan) = progress {
+            usable.push(plan.clone());
+        }
+        Control::Settle
+    });
+    let end = end.unwrap().end;
+    assert!(!usable.is_empty(), "nothing was said to be usable");
+    for plan in usable {
+        assert!(
+            (plan.trajectory.points[0].positions[0] - 3.0 - 4.0 * TAU).abs() < 1e-9,
+            "{:?}",
+            plan.trajectory.points[0]
+        );
+        assert_eq!(plan.end, end);
+    }
+}
+
+#[test]
+fn too_many_turns_of_an_arm_are_refused_as_are_positions_beyond_the_limits_of_a_joint_that_has_some() {
+    for (kind, start) in [("continuous", 1e5), ("continuous", f64::NAN), ("revolute", 3.5)] {
+        let robot = clock_arm(kind);
+        let goals = vec![Goal::Joints(JointVector::of([0.0, 0.0]))];
+        let refused = planned(&robot, &scene(None), &request(&robot, &[start, 0.0], goals)).unwrap_err();
+        assert!(matches!(&refused, PlanError::Malformed { what, .. } if what.contains("first_turns")), "{refused}");
+    }
+}
+
+/// A Panda, of whose joints some are continuous.
+fn roller(endless: &[usize]) -> Robot {
+    let mut urdf = include_str!("../robots/panda.urdf").to_owned();
+    for joint in endless {
+        let name = format!("<joint name=\"arm_joint_{joint}\" type=");
+        urdf = urdf.replace(&format!("{name}\"revolute\""), &format!("{name}\"continuous\""));
+    }
+    let description = RobotDescription::read(include_str!("../robots/panda.toml")).unwrap();
+    let srdf = include_str!("../robots/panda.srdf");
+    Robot::of(description, &urdf, Some(srdf), &mut |_| unreachable!("it has no meshes")).unwrap()
+}
+
+const READY: [f64; 7] = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785];
+
+#[test]
+fn a_pose_is_reached_and_a_line_followed_across_half_a_turn_of_a_joint() {
+    let robot = roller(&[1, 7]);
+    // The tool is behind the stand, where the first joint is at half a turn.
+    let start = |turns: f64| [PI - 0.15 + turns * TAU, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785];
+    let mut behind = start(0.0);
+    behind[0] = 0.15 - PI;
+    let behind = Configuration { arm: JointVector::of(behind), ..robot.at_zero() };
+    let goal = robot.tool_pose(&behind);
+    for turns in [0.0, 1.0, -3.0] {
+        let free = request(&robot, &start(turns), vec![Goal::Pose(goal)]);
+        let straight = Request { straight: Some(WayPoints { through: Vec::new(), blend_m: 0.0 }), ..free.clone() };
+        for request in [free, straight] {
+            let plan = planned(&robot, &scene(None), &request).unwrap();
+            let reached = robot.tool_pose(&Configuration { arm: plan.end, ..robot.at_zero() });
+            assert!(reached.distance(&goal) < 1e-3 && reached.angle(&goal) < 1e-2, "{reached:?}");
+            let positions = plan.trajectory.points.iter().map(|point| point.positions[0]);
+            let least = positions.clone().fold(f64::INFINITY, f64::min);
+            let greatest = positions.fold(f64::NEG_INFINITY, f64::max);
+            assert!(greatest - least < 1.0, "the first joint turns from {least} to {greatest}");
+        }
+    }
+}
+
+#[test]
+fn a_trajectory_is_followed_from_the_turn_in_which_the_arm_stands() {
+    let robot = roller(&[7]);
+    let at = |last: f64| {
+        let mut arm = READY;
+        arm[6] = last;
+        Configuration { arm: JointVector::of(arm), ..robot.at_zero() }
+    };
+    let goals = vec![Goal::Joints(JointVector::of(READY))];
+    let trajectory: Trajectory =
+        planned(&robot, &scene(None), &request(&robot, &at(3.0).arm, goals)).unwrap().trajectory;
+    for turns in [0.0, 1.0, -20.0] {
+        let here = at(3.0 + turns * TAU);
+        let curve = validate_trajectory(&robot, &scene(None), &here, &trajectory, Contact::None).unwrap();
+        assert!((curve.knots()[0].positions[6] - here.arm[6]).abs() < 1e-9, "{turns} turns");
+        assert!((curve.end()[6] - curve.knots()[0].positions[6] + 3.0 - READY[6]).abs() < 1e-6, "{turns} turns");
+    }
+    let half = validate_trajectory(&robot, &scene(None), &at(3.0 + PI), &trajectory, Contact::None);
+    assert!(matches!(half, Err(Violation::Start { .. })), "{half:?}");
 }

@@ -13,7 +13,7 @@ use ratn_motion::timing::{Section, timed};
 use ratn_motion::trajectory::{Curve, Knot};
 
 fn joint(velocity: f64, acceleration: f64, jerk: f64) -> Joint {
-    Joint { name: "joint".to_owned(), lower: -9.0, upper: 9.0, velocity, acceleration, jerk }
+    Joint { name: "joint".to_owned(), lower: -9.0, upper: 9.0, endless: false, velocity, acceleration, jerk }
 }
 
 fn free(joints: &[Joint], path: &[JointVector], speed: f64) -> Curve {

@@ -625,3 +625,35 @@ async fn a_world_pool_that_comes_back_is_waited_for_and_a_world_that_ended_with_
     assert_eq!(lost.code(), Some(tonic::Code::Aborted));
     assert!(lost.to_string().contains("is unknown or has ended"), "{lost}");
 }
+
+/// A Panda whose last joint turns without end.
+fn endless() -> Robot {
+    let file = |ending: &str| {
+        let path = format!("{}/../motion/robots/panda.{ending}", env!("CARGO_MANIFEST_DIR"));
+        std::fs::read_to_string(path).unwrap()
+    };
+    let [limited, endless] =
+        ["revolute", "continuous"].map(|kind| format!("<joint name=\"arm_joint_7\" type=\"{kind}\">"));
+    let urdf = file("urdf");
+    assert!(urdf.contains(&limited));
+    let description = RobotDescription::read(&file("toml")).unwrap();
+    let urdf = urdf.replace(&limited, &endless);
+    Robot::of(description, &urdf, Some(&file("srdf")), &mut |_| unreachable!("it has no meshes")).unwrap()
+}
+
+#[tokio::test]
+async fn a_joint_that_turns_without_end_goes_the_short_way_over_half_a_turn() {
+    let system = system_of(endless()).await;
+    let posture = |last: f64| Value::Joints(vec![0.0, -0.785, 0.0, -2.356, 0.0, 1.571, last]);
+    for (id, start, goal, turns) in [("a", 3.0, -3.0, 0.283), ("b", -7.0, 7.0, 1.434), ("c", 3.5, 3.0, -0.5)] {
+        let goal = system.goal(id, &[("start", posture(start)), ("goal", posture(goal))]);
+        let outcome = system.client.execute(&system.planner, goal, |_, _| {}).await.unwrap();
+        assert!(outcome.is_success(), "{}", outcome.reason);
+        let Value::Trajectory(trajectory) = &outcome.outputs["trajectory"] else { panic!() };
+        let turned: Vec<f64> = trajectory.points.iter().map(|point| point.positions[6] - start).collect();
+        let [first, last] = [turned[0], turned[turned.len() - 1]];
+        assert!(first.abs() < 1e-9 && (last - turns).abs() < 1e-3, "{turned:?}");
+        // Neither further, nor back.
+        assert!(turned.iter().all(|by| by.abs() < turns.abs() + 0.01), "{turned:?}");
+    }
+}

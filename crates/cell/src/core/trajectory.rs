@@ -50,7 +50,7 @@ fn is_short(trajectory: &Trajectory) -> Result<(), String> {
     Err(format!("the trajectory is refused: it lasts {lasts_s:.0} s, a motion lasts at most {MAX_MOTION_S} s"))
 }
 
-/// The straight line of joint space to a posture.
+/// The straight line of joint space to a posture, which joints that turn without end take in the turn that is nearest.
 ///
 /// # Errors
 /// When the speed is none.
@@ -59,5 +59,7 @@ pub(crate) fn straight(robot: &Robot, from: &JointVector, to: &JointVector, spee
         return Err(format!("a speed of {speed} is none: it is a fraction of the limits, from {MIN_SPEED} to 1"));
     }
     // A line without corners to round.
-    Ok(parameterise(robot, &[Section::AsGiven(vec![*from, *to])], speed, &mut |_, _| false))
+    let joints = robot.arm_joints();
+    let to = JointVector::from_fn(joints.len(), |j| joints[j].counted_from(from[j], to[j]));
+    Ok(parameterise(robot, &[Section::AsGiven(vec![*from, to])], speed, &mut |_, _| false))
 }

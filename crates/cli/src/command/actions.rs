@@ -140,7 +140,7 @@ impl Listed {
         let mut lines = vec![format!("{} ({}; a state that uses it blocks {})", self.action, self.from, self.resource)];
         let mut line = |head: &str, text: String| {
             if !text.is_empty() {
-                lines.push(format!("  {head:<10}{text}"));
+                lines.push(format!("  {head:<9} {text}"));
             }
         };
         line("does", description.clone());
@@ -152,6 +152,10 @@ impl Listed {
         );
         line("computes", if annotations.computes { "true".to_owned() } else { String::new() });
         annotations.lists().into_iter().for_each(|(key, list)| line(key, list.join("; ")));
+        for (input, said) in &annotations.given {
+            line("given", format!("`{input}`:"));
+            said.lists().into_iter().for_each(|(key, list)| line(key, list.join("; ")));
+        }
         lines.join("\n")
     }
 }

@@ -8,6 +8,7 @@ use crate::expression::Expr;
 use crate::expression::parse::{NameError, Names, ParseError, parse_effect, parse_expression, parse_fact};
 use crate::load::suggestion;
 use serde::{Deserialize, Deserializer, Serialize};
+use std::collections::BTreeMap;
 
 /// See the module. What is not said is as if no action had said it: the state then may read and change everything.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -27,6 +28,9 @@ pub struct Annotations {
     /// What it changes with `success`; empty for nothing.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub effects: Option<Vec<String>>,
+    /// Predicates of facts of which nothing is known after any other outcome: those that success sets are deleted then.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub unknown_after_failure: Vec<String>,
     /// Kinds of resources that it blocks one of, its provider's among them; `world_model` is room for a projection.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub resources: Vec<String>,
@@ -36,6 +40,9 @@ pub struct Annotations {
     /// It gives a result that can be used, and better ones later, until it is stopped: any of them will do. Only what computes or senses can be so.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub anytime: bool,
+    /// What is said otherwise where a state gives an optional input, by the input: each key that stands there, in place of the one above.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub given: BTreeMap<String, Annotations>,
 }
 
 /// An annotation that does not read.
@@ -59,15 +66,45 @@ impl Annotations {
     }
 
     /// The texts, by the key of a task file.
-    pub fn lists(&self) -> [(&'static str, &[String]); 6] {
+    pub fn lists(&self) -> [(&'static str, &[String]); 7] {
         [
             ("reads", self.reads.as_deref().unwrap_or_default()),
             ("senses", &self.senses),
             ("requires", &self.requires),
             ("effects", self.effects.as_deref().unwrap_or_default()),
+            ("unknown_after_failure", &self.unknown_after_failure),
             ("resources", &self.resources),
             ("duration", self.duration.as_slice()),
         ]
+    }
+
+    /// Itself, and what it says where an input is given.
+    pub fn all(&self) -> impl Iterator<Item = &Annotations> {
+        std::iter::once(self).chain(self.given.values())
+    }
+
+    /// What is said of a state that gives these inputs.
+    pub fn of_inputs(&self, is_given: impl Fn(&str) -> bool) -> Annotations {
+        let mut said = Annotations { given: BTreeMap::new(), ..self.clone() };
+        for (_, other) in self.given.iter().filter(|(input, _)| is_given(input)) {
+            let other = other.clone();
+            said.computes |= other.computes;
+            said.anytime |= other.anytime;
+            said.reads = other.reads.or(said.reads);
+            said.effects = other.effects.or(said.effects);
+            said.duration = other.duration.or(said.duration);
+            for (own, other) in [
+                (&mut said.senses, other.senses),
+                (&mut said.requires, other.requires),
+                (&mut said.unknown_after_failure, other.unknown_after_failure),
+                (&mut said.resources, other.resources),
+            ] {
+                if !other.is_empty() {
+                    *own = other;
+                }
+            }
+        }
+        said
     }
 
     /// Whether every text reads, in terms of the ports of its action.
@@ -93,6 +130,20 @@ impl Annotations {
             let message = "only an action that computes or senses can give a better result later: one that moves is real when it ends";
             return wrong("anytime", "true", message, "say `computes` or `senses` too, or leave `anytime` out");
         }
+        for (input, other) in &self.given {
+            if !signature.optional.contains_key(input) {
+                return wrong(
+                    "given",
+                    input,
+                    "the action has no optional input of this name",
+                    "name one of its optional inputs",
+                );
+            }
+            if !other.given.is_empty() {
+                return wrong("given", input, "a `given` stands within another one", "say it of each input by itself");
+            }
+            self.of_inputs(|name| name == input).check(signature)?;
+        }
         for (key, texts) in self.lists() {
             for text in texts {
                 let names = &mut Ports { signature, has_outputs: key == "effects" };
@@ -104,6 +155,10 @@ impl Annotations {
                         return wrong(key, text, "this is no kind of a resource", "write a name such as PathPlanner");
                     }
                     "resources" => Ok(()),
+                    "unknown_after_failure" if !crate::expression::display::is_word(text) => {
+                        return wrong(key, text, "this is no predicate", "write its name alone, such as arm_at");
+                    }
+                    "unknown_after_failure" => Ok(()),
                     _ => parse_expression(text, names).map(drop),
                 };
                 if let Err(ParseError { message, help, .. }) = read {

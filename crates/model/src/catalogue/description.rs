@@ -1,7 +1,7 @@
 //! What a worker says of itself: its provider's name, the kind of resource that it is, and its actions with their ports. Somebody else's
 //! words: it is believed only within these bounds.
 
-use super::{ActionSignature, Catalogue, InvalidAnnotation, Provider, ResourceOffer};
+use super::{ActionSignature, Annotations, Catalogue, InvalidAnnotation, Provider, ResourceOffer};
 use crate::expression::parse::parse_expression;
 use crate::expression::scope::NothingKnown;
 use crate::expression::{Expr, Function};
@@ -190,7 +190,8 @@ impl Catalogue {
 fn check(action: &str, signature: &ActionSignature) -> Result<(), DescriptionError> {
     let of = format!(" of action `{action}`");
     let ActionSignature { inputs, optional, outputs, outcomes, description, defaults, annotations } = signature;
-    let said: usize = annotations.lists().iter().map(|(_, list)| list.len()).sum();
+    let lists = || annotations.all().flat_map(Annotations::lists);
+    let said: usize = lists().map(|(_, list)| list.len()).sum::<usize>() + annotations.given.len();
     let ports = inputs.len() + optional.len() + outputs.len() + outcomes.len() + defaults.len() + said;
     bound("ports, outcomes and annotations", &of, ports, PORTS)?;
     text("description", &of, description, DESCRIPTION_BYTES)?;
@@ -211,8 +212,7 @@ fn check(action: &str, signature: &ActionSignature) -> Result<(), DescriptionErr
             return Err(DescriptionError::default_of(action, port, default, expected));
         }
     }
-    let mut lists = annotations.lists().into_iter();
-    lists.try_for_each(|(key, list)| list.iter().try_for_each(|said| text(key, &of, said, TEXT_BYTES)))?;
+    lists().try_for_each(|(key, list)| list.iter().try_for_each(|said| text(key, &of, said, TEXT_BYTES)))?;
     annotations.check(signature).map_err(|InvalidAnnotation { key, text, message, .. }| DescriptionError::Annotation {
         action: shown(action),
         key,

@@ -16,7 +16,7 @@ use super::yaml::{Content, Node};
 use crate::catalogue::{ActionSignature, Annotations, unknown_input};
 use crate::expression::parse::NameError;
 use crate::expression::{EffectExpr, Expr, FactExpr};
-use crate::program::{Location, Nature, Origin, SUCCESS, StateKind};
+use crate::program::{ABORTED, Location, Nature, Origin, PREEMPTED, SUCCESS, StateKind, VIOLATED};
 use crate::value::Value;
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet};
@@ -113,7 +113,8 @@ impl<'b> Sources<'b> {
                 missing: RefCell::default(),
                 parts: Cell::default(),
             };
-            Some((signature.annotations.clone(), Rc::new(ports), node.at))
+            let said = signature.annotations.of_inputs(|input| ports.inputs.contains_key(input));
+            Some((said, Rc::new(ports), node.at))
         };
         Sources { body: step.body, action: says(), origin: BTreeMap::new() }
     }
@@ -132,8 +133,37 @@ impl<'b> Sources<'b> {
         self.of_action(fields, key, read)
     }
 
-    /// What the state changes: what it says, and what its action changes beside that.
+    /// What the state changes: what it says, and what its action changes beside that. What success would set of facts that the action leaves unknown
+    /// where it fails is deleted with every other outcome of which the state says nothing of that predicate.
     pub(crate) fn effects(
+        &mut self,
+        fields: &mut Fields<'_, '_>,
+        read: impl Fn(&mut Fields<'_, '_>, &Node) -> BTreeMap<String, Vec<EffectExpr>>,
+    ) -> BTreeMap<String, Vec<EffectExpr>> {
+        let mut changed = self.declared_effects(fields, read);
+        let Some((said, ports, _)) = &self.action else { return changed };
+        let is_unknown = |predicate: &str| said.unknown_after_failure.iter().any(|known| known == predicate);
+        let set: Vec<FactExpr> = changed.get(SUCCESS).into_iter().flatten().filter_map(named_before).cloned().collect();
+        let lost: Vec<FactExpr> = set.into_iter().filter(|fact| is_unknown(&fact.predicate)).collect();
+        if lost.is_empty() {
+            return changed;
+        }
+        let cut_short = self.body.get("while").map(|_| VIOLATED);
+        let own = ports.signature.outcomes.iter().map(String::as_str);
+        for outcome in [ABORTED, PREEMPTED].into_iter().chain(cut_short).chain(own) {
+            let effects = changed.entry(outcome.to_owned()).or_default();
+            let said: BTreeSet<String> = effects.iter().filter_map(predicate).map(str::to_owned).collect();
+            let deleted = lost.iter().filter(|fact| !said.contains(&fact.predicate));
+            effects.extend(deleted.cloned().map(EffectExpr::Delete));
+        }
+        let from = self.origin.entry("effects".to_owned()).or_insert(Origin::Action);
+        if *from == Origin::State {
+            *from = Origin::Both;
+        }
+        changed
+    }
+
+    fn declared_effects(
         &mut self,
         fields: &mut Fields<'_, '_>,
         read: impl Fn(&mut Fields<'_, '_>, &Node) -> BTreeMap<String, Vec<EffectExpr>>,
@@ -298,6 +328,15 @@ fn in_its_terms<T: OfAction>(
         value.leave_out(ontology);
     }
     (value, ports.missing.take())
+}
+
+/// The fact that an effect sets, where it can be named without an output of the state's own: one that fails has none.
+fn named_before(effect: &EffectExpr) -> Option<&FactExpr> {
+    let EffectExpr::Set(fact, _) = effect else { return None };
+    let mut has_outputs = false;
+    let mut look = |part: &Expr| has_outputs |= matches!(part, Expr::Output(_));
+    fact.arguments.iter().flatten().for_each(|argument| argument.visit(&mut look));
+    (!has_outputs).then_some(fact)
 }
 
 /// The predicate that an effect on one fact changes.

@@ -225,6 +225,16 @@ impl Robot {
         Ok(self)
     }
 
+    /// The same robot with other limits of the arm's joints.
+    pub(crate) fn with_arm_joints(&self, joints: Vec<Joint>) -> Robot {
+        let mut seen = self.clone();
+        for (index, joint) in self.arm.indices.iter().zip(&joints) {
+            seen.model.joints[*index].clone_from(joint);
+        }
+        seen.arm.joints = joints;
+        seen
+    }
+
     fn no_arm(&self, name: &str) -> RobotFault {
         let arms: Vec<&str> = std::iter::once(self.arm_name()).chain(self.other_arms()).collect();
         RobotFault::NoArm { arm: name.to_owned(), robot: self.name().to_owned(), arms: arms.join(", ") }

@@ -36,7 +36,9 @@ impl Robot {
         count(&mut digester, self.model.joints.len());
         for joint in &self.model.joints {
             digester.text(&joint.name);
-            let limits = [joint.lower, joint.upper, joint.velocity, joint.acceleration, joint.jerk];
+            let [lower, upper] =
+                if joint.endless { [f64::NEG_INFINITY, f64::INFINITY] } else { [joint.lower, joint.upper] };
+            let limits = [lower, upper, joint.velocity, joint.acceleration, joint.jerk];
             limits.into_iter().for_each(|limit| number(&mut digester, limit));
         }
         count(&mut digester, self.model.links.len());

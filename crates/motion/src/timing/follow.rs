@@ -71,12 +71,13 @@ impl<const N: usize> Bounds<N> {
     pub(crate) fn new(joints: &[Joint], Speed { share: speed, tool }: Speed) -> Bounds<N> {
         // Those beyond stand still, so any limits do.
         let joint = |j: usize| joints.get(j).unwrap_or(&joints[0]);
+        let limits = |j: usize| joints.get(j).map_or([0.0; 2], Joint::limits);
         Bounds {
             velocities: std::array::from_fn(|j| joint(j).velocity * speed),
             accelerations: std::array::from_fn(|j| joint(j).acceleration * speed),
             jerks: std::array::from_fn(|j| joint(j).jerk),
-            lower: std::array::from_fn(|j| joints.get(j).map_or(0.0, |joint| joint.lower)),
-            upper: std::array::from_fn(|j| joints.get(j).map_or(0.0, |joint| joint.upper)),
+            lower: std::array::from_fn(|j| limits(j)[0]),
+            upper: std::array::from_fn(|j| limits(j)[1]),
             tool,
             joints: joints.len(),
         }

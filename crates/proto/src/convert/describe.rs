@@ -47,6 +47,8 @@ impl From<Annotations> for v1::ActionAnnotations {
             resources: said.resources,
             duration: said.duration.unwrap_or_default(),
             anytime: said.anytime,
+            unknown_after_failure: said.unknown_after_failure,
+            given: said.given.into_iter().map(|(input, said)| (input, said.into())).collect(),
         }
     }
 }
@@ -63,6 +65,8 @@ impl From<v1::ActionAnnotations> for Annotations {
             resources: said.resources,
             duration: Some(said.duration).filter(|duration| !duration.is_empty()),
             anytime: said.anytime,
+            unknown_after_failure: said.unknown_after_failure,
+            given: said.given.into_iter().map(|(input, said)| (input, said.into())).collect(),
         }
     }
 }

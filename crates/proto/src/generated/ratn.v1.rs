@@ -6183,7 +6183,7 @@ pub struct PortDescription {
 }
 /// What is true of every state that performs an action and says nothing else itself: expressions as task files have them, in which
 /// `$port` stands for what the state gives an input and a bare word in effects for an output.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ActionAnnotations {
     /// It reads its projection and changes nothing.
     #[prost(bool, tag = "1")]
@@ -6215,6 +6215,16 @@ pub struct ActionAnnotations {
     /// It gives a result that can be used, and better ones later, until it is stopped; any of them will do. Only what computes can be so.
     #[prost(bool, tag = "10")]
     pub anytime: bool,
+    /// Predicates of facts of which nothing is known after any other outcome than success: those that success sets are deleted then.
+    #[prost(string, repeated, tag = "11")]
+    pub unknown_after_failure: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// What is said otherwise where a state gives an optional input, by the input: what stands there, in place of the above. None of them has a
+    /// `given` of its own.
+    #[prost(btree_map = "string, message", tag = "12")]
+    pub given: ::prost::alloc::collections::BTreeMap<
+        ::prost::alloc::string::String,
+        ActionAnnotations,
+    >,
 }
 /// Generated client implementations.
 pub mod action_service_client {

@@ -312,6 +312,6 @@ fn said_by_action(said: &Said) -> OfAction {
         effects: said.effects.as_ref().map(|all| all.values().flatten().map(ToString::to_string).collect()),
         resources: said.resources.iter().flatten().map(kind).collect(),
         duration: said.duration.as_ref().map(ToString::to_string),
-        anytime: false,
+        ..OfAction::default()
     }
 }
