@@ -160,7 +160,7 @@ fn values() -> anyhow::Result<Vec<Value>> {
         Value::Float(0.1),
         Value::String("plate".to_owned()),
         Value::Joints(vec![0.5, -0.25]),
-        Value::List(vec![Value::Int(1), Value::String("two".to_owned())]),
+        Value::List(vec![Value::Int(1), Value::String("two".to_owned())].into()),
         Value::Map(BTreeMap::from([("b".to_owned(), Value::Int(2)), ("a".to_owned(), Value::Null)])),
         Value::Bytes(vec![0, 255, 7]),
     ];

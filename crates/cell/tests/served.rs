@@ -165,9 +165,9 @@ async fn the_detector_finds_the_boxes_through_the_leased_camera() {
     let table = Pose::at(x, y, aimm::TABLE_HEIGHT_M);
     let looked = system.execute(&lease, "PanTilt", "look_at", [("target", Value::Pose(table))]).await.unwrap();
     assert!(looked.is_success(), "{looked:?}");
-    let size = Value::List(vec![Value::Float(0.6), Value::Float(1.2)]);
+    let size = Value::List(vec![Value::Float(0.6), Value::Float(1.2)].into());
     let region = Value::map([("pose", Value::Pose(table)), ("size", size)]);
-    let measures = Value::List(["at", "shape"].map(|name| Value::String(name.to_owned())).to_vec());
+    let measures = Value::List(["at", "shape"].map(|name| Value::String(name.to_owned())).to_vec().into());
     let inputs = [("region", region), ("measures", measures)];
     let outcome = system.execute(&lease, "Detector", "segment", inputs).await.unwrap();
     assert!(outcome.is_success(), "{outcome:?}");

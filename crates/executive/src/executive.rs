@@ -1,8 +1,10 @@
 //! One run of one task, in either mode.
 
 mod checkpoint;
+mod order;
 
 pub use checkpoint::RestoreError;
+pub(crate) use order::removed;
 
 use crate::context::Context;
 use crate::hold;
@@ -14,17 +16,16 @@ use crate::signals::Signals;
 use crate::span::span;
 use crate::way_out::{Leaving, WayOut};
 use crate::window::{End, Window};
+use order::in_order;
 use ratn_model::expression::EffectExpr;
 use ratn_model::fact::FactKey;
 use ratn_model::id::InstanceId;
 use ratn_model::program::{ABORTED, PREEMPTED, Program, SUCCESS};
-use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
 use ratn_world::world::World;
 use serde::{Deserialize, Serialize};
-use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 
@@ -90,7 +91,7 @@ impl Executive {
             }
             event => self.step(now, event, &mut commands),
         }
-        most_urgent_first(commands)
+        in_order(commands)
     }
 
     /// The mirror of the root world model.
@@ -327,52 +328,6 @@ fn cut_short(context: &mut Context<'_>, interpreter: &mut Interpreter, outcome: 
     interpreter.way_out(context.program, &mut way_out);
     interpreter.abort(context);
     End { way_out, ..End::new(outcome, reason) }
-}
-
-/// Acquires of one event in the order of their priority, and what is given back after them: so that what is free, and what
-/// becomes free, goes to whom it serves most. The resource manager grants as requests arrive; it cannot know what comes next.
-/// What one event both asked for and withdrew is not asked for. Where something is deleted or used up it is the other way round: what is given
-/// back may be that, and nobody is granted what the program has removed before.
-fn most_urgent_first(commands: Vec<Command>) -> Vec<Command> {
-    let asks = |c: &Command| matches!(c, Command::Acquire { .. } | Command::Withdraw { .. } | Command::Release { .. });
-    if !commands.iter().any(asks) {
-        return commands;
-    }
-    let mut asked: BTreeMap<InstanceId, usize> = BTreeMap::new();
-    let mut needed = vec![true; commands.len()];
-    for (place, command) in commands.iter().enumerate() {
-        match command {
-            Command::Acquire { instance, .. } => drop(asked.insert(*instance, place)),
-            Command::Withdraw { instance } => {
-                if let Some(acquire) = asked.remove(instance) {
-                    (needed[acquire], needed[place]) = (false, false);
-                }
-            }
-            _ => {}
-        }
-    }
-    let mut needed = needed.into_iter();
-    let mut ordered = commands;
-    ordered.retain(|_| needed.next().unwrap_or(true));
-    let removes = ordered.iter().any(|command| removed(command).next().is_some());
-    ordered.sort_by_key(|command| match command {
-        Command::Release { .. } if removes => (1, Reverse(0)),
-        Command::Operate { .. } if removes => (2, Reverse(0)),
-        Command::Acquire { priority, .. } => (3, Reverse(*priority)),
-        Command::Release { .. } => (4, Reverse(0)),
-        Command::End { .. } => (5, Reverse(0)),
-        _ => (0, Reverse(0)),
-    });
-    ordered
-}
-
-/// What a command deletes or uses up.
-pub(crate) fn removed(command: &Command) -> impl Iterator<Item = &Requirement> {
-    let operations = match command {
-        Command::Operate { operations, .. } => operations.as_slice(),
-        _ => &[],
-    };
-    operations.iter().filter(|one| matches!(one.operation, ResourceOperation::Delete | ResourceOperation::Consume))
 }
 
 fn commit_initial(context: &mut Context<'_>, parameters: &BTreeMap<String, Value>) -> Result<(), String> {

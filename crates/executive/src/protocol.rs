@@ -292,7 +292,8 @@ pub const CERTAIN: i64 = 1 << 62;
 
 /// What the shell shall do. Performed in order: commits and projections reach the world pool, acquires and releases the
 /// resource manager, in this order. The
-/// acquires of one event come in the order of their priority and its releases last, so that what is free goes to the most urgent.
+/// acquires of one event come in the order of their priority and its releases last, so that what is free goes to the most urgent; where something is
+/// deleted or used up, releases come before that.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "command", rename_all = "snake_case")]
 pub enum Command {

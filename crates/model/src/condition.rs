@@ -233,7 +233,7 @@ mod tests {
         assert!(holds(Value::Int(2), LessOrEqual, Value::Int(2)) && !holds(Value::Int(3), LessOrEqual, Value::Int(2)));
         assert!(holds(Value::Float(2.5), Greater, Value::Int(2)) && !holds(Value::Int(2), Greater, Value::Int(2)));
         assert!(holds(Value::Int(2), GreaterOrEqual, Value::Int(2)));
-        let tools = Value::List(vec![Value::String("gripper".to_owned()), Value::Int(7)]);
+        let tools = Value::List(vec![Value::String("gripper".to_owned()), Value::Int(7)].into());
         assert!(holds(Value::Float(7.0), In, tools.clone()) && !holds(Value::Int(8), In, tools));
         assert!(holds(Value::Null, Has, Value::Null));
         assert!(!holds(Value::Bool(true), Less, Value::Int(2)) && !holds(Value::Int(2), Less, Value::Bool(true)));

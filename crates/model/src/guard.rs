@@ -29,6 +29,7 @@
 
 use crate::expression::{BinaryOperator, Expr};
 use crate::id::StateId;
+use crate::list::List;
 use crate::program::{
     ABORTED, Again, Annotations, CLOCK, Finally, Nature, PREEMPTED, Program, SUCCESS, State, StateKind, Target,
     TaskOutput, VIOLATED,
@@ -74,19 +75,6 @@ pub struct Limits {
 /// Whether a variable was made here or for an output: no file can say its name.
 pub fn is_made(variable: &str) -> bool {
     variable.contains(' ')
-}
-
-/// What is put behind the list that a variable is, where that is its new value: what an iteration gives that is collected. So the list need not be
-/// copied.
-pub fn appended<'e>(variable: &str, value: &'e Expr) -> Option<&'e Expr> {
-    let Expr::Binary(BinaryOperator::Add, list, more) = value else { return None };
-    match (&**list, &**more) {
-        (Expr::Variable(name), Expr::List(items)) if name == variable && is_made(name) => match items.as_slice() {
-            [one] => Some(one),
-            _ => None,
-        },
-        _ => None,
-    }
 }
 
 /// How a state is tried again.
@@ -306,7 +294,7 @@ impl Unfolding<'_> {
             let list = Box::new(Expr::Variable(variable.clone()));
             let longer = Expr::Binary(BinaryOperator::Add, list, Box::new(Expr::List(vec![value.clone()])));
             self.at(pass).assign.push((variable.clone(), longer));
-            self.at(new).variables.push((variable, Expr::Literal(Value::List(Vec::new()))));
+            self.at(new).variables.push((variable, Expr::Literal(Value::List(List::new()))));
         }
         Ok(vec![pass])
     }

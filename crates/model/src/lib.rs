@@ -14,6 +14,7 @@ pub mod grasp;
 pub mod guard;
 pub mod id;
 pub mod in_force;
+pub mod list;
 pub mod load;
 pub mod measurement;
 pub mod name;

@@ -401,8 +401,8 @@ fn of_type(fields: &mut Fields<'_, '_>, at: crate::program::Location, name: &str
     if ty.accepts(value) {
         return;
     }
-    let items = if let Value::List(items) = value { items.as_slice() } else { &[] };
-    let items: Vec<String> = items.iter().map(ToString::to_string).collect();
+    let items =
+        if let Value::List(items) = value { items.iter().map(ToString::to_string).collect() } else { Vec::new() };
     let help = check::types::called(ty, &items).unwrap_or_default();
     fields.error("type-mismatch", at, format!("the default of `{name}` is {}, not {ty}", value.type_name()), help);
 }

@@ -1,5 +1,6 @@
 //! Values that flow between states and stand in facts, and their types.
 
+use crate::list::List;
 use crate::pose::Pose;
 use serde::{Deserialize, Serialize};
 use std::cmp::Ordering;
@@ -27,7 +28,7 @@ pub enum Value {
     /// A timed path.
     Trajectory(Trajectory),
     /// A list; elements may differ in type.
-    List(Vec<Value>),
+    List(List),
     /// Named fields.
     Map(BTreeMap<String, Value>),
     /// Bytes that only their producer and consumer understand.

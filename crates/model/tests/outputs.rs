@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
 use ratn_model::catalogue::Catalogue;
+use ratn_model::list::List;
 use ratn_model::load::load;
 use ratn_model::program::{Program, State, StateKind};
 use ratn_model::value::{Type, Value};
@@ -163,7 +164,7 @@ fn a_loop_collects_what_each_iteration_gives() {
     let made = program(&states(", type: 'list<list<float>>'"));
     let looks = state(&made, "looks");
     assert_eq!(outputs(&made, "looks"), ["pans: $pans of looks", "last: either(looks/pass/a.pan, 0)"]);
-    assert_eq!(looks.defaults["pans"], Value::List(Vec::new()));
+    assert_eq!(looks.defaults["pans"], Value::List(List::new()));
     assert_eq!(looks.variables.len(), 1);
     assert_eq!(looks.outputs()[0].ty, Type::List(Box::new(Type::List(Box::new(Type::Float)))));
     let pass = state(&made, "looks/pass");

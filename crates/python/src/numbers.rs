@@ -7,6 +7,7 @@
 use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyList, PyTuple};
+use ratn_model::list::List;
 use ratn_model::value::Value;
 use ratn_proto::types::FactRecord;
 use std::ops::Deref;
@@ -236,8 +237,8 @@ pub(crate) fn nested(floats: &[f64], shape: &[usize]) -> Value {
 }
 
 /// Numbers one after the other with their shape, where they are that, or rows of as many each.
-fn floats_of(items: &[Value]) -> Option<(Vec<f64>, Vec<usize>)> {
-    let row = |items: &[Value]| items.iter().map(Value::as_number).collect::<Option<Vec<f64>>>();
+fn floats_of(items: &List) -> Option<(Vec<f64>, Vec<usize>)> {
+    let row = |items: &List| items.iter().map(Value::as_number).collect::<Option<Vec<f64>>>();
     let Some(Value::List(first)) = items.first() else { return Some((row(items)?, vec![items.len()])) };
     let mut floats = Vec::with_capacity(items.len() * first.len());
     for item in items {
@@ -277,7 +278,7 @@ mod tests {
 
     #[test]
     fn lists_of_numbers_and_of_rows_are_numbers_and_others_stay_what_they_are() {
-        let list = |items: &[Value]| Value::List(items.to_vec());
+        let list = |items: &[Value]| Value::List(items.to_vec().into());
         let row = list(&[Value::Int(1), Value::Float(2.5)]);
         let of = |value: Value| Numbers::of(value).map(|numbers| (numbers.floats(), numbers.shape));
         assert_eq!(of(row.clone()), Ok((vec![1.0, 2.5], vec![2])));

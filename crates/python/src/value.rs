@@ -512,7 +512,7 @@ fn taken(object: &Bound<'_, PyAny>, depth: usize) -> PyResult<Value> {
         return Err(PyTypeError::new_err(format!("a value has at most {MAX_DEPTH} levels")));
     }
     let items = |items: Vec<Bound<'_, PyAny>>| {
-        items.iter().map(|item| taken(item, depth + 1)).collect::<PyResult<Vec<_>>>().map(Value::List)
+        items.iter().map(|item| taken(item, depth + 1)).collect::<PyResult<_>>().map(Value::List)
     };
     if object.is_none() {
         return Ok(Value::Null);

@@ -376,7 +376,7 @@ fn a_resource_is_chosen_by_conditions_on_its_attributes_and_by_its_host() {
         ("payload", Comparison::LessOrEqual, number(5.0), &["large", "small"]),
         ("payload", Comparison::Greater, number(5.0), &[]),
         ("payload", Comparison::GreaterOrEqual, number(1.5), &["large"]),
-        ("payload", Comparison::In, Value::List(vec![number(1.0), number(2.0)]), &["small"]),
+        ("payload", Comparison::In, Value::List(vec![number(1.0), number(2.0)].into()), &["small"]),
         ("payload", Comparison::Has, Value::Null, &["large", "small"]),
         ("host", Comparison::Equal, text("compute"), &["small"]),
         ("payload", Comparison::Less, text("5"), &[]),

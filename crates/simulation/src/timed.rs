@@ -38,10 +38,10 @@ impl TimedProviders {
                 let field = |name: &str| object.and_then(|o| o.field(name)).cloned();
                 vec![
                     ("pose", field("pose").unwrap_or(Value::Pose(Pose::IDENTITY))),
-                    ("size", field("size").unwrap_or_else(|| Value::List(vec![Value::Float(0.08); 3]))),
+                    ("size", field("size").unwrap_or_else(|| Value::List(vec![Value::Float(0.08); 3].into()))),
                     ("class", Value::String("Box".to_owned())),
                     ("confidence", Value::Float(1.0)),
-                    ("covariance", Value::List(vec![Value::Float(0.0); 36])),
+                    ("covariance", Value::List(vec![Value::Float(0.0); 36].into())),
                 ]
             }
             ("path_planner", "plan") => plan(goal),
@@ -59,10 +59,10 @@ fn box_on_table(index: usize) -> Value {
     Value::map([
         ("id", Value::String(format!("box_{}", index + 1))),
         ("pose", Value::Pose(Pose::at(0.75, -0.4 + 0.1 * index as f64, 0.75))),
-        ("size", Value::List(vec![Value::Float(0.08), Value::Float(0.12), Value::Float(0.1)])),
+        ("size", Value::List(vec![Value::Float(0.08), Value::Float(0.12), Value::Float(0.1)].into())),
         ("class", Value::String("Box".to_owned())),
         ("confidence", Value::Float(1.0)),
-        ("covariance", Value::List(vec![Value::Float(0.0); 36])),
+        ("covariance", Value::List(vec![Value::Float(0.0); 36].into())),
     ])
 }
 

@@ -1,7 +1,7 @@
 //! What a run costs: linear in what it does, in constant memory where the window stays as large, without recursion.
 //!
 //! No test measures against a wall clock: each compares two sizes of one task in the same run, ten times apart, and allows 25 times
-//! the time. Live allocations are counted per thread.
+//! the time, or the allocations. They are counted per thread.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
@@ -11,6 +11,7 @@ use ratn_executive::executive::Executive;
 use ratn_executive::protocol::{Command, Event, Goal, Learned, Mode};
 use ratn_model::fact::FactKey;
 use ratn_model::id::{FencingToken, InstanceId, LeaseId, ProjectionId, Revision};
+use ratn_model::list::List;
 use ratn_model::program::Program;
 use ratn_model::resource::Lease;
 use ratn_model::time::Timestamp;
@@ -32,14 +33,25 @@ const RUNS: usize = 6;
 
 thread_local! {
     static LIVE: Cell<isize> = const { Cell::new(0) };
+    static MADE: Cell<usize> = const { Cell::new(0) };
 }
 
-/// Counts what each thread has allocated and not freed.
+/// Counts what each thread has allocated and not freed, and all that it has allocated.
 struct Counting;
 
 fn count(change: isize) {
     // A thread that ends frees what it has after its counter is gone.
     let _ = LIVE.try_with(|live| live.set(live.get() + change));
+    if change > 0 {
+        let _ = MADE.try_with(|made| made.set(made.get() + 1));
+    }
+}
+
+/// How many allocations something takes.
+fn allocations<T>(work: impl FnOnce() -> T) -> usize {
+    let before = MADE.get();
+    work();
+    MADE.get() - before
 }
 
 #[expect(unsafe_code, reason = "a global allocator is unsafe by its nature; this one adds a counter to the system's")]
@@ -145,7 +157,7 @@ impl Shell {
             instance,
             attempt,
             outcome: "success".to_owned(),
-            outputs: BTreeMap::from([("x".to_owned(), Value::Int(x)), ("list".to_owned(), Value::List(Vec::new()))]),
+            outputs: BTreeMap::from([("x".to_owned(), Value::Int(x)), ("list".to_owned(), Value::List(List::new()))]),
             measured: if &*goal.provider == "arm" { self.measured.clone() } else { Vec::new() },
             evidence: Vec::new(),
             reason: String::new(),
@@ -252,9 +264,19 @@ states:
     )
 }
 
+/// The same, with a list of a text of each iteration.
+fn collecting_ahead(iterations: usize) -> String {
+    let each = "      outputs: { texts: { each: \"concat('iteration ', $i)\", type: list<string> } }\n      do:";
+    computing_ahead(iterations).replace("      do:", each)
+}
+
 /// What the executive takes for it.
 fn compute_ahead(iterations: usize) -> Duration {
-    let mut shell = Shell::new(&computing_ahead(iterations));
+    compute_all_ahead(&computing_ahead(iterations), iterations)
+}
+
+fn compute_all_ahead(task: &str, iterations: usize) -> Duration {
+    let mut shell = Shell::new(task);
     shell.compute_ahead();
     assert_eq!(shell.started["brain"], iterations, "all are computed ahead");
     shell.finish();
@@ -313,6 +335,18 @@ fn a_loop_that_computes_ahead_costs_as_much_as_it_is_long() {
 #[test]
 fn what_check_says_of_a_loop_that_computes_ahead_costs_as_much_as_it_is_long() {
     is_linear("check", [100, 1_000], |n| check(&computing_ahead(n)));
+}
+
+/// Ten times as much takes at most 25 times as many allocations: each text of a list that is copied is one.
+fn allocates_linearly(what: &str, work: impl Fn(usize) -> Duration) {
+    let [small, large] = [100, 1_000].map(|iterations| allocations(|| work(iterations)));
+    assert!(large as f64 <= MOST * small as f64, "{what}: {small} allocations for 100 iterations, {large} for 1000");
+}
+
+#[test]
+fn a_loop_that_collects_what_it_computes_ahead_copies_no_lists() {
+    allocates_linearly("the executive", |n| compute_all_ahead(&collecting_ahead(n), n));
+    allocates_linearly("check", |n| check(&collecting_ahead(n)));
 }
 
 /// Runs in a thread with as little stack as threads have by default.

@@ -130,7 +130,7 @@ fn a_loop_that_was_tested_ahead_is_tested_again() {
 
 #[test]
 fn the_list_of_a_loop_that_was_known_ahead_is_asked_for_again() {
-    let now = Value::List(vec![text("b"), text("c")]);
+    let now = Value::List(vec![text("b"), text("c")].into());
     let states = "states:
   - go: { MOVE, reads: [], effects: [] }
   - each:

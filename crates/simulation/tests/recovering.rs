@@ -119,7 +119,7 @@ impl Room {
             let fields = [("id", Value::String(id))].into_iter().chain(described(&seen_so));
             seen.push(Value::Map(fields.map(|(name, value)| (name.to_owned(), value)).collect()));
         }
-        Ok(vec![("boxes", Value::List(seen))])
+        Ok(vec![("boxes", Value::List(seen.into()))])
     }
 
     fn locate(&mut self, goal: &Goal) -> Result<Outputs, String> {

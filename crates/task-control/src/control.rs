@@ -510,7 +510,7 @@ mod tests {
         let place = tempfile::tempdir()?;
         let mut control = Control::listen(place.path(), RUN)?;
         let signal = |name: &str, value| Message::Signal { run: ANY_RUN.to_owned(), signal: name.to_owned(), value };
-        let deep = (0..17).fold(Value::Null, |value, _| Value::List(vec![value]));
+        let deep = (0..17).fold(Value::Null, |value, _| Value::List(vec![value].into()));
         for (message, why) in [
             (signal("go", deep), "nest deeper than 16"),
             (signal("a\u{7}b", Value::Null), "holds control characters"),

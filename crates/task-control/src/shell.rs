@@ -346,7 +346,7 @@ impl Shell {
         interrupt: &Interrupt,
     ) -> anyhow::Result<Ended> {
         let mut ended = begin(self).await?;
-        let mut asked = Asks::default();
+        let mut asked = EndRequests::default();
         loop {
             if let Some(ended) = ended {
                 self.hand_over()?;
@@ -372,6 +372,11 @@ impl Shell {
         if *event == Event::Woken {
             self.timers.retain(|at| *at > now);
         }
+        Ok((now, self.decide_at(now, event)?))
+    }
+
+    /// The same at a moment, from which on nothing has happened yet.
+    fn decide_at(&mut self, now: Timestamp, event: &Event) -> anyhow::Result<Vec<Command>> {
         let commands = self.executive.handle(now, event.clone());
         commands.iter().for_each(|command| replay::follow(&mut self.states, command));
         self.log.note(now, event, &commands)?;
@@ -397,7 +402,7 @@ impl Shell {
         if self.lookout.is_due() || self.lookout.is_surprised() {
             self.ask_at.get_or_insert_with(|| Instant::now() + advisor::PAUSE);
         }
-        Ok((now, commands))
+        Ok(commands)
     }
 
     /// Of what is said together each line but the last ends with a line break.
@@ -607,7 +612,7 @@ impl Shell {
     }
 
     /// The next event that the executive has to know of.
-    async fn next(&mut self, interrupt: &Interrupt, asked: &mut Asks) -> anyhow::Result<Event> {
+    async fn next(&mut self, interrupt: &Interrupt, asked: &mut EndRequests) -> anyhow::Result<Event> {
         loop {
             if self.at_once < most_at_once()
                 && let Ok(answer) = self.answers.try_recv()
@@ -715,7 +720,7 @@ enum Due {
 
 /// What has asked the run to end.
 #[derive(Debug, Default)]
-struct Asks {
+struct EndRequests {
     /// So often.
     by_the_user: u32,
     for_lost_leases: bool,

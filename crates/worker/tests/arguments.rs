@@ -90,7 +90,7 @@ mod inputs {
 
     #[test]
     fn a_wrong_input_is_named_with_its_action() {
-        let region = Value::map([("size", Value::List(vec![Value::Int(1)]))]);
+        let region = Value::map([("size", Value::List(vec![Value::Int(1)].into()))]);
         let port = Port::of("segment", "region", Some(&region));
         let missing = port.field("pose").pose().unwrap_err().to_string();
         assert_eq!(missing, "input `region.pose` of `segment` is missing: expected a pose");

@@ -115,7 +115,7 @@ impl Action for Segment {
             outcome = facts.write(outcome, &id, object);
             boxes.push(Value::Map(fields([("id", Value::String(id))].into_iter().chain(described(object)))));
         }
-        Ok(outcome.with_output("boxes", Value::List(boxes)))
+        Ok(outcome.with_output("boxes", Value::List(boxes.into())))
     }
 }
 

@@ -6,6 +6,7 @@ use ratn_daemon::world_pool::{self, WorldPoolConfig};
 use ratn_model::catalogue::Catalogue;
 use ratn_model::fact::{Change, FactKey, Term};
 use ratn_model::id::{FencingToken, LeaseId, ProjectionId};
+use ratn_model::list::List;
 use ratn_model::pose::Pose;
 use ratn_model::resource::{Lease, LeasedResource};
 use ratn_model::value::Value;
@@ -107,7 +108,7 @@ impl System {
 
     fn grasp(&self, id: &str, more: &[(&str, Value)]) -> Goal {
         let grasps = aimm::grasp_poses(&box_pose(), BOX_SIZE).map(Value::Pose).to_vec();
-        let inputs = [("goal", Value::List(grasps)), ("approach_m", Value::Float(aimm::APPROACH_M))];
+        let inputs = [("goal", Value::List(grasps.into())), ("approach_m", Value::Float(aimm::APPROACH_M))];
         self.goal(id, &[&inputs[..], more].concat())
     }
 }
@@ -305,7 +306,7 @@ async fn a_straight_way_through_way_points_is_all_or_an_error_that_says_how_far(
         Value::Pose(Pose { position: [a + x, b + y, c + z], ..tool })
     };
     let start = ("start", Value::Joints(aimm::HOME.to_vec()));
-    let way_points = ("way_points", Value::List(vec![by(0.05, 0.0, 0.05), by(0.05, 0.1, 0.05)]));
+    let way_points = ("way_points", Value::List(vec![by(0.05, 0.0, 0.05), by(0.05, 0.1, 0.05)].into()));
     let rounded = [start.clone(), ("goal", by(0.0, 0.1, 0.0)), way_points.clone(), ("blend_m", Value::Float(0.02))];
     let outcome = system.client.execute(&system.planner, system.goal("a", &rounded), |_, _| {}).await.unwrap();
     assert!(outcome.is_success(), "{}", outcome.reason);
@@ -568,8 +569,10 @@ async fn what_a_goal_keeps_out_of_is_in_the_way_though_nothing_stands_there() {
     let system = system_of(Robot::built_in("twin").unwrap()).await;
     let swung = |by: f64| Value::Joints(vec![by, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]);
     let beyond = |y: f64, width: f64| {
-        let size = Value::List([4.0, width, 2.6].map(Value::Float).to_vec());
-        Value::List(vec![Value::map([("pose", Value::Pose(Pose::at(0.5, y - width / 2.0, 1.2))), ("size", size)])])
+        let size = Value::List([4.0, width, 2.6].map(Value::Float).to_vec().into());
+        Value::List(
+            vec![Value::map([("pose", Value::Pose(Pose::at(0.5, y - width / 2.0, 1.2))), ("size", size)])].into(),
+        )
     };
     // The left arm turns towards the middle of the table: its tool comes to y = 0.15.
     let asked = async |id: &str, keep_out: Option<Value>| {
@@ -578,7 +581,7 @@ async fn what_a_goal_keeps_out_of_is_in_the_way_though_nothing_stands_there() {
         let goal = system.goal(id, &[&inputs[..], &more].concat());
         system.client.execute(&system.planner, goal, |_, _| {}).await.unwrap()
     };
-    for (id, keep_out) in [("free", None), ("far", Some(beyond(-0.3, 2.0))), ("none", Some(Value::List(Vec::new())))] {
+    for (id, keep_out) in [("free", None), ("far", Some(beyond(-0.3, 2.0))), ("none", Some(Value::List(List::new())))] {
         let outcome = asked(id, keep_out).await;
         assert!(outcome.is_success(), "{id}: {}", outcome.reason);
     }

@@ -258,9 +258,12 @@ mod tests {
     fn quick_hashes_of_different_content_differ() {
         let mut seen = BTreeSet::new();
         for n in 0..20_000_i64 {
-            for value in
-                [Value::Int(n), Value::Float(n as f64), Value::String(n.to_string()), Value::List(vec![Value::Int(n)])]
-            {
+            for value in [
+                Value::Int(n),
+                Value::Float(n as f64),
+                Value::String(n.to_string()),
+                Value::List(vec![Value::Int(n)].into()),
+            ] {
                 let mut digester = Digester::<Quick>::default();
                 digester.values(&BTreeMap::from([("a".to_owned(), value)]));
                 assert!(seen.insert(digester.quick()), "{n}");

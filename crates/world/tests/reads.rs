@@ -203,7 +203,7 @@ fn what_came_nearly_as_predicted_is_no_contradiction_and_what_did_not_come_is_on
 #[test]
 fn a_digest_is_the_same_on_every_machine() {
     let values =
-        BTreeMap::from([("goal".to_owned(), Value::List(vec![Value::Int(1), Value::Null, Value::Float(0.5)]))]);
+        BTreeMap::from([("goal".to_owned(), Value::List(vec![Value::Int(1), Value::Null, Value::Float(0.5)].into()))]);
     assert_eq!(
         Digest::of_values(&values).to_string(),
         "e2c0b3c65406f047137d90a5aeefb4db135767155e79372c11e24708e8c53875"

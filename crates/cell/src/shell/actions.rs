@@ -311,7 +311,7 @@ impl ModuleAction {
                     .with_output("width", Value::Int(image.width as i64))
                     .with_output("height", Value::Int(image.height as i64))
                     .with_output("camera", Value::Pose(camera.pose))
-                    .with_output("camera_covariance", Value::List(self.calibration.map(Value::Float).to_vec()))
+                    .with_output("camera_covariance", Value::List(self.calibration.map(Value::Float).to_vec().into()))
                     .with_output("robot", Value::List(robot))
                     .with_output("fx", Value::Float(optics.fx))
                     .with_output("fy", Value::Float(optics.fy))

@@ -83,10 +83,10 @@ mod tests {
 
     #[test]
     fn a_list_takes_its_items_and_not_only_the_bytes_that_they_have_on_the_wire() {
-        let thousand = Value::List(vec![Value::Int(0); 1_000]);
+        let thousand = Value::List(vec![Value::Int(0); 1_000].into());
         assert_eq!(of_value(&thousand), 1_000 * size_of::<Value>());
         assert_eq!(
-            of_value(&Value::List(vec![thousand, Value::String("abc".to_owned())])),
+            of_value(&Value::List(vec![thousand, Value::String("abc".to_owned())].into())),
             1_002 * size_of::<Value>() + 3
         );
         let field = [("key".to_owned(), Value::Bytes(vec![0; 50]))];

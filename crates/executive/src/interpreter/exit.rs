@@ -4,9 +4,7 @@ use super::{Interpreter, Target};
 use crate::binding::{self, Outputs};
 use crate::context::{Context, Made};
 use crate::effects;
-use ratn_model::expression::MAX_LIST;
 use ratn_model::fact::FactKey;
-use ratn_model::guard::appended;
 use ratn_model::id::{InstanceId, StateId};
 use ratn_model::program::{ABORTED, Program, SUCCESS, State, is_failure};
 use ratn_model::value::Value;
@@ -16,13 +14,6 @@ use std::sync::Arc;
 /// every iteration, and its frame counts them.
 pub(super) fn outside(state: &State, variables: usize) -> usize {
     if state.is_loop() { variables.saturating_sub(state.variables.len()) } else { variables }
-}
-
-/// What a variable becomes.
-pub(super) enum Assigned {
-    Whole(Value),
-    /// The list that it is, with this behind it.
-    Behind(Value),
 }
 
 impl Interpreter {
@@ -65,7 +56,7 @@ impl Interpreter {
         path: &str,
         variables: usize,
         outcome: &str,
-    ) -> Result<Vec<(String, Assigned)>, String> {
+    ) -> Result<Vec<(String, Value)>, String> {
         // Its loop variables are gone, its scoped ones are still seen.
         if state.is_loop()
             && let Some(thread) = self.threads.get_mut(&thread)
@@ -121,33 +112,20 @@ impl Interpreter {
         thread: u64,
         state: &State,
         outputs: &Outputs,
-    ) -> Result<Vec<(String, Assigned)>, String> {
-        let length = |name: &str| {
-            let known = &self.threads.get(&thread)?.variables;
-            let (_, value) = known.iter().rev().find(|(n, _)| n == name)?;
-            if let Value::List(items) = &**value { Some(items.len()) } else { None }
-        };
+    ) -> Result<Vec<(String, Value)>, String> {
         let value = |(name, value): &(String, ratn_model::expression::Expr)| {
-            let one = appended(name, value).filter(|_| length(name).is_some_and(|length| length < MAX_LIST));
-            let found = self.with_scope(context, thread, Some(outputs), |scope| one.unwrap_or(value).evaluate(scope));
-            let found = found.map_err(|error| format!("`assign` of `{name}`: {error}"))?;
-            Ok((name.clone(), if one.is_some() { Assigned::Behind(found) } else { Assigned::Whole(found) }))
+            let value = self.with_scope(context, thread, Some(outputs), |scope| value.evaluate(scope));
+            value.map(|value| (name.clone(), value)).map_err(|error| format!("`assign` of `{name}`: {error}"))
         };
         state.assign.iter().map(value).collect()
     }
 
     /// Variables get new values, each the innermost of its name.
-    pub(super) fn assign(&mut self, thread: u64, assigned: Vec<(String, Assigned)>) {
+    pub(super) fn assign(&mut self, thread: u64, assigned: Vec<(String, Value)>) {
         let Some(thread) = self.threads.get_mut(&thread) else { return };
         for (name, value) in assigned {
-            let Some((_, variable)) = thread.variables.iter_mut().rev().find(|(n, _)| *n == name) else { continue };
-            match value {
-                Assigned::Whole(value) => *variable = Arc::new(value),
-                Assigned::Behind(one) => {
-                    if let Value::List(items) = Arc::make_mut(variable) {
-                        items.push(one);
-                    }
-                }
+            if let Some((_, variable)) = thread.variables.iter_mut().rev().find(|(n, _)| *n == name) {
+                *variable = Arc::new(value);
             }
         }
     }

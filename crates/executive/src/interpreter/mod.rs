@@ -30,6 +30,7 @@ use node::GoalEnd;
 use ratn_model::expression::Given;
 use ratn_model::fact::{Change, Footprint};
 use ratn_model::id::{InstanceId, ProjectionId, Revision, StateId};
+use ratn_model::list::List;
 use ratn_model::measurement::Evidence;
 use ratn_model::program::{Program, StateKind};
 use ratn_model::resource::Lease;
@@ -96,7 +97,7 @@ struct Frame {
     /// How often each state of the list was visited.
     visits: BTreeMap<StateId, u32>,
     /// Of a loop: the number of the iteration, and its elements; none of a `while`.
-    iteration: Option<(usize, Option<Vec<Value>>)>,
+    iteration: Option<(usize, Option<List>)>,
     /// How many variables there were before the owner was entered.
     variables: usize,
     /// Why the last state of it that failed did so.

@@ -5,6 +5,7 @@ use crate::binding::{self, Outputs, child_path};
 use crate::context::{Context, MAX_IDLE_VISITS, in_circles};
 use crate::protocol::Note;
 use ratn_model::id::{InstanceId, StateId};
+use ratn_model::list::List;
 use ratn_model::program::{ABORTED, Program, SUCCESS, StateKind, Target, is_failure};
 use ratn_model::value::Value;
 use std::sync::Arc;
@@ -245,7 +246,7 @@ impl Interpreter {
         list: usize,
         path: String,
         variables: usize,
-        iteration: Option<(usize, Option<Vec<Value>>)>,
+        iteration: Option<(usize, Option<List>)>,
     ) {
         let frame =
             Frame { owner, list, path, visits: Default::default(), iteration, variables, because: String::new() };

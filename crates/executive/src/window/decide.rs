@@ -106,7 +106,7 @@ impl Window {
         let path = self.path(context.program, id);
         context.note(Note::Decided { instance: id, path, decision: elements.len().to_string() });
         let looked = !collection.fact_expressions().is_empty();
-        let outputs = looked.then(|| remembered(&elements)).into_iter().collect();
+        let outputs = looked.then(|| remembered(elements.clone())).into_iter().collect();
         self.end_instance(id, Ended::success(outputs));
         self.growth.unroll(&self.graph, context, id, elements);
     }

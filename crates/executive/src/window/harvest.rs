@@ -136,14 +136,17 @@ impl Window {
         if self.improving.is_empty() {
             return;
         }
-        let removed: BTreeSet<String> = context.commands.iter().flat_map(removed).map(|one| one.kind.clone()).collect();
+        let kinds: BTreeSet<String> = context.commands.iter().flat_map(removed).map(|one| one.kind.clone()).collect();
         let holds = |improvement: &Improvement| {
             let held = &context.plan.state(improvement.state).requirements;
-            held.iter().any(|held| removed.contains(&held.kind))
+            held.iter().any(|held| kinds.contains(&held.kind))
         };
         let holders = self.improving.iter().filter(|(_, improvement)| holds(improvement));
         let holders: Vec<InstanceId> = holders.map(|(id, _)| id).collect();
+        let Some(first) = context.commands.iter().position(|command| removed(command).next().is_some()) else { return };
+        let behind = context.commands.split_off(first);
         holders.into_iter().for_each(|id| self.harvest(context, id));
+        context.commands.extend(behind);
     }
 
     /// The run is over.

@@ -13,6 +13,7 @@ use crate::context::Context;
 use ratn_model::expression::Expr;
 use ratn_model::fact::{FactKey, FactPattern, Footprint};
 use ratn_model::id::InstanceId;
+use ratn_model::list::List;
 use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;
 use ratn_world::world::World;
@@ -139,6 +140,6 @@ fn decides_from<'p>(program: &'p Program, instance: &Instance) -> Vec<&'p Expr> 
 }
 
 /// The list of a loop, for comparison.
-pub(super) fn remembered(elements: &[Value]) -> (String, Value) {
-    (ELEMENTS.to_owned(), Value::List(elements.to_vec()))
+pub(super) fn remembered(elements: List) -> (String, Value) {
+    (ELEMENTS.to_owned(), Value::List(elements))
 }

@@ -5,6 +5,7 @@ use super::evaluate::{EvaluateError, described};
 use super::scope::{Scope, WithVariable};
 use super::{EffectExpr, Expr, FactExpr};
 use crate::fact::{Change, FactKey, FactPattern, Footprint, Term};
+use crate::list::List;
 use crate::program::ResourceExpr;
 use crate::resource::Requirement;
 use crate::value::Value;
@@ -94,10 +95,10 @@ pub(super) fn term(argument: &Expr, scope: &dyn Scope) -> Result<Term, EvaluateE
     }
 }
 
-fn list<'a>(collection: &'a Expr, scope: &'a dyn Scope) -> Result<Cow<'a, [Value]>, EvaluateError> {
+fn list(collection: &Expr, scope: &dyn Scope) -> Result<List, EvaluateError> {
     match collection.value(scope)? {
-        Cow::Borrowed(Value::List(items)) => Ok(Cow::Borrowed(items)),
-        Cow::Owned(Value::List(items)) => Ok(Cow::Owned(items)),
+        Cow::Borrowed(Value::List(items)) => Ok(items.clone()),
+        Cow::Owned(Value::List(items)) => Ok(items),
         other => Err(collection.wrong(format!("expected a list, found {}", described(&other)))),
     }
 }
@@ -117,7 +118,7 @@ fn bind_into(effects: &[EffectExpr], scope: &dyn Scope, changes: &mut Vec<Change
                 changes.push(Change::Increase { fact: fact.key(scope)?, by: amount });
             }
             EffectExpr::ForEach { variable, collection, effects } => {
-                for value in list(collection, scope)?.iter() {
+                for value in &list(collection, scope)? {
                     let inner = WithVariable { outer: scope, name: variable, value: Some(value) };
                     bind_into(effects, &inner, changes)?;
                 }
@@ -179,7 +180,7 @@ mod tests {
     #[test]
     fn an_effect_on_a_list_that_is_not_known_may_write_any_of_its_predicate() {
         assert_eq!(printed(EffectExpr::footprint(&at_each_box(), &NothingKnown)), ["at(?)"]);
-        let boxes = Value::List(vec![Value::String("a".into()), Value::String("b".into())]);
+        let boxes = Value::List(vec![Value::String("a".into()), Value::String("b".into())].into());
         let scope = BTreeMap::from([("boxes".to_owned(), boxes), ("b".to_owned(), Value::String("other".into()))]);
         assert_eq!(printed(EffectExpr::footprint(&at_each_box(), &scope)), ["at(a)", "at(b)"]);
         let changes = EffectExpr::bind(&at_each_box(), &scope).unwrap();

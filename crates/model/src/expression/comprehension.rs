@@ -121,7 +121,7 @@ pub(super) fn evaluate(
         }
         Comprehension::SortBy => {
             let keyed = items.iter().map(|item| Ok((key(item)?, item.clone())));
-            Value::List(function::sorted(keyed.collect::<Result<_, EvaluateError>>()?).map_err(ordered)?)
+            Value::List(function::sorted(keyed.collect::<Result<_, EvaluateError>>()?).map_err(ordered)?.into())
         }
         Comprehension::MinBy | Comprehension::MaxBy => {
             let mut best: Option<(Value, &Value)> = None;

@@ -116,7 +116,7 @@ impl Expr {
                 Lookup::Unknown => known(None)?,
             },
             Expr::Query(conditions) => Cow::Owned(Value::Bool(self.has_answer(conditions, scope)?)),
-            Expr::Find(wanted, conditions) => Cow::Owned(Value::List(self.answers(wanted, conditions, scope)?)),
+            Expr::Find(wanted, conditions) => Cow::Owned(Value::List(self.answers(wanted, conditions, scope)?.into())),
             Expr::Unknown(name) => known(scope.unknown(name))?,
             Expr::Unary(UnaryOperator::Not, operand) => Cow::Owned(Value::Bool(!operand.holds(scope)?)),
             Expr::Unary(UnaryOperator::Negate, operand) => Cow::Owned(match operand.value(scope)?.as_ref() {
@@ -237,7 +237,7 @@ impl Expr {
             .ok_or_else(|| self.wrong(format!("index {wanted} is outside a list of {length}")))?;
         Ok(match of {
             Cow::Borrowed(Value::List(items)) => Cow::Borrowed(&items[at]),
-            Cow::Owned(Value::List(mut items)) => Cow::Owned(items.swap_remove(at)),
+            Cow::Owned(Value::List(items)) => Cow::Owned(items[at].clone()),
             Cow::Borrowed(Value::Joints(joints)) => Cow::Owned(Value::Float(joints[at])),
             Cow::Owned(Value::Joints(joints)) => Cow::Owned(Value::Float(joints[at])),
             _ => return Err(self.wrong("it has no elements")),
@@ -300,7 +300,9 @@ pub(super) fn binary(operator: BinaryOperator, a: &Value, b: &Value) -> Result<V
         },
         Op::Add => match (a, b) {
             (Value::List(a), Value::List(b)) if a.len() + b.len() <= MAX_LIST => {
-                Value::List(a.iter().chain(b).cloned().collect())
+                let mut both = a.clone();
+                both.extend(b.iter().cloned());
+                Value::List(both)
             }
             (Value::List(_), Value::List(_)) => return Err(format!("the list is longer than {MAX_LIST}")),
             _ => arithmetic(a, b, i64::checked_add, |x, y| x + y)?,

@@ -6,6 +6,7 @@
 use super::evaluate::{MAX_LIST, binary, described, equal, number, order};
 use super::{BinaryOperator, Function};
 use crate::grasp;
+use crate::list::List;
 use crate::pose::Pose;
 use crate::value::Value;
 use std::cmp::Ordering;
@@ -215,7 +216,7 @@ pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, Str
             if times > MAX_LIST {
                 return Err(format!("the list is longer than {MAX_LIST}"));
             }
-            Ok(Value::List(vec![value.clone(); times]))
+            Ok(Value::List(vec![value.clone(); times].into()))
         }
         (Function::Take, [Value::List(items), count]) => {
             let count = usize::try_from(int(count)?).map_err(|_| "cannot take a negative number".to_owned())?;
@@ -223,7 +224,7 @@ pub(crate) fn call(function: Function, arguments: &[Value]) -> Result<Value, Str
         }
         (Function::Sort, [Value::List(items)]) => {
             let keyed = items.iter().map(|item| (item.clone(), item.clone())).collect();
-            Ok(Value::List(sorted(keyed)?))
+            Ok(Value::List(sorted(keyed)?.into()))
         }
         (Function::Reverse, [Value::List(items)]) => Ok(Value::List(items.iter().rev().cloned().collect())),
         (Function::Unique, [Value::List(items)]) => unique(items),
@@ -252,7 +253,7 @@ pub(super) fn sorted(mut keyed: Vec<(Value, Value)>) -> Result<Vec<Value>, Strin
     Ok(keyed.into_iter().map(|(_, value)| value).collect())
 }
 
-fn sum(items: &[Value]) -> Result<Value, String> {
+fn sum(items: &List) -> Result<Value, String> {
     items.iter().try_fold(Value::Int(0), |sum, item| binary(BinaryOperator::Add, &sum, item)).and_then(
         |sum| match sum {
             Value::Int(_) | Value::Float(_) => Ok(sum),
@@ -262,7 +263,7 @@ fn sum(items: &[Value]) -> Result<Value, String> {
 }
 
 /// The elements that no element before is equal to. So many comparisons that a list that differs everywhere has a bound of its own.
-fn unique(items: &[Value]) -> Result<Value, String> {
+fn unique(items: &List) -> Result<Value, String> {
     let mut found: Vec<Value> = Vec::new();
     for item in items {
         if !found.iter().any(|other| equal(other, item)) {
@@ -272,7 +273,7 @@ fn unique(items: &[Value]) -> Result<Value, String> {
             return Err(format!("it has more than {MAX_UNIQUE} different elements"));
         }
     }
-    Ok(Value::List(found))
+    Ok(Value::List(found.into()))
 }
 
 fn length(n: usize) -> Value {
@@ -302,15 +303,15 @@ fn range(from: i64, to: i64) -> Result<Value, String> {
 
 /// The least or greatest of the arguments, or of the elements of the only one.
 fn extreme(arguments: &[Value], wanted: std::cmp::Ordering) -> Result<Value, String> {
-    let candidates = match arguments {
-        [Value::List(items)] => items.as_slice(),
-        _ => arguments,
+    let candidates: Vec<&Value> = match arguments {
+        [Value::List(items)] => items.iter().collect(),
+        _ => arguments.iter().collect(),
     };
-    let mut best = candidates.first().ok_or("the list is empty")?;
+    let mut best = *candidates.first().ok_or("the list is empty")?;
     if !matches!(best, Value::String(_)) {
         number(best)?;
     }
-    for candidate in &candidates[1..] {
+    for candidate in candidates.into_iter().skip(1) {
         if order(candidate, best)? == wanted {
             best = candidate;
         }
@@ -360,7 +361,7 @@ mod tests {
     fn object(yaw: f64, size: [f64; 3]) -> Value {
         Value::map([
             ("pose", Value::Pose(Pose::from_rpy([0.7, 0.1, 0.75], 0.0, 0.0, yaw))),
-            ("size", Value::List(size.map(Value::Float).to_vec())),
+            ("size", Value::List(size.map(Value::Float).to_vec().into())),
         ])
     }
 

@@ -13,6 +13,7 @@ use super::outline::{Form, Step};
 use super::yaml::Node;
 use crate::expression::{Expr, Function};
 use crate::guard::Collected;
+use crate::list::List;
 use crate::program::TaskOutput;
 use crate::value::{Type, Value};
 use std::collections::BTreeMap;
@@ -48,7 +49,7 @@ pub(crate) fn read(fields: &mut Fields<'_, '_>, step: &Step<'_>) -> Vec<TaskOutp
         match fields.view.state.filter(|_| is_loop && each.is_some()) {
             Some(id) => {
                 fields.out.guards.entry(id).or_default().collected.push(Collected { name: name.clone(), value });
-                outputs.push(TaskOutput { name, ty, value: Expr::Literal(Value::List(Vec::new())) });
+                outputs.push(TaskOutput { name, ty, value: Expr::Literal(Value::List(List::new())) });
             }
             None => outputs.push(TaskOutput { name, ty, value }),
         }

@@ -10,6 +10,7 @@ use crate::expression::parse::parse_expression;
 use crate::expression::{Expr, FactExpr, UnaryOperator};
 use crate::fact::SCENE_PREDICATES;
 use crate::id::StateId;
+use crate::list::List;
 use crate::program::{ABORTED, Annotations, Nature, PREEMPTED, SUCCESS, State, StateKind};
 use crate::value::{Type, Value};
 
@@ -236,7 +237,7 @@ fn defaults(fields: &mut Fields<'_, '_>, body: &Node) -> std::collections::BTree
         }
         // Before the first iteration there is nothing of any.
         if entry.value.get("each").is_some() {
-            defaults.entry(entry.key.clone()).or_insert_with(|| Value::List(Vec::new()));
+            defaults.entry(entry.key.clone()).or_insert_with(|| Value::List(List::new()));
         }
     }
     defaults

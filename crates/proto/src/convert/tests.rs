@@ -68,7 +68,7 @@ fn value() -> impl Strategy<Value = Value> {
     ];
     leaf.prop_recursive(4, 24, 4, |inner| {
         prop_oneof![
-            vec(inner.clone(), 0..4).prop_map(Value::List),
+            vec(inner.clone(), 0..4).prop_map(|items| Value::List(items.into())),
             btree_map(a_name(), inner, 0..4).prop_map(Value::Map),
         ]
     })
@@ -131,7 +131,7 @@ fn condition() -> impl Strategy<Value = Condition> {
     (a_name(), comparison, value()).prop_map(|(attribute, comparison, value)| {
         let value = match comparison {
             Comparison::Has => Value::Null,
-            Comparison::In => Value::List(std::vec![value]),
+            Comparison::In => Value::List(std::vec![value].into()),
             _ => value,
         };
         Condition { attribute, comparison, value }
@@ -359,7 +359,7 @@ fn what_means_nothing_is_refused_with_its_path() {
     refused::<Value, _>(v1::Value { kind: None }, "kind: is not set: one of null, boolean");
     refused::<Value, _>(v1::Value::from(Value::Float(f64::NAN)), "number: is NaN");
     refused::<Value, _>(v1::Value::from(Value::Joints(vec![0.0, f64::INFINITY])), "joints[1]: is inf");
-    let nested = Value::map([("a", Value::List(vec![Value::Null, Value::Float(f64::NAN)]))]);
+    let nested = Value::map([("a", Value::List(vec![Value::Null, Value::Float(f64::NAN)].into()))]);
     refused::<Value, _>(v1::Value::from(nested.clone()), "[a][1].number: is NaN");
     let goal = Goal {
         id: "g".to_owned(),
@@ -413,10 +413,13 @@ fn what_means_nothing_is_refused_with_its_path() {
 
 #[test]
 fn nesting_and_size_have_an_end() {
-    let nested = |depth: usize| (0..depth).fold(Value::Null, |inner, _| Value::List(vec![inner]));
+    let nested = |depth: usize| (0..depth).fold(Value::Null, |inner, _| Value::List(vec![inner].into()));
     assert!(Value::try_from(v1::Value::from(nested(MAX_DEPTH))).is_ok());
     refused::<Value, _>(v1::Value::from(nested(MAX_DEPTH + 1)), "nest deeper than 16");
-    refused::<Value, _>(v1::Value::from(Value::List(vec![Value::Null; MAX_ELEMENTS + 1])), "more than 200000 elements");
+    refused::<Value, _>(
+        v1::Value::from(Value::List(vec![Value::Null; MAX_ELEMENTS + 1].into())),
+        "more than 200000 elements",
+    );
     // The deepest value that is allowed also survives the decoder's own limit.
     let bytes = v1::Value::from(nested(MAX_DEPTH)).encode_to_vec();
     assert!(v1::Value::decode(bytes.as_slice()).is_ok());

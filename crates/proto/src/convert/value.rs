@@ -71,7 +71,7 @@ fn read(value: v1::Value, depth: usize, budget: &mut usize) -> Result<Value, Mal
             for (i, element) in list.values.into_iter().enumerate() {
                 values.push(read(element, depth + 1, budget).map_err(|m| m.within(format!("[{i}]")))?);
             }
-            Value::List(values)
+            Value::List(values.into())
         }
         Kind::Map(map) => {
             room(map.fields.len())?;

@@ -53,6 +53,7 @@ use super::fact;
 use ratn_executive::protocol::{Event, Goal, LogEntry, Unmade};
 use ratn_model::fact::FactKey;
 use ratn_model::id::{InstanceId, Revision};
+use ratn_model::list::List;
 use ratn_model::pose::Pose;
 use ratn_model::program::Program;
 use ratn_model::resource::Quantity;
@@ -252,7 +253,8 @@ impl Oracle for Script {
             Some(OneOrMore::More(all)) => all.get(*tries - 1).or(all.last()).map_or("success", String::as_str),
         };
         let outcome = reply.outcome.as_deref().unwrap_or(outcome).to_owned();
-        let mut outputs = BTreeMap::from([("x".to_owned(), Value::Int(1)), ("list".to_owned(), Value::List(vec![]))]);
+        let mut outputs =
+            BTreeMap::from([("x".to_owned(), Value::Int(1)), ("list".to_owned(), Value::List(List::new()))]);
         let said = self.outputs.get(path).into_iter().flatten().chain(&reply.outputs);
         outputs.extend(said.map(|(port, v)| (port.clone(), value(v))));
         let measured = self.measured.get(path).into_iter().flatten();

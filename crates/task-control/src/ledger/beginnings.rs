@@ -4,7 +4,8 @@
 //! ```text
 //! an action           counts from when it was granted what it holds, or its last goal was given
 //! a routine           from when it began: what it holds it holds to its end
-//! another composite   from when the first of its parts began; where what that held is lost, from when the first one began since
+//! another composite   from when the first of its parts began; where what that held is lost, from when the first one began since, as soon as
+//!                     that is real: one that is only expected changes nothing
 //! anything else       from now: it holds nothing
 //! ```
 //!
@@ -15,7 +16,7 @@ use ratn_event_log::without_visits;
 use ratn_executive::protocol::{Command, Event, Note};
 use ratn_model::id::{InstanceId, Revision};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 /// So many composite states are followed; of more one is forgotten of which nothing is under way, the one that began first. One that is left by an
 /// outcome for which it declares no effects stays until then, and so does one that was only expected.
@@ -36,6 +37,11 @@ impl Began {
     pub(crate) fn others_count(&self) -> Option<Revision> {
         self.held_until.map(|held| held.max(self.knows))
     }
+
+    /// Whether it is behind a loss that another one was before.
+    fn is_since(&self, other: &Began) -> bool {
+        other.held_until.is_some_and(|lost| self.held_until.is_none_or(|own| own > lost))
+    }
 }
 
 /// A composite state that has begun, and has not been left.
@@ -44,8 +50,8 @@ struct Entered {
     began: Began,
     /// The instance of a routine.
     routine: Option<InstanceId>,
-    /// Its parts that have begun and not come to their ends.
-    parts: BTreeSet<InstanceId>,
+    /// Its parts that have begun and not come to their ends, and how.
+    parts: BTreeMap<InstanceId, Began>,
     /// Whether the result of a part is real. Until one is, the state may only be expected.
     is_real: bool,
 }
@@ -54,6 +60,15 @@ impl Entered {
     /// Whether all that has begun of it was discarded. It was only expected, unless its commit follows: its first part was cut short then.
     fn is_discarded(&self) -> bool {
         self.parts.is_empty() && !self.is_real && self.routine.is_none()
+    }
+
+    /// A part of it is real.
+    fn is_made_of(&mut self, part: Began) {
+        let is_earlier = || part.held_until == self.began.held_until && part.knows < self.began.knows;
+        if self.routine.is_none() && (part.is_since(&self.began) || is_earlier()) {
+            self.began = part;
+        }
+        self.is_real = true;
     }
 
     /// Whether something of it is under way.
@@ -141,7 +156,7 @@ impl Beginnings {
     fn routine_begins(&mut self, instance: InstanceId, knows: Revision) {
         let Some(inside) = self.inside.get(&instance).filter(|inside| inside.is_routine) else { return };
         let began = Began { knows, held_until: None };
-        let routine = Entered { began, routine: Some(instance), parts: BTreeSet::new(), is_real: false };
+        let routine = Entered { began, routine: Some(instance), parts: BTreeMap::new(), is_real: false };
         self.entered.insert(inside.states[0].clone(), routine);
         self.enters(instance, 1, began);
     }
@@ -150,13 +165,12 @@ impl Beginnings {
     fn enters(&mut self, instance: InstanceId, from: usize, began: Began) {
         let Some(inside) = self.inside.get(&instance) else { return };
         for path in inside.states.iter().skip(from) {
-            let new = || Entered { began, routine: None, parts: BTreeSet::new(), is_real: false };
+            let new = || Entered { began, routine: None, parts: BTreeMap::new(), is_real: false };
             let entered = self.entered.entry(path.clone()).or_insert_with(new);
-            let is_lost = entered.began.held_until.is_some() && entered.routine.is_none();
-            if is_lost || entered.is_discarded() {
+            if entered.is_discarded() {
                 entered.began = began;
             }
-            entered.parts.insert(instance);
+            entered.parts.insert(instance, began);
         }
         while self.entered.len() > MOST_ENTERED {
             let order = |entered: &Entered| (entered.is_open(), !entered.is_discarded(), entered.began.knows);
@@ -171,8 +185,9 @@ impl Beginnings {
         let Some(inside) = self.inside.remove(&instance) else { return };
         for path in inside.states {
             let Some(entered) = self.entered.get_mut(&path) else { continue };
-            entered.parts.remove(&instance);
-            entered.is_real |= is_real;
+            if let Some(part) = entered.parts.remove(&instance).filter(|_| is_real) {
+                entered.is_made_of(part);
+            }
             if entered.routine == Some(instance) {
                 self.entered.remove(&path);
             }
@@ -181,7 +196,8 @@ impl Beginnings {
 
     /// What the run held is gone. Of what was lost before, others' changes count since then.
     fn lose(&mut self, held_until: Revision) {
-        let composites = self.entered.values_mut().map(|entered| &mut entered.began);
+        let composites =
+            self.entered.values_mut().flat_map(|entered| entered.parts.values_mut().chain([&mut entered.began]));
         for began in self.instances.values_mut().chain(composites) {
             began.held_until.get_or_insert(held_until);
         }
@@ -366,6 +382,9 @@ mod tests {
         bench.loses();
         assert_eq!([bench.of("part"), bench.of("routine")], [Some((part, true)), Some((routine, true))]);
         let anew = bench.begins(4, "part/again");
+        assert_eq!(bench.of("part"), Some((part, true)), "it is only expected");
+        bench.retired(4);
+        assert_eq!(bench.of("part"), Some((anew, false)));
         // The routine has what it needs anew, and one of its parts is tried again.
         bench.granted(2);
         bench.running(3);
@@ -376,6 +395,30 @@ mod tests {
         assert_eq!(bench.of("routine"), Some((anew, false)));
         bench.retired(2);
         assert_eq!(bench.of("routine"), None, "it is left, whatever it has committed");
+    }
+
+    #[test]
+    fn of_what_is_lost_a_part_that_is_only_expected_and_is_discarded_does_not_count() {
+        let mut bench = Bench::new(&["part"]);
+        let part = bench.begins(1, "part/move");
+        bench.retired(1);
+        bench.loses();
+        bench.begins(2, "part/expected");
+        bench.squashed(2);
+        assert_eq!(bench.of("part"), Some((part, true)), "what others change meanwhile counts");
+        // Of those that are real it is the first that counts, whichever ends first.
+        bench.begins(3, "part/expected");
+        let first = bench.begins(4, "part/again");
+        bench.begins(5, "part/more");
+        bench.retired(5);
+        bench.squashed(3);
+        bench.retired(4);
+        assert_eq!(bench.of("part"), Some((first, false)));
+        // Lost once more while another part is under way.
+        bench.begins(6, "part/last");
+        bench.loses();
+        bench.retired(6);
+        assert_eq!(bench.of("part"), Some((first, true)));
     }
 
     #[test]

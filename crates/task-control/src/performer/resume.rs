@@ -46,6 +46,9 @@ const WITHDRAWN_AT_ONCE: usize = 64;
 /// As the resource manager names the refusal of what is not there, or not free.
 const NOT_ENOUGH: &str = "NOT_ENOUGH";
 
+/// A revision of the root, and what the facts are there that a run believes to be otherwise.
+pub(crate) type Changed = (Revision, Vec<(FactKey, Option<Value>)>);
+
 /// What the world pool did not have of a run's commits.
 struct Missing {
     /// So many were made.
@@ -142,6 +145,18 @@ impl Performer {
         Ok(Some(Event::SessionLost { held_until }))
     }
 
+    /// What has changed from outside while nobody was there, with what the run had decided on top of it, be that in the world pool or not. What is due
+    /// is decided on that.
+    ///
+    /// # Errors
+    /// Where the world pool does not say what it has of the run.
+    pub(crate) async fn changed_meanwhile(&self, ledger: &Ledger, mirror: &World) -> anyhow::Result<Option<Changed>> {
+        let (revision, facts) = retry_unanswered(|| self.world.root()).await?;
+        let there = self.commits_there(ledger, revision).await?;
+        let facts = facts.into_iter().map(|fact| (fact.key, fact.value)).collect();
+        Ok(changed(revision, facts, &ledger.commits[there..], mirror))
+    }
+
     /// Takes up everything that is open, in the order in which it was decided; `now` is the time of the run. What the executive is to be told: that all
     /// of it is so in a new session, and what has changed from outside meanwhile.
     ///
@@ -155,13 +170,8 @@ impl Performer {
         now: Timestamp,
     ) -> anyhow::Result<Vec<Event>> {
         let (missing, revision, facts) = self.commit_again(program, &ledger, now).await?;
-        let mut root = World::from_facts(facts, revision);
-        for decided in &missing.behind {
-            // What cannot be made of what others have left there is refused when it is its turn.
-            let _ = root.apply(&decided.changes);
-        }
-        let facts = outside::differences(&root, mirror);
-        let changed = (!facts.is_empty()).then_some(Event::WorldChanged { revision, facts });
+        let changed = changed(revision, facts, &missing.behind, mirror);
+        let changed = changed.map(|(revision, facts)| Event::WorldChanged { revision, facts });
         self.stop_again(&ledger);
         // Before all that takes a while: whoever performs them waits for their run no longer than its grace.
         for (instance, (attempt, goal)) in std::mem::take(&mut ledger.goals) {
@@ -466,6 +476,17 @@ impl Performer {
         let mut fitting = there.iter().filter(|resource| fits(&resource.attributes)).peekable();
         Ok(fitting.peek().is_none() || fitting.any(|resource| resource.renewable))
     }
+}
+
+/// What is otherwise than in a mirror in a root of these facts, when these commits are made, too.
+fn changed(revision: Revision, facts: Vec<(FactKey, Value)>, missing: &[Decided], mirror: &World) -> Option<Changed> {
+    let mut root = World::from_facts(facts, revision);
+    for decided in missing {
+        // What cannot be made of what others have left there is refused when it is its turn.
+        let _ = root.apply(&decided.changes);
+    }
+    let facts = outside::differences(&root, mirror);
+    (!facts.is_empty()).then_some((revision, facts))
 }
 
 /// The requests of withdrawn acquires: those of the last moments may have been granted meanwhile and keep others waiting; older ones were answered

@@ -139,13 +139,21 @@ pub async fn resume(mut resumption: Resumption, place: &Place, interrupt: &Inter
         spans: None,
     };
     let begin = async |shell: &mut Shell| {
-        let mirror = shell.executive.root().clone();
         shell.log.append_commands(ledger.last, &missing)?;
         let before = Before { log: shell.log.path().to_owned(), bytes: shell.log.written(), last: ledger.last };
         shell.spans = Spans::of_a_run_that_goes_on(before, shell.clock.now(), place.speed, &place.messages);
+        // What is due is decided on the world as it is: it has become so before anybody is there again.
+        let (mut mirror, mut commands) = (shell.executive.root().clone(), Vec::new());
+        if let Some((revision, facts)) = shell.performer.changed_meanwhile(&ledger, &mirror).await? {
+            mirror.overwrite(facts.iter().cloned());
+            let changed = Event::WorldChanged { revision, facts };
+            commands = shell.decide_at(ledger.last, &changed)?;
+            ledger.event(ledger.last, &changed);
+        }
         // Request ids of now on have the number of this resumption: it is in the log before they are used.
         let resumed = Event::Resumed { share: another_share(&ledger, place.standing) };
-        let (mut now, mut commands) = shell.decide(&resumed)?;
+        let (mut now, more) = shell.decide(&resumed)?;
+        commands.extend(more);
         ledger.event(now, &resumed);
         shell.hand_over()?;
         let lost = shell.performer.session_lost(&ledger).await?;

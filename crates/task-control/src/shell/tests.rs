@@ -5,6 +5,7 @@ use crate::task_for_tests::{FETCH_BOXES, program};
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::world_pool::{self, WorldPoolConfig};
 use ratn_executive::protocol::{LogEntry, LogLine};
+use ratn_model::fact::{Change, FactKey, Term};
 use ratn_worker::runtime_directory::RuntimeDirectory;
 use std::time::Duration;
 use tokio_util::sync::{CancellationToken, DropGuard};
@@ -403,6 +404,33 @@ states:
     let world = ratn_worker::client::WorldClient::new(&channels, &place.endpoints.world_pool)?;
     let (_, facts) = world.root().await?;
     assert_eq!(facts.iter().map(|fact| fact.key.to_string()).collect::<Vec<_>>(), ["noted(desk)"]);
+    Ok(())
+}
+
+#[tokio::test]
+async fn what_is_due_when_a_run_is_resumed_is_decided_on_the_world_as_it_has_become() -> anyhow::Result<()> {
+    const DOOR: &str = "
+task: door
+outcomes: [too_late]
+states:
+  - opens: { wait: { for: open(door), timeout: 300 }, transitions: { timeout: too_late } }
+";
+    let bench = Bench::new(|door| *door = program(DOOR)).await?;
+    let (_asks, interrupt) = Interrupt::new();
+    tokio::select! {
+        ended = run(bench.run.clone(), &bench.place, &interrupt) => panic!("it ended: {ended:?}"),
+        () = waits(&bench.place, "opens") => {}
+    }
+    let channels = ratn_worker::client::Channels::new(&bench.place.tls);
+    let world = ratn_worker::client::WorldClient::new(&channels, &bench.place.endpoints.world_pool)?;
+    let fact = FactKey { predicate: "open".to_owned(), arguments: vec![Term::Name("door".to_owned())] };
+    world.commit("other/i1/1", vec![Change::Set { fact, value: Value::Bool(true) }], None).await?;
+    // The time of the wait is over by far when somebody is there again.
+    let place = &Place { speed: 1e6, ..bench.place.clone() };
+    let ended = Box::pin(resume(resumption_of(&bench.run).await?, place, &interrupt)).await?;
+    let (lines, now) = (bench.lines()?, Timestamp::from_seconds(300.0));
+    assert!(lines.last().is_some_and(|line| line.at > now), "nothing was due when it was resumed");
+    assert_eq!(ended.outcome, SUCCESS, "the door is open");
     Ok(())
 }
 

@@ -170,7 +170,7 @@ impl Maker {
         };
         self.at(id).kind = kind;
         if self.features.variables && self.dice.percent(65) {
-            let list = Value::List(vec![Value::Int(0)]);
+            let list = Value::List(vec![Value::Int(0)].into());
             self.at(id).defaults = BTreeMap::from([("x".to_owned(), Value::Int(1)), ("list".to_owned(), list)]);
         }
         if self.features.speculation && self.dice.percent(10) {

@@ -36,7 +36,8 @@ impl Maker {
                 self.at(id).transitions.insert(ABORTED.to_owned(), to.clone());
                 self.at(id).transitions.insert(PREEMPTED.to_owned(), to);
             }
-            let defaults = [("x".to_owned(), Value::Int(1)), ("list".to_owned(), Value::List(vec![Value::Int(0)]))];
+            let defaults =
+                [("x".to_owned(), Value::Int(1)), ("list".to_owned(), Value::List(vec![Value::Int(0)].into()))];
             self.at(id).defaults = BTreeMap::from(defaults);
             visible.ports.push(id);
             children.push(id);
@@ -74,7 +75,8 @@ impl Maker {
             for outcome in [ABORTED, PREEMPTED] {
                 self.states[part.0 as usize].transitions.insert(outcome.to_owned(), next(number));
             }
-            let defaults = [("x".to_owned(), Value::Int(1)), ("list".to_owned(), Value::List(vec![Value::Int(0)]))];
+            let defaults =
+                [("x".to_owned(), Value::Int(1)), ("list".to_owned(), Value::List(vec![Value::Int(0)].into()))];
             self.states[part.0 as usize].defaults = BTreeMap::from(defaults);
         }
         let collection = Expr::Call(Function::Range, vec![Expr::Literal(Value::Int(LOOP))]);

@@ -7,6 +7,7 @@ use super::super::{Dice, around, is_preemptive};
 use ratn_model::expression::{BinaryOperator, EffectExpr, Expr, Function};
 use ratn_model::guard::{Collected, Guard};
 use ratn_model::id::StateId;
+use ratn_model::list::List;
 use ratn_model::program::{Program, State, StateKind, TaskOutput};
 use ratn_model::value::{Type, Value};
 use std::collections::BTreeMap;
@@ -114,7 +115,7 @@ fn collect(state: &mut State, guards: &mut BTreeMap<StateId, Guard>, inside: &[S
         StateKind::While { index: Some(index), .. } if dice.percent(30) => Expr::Variable(index.clone()),
         _ => chosen(inside, dice),
     };
-    let nothing = || Value::List(Vec::new());
+    let nothing = || Value::List(List::new());
     state.defaults.insert(ALL.to_owned(), nothing());
     if let Some(outputs) = state.kind.outputs_mut() {
         outputs.push(TaskOutput { name: ALL.to_owned(), ty: Type::Any, value: Expr::Literal(nothing()) });

@@ -52,7 +52,7 @@ pub(super) fn read(
             let kept = keyed.into_iter().filter(|(key, _)| *key == Value::Bool(true));
             Ok(Value::List(kept.map(|(_, item)| item).collect()))
         }
-        Comprehension::SortBy => Ok(Value::List(ascending(keyed)?)),
+        Comprehension::SortBy => Ok(Value::List(ascending(keyed)?.into())),
         Comprehension::MinBy => best(Ordering::Less, keyed),
         Comprehension::MaxBy => best(Ordering::Greater, keyed),
         Comprehension::Any => Ok(Value::Bool(false)),

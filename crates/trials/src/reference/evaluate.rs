@@ -196,7 +196,7 @@ impl Read for Expr {
             }
             Expr::Element(name) => written(last(&place.elements, name)),
             Expr::Each { what, element, list, body } => comprehension::read((*what, element), (list, body), place),
-            Expr::Find(wanted, conditions) => Ok(Value::List(query::found_values(wanted, conditions, place)?)),
+            Expr::Find(wanted, conditions) => Ok(Value::List(query::found_values(wanted, conditions, place)?.into())),
             Expr::Query(conditions) => Ok(Value::Bool(query::has_answer(conditions, place)?)),
             Expr::Unary(UnaryOperator::Not, of) => Ok(Value::Bool(!of.is_true(place)?)),
             Expr::Unary(UnaryOperator::Negate, of) => match of.read(place)? {
@@ -287,7 +287,7 @@ pub(super) fn both(operator: BinaryOperator, a: &Value, b: &Value) -> Result<Val
         },
         Op::Add => match (a, b) {
             (Value::List(a), Value::List(b)) if a.len() + b.len() > LONGEST_LIST => wrong("too long"),
-            (Value::List(a), Value::List(b)) => Ok(Value::List([&a[..], &b[..]].concat())),
+            (Value::List(a), Value::List(b)) => Ok(Value::List(a.iter().chain(b).cloned().collect())),
             (Value::Int(i), Value::Int(j)) => whole(i.checked_add(*j)),
             _ => finite(number(a)? + number(b)?),
         },

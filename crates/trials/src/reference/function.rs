@@ -18,10 +18,10 @@ pub(super) fn call(function: Function, arguments: &[Value]) -> Result<Value, Fai
         (Function::Len, [Value::String(text)]) => Ok(Value::Int(text.chars().count() as i64)),
         (Function::Range, [Value::Int(to)]) => range(0, *to),
         (Function::Range, [Value::Int(from), Value::Int(to)]) => range(*from, *to),
-        (Function::Min, [Value::List(items)]) => best(items, Ordering::Less),
-        (Function::Max, [Value::List(items)]) => best(items, Ordering::Greater),
-        (Function::Min, items) => best(items, Ordering::Less),
-        (Function::Max, items) => best(items, Ordering::Greater),
+        (Function::Min, [Value::List(items)]) => best(items.iter(), Ordering::Less),
+        (Function::Max, [Value::List(items)]) => best(items.iter(), Ordering::Greater),
+        (Function::Min, items) => best(items.iter(), Ordering::Less),
+        (Function::Max, items) => best(items.iter(), Ordering::Greater),
         (Function::Abs, [Value::Int(i)]) => i.checked_abs().map_or_else(|| wrong("too large"), |i| Ok(Value::Int(i))),
         (Function::Abs, [x]) => Ok(Value::Float(number(x)?.abs())),
         (Function::Sqrt, [x]) if number(x)? >= 0.0 => Ok(Value::Float(number(x)?.sqrt())),
@@ -39,13 +39,13 @@ pub(super) fn call(function: Function, arguments: &[Value]) -> Result<Value, Fai
         (Function::Angle, [Value::Pose(a), Value::Pose(b)]) => Ok(Value::Float(a.angle(b))),
         (Function::Sort, [Value::List(items)]) => {
             let own = items.iter().map(|item| (item.clone(), item.clone())).collect();
-            Ok(Value::List(comprehension::ascending(own)?))
+            Ok(Value::List(comprehension::ascending(own)?.into()))
         }
         (Function::Reverse, [Value::List(items)]) => Ok(Value::List(items.iter().rev().cloned().collect())),
         (Function::Unique, [Value::List(items)]) => {
-            let new = |i: &usize| !items[..*i].iter().any(|other| same(other, &items[*i]));
+            let new = |i: &usize| !items.iter().take(*i).any(|other| same(other, &items[*i]));
             let found: Vec<Value> = (0..items.len()).filter(new).map(|i| items[i].clone()).collect();
-            if found.len() > 1_000 { wrong("too many different elements") } else { Ok(Value::List(found)) }
+            if found.len() > 1_000 { wrong("too many different elements") } else { Ok(Value::List(found.into())) }
         }
         (Function::StartsWith, [Value::String(text), Value::String(prefix)]) => {
             Ok(Value::Bool(text.get(..prefix.len()) == Some(prefix.as_str())))
@@ -76,7 +76,7 @@ pub(super) fn call(function: Function, arguments: &[Value]) -> Result<Value, Fai
             Ok(Value::List((0..*times).map(|_| value.clone()).collect()))
         }
         (Function::Take, [Value::List(items), Value::Int(count)]) if *count >= 0 => {
-            Ok(Value::List(items[..items.len().min(*count as usize)].to_vec()))
+            Ok(Value::List(items.iter().take(*count as usize).cloned().collect()))
         }
         _ => wrong(format!("{} of {arguments:?}", function.name())),
     }
@@ -89,8 +89,8 @@ fn range(from: i64, to: i64) -> Result<Value, Fail> {
     Ok(Value::List((from..to).map(Value::Int).collect()))
 }
 
-fn best(items: &[Value], wanted: Ordering) -> Result<Value, Fail> {
-    let Some(mut best) = items.first() else { return wrong("the best of nothing") };
+fn best<'v>(mut items: impl Iterator<Item = &'v Value>, wanted: Ordering) -> Result<Value, Fail> {
+    let Some(mut best) = items.next() else { return wrong("the best of nothing") };
     // One alone has to have an order, too.
     order(best, best)?;
     for item in items {

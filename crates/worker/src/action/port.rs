@@ -183,7 +183,7 @@ mod tests {
 
     #[test]
     fn a_wrong_input_is_named_with_what_was_expected_and_found() {
-        let region = Value::map([("size", Value::List(vec![Value::Int(1), Value::Float(2.0)]))]);
+        let region = Value::map([("size", Value::List(vec![Value::Int(1), Value::Float(2.0)].into()))]);
         let port = Port::new("region", Some(&region));
         let message = |error: InputError| error.to_string();
         assert_eq!(

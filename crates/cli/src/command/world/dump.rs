@@ -119,7 +119,7 @@ pub(super) mod tests {
         ];
         leaf.prop_recursive(3, 24, 4, |inner| {
             prop_oneof![
-                vec(inner.clone(), 0..4).prop_map(Value::List),
+                vec(inner.clone(), 0..4).prop_map(|items| Value::List(items.into())),
                 btree_map(text(), inner, 0..4).prop_map(Value::Map),
             ]
         })

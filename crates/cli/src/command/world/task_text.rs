@@ -39,7 +39,6 @@ pub(super) fn key(key: &FactKey) -> String {
 
 /// A value as an expression; `None` for what none stands for.
 pub(super) fn value(value: &Value) -> Option<String> {
-    let all = |values: &[Value]| values.iter().map(self::value).collect::<Option<Vec<_>>>();
     Some(match value {
         Value::Null => "null".to_owned(),
         Value::Bool(yes) => yes.to_string(),
@@ -53,7 +52,7 @@ pub(super) fn value(value: &Value) -> Option<String> {
         Value::Joints(positions) => {
             format!("joints({})", positions.iter().map(|one| rounded(*one)).collect::<Vec<_>>().join(", "))
         }
-        Value::List(items) => format!("[{}]", all(items)?.join(", ")),
+        Value::List(items) => format!("[{}]", items.iter().map(self::value).collect::<Option<Vec<_>>>()?.join(", ")),
         Value::Map(fields) => {
             let said = fields.iter().map(|(name, one)| Some(format!("{}: {}", text(name), self::value(one)?)));
             format!("{{{}}}", said.collect::<Option<Vec<_>>>()?.join(", "))
@@ -129,7 +128,7 @@ mod tests {
 
     #[test]
     fn what_is_shown_can_be_pasted_into_a_task() {
-        let size = Value::List(vec![Value::Float(0.078846), Value::Float(-2.0), Value::Float(1e-4)]);
+        let size = Value::List(vec![Value::Float(0.078846), Value::Float(-2.0), Value::Float(1e-4)].into());
         let values = [
             Value::Null,
             Value::Bool(true),
@@ -143,7 +142,7 @@ mod tests {
                 ("type".to_owned(), Value::String("box".to_owned())),
                 ("size".to_owned(), size.clone()),
             ])),
-            Value::List(vec![size]),
+            Value::List(vec![size].into()),
         ];
         let facts: Vec<FactRecord> = values.iter().map(|value| fact("left hand", value.clone())).collect();
         assert_eq!(pasted(&world(&facts)), values);

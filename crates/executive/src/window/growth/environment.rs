@@ -10,6 +10,7 @@ use super::table::Table;
 use crate::binding::Outputs;
 use crate::plan::{Chain, Outcome, Plan};
 use ratn_model::id::{InstanceId, StateId};
+use ratn_model::list::List;
 use ratn_model::program::{Program, StateKind};
 use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
@@ -89,7 +90,7 @@ pub(crate) struct Frame {
 pub(crate) struct Iteration {
     pub(crate) index: usize,
     /// The elements; none of a `while`.
-    pub(crate) elements: Option<Arc<Vec<Value>>>,
+    pub(crate) elements: Option<Arc<List>>,
 }
 
 /// Variables in sight, the innermost last. Copying is cheap.

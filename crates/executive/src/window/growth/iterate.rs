@@ -8,13 +8,13 @@ use crate::context::Context;
 use crate::window::graph::Graph;
 use crate::window::graph::instance::Role;
 use ratn_model::id::{InstanceId, StateId};
+use ratn_model::list::List;
 use ratn_model::program::{Program, StateKind};
-use ratn_model::value::Value;
 use std::sync::Arc;
 
 impl Growth {
     /// The list of a loop is known: its iterations begin.
-    pub(crate) fn unroll(&mut self, graph: &Graph, context: &Context<'_>, waits_for: InstanceId, elements: Vec<Value>) {
+    pub(crate) fn unroll(&mut self, graph: &Graph, context: &Context<'_>, waits_for: InstanceId, elements: List) {
         let Some(index) = self.cursors.iter().position(|cursor| cursor.todo == Todo::Await(waits_for)) else { return };
         let Some(instance) = graph.get(waits_for) else { return };
         let (state, visit) = (context.program.state(instance.state), instance.visit);

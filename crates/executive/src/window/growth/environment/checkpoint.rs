@@ -9,6 +9,7 @@ use crate::checkpoint::{Broken, Pool, at};
 use crate::plan::Plan;
 use crate::window::growth::table::{NodeForm, Nodes, Table};
 use ratn_model::id::{InstanceId, StateId};
+use ratn_model::list::List;
 use ratn_model::value::Value;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
@@ -25,7 +26,7 @@ pub(crate) struct Places<'a> {
 #[derive(Debug, Serialize, Deserialize)]
 struct Shared<'a> {
     producers: Vec<ProducerForm<'a>>,
-    lists: Vec<Cow<'a, [Value]>>,
+    lists: Vec<Cow<'a, List>>,
     frames: Vec<FrameForm>,
     variables: Vec<Vec<(Arc<str>, BindingForm<'a>)>>,
     writer_nodes: Vec<NodeForm<Link>>,
@@ -86,7 +87,7 @@ pub(crate) struct Collector<'a> {
 #[derive(Default)]
 struct Known<'a> {
     producers: Pool<ProducerForm<'a>>,
-    lists: Pool<Cow<'a, [Value]>>,
+    lists: Pool<Cow<'a, List>>,
     frames: Pool<FrameForm>,
 }
 
@@ -212,7 +213,7 @@ impl Places<'_> {
         };
         let producers: Vec<Arc<Producer>> = producers.into_iter().map(producer).collect();
         let producer = |place: u32| at(&producers, place, "a producer that is not there");
-        let lists: Vec<Arc<Vec<Value>>> = lists.into_iter().map(|list| Arc::new(list.into_owned())).collect();
+        let lists: Vec<Arc<List>> = lists.into_iter().map(|list| Arc::new(list.into_owned())).collect();
         let iteration = |IterationForm { index, elements }| {
             let elements = elements.map(|place| at(&lists, place, "a list of a loop that is not there")).transpose()?;
             Ok::<_, Broken>(Iteration { index, elements })
