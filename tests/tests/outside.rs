@@ -104,3 +104,21 @@ fn a_fact_that_expires_during_a_run_is_gone_where_the_program_comes_to_it() -> a
     }
     Ok(())
 }
+
+/// Each character of it is six in a log.
+#[test]
+fn a_run_begins_in_a_world_of_more_than_a_line_of_its_log_holds() -> anyhow::Result<()> {
+    let place = Place::new()?;
+    let _up = up(&place, &[])?;
+    let noise = r"\u0001".repeat(700_000);
+    let fact = |n: usize| format!(r#"{{"predicate": "noise", "arguments": [{n}], "value": {{"string": "{noise}"}}}}"#);
+    load(&place, &(0..5).map(fact).collect::<Vec<_>>().join(", "))?;
+    let (went, log) = run(&place, "goal(arm) = near", "cdtn", || Ok(()))?;
+    ensure!(went == "near", "{went}");
+    let parts: Vec<u64> = log.iter().map_while(|line| line["part"].as_u64()).collect();
+    ensure!(parts.len() > 1 && parts.iter().zip(1..).all(|(part, at)| *part == at), "{parts:?}");
+    let log = place.path().join("cdtn.jsonl");
+    let (report, error) = texts(&place.ratn(&["report", log.to_str().context("a path")?]).output()?);
+    ensure!(report.contains("first") && error.is_empty(), "{report}{error}");
+    Ok(())
+}

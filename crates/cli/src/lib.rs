@@ -35,8 +35,8 @@ pub fn main() -> ExitCode {
     let arguments = match arguments::Arguments::try_parse() {
         Ok(arguments) => arguments,
         Err(error) => {
+            output::usage(&error);
             // clap gives 0 to --help and --version and 2 to a usage error, as we want it.
-            let _ = error.print();
             return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(1));
         }
     };

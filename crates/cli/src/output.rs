@@ -7,7 +7,9 @@ use crate::failure::Failure;
 use crate::fitted::{rows, visible};
 use nix::errno::Errno;
 use nix::unistd::{AccessFlags, access};
+use ratn_model::readable::readable;
 use ratn_task_control::Messages;
+use std::borrow::Cow;
 use std::fmt::Display;
 use std::io::{self, ErrorKind, Write};
 use std::path::Path;
@@ -26,14 +28,28 @@ struct Progress {
 pub(crate) fn progress(line: impl Display) {
     let mut progress = PROGRESS.lock().unwrap_or_else(PoisonError::into_inner);
     if !progress.is_quiet {
-        let _ = io::stderr().write_all(format!("{}{line}\n", progress.cleared()).as_bytes());
+        let _ = io::stderr().write_all(said(&mut progress, &line.to_string()).as_bytes());
     }
 }
 
 /// Why the command did not do what was asked: said also where nothing is said of progress.
 pub(crate) fn failure(failure: &Failure) {
     let mut progress = PROGRESS.lock().unwrap_or_else(PoisonError::into_inner);
-    let _ = io::stderr().write_all(format!("{}{failure}\n", progress.cleared()).as_bytes());
+    let _ = io::stderr().write_all(said(&mut progress, &failure.to_string()).as_bytes());
+}
+
+/// What is wrong with a command line, or what somebody asked to know of it. In colours, unless a word of it would steer the terminal.
+pub(crate) fn usage(error: &clap::Error) {
+    let plain = error.render().to_string();
+    let _ = match readable(&plain) {
+        Cow::Borrowed(_) => error.print(),
+        Cow::Owned(readable) => io::stderr().write_all(readable.as_bytes()),
+    };
+}
+
+/// What is written for a message: what others have named, paths too, steers no terminal.
+fn said(progress: &mut Progress, message: &str) -> String {
+    format!("{}{}\n", progress.cleared(), readable(message))
 }
 
 /// From now on nothing is said of progress.
@@ -153,6 +169,13 @@ mod tests {
         fn flush(&mut self) -> io::Result<()> {
             Ok(())
         }
+    }
+
+    #[test]
+    fn what_a_message_names_steers_no_terminal() {
+        let mut progress = Progress { is_quiet: false, area: Vec::new() };
+        let failure = Failure::Refused("ratn: cannot read a\u{1b}[2Jb:\n\twhy".to_owned());
+        assert_eq!(said(&mut progress, &failure.to_string()), "ratn: cannot read a\\u{1b}[2Jb:\n\twhy\n");
     }
 
     #[test]

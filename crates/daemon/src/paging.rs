@@ -65,55 +65,50 @@ impl<T> Default for Filled<T> {
 /// What a field takes beside its message.
 const ITEM_BYTES: usize = 8;
 
-/// Cut into parts of at most a page each; at least one, which may be empty.
-pub(crate) fn parts<T: Message>(items: Vec<T>) -> Vec<Vec<T>> {
-    let (mut parts, mut bytes) = (vec![Vec::new()], 0);
-    for item in items {
-        let more = item.encoded_len() + ITEM_BYTES;
-        if bytes + more > MAX_PAGE_BYTES
-            && let Some(last) = parts.last()
-            && !last.is_empty()
-        {
-            parts.push(Vec::new());
-            bytes = 0;
+/// A snapshot in parts of at most a page each, and whether another one follows: at least one, which may be empty. A part is made by `make` when it is
+/// asked for, so a client that does not read has one of them at the most. A client that takes no parts gets all in one part, where that
+/// fits into a message.
+pub(crate) fn snapshot_parts<T>(
+    in_parts: bool,
+    mut make: impl FnMut(Page, &mut Filled<T>) -> Result<bool, Status>,
+) -> impl Iterator<Item = Result<(Vec<T>, bool), Status>> {
+    let page = Page { bytes: in_parts.then_some(MAX_PAGE_BYTES) };
+    let mut follows = true;
+    std::iter::from_fn(move || {
+        if !std::mem::take(&mut follows) {
+            return None;
         }
-        bytes += more;
-        if let Some(last) = parts.last_mut() {
-            last.push(item);
-        }
-    }
-    parts
-}
-
-/// A snapshot's items in parts of at most a page each. A client that takes no parts gets all in one part, where that fits into a message.
-pub(crate) fn snapshot_parts<T: Message>(items: Vec<T>, in_parts: bool) -> Result<Vec<Vec<T>>, Status> {
-    let parts = parts(items);
-    if parts.len() == 1 || in_parts {
-        return Ok(parts);
-    }
-    let mut filled = Filled::default();
-    Page::of(0, "").fill(parts.into_iter().flatten(), &mut filled)?;
-    Ok(vec![filled.items])
+        let mut part = Filled::default();
+        Some(make(page, &mut part).map(|more| {
+            follows = more;
+            (part.items, more)
+        }))
+    })
 }
 
 /// As many from the first on as a page has room for.
 pub(crate) fn first<T: Message>(items: Vec<T>) -> Vec<T> {
-    parts(items).swap_remove(0)
+    let mut filled = Filled::default();
+    let page = Page { bytes: Some(MAX_PAGE_BYTES) };
+    // A page that has a length is never too large.
+    let _ = page.fill(items, &mut filled);
+    filled.items
 }
 
-/// What a token says: a revision, and how many were on the pages before.
-pub(crate) fn place(token: &str) -> Result<Option<(u64, usize)>, Status> {
-    label(token, "page_token")?;
-    if token.is_empty() {
+/// What a token says to a call that asks for the same as before: a revision, and how many were on the pages before.
+pub(crate) fn place(token: &str, asked: &impl Message) -> Result<Option<(u64, usize)>, Status> {
+    let place = behind(token, asked)?;
+    if place.is_empty() {
         return Ok(None);
     }
-    let read = || token.split_once(':').and_then(|(at, seen)| Some((at.parse().ok()?, seen.parse().ok()?)));
+    let read = || place.split_once(':').and_then(|(at, seen)| Some((at.parse().ok()?, seen.parse().ok()?)));
     read().map(Some).ok_or_else(no_token)
 }
 
-/// The token of the page behind, where there is one.
-pub(crate) fn token(more: bool, revision: u64, seen: usize) -> String {
-    if more { format!("{revision}:{seen}") } else { String::new() }
+/// The token of the page behind, where there is one; as [`token_behind`].
+pub(crate) fn token(more: bool, revision: u64, seen: usize, asked: &impl Message) -> String {
+    let place = more.then(|| format!("{revision}:{seen}"));
+    token_behind(place.as_deref(), asked)
 }
 
 /// The token of the page behind the one that ends with this id, where there is one. Only a call that asks for the same goes on with it: `asked` is
@@ -132,9 +127,10 @@ pub(crate) fn behind<'a>(token: &'a str, asked: &impl Message) -> Result<&'a str
     own.map(|(_, last)| last).ok_or_else(no_token)
 }
 
-/// FNV-1a of what is asked and an id: it tells a token of ours from another text, and protects nothing.
-fn seal(last: &str, asked: &impl Message) -> u64 {
-    let bytes = asked.encode_to_vec().into_iter().chain([0]).chain(last.bytes());
+/// FNV-1a of what is asked, in which words, and an id: it tells a token of ours from another text, and protects nothing.
+fn seal<T: Message>(last: &str, asked: &T) -> u64 {
+    let question = std::any::type_name::<T>().bytes().chain(asked.encode_to_vec());
+    let bytes = question.chain([0]).chain(last.bytes());
     bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3))
 }
 
@@ -219,17 +215,37 @@ mod tests {
     }
 
     #[test]
-    fn parts_hold_everything_in_order() {
+    fn parts_hold_everything_in_order_and_each_is_made_when_it_is_asked_for() {
         let half = MAX_PAGE_BYTES / 2;
-        let sizes: Vec<usize> = parts(texts(&[half, half, 1, half])).iter().map(Vec::len).collect();
-        assert_eq!(sizes, [1, 2, 1]);
-        assert_eq!(parts(texts(&[])).len(), 1);
+        let parts = |sizes: &[usize], in_parts| {
+            let (all, mut at) = (texts(sizes), 0);
+            snapshot_parts(in_parts, move |page, part| {
+                let more = page.fill(all[at..].iter().cloned(), part)?;
+                at += part.items.len();
+                Ok(more)
+            })
+        };
+        let sizes = |parts: Vec<Result<(Vec<String>, bool), Status>>| -> Vec<(usize, bool)> {
+            parts.into_iter().map(|part| part.map(|(part, more)| (part.len(), more)).unwrap()).collect()
+        };
+        let four = [half, half, 1, half];
+        assert_eq!(sizes(parts(&four, true).collect()), [(1, true), (2, true), (1, false)]);
+        assert_eq!(sizes(parts(&[], true).collect()), [(0, false)]);
+        assert_eq!(sizes(parts(&four, false).collect()), [(4, false)]);
+        let too_large: Vec<_> = parts(&[half; 5], false).collect();
+        assert!(too_large.len() == 1 && too_large[0].is_err());
+        assert_eq!(first(texts(&four)).len(), 1);
     }
 
     #[test]
-    fn a_token_is_read_as_it_was_written() {
-        assert_eq!(place(&token(true, 7, 12)).unwrap(), Some((7, 12)));
-        assert_eq!(place(&token(false, 7, 12)).unwrap(), None);
-        assert!(place("7").is_err() && place("a:b").is_err());
+    fn a_token_is_read_as_it_was_written_by_who_asks_for_the_same() {
+        let (asked, other) = ("boxes".to_owned(), "cups".to_owned());
+        assert_eq!(place(&token(true, 7, 12, &asked), &asked).unwrap(), Some((7, 12)));
+        assert_eq!(place(&token(false, 7, 12, &asked), &asked).unwrap(), None);
+        for none in ["7", "7:12", "a:b", "0000000000000000:7:12"] {
+            let refused = place(none, &asked).unwrap_err();
+            assert!(refused.message().contains("page_token"), "{refused}");
+        }
+        assert!(place(&token(true, 7, 12, &asked), &other).is_err());
     }
 }

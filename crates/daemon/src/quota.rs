@@ -4,6 +4,9 @@
 //!   call ──admit(caller, path)──▶ Permit, held until the answer has been sent
 //!                           └───▶ RESOURCE_EXHAUSTED: which quota, and whose
 //! ```
+//! What is made of answers and not sent yet, because who asked does not read it, counts in bytes; so does what a watch has still to tell of
+//! the beginning. An answer that is too much is refused, and what was done for it stands: who asks again hears of it.
+//!
 //! Quotas are by name ([`Caller::name`]): all who are anonymous are one caller. Operators have none, and a share of what all others can take
 //! together is kept for them. Sessions and acquires that wait have theirs in the pool ([`ratn_resources::Limits`]). Calls of health and
 //! reflection count like all others, but `HEALTH_CHECKS_PER_S` checks of a caller are answered whatever else it does: whoever watches
@@ -13,6 +16,7 @@ use crate::access::{Caller, HEALTH_CHECK};
 use crate::config::{Check, ConfigError, rule};
 use crate::details::retry_later;
 use crate::metrics::Metrics;
+use ratn_proto::MAX_MESSAGE_BYTES;
 use ratn_worker::connections::ConnectionLimits;
 use ratn_worker::gate::Permit;
 use ratn_worker::token_bucket::TokenBucket;
@@ -34,6 +38,10 @@ pub struct QuotaConfig {
     pub watches: usize,
     /// Watches of all callers that are no operators.
     pub watches_of_all: usize,
+    /// Bytes of answers to one caller that wait for it to read them.
+    pub unread_bytes: usize,
+    /// Bytes of answers to all callers that are no operators.
+    pub unread_bytes_of_all: usize,
     /// Connections at once: the one that has said nothing for longest gives way to a new one. Fewer than the process may open files.
     pub connections: usize,
     /// Connections of one user of this machine, or from one host, in a second; as many as `connections` may come at once.
@@ -70,6 +78,8 @@ impl Default for QuotaConfig {
             calls: 8_192,
             watches: 256,
             watches_of_all: 896,
+            unread_bytes: 128 << 20,
+            unread_bytes_of_all: 512 << 20,
             connections: 768,
             connections_per_s: 200,
             connections_in_use: 512,
@@ -85,6 +95,10 @@ impl Check for QuotaConfig {
         rule("quotas.calls_per_s", self.calls_per_s >= 1, "at least 1")?;
         rule("quotas.calls", self.calls >= 1, "at least 1")?;
         rule("quotas.watches", self.watches >= 1, "at least 1")?;
+        let holds = self.unread_bytes >= 2 * MAX_MESSAGE_BYTES;
+        rule("quotas.unread_bytes", holds, "at least 32 MiB: two messages of the greatest length")?;
+        let holds = self.unread_bytes_of_all >= self.unread_bytes;
+        rule("quotas.unread_bytes_of_all", holds, "at least quotas.unread_bytes")?;
         rule("quotas.connections", self.connections >= 2, "at least 2")?;
         rule("quotas.connections_per_s", self.connections_per_s >= 1, "at least 1")?;
         rule("quotas.connections_in_use", self.connections_in_use >= 1, "at least 1")?;
@@ -116,12 +130,15 @@ pub(crate) struct Quotas {
 struct Use {
     callers: BTreeMap<Arc<str>, UseOfOne>,
     watches: usize,
+    unread: usize,
 }
 
 #[derive(Debug)]
 struct UseOfOne {
     calls: usize,
     watches: usize,
+    /// Bytes.
+    unread: usize,
     /// Calls that may begin now.
     rate: TokenBucket,
     /// Health checks beyond the quotas.
@@ -146,14 +163,7 @@ impl Quotas {
         let is_watch = is_watch(path);
         let mut use_of = self.use_of();
         let all_watches = use_of.watches;
-        let rate = self.config.calls_per_s;
-        let fresh = || UseOfOne {
-            calls: 0,
-            watches: 0,
-            rate: TokenBucket::full(at_once(rate), now),
-            checks: TokenBucket::full(at_once(HEALTH_CHECKS_PER_S), now),
-        };
-        let one = use_of.callers.entry(caller.name.clone()).or_insert_with(fresh);
+        let one = use_of.of(caller, self.config.calls_per_s, now);
         if let Err(beyond) = self.within(one, all_watches, is_watch, now) {
             if path == HEALTH_CHECK && one.checks.take(HEALTH_CHECKS_PER_S, at_once(HEALTH_CHECKS_PER_S), now) {
                 return Ok(None);
@@ -166,6 +176,34 @@ impl Quotas {
         use_of.watches += usize::from(is_watch);
         drop(use_of);
         Ok(Some(Permit::new(Held { quotas: self.clone(), caller: caller.name.clone(), is_watch })))
+    }
+
+    /// So many bytes more that wait for a caller to read them, until the permit is dropped; few of one call, and those of operators, do not
+    /// count.
+    pub(crate) fn unread(&self, caller: &Caller, bytes: usize, now: Instant) -> Result<Option<Permit>, Status> {
+        if caller.is_operator() || bytes < UNREAD_COUNTED_FROM {
+            return Ok(None);
+        }
+        let QuotaConfig { calls_per_s, unread_bytes, unread_bytes_of_all, .. } = self.config;
+        let mut use_of = self.use_of();
+        let of_all = use_of.unread.saturating_add(bytes);
+        let one = use_of.of(caller, calls_per_s, now);
+        let of_one = one.unread.saturating_add(bytes);
+        let beyond = if of_one > unread_bytes {
+            Some(("unread_bytes", unread_bytes))
+        } else {
+            (of_all > unread_bytes_of_all).then_some((UNREAD_OF_ALL, unread_bytes_of_all))
+        };
+        if let Some((key, most)) = beyond {
+            let beyond = Beyond { key, what: "bytes of answers that were not read", most };
+            drop(use_of);
+            self.metrics.refused("call", beyond.reason());
+            return Err(beyond.of(&caller.name));
+        }
+        one.unread = of_one;
+        use_of.unread = of_all;
+        drop(use_of);
+        Ok(Some(Permit::new(HeldBytes { quotas: self.clone(), caller: caller.name.clone(), bytes })))
     }
 
     /// Whether a caller may have one call more.
@@ -192,6 +230,35 @@ impl Quotas {
     }
 }
 
+impl Use {
+    fn of(&mut self, caller: &Caller, calls_per_s: u32, now: Instant) -> &mut UseOfOne {
+        self.callers.entry(caller.name.clone()).or_insert_with(|| UseOfOne {
+            calls: 0,
+            watches: 0,
+            unread: 0,
+            rate: TokenBucket::full(at_once(calls_per_s), now),
+            checks: TokenBucket::full(at_once(HEALTH_CHECKS_PER_S), now),
+        })
+    }
+}
+
+/// Bytes that wait for their reader.
+struct HeldBytes {
+    quotas: Quotas,
+    caller: Arc<str>,
+    bytes: usize,
+}
+
+impl Drop for HeldBytes {
+    fn drop(&mut self) {
+        let mut use_of = self.quotas.use_of();
+        use_of.unread -= self.bytes;
+        if let Some(one) = use_of.callers.get_mut(&self.caller) {
+            one.unread -= self.bytes;
+        }
+    }
+}
+
 /// A call that is under way.
 struct Held {
     quotas: Quotas,
@@ -208,7 +275,7 @@ impl Drop for Held {
             one.watches -= usize::from(self.is_watch);
         }
         if use_of.callers.len() > MOST_REMEMBERED {
-            use_of.callers.retain(|_, one| one.calls > 0);
+            use_of.callers.retain(|_, one| one.calls > 0 || one.unread > 0);
         }
     }
 }
@@ -221,8 +288,11 @@ fn is_watch(path: &str) -> bool {
     path.rsplit('/').next().is_some_and(|method| method.starts_with("Watch"))
 }
 
-/// The key of the one quota that is not of one caller.
+/// The keys of the quotas that are not of one caller.
 const WATCHES_OF_ALL: &str = "watches_of_all";
+const UNREAD_OF_ALL: &str = "unread_bytes_of_all";
+/// What is less counts as a call alone: `calls` bounds it, and whoever reads nothing is still told that.
+const UNREAD_COUNTED_FROM: usize = 16 << 10;
 
 /// A quota that is used up.
 #[derive(Debug, Clone, Copy)]
@@ -241,7 +311,7 @@ impl Beyond {
     /// What its caller is told.
     fn of(self, caller: &str) -> Status {
         let Beyond { key, what, most } = self;
-        let whose = if key == WATCHES_OF_ALL { "all who are no operators" } else { caller };
+        let whose = if [WATCHES_OF_ALL, UNREAD_OF_ALL].contains(&key) { "all who are no operators" } else { caller };
         let message = format!("{what} of {whose}: the quota of {most} is reached (service.quotas.{key})");
         retry_later(Code::ResourceExhausted, &self.reason(), message, RETRY_DELAY)
     }
@@ -285,6 +355,30 @@ mod tests {
             held.push(quotas.admit(&eve, path, now).unwrap());
             assert!(quotas.admit(&eve, path, now).is_err());
         }
+    }
+
+    #[test]
+    fn bytes_that_wait_for_their_reader_have_a_bound_for_one_caller_and_one_for_all() {
+        let quotas = self::quotas(QuotaConfig {
+            unread_bytes: 3 * UNREAD_COUNTED_FROM,
+            unread_bytes_of_all: 4 * UNREAD_COUNTED_FROM,
+            ..QuotaConfig::default()
+        });
+        let (eve, adam, now) = (caller("eve", Role::Task), caller("adam", Role::Task), Instant::now());
+        let unread = |who: &Caller, parts: usize| quotas.unread(who, parts * UNREAD_COUNTED_FROM, now);
+        let _first = unread(&eve, 2).unwrap().unwrap();
+        let second = unread(&eve, 1).unwrap().unwrap();
+        let refused = unread(&eve, 1).unwrap_err();
+        let says =
+            "bytes of answers that were not read of eve: the quota of 49152 is reached (service.quotas.unread_bytes)";
+        assert_eq!((refused.code(), refused.message()), (Code::ResourceExhausted, says));
+        assert!(quotas.unread(&eve, UNREAD_COUNTED_FROM - 1, now).unwrap().is_none(), "few are let through");
+        let _adams = unread(&adam, 1).unwrap().unwrap();
+        let refused = unread(&adam, 1).unwrap_err();
+        assert!(refused.message().contains("all who are no operators: the quota of 65536"), "{refused}");
+        assert!(unread(&caller("root", Role::Operator), 9).unwrap().is_none());
+        drop(second);
+        assert!(unread(&eve, 1).is_ok() && unread(&adam, 1).is_ok());
     }
 
     #[test]

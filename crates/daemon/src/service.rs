@@ -11,7 +11,7 @@ use crate::quota::{QuotaConfig, Quotas};
 use crate::telemetry::{self, LogConfig};
 use ratn_otlp::OtlpConfig;
 use ratn_worker::connections::OutOfConnections;
-use ratn_worker::gate::{Gate, Identity};
+use ratn_worker::gate::{Gate, Identity, Permit};
 use ratn_worker::server::{Exposure, Serving};
 use ratn_worker::tls::{self, ClientTls, LiveServerTls, ServerTls, TlsError};
 use ratn_worker::unix_socket::SocketAccess;
@@ -166,6 +166,10 @@ impl Gate for QuotaGate {
 
     fn answered(&self, path: &str, code: Code, took: Duration) {
         self.metrics.call(path, code, took);
+    }
+
+    fn unread(&self, caller: &Caller, bytes: usize) -> Result<Option<Permit>, Status> {
+        self.quotas.unread(caller, bytes, Instant::now())
     }
 
     fn out_of_connections(&self, why: &OutOfConnections) {

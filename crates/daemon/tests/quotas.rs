@@ -7,8 +7,11 @@ use ratn_daemon::metrics::Metrics;
 use ratn_daemon::quota::QuotaConfig;
 use ratn_daemon::resource_manager::{self, ResourceManagerConfig};
 use ratn_daemon::service::ServiceConfig;
+use ratn_model::resource::ResourceClass;
+use ratn_proto::types::Resource;
 use ratn_proto::v1;
 use ratn_proto::v1::resource_service_client::ResourceServiceClient;
+use ratn_proto::v1::resource_service_watch_response::Kind;
 use ratn_resources::Limits;
 use ratn_worker::endpoint::Endpoint;
 use std::sync::Arc;
@@ -52,6 +55,62 @@ async fn ping(client: &mut ResourceServiceClient<Channel>, session: &str) -> Res
     };
     let answers = client.keep_alive(tokio_stream::iter([ping])).await?;
     in_time(answers.into_inner().message()).await.map(drop)
+}
+
+/// Connections of one caller, which begin to watch and read nothing: their windows are full, and the daemon has what comes next.
+#[tokio::test]
+async fn answers_that_a_caller_does_not_read_have_a_bound_in_bytes_until_it_reads_or_goes_away() {
+    let system = TestSystem::new();
+    let quotas = QuotaConfig { unread_bytes: 20 << 20, ..QuotaConfig::default() };
+    let (endpoint, _end) = manager(&system, quotas, Limits::default()).await;
+    let mut client = self::client(&endpoint).await.max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
+    let map = ratn_model::value::Value::String("x".repeat(60_000));
+    ping(&mut client, "maps").await.unwrap();
+    for number in 0..240 {
+        let resource = Resource::new(&format!("map-{number:03}"), ResourceClass::Task, "Map");
+        let resource = Some(resource.with_attribute("map", map.clone()).into());
+        client
+            .create(v1::CreateRequest { session_id: "maps".to_owned(), resource, ..Default::default() })
+            .await
+            .unwrap();
+    }
+    let watch = v1::ResourceServiceWatchRequest { in_parts: true, ..Default::default() };
+    let mut unread = Vec::new();
+    let too_much = loop {
+        assert!(unread.len() < 3, "each has 8 MiB of it at least");
+        let mut other = self::client(&endpoint).await;
+        match other.watch(watch.clone()).await {
+            Ok(stream) => unread.push((other, stream)),
+            Err(refused) => break refused,
+        }
+    };
+    refused(
+        too_much,
+        "bytes of answers that were not read of anonymous: the quota of 20971520 is reached (service.quotas.unread_bytes)",
+    );
+    refused(client.list(v1::ListRequest::default()).await.unwrap_err(), "service.quotas.unread_bytes");
+    // What is small is answered.
+    ping(&mut client, "maps").await.unwrap();
+    drop(unread);
+    let mut watched = in_time(async {
+        loop {
+            match client.watch(watch.clone()).await {
+                Ok(watched) => break watched.into_inner(),
+                Err(_) => tokio::task::yield_now().await,
+            }
+        }
+    })
+    .await;
+    let mut resources = 0;
+    while let Some(v1::ResourceServiceWatchResponse { kind: Some(Kind::Snapshot(part)) }) =
+        in_time(watched.message()).await.unwrap()
+    {
+        resources += part.resources.len();
+        if !part.more {
+            break;
+        }
+    }
+    assert_eq!(resources, 240);
 }
 
 #[tokio::test]

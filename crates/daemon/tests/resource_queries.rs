@@ -368,7 +368,11 @@ async fn a_kind_is_a_letter_then_letters_digits_underscores_and_hyphens_whoever_
     for kind in ["2Arm", "_Arm", "Arm left", "Arm.left", "Größe", "Arm/left", "-"] {
         let created = a.resources.create(Resource::new("odd", ResourceClass::Module, kind)).await.unwrap_err();
         let blocked = a.resources.acquire(vec![block(kind)], AcquireOptions::default()).await.unwrap_err();
-        for refused in [created, blocked] {
+        let mut refusals = vec![created, blocked];
+        refusals.push(a.resources.list(&[kind]).await.unwrap_err());
+        refusals.push(a.resources.exists(block(kind)).await.unwrap_err());
+        refusals.push(a.resources.watch(&[kind]).await.map(drop).unwrap_err());
+        for refused in refusals {
             assert_eq!(refused.code(), Some(Code::InvalidArgument), "{kind}: {refused}");
             assert!(refused.to_string().contains("a letter, then letters, digits, `_` and `-`"), "{refused}");
         }

@@ -6,11 +6,13 @@ mod support;
 use ratn_daemon::config::StorageConfig;
 use ratn_daemon::world_pool::WorldPoolConfig;
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint, Term};
-use ratn_model::id::{ProjectionId, Revision};
+use ratn_model::id::{LeaseId, ProjectionId, Revision};
 use ratn_model::measurement::{Certainty, Measurement};
 use ratn_model::resource::ResourceClass;
 use ratn_model::value::Value;
 use ratn_proto::types::{Resource, ResourceEventKind, WorldUpdate};
+use ratn_proto::v1;
+use ratn_proto::v1::world_pool_service_client::WorldPoolServiceClient;
 use ratn_worker::client::{AcquireOptions, Commit, Projection, WorldClient, WorldWatch};
 use ratn_worker::endpoint::Endpoint;
 use std::time::Duration;
@@ -58,7 +60,85 @@ async fn a_projection_shows_its_reads_only_and_dies_with_its_lease() {
     client.resources.release(lease.id).await.unwrap();
     in_time(async { while values(&world, Some(id), "at").await != Err(Code::NotFound) {} }).await;
     let late = Projection { request: "run/i2/2".to_owned(), ..projection };
-    assert_eq!(world.project(late).await.unwrap_err().code(), Some(Code::FailedPrecondition), "its lease has ended");
+    assert_eq!(world.project(late.clone()).await.unwrap_err().code(), Some(Code::FailedPrecondition), "it has ended");
+    let never =
+        Projection { request: "run/i2/3".to_owned(), lease: Some((LeaseId(lease.id.0 + 1_000), lease.token)), ..late };
+    let refused = world.project(never).await.unwrap_err();
+    assert!(refused.to_string().contains("is not known to the world pool"), "{refused}");
+}
+
+#[tokio::test]
+async fn facts_and_differences_go_on_with_the_page_tokens_that_were_given_for_them_and_with_no_other_ones() {
+    let system = TestSystem::new();
+    let pool = system.world_pool(1).await;
+    let world = system.world(&pool);
+    world.commit("a", vec![set("at", "box", 1), set("at", "cup", 1), set("on", "box", 1)], None).await.unwrap();
+    let mut plain = WorldPoolServiceClient::new(system.channels.get(&pool.endpoint).unwrap());
+    let query = |predicate: &str, token: &str| v1::QueryRequest {
+        patterns: vec![any(predicate).into()],
+        page_bytes: 1,
+        page_token: token.to_owned(),
+        ..Default::default()
+    };
+    let root = |token: &str| v1::GetRootRequest { page_bytes: 1, page_token: token.to_owned() };
+    let diff = |from_revision, token: &str| v1::DiffRequest {
+        from_revision,
+        page_bytes: 1,
+        page_token: token.to_owned(),
+        ..Default::default()
+    };
+    let of_root = plain.get_root(root("")).await.unwrap().into_inner().next_page_token;
+    let of_query = plain.query(query("at", "")).await.unwrap().into_inner().next_page_token;
+    let of_diff = plain.diff(diff(0, "")).await.unwrap().into_inner().next_page_token;
+    world.commit("b", vec![set("at", "box", 2)], None).await.unwrap();
+    assert_eq!(plain.get_root(root(&of_root)).await.unwrap().into_inner().revision, 1);
+    // With a token it is not looked at which revision is asked for.
+    let again = v1::QueryRequest { at_revision: Some(2), ..query("at", &of_query) };
+    let again = plain.query(again).await.unwrap().into_inner();
+    assert_eq!((again.facts.len(), again.revision, again.next_page_token.is_empty()), (1, 1, true));
+    assert_eq!(plain.diff(diff(0, &of_diff)).await.unwrap().into_inner().to_revision, 1);
+    let of_others = ["1:0", "1:1", "2:0", "x", "0:1:1"].into_iter();
+    for token in of_others.clone().chain([of_query.as_str(), &of_diff]) {
+        let refused = plain.get_root(root(token)).await.unwrap_err();
+        assert!(refused.code() == Code::InvalidArgument && refused.message().contains("page_token"), "{refused}");
+    }
+    for token in of_others.clone().chain([of_root.as_str(), &of_diff]) {
+        assert_eq!(plain.query(query("at", token)).await.unwrap_err().code(), Code::InvalidArgument, "{token}");
+    }
+    assert_eq!(plain.query(query("on", &of_query)).await.unwrap_err().code(), Code::InvalidArgument);
+    for token in of_others.chain([of_root.as_str(), &of_query]) {
+        assert_eq!(plain.diff(diff(0, token)).await.unwrap_err().code(), Code::InvalidArgument, "{token}");
+    }
+    assert_eq!(plain.diff(diff(1, &of_diff)).await.unwrap_err().code(), Code::InvalidArgument);
+}
+
+/// A watch that is not read keeps nothing of the world: it ends where the history has forgotten what it has still to tell.
+#[tokio::test]
+async fn a_watch_that_is_not_read_keeps_no_revision_that_the_pool_has_forgotten() {
+    let system = TestSystem::new();
+    let config = WorldPoolConfig { revisions_kept: 3, ..system.world_pool_config() };
+    let pool = system.world_pool_with(config).await;
+    let world = system.world(&pool);
+    let large = |name: &str| Change::Set { fact: key("cloud", name), value: Value::String("x".repeat(1_000_000)) };
+    for number in 0..30 {
+        world.commit(&format!("{number}"), vec![large(&format!("{number:02}"))], None).await.unwrap();
+    }
+    let mut plain = WorldPoolServiceClient::new(system.channels.get(&pool.endpoint).unwrap())
+        .max_decoding_message_size(ratn_proto::MAX_MESSAGE_BYTES);
+    let request = v1::WorldPoolServiceWatchRequest { in_parts: true, ..Default::default() };
+    let mut watch = plain.watch(request).await.unwrap().into_inner();
+    for number in 0..5 {
+        world.commit(&format!("more-{number}"), vec![set("at", "box", number)], None).await.unwrap();
+    }
+    let mut parts = 0;
+    let refused = loop {
+        match in_time(watch.message()).await {
+            Ok(part) => parts += usize::from(part.is_some()),
+            Err(refused) => break refused,
+        }
+    };
+    assert!(refused.code() == Code::Unavailable && refused.message().contains("too slow"), "{refused}");
+    assert!((1..4).contains(&parts), "{parts} parts of four were made before the next was asked for");
 }
 
 #[tokio::test]

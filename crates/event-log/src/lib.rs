@@ -3,10 +3,16 @@
 //! It is the single source of Gantt charts, statistics, replay and resume, so each line is on its way to the file before anything of the
 //! commands of its event leaves the process, and on the disk where they cannot be undone. Its writer holds a lock on it: nobody else
 //! writes it meanwhile. Reading says which line is wrong and why; a torn last line (the writer was killed) is left out and named.
+//!
+//! What is too long for one line, as the beginning of a run in a large world, stands in several, in pieces of its text (`pieces`). Readers
+//! get it in one, and count the lines as they are in the file.
 
 mod parts;
+mod pieces;
 
 pub use parts::Parts;
+
+use pieces::Joined;
 
 use ratn_executive::protocol::{Command, Event, LogEntry, LogLine};
 use ratn_model::time::Timestamp;
@@ -15,8 +21,10 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-/// A longer line is not written by any task; whoever wrote it is not `ratn`.
-const MAX_LINE_BYTES: usize = 16 << 20;
+/// A longer line is not written by any task; whoever wrote it is not `ratn`. Tests take less time with shorter ones.
+const MAX_LINE_BYTES: usize = if cfg!(test) { 1 << 20 } else { 16 << 20 };
+/// An event or a command that is longer, in all its pieces, is not written: whoever reads it has it in memory.
+const MAX_ENTRY_BYTES: usize = 8 * MAX_LINE_BYTES;
 /// Room that is kept for the next lines, however long the last ones were.
 const USUAL_BYTES: usize = 64 << 10;
 /// A run whose log grows beyond this is ended rather than filling the disk.
@@ -53,13 +61,15 @@ pub enum LogError {
         /// The log.
         path: PathBuf,
     },
-    /// A line would be longer than a reader takes.
+    /// An event or a command would be longer than a reader takes.
     #[error(
-        "the {what} has {bytes} bytes as a line of the event log {}, and at most {MAX_LINE_BYTES} can be read again; the run ends here, and \
-         nothing is done that follows from it",
-        path.display()
+        "the {what} has {bytes} bytes in the event log {}, and at most {MAX_ENTRY_BYTES} can be read again{}; the run ends here, and nothing \
+         is done that follows from it",
+        path.display(),
+        if what == "event started" { " (it says every fact of the world pool: delete what is not needed, or begin anew with `ratn reset`)" }
+        else { "" }
     )]
-    LineTooLong {
+    TooMuchAtOnce {
         /// The log.
         path: PathBuf,
         /// Which event or command, as it is named there.
@@ -147,7 +157,7 @@ impl LogWriter {
 
     /// Goes on behind the whole lines of what was read. A torn line is cut off before the first line is written.
     pub fn go_on_behind(&mut self, log: &Log) {
-        (self.written, self.lines) = (log.whole, log.before + log.lines.len());
+        (self.written, self.lines) = (log.whole, log.read);
     }
 
     /// Where the log is.
@@ -170,9 +180,9 @@ impl LogWriter {
         self.lines
     }
 
-    fn open(path: &Path, options: &OpenOptions, what: &'static str) -> Result<Self, LogError> {
+    fn open(path: &Path, options: &mut OpenOptions, what: &'static str) -> Result<Self, LogError> {
         let io = |source| LogError::Io { what, path: path.to_owned(), source };
-        let file = options.open(path).map_err(io)?;
+        let file = ratn_regular_file::open_to_write(path, options).map_err(io)?;
         let on_disk = file.metadata().map_err(io)?.is_file();
         if on_disk {
             file.try_lock().map_err(|error| match error {
@@ -219,18 +229,18 @@ impl LogWriter {
     }
 
     fn add(&mut self, at: Timestamp, event: Option<&Event>, commands: &[Command]) -> Result<(), LogError> {
-        let before = self.text.len();
-        let added = event.map_or(Ok(()), |event| self.add_line(&Written { at, entry: event }));
+        let (before, noted) = (self.text.len(), self.noted);
+        let added = event.map_or(Ok(()), |event| self.add_entry(&Written { at, entry: event }));
         let added = added.and_then(|()| {
-            commands.iter().try_for_each(|command| self.add_line(&Written { at, entry: command }))?;
+            commands.iter().try_for_each(|command| self.add_entry(&Written { at, entry: command }))?;
             if self.written + self.text.len() as u64 > MAX_LOG_BYTES {
                 return Err(LogError::TooLong { path: self.path.clone() });
             }
             Ok(())
         });
-        match &added {
-            Ok(()) => self.noted += usize::from(event.is_some()) + commands.len(),
-            Err(_) => self.text.truncate(before),
+        if added.is_err() {
+            self.text.truncate(before);
+            self.noted = noted;
         }
         added
     }
@@ -252,14 +262,21 @@ impl LogWriter {
         Ok(())
     }
 
-    fn add_line(&mut self, line: &Written<impl Serialize>) -> Result<(), LogError> {
+    fn add_entry(&mut self, entry: &Written<'_, impl Serialize>) -> Result<(), LogError> {
         let begins = self.text.len();
-        serde_json::to_writer(&mut self.text, line).map_err(|source| self.io(source.into()))?;
+        serde_json::to_writer(&mut self.text, entry).map_err(|source| self.io(source.into()))?;
         let bytes = self.text.len() - begins;
-        if bytes > MAX_LINE_BYTES {
-            return Err(LogError::LineTooLong { path: self.path.clone(), what: named(&self.text[begins..]), bytes });
+        if bytes > MAX_ENTRY_BYTES {
+            return Err(LogError::TooMuchAtOnce { path: self.path.clone(), what: named(&self.text[begins..]), bytes });
         }
-        self.text.push(b'\n');
+        if bytes <= MAX_LINE_BYTES {
+            self.text.push(b'\n');
+            self.noted += 1;
+            return Ok(());
+        }
+        let entire = String::from_utf8(self.text.split_off(begins));
+        let entire = entire.map_err(|error| self.io(std::io::Error::other(error)))?;
+        self.noted += pieces::write(&mut self.text, entry.at, &entire).map_err(|source| self.io(source))?;
         Ok(())
     }
 
@@ -291,8 +308,9 @@ pub struct Log {
     pub before: usize,
     /// The number of its last line if that is torn, which is not among the others.
     pub torn: Option<usize>,
-    /// How many bytes the whole lines have, those that were not read among them.
+    /// How many bytes and lines it has up to the end of what was read.
     pub whole: u64,
+    read: usize,
 }
 
 /// Reads a whole event log.
@@ -326,7 +344,7 @@ pub fn first(path: &Path) -> Result<LogLine, LogError> {
 fn read_from(path: &Path, bytes: u64, before: usize, at_most: usize) -> Result<Log, LogError> {
     let mut all = Lines::open(path, bytes, before)?;
     let lines = all.by_ref().take(at_most).collect::<Result<Vec<LogLine>, LogError>>()?;
-    Ok(Log { lines, before, torn: all.torn, whole: all.whole })
+    Ok(Log { lines, before, torn: all.torn, whole: all.whole, read: all.read })
 }
 
 /// Follows an event log that grows.
@@ -352,7 +370,7 @@ impl Tail {
             return Ok(Vec::new());
         }
         let log = read_behind(&self.path, self.bytes, self.lines)?;
-        (self.bytes, self.lines) = (log.whole, self.lines + log.lines.len());
+        (self.bytes, self.lines) = (log.whole, log.read);
         Ok(log.lines)
     }
 }
@@ -406,31 +424,54 @@ impl Lines {
         Ok(Lines { path, reader, read: before, whole: bytes, torn: None, text: Vec::new(), is_over: false })
     }
 
-    fn line(&mut self) -> Result<Option<LogLine>, LogError> {
+    /// The next event or command, all pieces of it together.
+    fn entry(&mut self) -> Result<Option<LogLine>, LogError> {
+        let first = self.read + 1;
+        let Some(mut length) = self.line(first)? else { return Ok(None) };
+        let mut read = first;
+        if pieces::is_one(&self.text) {
+            let mut entire = Joined::default();
+            while !entire.add(&self.text).map_err(|reason| self.foreign(read, reason))? {
+                read += 1;
+                let Some(more) = self.line(read)? else {
+                    self.torn = Some(first);
+                    return Ok(None);
+                };
+                length += more;
+            }
+            self.text = entire.into_text();
+        }
+        let parsed: LogLine =
+            serde_json::from_slice(&self.text).map_err(|error| self.foreign(first, explain(&self.text, &error)))?;
+        if self.whole == 0 && !matches!(parsed.entry, LogEntry::Event(Event::Started { .. })) {
+            return Err(self.foreign(first, "an event log begins with the event `started`".into()));
+        }
+        self.read = read;
+        self.whole += length;
+        self.text.shrink_to(USUAL_BYTES);
+        Ok(Some(parsed))
+    }
+
+    /// Reads a whole line of this number; how long it is.
+    fn line(&mut self, line: usize) -> Result<Option<u64>, LogError> {
         self.text.clear();
         let limit = MAX_LINE_BYTES as u64 + 1;
         let length = self.reader.by_ref().take(limit).read_until(b'\n', &mut self.text);
         let length = length.map_err(|source| LogError::Io { what: "read", path: self.path.clone(), source })?;
-        if length == 0 {
-            return Ok(None);
+        if self.text.last() == Some(&b'\n') {
+            return Ok(Some(length as u64));
         }
-        let line = self.read + 1;
-        let foreign = |reason: String| LogError::Foreign { path: self.path.clone(), line, reason };
-        if self.text.last() != Some(&b'\n') {
-            if length as u64 == limit {
-                return Err(foreign(format!("longer than {MAX_LINE_BYTES} bytes")));
-            }
+        if length as u64 == limit {
+            return Err(self.foreign(line, format!("longer than {MAX_LINE_BYTES} bytes")));
+        }
+        if length > 0 {
             self.torn = Some(line);
-            return Ok(None);
         }
-        let parsed: LogLine =
-            serde_json::from_slice(&self.text).map_err(|error| foreign(explain(&self.text, &error)))?;
-        if self.whole == 0 && !matches!(parsed.entry, LogEntry::Event(Event::Started { .. })) {
-            return Err(foreign("an event log begins with the event `started`".into()));
-        }
-        self.read = line;
-        self.whole += length as u64;
-        Ok(Some(parsed))
+        Ok(None)
+    }
+
+    fn foreign(&self, line: usize, reason: String) -> LogError {
+        LogError::Foreign { path: self.path.clone(), line, reason }
     }
 }
 
@@ -441,7 +482,7 @@ impl Iterator for Lines {
         if self.is_over {
             return None;
         }
-        let line = self.line().transpose();
+        let line = self.entry().transpose();
         self.is_over = !matches!(line, Some(Ok(_)));
         line
     }
@@ -497,7 +538,9 @@ mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
     use ratn_executive::protocol::{Mode, Note};
+    use ratn_model::fact::{FactKey, Term};
     use ratn_model::id::{InstanceId, Revision};
+    use ratn_model::value::Value;
 
     fn started() -> Event {
         Event::Started {
@@ -546,8 +589,8 @@ mod tests {
         log.note(Timestamp(0), &started(), &[Command::Wake { at: Timestamp(7) }]).unwrap();
         assert_eq!((log.written(), log.lines(), std::fs::read(file.path()).unwrap().len()), (0, 0, 0));
         let value = ratn_model::value::Value::Null;
-        let long = Event::Signalled { signal: "x".repeat(MAX_LINE_BYTES), value };
-        assert!(matches!(log.note(Timestamp(1), &long, &[]), Err(LogError::LineTooLong { .. })));
+        let long = Event::Signalled { signal: "x".repeat(MAX_ENTRY_BYTES), value };
+        assert!(matches!(log.note(Timestamp(1), &long, &[]), Err(LogError::TooMuchAtOnce { .. })));
         log.note(Timestamp(2), &Event::Woken, &[]).unwrap();
         log.write().unwrap();
         log.write().unwrap();
@@ -587,6 +630,16 @@ mod tests {
     }
 
     #[test]
+    fn a_log_into_a_pipe_that_nobody_reads_is_refused_at_once() {
+        let place = tempfile::tempdir().unwrap();
+        let pipe = place.path().join("pipe");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        let refused = LogWriter::create(&pipe).unwrap_err();
+        let why = std::error::Error::source(&refused).map(ToString::to_string).unwrap_or_default();
+        assert!(why.contains("nobody reads"), "{refused}: {why}");
+    }
+
+    #[test]
     fn nothing_is_written_over_a_file_with_something_in_it() {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), "mine").unwrap();
@@ -612,29 +665,70 @@ mod tests {
     }
 
     #[test]
-    fn a_line_that_no_reader_takes_is_refused_when_it_is_written_with_all_of_its_event() {
+    fn what_no_reader_takes_is_refused_when_it_is_written_with_all_of_its_event() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let mut log = LogWriter::create(file.path()).unwrap();
         log.append(Timestamp(0), &started(), &[]).unwrap();
-        let says =
-            |length: usize| Event::Signalled { signal: "x".repeat(length), value: ratn_model::value::Value::Null };
         let around = serde_json::to_string(&Written { at: Timestamp(1), entry: &says(0) }).unwrap().len();
-        log.append(Timestamp(1), &says(MAX_LINE_BYTES - around), &[]).unwrap();
-        assert_eq!(read(file.path()).unwrap().lines.len(), 2);
         let (bytes, lines) = (log.written(), log.lines());
-        let refused = log.append(Timestamp(1), &says(MAX_LINE_BYTES - around + 1), &[]).unwrap_err();
-        assert!(refused.to_string().starts_with("the event signalled has 16777217 bytes"), "{refused}");
+        let refused = log.append(Timestamp(1), &says(MAX_ENTRY_BYTES - around + 1), &[]).unwrap_err();
+        assert!(refused.to_string().starts_with("the event signalled has 8388609 bytes"), "{refused}");
         // Nor is an event there without what was decided on it.
         let end = Command::End {
             outcome: "aborted".to_owned(),
             outputs: Default::default(),
-            reason: "y".repeat(MAX_LINE_BYTES),
+            reason: "y".repeat(MAX_ENTRY_BYTES),
         };
         let refused = log.append(Timestamp(1), &Event::Woken, &[Command::Wake { at: Timestamp(2) }, end]).unwrap_err();
-        assert!(matches!(&refused, LogError::LineTooLong { what, .. } if what == "command end"), "{refused}");
+        assert!(matches!(&refused, LogError::TooMuchAtOnce { what, .. } if what == "command end"), "{refused}");
         assert_eq!((log.written(), log.lines()), (bytes, lines));
         log.append(Timestamp(2), &Event::Resumed { share: None }, &[]).unwrap();
-        assert_eq!(read(file.path()).unwrap().lines.len(), 3);
+        assert_eq!(read(file.path()).unwrap().lines.len(), 2);
+    }
+
+    #[test]
+    fn a_world_too_large_for_a_line_stands_in_several_and_is_read_as_one() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let mut log = LogWriter::create(file.path()).unwrap();
+        let mut large = started();
+        if let Event::Started { world, .. } = &mut large {
+            // What stands in quotation marks, what is written with several bytes, and what would end a line.
+            let text = "a\"\\\u{1}\n漢".repeat(100);
+            let fact = |i| FactKey { predicate: "at".to_owned(), arguments: vec![Term::Int(i)] };
+            world.extend((0..2_000).map(|i| (fact(i), Value::String(text.clone()))));
+        }
+        log.append(Timestamp(5), &large, &[Command::Wake { at: Timestamp(7) }]).unwrap();
+        let lines = std::fs::read(file.path()).unwrap();
+        let lines: Vec<&[u8]> = lines.split_inclusive(|byte| *byte == b'\n').collect();
+        assert!(lines.len() > 3 && lines.len() == log.lines(), "{}", lines.len());
+        for line in &lines {
+            assert!(line.len() <= MAX_LINE_BYTES);
+            serde_json::from_slice::<serde_json::Value>(line).unwrap();
+        }
+        let all = read(file.path()).unwrap();
+        let entries = [LogEntry::Event(large), LogEntry::Command(Command::Wake { at: Timestamp(7) })];
+        assert!(all.lines.iter().map(|line| &line.entry).eq(&entries));
+        assert_eq!((all.whole, all.read), (log.written(), log.lines()));
+        // The writer was killed within it.
+        let whole = log.written();
+        log.append(Timestamp(6), &says(MAX_LINE_BYTES), &[]).unwrap();
+        let lines = log.lines();
+        drop(log);
+        let short = std::fs::File::options().write(true).open(file.path()).unwrap();
+        for cut in [1, MAX_LINE_BYTES as u64 / 2] {
+            let length = short.metadata().unwrap().len();
+            short.set_len(length - cut).unwrap();
+            let all = read(file.path()).unwrap();
+            assert_eq!((all.lines.len(), all.whole, all.torn), (2, whole, Some(all.read + 1)));
+        }
+        let mut log = LogWriter::go_on(file.path()).unwrap();
+        log.go_on_behind(&read(file.path()).unwrap());
+        log.append(Timestamp(6), &says(MAX_LINE_BYTES), &[]).unwrap();
+        assert_eq!((read(file.path()).unwrap().lines.len(), log.lines()), (3, lines));
+    }
+
+    fn says(length: usize) -> Event {
+        Event::Signalled { signal: "x".repeat(length), value: Value::Null }
     }
 
     #[test]

@@ -4,7 +4,7 @@
 //! offset and a moment of each part and nothing of the lines, except how the first one ends: it says which run the log is of, so another log
 //! that takes the place of this one is known as another.
 
-use crate::{LogError, MAX_LINE_BYTES};
+use crate::{LogError, MAX_LINE_BYTES, pieces};
 use ratn_model::time::Timestamp;
 use serde::Deserialize;
 use std::fs::{File, Metadata};
@@ -99,12 +99,17 @@ impl Parts {
             return Ok(true);
         }
         if self.mark.is_none() {
-            let line = self.line(&mut BufReader::new(&file))?;
-            let mark = line.map(|line| Mark::of(&file, &is, line.len() as u64)).transpose();
+            let first = self.first_length(&mut BufReader::new(&file))?;
+            let mark = first.map(|first| Mark::of(&file, &is, first)).transpose();
             self.mark = mark.map_err(|source| self.io(source))?;
         }
         while self.begin.len() as u64 * self.part_bytes < length {
             let from = self.begin.len() as u64 * self.part_bytes;
+            // What is longer than a part is gone through once.
+            if let Some(same) = self.begin.last().copied().filter(|(offset, _)| *offset >= from) {
+                self.begin.push(same);
+                continue;
+            }
             let Some(begin) = self.first_behind(&mut file, from)? else { break };
             self.begin.push(begin);
         }
@@ -132,7 +137,23 @@ impl Parts {
         if part == 0 { (0, Timestamp(0)) } else { self.begin[part] }
     }
 
-    /// The first whole line that begins at a byte or behind it.
+    /// How long the first event is, all its pieces together; `None` where it is not whole yet.
+    fn first_length(&self, reader: &mut impl BufRead) -> Result<Option<u64>, LogError> {
+        let Some(first) = self.line(reader)? else { return Ok(None) };
+        let mut length = first.len() as u64;
+        if pieces::is_one(&first) {
+            loop {
+                let Some(next) = self.line(reader)? else { return Ok(None) };
+                if !pieces::goes_on(&next) {
+                    break;
+                }
+                length += next.len() as u64;
+            }
+        }
+        Ok(Some(length))
+    }
+
+    /// The first whole line that begins at a byte or behind it, and that is no piece of something that began before it.
     fn first_behind(&self, file: &mut File, from: u64) -> Result<Option<(u64, Timestamp)>, LogError> {
         let mut offset = from.saturating_sub(1);
         file.seek(SeekFrom::Start(offset)).map_err(|source| self.io(source))?;
@@ -142,8 +163,13 @@ impl Parts {
             let Some(rest) = self.line(&mut reader)? else { return Ok(None) };
             offset += rest.len() as u64;
         }
-        let Some(line) = self.line(&mut reader)? else { return Ok(None) };
-        Ok(Some((offset, self.stamp(&line, offset)?)))
+        loop {
+            let Some(line) = self.line(&mut reader)? else { return Ok(None) };
+            if !pieces::goes_on(&line) {
+                return Ok(Some((offset, self.stamp(&line, offset)?)));
+            }
+            offset += line.len() as u64;
+        }
     }
 
     fn last_of(&self, file: &mut File, length: u64) -> Result<Option<Timestamp>, LogError> {

@@ -1,6 +1,6 @@
 //! Ids as newtypes, all from one macro, so that one kind is never passed for another.
 
-/// Defines a `u64` id newtype with `Display` as `prefix` + number.
+/// Defines a `u64` id newtype with `Display` as `prefix` + number. It is read as that, and as the number alone.
 #[macro_export]
 macro_rules! number_id {
     ($(#[$doc:meta])* $name:ident, $prefix:literal) => {
@@ -14,6 +14,15 @@ macro_rules! number_id {
         impl std::fmt::Display for $name {
             fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
                 write!(f, concat!($prefix, "{}"), self.0)
+            }
+        }
+
+        impl std::str::FromStr for $name {
+            type Err = String;
+
+            fn from_str(text: &str) -> Result<$name, String> {
+                let number = text.strip_prefix($prefix).unwrap_or(text).parse();
+                number.map($name).map_err(|_| concat!("expected a number, 17 or ", $prefix, "17").to_owned())
             }
         }
     };
@@ -43,3 +52,17 @@ number_id!(
     /// A revision of the root world model or of the resource pool; 0 is the empty one.
     Revision, "r"
 );
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_id_is_read_as_messages_write_it_and_as_its_number_alone() {
+        assert_eq!(["lease-17", "17"].map(str::parse::<LeaseId>), [Ok(LeaseId(17)), Ok(LeaseId(17))]);
+        assert_eq!(Revision(9).to_string().parse::<Revision>(), Ok(Revision(9)));
+        for other in ["", "lease-", "lease-x", "projection-17", "-17", "lease-lease-1"] {
+            assert_eq!(other.parse::<LeaseId>(), Err("expected a number, 17 or lease-17".to_owned()), "{other}");
+        }
+    }
+}

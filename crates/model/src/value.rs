@@ -342,16 +342,22 @@ impl fmt::Display for Value {
             Value::Null => f.write_str("null"),
             Value::Bool(b) => write!(f, "{b}"),
             Value::Int(i) => write!(f, "{i}"),
-            Value::Float(x) => write!(f, "{x}"),
+            Value::Float(x) => float(f, *x, None),
             Value::String(s) => f.write_str(s),
             Value::Pose(p) => {
                 let ([x, y, z], [i, j, k, w]) = (p.position, p.quaternion_xyzw);
-                write!(f, "pose({x:.3}, {y:.3}, {z:.3}; {i:.3}, {j:.3}, {k:.3}, {w:.3})")
+                for (number, before) in [(x, "pose("), (y, ", "), (z, ", "), (i, "; "), (j, ", "), (k, ", "), (w, ", ")]
+                {
+                    f.write_str(before)?;
+                    float(f, number, Some(3))?;
+                }
+                f.write_str(")")
             }
             Value::Joints(j) => {
                 f.write_str("joints(")?;
                 for (i, x) in j.iter().enumerate() {
-                    write!(f, "{}{x:.3}", if i == 0 { "" } else { ", " })?;
+                    f.write_str(if i == 0 { "" } else { ", " })?;
+                    float(f, *x, Some(3))?;
                 }
                 f.write_str(")")
             }
@@ -375,9 +381,32 @@ impl fmt::Display for Value {
     }
 }
 
+/// A number with so many digits behind the point, or all that it has; one of more than sixteen before or many zeros behind the point has an
+/// exponent.
+fn float(f: &mut fmt::Formatter<'_>, number: f64, digits: Option<usize>) -> fmt::Result {
+    match digits {
+        _ if number.is_finite() && number.abs() >= 1e16 => write!(f, "{number:e}"),
+        Some(digits) => write!(f, "{number:.digits$}"),
+        None if number != 0.0 && number.abs() < 1e-9 => write!(f, "{number:e}"),
+        None => write!(f, "{number}"),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn numbers_are_short_however_large_or_small_they_are() {
+        let said = |value: Value| value.to_string();
+        assert_eq!(
+            [1e300, -1.5e16, 1e15, 0.25, 1e-6, 5e-324].map(|x| said(Value::Float(x))),
+            ["1e300", "-1.5e16", "1000000000000000", "0.25", "0.000001", "5e-324"]
+        );
+        assert_eq!(said(Value::Joints(vec![1e300, 0.5])), "joints(1e300, 0.500)");
+        let pose = said(Value::Pose(Pose::at(1e300, 0.5, 0.0)));
+        assert_eq!(pose, "pose(1e300, 0.500, 0.000; 0.000, 0.000, 0.000, 1.000)");
+    }
 
     #[test]
     fn types_read_back_as_written() {

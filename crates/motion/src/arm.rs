@@ -55,9 +55,9 @@ pub fn in_scene(robot: &Robot, scene: &Scene, here: &Configuration) -> (Mechanis
     let resting = arm.poses(&JointVector::zeros(arm.joints.len()));
     let (moving, standing): (Vec<usize>, Vec<usize>) =
         (0..arm.links.len()).partition(|link| *link >= robot.model.links.len() || robot.arm_links.contains(link));
-    let mut obstacles = Vec::new();
+    let (mut obstacles, carriers) = (Vec::new(), arm.carriers());
     for index in standing {
-        let is_beside = |link: &usize| !arm.is_checked(*link, index) || is_unseen(&arm, *link, index);
+        let is_beside = |link: &usize| !arm.is_checked_among(&carriers, *link, index) || is_unseen(&arm, *link, index);
         let beside: Vec<usize> = moving.iter().copied().filter(is_beside).collect();
         let link = &mut arm.links[index];
         link.spheres.clear();

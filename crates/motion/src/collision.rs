@@ -302,9 +302,10 @@ impl<'a> Checker<'a> {
 
     /// Which pairs are to be kept apart: the arm says so of its links, and everything of the arm is to be kept from the objects.
     fn find_pairs(&mut self, arm: &Mechanism) {
+        let carriers = arm.carriers();
         let is_looked_at = |a: &Moving, form: Form, link: Option<usize>| {
             let by_shapes = link.is_some_and(|link| arm.is_by_shapes(a.link, link));
-            let is_checked = link.is_none_or(|link| arm.is_checked(a.link, link));
+            let is_checked = link.is_none_or(|link| arm.is_checked_among(&carriers, a.link, link));
             is_checked && a.form.counts(by_shapes) && form.counts(by_shapes)
         };
         for i in 0..self.moving.len() {

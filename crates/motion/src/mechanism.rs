@@ -163,6 +163,23 @@ impl Mechanism {
         self.carrier(a) != self.carrier(b) && !self.excepted.contains(&(a.min(b), a.max(b)))
     }
 
+    /// As [`Mechanism::is_checked`], with the carriers of all links: for who asks of many pairs.
+    pub(crate) fn is_checked_among(&self, carriers: &[Option<usize>], a: usize, b: usize) -> bool {
+        carriers[a] != carriers[b] && !self.excepted.contains(&(a.min(b), a.max(b)))
+    }
+
+    /// Of each link what [`Mechanism::carrier`] says.
+    pub(crate) fn carriers(&self) -> Vec<Option<usize>> {
+        let mut carriers: Vec<Option<usize>> = Vec::with_capacity(self.links.len());
+        for (index, link) in self.links.iter().enumerate() {
+            // Parents come before children.
+            let carrier =
+                if link.drive.is_some() { Some(index) } else { link.parent.and_then(|parent| carriers[parent]) };
+            carriers.push(carrier);
+        }
+        carriers
+    }
+
     /// Whether two links are told apart by their exact shapes alone.
     pub fn is_by_shapes(&self, a: usize, b: usize) -> bool {
         self.by_shapes.contains(&(a.min(b), a.max(b)))
@@ -181,7 +198,8 @@ impl Mechanism {
     pub fn pairs(&self) -> Vec<(usize, usize)> {
         let solid: Vec<usize> = (0..self.links.len()).filter(|l| !self.links[*l].spheres.is_empty()).collect();
         let pairs = solid.iter().flat_map(|b| solid.iter().take_while(move |a| *a < b).map(move |a| (*a, *b)));
-        pairs.filter(|(a, b)| self.is_checked(*a, *b)).collect()
+        let carriers = self.carriers();
+        pairs.filter(|(a, b)| self.is_checked_among(&carriers, *a, *b)).collect()
     }
 
     /// How many times as closely motions of each joint have to be looked at: more often than once where a link that mimics it turns or slides

@@ -20,6 +20,9 @@ pub const MAX_TRIANGLES: usize = 1_000_000;
 const MAX_SPHERES: usize = 96;
 const FINEST: usize = 24;
 
+/// Cells that the triangles are looked for in: a mesh of many that are all as large as itself is put into a coarser grid.
+const MOST_LOOKS: usize = 5_000_000;
+
 /// Surfaces that lie between two cells belong to both, in cells.
 const SKIN: f64 = 1e-6;
 
@@ -230,6 +233,9 @@ impl Mesh {
     /// Spheres that hold it, `padding` metres larger.
     pub fn cover(&self, padding: f64) -> Vec<Sphere> {
         let mut cells = FINEST;
+        while cells > 1 && self.looks(cells) > MOST_LOOKS {
+            cells = cells * 4 / 5;
+        }
         loop {
             let grid = Grid::new(self, cells);
             let spheres = grid.spheres(padding);
@@ -238,6 +244,22 @@ impl Mesh {
             }
             cells = cells * 4 / 5;
         }
+    }
+}
+
+impl Mesh {
+    /// In how many cells the triangles may be, of a grid with so many along the longest edge.
+    fn looks(&self, longest: usize) -> usize {
+        let cell = self.extent_m().max(1e-9) / longest as f64;
+        let of = |triangle: &[[f64; 3]; 3]| -> usize {
+            let along = |i: usize| {
+                let least = triangle.iter().map(|corner| corner[i]).fold(f64::INFINITY, f64::min);
+                let greatest = triangle.iter().map(|corner| corner[i]).fold(f64::NEG_INFINITY, f64::max);
+                ((greatest - least) / cell) as usize + 1
+            };
+            (0..3).map(along).product()
+        };
+        self.triangles.iter().map(of).sum()
     }
 }
 

@@ -20,6 +20,14 @@ pub enum RobotError {
     /// Not a URDF for another reason, without a place.
     #[error("the robot description is not valid URDF: {0}")]
     Urdf(String),
+    /// More than the pairs of them can be looked at.
+    #[error(
+        "the robot description has {count} links: at most {MAX_LINKS} are supported; leave out those that do not matter for collisions"
+    )]
+    TooManyLinks {
+        /// How many.
+        count: usize,
+    },
     /// A joint or link that must be there is not.
     #[error("the robot description has no {what} `{name}`")]
     Missing {
@@ -104,6 +112,9 @@ const ENDLESS_RAD: f64 = std::f64::consts::PI;
 /// A mesh of a link that is longer than this has its numbers in millimetres, unless a `scale` says that it has not.
 const PLAUSIBLE_M: f64 = 25.0;
 
+/// Links of a robot at the most: every pair of them is looked at in many postures.
+const MAX_LINKS: usize = 1_024;
+
 /// Where a URDF names no acceleration, the speed is reached in this time, in seconds.
 const TIME_TO_SPEED_S: f64 = 0.25;
 
@@ -116,6 +127,9 @@ const TIME_TO_ACCELERATION_S: f64 = 0.1;
 /// [`RobotError`] names the link or joint.
 pub(crate) fn read(text: &str, load: &mut Loader<'_>) -> Result<Description, RobotError> {
     let (urdf, texts) = parse(text)?;
+    if urdf.links.len() > MAX_LINKS {
+        return Err(RobotError::TooManyLinks { count: urdf.links.len() });
+    }
     let moves = |j: &&urdf_rs::Joint| j.joint_type != urdf_rs::JointType::Fixed && j.mimic.is_none();
     let mut driving: Vec<(&str, Limits)> =
         urdf.joints.iter().filter(moves).map(|joint| (joint.name.as_str(), Limits::of(joint))).collect();

@@ -101,6 +101,20 @@ fn a_mesh_in_millimetres_without_a_scale_is_refused_with_what_to_write() {
     assert_eq!(with("scale='0.001 0.001 0.001'"), None);
 }
 
+/// Each of them would be looked for in a thousand cells and more of the finest grid.
+#[test]
+fn a_mesh_of_thousands_of_triangles_as_large_as_itself_is_held_by_few_spheres() {
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let mut corner = || std::array::from_fn(|_| random.random_range(-0.5..0.5));
+    let triangles: Vec<[[f64; 3]; 3]> = (0..10_000).map(|_| [corner(), corner(), corner()]).collect();
+    let mesh = Mesh::new(triangles).unwrap();
+    let spheres = mesh.cover(0.0);
+    assert!(spheres.len() < 100, "{}", spheres.len());
+    let away = |a: [f64; 3], b: [f64; 3]| (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f64>().sqrt();
+    let is_held = |corner: &[f64; 3]| spheres.iter().any(|s| away(s.centre, *corner) <= s.radius + 1e-9);
+    assert!(mesh.triangles().iter().flatten().all(is_held));
+}
+
 #[test]
 fn every_point_of_a_mesh_is_in_one_of_its_spheres_and_they_stay_close() {
     let square = [[0.0, 0.0], [30.0, 0.0], [30.0, 30.0], [0.0, 30.0]];

@@ -56,6 +56,19 @@ fn says(urdf: &str, parts: &[&str]) {
 }
 
 #[test]
+fn a_chain_of_more_links_than_are_supported_is_refused_and_one_of_as_many_is_read() {
+    let chain = |links: usize| {
+        let one = |n: usize| {
+            let (name, parent) = (format!("l{n}"), format!("l{}", n - 1));
+            link(&name) + &joint(&format!("j{n}"), &parent, &name)
+        };
+        robot(&[link("l0") + &(1..links).map(one).collect::<String>()])
+    };
+    says(&chain(1_025), &["1025 links", "at most 1024"]);
+    assert_eq!(RobotModel::read(&chain(1_024), None).unwrap().links.len(), 1_024);
+}
+
+#[test]
 fn a_stray_link_and_one_that_hangs_on_a_name_that_is_misspelt_are_refused() {
     let arm = [link("base"), link("upper"), joint("shoulder", "base", "upper")].concat();
     assert!(RobotModel::read(&robot(std::slice::from_ref(&arm)), None).is_ok());

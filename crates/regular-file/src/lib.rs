@@ -1,13 +1,14 @@
-//! Reading a file that somebody names: on the command line, in a log, in the file of a robot.
+//! Reading and writing a file that somebody names: on the command line, in a log, in the file of a robot.
 //!
 //! Only a regular file is opened. A named pipe would make its reader wait for a writer, a device may never end, and opening one may already do
 //! something. What has the name may be another file a moment later, so it is looked at before it is opened and once it is open, and it is opened
-//! without waiting.
+//! without waiting. What is written may also go to a device or a pipe, but to none that nobody reads: opening it would wait for a reader.
 
-use nix::fcntl::OFlag;
-use std::fs::File;
+use nix::errno::Errno;
+use nix::fcntl::{FcntlArg, OFlag, fcntl};
+use std::fs::{File, OpenOptions};
 use std::io::{Error, ErrorKind, Read, Result};
-use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
 use std::path::Path;
 
 /// More bytes than a config, a certificate, an ontology or the description of a robot has.
@@ -46,6 +47,27 @@ pub fn read_text(path: &Path, most: usize) -> Result<String> {
     String::from_utf8(read(path, most)?).map_err(|error| Error::new(ErrorKind::InvalidData, error))
 }
 
+/// Opens what these options say to write it. It never waits for anybody; writing into a pipe waits for its reader, as ever.
+///
+/// # Errors
+/// What the system says; where the file is a pipe that nobody reads, [`ErrorKind::NotConnected`].
+pub fn open_to_write(path: &Path, options: &mut OpenOptions) -> Result<File> {
+    let flags = OFlag::O_NONBLOCK | OFlag::O_NOCTTY;
+    let file = options.custom_flags(flags.bits()).open(path).map_err(|error| {
+        let is_pipe = || std::fs::metadata(path).is_ok_and(|is| is.file_type().is_fifo());
+        match error.raw_os_error().map(Errno::from_raw) {
+            Some(Errno::ENXIO) if is_pipe() => Error::new(
+                ErrorKind::NotConnected,
+                "it is a named pipe that nobody reads: start its reader first, or name a file",
+            ),
+            _ => error,
+        }
+    })?;
+    let flags = OFlag::from_bits_retain(fcntl(&file, FcntlArg::F_GETFL)?);
+    fcntl(&file, FcntlArg::F_SETFL(flags - OFlag::O_NONBLOCK))?;
+    Ok(file)
+}
+
 fn regular(is_file: bool) -> Result<()> {
     let problem = "not a regular file: what comes from a pipe or a device has to be written to a file first";
     if is_file { Ok(()) } else { Err(Error::new(ErrorKind::InvalidInput, problem)) }
@@ -55,6 +77,7 @@ fn regular(is_file: bool) -> Result<()> {
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test may panic")]
     use super::*;
+    use std::io::Write;
 
     #[test]
     fn what_is_no_regular_file_is_refused_at_once() {
@@ -66,6 +89,31 @@ mod tests {
             assert_eq!(refused.kind(), ErrorKind::InvalidInput);
             assert!(refused.to_string().starts_with("not a regular file"), "{refused}");
         }
+    }
+
+    #[test]
+    fn a_pipe_is_written_where_somebody_reads_it_and_refused_at_once_where_nobody_does() {
+        let place = tempfile::tempdir().unwrap();
+        let pipe = place.path().join("pipe");
+        nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).unwrap();
+        let to_write = || open_to_write(&pipe, File::options().write(true).create(true));
+        let refused = to_write().unwrap_err();
+        assert!(refused.kind() == ErrorKind::NotConnected && refused.to_string().contains("nobody reads"), "{refused}");
+        let mut reader = File::options().read(true).custom_flags(OFlag::O_NONBLOCK.bits()).open(&pipe).unwrap();
+        let mut writer = to_write().unwrap();
+        // More than a pipe holds: it waits, and is no error.
+        let writing = std::thread::spawn(move || writer.write_all(&[7; 200_000]));
+        let mut read = 0;
+        while read < 200_000 {
+            match reader.read(&mut [0; 4_096]) {
+                Ok(more) => read += more,
+                Err(error) => assert_eq!(error.kind(), ErrorKind::WouldBlock),
+            }
+        }
+        writing.join().unwrap().unwrap();
+        assert!(open_to_write(Path::new("/dev/null"), File::options().write(true)).is_ok());
+        let file = place.path().join("file");
+        assert!(open_to_write(&file, File::options().write(true).create(true)).is_ok() && file.is_file());
     }
 
     #[test]

@@ -4,6 +4,7 @@
 //!   connection ─▶ Identity ─▶ Gate::caller ─▶ Gate::admit(caller, path) ─┬─▶ service (finds the Caller in the request)
 //!   (uid, certificate)                                                   └─▶ PERMISSION_DENIED, RESOURCE_EXHAUSTED
 //!                            Gate::answered(path, code, duration) ◀─ answer
+//!                                 Gate::unread(caller, bytes) ◀─ each part of it, until the connection has written it
 //! ```
 //! The trace of a call that carries one (`traceparent`) is that of everything done for it. What is admitted is the gate's business.
 //!
@@ -14,7 +15,7 @@ use crate::access::{Caller, HEALTH_CHECK};
 use crate::connections::{Link, LinkInfo, OutOfConnections};
 use crate::protocol;
 use crate::trace::{self, TraceContext};
-use crate::under_way::{Answer, Held, Revocation};
+use crate::under_way::{Answer, Held, Revocation, Unread};
 use std::any::Any;
 use std::fmt;
 use std::future::Future;
@@ -77,6 +78,14 @@ pub trait Gate: Send + Sync + 'static {
 
     /// A call was answered (a stream: began to be).
     fn answered(&self, path: &str, code: Code, took: Duration);
+
+    /// So many bytes of an answer are there, and wait until their reader has room for them: then the permit is dropped.
+    ///
+    /// # Errors
+    /// The status that the caller gets instead of the rest of the answer.
+    fn unread(&self, _caller: &Caller, _bytes: usize) -> Result<Option<Permit>, Status> {
+        Ok(None)
+    }
 
     /// A connection was not accepted, or a call refused, because there are too many connections.
     fn out_of_connections(&self, _why: &OutOfConnections) {}
@@ -233,18 +242,23 @@ where
         let answer = self.inner.call(request);
         let answered = async move {
             let answer = match held.until(answer).await {
-                Ok(answer) => answer,
+                Ok(Ok(answer)) => answer,
+                Ok(Err(error)) => return Err(error),
                 Err(ended) => {
                     gate.answered(path.path(), ended.code(), began.elapsed());
                     ended_with(ended.code());
                     return Ok(ended.into_http());
                 }
             };
-            if let Ok(answer) = &answer {
-                gate.answered(path.path(), code_of(answer), began.elapsed());
-                ended_with(code_of(answer));
-            }
-            answer.map(|answer| answer.map(|body| Body::new(Answer { body, held: Some(held) })))
+            let (head, body) = answer.into_parts();
+            let code = code_of(&head.headers);
+            let (answer, code) = match Answer::begin(body, held).await {
+                Ok(answer) => (http::Response::from_parts(head, Body::new(answer)), code),
+                Err(refused) => (refused.clone().into_http(), refused.code()),
+            };
+            gate.answered(path.path(), code, began.elapsed());
+            ended_with(code);
+            Ok(answer)
         };
         match own {
             None => Box::pin(answered),
@@ -280,11 +294,12 @@ fn admit(gate: &Arc<dyn Gate>, calls: &Calls, request: &mut http::Request<Body>)
     };
     let call = calls.begin(counted)?;
     let revocation = changes.map(|changes| Revocation::new(gate.clone(), changes, identity, caller.clone(), path));
+    let unread = Unread::of(gate.clone(), caller.clone());
     request.extensions_mut().insert(caller);
-    Ok(Held { _call: call, _permit: permit, _in_use: in_use, revocation })
+    Ok(Held { _call: call, _permit: permit, _in_use: in_use, revocation, unread })
 }
 
 /// The code of an answer that is only a status; a body may still end with another.
-fn code_of(answer: &http::Response<Body>) -> Code {
-    answer.headers().get("grpc-status").map_or(Code::Ok, |code| Code::from_bytes(code.as_bytes()))
+fn code_of(headers: &http::HeaderMap) -> Code {
+    headers.get("grpc-status").map_or(Code::Ok, |code| Code::from_bytes(code.as_bytes()))
 }

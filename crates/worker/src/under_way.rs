@@ -5,12 +5,16 @@
 //!   admitted ──▶ performed ──▶ answered ──▶ over
 //!                    └──────────────┴─ roles have changed, Caller::goes_on refuses ──▶ dropped; the caller gets the refusal
 //! ```
+//! What of an answer was made and not taken by the connection counts for its caller ([`Gate::unread`]): an answer whose first part is made is made
+//! into bytes at once, so that it is known how many wait.
+//!
 //! A call that is dropped like this ends as one whose client went away: an acquire leaves the queue, a goal has its grace.
 
 use crate::access::Caller;
 use crate::connections::InUse;
 use crate::gate::{Gate, Identity, Permit};
-use http_body::{Frame, SizeHint};
+use bytes::Bytes;
+use http_body::{Body as _, Frame, SizeHint};
 use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -27,6 +31,44 @@ pub(crate) struct Held {
     pub(crate) _permit: Option<Permit>,
     pub(crate) _in_use: Option<InUse>,
     pub(crate) revocation: Option<Revocation>,
+    pub(crate) unread: Unread,
+}
+
+/// Whose answer it is that waits for its reader, and what keeps account of that.
+pub(crate) struct Unread {
+    gate: Arc<dyn Gate>,
+    caller: Caller,
+}
+
+impl Unread {
+    pub(crate) fn of(gate: Arc<dyn Gate>, caller: Caller) -> Unread {
+        Unread { gate, caller }
+    }
+
+    /// A part that counts until the connection has written all of it.
+    fn counted(&self, part: Frame<Bytes>) -> Result<Frame<Bytes>, Status> {
+        let bytes = match part.into_data() {
+            Ok(bytes) if !bytes.is_empty() => bytes,
+            Ok(bytes) => return Ok(Frame::data(bytes)),
+            Err(other) => return Ok(other),
+        };
+        Ok(Frame::data(match self.gate.unread(&self.caller, bytes.len())? {
+            None => bytes,
+            Some(permit) => Bytes::from_owner(Counted { bytes, _permit: permit }),
+        }))
+    }
+}
+
+/// Bytes that count as long as somebody has some of them.
+struct Counted {
+    bytes: Bytes,
+    _permit: Permit,
+}
+
+impl AsRef<[u8]> for Counted {
+    fn as_ref(&self) -> &[u8] {
+        &self.bytes
+    }
 }
 
 /// Says when a call's caller has lost what it was let in with.
@@ -69,35 +111,71 @@ impl Held {
     }
 }
 
-/// The body of the answer to a call.
+/// The body of the answer to a call. The connection asks for a part when it has begun to send the one before.
 pub(crate) struct Answer {
-    pub(crate) body: Body,
+    body: Body,
+    /// What was made of it before the connection asked for anything.
+    first: Option<Result<Frame<Bytes>, Status>>,
     /// Nothing once the call has ended before its time.
-    pub(crate) held: Option<Held>,
+    held: Option<Held>,
+}
+
+impl Answer {
+    /// An answer of which the part that is there, if one is, is made into bytes.
+    pub(crate) async fn begin(mut body: Body, held: Held) -> Result<Answer, Status> {
+        let first = std::future::poll_fn(|context| match Pin::new(&mut body).poll_frame(context) {
+            Poll::Ready(first) => Poll::Ready(Some(first)),
+            Poll::Pending => Poll::Ready(None),
+        });
+        let first = match first.await {
+            Some(Some(Ok(first))) => Some(Ok(held.unread.counted(first)?)),
+            Some(Some(Err(error))) => Some(Err(error)),
+            // There is nothing of it, and it is not asked again.
+            Some(None) => {
+                body = Body::empty();
+                None
+            }
+            None => None,
+        };
+        Ok(Answer { body, first, held: Some(held) })
+    }
+
+    /// Ends with this.
+    fn end(&mut self, with: &Status) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        (self.held, self.first, self.body) = (None, None, Body::empty());
+        let mut trailers = http::HeaderMap::new();
+        Poll::Ready(Some(with.add_header(&mut trailers).map(|()| Frame::trailers(trailers))))
+    }
 }
 
 impl http_body::Body for Answer {
-    type Data = <Body as http_body::Body>::Data;
+    type Data = Bytes;
     type Error = Status;
 
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Self::Data>, Status>>> {
+    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
         let Some(held) = &mut self.held else { return Poll::Ready(None) };
         if let Some(Poll::Ready(lost)) = held.revocation.as_mut().map(|revocation| revocation.poll_lost(context)) {
-            (self.held, self.body) = (None, Body::empty());
-            let mut trailers = http::HeaderMap::new();
-            return Poll::Ready(Some(lost.add_header(&mut trailers).map(|()| Frame::trailers(trailers))));
+            return self.end(&lost);
         }
-        Pin::new(&mut self.body).poll_frame(context)
+        if let Some(first) = self.first.take() {
+            return Poll::Ready(Some(first));
+        }
+        let part = match Pin::new(&mut self.body).poll_frame(context) {
+            Poll::Ready(Some(Ok(part))) => part,
+            other => return other,
+        };
+        match self.held.as_ref().map(|held| held.unread.counted(part)) {
+            None => Poll::Ready(None),
+            Some(Ok(part)) => Poll::Ready(Some(Ok(part))),
+            Some(Err(refused)) => self.end(&refused),
+        }
     }
 
     fn is_end_stream(&self) -> bool {
-        self.held.is_none() || self.body.is_end_stream()
+        self.held.is_none() || (self.first.is_none() && self.body.is_end_stream())
     }
 
     fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
+        if self.first.is_none() { self.body.size_hint() } else { SizeHint::default() }
     }
 }

@@ -11,16 +11,19 @@
 //! ```
 //!
 //! [`Live`] finds the projections that read what a commit touches by the patterns that can match a fact, of which a fact of n
-//! arguments has 2ⁿ; so a commit costs what it touches and who reads that, not the number of projections or facts. What a projection
-//! has read is not copied: it is the projection, which shares its store with the root.
+//! arguments has 2ⁿ, and looks at those of one pattern together: where their effects leave a fact alone, all whose bases have the same
+//! version of it show the same. A projection is looked at by itself for the facts that its effects write, for those of which they delete the
+//! pattern, and once when it is contradicted. So a commit costs what it touches and who reads that, not the product of the two. What a
+//! projection has read is not copied: it is the projection, which shares its store with the root.
 
 use crate::table::hash_of;
-use crate::world::{World, increased, written};
+use crate::world::{Fact as WrittenFact, World, increased, written};
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
 use ratn_model::id::Revision;
 use ratn_model::tolerance::Tolerance;
 use ratn_model::value::Value;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Bound;
 use std::sync::Arc;
 
 /// Of a fact with more arguments, every pattern of its predicate is tried instead of those that can match it.
@@ -33,15 +36,22 @@ pub struct Live<Id> {
     /// By place; places of ended ones are taken again.
     projections: Vec<Option<(Id, Projection)>>,
     free: Vec<Place>,
-    /// Who has read by a pattern, in order.
-    by_pattern: BTreeMap<FactPattern, Vec<Place>>,
-    everything: Vec<Place>,
+    /// Who has read by a pattern.
+    by_pattern: BTreeMap<FactPattern, Readers>,
+    everything: Readers,
     /// Who waits for a writer's effects, in order.
     by_writer: BTreeMap<Arc<str>, Vec<Place>>,
+    /// Whose effects write a fact, by its hash, in order.
+    by_hash: BTreeMap<u64, Vec<Place>>,
+    /// Whose effects delete patterns, in order.
+    deleting: Vec<Place>,
 }
 
 /// Where a projection is among the others.
 type Place = usize;
+
+/// Who has read by the same pattern: by their bases, in order.
+type Readers = BTreeMap<Revision, Vec<Place>>;
 
 #[derive(Debug, Clone)]
 struct Projection {
@@ -101,8 +111,8 @@ pub struct Contradiction<Id> {
 
 impl<Id> Default for Live<Id> {
     fn default() -> Live<Id> {
-        let (places, projections, free, by_pattern, everything, by_writer) = Default::default();
-        Live { places, projections, free, by_pattern, everything, by_writer }
+        let (places, projections, free, by_pattern, everything, by_writer, by_hash, deleting) = Default::default();
+        Live { places, projections, free, by_pattern, everything, by_writer, by_hash, deleting }
     }
 }
 
@@ -123,10 +133,10 @@ impl<Id: Ord + Copy> Live<Id> {
         self.remove(id);
         let place = self.free.pop().unwrap_or(self.projections.len());
         match &reads {
-            Footprint::Everything => put(&mut self.everything, place),
+            Footprint::Everything => put_in(&mut self.everything, &base, place),
             Footprint::Patterns(patterns) => {
                 for pattern in patterns {
-                    put(self.by_pattern.entry(pattern.clone()).or_default(), place);
+                    put_in(self.by_pattern.entry(pattern.clone()).or_default(), &base, place);
                 }
             }
         }
@@ -141,8 +151,10 @@ impl<Id: Ord + Copy> Live<Id> {
         };
         effects.into_iter().for_each(|effect| projection.predict(effect));
         projection.index();
-        for (writer, _) in &projection.writers {
-            put(self.by_writer.entry(Arc::clone(writer)).or_default(), place);
+        projection.writers.iter().for_each(|(writer, _)| put_in(&mut self.by_writer, writer, place));
+        projection.written.iter().for_each(|written| put_in(&mut self.by_hash, &written.hash, place));
+        if !projection.deleted.is_empty() {
+            put(&mut self.deleting, place);
         }
         if place == self.projections.len() {
             self.projections.push(None);
@@ -157,18 +169,21 @@ impl<Id: Ord + Copy> Live<Id> {
         let Some((_, projection)) = self.projections[place].take() else { return };
         self.free.push(place);
         match &projection.reads {
-            Footprint::Everything => take(&mut self.everything, place),
+            Footprint::Everything => take_from(&mut self.everything, &projection.base, place),
             Footprint::Patterns(patterns) => {
-                patterns.iter().for_each(|pattern| take_from(&mut self.by_pattern, pattern, place));
+                for pattern in patterns {
+                    if let Some(readers) = self.by_pattern.get_mut(pattern) {
+                        take_from(readers, &projection.base, place);
+                        if readers.is_empty() {
+                            self.by_pattern.remove(pattern);
+                        }
+                    }
+                }
             }
         }
         projection.writers.iter().for_each(|(writer, _)| take_from(&mut self.by_writer, writer, place));
-    }
-
-    /// What a projection showed.
-    pub fn shown(&self, id: Id) -> Option<&World> {
-        let place = self.places.get(&id)?;
-        self.projections[*place].as_ref().map(|(_, projection)| &projection.shown)
+        projection.written.iter().for_each(|written| take_from(&mut self.by_hash, &written.hash, place));
+        take(&mut self.deleting, place);
     }
 
     /// The projections that a commit contradicts, in the order of ids. `before` and `after` are the root; `writer` is who
@@ -182,38 +197,116 @@ impl<Id: Ord + Copy> Live<Id> {
         changes: &[Change],
         tolerance: &dyn Fn(&str) -> Tolerance,
     ) -> Vec<Contradiction<Id>> {
-        let touched = written(before, changes);
+        let mut touched = written(before, changes);
+        // What was written and deleted at once has not changed for anybody; who predicted it is among those who are compared alone.
+        touched.retain(|key| before.fact(key).is_some() || after.fact(key).is_some());
         let mut hashes: Vec<u64> = touched.iter().map(hash_of).collect();
         hashes.sort_unstable();
         // What was predicted of the writer and did not come is as much a difference as what came.
         let alone = self.come_true(writer, before, &hashes);
-        let mut found: BTreeMap<Id, Contradiction<Id>> = BTreeMap::new();
+        let mut found = Found::default();
         for (place, key) in &alone {
-            let mut fact = Fact::of(key, after);
-            self.compare(*place, &mut fact, tolerance, &mut found);
+            self.compare(*place, &Fact::of(key, before, after), tolerance, &mut found);
         }
         for key in &touched {
-            let mut fact = Fact::of(key, after);
-            self.everything.iter().for_each(|place| self.compare(*place, &mut fact, tolerance, &mut found));
-            self.readers(key, &mut |place| self.compare(place, &mut fact, tolerance, &mut found));
+            let fact = Fact::of(key, before, after);
+            let by_themselves = self.by_themselves(&fact);
+            for place in &by_themselves {
+                if self.compare(*place, &fact, tolerance, &mut found) {
+                    found.over.insert(*place);
+                }
+            }
+            self.compare_together(None, &self.everything, &fact, &by_themselves, tolerance, &mut found);
+            self.readers(key, &mut |pattern, readers| {
+                self.compare_together(Some(pattern), readers, &fact, &by_themselves, tolerance, &mut found);
+            });
         }
-        found.into_values().collect()
+        found.first.into_values().collect()
     }
 
+    /// Who has to be looked at alone for a fact, in order: its effects may have to do with it.
+    fn by_themselves(&self, fact: &Fact<'_>) -> Vec<Place> {
+        let writing = self.by_hash.get(&fact.hash).into_iter().flatten();
+        let deletes = |place: &&Place| {
+            let projection = self.projections[**place].as_ref();
+            projection.is_some_and(|(_, projection)| projection.deletes(fact.key))
+        };
+        let mut all: Vec<Place> = writing.chain(self.deleting.iter().filter(deletes)).copied().collect();
+        all.sort_unstable();
+        all.dedup();
+        all
+    }
+
+    /// Whether a projection that may have read a fact is contradicted in it.
     fn compare(
         &self,
         place: Place,
-        fact: &mut Fact<'_>,
+        fact: &Fact<'_>,
         tolerance: &dyn Fn(&str) -> Tolerance,
-        found: &mut BTreeMap<Id, Contradiction<Id>>,
+        found: &mut Found<'_, Id>,
+    ) -> bool {
+        let Some((id, projection)) = &self.projections[place] else { return false };
+        if found.over.contains(&place) || !projection.reads.contains(fact.key) {
+            return false;
+        }
+        let difference = projection.difference(fact, tolerance);
+        let differs = difference.is_some();
+        difference.into_iter().for_each(|difference| add(&mut found.first, *id, fact.key, difference));
+        differs
+    }
+
+    /// Compares a fact for those who have read it by one pattern and whose effects leave it alone, all of one version of it at once.
+    fn compare_together<'a>(
+        &'a self,
+        pattern: Option<&'a FactPattern>,
+        readers: &'a Readers,
+        fact: &Fact<'_>,
+        by_themselves: &[Place],
+        tolerance: &dyn Fn(&str) -> Tolerance,
+        found: &mut Found<'a, Id>,
     ) {
-        let Some((id, projection)) = &self.projections[place] else { return };
-        let Some((was, is)) = projection.difference(fact, tolerance) else { return };
-        let contradiction = Contradiction { projection: *id, fact: fact.key.clone(), was, is };
-        match found.get_mut(id) {
-            Some(first) if first.fact <= contradiction.fact => {}
-            Some(first) => *first = contradiction,
-            None => drop(found.insert(*id, contradiction)),
+        let is_together = |place: &Place| by_themselves.binary_search(place).is_err();
+        // The bases below this one are still to be looked at.
+        let mut below = Bound::Unbounded;
+        let mut version = fact.before;
+        loop {
+            let left = found.left.get(&pattern).unwrap_or(readers);
+            let Some((newest, places)) = left.range((Bound::Unbounded, below)).next_back() else { return };
+            let since = match version.take().filter(|version| version.revision <= *newest) {
+                // Of the root before, unless it was written behind this base.
+                Some(version) => Some(version),
+                None => {
+                    let Some(place) = places.iter().find(|place| is_together(place)) else {
+                        below = Bound::Excluded(*newest);
+                        continue;
+                    };
+                    let shown = self.projections[*place].as_ref().map(|(_, projection)| &projection.shown);
+                    shown.and_then(|shown| shown.fact(fact.key))
+                }
+            };
+            let oldest = since.map_or(*newest, |version| version.revision.min(*newest));
+            let newest = below;
+            below = Bound::Excluded(oldest);
+            let Some(difference) = differ(fact, since.map(|version| &version.value), fact.now, tolerance) else {
+                continue;
+            };
+            let Found { first, over, left } = &mut *found;
+            let left = left.entry(pattern).or_insert_with(|| readers.clone());
+            let bases: Vec<Revision> = left.range((Bound::Included(oldest), newest)).map(|(base, _)| *base).collect();
+            for base in bases {
+                let Some(places) = left.remove(&base) else { continue };
+                let (contradicted, by_themselves): (Vec<Place>, Vec<Place>) = places.into_iter().partition(is_together);
+                for place in contradicted {
+                    if let Some((id, _)) = &self.projections[place]
+                        && over.insert(place)
+                    {
+                        add(first, *id, fact.key, difference.clone());
+                    }
+                }
+                if !by_themselves.is_empty() {
+                    left.insert(base, by_themselves);
+                }
+            }
         }
     }
 
@@ -249,17 +342,15 @@ impl<Id: Ord + Copy> Live<Id> {
         alone
     }
 
-    /// Calls `visit` for whoever has read a fact by a pattern.
-    fn readers(&self, key: &FactKey, visit: &mut dyn FnMut(Place)) {
+    /// Calls `visit` with each pattern by which a fact was read, and who did.
+    fn readers<'a>(&'a self, key: &FactKey, visit: &mut dyn FnMut(&'a FactPattern, &'a Readers)) {
         let arity = key.arguments.len();
         let mut pattern = FactPattern::of(key);
         if arity > MAX_ENUMERATED {
             pattern.arguments.fill(None);
             pattern.arguments.clear();
             let of_predicate = self.by_pattern.range(pattern..).take_while(|(p, _)| p.predicate == key.predicate);
-            return of_predicate
-                .filter(|(p, _)| p.matches(key))
-                .for_each(|(_, places)| places.iter().for_each(|place| visit(*place)));
+            return of_predicate.filter(|(p, _)| p.matches(key)).for_each(|(pattern, readers)| visit(pattern, readers));
         }
         for hidden in 0_usize..1 << arity {
             for (position, argument) in pattern.arguments.iter_mut().enumerate() {
@@ -268,8 +359,8 @@ impl<Id: Ord + Copy> Live<Id> {
                     *argument = (!is_hidden).then(|| key.arguments[position].clone());
                 }
             }
-            if let Some(places) = self.by_pattern.get(&pattern) {
-                places.iter().for_each(|place| visit(*place));
+            if let Some((pattern, readers)) = self.by_pattern.get_key_value(&pattern) {
+                visit(pattern, readers);
             }
         }
     }
@@ -279,19 +370,52 @@ impl<Id: Ord + Copy> Live<Id> {
 struct Fact<'a> {
     key: &'a FactKey,
     hash: u64,
+    /// In the root before: it has been so since its revision.
+    before: Option<&'a WrittenFact>,
     now: Option<&'a Value>,
-    /// Bases that have been looked at, and how what they say of it differs: projections of one base say the same of what their
-    /// effects leave alone.
-    of_bases: Vec<(Revision, Option<Difference>)>,
 }
 
 /// Was, is.
 type Difference = (Option<Value>, Option<Value>);
 
 impl<'a> Fact<'a> {
-    fn of(key: &'a FactKey, after: &'a World) -> Fact<'a> {
-        Fact { key, hash: hash_of(key), now: after.get(key), of_bases: Vec::new() }
+    fn of(key: &'a FactKey, before: &'a World, after: &'a World) -> Fact<'a> {
+        Fact { key, hash: hash_of(key), before: before.fact(key), now: after.get(key) }
     }
+}
+
+/// What a commit has been found to contradict so far.
+struct Found<'a, Id> {
+    first: BTreeMap<Id, Contradiction<Id>>,
+    /// Whom no later fact has to be compared for: facts are looked at in the order of keys.
+    over: BTreeSet<Place>,
+    /// Who is left of the readers of a pattern (`None`: of everything) of which some are over.
+    left: BTreeMap<Option<&'a FactPattern>, Readers>,
+}
+
+impl<Id> Default for Found<'_, Id> {
+    fn default() -> Self {
+        Found { first: BTreeMap::new(), over: BTreeSet::new(), left: BTreeMap::new() }
+    }
+}
+
+fn add<Id: Ord + Copy>(found: &mut BTreeMap<Id, Contradiction<Id>>, id: Id, fact: &FactKey, (was, is): Difference) {
+    let contradiction = Contradiction { projection: id, fact: fact.clone(), was, is };
+    match found.get_mut(&id) {
+        Some(first) if first.fact <= contradiction.fact => {}
+        Some(first) => *first = contradiction,
+        None => drop(found.insert(id, contradiction)),
+    }
+}
+
+/// What a fact was where it is otherwise now.
+fn differ(
+    fact: &Fact<'_>,
+    was: Option<&Value>,
+    is: Option<&Value>,
+    tolerance: &dyn Fn(&str) -> Tolerance,
+) -> Option<Difference> {
+    (!same(was, is, || tolerance(&fact.key.predicate))).then(|| (was.cloned(), is.cloned()))
 }
 
 impl Projection {
@@ -325,12 +449,14 @@ impl Projection {
         });
     }
 
+    /// Whether one of its effects deletes a fact, if there is one.
+    fn deletes(&self, key: &FactKey) -> bool {
+        self.deleted.iter().any(|pattern| pattern.matches(key))
+    }
+
     /// How what it would show of a fact now differs from what it showed.
-    fn difference(&self, fact: &mut Fact<'_>, tolerance: &dyn Fn(&str) -> Tolerance) -> Option<Difference> {
-        let deletes = self.deleted.iter().any(|pattern| pattern.matches(fact.key));
-        let differ = |was: Option<&Value>, is: Option<&Value>| {
-            (!same(was, is, || tolerance(&fact.key.predicate))).then(|| (was.cloned(), is.cloned()))
-        };
+    fn difference(&self, fact: &Fact<'_>, tolerance: &dyn Fn(&str) -> Tolerance) -> Option<Difference> {
+        let differ = |was: Option<&Value>, is: Option<&Value>| differ(fact, was, is, tolerance);
         let written = self.written.binary_search_by_key(&fact.hash, |written| written.hash);
         let is_to_come = |effect: &Predicted| effect.writer.is_none_or(|writer| !self.writers[writer].1);
         if let Ok(at) = written
@@ -340,14 +466,6 @@ impl Projection {
         {
             // What is still to come hides whatever there is now.
             return if is_to_come(effect) { None } else { differ(Some(value), fact.now) };
-        }
-        if !deletes && written.is_err() {
-            if let Some((_, difference)) = fact.of_bases.iter().find(|(base, _)| *base == self.base) {
-                return difference.clone();
-            }
-            let difference = differ(self.shown.get(fact.key), fact.now);
-            fact.of_bases.push((self.base, difference.clone()));
-            return difference;
         }
         let mut own = self.effects.iter().filter(|effect| effect.hash == fact.hash || effect.hash == 0);
         let was = match own.clone().next_back().map(|effect| &effect.change) {
@@ -389,6 +507,13 @@ fn put(places: &mut Vec<Place>, place: Place) {
 fn take(places: &mut Vec<Place>, place: Place) {
     if let Ok(at) = places.binary_search(&place) {
         places.remove(at);
+    }
+}
+
+fn put_in<K: Ord + Clone>(index: &mut BTreeMap<K, Vec<Place>>, key: &K, place: Place) {
+    match index.get_mut(key) {
+        Some(places) => put(places, place),
+        None => drop(index.insert(key.clone(), vec![place])),
     }
 }
 

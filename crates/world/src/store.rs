@@ -69,6 +69,12 @@ impl Store {
         self.in_order.iter().map(|(key, fact)| (key.as_ref(), fact.as_ref()))
     }
 
+    /// Every fact whose key is greater, in the order of keys.
+    pub(crate) fn iter_behind(&self, key: &FactKey) -> impl Iterator<Item = (&FactKey, &Fact)> {
+        let behind = self.in_order.range::<_, FactKey>((Bound::Excluded(key), Bound::Unbounded));
+        behind.map(|(key, fact)| (key.as_ref(), fact.as_ref()))
+    }
+
     /// The facts that match, and what the index cannot tell from them, in the order of keys; by the index that narrows most by
     /// position: a whole key, the leading arguments, a later argument, the predicate.
     pub(crate) fn candidates<'a>(

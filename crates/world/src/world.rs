@@ -11,6 +11,7 @@ use ratn_model::measurement::Measurement;
 use ratn_model::value::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::iter::Peekable;
+use std::ops::Bound;
 use std::sync::Arc;
 
 /// As many facts may differ between a projection and the store it shares, before it gets a store of its own.
@@ -135,6 +136,13 @@ impl World {
     pub fn iter(&self) -> impl Iterator<Item = (&FactKey, &Fact)> {
         let overlay = self.overlay.iter().map(|(key, fact)| (key.as_ref(), fact.as_deref()));
         Merged { below: self.store.iter().peekable(), above: overlay.peekable() }
+    }
+
+    /// Every fact whose key is greater, in the order of keys.
+    pub fn iter_behind<'a>(&'a self, key: &'a FactKey) -> impl Iterator<Item = (&'a FactKey, &'a Fact)> {
+        let behind = (Bound::Excluded(key), Bound::Unbounded);
+        let overlay = self.overlay.range::<FactKey, _>(behind).map(|(key, fact)| (key.as_ref(), fact.as_deref()));
+        Merged { below: self.store.iter_behind(key).peekable(), above: overlay.peekable() }
     }
 
     /// The facts that match, in the order of keys; costs what matches where the whole key, its leading arguments (the subject) or

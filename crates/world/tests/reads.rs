@@ -200,6 +200,49 @@ fn what_came_nearly_as_predicted_is_no_contradiction_and_what_did_not_come_is_on
     assert_eq!(found, [Contradiction { projection: 7, fact: fact.clone(), was: Some(Value::Float(1.0)), is: None }]);
 }
 
+/// Each at a base of its own, half of them of everything, half of all that moves.
+#[test]
+fn a_commit_costs_its_facts_and_who_reads_them_and_not_the_product_of_the_two() {
+    const READERS: usize = 200;
+    const FACTS: i64 = 300;
+    let fact = |i: i64| FactKey { predicate: "at".to_owned(), arguments: vec![Term::Int(i)] };
+    let all = |x: f64| (0..FACTS).map(|i| Change::Set { fact: fact(i), value: Value::Float(x) }).collect::<Vec<_>>();
+    let mut root = World::default();
+    root.apply(&all(0.0)).unwrap();
+    let mut live: Live<usize> = Live::default();
+    for id in 0..READERS {
+        let reads = match id % 2 {
+            0 => Footprint::Everything,
+            _ => Footprint::Patterns(vec![FactPattern { predicate: "at".to_owned(), arguments: vec![None] }]),
+        };
+        let own = Change::Set { fact: fact(id as i64), value: Value::Float(7.0) };
+        let effect = Effect { writer: Some(Arc::from("place")), change: own.clone() };
+        live.insert(id, root.revision(), root.project(&[own]).unwrap(), vec![effect], reads);
+        let other = FactKey { predicate: "other".to_owned(), arguments: Vec::new() };
+        root.apply(&[Change::Set { fact: other, value: Value::Int(id as i64) }]).unwrap();
+    }
+    let mut commit = |live: &mut Live<usize>, x: f64| {
+        let (before, looks) = (root.clone(), std::cell::Cell::new(0));
+        root.apply(&all(x)).unwrap();
+        let tolerance = |_: &str| {
+            looks.set(looks.get() + 1);
+            Tolerance { number: 0.1, ..Tolerance::EXACT }
+        };
+        (live.contradicted(&before, &root, None, &all(x), &tolerance), looks.get())
+    };
+    // Nearly the same, twice: the second time it was written behind all bases. Both patterns look at each fact.
+    for x in [0.04, 0.08] {
+        let (found, looks) = commit(&mut live, x);
+        assert!(found.is_empty() && looks <= 2 * FACTS, "{looks} looks");
+    }
+    // What is still to come of one hides the first fact from it.
+    let (found, looks) = commit(&mut live, 1.0);
+    let first: Vec<_> = found.iter().map(|found| found.fact.clone()).collect();
+    let expected = (0..READERS).map(|id| fact(i64::from(id == 0)));
+    assert_eq!(first, expected.collect::<Vec<_>>());
+    assert!(looks <= 2 * FACTS, "{looks} looks");
+}
+
 #[test]
 fn a_digest_is_the_same_on_every_machine() {
     let values =

@@ -21,7 +21,8 @@ pub(crate) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
                 let place = path.display();
                 return Err(Failure::Refused(format!("ratn: {place} is the event log itself: name another file")));
             }
-            let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
+            let file = ratn_regular_file::open_to_write(path, File::options().write(true).create(true).truncate(true));
+            let file = file.with_context(|| format!("cannot write {}", path.display()))?;
             let written = export(format, lines.by_ref(), BufWriter::new(file));
             written.with_context(|| format!("{} is incomplete", path.display()))?;
         }
@@ -81,6 +82,11 @@ mod tests {
         assert!(std::fs::read_to_string(&table)?.contains("\r\n1,look,look,waiting,"));
         assert!(matches!(run(&to(&place.path().join("./run.jsonl"))), Err(Failure::Refused(_))));
         assert_eq!(std::fs::read_to_string(&log)?, LOG);
+        // It does not wait for a reader.
+        let pipe = place.path().join("pipe");
+        nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU)?;
+        let refused = run(&to(&pipe)).err().map(|error| error.to_string()).unwrap_or_default();
+        assert!(refused.contains("pipe") && refused.contains("nobody reads"), "{refused}");
         Ok(())
     }
 }

@@ -26,13 +26,10 @@ impl WatchMessage {
         }
     }
 
-    /// What a watch is told of it: what it is about, behind what it has seen.
+    /// What a watch is told of an event: what it is about, behind what it has seen. A snapshot is told in parts.
     pub(super) fn updates(&self, filter: &WatchFilter, after: Option<WatchPosition>) -> Vec<ResourceUpdate> {
         match self {
-            WatchMessage::Snapshot { revision, resources, youngest } => {
-                let resources = resources.iter().map(wire::resource).collect();
-                vec![ResourceUpdate::Snapshot { revision: *revision, resources, youngest: *youngest }]
-            }
+            WatchMessage::Snapshot { .. } => Vec::new(),
             WatchMessage::Event(event) => {
                 let unseen = |event: &ResourceEvent| {
                     after.is_none_or(|after| event.revision > after.revision || Some(event.part) > after.part)

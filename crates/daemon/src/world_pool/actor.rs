@@ -8,7 +8,7 @@ use super::history::{Between, Commit, History, Kept, Version};
 use super::leases::{Known, LiveLeases};
 use super::parked::Parked;
 use super::query::View;
-use super::{WorldPoolConfig, status};
+use super::{WorldPoolConfig, size, status};
 use crate::access::Caller;
 use crate::durable_actor::{self, Core, Journal, JournalError, TurnContext, floor};
 use ratn_model::fact::{Change, FactKey, FactPattern, Footprint};
@@ -19,10 +19,9 @@ use ratn_proto::types::Contradiction;
 use ratn_worker::vitals::Vitals;
 use ratn_world::digest::Digest;
 use ratn_world::scene::delta::SceneDelta;
-use ratn_world::world::World;
 use std::collections::BTreeMap;
 use std::convert::Infallible;
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::time::Duration;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
@@ -91,12 +90,12 @@ pub(super) enum Message {
 
 type Answer<T> = oneshot::Sender<Result<T, Status>>;
 
-/// What watchers are told.
+/// What watchers are told, as long as the history keeps it: one that is slower does not make it keep more.
 #[derive(Debug, Clone)]
 pub(super) enum Update {
     /// What holds; every revision follows.
-    Snapshot(World),
-    Revision(Arc<Kept>),
+    Snapshot(Weak<Kept>),
+    Revision(Weak<Kept>),
 }
 
 /// A projection as it was asked for.
@@ -211,7 +210,7 @@ impl Core for WorldCore {
             if lets_go_on {
                 self.take_up(context);
             }
-        } else if let Err(message) = self.parked.park(context.now(), message.whose(), message) {
+        } else if let Err(message) = self.parked.park(context.now(), message.whose(), message.bytes(), message) {
             message.refused(status::too_many_wait());
         }
     }
@@ -235,7 +234,7 @@ impl Core for WorldCore {
 
     fn hand_out(&mut self, said: Said, context: &mut WorldTurn) {
         match said {
-            Said::News(kept) => context.watchers.publish(&Update::Revision(kept)),
+            Said::News(kept) => context.watchers.publish(&Update::Revision(Arc::downgrade(&kept))),
             Said::Contradicted(contradiction) => {
                 if let Some(watched) = self.watched.get(&contradiction.projection) {
                     watched.send_if_modified(|first| {
@@ -293,6 +292,18 @@ impl Message {
             Message::Query { by, .. } | Message::Scene { by, .. } | Message::WatchProjection { by, .. } => by.clone(),
             _ => Arc::default(),
         }
+    }
+
+    /// What it takes in memory, of those that may have to wait, about.
+    fn bytes(&self) -> usize {
+        let of = match self {
+            Message::Project { projection, .. } => {
+                size::of_changes(&projection.changes) + size::of_footprint(&projection.reads)
+            }
+            Message::Query { patterns, .. } => size::of_patterns(patterns),
+            _ => 0,
+        };
+        size_of::<Message>() + of
     }
 
     /// To who asked for something that is waited for.
@@ -383,28 +394,26 @@ impl WorldCore {
     fn watch(&self, after: Option<Revision>, context: &mut WorldTurn) -> Result<mpsc::Receiver<Update>, Status> {
         context.watchers.admit(self.config.max_watchers)?;
         let first = match after {
-            None => vec![Update::Snapshot(self.pool.root().clone())],
+            None => vec![Update::Snapshot(self.pool.history.newest().map(Arc::downgrade).unwrap_or_default())],
             Some(after) => {
                 let missed = self.pool.history.after(after).map_err(status::of_revision)?;
-                missed.map(|kept| Update::Revision(Arc::clone(kept))).collect()
+                missed.map(|kept| Update::Revision(Arc::downgrade(kept))).collect()
             }
         };
         context.watch(first)
     }
 
     fn project(&mut self, new: NewProjection, now: Timestamp) -> Result<ProjectionId, Status> {
-        let unbound = HeldBy::Until(now + self.pool.unbound_ttl());
         // Looked at here and not where the call came in: a lease that ends from now on ends the projection, too.
         let held_by = match new.lease {
-            None => unbound,
+            None => HeldBy::Until(now + self.pool.unbound_ttl()),
             Some(lease) => match self.leases.borrow().known(lease) {
                 Known::Lives { opened_by } if !new.by.may_act_for(opened_by) => {
                     return Err(status::lease_of_another(lease, opened_by, &new.by));
                 }
                 Known::Lives { .. } => HeldBy::Lease(lease),
                 Known::Ended => return Err(status::lease_ended(lease)),
-                // A lease without a resource is never told of.
-                Known::NotYet => unbound,
+                Known::NotYet => return Err(status::lease_not_known(lease)),
             },
         };
         let NewProjection { by, request_id, id, after, base, changes, writers, reads, .. } = new;
@@ -451,6 +460,8 @@ mod tests {
         assert!(code == Code::PermissionDenied && message.contains("of a session of `adam`"), "{message}");
         let ended = project("adam", Role::Task, 2).await.unwrap_err();
         assert_eq!(ended.0, Code::FailedPrecondition, "{}", ended.1);
+        let (code, message) = project("adam", Role::Task, 77).await.unwrap_err();
+        assert!(code == Code::Unavailable && message.starts_with("lease-77 is not known"), "{message}");
     }
 
     #[tokio::test]

@@ -40,7 +40,7 @@ pub(super) struct WorldPool {
     pub(super) projections: BTreeMap<ProjectionId, Projection>,
     /// What planners were sent.
     pub(super) scenes: Scenes,
-    /// What they show, to compare with what is committed.
+    /// What those show that nothing has contradicted yet, to compare with what is committed.
     live: Live<ProjectionId>,
     /// Since [`WorldPool::take_contradictions`].
     contradictions: Vec<Contradiction>,
@@ -64,7 +64,7 @@ pub(super) struct Projection {
     request_id: String,
     /// What it takes of its own.
     bytes: usize,
-    /// The first that there was.
+    /// Once there is one, it is compared with no more commits.
     contradiction: Option<Contradiction>,
 }
 
@@ -218,8 +218,9 @@ impl WorldPool {
             let found = self.live.contradicted(&before, &kept.world, writer, changes, &tolerance);
             for found in found {
                 let contradiction = wire(found, revision);
+                self.live.remove(contradiction.projection);
                 if let Some(projection) = self.projections.get_mut(&contradiction.projection) {
-                    projection.contradiction.get_or_insert_with(|| contradiction.clone());
+                    projection.contradiction = Some(contradiction.clone());
                 }
                 self.contradictions.push(contradiction);
             }
@@ -232,7 +233,7 @@ impl WorldPool {
         std::mem::take(&mut self.contradictions)
     }
 
-    /// The first contradiction of a projection, if there was one.
+    /// What has contradicted a projection, if something has.
     pub(super) fn contradiction(&self, id: ProjectionId) -> Result<Option<&Contradiction>, QueryError> {
         Ok(self.projection(id)?.contradiction.as_ref())
     }
@@ -256,19 +257,19 @@ impl WorldPool {
         let mut alone: Live<ProjectionId> = Live::default();
         alone.insert(id, request.base, world.clone(), effects.clone(), request.reads.clone());
         let tolerance = |predicate: &str| self.tolerances.of(predicate, Tolerance::EXACT);
-        let mut first = None;
         let Ok(mut before) = self.history.at(request.base) else { return (None, effects) };
         let Ok(since) = self.history.after(request.base) else { return (None, effects) };
         for kept in since {
             let changes: Vec<Change> = kept.changes().collect();
             let writer = kept.writer.as_deref();
             let found = alone.contradicted(before, &kept.world, writer, &changes, &tolerance);
-            let found = found.into_iter().map(|found| wire(found, kept.world.revision()));
-            first = first.or(found.into_iter().next());
+            if let Some(found) = found.into_iter().next() {
+                return (Some(wire(found, kept.world.revision())), effects);
+            }
             effects.retain(|effect| writer.is_none() || effect.writer.as_deref() != writer);
             before = &kept.world;
         }
-        (first, effects)
+        (None, effects)
     }
 
     /// When [`WorldPool::expire_facts`] has something to do.
@@ -389,7 +390,9 @@ impl WorldPool {
             ProjectionId(self.last_projection)
         });
         let (contradiction, effects) = self.catch_up(id, &world, &request);
-        self.live.insert(id, request.base, world.clone(), effects, request.reads.clone());
+        if contradiction.is_none() {
+            self.live.insert(id, request.base, world.clone(), effects, request.reads.clone());
+        }
         if let HeldBy::Lease(lease) = request.held_by {
             self.by_lease.entry(lease).or_default().insert(id);
         }

@@ -14,36 +14,50 @@ pub(super) const MOST: usize = 4_096;
 /// Of these, so many of one caller: who asks in vain leaves room for the others.
 pub(super) const MOST_OF_ONE: usize = 2_048;
 
+/// What those that wait take in memory at the most, about, and those of one caller.
+const MOST_BYTES: usize = 256 << 20;
+const MOST_BYTES_OF_ONE: usize = MOST_BYTES / 2;
+
 /// The messages that wait, the oldest first, each with the end of its patience.
 #[derive(Debug)]
 pub(super) struct Parked<M> {
     messages: VecDeque<One<M>>,
-    /// How many of each caller wait.
-    of: BTreeMap<Arc<str>, usize>,
+    bytes: usize,
+    /// What of each caller waits.
+    of: BTreeMap<Arc<str>, Waiting>,
+}
+
+#[derive(Debug, Clone, Copy, Default)]
+struct Waiting {
+    messages: usize,
+    bytes: usize,
 }
 
 #[derive(Debug)]
 struct One<M> {
     until: Timestamp,
     whose: Arc<str>,
+    bytes: usize,
     message: M,
 }
 
 impl<M> Default for Parked<M> {
     fn default() -> Parked<M> {
-        Parked { messages: VecDeque::new(), of: BTreeMap::new() }
+        Parked { messages: VecDeque::new(), bytes: 0, of: BTreeMap::new() }
     }
 }
 
 impl<M> Parked<M> {
-    /// Has a message of a caller wait; gives it back where as many wait already as may, in all or of that caller.
-    pub(super) fn park(&mut self, now: Timestamp, whose: Arc<str>, message: M) -> Result<(), M> {
-        let of_caller = self.of.get(&whose).copied().unwrap_or_default();
-        if self.messages.len() >= MOST || of_caller >= MOST_OF_ONE {
+    /// Has a message of a caller wait, which has so many bytes; gives it back where as many wait already as may, in all or of that caller.
+    pub(super) fn park(&mut self, now: Timestamp, whose: Arc<str>, bytes: usize, message: M) -> Result<(), M> {
+        let Waiting { messages: of_caller, bytes: bytes_of_caller } = self.of.get(&whose).copied().unwrap_or_default();
+        let too_many = self.messages.len() >= MOST || of_caller >= MOST_OF_ONE;
+        if too_many || self.bytes + bytes > MOST_BYTES || bytes_of_caller + bytes > MOST_BYTES_OF_ONE {
             return Err(message);
         }
-        *self.of.entry(whose.clone()).or_default() += 1;
-        self.messages.push_back(One { until: now + PATIENCE, whose, message });
+        self.of.insert(whose.clone(), Waiting { messages: of_caller + 1, bytes: bytes_of_caller + bytes });
+        self.bytes += bytes;
+        self.messages.push_back(One { until: now + PATIENCE, whose, bytes, message });
         Ok(())
     }
 
@@ -61,9 +75,11 @@ impl<M> Parked<M> {
         let (early, rest): (Vec<_>, Vec<_>) = all.partition(|one| one.until > now && is_early(&one.message));
         self.messages = early.into();
         for one in &rest {
-            if let Some(count) = self.of.get_mut(&one.whose) {
-                *count -= 1;
-                if *count == 0 {
+            self.bytes -= one.bytes;
+            if let Some(waiting) = self.of.get_mut(&one.whose) {
+                waiting.messages -= 1;
+                waiting.bytes -= one.bytes;
+                if waiting.messages == 0 {
                     self.of.remove(&one.whose);
                 }
             }
@@ -77,7 +93,19 @@ mod tests {
     use super::*;
 
     fn one(parked: &mut Parked<usize>, at: Timestamp, whose: &str, message: usize) -> Result<(), usize> {
-        parked.park(at, whose.into(), message)
+        parked.park(at, whose.into(), 1, message)
+    }
+
+    #[test]
+    fn what_waits_has_a_bound_in_bytes_of_each_caller_and_in_all() {
+        let (mut parked, start) = (Parked::default(), Timestamp(0));
+        let park = |parked: &mut Parked<u8>, whose: &str, bytes| parked.park(start, whose.into(), bytes, 0);
+        assert_eq!(park(&mut parked, "eve", MOST_BYTES_OF_ONE), Ok(()));
+        assert_eq!(park(&mut parked, "eve", 1), Err(0));
+        assert_eq!(park(&mut parked, "adam", MOST_BYTES_OF_ONE), Ok(()));
+        assert_eq!(park(&mut parked, "cain", 1), Err(0));
+        assert_eq!(parked.take(start, |_| false).len(), 2);
+        assert_eq!((parked.bytes, park(&mut parked, "eve", 1)), (0, Ok(())));
     }
 
     #[test]

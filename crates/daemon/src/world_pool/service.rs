@@ -1,7 +1,7 @@
 //! gRPC in front of the actor.
 
 use super::actor::{Handle, Message, NewProjection, Update, WATCH_AGAIN_AFTER};
-use super::history::Commit;
+use super::history::{Commit, Kept};
 use super::leases::{Known, LiveLeases};
 use super::query::{Found, View};
 use super::stream::CallerService;
@@ -26,7 +26,7 @@ use ratn_worker::multiplex::server::Answers;
 use ratn_world::digest::Digest;
 use ratn_world::world::Fact;
 use std::collections::BTreeSet;
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::time::Duration;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
@@ -200,7 +200,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         if let Some(lease) = lease {
             let mut leases = self.leases.clone();
             let told = leases.wait_for(|leases| leases.known(lease) != Known::NotYet);
-            // In vain for a lease that holds nothing: the actor knows what to do with that.
+            // In vain for one that was never given: the actor refuses that.
             let _ = tokio::time::timeout(LEASE_PATIENCE, told).await;
         }
         let promise = request.promise;
@@ -215,8 +215,9 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let (by, request) = (Caller::of(&request).name, request.into_inner());
         let projection = request.projection_id.map(ProjectionId);
         few(request.patterns.len(), "patterns")?;
+        let same = v1::QueryRequest { page_bytes: 0, page_token: String::new(), at_revision: None, ..request.clone() };
         let patterns = each(request.patterns, "patterns")?;
-        let place = paging::place(&request.page_token)?;
+        let place = paging::place(&request.page_token, &same)?;
         let page = Page::of(request.page_bytes, &request.page_token);
         let at = match place {
             // The next page is of the same revision; a projection has only one.
@@ -242,7 +243,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
                 self.long_reads.read(read).await?
             }
         };
-        let next_page_token = paging::token(more, revision.0, seen + facts.len());
+        let next_page_token = paging::token(more, revision.0, seen + facts.len(), &same);
         Ok(Response::new(v1::QueryResponse { facts, revision: revision.0, next_page_token }))
     }
 
@@ -255,14 +256,11 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
         let request = request.into_inner();
         few(request.patterns.len(), "patterns")?;
         let patterns: Vec<FactPattern> = each(request.patterns, "patterns")?;
-        let (after, in_parts) = (request.after_revision.map(Revision), request.in_parts);
+        let (patterns, after): (Arc<[FactPattern]>, _) = (patterns.into(), request.after_revision.map(Revision));
         let updates = self.actor.request(|answer| Message::Watch { after, answer }).await?;
         let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
-            .filter_map(move |update| futures::future::ready(told(&update, &patterns)))
-            .flat_map(move |update| futures::stream::iter(messages(update.into(), in_parts)));
-        let message = "the watch has ended, for it was too slow or the disk failed: watch again";
-        let cut_off = retry_later(Code::Unavailable, "WATCH_AGAIN", message, WATCH_AGAIN_AFTER);
-        Ok(Response::new(watch_stream::ended(updates, self.shutdown.clone(), cut_off)))
+            .flat_map(move |update| futures::stream::iter(messages(update, patterns.clone(), request.in_parts)));
+        Ok(Response::new(watch_stream::ended(updates, self.shutdown.clone(), cut_off())))
     }
 
     type WatchProjectionStream = BoxStream<'static, Result<v1::WatchProjectionResponse, Status>>;
@@ -283,9 +281,10 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
     async fn diff(&self, request: Request<v1::DiffRequest>) -> Result<Response<v1::DiffResponse>, Status> {
         let request = request.into_inner();
         few(request.patterns.len(), "patterns")?;
+        let same = v1::DiffRequest { page_bytes: 0, page_token: String::new(), to_revision: None, ..request.clone() };
         let patterns: Vec<FactPattern> = each(request.patterns, "patterns")?;
         let from = Revision(request.from_revision);
-        let place = paging::place(&request.page_token)?;
+        let place = paging::place(&request.page_token, &same)?;
         let page = Page::of(request.page_bytes, &request.page_token);
         let to = place.map(|(to, _)| Revision(to)).or(request.to_revision.map(Revision));
         let (between, to) = self.actor.request(|answer| Message::Diff { from, to, answer }).await?;
@@ -302,7 +301,7 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
             Ok((filled.items, more))
         };
         let (differences, more) = self.long_reads.read(read).await?;
-        let next_page_token = paging::token(more, to.0, seen + differences.len());
+        let next_page_token = paging::token(more, to.0, seen + differences.len(), &same);
         Ok(Response::new(v1::DiffResponse { differences, to_revision: to.0, next_page_token }))
     }
 
@@ -363,53 +362,79 @@ impl v1::world_pool_service_server::WorldPoolService for Service {
     }
 }
 
-/// What of an update a watcher of these patterns is told; nothing, when none of it.
-fn told(update: &Update, patterns: &[FactPattern]) -> Option<WorldUpdate> {
+/// What a watch ends with that did not end by itself.
+fn cut_off() -> Status {
+    let message = "the watch has ended, for it was too slow or the disk failed: watch again";
+    retry_later(Code::Unavailable, "WATCH_AGAIN", message, WATCH_AGAIN_AFTER)
+}
+
+type Messages = Box<dyn Iterator<Item = Result<v1::WorldPoolServiceWatchResponse, Status>> + Send>;
+
+/// What of an update a watcher of these patterns is told, each message made when it is wanted. Where the history keeps a revision no more that
+/// it has still to tell of, the watcher was too slow.
+fn messages(update: Update, patterns: Arc<[FactPattern]>, in_parts: bool) -> Messages {
     match update {
-        Update::Snapshot(world) => {
-            let facts = world.iter().filter(|(key, _)| wanted(key, patterns));
-            let facts = facts.map(|(key, fact)| record((key.clone(), fact.clone()))).collect();
-            Some(WorldUpdate::Snapshot { revision: world.revision(), facts })
-        }
-        Update::Revision(kept) => {
-            let (mut written, mut gone) = (Vec::new(), Vec::new());
-            for (key, fact) in kept.written.iter().filter(|(key, _)| wanted(key, patterns)) {
-                match fact {
-                    Some(fact) => written.push(record((key.as_ref().clone(), fact.as_ref().clone()))),
-                    None => gone.push(key.as_ref().clone()),
-                }
-            }
-            let nothing = written.is_empty() && gone.is_empty() && !patterns.is_empty();
-            let (revision, commit, writer) = (kept.world.revision(), kept.commit.to_string(), kept.writer.clone());
-            (!nothing).then_some(WorldUpdate::Changed(WorldChange { revision, commit, written, gone, writer }))
-        }
+        Update::Snapshot(root) => Box::new(snapshot(root, patterns, in_parts)),
+        Update::Revision(kept) => match kept.upgrade() {
+            Some(kept) => Box::new(change(&kept, &patterns).into_iter()),
+            None => Box::new(std::iter::once(Err(cut_off()))),
+        },
     }
 }
 
-/// A snapshot in messages that are not too large; a revision that is too large as that, so that the client begins anew.
-fn messages(
-    message: v1::WorldPoolServiceWatchResponse,
+/// What holds, in messages that are not too large.
+fn snapshot(
+    root: Weak<Kept>,
+    patterns: Arc<[FactPattern]>,
     in_parts: bool,
-) -> Vec<Result<v1::WorldPoolServiceWatchResponse, Status>> {
-    use v1::world_pool_service_watch_response::Kind;
-    let mut snapshot = match message.kind {
-        Some(Kind::Snapshot(snapshot)) => snapshot,
-        Some(Kind::Change(ref change)) if change.encoded_len() > MAX_PAGE_BYTES + MAX_PAGE_BYTES / 2 => {
-            let message = "the revision changed more than a message has room for: watch again without a revision";
-            return vec![Err(status(Code::OutOfRange, "REVISION_TOO_LARGE", message))];
+) -> impl Iterator<Item = Result<v1::WorldPoolServiceWatchResponse, Status>> {
+    let revision = root.upgrade().map_or(0, |root| root.world.revision().0);
+    let mut behind: Option<FactKey> = None;
+    let parts = paging::snapshot_parts(in_parts, move |page, part| {
+        let root = root.upgrade().ok_or_else(cut_off)?;
+        let facts: Box<dyn Iterator<Item = (&FactKey, &Fact)>> = match &behind {
+            Some(key) => Box::new(root.world.iter_behind(key)),
+            None => Box::new(root.world.iter()),
+        };
+        let (mut before, mut last) = (None, None);
+        let facts = facts.filter(|(key, _)| wanted(key, &patterns)).map(|(key, fact)| {
+            (before, last) = (last, Some(key));
+            v1::Fact::from(record((key.clone(), fact.clone())))
+        });
+        let more = page.fill(facts, part)?;
+        let last = before.cloned();
+        // The last one that was looked at had no room.
+        behind = if more { last } else { None };
+        Ok(more)
+    });
+    parts.map(move |part| {
+        let (facts, more) = part?;
+        let snapshot = v1::WorldSnapshot { facts, more, revision };
+        let kind = v1::world_pool_service_watch_response::Kind::Snapshot(snapshot);
+        Ok(v1::WorldPoolServiceWatchResponse { kind: Some(kind) })
+    })
+}
+
+/// A revision, where some of it is wanted; one that is too large for a message as that, so that the client begins anew.
+fn change(kept: &Kept, patterns: &[FactPattern]) -> Option<Result<v1::WorldPoolServiceWatchResponse, Status>> {
+    let (mut written, mut gone) = (Vec::new(), Vec::new());
+    for (key, fact) in kept.written.iter().filter(|(key, _)| wanted(key, patterns)) {
+        match fact {
+            Some(fact) => written.push(record((key.as_ref().clone(), fact.as_ref().clone()))),
+            None => gone.push(key.as_ref().clone()),
         }
-        _ => return vec![Ok(message)],
-    };
-    let parts = match paging::snapshot_parts(std::mem::take(&mut snapshot.facts), in_parts) {
-        Ok(parts) => parts,
-        Err(too_large) => return vec![Err(too_large)],
-    };
-    let last = parts.len() - 1;
-    let part = |(index, facts)| {
-        let snapshot = v1::WorldSnapshot { facts, more: index < last, revision: snapshot.revision };
-        Ok(v1::WorldPoolServiceWatchResponse { kind: Some(Kind::Snapshot(snapshot)) })
-    };
-    parts.into_iter().enumerate().map(part).collect()
+    }
+    if written.is_empty() && gone.is_empty() && !patterns.is_empty() {
+        return None;
+    }
+    let (revision, commit, writer) = (kept.world.revision(), kept.commit.to_string(), kept.writer.clone());
+    let change = WorldUpdate::Changed(WorldChange { revision, commit, written, gone, writer });
+    let message = v1::WorldPoolServiceWatchResponse::from(change);
+    if message.encoded_len() > MAX_PAGE_BYTES + MAX_PAGE_BYTES / 2 {
+        let message = "the revision changed more than a message has room for: watch again without a revision";
+        return Some(Err(status(Code::OutOfRange, "REVISION_TOO_LARGE", message)));
+    }
+    Some(Ok(message))
 }
 
 fn wanted(key: &FactKey, patterns: &[FactPattern]) -> bool {

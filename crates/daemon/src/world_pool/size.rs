@@ -36,8 +36,12 @@ pub(super) fn of_changes(changes: &[Change]) -> usize {
 pub(super) fn of_footprint(footprint: &Footprint) -> usize {
     match footprint {
         Footprint::Everything => 0,
-        Footprint::Patterns(patterns) => patterns.iter().map(of_pattern).sum(),
+        Footprint::Patterns(patterns) => of_patterns(patterns),
     }
+}
+
+pub(super) fn of_patterns(patterns: &[FactPattern]) -> usize {
+    patterns.iter().map(of_pattern).sum()
 }
 
 fn of_pattern(pattern: &FactPattern) -> usize {

@@ -89,6 +89,15 @@ pub(super) fn lease_ended(lease: LeaseId) -> Status {
     status(Code::FailedPrecondition, "LEASE_ENDED", message)
 }
 
+/// One that was never given looks the same as one that the resource manager has just given: so it is to be asked for again.
+pub(super) fn lease_not_known(lease: LeaseId) -> Status {
+    let message = format!(
+        "{lease} is not known to the world pool: it was never given, or holds nothing, or the resource manager has not told of it yet; ask \
+         again, or project without a lease"
+    );
+    retry_later(Code::Unavailable, "LEASE_NOT_KNOWN", message, RETRY_DELAY)
+}
+
 pub(super) fn lease_of_another(lease: LeaseId, opened_by: &str, caller: &Caller) -> Status {
     let message = format!(
         "{lease} is of a session of `{opened_by}`, and the projection is asked for by `{caller}`: acquire a lease of your own; only agents \

@@ -14,7 +14,7 @@ mod world;
 
 use crate::MAX_PORTS_BYTES;
 use prost::Message as _;
-use ratn_model::name::is_unseen;
+use ratn_model::name::{KIND_RULE, is_kind, is_unseen};
 use ratn_model::value::Value;
 use std::collections::BTreeMap;
 use std::fmt;
@@ -186,6 +186,23 @@ pub fn label(text: &str, field: &str) -> Result<(), Malformed> {
 /// [`Malformed`] of the first that is none.
 pub fn names(texts: &[String], field: &str) -> Result<(), Malformed> {
     texts.iter().enumerate().try_for_each(|(i, text)| name(text, &format!("{field}[{i}]")))
+}
+
+/// That texts are kinds that a resource can have.
+///
+/// # Errors
+/// [`Malformed`] of the first that is none.
+pub fn kinds(texts: &[String], field: &str) -> Result<(), Malformed> {
+    texts.iter().enumerate().try_for_each(|(i, text)| kind(text, &format!("{field}[{i}]")))
+}
+
+/// That a text is a kind that a resource can have.
+///
+/// # Errors
+/// [`Malformed`] where it is none.
+pub fn kind(text: &str, field: &str) -> Result<(), Malformed> {
+    name(text, field)?;
+    if is_kind(text) { Ok(()) } else { Err(Malformed::new(field, format!("is `{text}`: it must be {KIND_RULE}"))) }
 }
 
 fn finite(number: f64, field: impl fmt::Display) -> Result<f64, Malformed> {

@@ -525,7 +525,7 @@ impl TryFrom<v1::ListRequest> for ResourceFilter {
         few(request.kinds.len(), "kinds")?;
         few(request.attributes.len(), "attributes")?;
         few(request.conditions.len(), "conditions")?;
-        names(&request.kinds, "kinds")?;
+        super::kinds(&request.kinds, "kinds")?;
         Ok(ResourceFilter {
             kinds: request.kinds,
             class: class(request.class)?,

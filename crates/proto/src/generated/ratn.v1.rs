@@ -3319,8 +3319,8 @@ pub struct CommitResponse {
     /// The root's revision with them.
     #[prost(uint64, tag = "1")]
     pub revision: u64,
-    /// The projections that show something now that is not so any more, in the order of ids, as many as a message has room for; empty for
-    /// an answer that was given before.
+    /// The projections that show something now that is not so any more, each in the answer to the first commit that contradicts it, in the
+    /// order of ids, as many as a message has room for; empty for an answer that was given before.
     #[prost(message, repeated, tag = "2")]
     pub contradictions: ::prost::alloc::vec::Vec<Contradiction>,
 }

@@ -3,6 +3,7 @@
 use crate::failure::Failure;
 use clap::{Args, Subcommand};
 use ratn_model::condition::Condition;
+use ratn_model::id::LeaseId;
 use ratn_model::name::{KIND_RULE, is_kind};
 use ratn_model::resource::{Quantity, ResourceClass};
 use ratn_model::value::Value;
@@ -45,9 +46,9 @@ pub(super) enum ResourceCommand {
     Block(HoldArguments),
     /// End a lease of any holder
     Release {
-        /// Its number, as `list` shows it
+        /// Its number, as `list` shows it, or `lease-17` as messages write it
         #[arg(value_name = "LEASE")]
-        lease: u64,
+        lease: LeaseId,
     },
     /// Say whether such resources exist, free or not; exit code 1 when not
     Exists(Selector),

@@ -18,7 +18,6 @@ use crate::repainting::{self, json_text};
 use crate::system::public_directory;
 use anyhow::Context;
 use arguments::{ResourceCommand, Selector};
-use ratn_model::id::LeaseId;
 use ratn_model::resource::{Quantity, Requirement, ResourceOperation};
 use ratn_proto::types::{Resource, ResourceFilter};
 use ratn_worker::client::{Channels, ResourceClient};
@@ -91,7 +90,7 @@ impl Asking {
             ResourceCommand::Block(held) => return hold::block(self, held).await,
             ResourceCommand::Consume(held) => return hold::consume(self, held).await,
             ResourceCommand::Release { lease } => {
-                let released = client.release(LeaseId(*lease)).await.context("not released")?;
+                let released = client.release(*lease).await.context("not released")?;
                 if !released {
                     return Err(anyhow::anyhow!("lease {lease} had ended before, or never was").into());
                 }

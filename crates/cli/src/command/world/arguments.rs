@@ -2,6 +2,7 @@
 
 use clap::{Args, Subcommand, ValueEnum};
 use ratn_model::fact::{FactKey, FactPattern};
+use ratn_model::id::Revision;
 use ratn_worker::client::{fact, pattern};
 use ratn_worker::endpoint::Endpoint;
 use std::path::PathBuf;
@@ -30,7 +31,7 @@ pub(super) enum WorldCommand {
         patterns: Vec<FactPattern>,
         /// As they were at this revision
         #[arg(long, value_name = "REVISION")]
-        at: Option<u64>,
+        at: Option<Revision>,
         /// As the `world` of a task file
         #[arg(long)]
         task: bool,
@@ -48,7 +49,7 @@ pub(super) enum WorldCommand {
         sparql: bool,
         /// Of the root as it was at this revision
         #[arg(long, value_name = "REVISION")]
-        at: Option<u64>,
+        at: Option<Revision>,
         /// Show at most so many answers
         #[arg(long, value_name = "N", default_value_t = 1_000)]
         limit: usize,
@@ -57,10 +58,10 @@ pub(super) enum WorldCommand {
     Diff {
         /// The one
         #[arg(value_name = "FROM")]
-        from: u64,
+        from: Revision,
         /// The other; the root as it is unless given
         #[arg(value_name = "TO")]
-        to: Option<u64>,
+        to: Option<Revision>,
         /// Only facts that match, `at(?)`; may be repeated
         #[arg(long = "only", value_name = "PATTERN", value_parser = pattern)]
         patterns: Vec<FactPattern>,
@@ -78,7 +79,7 @@ pub(super) enum WorldCommand {
         patterns: Vec<FactPattern>,
         /// Every revision after this instead, without the facts
         #[arg(long, value_name = "REVISION")]
-        after: Option<u64>,
+        after: Option<Revision>,
     },
     /// Write all facts to standard output, exactly
     Dump {
@@ -87,7 +88,7 @@ pub(super) enum WorldCommand {
         format: Format,
         /// As they were at this revision
         #[arg(long, value_name = "REVISION")]
-        at: Option<u64>,
+        at: Option<Revision>,
     },
     /// Commit the facts of a dump, all as one revision or none
     Load {

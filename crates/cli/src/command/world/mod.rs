@@ -97,24 +97,24 @@ impl Asking {
                 repainting::repeat(true, self.json, look).await?;
             }
             WorldCommand::Facts { patterns, at, task, watch: false } => {
-                let (revision, facts) = client.root_at(at.map(Revision), patterns).await?;
+                let (revision, facts) = client.root_at(*at, patterns).await?;
                 let text = || if *task { task_text::world(&facts) } else { show::facts(&facts) };
                 self.show(&dump::json(revision, &facts), text)?;
                 if facts.is_empty() && !patterns.is_empty() {
-                    let (_, all) = client.root_at(at.map(Revision), &[]).await?;
+                    let (_, all) = client.root_at(*at, &[]).await?;
                     unheard_of(patterns.iter().map(|pattern| pattern.predicate.as_str()), &all);
                 }
             }
             #[cfg(feature = "sparql")]
             WorldCommand::Query { query, sparql: true, at, limit } => {
-                self.sparql(query, at.map(Revision), *limit).await?;
+                self.sparql(query, *at, *limit).await?;
             }
             WorldCommand::Query { query, at, limit, .. } => {
-                self.query(query, at.map(Revision), *limit).await?;
+                self.query(query, *at, *limit).await?;
             }
             WorldCommand::Diff { from, to, patterns } => {
-                let (differences, to) = client.diff(Revision(*from), to.map(Revision), patterns).await?;
-                let json = show::differences_json(Revision(*from), to, &differences);
+                let (differences, to) = client.diff(*from, *to, patterns).await?;
+                let json = show::differences_json(*from, to, &differences);
                 self.show(&json, || show::differences(&differences))?;
             }
             WorldCommand::History { fact } => {
@@ -122,9 +122,9 @@ impl Asking {
                 let json = show::versions_json(oldest, &versions);
                 self.show(&json, || show::versions(fact, oldest, &versions))?;
             }
-            WorldCommand::Watch { patterns, after } => self.watch(patterns, after.map(Revision)).await?,
+            WorldCommand::Watch { patterns, after } => self.watch(patterns, *after).await?,
             WorldCommand::Dump { format, at } => {
-                let (revision, facts) = client.root_at(at.map(Revision), &[]).await?;
+                let (revision, facts) = client.root_at(*at, &[]).await?;
                 output::result(match format {
                     Format::Json => serde_json::to_string_pretty(&dump::json(revision, &facts)).context("the facts")?,
                     Format::Turtle => turtle::write(&facts)?.trim_end().to_owned(),

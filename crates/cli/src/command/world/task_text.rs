@@ -10,6 +10,8 @@ use std::f64::consts::FRAC_PI_2;
 
 /// A smaller number keeps all its digits.
 const SMALL: f64 = 1e-3;
+/// A larger number is whole, and is written with its exponent.
+const LARGE: f64 = 1e16;
 /// So near to a pitch of a right angle roll and yaw turn about one axis.
 const UPRIGHT: f64 = 1.0 - 1e-9;
 /// Words that an expression does not read as texts.
@@ -84,6 +86,9 @@ fn rounded(number: f64) -> String {
     if number != 0.0 && number.abs() < SMALL && number.abs() >= 1e-6 {
         return format!("{number:.9}").trim_end_matches('0').trim_end_matches('.').to_owned();
     }
+    if number.abs() >= LARGE {
+        return format!("{number:?}");
+    }
     let fixed = format!("{number:.6}");
     let short = fixed.trim_end_matches('0').trim_end_matches('.');
     if short == "-0" { "0".to_owned() } else { short.to_owned() }
@@ -134,6 +139,9 @@ mod tests {
             Value::Bool(true),
             Value::Int(-7),
             Value::Float(2.0),
+            Value::Float(1e300),
+            Value::Float(-1.5e16),
+            Value::Joints(vec![1e300, 0.5]),
             Value::String("box_1".to_owned()),
             Value::String("true".to_owned()),
             Value::String("it's: a \"left\" hand # 2\\".to_owned()),

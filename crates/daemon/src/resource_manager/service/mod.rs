@@ -207,6 +207,8 @@ impl v1::resource_service_server::ResourceService for Service {
         &self,
         request: Request<v1::ResourceServiceWatchRequest>,
     ) -> Result<Response<Self::WatchStream>, Status> {
-        watches::watch(&self.requests, request.into_inner(), self.shutdown.clone()).await.map(Response::new)
+        let reader =
+            watches::Reader { caller: Caller::of(&request), quotas: request.extensions().get::<Quotas>().cloned() };
+        watches::watch(&self.requests, reader, request.into_inner(), self.shutdown.clone()).await.map(Response::new)
     }
 }

@@ -7,7 +7,7 @@ use crate::paging::{self, Filled, Page};
 use crate::resource_manager::actor::Message;
 use crate::resource_manager::wire;
 use ratn_model::resource::{Requirement, ResourceClass};
-use ratn_proto::convert::{name, required};
+use ratn_proto::convert::{kind, name, required};
 use ratn_proto::types::{ENDPOINT_ATTRIBUTE, Resource, ResourceFilter};
 use ratn_proto::v1;
 use ratn_resources::{Reply, Request, ResourceSpec, Search};
@@ -101,6 +101,7 @@ pub(super) async fn delete(
 
 pub(super) async fn exists(requests: &Requests, request: v1::ExistsRequest) -> Result<v1::ExistsResponse, Status> {
     let requirement: Requirement = required(request.requirement, "requirement")?;
+    kind(&requirement.kind, "requirement.kind")?;
     let wanted = requirement.count;
     let mut search = Search::new(requirement, MOST_IDS);
     loop {

@@ -2,18 +2,24 @@
 
 use super::Streamed;
 use super::requests::Requests;
+use crate::access::Caller;
 use crate::details::{retry_later, status};
 use crate::paging;
+use crate::quota::Quotas;
 use crate::resource_manager::actor::Message;
 use crate::resource_manager::watch_filter::WatchFilter;
+use crate::resource_manager::watch_message::WatchMessage;
+use crate::resource_manager::wire;
 use crate::watch_stream;
 use futures::StreamExt;
 use ratn_model::id::Revision;
-use ratn_proto::convert::{few, names};
+use ratn_proto::convert::{few, kinds, names};
 use ratn_proto::types::WatchPosition;
 use ratn_proto::v1;
+use ratn_resources::{Holding, ResourceView};
+use ratn_worker::gate::Permit;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Status};
 
@@ -24,11 +30,12 @@ const WATCH_AGAIN_AFTER: Duration = Duration::from_millis(50);
 
 pub(super) async fn watch(
     requests: &Requests,
+    reader: Reader,
     request: v1::ResourceServiceWatchRequest,
     shutdown: CancellationToken,
 ) -> Result<Streamed<v1::ResourceServiceWatchResponse>, Status> {
     few(request.kinds.len(), "kinds")?;
-    names(&request.kinds, "kinds")?;
+    kinds(&request.kinds, "kinds")?;
     names(&request.resource_ids, "resource_ids")?;
     if request.resource_ids.len() > MAX_WATCHED {
         let there = request.resource_ids.len();
@@ -44,28 +51,58 @@ pub(super) async fn watch(
     let watch = |answer| Message::Watch { after, filter: filter.clone(), answer };
     let updates = requests.counted("watch", requests.actor().request(watch).await)?;
     let updates = tokio_stream::wrappers::ReceiverStream::new(updates)
-        .flat_map(move |told| futures::stream::iter(told.updates(&filter, after)))
-        .flat_map(move |update| futures::stream::iter(messages(update.into(), in_parts)));
+        .flat_map(move |told| futures::stream::iter(messages(told, &filter, after, in_parts, &reader)));
     let message = "the watch has ended, for it was too slow: watch again";
     let cut_off = retry_later(Code::Unavailable, "WATCH_AGAIN", message, WATCH_AGAIN_AFTER);
     Ok(watch_stream::ended(updates, shutdown, cut_off))
 }
 
-/// A snapshot in messages that are not too large; anything else as it is.
+/// Who watches, for what it has not read yet.
+#[derive(Debug)]
+pub(super) struct Reader {
+    pub(super) caller: Caller,
+    /// None where the server has no quotas.
+    pub(super) quotas: Option<Quotas>,
+}
+
+impl Reader {
+    /// A snapshot is kept for it until it has read all of it.
+    fn keep(&self, resources: &[ResourceView]) -> Result<Option<Permit>, Status> {
+        let holders: usize = resources.iter().map(|view| view.holders.live().count()).sum();
+        let bytes = std::mem::size_of_val(resources) + holders * size_of::<Holding>();
+        let kept = self.quotas.as_ref().map(|quotas| quotas.unread(&self.caller, bytes, Instant::now()));
+        Ok(kept.transpose()?.flatten())
+    }
+}
+
+type Messages = Box<dyn Iterator<Item = Result<v1::ResourceServiceWatchResponse, Status>> + Send>;
+
+/// A snapshot in messages that are not too large, each made when it is wanted; anything else as it is.
 fn messages(
-    message: v1::ResourceServiceWatchResponse,
+    told: WatchMessage,
+    filter: &WatchFilter,
+    after: Option<WatchPosition>,
     in_parts: bool,
-) -> Vec<Result<v1::ResourceServiceWatchResponse, Status>> {
-    use v1::resource_service_watch_response::Kind;
-    let Some(Kind::Snapshot(mut snapshot)) = message.kind else { return vec![Ok(message)] };
-    let parts = match paging::snapshot_parts(std::mem::take(&mut snapshot.resources), in_parts) {
-        Ok(parts) => parts,
-        Err(too_large) => return vec![Err(too_large)],
+    reader: &Reader,
+) -> Messages {
+    let WatchMessage::Snapshot { revision, resources, youngest } = told else {
+        return Box::new(told.updates(filter, after).into_iter().map(|update| Ok(update.into())));
     };
-    let last = parts.len() - 1;
-    let part = |(index, resources)| {
-        let snapshot = v1::ResourceSnapshot { resources, more: index < last, ..snapshot.clone() };
-        Ok(v1::ResourceServiceWatchResponse { kind: Some(Kind::Snapshot(snapshot)) })
+    let kept = match reader.keep(&resources) {
+        Ok(kept) => kept,
+        Err(refused) => return Box::new(std::iter::once(Err(refused))),
     };
-    parts.into_iter().enumerate().map(part).collect()
+    let mut at = 0;
+    let parts = paging::snapshot_parts(in_parts, move |page, part| {
+        let _kept = &kept;
+        let more = page.fill(resources[at..].iter().map(|view| wire::resource(view).into()), part)?;
+        at += part.items.len();
+        Ok(more)
+    });
+    Box::new(parts.map(move |part| {
+        let (resources, more) = part?;
+        let snapshot = v1::ResourceSnapshot { resources, more, revision: revision.0, youngest_lease_id: youngest.0 };
+        let kind = v1::resource_service_watch_response::Kind::Snapshot(snapshot);
+        Ok(v1::ResourceServiceWatchResponse { kind: Some(kind) })
+    }))
 }
