@@ -1,0 +1,155 @@
+//! Random regions that share facts: what each decides, and computes, is by what the other has really done when it comes to its place, in both
+//! modes. They hold motions alone, of two units and with durations that are never over at the same moment: so both modes do the same at the
+//! same times.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
+
+mod support;
+
+use ratn_executive::protocol::Mode;
+use ratn_simulation::run::Run;
+use std::fmt::Write;
+use support::script::Script;
+use support::{MODES, NoFiles, acts, facts, load};
+
+/// A random task, written line by line.
+struct Writer {
+    dice: u64,
+    text: String,
+    names: u64,
+    actuator: usize,
+}
+
+impl Writer {
+    fn below(&mut self, limit: u64) -> u64 {
+        self.dice = self.dice.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.dice >> 33) % limit
+    }
+
+    fn fact(&mut self) -> String {
+        format!("f{}()", self.below(3))
+    }
+
+    fn line(&mut self, depth: usize, line: &str) {
+        let _ = writeln!(self.text, "{}{line}", "  ".repeat(depth));
+    }
+
+    fn motion(&mut self, depth: usize, inputs: &str, effect: &str) {
+        self.names += 1;
+        let number = self.names;
+        // No sum of some of them is one of others.
+        let duration =
+            0.3 + 0.17 * self.below(20) as f64 + 0.000_137 * number as f64 + 0.000_001_9 * (number * number) as f64;
+        let [of, unit] = [["arm/move", "Arm"], ["head/turn", "Head"]][self.actuator];
+        let what = format!("pia: true, reads: [], {inputs}effects: ['{effect}'], resources: [{{ block: {unit} }}]");
+        self.line(depth, &format!("- m{number}: {{ action: {of}, {what}, duration: {duration:.7} }}"));
+    }
+
+    /// A motion that changes what is shared, or says what it has found.
+    fn any_motion(&mut self, depth: usize) {
+        let (fact, other, number) = (self.fact(), self.fact(), self.below(3));
+        let own = format!("said{}()", self.names + 1);
+        match self.below(5) {
+            0 => self.motion(depth, "", &format!("{fact} = {number}")),
+            1 => self.motion(depth, "", &format!("increase {fact} by 1")),
+            2 => self.motion(depth, "", &format!("{fact} = {other}")),
+            3 => self.motion(depth, "", &format!("{own} = {fact}")),
+            _ => self.motion(depth, &format!("in: {{ a: {fact} }}, "), &format!("{own} = 1")),
+        }
+    }
+
+    fn part(&mut self, depth: usize, within: u64) {
+        let kind = if within == 0 { 0 } else { self.below(9) };
+        if kind < 4 {
+            return self.any_motion(depth);
+        }
+        self.names += 1;
+        let (name, fact, limit) = (format!("s{}", self.names), self.fact(), self.below(3));
+        self.line(depth, &format!("- {name}:"));
+        let inside = depth + 2;
+        match kind {
+            4 => {
+                self.line(inside, &format!("condition: {fact} > {limit}"));
+                for branch in ["then:", "else:"] {
+                    self.line(inside, branch);
+                    self.parts(inside + 1, within - 1, 2);
+                }
+            }
+            5 => {
+                self.line(inside, &format!("for: each{} in range(0, {fact})", self.names));
+                self.line(inside, "do:");
+                self.parts(inside + 1, within - 1, 1);
+            }
+            6 => {
+                self.line(inside, &format!("index: i{}", self.names));
+                self.line(inside, &format!("while: $i{} < 3 and {fact} < {}", self.names, limit + 1));
+                self.line(inside, "do:");
+                self.parts(inside + 1, within - 1, 2);
+            }
+            7 => {
+                self.line(inside, "routine: true");
+                self.line(inside, "states:");
+                self.parts(inside + 1, within - 1, 2);
+            }
+            _ => {
+                let seen = format!("v{}", self.names);
+                self.line(inside, &format!("variables: {{ {seen}: {fact} }}"));
+                let given = self.fact();
+                self.line(inside, &format!("outputs: {{ v: {{ value: {given} }} }}"));
+                self.line(inside, "states:");
+                self.parts(inside + 1, within - 1, 2);
+                let own = format!("said{}()", self.names + 1);
+                self.motion(inside + 1, "", &format!("{own} = ${seen}"));
+                let own = format!("said{}()", self.names + 1);
+                self.motion(depth, "", &format!("{own} = {name}.v"));
+            }
+        }
+    }
+
+    fn parts(&mut self, depth: usize, within: u64, most: u64) {
+        for _ in 0..=self.below(most) {
+            self.part(depth, within);
+        }
+    }
+}
+
+fn task(seed: u64) -> String {
+    let mut writer =
+        Writer { dice: seed.wrapping_mul(0x9e37_79b9_7f4a_7c15), text: String::new(), names: 0, actuator: 0 };
+    writer.line(0, "task: t\nworld: ['f0() = 0', 'f1() = 1', 'f2() = 2']\nstates:\n  - both:");
+    writer.line(3, "concurrency: barrier");
+    writer.line(3, "regions:");
+    for (actuator, region) in ["left", "right"].into_iter().enumerate() {
+        writer.actuator = actuator;
+        writer.line(4, &format!("- {region}:"));
+        writer.line(6, "shared: ['f0()', 'f1()', 'f2()']");
+        writer.line(6, "states:");
+        for _ in 0..4 {
+            writer.part(7, 2);
+        }
+    }
+    writer.line(1, "- all:");
+    writer.line(3, "outputs: { v: { value: 'f0() + 10 * f1() + 100 * f2()' } }");
+    writer.line(3, "states: []");
+    writer.motion(1, "", "found() = all.v");
+    writer.text
+}
+
+#[test]
+fn regions_that_share_facts_end_alike_in_both_modes() {
+    let first: u64 = std::env::var("RATN_FIRST").map_or(0, |first| first.parse().unwrap());
+    let count: u64 = std::env::var("RATN_PROGRAMS").map_or(150, |count| count.parse().unwrap());
+    for seed in first..first + count {
+        let text = task(seed);
+        let program = load(&text, "task.yaml", &NoFiles);
+        let end = |mode: Mode| {
+            let run: Run =
+                Script::default().run(&program, mode).unwrap_or_else(|problem| panic!("{seed}: {problem}\n{text}"));
+            let acts = acts(&program, &run);
+            (run.outcome.clone(), run.reason.clone(), facts(&run), acts)
+        };
+        let [hsm, cdtn] = MODES.map(end);
+        assert_eq!(hsm.0, "success", "{seed}: {}\n{text}", hsm.1);
+        assert_eq!(hsm, cdtn, "{seed}\n{text}");
+    }
+}
