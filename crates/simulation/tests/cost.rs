@@ -264,9 +264,9 @@ states:
     )
 }
 
-/// The same, with a list of a text of each iteration.
+/// The same, with a list of ten texts of each iteration.
 fn collecting_ahead(iterations: usize) -> String {
-    let each = "      outputs: { texts: { each: \"concat('iteration ', $i)\", type: list<string> } }\n      do:";
+    let each = "      outputs: { texts: { each: \"repeat(concat('iteration ', $i), 10)\", type: list<list<string>> } }\n      do:";
     computing_ahead(iterations).replace("      do:", each)
 }
 

@@ -63,7 +63,7 @@ impl Entered {
     }
 
     /// A part of it is real.
-    fn is_made_of(&mut self, part: Began) {
+    fn part_is_real(&mut self, part: Began) {
         let is_earlier = || part.held_until == self.began.held_until && part.knows < self.began.knows;
         if self.routine.is_none() && (part.is_since(&self.began) || is_earlier()) {
             self.began = part;
@@ -186,7 +186,7 @@ impl Beginnings {
         for path in inside.states {
             let Some(entered) = self.entered.get_mut(&path) else { continue };
             if let Some(part) = entered.parts.remove(&instance).filter(|_| is_real) {
-                entered.is_made_of(part);
+                entered.part_is_real(part);
             }
             if entered.routine == Some(instance) {
                 self.entered.remove(&path);

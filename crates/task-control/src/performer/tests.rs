@@ -1418,6 +1418,7 @@ async fn what_others_change_stands_against_the_effects_of_a_composite_state_whos
             };
             bench.performer.accept(held.into(), &World::default());
             bench.performer.perform(start(InstanceId(instance), 2, "work", LeaseId(2), ""))?;
+            bench.performer.perform(Command::Note(Note::Retired { instance: InstanceId(instance) }))?;
         }
         if let Some(left) = left {
             done = bench.performer.perform(left.clone());
