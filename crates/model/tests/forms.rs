@@ -200,6 +200,27 @@ states:
 }
 
 #[test]
+fn a_region_removes_nothing_that_another_one_sees() {
+    let said = |first: &str, second: &str| {
+        findings(&format!(
+            "task: t\nstates:\n  - make: {{ action: gripper/release, pia: true, effects: [], resources: [{{ block: Gripper }}, {{ create: Token, class: task, with: {{ colour: red }} }}] }}\n  - both:\n      concurrency: barrier\n      regions:\n        - left: {{ action: gripper/release, pia: true, effects: [], resources: [{{ block: Gripper }}, {{ {first} }}] }}\n        - right: {{ action: pan_tilt/look_at, in: {{ target: \"pose(1, 0, 0)\" }}, pia: true, effects: [], resources: [{{ block: PanTilt }}, {{ {second} }}] }}\n"
+        ))
+    };
+    for (first, second, is_refused) in [
+        ("delete: Token, class: task", "block: Token", true),
+        ("exists: Token", "delete: Token, class: task", true),
+        ("create: Token, class: task", "exists: Token", true),
+        ("create: Token, class: task", "block: Token", false),
+        ("block: Token", "block: Token", false),
+        ("delete: Token, class: task, where: { colour: red }", "block: Token, where: { colour: red }", true),
+        ("delete: Token, class: task, where: { colour: red }", "block: Token, where: { colour: blue }", false),
+    ] {
+        let found = said(first, second);
+        assert_eq!(found.contains("region-conflict"), is_refused, "{first} beside {second}: {found}");
+    }
+}
+
+#[test]
 fn what_computes_and_does_not_say_what_it_reads_may_read_what_another_region_changes() {
     let said = |reads: &str| {
         findings(&format!(
@@ -207,6 +228,7 @@ fn what_computes_and_does_not_say_what_it_reads_may_read_what_another_region_cha
         ))
     };
     assert!(said("").contains("region-conflict"), "{}", said(""));
+    assert!(said("").contains("`both/right` says no `reads`"), "{}", said(""));
     assert!(!said(", reads: ['weight(?)']").contains("region-conflict"), "{}", said(", reads: ['weight(?)']"));
 }
 

@@ -434,7 +434,7 @@ impl Simulation<'_> {
             Entry::Loss { lease, instance, attempt } => {
                 self.lose(lease)?;
                 // In reality what is performed under it ends before anything else begins there.
-                self.busy.given_back(lease);
+                self.busy.given_back(lease).ok();
                 Event::Crashed { instance, attempt, reason: "its lease was lost".to_owned(), unknown: false }
             }
         };
@@ -583,9 +583,13 @@ impl Simulation<'_> {
             }
             Command::Release { lease, projection, .. } => {
                 if let Some(lease) = lease {
-                    self.busy.given_back(lease);
+                    let given_back = self.busy.given_back(lease);
                     self.leases.remove(&lease);
                     if !self.lost.contains(&lease) {
+                        given_back.map_err(|instance| {
+                            let path = self.paths.get(&instance).cloned().unwrap_or_default();
+                            self.broken(format!("{lease} is given back while {path} is under way under it"))
+                        })?;
                         self.pool.release(self.now, Some(&self.session), lease).map_err(|e| self.broken(e))?;
                     }
                 }

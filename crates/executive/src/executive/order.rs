@@ -13,6 +13,9 @@
 //! - before the removal that it follows, where nothing is committed in between;
 //! - else before the removal that follows it, or before the acquires where none does.
 //!
+//! A goal is told to stop before what it was given is given back: a cancellation goes before the removal that it follows, too, where nothing is
+//! committed in between.
+//!
 //! A commit stays behind the removals that it follows in the program: where one of these is refused, nothing behind it becomes real.
 
 use crate::protocol::Command;
@@ -21,8 +24,16 @@ use ratn_model::resource::{Requirement, ResourceOperation};
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
-/// Where a command stands: its part, its place in the program, whether it is there before or behind what has that place, and its priority.
-type Place = (u8, usize, u8, Reverse<i64>);
+/// Where a command stands: its part, its place in the program, its turn among those that have the same one, and its priority.
+type Place = (u8, usize, Turn, Reverse<i64>);
+
+/// Before what has a place of its own, goals are told to stop, and then what they held is given back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Turn {
+    Stop,
+    GiveBack,
+    Own,
+}
 
 /// The commands of one event as they are performed. What one event both asked for and withdrew is not asked for.
 pub(super) fn in_order(commands: Vec<Command>) -> Vec<Command> {
@@ -33,11 +44,17 @@ pub(super) fn in_order(commands: Vec<Command>) -> Vec<Command> {
     let commands = without_withdrawn(commands);
     let removes = commands.iter().any(removes);
     let place = |(number, command): (usize, &Command)| match command {
-        Command::Release { instance, .. } if removes => release(&commands, number, *instance),
-        Command::Acquire { priority, .. } => (1, 0, 0, Reverse(*priority)),
-        Command::Release { .. } => (2, 0, 0, Reverse(0)),
-        Command::End { .. } => (3, 0, 0, Reverse(0)),
-        _ => (0, number, 1, Reverse(0)),
+        Command::Release { instance, .. } if removes => {
+            (0, release(&commands, number, *instance), Turn::GiveBack, Reverse(0))
+        }
+        Command::Cancel { .. } if removes => match removal_before(&commands, number) {
+            Some(removal) => (0, removal, Turn::Stop, Reverse(0)),
+            None => (0, number, Turn::Own, Reverse(0)),
+        },
+        Command::Acquire { priority, .. } => (1, 0, Turn::Own, Reverse(*priority)),
+        Command::Release { .. } => (2, 0, Turn::Own, Reverse(0)),
+        Command::End { .. } => (3, 0, Turn::Own, Reverse(0)),
+        _ => (0, number, Turn::Own, Reverse(0)),
     };
     let places: Vec<Place> = commands.iter().enumerate().map(place).collect();
     let mut ordered: Vec<(Place, Command)> = places.into_iter().zip(commands).collect();
@@ -45,20 +62,22 @@ pub(super) fn in_order(commands: Vec<Command>) -> Vec<Command> {
     ordered.into_iter().map(|(_, command)| command).collect()
 }
 
-/// The place of a release beside removals.
-fn release(commands: &[Command], number: usize, instance: InstanceId) -> Place {
-    let commits = |command: &Command| matches!(command, Command::Commit { .. });
+/// The number of the command that a release goes before, beside removals.
+fn release(commands: &[Command], number: usize, instance: InstanceId) -> usize {
     let is_own = |command: &Command| matches!(command, Command::Commit { instance: of, .. } if *of == instance);
     let own = commands.iter().rposition(is_own).filter(|own| *own > number);
-    let before = own.is_none().then(|| {
-        let since = commands[..number].iter().rposition(commits).map_or(0, |commit| commit + 1);
-        commands[since..number].iter().position(removes).map(|removal| since + removal)
-    });
     let behind = || {
         let from = own.unwrap_or(number);
         commands[from..].iter().position(removes).map_or(commands.len(), |removal| from + removal)
     };
-    (0, before.flatten().unwrap_or_else(behind), 0, Reverse(0))
+    own.is_none().then(|| removal_before(commands, number)).flatten().unwrap_or_else(behind)
+}
+
+/// The first removal since the last commit before a command.
+fn removal_before(commands: &[Command], number: usize) -> Option<usize> {
+    let commits = |command: &Command| matches!(command, Command::Commit { .. });
+    let since = commands[..number].iter().rposition(commits).map_or(0, |commit| commit + 1);
+    commands[since..number].iter().position(removes).map(|removal| since + removal)
 }
 
 fn without_withdrawn(mut commands: Vec<Command>) -> Vec<Command> {
@@ -99,7 +118,7 @@ mod tests {
     use ratn_model::id::{LeaseId, Revision};
 
     /// Commands by a letter and the number of an instance: `c` commits, `d` deletes, `n` creates, `r` gives back, `a` asks (the lower the number the
-    /// more urgent), `w` withdraws, `e` ends.
+    /// more urgent), `w` withdraws, `x` stops a goal, `e` ends.
     fn command(said: &str) -> Command {
         let number = said[1..].parse().unwrap_or(0);
         let instance = InstanceId(number);
@@ -119,6 +138,7 @@ mod tests {
                 Command::Acquire { instance, requirements: Vec::new(), priority: -i64::try_from(number).unwrap_or(0) }
             }
             "w" => Command::Withdraw { instance },
+            "x" => Command::Cancel { instance, attempt: 1 },
             _ => Command::End { outcome: String::new(), outputs: BTreeMap::new(), reason: String::new() },
         }
     }
@@ -131,6 +151,7 @@ mod tests {
             Command::Release { instance, .. } => format!("r{}", instance.0),
             Command::Acquire { instance, .. } => format!("a{}", instance.0),
             Command::Withdraw { instance } => format!("w{}", instance.0),
+            Command::Cancel { instance, .. } => format!("x{}", instance.0),
             _ => "e".to_owned(),
         }
     }
@@ -159,6 +180,15 @@ mod tests {
         check("r1 c1 d1 c0 a2", "c1 r1 d1 c0 a2");
         check("c1 d1 r1 c0 a2", "c1 r1 d1 c0 a2");
         check("c1 d1 r1 c0 d0 c5", "c1 r1 d1 c0 d0 c5");
+    }
+
+    #[test]
+    fn a_goal_is_told_to_stop_before_what_it_holds_goes_back() {
+        check("c1 d1 x2 r2", "c1 x2 r2 d1");
+        check("c1 d1 r2 x2", "c1 x2 r2 d1");
+        check("c1 d1 x2 c3 r2", "c1 x2 d1 c3 r2");
+        check("x2 c1 d1 r2", "x2 c1 r2 d1");
+        check("c1 x2 r2", "c1 x2 r2");
     }
 
     #[test]

@@ -5,9 +5,9 @@ use super::graph::Point;
 use super::{Subject, expressions};
 use crate::diagnostic::Findings;
 use crate::expression::scope::NothingKnown;
-use crate::expression::{EffectExpr, FactExpr};
+use crate::expression::{EffectExpr, Expr, FactExpr};
 use crate::fact::{FactPattern, Footprint};
-use crate::program::{Nature, Program, State, StateKind};
+use crate::program::{Nature, Program, ResourceExpr, State, StateKind};
 use crate::resource::ResourceOperation;
 use std::collections::BTreeSet;
 
@@ -85,31 +85,27 @@ fn nodes(program: &Program, state: &State) -> usize {
 }
 
 /// What the states of a region touch.
-struct Touched {
+struct Touched<'a> {
     reads: Footprint,
+    /// The first state that computes without saying what it reads.
+    reads_everything: Option<String>,
     writes: Footprint,
     shared: Vec<FactExpr>,
     assigns: BTreeSet<String>,
     uses: BTreeSet<String>,
-    /// Kinds of resources that it makes, removes or uses up, holds, and asks for.
-    created: BTreeSet<String>,
-    removed: BTreeSet<String>,
-    held: BTreeSet<String>,
-    looked_for: BTreeSet<String>,
+    resources: Vec<&'a ResourceExpr>,
     unannotated: Option<String>,
 }
 
-fn touched(program: &Program, region: &State) -> Touched {
+fn touched<'a>(program: &'a Program, region: &'a State) -> Touched<'a> {
     let mut touched = Touched {
         reads: Footprint::NOTHING,
+        reads_everything: None,
         writes: Footprint::NOTHING,
         shared: Vec::new(),
         assigns: BTreeSet::new(),
         uses: BTreeSet::new(),
-        created: BTreeSet::new(),
-        removed: BTreeSet::new(),
-        held: BTreeSet::new(),
-        looked_for: BTreeSet::new(),
+        resources: Vec::new(),
         unannotated: None,
     };
     let mut declared: BTreeSet<&String> = BTreeSet::new();
@@ -122,15 +118,7 @@ fn touched(program: &Program, region: &State) -> Touched {
         touched.assigns.extend(state.assign.iter().map(|(name, _)| name.clone()));
         let expressions = expressions(program, state);
         touched.uses.extend(expressions.iter().flat_map(|(_, e)| e.variables()).map(str::to_owned));
-        for line in &annotations.resources {
-            let kinds = match line.operation {
-                ResourceOperation::Create => &mut touched.created,
-                ResourceOperation::Delete | ResourceOperation::Consume => &mut touched.removed,
-                ResourceOperation::Block => &mut touched.held,
-                ResourceOperation::Exists => &mut touched.looked_for,
-            };
-            kinds.insert(line.kind.clone());
-        }
+        touched.resources.extend(&annotations.resources);
         let is_action = matches!(state.kind, StateKind::Action { .. });
         let looked_up = expressions.iter().flat_map(|(_, e)| e.fact_expressions());
         let named = annotations.reads.iter().flatten().chain(annotations.senses());
@@ -140,6 +128,7 @@ fn touched(program: &Program, region: &State) -> Touched {
         // Who moves without a word of what it reads is warned of below, and is in nobody's way here.
         if says_no_reads && annotations.nature == Nature::Computes {
             touched.reads = Footprint::Everything;
+            touched.reads_everything.get_or_insert_with(|| state.path.clone());
         }
         let open_writes = is_action
             && annotations.nature != Nature::Computes
@@ -159,16 +148,29 @@ fn touched(program: &Program, region: &State) -> Touched {
 }
 
 /// A kind of resource that one makes, removes or uses up, and of which the other one sees a difference. Who wants to hold what is made waits for it.
-fn clash<'a>(one: &'a Touched, other: &Touched) -> Option<&'a String> {
-    let meets = |kinds: &'a BTreeSet<String>, seen: &[&BTreeSet<String>]| {
-        kinds.iter().find(|kind| seen.iter().any(|seen| seen.contains(*kind)))
+fn clash<'a>(one: &Touched<'a>, other: &Touched<'_>) -> Option<&'a str> {
+    use ResourceOperation::{Block, Consume, Create, Delete, Exists};
+    let sees = |changed: &ResourceExpr, seen: &ResourceExpr| match changed.operation {
+        Delete | Consume => true,
+        Create => matches!(seen.operation, Create | Exists),
+        Block | Exists => false,
     };
-    meets(&one.removed, &[&other.removed, &other.created, &other.held, &other.looked_for])
-        .or_else(|| meets(&one.created, &[&other.created, &other.looked_for]))
+    let meets =
+        |changed: &ResourceExpr| other.resources.iter().any(|seen| may_be_one(changed, seen) && sees(changed, seen));
+    one.resources.iter().find(|changed| meets(changed)).map(|changed| changed.kind.as_str())
+}
+
+/// Whether some resource may be meant by both: they are of one kind, and of no attribute do they say two values.
+fn may_be_one(a: &ResourceExpr, b: &ResourceExpr) -> bool {
+    let differ = |(name, value): &(String, Expr)| {
+        let other = b.attributes.iter().find(|(other, _)| other == name).map(|(_, other)| other);
+        matches!((value, other), (Expr::Literal(one), Some(Expr::Literal(another))) if one != another)
+    };
+    a.kind == b.kind && !a.attributes.iter().any(differ)
 }
 
 fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings) {
-    let all: Vec<Touched> = regions.iter().map(|region| touched(subject.program, region)).collect();
+    let all: Vec<Touched<'_>> = regions.iter().map(|region| touched(subject.program, region)).collect();
     // Who watches a region changes nothing.
     let is_watched = regions.iter().any(|region| region.is_watch());
     for (region, touched) in regions.iter().zip(&all) {
@@ -212,10 +214,17 @@ fn conflicts(subject: &Subject<'_>, regions: &[&State], findings: &mut Findings)
             // Who watches a region ends it in the moment in which a fact is written.
             let is_watched = regions[i].is_watch() || other.is_watch();
             let fact = fact.filter(|_| !is_watched);
+            let together = "put them into one region";
+            let help = match (&fact, first.reads_everything.as_ref().or(second.reads_everything.as_ref())) {
+                (None, _) => together.to_owned(),
+                (Some(_), None) => format!("{together}, or mark the facts as `shared` if the order does not matter"),
+                (Some(_), Some(path)) => format!(
+                    "`{path}` says no `reads`, and so may read every fact: say which, {together}, or mark the facts as `shared` if the order does not matter"
+                ),
+            };
             if let Some(what) = fact.or(variable).or(resource) {
                 let message =
                     format!("this region and `{}` both touch {what}, and nothing says in which order", other.name);
-                let help = "put them into one region, or mark the facts as `shared` if the order does not matter";
                 let region = regions[i];
                 findings.error("region-conflict", region.location, &region.path, message, help);
             }

@@ -57,8 +57,10 @@ impl Busy {
         self.goals.retain(|_, goal| (goal.0, goal.1) != (instance, attempt));
     }
 
-    /// A lease goes back: in reality when the goals under it have ended.
-    pub(super) fn given_back(&mut self, lease: LeaseId) {
+    /// A lease goes back; an error is the instance whose goal under it has neither ended nor been told to stop: nobody would tell it any more.
+    pub(super) fn given_back(&mut self, lease: LeaseId) -> Result<(), InstanceId> {
+        let under_way = self.goals.values().find(|goal| goal.2 == lease).map(|goal| goal.0);
         self.goals.retain(|_, goal| goal.2 != lease);
+        under_way.map_or(Ok(()), Err)
     }
 }

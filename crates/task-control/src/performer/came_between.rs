@@ -65,6 +65,20 @@ impl fmt::Display for Overtaken {
     }
 }
 
+/// Asks anew where others have made the oldest revision leave the pool since that was asked for.
+pub(super) async fn retry_forgotten<T, F>(mut ask: impl FnMut() -> F) -> Result<T, CallError>
+where
+    F: Future<Output = Result<T, CallError>>,
+{
+    for _ in 1..TRIES {
+        match ask().await {
+            Err(error) if error.reason() == FORGOTTEN => {}
+            answered => return answered,
+        }
+    }
+    ask().await
+}
+
 impl ChangedByOthers {
     /// What others than a run have changed behind a revision, as far as the pool keeps that, up to another one that it has had.
     pub(super) async fn of(
@@ -73,14 +87,7 @@ impl ChangedByOthers {
         behind: Revision,
         up_to: Revision,
     ) -> Result<ChangedByOthers, CallError> {
-        for _ in 1..TRIES {
-            match ChangedByOthers::asked(world, run, behind, up_to).await {
-                // Others have made the oldest one leave since it was asked for.
-                Err(error) if error.reason() == FORGOTTEN => {}
-                answered => return answered,
-            }
-        }
-        ChangedByOthers::asked(world, run, behind, up_to).await
+        retry_forgotten(|| ChangedByOthers::asked(world, run, behind, up_to)).await
     }
 
     async fn asked(

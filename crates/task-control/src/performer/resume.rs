@@ -12,7 +12,7 @@
 
 use super::Performer;
 use super::acquiring::late_request;
-use super::came_between::{CameBetween, ChangedByOthers, Untouched, refuse};
+use super::came_between::{CameBetween, ChangedByOthers, Untouched, refuse, retry_forgotten};
 use super::goal::Given;
 use crate::decided::{Unanswered, Undone, insist};
 use crate::ledger::{Confirmed, Ledger, WentBack, operation_request};
@@ -29,8 +29,7 @@ use ratn_model::resource::{Requirement, ResourceOperation};
 use ratn_model::time::Timestamp;
 use ratn_model::value::Value;
 use ratn_proto::types::{Resource, WorldUpdate};
-use ratn_worker::client::retry_unanswered;
-use ratn_worker::client::{Channels, ResourceClient, WorldClient};
+use ratn_worker::client::{CallError, Channels, ResourceClient, WorldClient, retry_unanswered};
 use ratn_worker::session::Trust;
 use ratn_world::world::World;
 use std::borrow::Cow;
@@ -110,19 +109,25 @@ struct There {
 }
 
 /// How many of the ledger's commits the pool has: they were made in order, so those up to the youngest that it tells of.
-async fn youngest_there(world: &WorldClient, ledger: &Ledger, root: Revision) -> anyhow::Result<There> {
+async fn youngest_there(world: &WorldClient, ledger: &Ledger, root: Revision) -> Result<There, CallError> {
+    // Where many others commit, what is told of may leave the pool before it was read.
+    retry_unanswered(|| retry_forgotten(|| youngest_told(world, ledger, root))).await
+}
+
+async fn youngest_told(world: &WorldClient, ledger: &Ledger, root: Revision) -> Result<There, CallError> {
     // Any fact says how far back the pool can tell.
     let any = FactKey { predicate: "at".to_owned(), arguments: Vec::new() };
-    let (_, oldest) = retry_unanswered(|| world.history(any.clone())).await?;
+    let (_, oldest) = world.history(any).await?;
     let after = oldest.max(ledger.first_revision);
     let run = &ledger.origin.run;
     let ids: BTreeMap<String, usize> =
         ledger.commits.iter().enumerate().map(|(place, decided)| (decided.id(run), place + 1)).collect();
-    let mut watch = retry_unanswered(|| world.watch(Some(after), &[])).await?;
+    let mut watch = world.watch(Some(after), &[]).await?;
     let (mut told, mut youngest) = (after, None);
     while told < root {
         let Some(WorldUpdate::Changed(change)) = watch.next().await? else {
-            bail!("the world pool does not tell of its revisions up to {root}");
+            let reason = format!("it does not tell of its revisions up to {root}");
+            return Err(CallError::Broken { endpoint: world.endpoint().clone(), reason });
         };
         told = change.revision;
         youngest = ids.get(&change.commit).map(|count| (*count, told)).or(youngest);
