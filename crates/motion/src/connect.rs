@@ -238,7 +238,17 @@ fn grow_with(
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<(Vec<State>, usize), ConnectError> {
     let (lower, upper) = (with(start, space.limits().0, joints), with(start, space.limits().1, joints));
-    grow_by(space, start, ends, (iterations, range), || samples.next(&lower, &upper), control)
+    let mut drawn = 0;
+    let sample = || {
+        drawn += 1;
+        samples.next(&lower, &upper)
+    };
+    let found = grow_by(space, start, ends, (iterations, range), sample, control);
+    if let Ok((_, used)) = &found {
+        // The others were drawn ahead; the next arm begins with them.
+        samples.take_back(drawn - used);
+    }
+    found
 }
 
 /// Searches a path from `start` to a posture that meets one of `targets`: several postures for each, all of them roots of one
