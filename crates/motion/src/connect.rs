@@ -6,13 +6,14 @@
 //!
 //! The same space, ends, seed and budget give the same path. The caller is asked every `POLL` iterations whether to go on.
 
+use crate::ahead::Ahead;
 use crate::branches::{together, with};
 use crate::ellipsoid;
 use crate::joint_vector::JointVector;
 use crate::pace::Control;
 use crate::reach::{Reach, Target};
 use crate::sobol::Sobol;
-use crate::space::{Space, State, between, difference, distance, length};
+use crate::space::{Space, State, between, difference, distance, length, towards};
 use crate::tree::Tree;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -40,8 +41,9 @@ const DOMAIN_CHANGE: f32 = 1e-4;
 /// twice as large, a shut-in tree gets half of the samples that it needs. From 0.3 to 0.8 the times differ little.
 const BALANCE: f32 = 0.67;
 
-/// A tree is shut in where so many times as many of its motions failed as it has nodes. What gets out then goes on towards its sample, as long as the
-/// way is free and nearer to the other tree than before: the next motion out would take as many attempts. Elsewhere that finds little, and makes paths longer.
+/// A tree is shut in where so many times as many of its motions failed as it has nodes. Its motions are then looked at several at once
+/// ([`Ahead`]). What gets out goes on towards its sample, as long as the way is free and nearer to the other tree than before: the next motion
+/// out would take as many attempts. Elsewhere that finds little, and makes paths longer.
 const SHUT_IN: usize = 8;
 
 /// After so many samples, each so many extensions of nodes that have failed before one is shorter, by this factor: what is shut in finds its way
@@ -236,7 +238,17 @@ fn grow_with(
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<(Vec<State>, usize), ConnectError> {
     let (lower, upper) = (with(start, space.limits().0, joints), with(start, space.limits().1, joints));
-    grow_by(space, start, ends, (iterations, range), || samples.next(&lower, &upper), control)
+    let mut drawn = 0;
+    let sample = || {
+        drawn += 1;
+        samples.next(&lower, &upper)
+    };
+    let found = grow_by(space, start, ends, (iterations, range), sample, control);
+    if let Ok((_, used)) = &found {
+        // The others were drawn ahead; the next arm begins with them.
+        samples.take_back(drawn - used);
+    }
+    found
 }
 
 /// Searches a path from `start` to a posture that meets one of `targets`: several postures for each, all of them roots of one
@@ -378,19 +390,13 @@ fn join(space: &mut Space, tree: &mut Tree, other: &Tree, mut node: usize, range
     Joining { gap, met: Some((node, meeting)) }
 }
 
-/// The posture at most so far from another on the straight way to a third.
-fn towards(from: &State, to: &State, at_most: f32) -> State {
-    let far = distance(from, to);
-    if far <= at_most { *to } else { between(from, to, at_most / far) }
-}
-
 /// Grows a tree from the start and one from all ends, which are free, until they meet; gives the path and the iterations.
 fn grow_by(
     space: &mut Space,
     start: &State,
     ends: &[State],
     (iterations, range): (usize, f32),
-    mut sample: impl FnMut() -> State,
+    sample: impl FnMut() -> State,
     control: &mut dyn FnMut(usize) -> Control,
 ) -> Result<(Vec<State>, usize), ConnectError> {
     let joints = space.joints();
@@ -404,6 +410,12 @@ fn grow_by(
     let (domain, least_domain) = (DOMAIN * apart, LEAST_DOMAIN * first_range);
     // Which tree grows towards the sample, and how many of its motions failed.
     let (mut growing, mut failed) = (1, [0, 0]);
+    let is_shut_in = |failed: usize, tree: &Tree| failed >= SHUT_IN * tree.len();
+    let step = |iteration: usize, radius: f32| {
+        let may_be_short = iteration > SHORT_FROM && iteration.is_multiple_of(SHORT_EVERY);
+        if may_be_short && radius.is_finite() { SHORT * range } else { range }
+    };
+    let mut ahead = Ahead::new(sample);
     // Where nothing may be left between postures, an iteration takes as long as many others.
     let poll = if space.is_swept() { 1 } else { POLL };
     for iteration in 1..=iterations {
@@ -414,47 +426,53 @@ fn grow_by(
         if others < BALANCE * own {
             growing = 1 - growing;
         }
-        let sample = sample();
         let (first, second) = trees.split_at_mut(1);
         let (tree, other) = if growing == 0 { (&mut first[0], &second[0]) } else { (&mut second[0], &first[0]) };
-        let (near, far) = tree.nearest(&sample);
+        if is_shut_in(failed[growing], tree) && !ahead.knows_next(growing) {
+            // A search that has failed so often is likely to go on as long.
+            let wanted = failed[growing].min(iterations - iteration + 1);
+            ahead.look(space, (growing, tree), wanted, |after, radius| step(iteration + after, radius));
+        }
+        let drawn = ahead.next(growing);
+        let sample = drawn.sample;
+        let (near, far) = drawn.nearest.unwrap_or_else(|| tree.nearest(&sample));
         if tree.radii[near] < far {
             continue;
         }
         let from = tree.states[near];
-        let may_be_short = iteration > SHORT_FROM && iteration.is_multiple_of(SHORT_EVERY);
-        let is_short = may_be_short && tree.radii[near].is_finite();
-        let step = if is_short { SHORT * range } else { range };
-        let mut to = if far <= step { sample } else { between(&from, &sample, step / far) };
-        if !space.is_free_motion(&from, &to) {
+        let step = step(iteration, tree.radii[near]);
+        let next = if drawn.touches == Some(step) { None } else { Some(towards(&from, &sample, far, step)) };
+        let Some(mut to) = next.filter(|to| space.is_free_motion(&from, to)) else {
             failed[growing] += 1;
             let radius = &mut tree.radii[near];
             *radius = if radius.is_infinite() { domain } else { (*radius * (1.0 - DOMAIN_CHANGE)).max(least_domain) };
             continue;
-        }
+        };
+        let first = tree.len();
         let mut node = tree.push(to, near);
         if tree.radii[near].is_finite() {
             tree.radii[near] *= 1.0 + DOMAIN_CHANGE;
         }
-        let is_shut_in = failed[growing] >= SHUT_IN * tree.len();
         // No gap is less than none.
-        let mut least_gap = if is_shut_in { other.nearest(&from).1 } else { 0.0 };
+        let mut least_gap = if is_shut_in(failed[growing], tree) { other.nearest(&from).1 } else { 0.0 };
         let joined = loop {
             let joining = join(space, tree, other, node, range);
             if joining.met.is_some() {
                 break joining.met;
             }
-            if joining.gap >= least_gap || distance(&to, &sample) == 0.0 {
+            let far = distance(&to, &sample);
+            if joining.gap >= least_gap || far == 0.0 {
                 break None;
             }
             least_gap = joining.gap;
-            let next = towards(&to, &sample, step);
+            let next = towards(&to, &sample, far, step);
             if !space.is_free_motion(&to, &next) {
                 break None;
             }
             node = tree.push(next, node);
             to = next;
         };
+        ahead.grown(growing, tree, first);
         if let Some((node, meeting)) = joined {
             let (mut path, rest) = (tree.branch(node), other.branch(meeting));
             path.reverse();

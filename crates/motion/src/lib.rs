@@ -3,6 +3,7 @@
 //! A pure library: no clock, no threads, no ambient randomness. The caller says through a callback when time is up, and
 //! hands in the seed.
 
+mod ahead;
 pub mod aimm;
 mod along;
 pub mod arm;

@@ -87,19 +87,46 @@ impl Sobol {
             let unit = (self.digits[j] >> 8) as i32 as f32 * WORTH;
             *position = lower[j] + (upper[j] - lower[j]) * unit;
         }
+        self.change();
+        self.index = self.index.wrapping_add(1);
+        state
+    }
+
+    /// Takes back so many samples, which come next then.
+    pub(crate) fn take_back(&mut self, count: usize) {
+        for _ in 0..count {
+            self.index = self.index.wrapping_sub(1);
+            self.change();
+        }
+    }
+
+    /// Changes what differs between the sample of this index and the next one.
+    #[inline]
+    fn change(&mut self) {
         // After all samples of 32 digits it begins anew.
         let changed = self.index.trailing_ones() as usize % DIGITS;
-        self.index = self.index.wrapping_add(1);
         for (digits, direction) in self.digits.iter_mut().zip(&DIRECTIONS[changed]) {
             *digits ^= direction;
         }
-        state
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn samples_that_are_taken_back_come_again() {
+        let (lower, upper) = ([0.0; MAX_JOINTS], [1.0; MAX_JOINTS]);
+        let mut sobol = Sobol::new(5);
+        let first: Vec<State> = (0..100).map(|_| sobol.next(&lower, &upper)).collect();
+        for count in [100, 1, 37, 64] {
+            sobol.take_back(count);
+            for (at, sample) in first.iter().enumerate().skip(100 - count) {
+                assert_eq!(sobol.next(&lower, &upper), *sample, "sample {at} after {count} were taken back");
+            }
+        }
+    }
 
     #[test]
     fn every_power_of_two_of_samples_has_one_in_each_part_of_every_joint() {

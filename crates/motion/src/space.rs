@@ -49,7 +49,7 @@ const ALL: Among = Among { depth: 0, lanes: 0 };
 const SMALL_CLOUD: usize = 1_000;
 
 /// Postures of the widest batch.
-const WIDEST: usize = 16;
+pub(crate) const WIDEST: usize = 16;
 
 /// Something that stands still.
 #[derive(Debug, Clone, PartialEq)]
@@ -179,6 +179,17 @@ impl Space {
         !self.blocked && self.check(state, &[0.0; MAX_JOINTS], 1, ALL)
     }
 
+    /// Which of up to [`WIDEST`] postures touch something that was touched lately, a bit each.
+    pub(crate) fn touching_again(&mut self, states: &[State]) -> u32 {
+        let mut positions = [Block([0.0; WIDEST]); MAX_JOINTS];
+        for (lane, state) in states.iter().enumerate() {
+            for (positions, position) in positions[..self.joints()].iter_mut().zip(state) {
+                positions.0[lane] = *position;
+            }
+        }
+        self.isa.touching_again(&self.compiled, &positions, states.len(), &mut self.scratch)
+    }
+
     /// Whether a straight motion touches nothing; `from` itself is not looked at.
     #[inline]
     pub fn is_free_motion(&mut self, from: &State, to: &State) -> bool {
@@ -285,6 +296,12 @@ pub fn distance(a: &State, b: &State) -> f32 {
 #[inline]
 pub fn between(a: &State, b: &State, fraction: f32) -> State {
     std::array::from_fn(|j| a[j] + (b[j] - a[j]) * fraction)
+}
+
+/// The posture at most so far from another on the straight way to a third, which is `far` from it.
+#[inline]
+pub(crate) fn towards(from: &State, to: &State, far: f32, at_most: f32) -> State {
+    if far <= at_most { *to } else { between(from, to, at_most / far) }
 }
 
 /// How far a point is from an obstacle, in metres; zero inside.

@@ -1,5 +1,6 @@
 //! A tree of free postures, laid out for the vector scan of `simd::nearest`.
 
+use crate::mechanism::MAX_JOINTS;
 use crate::simd::{Block, Isa};
 use crate::space::{State, distance};
 
@@ -46,6 +47,22 @@ impl Tree {
     pub(crate) fn nearest(&self, to: &State) -> (usize, f32) {
         let index = self.isa.nearest(&self.blocks, self.joints, to);
         (index, distance(&self.states[index], to))
+    }
+
+    /// The nearest node of each of up to sixteen postures, and its distance.
+    pub(crate) fn nearest_each(&self, to: &[State]) -> [(usize, f32); 16] {
+        let mut goals = [Block([0.0; 16]); MAX_JOINTS];
+        for (lane, state) in to.iter().enumerate() {
+            for (goal, position) in goals[..self.joints].iter_mut().zip(state) {
+                goal.0[lane] = *position;
+            }
+        }
+        let indices = self.isa.nearest_each(&self.blocks, &self.states, &goals[..self.joints]);
+        let mut nearest = [(0, 0.0); 16];
+        for ((nearest, index), to) in nearest.iter_mut().zip(indices).zip(to) {
+            *nearest = (index as usize, distance(&self.states[index as usize], to));
+        }
+        nearest
     }
 
     /// From a node to its root.

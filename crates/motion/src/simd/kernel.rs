@@ -151,8 +151,10 @@ impl Visitor for First {
 /// Lists of what is near, one for each level of a swept check.
 pub(crate) const DEPTH: usize = 4;
 
-/// Contacts that are remembered: what was in the way of a motion is often in the way of the next one, too.
-const CONTACTS: usize = 4;
+/// Contacts that are remembered: what was in the way of a motion is often in the way of the next one, too. How many of them a motion is first
+/// looked at beside: what they cost is in vain for motions that are free.
+const CONTACTS: usize = 32;
+const LATEST: usize = 8;
 
 /// Room for one batch.
 #[derive(Debug, Clone)]
@@ -229,6 +231,39 @@ pub(crate) struct Among {
     pub(crate) lanes: u32,
 }
 
+/// Where the joints are in the postures of a batch.
+trait Postures<V> {
+    /// So many times the position of a joint.
+    fn position(&self, joint: usize, factor: f32) -> V;
+}
+
+/// Postures along an edge, a lane for each, by how far along it they are.
+struct Along<'a, V> {
+    edge: &'a Edge<'a>,
+    at: V,
+}
+
+impl<V: Lanes> Postures<V> for Along<'_, V> {
+    #[inline(always)]
+    fn position(&self, joint: usize, factor: f32) -> V {
+        let (start, delta) = (self.edge.start[joint] * factor, self.edge.delta[joint] * factor);
+        self.at.mul_add(V::splat(delta), V::splat(start))
+    }
+}
+
+/// A part of sixteen postures that have nothing to do with each other: a block per joint.
+struct Each<'a> {
+    positions: &'a [Block],
+    part: usize,
+}
+
+impl<V: Lanes> Postures<V> for Each<'_> {
+    #[inline(always)]
+    fn position(&self, joint: usize, factor: f32) -> V {
+        V::load_part(&self.positions[joint], self.part).mul(V::splat(factor))
+    }
+}
+
 /// Places the robot's frames in the postures of a batch. Those of one batch are spread over the whole edge, later batches fill the gaps, so
 /// that the first most likely finds what is in the way.
 #[inline(always)]
@@ -239,20 +274,25 @@ pub(super) fn pose<V: Lanes>(edge: &Edge<'_>, batch: usize, scratch: &mut Scratc
     }
     let back = 1.0 / (V::WIDTH * edge.batches) as f32;
     let at = V::load(&fractions).sub(V::splat(batch as f32 * back));
-    scratch.batch += 1;
-    kinematics(edge, at, scratch);
+    kinematics(edge.compiled, &Along { edge, at }, scratch);
+}
+
+/// Places the robot's frames in a part of sixteen postures, as many as there are lanes; of each joint a block.
+#[inline(always)]
+pub(super) fn pose_each<V: Lanes>(compiled: &Compiled, positions: &[Block], part: usize, scratch: &mut Scratch) {
+    kinematics::<V>(compiled, &Each { positions, part }, scratch);
 }
 
 /// Shows a visitor all contacts in the postures of the batch, and says whether it went on to the end.
 #[inline(always)]
-pub(super) fn walk<V: Lanes, F: Visitor>(edge: &Edge<'_>, scratch: &mut Scratch, visitor: &mut F) -> bool {
-    in_obstacles::<V, F>(edge, scratch, visitor) && in_itself::<V, F>(edge, scratch, visitor)
+pub(super) fn walk<V: Lanes, F: Visitor>(compiled: &Compiled, scratch: &mut Scratch, visitor: &mut F) -> bool {
+    in_obstacles::<V, F>(compiled, scratch, visitor) && in_itself::<V, F>(compiled, scratch, visitor)
 }
 
 /// As [`walk`], where only what was near in some of these lanes is looked at.
 #[inline(always)]
 pub(super) fn walk_among<V: Lanes, F: Visitor>(
-    edge: &Edge<'_>,
+    compiled: &Compiled,
     (near, lanes): (&[Near], u32),
     scratch: &mut Scratch,
     visitor: &mut F,
@@ -260,9 +300,9 @@ pub(super) fn walk_among<V: Lanes, F: Visitor>(
     for Near { group, other, .. } in near.iter().filter(|near| near.lanes & lanes != 0) {
         let group = *group as usize;
         let goes_on = match other {
-            Other::Obstacle(number) => group_in_obstacle::<V, F>(edge, group, *number, V::ALL, scratch, visitor),
-            Other::Group(second) => groups_meet::<V, F>(edge, (group, *second as usize), scratch, visitor),
-            Other::Cloud(number) => group_in_cloud::<V, F>(edge, group, *number, V::ALL, scratch, visitor),
+            Other::Obstacle(number) => group_in_obstacle::<V, F>(compiled, group, *number, V::ALL, scratch, visitor),
+            Other::Group(second) => groups_meet::<V, F>(compiled, (group, *second as usize), scratch, visitor),
+            Other::Cloud(number) => group_in_cloud::<V, F>(compiled, group, *number, V::ALL, scratch, visitor),
         };
         if !goes_on {
             return false;
@@ -271,22 +311,11 @@ pub(super) fn walk_among<V: Lanes, F: Visitor>(
     true
 }
 
-/// Whether one of the remembered contacts is there again. It decides nothing that the whole check would not find.
+/// Whether one of the contacts remembered last is there again. It decides nothing that the whole check would not find.
 #[inline(always)]
-pub(super) fn touches_again<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
-    for i in 0..scratch.contacts.len() {
-        let Contact { group, other, spheres } = scratch.contacts[i];
-        let (at, radius) = fine_sphere::<V>(edge, (group, spheres.0), scratch);
-        let found = match other {
-            Other::Obstacle(obstacle) => meets(at, radius, &edge.compiled.obstacles[obstacle as usize]),
-            Other::Group(other) => {
-                let (other, more) = fine_sphere::<V>(edge, (other, spheres.1), scratch);
-                meet(at, other, radius + more)
-            }
-            // None is remembered.
-            Other::Cloud(_) => 0,
-        };
-        if found != 0 {
+pub(super) fn touches_again<V: Lanes>(compiled: &Compiled, scratch: &mut Scratch) -> bool {
+    for i in 0..scratch.contacts.len().min(LATEST) {
+        if touching_again::<V>(compiled, scratch.contacts[i], scratch) != 0 {
             scratch.contacts[..=i].rotate_right(1);
             return true;
         }
@@ -294,9 +323,42 @@ pub(super) fn touches_again<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) ->
     false
 }
 
+/// In which of these lanes one of all remembered contacts is there again.
 #[inline(always)]
-fn fine_sphere<V: Lanes>(edge: &Edge<'_>, (group, which): (u32, u32), scratch: &Scratch) -> ([V; 3], f32) {
-    let group = &edge.compiled.groups[group as usize];
+pub(super) fn all_touching_again<V: Lanes>(compiled: &Compiled, lanes: u32, scratch: &mut Scratch) -> u32 {
+    let mut left = lanes;
+    for i in 0..scratch.contacts.len() {
+        let found = touching_again::<V>(compiled, scratch.contacts[i], scratch) & left;
+        if found != 0 {
+            scratch.contacts[..=i].rotate_right(1);
+            left &= !found;
+            if left == 0 {
+                break;
+            }
+        }
+    }
+    lanes & !left
+}
+
+/// In which lanes a remembered contact is there again.
+#[inline(always)]
+fn touching_again<V: Lanes>(compiled: &Compiled, contact: Contact, scratch: &Scratch) -> u32 {
+    let Contact { group, other, spheres } = contact;
+    let (at, radius) = fine_sphere::<V>(compiled, (group, spheres.0), scratch);
+    match other {
+        Other::Obstacle(obstacle) => meets(at, radius, &compiled.obstacles[obstacle as usize]),
+        Other::Group(other) => {
+            let (other, more) = fine_sphere::<V>(compiled, (other, spheres.1), scratch);
+            meet(at, other, radius + more)
+        }
+        // None is remembered.
+        Other::Cloud(_) => 0,
+    }
+}
+
+#[inline(always)]
+fn fine_sphere<V: Lanes>(compiled: &Compiled, (group, which): (u32, u32), scratch: &Scratch) -> ([V; 3], f32) {
+    let group = &compiled.groups[group as usize];
     let sphere = &group.fine[which as usize];
     (place(&scratch.frames[group.frame], sphere), sphere[3])
 }
@@ -326,8 +388,9 @@ fn sin_cos<V: Lanes>(x: V) -> (V, V) {
 }
 
 #[inline(always)]
-fn kinematics<V: Lanes>(edge: &Edge<'_>, at: V, scratch: &mut Scratch) {
-    for (index, frame) in edge.compiled.frames.iter().enumerate() {
+fn kinematics<V: Lanes>(compiled: &Compiled, postures: &impl Postures<V>, scratch: &mut Scratch) {
+    scratch.batch += 1;
+    for (index, frame) in compiled.frames.iter().enumerate() {
         let parent = &scratch.frames[frame.parent];
         let o = &frame.origin;
         let mut r: [V; 9] = [V::splat(0.0); 9];
@@ -348,8 +411,7 @@ fn kinematics<V: Lanes>(edge: &Edge<'_>, at: V, scratch: &mut Scratch) {
                 t[row] = p[2].mul_add(V::splat(o[11]), p[1].mul_add(V::splat(o[10]), moved));
             }
         }
-        let (start, delta) = (edge.start[frame.joint] * frame.factor, edge.delta[frame.joint] * frame.factor);
-        let q = at.mul_add(V::splat(delta), V::splat(start));
+        let q = postures.position(frame.joint, frame.factor);
         if frame.slides {
             for row in 0..3 {
                 t[row] = r[3 * row + 2].mul_add(q, t[row]);
@@ -414,13 +476,13 @@ fn fetch<V: Lanes>(from: &[Block; 3]) -> [V; 3] {
 
 /// Fills in the centre of a group's bounding sphere, once per batch.
 #[inline(always)]
-fn approach<V: Lanes>(edge: &Edge<'_>, index: usize, scratch: &mut Scratch) {
+fn approach<V: Lanes>(compiled: &Compiled, index: usize, scratch: &mut Scratch) {
     if scratch.coarse_stamps[index] != scratch.batch {
         scratch.coarse_stamps[index] = scratch.batch;
-        let group = &edge.compiled.groups[index];
+        let group = &compiled.groups[index];
         let (at, grown) = &mut scratch.coarse[index];
         store(place::<V>(&scratch.frames[group.frame], &group.coarse), at);
-        *grown = scratch.growth.of::<V>(edge.compiled.rigids.len() + index, at);
+        *grown = scratch.growth.of::<V>(compiled.rigids.len() + index, at);
     }
 }
 
@@ -437,8 +499,7 @@ fn refine<V: Lanes>(group: &Group, index: usize, scratch: &mut Scratch) {
 }
 
 #[inline(always)]
-fn in_obstacles<V: Lanes, F: Visitor>(edge: &Edge<'_>, scratch: &mut Scratch, visitor: &mut F) -> bool {
-    let compiled = edge.compiled;
+fn in_obstacles<V: Lanes, F: Visitor>(compiled: &Compiled, scratch: &mut Scratch, visitor: &mut F) -> bool {
     for (index, rigid) in compiled.rigids.iter().enumerate() {
         let centre = place::<V>(&scratch.frames[rigid.frame], &rigid.coarse);
         let (at, grown) = &mut scratch.rigid[index];
@@ -460,7 +521,7 @@ fn in_obstacles<V: Lanes, F: Visitor>(edge: &Edge<'_>, scratch: &mut Scratch, vi
                 }
                 for group in rigid.groups.clone() {
                     let about = if rigid.groups.len() == 1 { about } else { V::ALL };
-                    if !group_in_obstacle::<V, F>(edge, group, number, about, scratch, visitor) {
+                    if !group_in_obstacle::<V, F>(compiled, group, number, about, scratch, visitor) {
                         return false;
                     }
                 }
@@ -477,7 +538,7 @@ fn in_obstacles<V: Lanes, F: Visitor>(edge: &Edge<'_>, scratch: &mut Scratch, vi
                 continue;
             }
             for group in rigid.groups.clone() {
-                if !group_in_cloud::<V, F>(edge, group, *number, about, scratch, visitor) {
+                if !group_in_cloud::<V, F>(compiled, group, *number, about, scratch, visitor) {
                     return false;
                 }
             }
@@ -489,16 +550,16 @@ fn in_obstacles<V: Lanes, F: Visitor>(edge: &Edge<'_>, scratch: &mut Scratch, vi
 /// Where a group meets an obstacle; `about` says where its bounding sphere does, if that is known, and else all lanes.
 #[inline(always)]
 fn group_in_obstacle<V: Lanes, F: Visitor>(
-    edge: &Edge<'_>,
+    compiled: &Compiled,
     index: usize,
     number: u32,
     mut about: u32,
     scratch: &mut Scratch,
     visitor: &mut F,
 ) -> bool {
-    let group = &edge.compiled.groups[index];
-    let obstacle = &edge.compiled.obstacles[number as usize];
-    approach::<V>(edge, index, scratch);
+    let group = &compiled.groups[index];
+    let obstacle = &compiled.obstacles[number as usize];
+    approach::<V>(compiled, index, scratch);
     let (at, grown) = &scratch.coarse[index];
     let grown = *grown;
     if about == V::ALL {
@@ -530,16 +591,16 @@ fn group_in_obstacle<V: Lanes, F: Visitor>(
 /// Where a group touches a cloud, in some lanes.
 #[inline(always)]
 fn group_in_cloud<V: Lanes, F: Visitor>(
-    edge: &Edge<'_>,
+    compiled: &Compiled,
     index: usize,
     number: u32,
     mut about: u32,
     scratch: &mut Scratch,
     visitor: &mut F,
 ) -> bool {
-    let group = &edge.compiled.groups[index];
-    let cloud = &*edge.compiled.clouds[number as usize];
-    approach::<V>(edge, index, scratch);
+    let group = &compiled.groups[index];
+    let cloud = &*compiled.clouds[number as usize];
+    approach::<V>(compiled, index, scratch);
     let (at, grown) = &scratch.coarse[index];
     let grown = *grown + cloud.radius;
     let mut cells = Block([0.0; 16]);
@@ -643,17 +704,17 @@ fn meet<V: Lanes>(a: [V; 3], b: [V; 3], reach: f32) -> u32 {
 
 /// Where links touch each other; the places of the rigid parts are known.
 #[inline(always)]
-fn in_itself<V: Lanes, F: Visitor>(edge: &Edge<'_>, scratch: &mut Scratch, visitor: &mut F) -> bool {
-    for pair in &edge.compiled.pairs {
+fn in_itself<V: Lanes, F: Visitor>(compiled: &Compiled, scratch: &mut Scratch, visitor: &mut F) -> bool {
+    for pair in &compiled.pairs {
         let (i, j) = (pair.first as usize, pair.second as usize);
         let ((at_a, more_a), (at_b, more_b)) = (&scratch.rigid[i], &scratch.rigid[j]);
-        let (a, b) = (&edge.compiled.rigids[i], &edge.compiled.rigids[j]);
+        let (a, b) = (&compiled.rigids[i], &compiled.rigids[j]);
         let reach = a.coarse[3] + b.coarse[3] + (more_a + more_b);
         if meet::<V>(fetch(at_a), fetch(at_b), reach) == 0 {
             continue;
         }
         for (i, j) in &pair.groups {
-            if !groups_meet::<V, F>(edge, (*i as usize, *j as usize), scratch, visitor) {
+            if !groups_meet::<V, F>(compiled, (*i as usize, *j as usize), scratch, visitor) {
                 return false;
             }
         }
@@ -664,14 +725,14 @@ fn in_itself<V: Lanes, F: Visitor>(edge: &Edge<'_>, scratch: &mut Scratch, visit
 /// Where two groups touch.
 #[inline(always)]
 fn groups_meet<V: Lanes, F: Visitor>(
-    edge: &Edge<'_>,
+    compiled: &Compiled,
     (i, j): (usize, usize),
     scratch: &mut Scratch,
     visitor: &mut F,
 ) -> bool {
-    approach::<V>(edge, i, scratch);
-    approach::<V>(edge, j, scratch);
-    let (a, b) = (&edge.compiled.groups[i], &edge.compiled.groups[j]);
+    approach::<V>(compiled, i, scratch);
+    approach::<V>(compiled, j, scratch);
+    let (a, b) = (&compiled.groups[i], &compiled.groups[j]);
     let more = scratch.coarse[i].1 + scratch.coarse[j].1;
     let (at_a, at_b) = (fetch::<V>(&scratch.coarse[i].0), fetch::<V>(&scratch.coarse[j].0));
     // Where their bounding spheres meet and no others were found to.

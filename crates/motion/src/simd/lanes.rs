@@ -8,7 +8,7 @@
 #![allow(unsafe_code, reason = "vector intrinsics behind a detected instruction set, see above")]
 
 use super::cloud::{self, Cloud};
-use super::kernel::{Edge, Scratch};
+use super::kernel::{Compiled, Edge, Scratch};
 use super::{nearest, sweep};
 
 /// Sixteen numbers on one cache line; narrower lanes use the first of them.
@@ -139,6 +139,29 @@ impl Isa {
         }
     }
 
+    /// See [`sweep::touching_again`].
+    #[inline]
+    pub(crate) fn touching_again(
+        self,
+        compiled: &Compiled,
+        positions: &[Block],
+        count: usize,
+        scratch: &mut Scratch,
+    ) -> u32 {
+        match self.0 {
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx512 => unsafe { touching_again_avx512(compiled, positions, count, scratch) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx2 => unsafe { touching_again_avx2(compiled, positions, count, scratch) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => unsafe { touching_again_neon(compiled, positions, count, scratch) },
+            Kind::Plain => sweep::touching_again::<[f32; 8]>(compiled, positions, count, scratch),
+        }
+    }
+
     /// See [`cloud::fill`].
     pub(crate) fn fill_cloud(self, cloud: &mut Cloud, points: &[[Block; 3]], reach: f32) {
         match self.0 {
@@ -153,6 +176,25 @@ impl Isa {
             Kind::Neon => unsafe { fill_cloud_neon(cloud, points, reach) },
             Kind::Plain => cloud::fill::<[f32; 8]>(cloud, points, reach),
         }
+    }
+
+    /// See [`nearest::nearest_each`].
+    #[inline]
+    pub(crate) fn nearest_each(self, blocks: &[Block], states: &[[f32; 16]], to: &[Block]) -> [u32; 16] {
+        let mut found = [0; 16];
+        match self.0 {
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx512 => unsafe { nearest_each_avx512(blocks, states, to, &mut found) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Kind::Avx2 => unsafe { nearest_each_avx2(blocks, states, to, &mut found) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Kind::Neon => unsafe { nearest_each_neon(blocks, states, to, &mut found) },
+            Kind::Plain => nearest::nearest_each::<[f32; 8]>(blocks, states, to, &mut found),
+        }
+        found
     }
 
     /// See [`nearest::nearest`].
@@ -195,6 +237,30 @@ fn near_avx512(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
 #[target_feature(enable = "avx2,fma")]
 fn near_avx2(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
     sweep::near::<x86::Wide8>(edge, scratch)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx2,fma")]
+fn touching_again_avx512(compiled: &Compiled, positions: &[Block], count: usize, scratch: &mut Scratch) -> u32 {
+    sweep::touching_again::<x86::Wide16>(compiled, positions, count, scratch)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn touching_again_avx2(compiled: &Compiled, positions: &[Block], count: usize, scratch: &mut Scratch) -> u32 {
+    sweep::touching_again::<x86::Wide8>(compiled, positions, count, scratch)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx2,fma")]
+fn nearest_each_avx512(blocks: &[Block], states: &[[f32; 16]], to: &[Block], found: &mut [u32; 16]) {
+    nearest::nearest_each::<x86::Wide16>(blocks, states, to, found);
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn nearest_each_avx2(blocks: &[Block], states: &[[f32; 16]], to: &[Block], found: &mut [u32; 16]) {
+    nearest::nearest_each::<x86::Wide8>(blocks, states, to, found);
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -243,6 +309,18 @@ fn is_free_neon(edge: &Edge<'_>, scratch: &mut Scratch) -> bool {
 #[target_feature(enable = "neon")]
 fn near_neon(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
     sweep::near::<arm::Pair>(edge, scratch)
+}
+
+#[cfg(target_arch = "aarch64")]
+#[target_feature(enable = "neon")]
+fn touching_again_neon(compiled: &Compiled, positions: &[Block], count: usize, scratch: &mut Scratch) -> u32 {
+    sweep::touching_again::<arm::Pair>(compiled, positions, count, scratch)
+}
+
+#[cfg(target_arch = "aarch64")]
+#[target_feature(enable = "neon")]
+fn nearest_each_neon(blocks: &[Block], states: &[[f32; 16]], to: &[Block], found: &mut [u32; 16]) {
+    nearest::nearest_each::<arm::Pair>(blocks, states, to, found);
 }
 
 impl Lanes for [f32; 8] {

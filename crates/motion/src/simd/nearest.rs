@@ -34,6 +34,32 @@ pub(super) fn nearest<V: Lanes>(blocks: &[Block], dimensions: usize, to: &[f32; 
     best.first()
 }
 
+/// As [`nearest`], for sixteen goals at once, of each joint a block. Here the nodes come one after the other: `states` has them, `blocks` only half of
+/// their squared lengths.
+#[inline(always)]
+pub(super) fn nearest_each<V: Lanes>(blocks: &[Block], states: &[[f32; 16]], to: &[Block], found: &mut [u32; 16]) {
+    let size = to.len() + 1;
+    for part in 0..16 / V::WIDTH {
+        let (mut sums, mut indices) = (V::splat(f32::INFINITY), V::splat(0.0));
+        for (row, nodes) in states.chunks(16).enumerate() {
+            let halves = &blocks[row * size + size - 1].0;
+            for (lane, (node, half)) in nodes.iter().zip(halves).enumerate() {
+                let mut sum = V::splat(*half);
+                for (goal, along) in to.iter().zip(node) {
+                    sum = V::splat(-*along).mul_add(V::load_part(goal, part), sum);
+                }
+                indices = sum.choose_below(sums, V::splat((row * 16 + lane) as f32), indices);
+                sums = sum.min(sums);
+            }
+        }
+        let mut whole = Block([0.0; 16]);
+        indices.store(&mut whole);
+        for (to, index) in found[part * V::WIDTH..].iter_mut().zip(&whole.0[..V::WIDTH]) {
+            *to = *index as u32;
+        }
+    }
+}
+
 /// Of each lane of each chain, the least sum and the row that it is in, which is a whole number.
 struct Best<V> {
     sums: [V; CHAINS],
@@ -124,6 +150,13 @@ mod tests {
                 let first = nodes.iter().position(|node| square(node) == least);
                 for isa in Isa::available() {
                     assert_eq!(Some(isa.nearest(&blocks, dimensions, &to)), first, "{isa:?} {dimensions} {count}");
+                    // All others are where the first node is.
+                    let goal = |lane, j| if lane == count % 16 { to[j] } else { nodes[0][j] };
+                    let goals: Vec<Block> =
+                        (0..dimensions).map(|j| Block(std::array::from_fn(|lane| goal(lane, j)))).collect();
+                    let each = isa.nearest_each(&blocks, &nodes, &goals);
+                    assert_eq!(Some(each[count % 16] as usize), first, "{isa:?} {dimensions} {count}");
+                    assert_eq!(each[(count + 1) % 16], 0, "{isa:?} {dimensions} {count}");
                 }
             }
         }

@@ -7,7 +7,7 @@
 //!
 //! Motions of the search are postures alone, and what is near them is not noted: most end in the first batch or have few.
 
-use super::kernel::{self, Among, Contact, Edge, First, LENGTH, Other, Scratch, Visitor};
+use super::kernel::{self, Among, Compiled, Contact, Edge, First, LENGTH, Other, Scratch, Visitor};
 use super::lanes::{Block, Lanes};
 
 /// How spheres move with each joint: of each joint a list over the rigid parts, then the groups, so that many are added up at once.
@@ -114,15 +114,15 @@ pub(super) fn is_free<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool 
     scratch.growth.is_on = false;
     for batch in 0..edge.batches {
         kernel::pose::<V>(edge, batch, scratch);
-        if batch == 0 && kernel::touches_again::<V>(edge, scratch) {
+        if batch == 0 && kernel::touches_again::<V>(edge.compiled, scratch) {
             return false;
         }
         let mut first = First::default();
         let is_free = if depth == 0 {
-            kernel::walk::<V, _>(edge, scratch, &mut first)
+            kernel::walk::<V, _>(edge.compiled, scratch, &mut first)
         } else {
             let near = std::mem::take(&mut scratch.near[depth - 1]);
-            let is_free = kernel::walk_among::<V, _>(edge, (&near, lanes), scratch, &mut first);
+            let is_free = kernel::walk_among::<V, _>(edge.compiled, (&near, lanes), scratch, &mut first);
             scratch.near[depth - 1] = near;
             is_free
         };
@@ -132,6 +132,24 @@ pub(super) fn is_free<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> bool 
         }
     }
     true
+}
+
+/// In which of up to sixteen postures one of the remembered contacts is there again, a bit each; of each joint a block. The postures have nothing to
+/// do with each other.
+#[inline(always)]
+pub(super) fn touching_again<V: Lanes>(
+    compiled: &Compiled,
+    positions: &[Block],
+    count: usize,
+    scratch: &mut Scratch,
+) -> u32 {
+    let mut touching = 0;
+    for part in 0..count.div_ceil(V::WIDTH) {
+        let lanes = V::ALL >> V::WIDTH.saturating_sub(count - part * V::WIDTH);
+        kernel::pose_each::<V>(compiled, positions, part, scratch);
+        touching |= kernel::all_touching_again::<V>(compiled, lanes, scratch) << (part * V::WIDTH);
+    }
+    touching
 }
 
 /// Which steps of a batch may touch something, a bit each. What they may touch is in the list of this depth then.
@@ -147,10 +165,10 @@ pub(super) fn near<V: Lanes>(edge: &Edge<'_>, scratch: &mut Scratch) -> u32 {
     let mut found = std::mem::take(&mut scratch.near[depth]);
     found.clear();
     if depth == 0 {
-        kernel::walk::<V, _>(edge, scratch, &mut Notes(&mut found));
+        kernel::walk::<V, _>(edge.compiled, scratch, &mut Notes(&mut found));
     } else {
         let before = std::mem::take(&mut scratch.near[depth - 1]);
-        kernel::walk_among::<V, _>(edge, (&before, lanes), scratch, &mut Notes(&mut found));
+        kernel::walk_among::<V, _>(edge.compiled, (&before, lanes), scratch, &mut Notes(&mut found));
         scratch.near[depth - 1] = before;
     }
     let doubtful = found.iter().fold(0, |lanes, near| lanes | near.lanes);
