@@ -239,7 +239,8 @@ impl Window {
                 });
                 real.before = written.map(|fact| (fact.clone(), context.root.get(fact).cloned())).collect();
             }
-            let changes = made.changes.clone();
+            let may_cross = !context.plan.crossing.is_nothing();
+            let changes = if has_readers || may_cross { made.changes.clone() } else { Vec::new() };
             let writer = self.path(context.program, id);
             if let Err(problem) = context.commit(id, writer, made) {
                 real.reason = problem;
