@@ -98,7 +98,17 @@ fn a_gripper_that_cannot_hold_is_told_with_what_is_wrong_with_it() {
     // The finger slides along another axis, or inwards.
     let slides = |axis: &str| format!("<child link='left_finger_a'/><axis xyz='{axis}'/>");
     finger(&[[&slides("0 1 0"), &slides("1 0 0")]], &["`left_finger`", "goes by (40, 0, 0) mm", "along y"]);
-    finger(&[[&slides("0 1 0"), &slides("0 -1 0")]], &["goes by (0, 40, 0) mm", "away from the middle"]);
+    finger(
+        &[[&slides("0 1 0"), &slides("0 -1 0")]],
+        &[
+            "goes by (0, 40, 0) mm",
+            "its pad",
+            "where y is below 0",
+            "away from the middle",
+            "along -y",
+            "fixed to it do not count",
+        ],
+    );
     // At zero the fingers are apart.
     finger(&[["0 0.005 -0.06", "0 0.015 -0.06"]], &["10.0 mm from the middle", "0 is where the fingers meet"]);
     finger(

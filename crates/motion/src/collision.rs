@@ -138,18 +138,28 @@ pub struct Collision {
     pub other: String,
     /// How deep, in metres; negative: how far apart, where that is less than the padding, or [`by_spheres`](Collision::by_spheres).
     pub depth_m: f64,
+    /// How far apart they have to be, in metres.
+    pub padding_m: f64,
     /// The shapes are farther apart than the padding, but the spheres that stand for meshes are not.
     pub by_spheres: bool,
 }
 
 impl fmt::Display for Collision {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Collision { moving, other, .. } = self;
         let millimetres = self.depth_m.abs() * 1000.0;
         if self.depth_m > 0.0 {
-            return write!(f, "{} is {millimetres:.0} mm inside {}", self.moving, self.other);
+            return write!(f, "{moving} is {millimetres:.0} mm inside {other}");
         }
-        write!(f, "{} is only {millimetres:.0} mm away from {}", self.moving, self.other)?;
-        if self.by_spheres { f.write_str(", and touches it by the spheres that stand for meshes") } else { Ok(()) }
+        if self.by_spheres {
+            return write!(
+                f,
+                "{moving} is only {millimetres:.0} mm away from {other}, and touches it by the spheres that stand for meshes"
+            );
+        }
+        // To a tenth: what is nearly far enough is not to read as if it were.
+        let [apart, kept] = [millimetres, self.padding_m * 1000.0].map(|mm| (10.0 * mm).round() / 10.0);
+        write!(f, "{moving} is only {apart} mm away from {other}, and {kept} mm are kept between them")
     }
 }
 
@@ -373,7 +383,8 @@ impl<'a> Checker<'a> {
             Other::Moving(j) => self.moving[j].name.clone(),
             Other::Cloud => self.cloud.as_ref().map(|cloud| cloud.name.clone()).unwrap_or_default(),
         };
-        Some(Collision { moving: self.moving[i].name.clone(), other, depth_m, by_spheres })
+        let (moving, padding_m) = (self.moving[i].name.clone(), self.padding);
+        Some(Collision { moving, other, depth_m, padding_m, by_spheres })
     }
 
     /// Whether something meets what stands that moves with the tool alone: then every posture of that pose of the tool does.

@@ -165,7 +165,7 @@ impl DescriptionError {
             DescriptionError::Form { .. } => false,
             DescriptionError::Fault { fault, .. } => matches!(
                 **fault,
-                RobotFault::Model(MechanismError::Robot(RobotError::Mesh { source: MeshError::Read { .. }, .. }))
+                RobotFault::Model(MechanismError::Robot(RobotError::Mesh { error: MeshError::Read { .. }, .. }))
             ),
         }
     }

@@ -323,13 +323,13 @@ impl Robot {
         srdf: Option<&str>,
         load: &mut dyn FnMut(&str) -> Result<Vec<u8>, MeshError>,
     ) -> Result<Robot, RobotFault> {
-        let robot = Robot::on(description, RobotModel::read_with_covers(urdf, srdf, load)?)?;
-        // What is wrong with any arm is said at once.
-        robot.other_arms().try_for_each(|arm| robot.with_arm(arm).map(drop))?;
-        Ok(robot)
+        // What needs no shapes is said before the meshes are read, which takes seconds; and what is wrong with any arm at once.
+        let outline = Robot::on(description.clone(), RobotModel::outline(urdf, srdf)?)?;
+        outline.other_arms().try_for_each(|arm| outline.with_arm(arm).map(drop))?;
+        Robot::on(description, RobotModel::read_with_covers(urdf, srdf, load)?)
     }
 
-    /// Holds a description against a robot whose meshes spheres stand for.
+    /// Holds a description against a robot. Its shapes are not looked at.
     fn on(description: RobotDescription, model: RobotModel) -> Result<Robot, RobotFault> {
         let link = |key: &'static str, name: &str| {
             let known = model.links.iter().map(|link| link.name.as_str());

@@ -253,6 +253,18 @@ impl RobotModel {
         Ok(model)
     }
 
+    /// Links and joints without shapes, and nothing of what is checked: all that can be said before a mesh is read.
+    ///
+    /// # Errors
+    /// As [`RobotModel::read_with_meshes`], but for what is wrong with meshes.
+    pub(crate) fn outline(urdf: &str, srdf: Option<&str>) -> Result<RobotModel, MechanismError> {
+        let Description { name, joints, links, mimics, texts } = urdf::read_outline(urdf)?;
+        if let Some(text) = srdf {
+            srdf::excepted(text, &links)?;
+        }
+        Ok(RobotModel { name, joints, links, mimics, texts, checks: Checks::default() })
+    }
+
     fn of(description: Description, srdf: Option<&str>) -> Result<RobotModel, MechanismError> {
         let Description { name, joints, links, mimics, texts } = description;
         let excepted = srdf.map(|text| srdf::excepted(text, &links)).transpose()?;

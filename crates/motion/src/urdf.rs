@@ -4,10 +4,11 @@ use crate::geometry::{Body, Geometry};
 use crate::mesh::{Mesh, MeshError, Meshed};
 use crate::robot_model::{Drive, Joint, Link};
 use crate::spheres;
-use crate::urdf_faults;
-use crate::urdf_faults::UrdfFault;
+use crate::urdf_faults::{self, Checked, UrdfFault, is_empty_material};
 use crate::urdf_tree::JointText;
+use crate::xml_text;
 use ratn_model::pose::Pose;
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -16,7 +17,7 @@ use std::sync::Arc;
 pub enum RobotError {
     /// Not a URDF, and where.
     #[error("the robot description is not valid URDF: {0}")]
-    Fault(#[from] UrdfFault),
+    Fault(UrdfFault),
     /// Not a URDF for another reason, without a place.
     #[error("the robot description is not valid URDF: {0}")]
     Urdf(String),
@@ -60,15 +61,14 @@ pub enum RobotError {
         reason: String,
     },
     /// A mesh that cannot be used.
-    #[error("the mesh `{file}` of link `{link}`: {source}")]
+    #[error("the mesh `{file}` of link `{link}`: {error}")]
     Mesh {
         /// The link.
         link: String,
         /// As the description names it.
         file: String,
         /// What is wrong.
-        #[source]
-        source: MeshError,
+        error: MeshError,
     },
     /// Something this model does not support.
     #[error("{what} `{name}` of the robot description is not supported: {reason}")]
@@ -82,14 +82,25 @@ pub enum RobotError {
     },
 }
 
+// Not by `#[from]`, which would make it a source that is said twice.
+impl From<UrdfFault> for RobotError {
+    fn from(fault: UrdfFault) -> RobotError {
+        RobotError::Fault(fault)
+    }
+}
+
 /// What a text describes, and where it says so of its joints.
 ///
 /// # Errors
 /// [`RobotError::Fault`] names the line.
 pub(crate) fn parse(text: &str) -> Result<(urdf_rs::Robot, BTreeMap<String, JointText>), RobotError> {
-    let joints = urdf_faults::check(text)?;
-    let robot = urdf_rs::read_from_string(text).map_err(|error| RobotError::Urdf(error.to_string()))?;
-    Ok((robot, joints))
+    let Checked { joints, has_empty_materials } = urdf_faults::check(text)?;
+    let unread = |error: &dyn std::fmt::Display| RobotError::Urdf(error.to_string());
+    let filled: Cow<'_, str> = match has_empty_materials {
+        true => xml_text::without(text, is_empty_material).map_err(|error| unread(&error))?.into(),
+        false => text.into(),
+    };
+    Ok((urdf_rs::read_from_string(&filled).map_err(|error| unread(&error))?, joints))
 }
 
 /// What a URDF describes.
@@ -126,7 +137,23 @@ const TIME_TO_ACCELERATION_S: f64 = 0.1;
 /// # Errors
 /// [`RobotError`] names the link or joint.
 pub(crate) fn read(text: &str, load: &mut Loader<'_>) -> Result<Description, RobotError> {
-    let (urdf, texts) = parse(text)?;
+    described(parse(text)?, load)
+}
+
+/// Reads links and joints without any shapes: no mesh file is read for that.
+///
+/// # Errors
+/// As [`read`], but for what is wrong with meshes.
+pub(crate) fn read_outline(text: &str) -> Result<Description, RobotError> {
+    let (mut urdf, texts) = parse(text)?;
+    urdf.links.iter_mut().for_each(|link| link.collision.clear());
+    described((urdf, texts), &mut |_| Err(MeshError::Kind))
+}
+
+fn described(
+    (urdf, texts): (urdf_rs::Robot, BTreeMap<String, JointText>),
+    load: &mut Loader<'_>,
+) -> Result<Description, RobotError> {
     if urdf.links.len() > MAX_LINKS {
         return Err(RobotError::TooManyLinks { count: urdf.links.len() });
     }
@@ -295,7 +322,7 @@ fn shapes(link: &urdf_rs::Link, load: &mut Loader<'_>) -> Result<(Vec<Body>, Vec
         if let Some(geometry) = primitive(&collision.geometry) {
             bodies.push(geometry.at(pose));
         } else if let urdf_rs::Geometry::Mesh { filename, scale } = &collision.geometry {
-            let failed = |source| RobotError::Mesh { link: link.name.clone(), file: filename.clone(), source };
+            let failed = |error| RobotError::Mesh { link: link.name.clone(), file: filename.clone(), error };
             let factors = scale.map_or([1.0; 3], |scale| scale.0);
             let mesh = load(filename).and_then(|bytes| Mesh::read(filename, &bytes, factors)).map_err(failed)?;
             if scale.is_none() && mesh.extent_m() > PLAUSIBLE_M {

@@ -5,6 +5,7 @@
 use crate::urdf_tree::{JointText, Place, Tree};
 use crate::xml_text;
 use std::collections::BTreeMap;
+use xml::attribute::OwnedAttribute;
 use xml::common::Position;
 use xml::reader::XmlEvent;
 
@@ -90,20 +91,52 @@ const ATTRIBUTES: &[(&str, &str, &str, Value, bool)] = &[
     ("geometry", "capsule", "length", Sizes(1), true),
     ("geometry", "mesh", "filename", Text, true),
     ("geometry", "mesh", "scale", Scale, false),
+    ("visual", "material", "name", Text, true),
+    ("material", "color", "rgba", Numbers(4), false),
 ];
+
+/// What a text without a fault says.
+#[derive(Debug, Default)]
+pub(crate) struct Checked {
+    /// What it says of its joints.
+    pub(crate) joints: BTreeMap<String, JointText>,
+    /// Whether there is what [`is_empty_material`] finds.
+    pub(crate) has_empty_materials: bool,
+}
+
+/// Whether an element is a colour or a texture that names none: it says nothing, and other readers of URDF pass over it.
+pub(crate) fn is_empty_material(parent: &str, element: &str, attributes: &[OwnedAttribute]) -> bool {
+    let lacks = |key: &str| !attributes.iter().any(|attribute| attribute.name.local_name == key);
+    parent == "material" && (element == "texture" && lacks("filename") || element == "color" && lacks("rgba"))
+}
+
+/// What is not XML, and what to do where that is known.
+fn not_xml(message: &str) -> String {
+    match message.strip_suffix(" prefix is unbound").and_then(|name| name.split_once(' ')) {
+        Some((_, name)) => {
+            let prefix = name.split(':').next().unwrap_or(name);
+            format!(
+                "{message}: declare it at the outermost element, `<robot xmlns:{prefix}=\"{prefix}\" ...>`, or take the attributes and elements \
+                 with `{prefix}:` out"
+            )
+        }
+        None => message.to_owned(),
+    }
+}
 
 /// The types of joints that there are.
 const TYPES: [&str; 7] = ["revolute", "continuous", "prismatic", "fixed", "floating", "planar", "spherical"];
 
-/// Looks for the first fault; without one, what the text says of its joints.
+/// Looks for the first fault; without one, what the text says.
 ///
 /// # Errors
 /// [`UrdfFault`].
-pub(crate) fn check(text: &str) -> Result<BTreeMap<String, JointText>, UrdfFault> {
+pub(crate) fn check(text: &str) -> Result<Checked, UrdfFault> {
     let mut reader = xml_text::reader(text.as_bytes());
     let (mut open, mut tree, mut has_limits): (Vec<String>, _, _) = (Vec::new(), Tree::default(), false);
     // Of the link or joint that is being read, its name, and of a joint whether it moves.
     let (mut named, mut moves) = (String::new(), false);
+    let mut has_empty_materials = false;
     loop {
         let event = reader.next();
         let at = reader.position();
@@ -112,7 +145,7 @@ pub(crate) fn check(text: &str) -> Result<BTreeMap<String, JointText>, UrdfFault
         match event {
             Err(error) => {
                 let at = error.position();
-                return Err(Place { line: at.row + 1, column: at.column + 1 }.fault(error.msg().to_owned()));
+                return Err(Place { line: at.row + 1, column: at.column + 1 }.fault(not_xml(error.msg())));
             }
             Ok(XmlEvent::StartElement { name, attributes, .. }) => {
                 let element = name.local_name;
@@ -137,6 +170,7 @@ pub(crate) fn check(text: &str) -> Result<BTreeMap<String, JointText>, UrdfFault
                     let wrong = wrong(&element, key, value_of(key), *value, *needed);
                     wrong.map_or(Ok(()), |reason| Err(fault(reason + place)))?;
                 }
+                has_empty_materials |= is_empty_material(parent, &element, &attributes);
                 match (parent, &element[..]) {
                     ("robot", "link") => tree.link(text("name"), at)?,
                     ("robot", "joint") => {
@@ -170,7 +204,9 @@ pub(crate) fn check(text: &str) -> Result<BTreeMap<String, JointText>, UrdfFault
             Ok(XmlEvent::EndElement { .. }) => {
                 open.pop();
             }
-            Ok(XmlEvent::EndDocument) => return tree.check().map(|()| tree.joints()),
+            Ok(XmlEvent::EndDocument) => {
+                return tree.check().map(|()| Checked { joints: tree.joints(), has_empty_materials });
+            }
             Ok(_) => {}
         }
     }
@@ -240,7 +276,7 @@ mod tests {
         let joint = |inner: &str| {
             format!("<robot name='r'><link name='l'/>\n<joint name='j' type='revolute'>\n{inner}</joint></robot>")
         };
-        let read = check(&joint("<axis xyz='0 0 1'/>")).unwrap_or_default();
+        let read = check(&joint("<axis xyz='0 0 1'/>")).unwrap_or_default().joints;
         assert_eq!(read.get("j"), Some(&JointText { line: 2, has_limit: false }));
         let said = fault(&joint("<axis xyz='0 0'/>"));
         assert_eq!(said, "line 3, column 1: `xyz` of `axis` is `0 0` instead of 3 numbers (in the joint `j`)");
@@ -252,5 +288,14 @@ mod tests {
         );
         assert!(fault("<robot name='r'>\n\n</robt>").starts_with("line 3"));
         assert!(fault("<sdf/>").contains("`sdf` instead of `robot`"));
+    }
+
+    #[test]
+    fn a_prefix_that_is_not_declared_is_told_with_its_declaration() {
+        let text = "<robot name='r'><link name='a'/><link name='b'/>\n<joint name='j' type='revolute'><parent link='a'/>\
+                    <child link='b'/>\n<limit lower='0' upper='1' velocity='1' effort='1' drake:acceleration='3'/></joint></robot>";
+        let said = check(text).err().map(|fault| fault.to_string()).unwrap_or_default();
+        assert!(said.starts_with("line 3, ") && said.contains("`<robot xmlns:drake=\"drake\" ...>`"), "{said}");
+        assert!(check(&text.replace("<robot ", "<robot xmlns:drake='drake' ")).is_ok());
     }
 }

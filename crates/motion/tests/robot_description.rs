@@ -4,6 +4,7 @@
 
 use ratn_motion::description::RobotDescription;
 use ratn_motion::joint_vector::JointVector;
+use ratn_motion::mesh::MeshError;
 use ratn_motion::robot::{Robot, RobotFault};
 use std::path::PathBuf;
 
@@ -113,6 +114,26 @@ fn what_does_not_fit_is_refused_by_its_name() {
     );
     let unknown = RobotDescription::read(&TOML.replace("tool =", "tol =")).unwrap_err();
     assert!(unknown.contains("line 6") && unknown.contains("tol"), "{unknown}");
+}
+
+#[test]
+fn what_needs_no_mesh_is_refused_before_one_is_read() {
+    let mesh = r#"<link name="foot"><collision><geometry><mesh filename="foot.stl"/></geometry></collision></link>"#;
+    let urdf = URDF.replace(r#"<link name="foot"/>"#, mesh);
+    let refused = |toml: &str| {
+        let (description, mut files) = (RobotDescription::read(toml).unwrap(), Vec::new());
+        let read = Robot::of(description, &urdf, None, &mut |file| {
+            files.push(file.to_owned());
+            Err(MeshError::Kind)
+        });
+        (read.unwrap_err().to_string(), files)
+    };
+    let (said, files) = refused(&format!("{TOML}[gripper]\njoint = 'hinge'\nhand = 'foot'\nfinger = 'lid'\n"));
+    assert!(said.contains("the joint `hinge` turns"), "{said}");
+    assert_eq!(files, Vec::<String>::new());
+    let (said, files) = refused(TOML);
+    assert!(said.contains("the mesh `foot.stl` of link `foot`"), "{said}");
+    assert_eq!(files, ["foot.stl"]);
 }
 
 /// A base, an arm of one joint, a head and two fingers, of joints as they are given.

@@ -8,7 +8,9 @@ use ratn_model::pose::Pose;
 use ratn_motion::exact::Exact;
 use ratn_motion::geometry::Geometry;
 use ratn_motion::joint_vector::JointVector;
+use ratn_motion::looks::Looks;
 use ratn_motion::mechanism::{MAX_JOINTS, Mechanism};
+use ratn_motion::mesh::MeshError;
 use ratn_motion::reach::{Reach, Target};
 use ratn_motion::robot_model::RobotModel;
 use ratn_motion::robot_state::{RobotState, StateError};
@@ -66,6 +68,38 @@ fn a_chain_of_more_links_than_are_supported_is_refused_and_one_of_as_many_is_rea
     };
     says(&chain(1_025), &["1025 links", "at most 1024"]);
     assert_eq!(RobotModel::read(&chain(1_024), None).unwrap().links.len(), 1_024);
+}
+
+#[test]
+fn a_colour_or_a_texture_that_names_none_is_passed_over() {
+    let seen = |inside: &str| {
+        robot(&[format!(
+            "<link name='l'><visual><geometry><box size='1 1 1'/></geometry><material name='m &amp; n'>{inside}</material></visual></link>"
+        )])
+    };
+    for (inside, has_colour) in
+        [("<texture/>", false), ("<color/>", false), ("<texture><more/></texture><color rgba='1 0 0 1'/>", true)]
+    {
+        RobotModel::read(&seen(inside), None).unwrap();
+        let looks = Looks::read(&seen(inside), &mut |_| Err(MeshError::Kind));
+        assert_eq!(looks.lacks, [], "{inside}");
+        assert_eq!(looks.visuals.iter().map(|visual| visual.colour.is_some()).collect::<Vec<_>>(), [has_colour]);
+    }
+    says(
+        &seen("\n<color rgba='1 0 0'/>"),
+        &["line 3", "`rgba` of `color` is `1 0 0` instead of 4 numbers", "the link `l`"],
+    );
+}
+
+#[test]
+fn a_fault_is_said_once() {
+    let mesh = |attribute: &str| {
+        robot(&[format!("<link name='l'><collision><geometry><mesh {attribute}/></geometry></collision></link>")])
+    };
+    for (attribute, fault) in [("", "`mesh` has no attribute `filename`"), ("filename='l.stl'", "no folder to look in")]
+    {
+        assert_eq!(refusal(&mesh(attribute)).matches(fault).count(), 1, "{}", refusal(&mesh(attribute)));
+    }
 }
 
 #[test]

@@ -177,13 +177,32 @@ fn ungrasping(view: &Robot, is_first: bool, boxes: Option<&Boxes>, of_arm: &str)
     let way = ways.iter().find(|(link, _)| *link == finger).map_or([0.0; 3], |(_, way)| *way);
     if !goes(way, outward * opens) {
         // Adding zero takes the sign from a zero.
-        let [x, y, z] = way.map(|c| (1e3 * c).round() + 0.0);
+        let millimetres = |at: [f64; 3]| {
+            let [x, y, z] = at.map(|c| (1e3 * c).round() + 0.0);
+            format!("({x:.0}, {y:.0}, {z:.0}) mm")
+        };
+        let goes_by = format!(
+            "when its joint `{}` goes from 0 to {:.0} mm, its finger `{name}` goes by {} in the tool's frame",
+            joint.name,
+            1e3 * opens,
+            millimetres(way)
+        );
+        if goes(way, -outward * opens) {
+            let (side, axis) = if outward < 0.0 { ("below", "-y") } else { ("above", "y") };
+            let pad = millimetres(part.middle);
+            return unmet(
+                format!(
+                    "{goes_by}, and its pad, of its boxes the one nearest to the other finger, is at {pad}, where y is {side} 0"
+                ),
+                "a finger opens away from the middle, to the side of its pad",
+                &format!(
+                    "let the joint slide the finger along {axis} of the tool's frame, or give the finger a box for its pad on the other side (shapes of \
+                     links that are fixed to it do not count)"
+                ),
+            );
+        }
         return unmet(
-            format!(
-                "when its joint `{}` goes from 0 to {:.0} mm, its finger `{name}` goes by ({x:.0}, {y:.0}, {z:.0}) mm in the tool's frame",
-                joint.name,
-                1e3 * opens
-            ),
+            goes_by,
             "the position of the joint is how far each finger is from the middle, along the tool's y",
             "let the joint slide the finger along y of the tool's frame, away from the middle, with 0 where the fingers meet",
         );

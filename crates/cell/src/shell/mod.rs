@@ -59,6 +59,7 @@ pub async fn run_as(
 ) -> anyhow::Result<()> {
     config.check()?;
     let laid = config.clone();
+    tracing::info!(robot = config.robot, "reading the robot and its meshes, and laying the scene");
     let cell = tokio::task::spawn_blocking(move || Cell::new(laid)).await.context("cannot lay the scene")??;
     let recorder = match &config.record {
         Some(file) => Recorder::begin(file, &cell)?,

@@ -26,7 +26,15 @@ pub(crate) fn run(arguments: &RobotArguments) -> Result<(), Failure> {
     if faults.is_empty() {
         return Ok(());
     }
-    Err(anyhow::anyhow!("{}: {}", robot.name(), faults.join("; ")).into())
+    Err(anyhow::anyhow!("{}", listed(robot.name(), &faults)).into())
+}
+
+/// All that is wrong: a line for each where there is more than one.
+fn listed(robot: &str, faults: &[String]) -> String {
+    match faults {
+        [fault] => format!("{robot}: {fault}"),
+        _ => format!("{robot}: {} faults:\n- {}", faults.len(), faults.join("\n- ")),
+    }
 }
 
 /// What a cell would refuse in a scene that the robot has a workplace for. Without any workplace the robot is for planning alone.
@@ -73,6 +81,13 @@ mod tests {
         assert!(matches!(check(), Err(Failure::Failed(_))), "{:?}", check());
         std::fs::write(folder.path().join("r.urdf"), shape("<box size='0.1 0.1 0.1'/>")).unwrap();
         assert!(check().is_ok());
+    }
+
+    #[test]
+    fn each_fault_of_several_has_its_line() {
+        let faults = ["it stands".to_owned(), "it falls".to_owned()];
+        assert_eq!(listed("r", &faults[..1]), "r: it stands");
+        assert_eq!(listed("r", &faults), "r: 2 faults:\n- it stands\n- it falls");
     }
 
     #[test]

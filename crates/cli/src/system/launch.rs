@@ -5,6 +5,7 @@
 //! a log file of the runtime directory. A system is ready when every role has published its endpoint and every resource that
 //! the config promises is there.
 
+use super::patience::{Patience, Verdict, processor_time};
 use crate::output;
 use anyhow::{Context, bail};
 use ratn_daemon::supervisor::command_of;
@@ -17,9 +18,9 @@ use std::process::Stdio;
 use std::time::{Duration, Instant};
 use tokio::process::Child;
 
-/// From the start of the processes to the last resource.
-const READY_DEADLINE: Duration = Duration::from_secs(30);
 const POLL: Duration = Duration::from_millis(10);
+/// So often it is looked whether what is missing works.
+const LOOK: Duration = Duration::from_secs(1);
 /// From SIGTERM to SIGKILL, for all roles together.
 const STOP_DEADLINE: Duration = Duration::from_secs(3);
 /// How much of a dead child's log is shown.
@@ -84,34 +85,53 @@ impl Processes {
         Ok(Processes { roles })
     }
 
-    /// Waits until nothing is `missing`: what is not there yet, for people.
+    /// Waits until nothing is `missing`: what is not there yet, for people; roles by their names.
     ///
     /// # Errors
-    /// What `missing` gives where waiting is in vain; or when a process ends, or after [`READY_DEADLINE`], with the last words of the log.
+    /// What `missing` gives where waiting is in vain; or when a process ends, or when the [`Patience`] does, with the last words of the log.
     pub(crate) async fn wait_until<F>(&mut self, mut missing: F) -> anyhow::Result<()>
     where
         F: AsyncFnMut() -> anyhow::Result<Vec<String>>,
     {
-        let start = Instant::now();
+        let (mut patience, mut looked) = (Patience::new(Instant::now()), Instant::now());
         loop {
             self.check_running()?;
             let missing = missing().await?;
             if missing.is_empty() {
                 return Ok(());
             }
-            if start.elapsed() > READY_DEADLINE {
-                let mut text = format!(
-                    "the system is not ready after {} s: still missing {}",
-                    READY_DEADLINE.as_secs(),
-                    missing.join(", ")
-                );
-                for role in &self.roles {
-                    text += &format!("\nthe end of {}:\n{}", role.log.display(), last_words(&role.log));
+            let now = Instant::now();
+            if now.duration_since(looked) >= LOOK {
+                looked = now;
+                let missing_now = missing.join(", ");
+                match patience.look(now, &self.processor_time_of(&missing)) {
+                    Verdict::Wait => {}
+                    Verdict::Say(waited) => output::progress(format_args!(
+                        "still missing after {} s: {missing_now}; it is waited for while it works",
+                        waited.as_secs()
+                    )),
+                    Verdict::GiveUp(waited, why) => {
+                        let mut text = format!(
+                            "the system is not ready after {} s, {why}: still missing {missing_now}",
+                            waited.as_secs()
+                        );
+                        for role in &self.roles {
+                            text += &format!("\nthe end of {}:\n{}", role.log.display(), last_words(&role.log));
+                        }
+                        bail!(text);
+                    }
                 }
-                bail!(text);
             }
             tokio::time::sleep(POLL).await;
         }
+    }
+
+    /// The processor time of the missing roles, and of the workers that roles have started.
+    fn processor_time_of(&self, missing: &[String]) -> BTreeMap<u32, Duration> {
+        let is_missing = |role: &&RoleProcess| missing.iter().any(|name| name == role.role);
+        let of: Vec<u32> = self.roles.iter().filter(is_missing).filter_map(|role| role.child.id()).collect();
+        let all: Vec<u32> = self.roles.iter().filter_map(|role| role.child.id()).collect();
+        processor_time(&of, &all)
     }
 
     /// An error when one of them has ended.

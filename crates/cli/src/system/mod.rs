@@ -6,6 +6,7 @@ mod crashes;
 pub(crate) mod drivers;
 pub(crate) mod known;
 mod launch;
+mod patience;
 pub(crate) mod workers;
 
 use crate::failure::Failure;

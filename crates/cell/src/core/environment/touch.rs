@@ -8,6 +8,9 @@
 //! which a single joint decides (the flange and the link before the wrist): its limits keep them apart, not who plans. Two links that are told
 //! apart by their meshes are looked at by those and by their primitives (`shell`): the bodies have spheres in place of the meshes, and the spheres of
 //! such links nearly always meet.
+//!
+//! A link may have a hundred bodies, and each step looks: first whether the boxes around links, pieces of furniture and objects meet, then, of two that
+//! do, at those bodies that are in the other's box.
 //! What is shared with the planner: the reader of the robot's description and its forward kinematics.
 
 use super::convex::Convex;
@@ -16,12 +19,13 @@ use super::shell::Shell;
 use super::world::{Environment, FLOOR, LEVEL, TOUCH_M};
 use rapier3d::math::{Pose as Pose32, Vector};
 use rapier3d::parry::bounding_volume::{Aabb, BoundingVolume};
-use rapier3d::parry::shape::Shape;
+use rapier3d::parry::shape::{Shape, SharedShape};
 use rapier3d::prelude::{Collider, ColliderHandle, RigidBody, RigidBodyHandle};
 use ratn_model::pose::Pose;
-use ratn_motion::robot::{Configuration, Drive, Geometry, Robot};
+use ratn_motion::robot::{Configuration, Drive, Geometry, Link, Robot, to_f32};
 use ratn_motion::workplace::HOME;
 use serde::{Deserialize, Serialize};
+use std::cell::OnceCell;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A body that can touch another.
@@ -57,11 +61,17 @@ pub const NEAR_M: f64 = 5e-4;
 /// What counts as on an axis, in metres and as a sine.
 const ALIGNED: f64 = 1e-9;
 
-/// Which links may not be looked at together, by their indices in [`Robot::model`], and which stand on the floor.
+/// By how much more than [`NEAR_M`] the box around a link is larger, in metres: where bodies are is rounded otherwise than where their link is.
+const ROUNDED_M: f32 = 1e-4;
+
+/// Which links are looked at together, by their indices in [`Robot::model`], and which stand on the floor.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Joined {
-    links: BTreeSet<[usize; 2]>,
+    /// Pairs of links with shapes, the lower index first, but those that are made to touch.
+    apart: Vec<[usize; 2]>,
     on_floor: BTreeSet<usize>,
+    /// The box around all shapes of each link that has some, in its own frame.
+    boxes: BTreeMap<usize, Aabb>,
     /// Those of them that are told apart by their own shapes, and may not touch.
     by_shells: Vec<[usize; 2]>,
     /// Of each link in such a pair.
@@ -77,24 +87,22 @@ impl Joined {
             ..robot.at_zero()
         };
         // The other arms are in their postures `home` with open fingers, where the robot has them.
-        let shapes = robot.shapes(&home);
-        let mut joined = Joined::default();
-        for (i, (a, pose_a, shape_a)) in shapes.iter().enumerate() {
-            for (b, pose_b, shape_b) in &shapes[..i] {
-                let touch = meeting(&convex(&**shape_a, pose_a), &convex(&**shape_b, pose_b), 0.0);
-                if a == b || above(robot, *a) == Some(*b) || touch.is_some() || is_covered(robot, *a, *b) {
-                    joined.links.insert([*b.min(a), *b.max(a)]);
-                }
-            }
-            let next = above(robot, *a).and_then(|between| above(robot, between));
-            if let Some(next) = next.filter(|_| turns_in_itself(robot, *a)) {
-                joined.links.insert([next, *a]);
-            }
-            if shape_a.compute_aabb(pose_a).mins.z <= NEAR_M as f32 {
-                joined.on_floor.insert(*a);
+        let (shapes, poses) = (robot.shapes(&home), robot.poses(&home));
+        let mut joined = Joined { boxes: boxes(robot), ..Joined::default() };
+        let links: Vec<(usize, Vec<Shaped<'_>>)> = shapes
+            .chunk_by(|(a, ..), (b, ..)| a == b)
+            .map(|link| (link[0].0, link.iter().map(Shaped::of).collect()))
+            .collect();
+        for (i, (b, of_b)) in links.iter().enumerate() {
+            let before = links[..i]
+                .iter()
+                .filter(|(a, of_a)| !hangs(robot, *a, *b) && !is_covered(robot, *a, *b) && !do_meet(of_a, of_b));
+            joined.apart.extend(before.map(|(a, _)| [*a, *b]));
+            if of_b.iter().any(|shaped| shaped.aabb.mins.z <= NEAR_M as f32) {
+                joined.on_floor.insert(*b);
             }
         }
-        joined.add_shells(robot, &robot.poses(&home));
+        joined.add_shells(robot, &poses);
         joined
     }
 
@@ -102,11 +110,7 @@ impl Joined {
     fn add_shells(&mut self, robot: &Robot, poses: &[Pose]) {
         let links = &robot.model.links;
         let all = (0..links.len()).flat_map(|b| (0..b).map(move |a| [a, b]));
-        let hang = |a: usize, b: usize| {
-            let next = above(robot, b).filter(|_| turns_in_itself(robot, b)).and_then(|between| above(robot, between));
-            above(robot, b) == Some(a) || next == Some(a)
-        };
-        for [a, b] in all.filter(|[a, b]| is_covered(robot, *a, *b) && !hang(*a, *b)) {
+        for [a, b] in all.filter(|[a, b]| is_covered(robot, *a, *b) && !hangs(robot, *a, *b)) {
             for link in [a, b] {
                 self.shells.entry(link).or_insert_with(|| Shell::of(&links[link]));
             }
@@ -115,10 +119,41 @@ impl Joined {
             }
         }
     }
+}
 
-    fn has(&self, a: usize, b: usize) -> bool {
-        a == b || self.links.contains(&[a.min(b), a.max(b)])
+/// A shape of a link in its place, and the box around it.
+struct Shaped<'s> {
+    shape: &'s dyn Shape,
+    pose: &'s Pose32,
+    aabb: Aabb,
+}
+
+impl<'s> Shaped<'s> {
+    fn of((_, pose, shape): &'s (usize, Pose32, SharedShape)) -> Shaped<'s> {
+        Shaped { shape: &**shape, pose, aabb: shape.compute_aabb(pose) }
     }
+}
+
+/// Whether two links touch.
+fn do_meet(of_a: &[Shaped<'_>], of_b: &[Shaped<'_>]) -> bool {
+    let mut pairs = of_a.iter().flat_map(|a| of_b.iter().map(move |b| (a, b)));
+    let touch = |a: &Shaped<'_>, b: &Shaped<'_>| meeting(&convex(b.shape, b.pose), &convex(a.shape, a.pose), 0.0);
+    pairs.any(|(a, b)| a.aabb.loosened(NEAR_M as f32).intersects(&b.aabb) && touch(a, b).is_some())
+}
+
+/// Whether a link is made to touch one before it: it hangs on that, or its joint only turns it about itself and the link between hangs on that.
+fn hangs(robot: &Robot, on: usize, link: usize) -> bool {
+    let next = above(robot, link).filter(|_| turns_in_itself(robot, link)).and_then(|between| above(robot, between));
+    above(robot, link) == Some(on) || next == Some(on)
+}
+
+/// The box around the shapes of each link that has some, in its own frame.
+fn boxes(robot: &Robot) -> BTreeMap<usize, Aabb> {
+    let around = |link: &Link| {
+        let boxes = link.bodies.iter().map(|body| body.geometry.shape(0.0).compute_aabb(&to_f32(&body.pose)));
+        boxes.reduce(|a, b| a.merged(&b))
+    };
+    robot.model.links.iter().enumerate().filter_map(|(i, link)| Some((i, around(link)?))).collect()
 }
 
 /// Whether spheres that stand for meshes say nothing of two links.
@@ -169,6 +204,98 @@ impl Speed {
     }
 }
 
+/// What is a link, a piece of furniture or an object.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Of<'a> {
+    Link(usize),
+    Fixed(&'a str),
+    Object(usize),
+}
+
+/// The colliders of one thing, placed when they are asked for.
+struct Group<'a> {
+    environment: &'a Environment,
+    of: Of<'a>,
+    colliders: Vec<ColliderHandle>,
+    /// Holds all of them and what is near.
+    room: Aabb,
+    parts: OnceCell<Parts<'a>>,
+}
+
+struct Parts<'a> {
+    all: Vec<Part<'a>>,
+    around: Aabb,
+}
+
+/// All things that can touch; links by their indices.
+struct Groups<'a> {
+    links: BTreeMap<usize, Group<'a>>,
+    fixed: Vec<Group<'a>>,
+    objects: Vec<Group<'a>>,
+}
+
+/// Two colliders that may touch: each is in the box around the thing that the other belongs to.
+struct Candidate<'g, 'a> {
+    of: [Of<'a>; 2],
+    parts: [&'g Part<'a>; 2],
+}
+
+impl<'a> Group<'a> {
+    /// A link, by the box that moves with it.
+    fn link(environment: &'a Environment, link: usize, colliders: Vec<ColliderHandle>) -> Option<Group<'a>> {
+        let own = environment.joined().boxes.get(&link)?;
+        let room = own.transform_by(&to_f32(&environment.link_pose(link))).loosened(NEAR_M as f32 + ROUNDED_M);
+        Some(Group { environment, of: Of::Link(link), colliders, room, parts: OnceCell::new() })
+    }
+
+    /// Something of few shapes.
+    fn placed(environment: &'a Environment, of: Of<'a>, colliders: Vec<ColliderHandle>) -> Option<Group<'a>> {
+        let parts = Parts::of(environment, &colliders)?;
+        Some(Group { environment, of, colliders, room: parts.around, parts: OnceCell::from(parts) })
+    }
+
+    fn parts(&self) -> Option<&Parts<'a>> {
+        if let Some(parts) = self.parts.get() {
+            return Some(parts);
+        }
+        let parts = Parts::of(self.environment, &self.colliders)?;
+        Some(self.parts.get_or_init(|| parts))
+    }
+
+    /// The pairs of a part of this and one of the other that may touch, in the order of the parts.
+    fn pairs<'g>(&'g self, other: &'g Group<'a>) -> impl Iterator<Item = [&'g Part<'a>; 2]> {
+        let do_meet = |a: &Aabb, b: &Aabb| a.intersects(b);
+        let near = do_meet(&self.room, &other.room).then(|| Some([self.parts()?, other.parts()?])).flatten();
+        near.filter(|[mine, its]| do_meet(&mine.around, &its.around)).into_iter().flat_map(move |[mine, its]| {
+            let within = |parts: &'g Parts<'a>, around: &Aabb| -> Vec<&'g Part<'a>> {
+                parts.all.iter().filter(|part| do_meet(&part.aabb, around)).collect()
+            };
+            let (mine, its) = (within(mine, &its.around), within(its, &mine.around));
+            mine.into_iter().flat_map(move |a| its.clone().into_iter().map(move |b| [a, b]))
+        })
+    }
+}
+
+impl<'a> Parts<'a> {
+    fn of(environment: &'a Environment, colliders: &[ColliderHandle]) -> Option<Parts<'a>> {
+        let all: Vec<Part<'a>> = colliders.iter().map(|collider| environment.part(*collider)).collect();
+        let around = all.iter().map(|part| part.aabb).reduce(|a, b| a.merged(&b))?;
+        Some(Parts { all, around })
+    }
+}
+
+/// Colliders that come one after another of what is the same thing.
+fn grouped<K: PartialEq>(colliders: impl Iterator<Item = (K, ColliderHandle)>) -> Vec<(K, Vec<ColliderHandle>)> {
+    let mut groups: Vec<(K, Vec<ColliderHandle>)> = Vec::new();
+    for (of, collider) in colliders {
+        match groups.last_mut() {
+            Some((last, group)) if *last == of => group.push(collider),
+            _ => groups.push((of, vec![collider])),
+        }
+    }
+    groups
+}
+
 /// A collider as one of the pair.
 struct Part<'a> {
     collider: &'a Collider,
@@ -193,55 +320,75 @@ impl Environment {
     /// What touches what, after the last step: all pairs of a link, or of a carried object, with anything else, but those that the robot
     /// is built to have in contact. Of two bodies the deepest place.
     pub fn touches(&self) -> Vec<Touch> {
-        let links: Vec<(usize, Part<'_>)> = self.link_colliders().map(|(link, c)| (link, self.part(c))).collect();
-        let fixed: Vec<(&str, Part<'_>)> = self.fixed_colliders().map(|(name, c)| (name, self.part(c))).collect();
-        let objects: Vec<Vec<Part<'_>>> =
-            (0..self.len()).map(|i| self.object_colliders(i).map(|c| self.part(c)).collect()).collect();
-        let around = |parts: &[Part<'_>]| parts.iter().map(|part| part.aabb).reduce(|a, b| a.merged(&b));
-        let around: Vec<Option<Aabb>> = objects.iter().map(|parts| around(parts)).collect();
-        let near = |part: &Part<'_>, object: usize| around[object].is_some_and(|aabb| aabb.intersects(&part.aabb));
-
-        let mut found: Vec<Touch> = self.touches_of_shells().collect();
-        let mut look = |a: &Part<'_>, b: &Part<'_>, things: &dyn Fn() -> [Thing; 2]| {
-            if a.aabb.intersects(&b.aabb) {
-                found.extend(touch(a, b).map(|touch| Touch { things: things(), ..touch }));
-            }
-        };
-        for (i, (link, part)) in links.iter().enumerate() {
-            let name = || Thing::Link(self.link_name(*link).to_owned());
-            for (other, its) in &links[..i] {
-                if !self.joined().has(*link, *other) {
-                    look(its, part, &|| [Thing::Link(self.link_name(*other).to_owned()), name()]);
-                }
-            }
-            for (other, its) in &fixed {
-                if *other != FLOOR || !self.joined().on_floor.contains(link) {
-                    look(part, its, &|| [name(), Thing::Fixed((*other).to_owned())]);
-                }
-            }
-            for (object, parts) in objects.iter().enumerate().filter(|(object, _)| near(part, *object)) {
-                parts.iter().for_each(|its| look(part, its, &|| [name(), Thing::Object(object)]));
-            }
-        }
-        for (carried, parts) in objects.iter().enumerate().filter(|(object, _)| self.state(*object).carried) {
-            for part in parts {
-                for (other, its) in &fixed {
-                    look(its, part, &|| [Thing::Fixed((*other).to_owned()), Thing::Object(carried)]);
-                }
-                for (other, its) in objects.iter().enumerate().filter(|(other, _)| *other != carried) {
-                    if near(part, other) {
-                        its.iter().for_each(|one| look(one, part, &|| [Thing::Object(other), Thing::Object(carried)]));
-                    }
-                }
-            }
+        let groups = self.groups();
+        let mut found: Vec<Touch> = self.touches_of_shells(&groups).collect();
+        let mut deepest_yet: Option<([Of<'_>; 2], f64)> = None;
+        for Candidate { of, parts: [a, b] } in self.candidates(&groups) {
+            // Of two things the deepest place counts: what is less deep than another one of them need not be known.
+            let within_m = deepest_yet.filter(|(of_it, _)| *of_it == of).map_or(NEAR_M, |(_, depth_m)| -depth_m);
+            let Some(touch) = a.aabb.intersects(&b.aabb).then(|| touch(a, b, within_m)).flatten() else { continue };
+            deepest_yet = Some((of, touch.depth_m));
+            found.push(Touch { things: of.map(|of| self.thing(of)), ..touch });
         }
         deepest(found)
     }
 
+    fn thing(&self, of: Of<'_>) -> Thing {
+        match of {
+            Of::Link(link) => Thing::Link(self.link_name(link).to_owned()),
+            Of::Fixed(name) => Thing::Fixed(name.to_owned()),
+            Of::Object(object) => Thing::Object(object),
+        }
+    }
+
+    /// All that can touch, where it is after the last step.
+    fn groups(&self) -> Groups<'_> {
+        let links = grouped(self.link_colliders()).into_iter();
+        let links = links.filter_map(|(link, colliders)| Some((link, Group::link(self, link, colliders)?))).collect();
+        let fixed = grouped(self.fixed_colliders()).into_iter();
+        let fixed = fixed.filter_map(|(name, colliders)| Group::placed(self, Of::Fixed(name), colliders)).collect();
+        let object = |object| Group::placed(self, Of::Object(object), self.object_colliders(object).collect());
+        Groups { links, fixed, objects: (0..self.len()).filter_map(object).collect() }
+    }
+
+    /// The pairs of colliders that have to be looked at.
+    fn candidates<'g, 'a>(&'a self, groups: &'g Groups<'a>) -> Vec<Candidate<'g, 'a>> {
+        let mut found = Vec::new();
+        // The parts of the first are gone through one by one; `turned` names the second before it.
+        let mut look = |first: &'g Group<'a>, second: &'g Group<'a>, turned: bool| {
+            let candidate = |[a, b]: [&'g Part<'a>; 2]| match turned {
+                true => Candidate { of: [second.of, first.of], parts: [b, a] },
+                false => Candidate { of: [first.of, second.of], parts: [a, b] },
+            };
+            found.extend(first.pairs(second).map(candidate));
+        };
+        let Groups { links, fixed, objects } = groups;
+        for [a, b] in &self.joined().apart {
+            if let (Some(a), Some(b)) = (links.get(a), links.get(b)) {
+                look(b, a, true);
+            }
+        }
+        for (index, link) in links {
+            let stands = self.joined().on_floor.contains(index);
+            let is_floor = |group: &Group<'_>| matches!(group.of, Of::Fixed(FLOOR));
+            let fixed = fixed.iter().filter(|piece| !(stands && is_floor(piece)));
+            fixed.chain(objects).for_each(|other| look(link, other, false));
+        }
+        let is_carried = |group: &&Group<'_>| matches!(group.of, Of::Object(object) if self.state(object).carried);
+        for (at, carried) in objects.iter().enumerate().filter(|(_, object)| is_carried(object)) {
+            let others = objects.iter().enumerate().filter(|(other, _)| *other != at).map(|(_, other)| other);
+            fixed.iter().chain(others).for_each(|other| look(carried, other, true));
+        }
+        found
+    }
+
     /// Which links touch of those that are told apart by their own shapes.
-    fn touches_of_shells(&self) -> impl Iterator<Item = Touch> {
+    fn touches_of_shells(&self, groups: &Groups<'_>) -> impl Iterator<Item = Touch> {
         let Joined { by_shells, shells, .. } = self.joined();
-        by_shells.iter().filter_map(|pair| {
+        // The spheres of a link hold its meshes.
+        let room = move |link: &usize| groups.links.get(link).map(|group| group.room);
+        let is_near = move |[a, b]: &&[usize; 2]| room(a).zip(room(b)).is_some_and(|(a, b)| a.intersects(&b));
+        by_shells.iter().filter(is_near).filter_map(|pair| {
             let [at, its] = pair.map(|link| self.link_pose(link));
             let met = shells[&pair[0]].meeting(at, &shells[&pair[1]], its, NEAR_M)?;
             let speeds = pair.map(|link| self.link_body(link).map(Speed::of).unwrap_or_default());
@@ -282,9 +429,9 @@ impl Environment {
     }
 }
 
-/// Where two parts touch.
-fn touch(a: &Part<'_>, b: &Part<'_>) -> Option<Touch> {
-    Some(touched(&meeting(&a.convex(), &b.convex(), NEAR_M)?, [a.speed, b.speed]))
+/// Where two parts touch, if they are no farther apart than `within_m` metres, or, where that is below 0, at least so deep in each other.
+fn touch(a: &Part<'_>, b: &Part<'_>, within_m: f64) -> Option<Touch> {
+    Some(touched(&meeting(&a.convex(), &b.convex(), within_m)?, [a.speed, b.speed]))
 }
 
 /// The same of what moves so.
@@ -305,4 +452,68 @@ fn deepest(mut found: Vec<Touch>) -> Vec<Touch> {
     found.sort_by(|a, b| a.things.cmp(&b.things).then(b.depth_m.total_cmp(&a.depth_m)));
     found.dedup_by(|later, first| later.things == first.things);
     found
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+    use ratn_motion::description::RobotDescription;
+    use ratn_motion::joint_vector::JointVector;
+
+    /// Links of an arm that are cubes.
+    const CUBES: usize = 6;
+
+    /// An arm of cubes, which are meshes, one 0.2 m beyond the other; each turns about the upright.
+    fn cubes() -> Robot {
+        let corner = |i: usize| [0, 1, 2].map(|axis| if i >> axis & 1 == 0 { -0.05 } else { 0.05 });
+        let faces = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+        let facet = |triangle: [usize; 3]| {
+            let corners: String =
+                triangle.into_iter().map(corner).map(|[x, y, z]| format!("vertex {x} {y} {z}\n")).collect();
+            format!("facet normal 0 0 0\nouter loop\n{corners}endloop\nendfacet\n")
+        };
+        let triangles = faces.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]);
+        let stl = format!("solid cube\n{}endsolid cube\n", triangles.map(facet).collect::<String>());
+        let cube = "<collision><geometry><mesh filename='cube.stl'/></geometry></collision>";
+        let link = |i: usize| {
+            let (on, at) = if i == 0 { ("foot".to_owned(), "0 0 1") } else { (format!("cube{}", i - 1), "0.2 0 0") };
+            format!(
+                "<link name='cube{i}'>{cube}</link><joint name='turn{i}' type='revolute'><parent link='{on}'/><child link='cube{i}'/>\
+                 <origin xyz='{at}'/><axis xyz='0 0 1'/><limit lower='-3' upper='3' velocity='1' effort='1'/></joint>"
+            )
+        };
+        let urdf =
+            format!("<robot name='cubes'><link name='foot'/>{}</robot>", (0..CUBES).map(link).collect::<String>());
+        let joints: Vec<String> = (0..CUBES).map(|i| format!("'turn{i}'")).collect();
+        let description = format!(
+            "name = 'cubes'\nurdf = 'cubes.urdf'\n[arm]\njoints = [{}]\ntool = 'cube{}'\n",
+            joints.join(", "),
+            CUBES - 1
+        );
+        let description = RobotDescription::read(&description).unwrap();
+        Robot::of(description, &urdf, Some("<robot name='cubes'/>"), &mut |_| Ok(stl.clone().into_bytes())).unwrap()
+    }
+
+    #[test]
+    fn only_bodies_of_links_that_are_near_each_other_are_looked_at() {
+        let robot = cubes();
+        let bodies: usize = robot.model.links.iter().map(|link| link.bodies.len()).sum();
+        assert!(bodies > 30 * CUBES, "{bodies} spheres");
+        let at = |turns: [f64; CUBES]| Configuration { arm: JointVector::of(turns), ..robot.at_zero() };
+        let mut environment = Environment::new(&robot, &at([0.0; CUBES]), &[], &[]);
+        let mut look = |turns: [f64; CUBES]| {
+            environment.step(&robot, &at(turns));
+            let groups = environment.groups();
+            let pairs = environment.candidates(&groups).len();
+            let placed = groups.links.values().filter(|link| link.parts.get().is_some()).count();
+            (pairs, placed, environment.touches())
+        };
+        assert_eq!(look([0.0; CUBES]), (0, 0, Vec::new()));
+        // The third cube turns the rest back: the fourth comes beside the second, the others beyond are free.
+        let (pairs, placed, touches) = look([0.0, 0.0, 2.6, 0.0, -1.5, 0.0]);
+        assert!(touches.iter().any(|touch| touch.depth_m > 0.0), "{touches:?}");
+        assert!(pairs > 0 && pairs < bodies * (bodies - 1) / 2 / 10, "{pairs} pairs of {bodies} bodies");
+        assert!(placed < CUBES, "{placed}");
+    }
 }

@@ -1,0 +1,157 @@
+//! How long a system that starts is waited for: for as long as what is missing works, up to a bound.
+//!
+//! A cell or a worker that reads a robot with many meshes computes for many seconds before it is there, and for longer on a busy machine. Processor time
+//! tells that from a process that waits for something that never comes.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+/// For so long nothing that is missing may have worked.
+const IDLE: Duration = Duration::from_secs(30);
+/// However much it works.
+const LONGEST: Duration = Duration::from_secs(600);
+/// A process that has used so much more processor time works; what only waits wakes up now and then and uses far less of it in [`IDLE`].
+const WORK: Duration = Duration::from_secs(1);
+/// So often it is said what is waited for.
+const SAID_EVERY: Duration = Duration::from_secs(10);
+
+/// What the kernel counts processor time in, for programs (`proc_pid_stat(5)`): Linux has had it at a hundredth of a second on every machine.
+const TICK: Duration = Duration::from_millis(10);
+
+/// See the module.
+#[derive(Debug)]
+pub(super) struct Patience {
+    began: Instant,
+    worked: Instant,
+    said: Instant,
+    /// Of each process the processor time that it had when it was last found to work.
+    counted: BTreeMap<u32, Duration>,
+}
+
+/// What comes of a look.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Verdict {
+    /// Waits on.
+    Wait,
+    /// The same, and those who watch are told for how long already.
+    Say(Duration),
+    /// It is in vain: for how long it was waited, and why.
+    GiveUp(Duration, &'static str),
+}
+
+impl Patience {
+    /// What is waited for was started now.
+    pub(super) fn new(now: Instant) -> Patience {
+        Patience { began: now, worked: now, said: now, counted: BTreeMap::new() }
+    }
+
+    /// The processor time that the processes have used by now that are waited for.
+    pub(super) fn look(&mut self, now: Instant, used: &BTreeMap<u32, Duration>) -> Verdict {
+        for (pid, used) in used {
+            let counted = self.counted.entry(*pid).or_default();
+            if used.saturating_sub(*counted) >= WORK {
+                (*counted, self.worked) = (*used, now);
+            }
+        }
+        let waited = now.duration_since(self.began);
+        if waited >= LONGEST {
+            return Verdict::GiveUp(waited, "that is the longest that it is waited for");
+        }
+        if now.duration_since(self.worked) >= IDLE {
+            return Verdict::GiveUp(waited, "and nothing that is missing has used processor time for 30 s");
+        }
+        if now.duration_since(self.said) >= SAID_EVERY {
+            self.said = now;
+            return Verdict::Say(waited);
+        }
+        Verdict::Wait
+    }
+}
+
+/// The processor time of some processes, and of all that these and `parents` have started.
+pub(super) fn processor_time(of: &[u32], parents: &[u32]) -> BTreeMap<u32, Duration> {
+    let entries = std::fs::read_dir("/proc").into_iter().flatten().flatten();
+    let pids = entries.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());
+    let all: BTreeMap<u32, (u32, Duration)> = pids.filter_map(|pid| Some((pid, stat(pid)?))).collect();
+    let is_below = |pid: u32| {
+        // No chain of parents is longer than there are processes.
+        let above = std::iter::successors(Some(pid), |pid| all.get(pid).map(|(parent, _)| *parent));
+        above.skip(1).take(all.len()).any(|above| of.contains(&above) || parents.contains(&above))
+    };
+    let counts = all.iter().filter(|(pid, _)| of.contains(pid) || is_below(**pid));
+    counts.map(|(pid, (_, used))| (*pid, *used)).collect()
+}
+
+/// The parent of a process, and the processor time that it has used.
+fn stat(pid: u32) -> Option<(u32, Duration)> {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    // The name before may have spaces and parentheses.
+    let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
+    let ticks = |field: usize| fields.get(field)?.parse::<u32>().ok();
+    Some((fields.get(1)?.parse().ok()?, TICK * ticks(11)?.checked_add(ticks(12)?)?))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test may panic")]
+    use super::*;
+
+    /// What comes of a look at every second at a process that uses so much of each.
+    fn after(percent: u32) -> (Duration, &'static str) {
+        let began = Instant::now();
+        let mut patience = Patience::new(began);
+        for second in 1..=LONGEST.as_secs() {
+            let passed = Duration::from_secs(second);
+            let used = BTreeMap::from([(7, passed * percent / 100)]);
+            if let Verdict::GiveUp(waited, why) = patience.look(began + passed, &used) {
+                return (waited, why);
+            }
+        }
+        unreachable!("it is waited for ever");
+    }
+
+    #[test]
+    fn what_works_is_waited_for_up_to_a_bound_and_what_does_not_work_for_30_s() {
+        let (waited, why) = after(0);
+        assert!(waited == IDLE && why.contains("processor time"), "{waited:?} {why}");
+        // A daemon that waits.
+        assert_eq!(after(1).0, IDLE);
+        // The share of one process among many on a busy machine.
+        let (waited, why) = after(5);
+        assert!(waited == LONGEST && why.contains("longest"), "{waited:?} {why}");
+    }
+
+    #[test]
+    fn what_stops_to_work_is_waited_for_30_s_from_then() {
+        let began = Instant::now();
+        let mut patience = Patience::new(began);
+        let mut look = |second: u64, used_s: u64| {
+            patience.look(began + Duration::from_secs(second), &BTreeMap::from([(7, Duration::from_secs(used_s))]))
+        };
+        assert_eq!(look(5, 1), Verdict::Wait);
+        assert_eq!(look(20, 9), Verdict::Say(Duration::from_secs(20)));
+        assert_eq!(look(29, 9), Verdict::Wait);
+        assert!(matches!(look(49, 9), Verdict::Say(_)));
+        assert!(matches!(look(50, 9), Verdict::GiveUp(..)));
+    }
+
+    #[test]
+    fn the_processor_time_of_a_process_is_that_of_its_children_too() {
+        let busy = "for i in $(seq 100000); do :; done; sleep 100";
+        let mut child = std::process::Command::new("sh").args(["-c", busy]).spawn().unwrap();
+        let (own, pid) = (std::process::id(), child.id());
+        let begin = Instant::now();
+        let found = loop {
+            let used = processor_time(&[], &[own]);
+            assert!(!used.contains_key(&own));
+            if used.get(&pid).is_some_and(|used| *used >= TICK) || begin.elapsed() > Duration::from_secs(60) {
+                break used;
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        };
+        let of_it = processor_time(&[pid], &[]);
+        let end = (child.kill(), child.wait());
+        assert!(end.0.is_ok() && end.1.is_ok());
+        assert!(found[&pid] >= TICK && of_it[&pid] >= TICK && !of_it.contains_key(&own), "{found:?} {of_it:?}");
+    }
+}
