@@ -102,6 +102,22 @@ fn a_mesh_in_millimetres_without_a_scale_is_refused_with_what_to_write() {
 }
 
 #[test]
+fn the_spheres_of_a_thick_link_are_few_and_stand_out_by_a_small_part_of_its_length() {
+    // A limb 120 mm thick and 400 mm long.
+    let around = |i: usize| std::f64::consts::TAU * i as f64 / 48.0;
+    let outline: Vec<[f64; 2]> = (0..48).map(|i| [60.0 * around(i).cos(), 60.0 * around(i).sin()]).collect();
+    let mesh = Mesh::stl(&binary(&prism(&outline, 400.0)), MILLIMETRES).unwrap();
+    let spheres = mesh.cover(0.0);
+    let beyond = spheres.iter().map(|s| {
+        let [x, y, z] = s.centre;
+        (x.hypot(y) + s.radius - 0.06).max(s.radius - z).max(z + s.radius - 0.4)
+    });
+    let beyond_m = beyond.fold(0.0, f64::max);
+    assert!(beyond_m < 0.05 * 0.4, "they stand out by {beyond_m} m");
+    assert!(spheres.len() < 60, "{}", spheres.len());
+}
+
+#[test]
 fn every_point_of_a_mesh_is_in_one_of_its_spheres_and_they_stay_close() {
     let square = [[0.0, 0.0], [30.0, 0.0], [30.0, 30.0], [0.0, 30.0]];
     let long = prism(&square, 900.0);
