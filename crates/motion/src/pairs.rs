@@ -159,7 +159,7 @@ pub(crate) fn beside_srdf(model: &RobotModel, excepted: BTreeSet<Pair>) -> Check
 }
 
 /// The names of pairs, at the most so many of them.
-pub fn named<'p>(model: &RobotModel, pairs: &mut dyn Iterator<Item = &'p Pair>, most: usize) -> String {
+pub fn named(model: &RobotModel, pairs: &mut dyn Iterator<Item = &Pair>, most: usize) -> String {
     let name = |(a, b): &Pair| format!("{} and {}", model.links[*a].name, model.links[*b].name);
     let mut names: Vec<String> = pairs.map(name).collect();
     let more = names.len().saturating_sub(most);
