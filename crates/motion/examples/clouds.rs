@@ -23,7 +23,11 @@ fn main() {
     let number = |i: usize, other: f64| arguments.get(i).map_or(other, |text| text.parse().unwrap());
     let problems = Problems::parse(&read(2)).unwrap();
     let mechanism = Mechanism::read(&read(0), Some(&read(1)), &problems.joints).unwrap();
-    let settings = Settings { budget: Budget { iterations: 100_000, seed: 1 }, repetitions: number(5, 15.0) as usize };
+    let settings = Settings {
+        budget: Budget { iterations: 100_000, seed: 1 },
+        repetitions: number(5, 15.0) as usize,
+        limit: f64::INFINITY,
+    };
     let only = arguments.get(6);
     let (count, radius_m) = (number(3, 1e5) as usize, number(4, 2.5) * 1e-3);
     let begin = Instant::now();

@@ -23,7 +23,7 @@ fn main() {
     let budget = Budget { iterations: number(5, 1_000_000), seed: number(6, 1) as u64 };
     let width = number(7, Isa::detect().width());
     let isa = Isa::available().into_iter().find(|isa| isa.width() == width).unwrap();
-    let settings = Settings { budget, repetitions: number(3, 1) };
+    let settings = Settings { budget, repetitions: number(3, 1), limit: f64::INFINITY };
     let only = arguments.get(4).filter(|class| !class.is_empty());
     let mut clock = || {
         let time = clock_gettime(ClockId::ThreadCPUTime);

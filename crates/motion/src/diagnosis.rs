@@ -2,15 +2,25 @@
 //!
 //! The exact shapes are asked first. The search sees spheres that hold them, so it may find touching what is not: then those spheres are asked.
 
+use crate::confirmed::{Doubts, Met};
 use crate::exact::{Exact, Touch};
 use crate::geometry::{Body, Geometry};
 use crate::mechanism::Mechanism;
+use crate::pairs::{self, Pair};
 use crate::problems::Problem;
 use crate::robot_model::Link;
-use crate::space::ROUNDING_M;
+use crate::space::{ROUNDING_M, Space};
 use crate::spheres::Sphere;
 use crate::surroundings::Surroundings;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+
+/// Postures drawn for what is in the way, and what is named of it at the most.
+const DRAWN: usize = 100;
+const NAMED: usize = 3;
 
 /// What a posture breaks; `which` of the problem's ends it is begins each line.
 pub(crate) fn diagnosis(mechanism: &Mechanism, problem: &Problem, positions: &[f64], which: &str) -> Vec<String> {
@@ -21,14 +31,111 @@ pub(crate) fn diagnosis(mechanism: &Mechanism, problem: &Problem, positions: &[f
         format!("{which}: {name} is at {position}, outside {lower} to {upper} by {by:.2e}")
     });
     let touches = Exact::new(mechanism, problem.surroundings()).touches(positions);
-    let found: Vec<String> = limits.chain(touches.iter().map(|touch| format!("{which}: {touch}"))).collect();
+    let stuck: Vec<[&str; 2]> = match touches.is_empty() {
+        true => Vec::new(),
+        false => pairs::never_apart(mechanism).into_iter().map(|pair| names(mechanism, pair)).collect(),
+    };
+    let touch = |touch: &Touch| match stuck.contains(&[&touch.link, &touch.other]) {
+        true => format!("{which}: {touch}, {}", no_joint_parts([&touch.link, &touch.other])),
+        false => format!("{which}: {touch}"),
+    };
+    let found: Vec<String> = limits.chain(touches.iter().map(touch)).collect();
     if found.is_empty() { by_spheres(mechanism, problem, positions, which) } else { found }
+}
+
+fn names(mechanism: &Mechanism, (a, b): Pair) -> [&str; 2] {
+    [&mechanism.links[a].name, &mechanism.links[b].name]
+}
+
+/// What to do about two links that meet in every posture of the planned joints.
+pub(crate) fn no_joint_parts([a, b]: [&str; 2]) -> String {
+    format!(
+        "and no planned joint parts the two: put the joints that are not planned for elsewhere, or, if the two are made to touch, say so in the \
+         SRDF: {}",
+        exception(a, b, "Default")
+    )
+}
+
+/// What an SRDF says of two links that are not to be checked.
+pub(crate) fn exception(a: &str, b: &str, reason: &str) -> String {
+    format!("<disable_collisions link1=\"{a}\" link2=\"{b}\" reason=\"{reason}\"/>")
+}
+
+/// What is in the way of a search that found no path.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Blocked {
+    /// For people.
+    pub(crate) lines: Vec<String>,
+    /// Pairs whose spheres meet in many postures though the shapes do not.
+    pub(crate) doubts: Doubts,
+}
+
+/// Looks at the straight way, and at postures drawn from all of the planned joints.
+pub(crate) fn blocked(mechanism: &Mechanism, problem: &Problem, ends: [&[f64]; 2]) -> Blocked {
+    let exact = Exact::new(mechanism, problem.surroundings());
+    let mut lines = Vec::new();
+    let straight = exact.touch_along(&ends.map(<[f64]>::to_vec), Space::RESOLUTION.into());
+    lines.extend(straight.map(|touch| format!("on the straight way {touch}")));
+    // In how many postures each thing meets another by the shapes, and in how many two links do by their spheres.
+    let mut met: BTreeMap<Met, [usize; 2]> = BTreeMap::new();
+    let (around, mut random) = (pairs::around(mechanism), ChaCha8Rng::seed_from_u64(1));
+    let searched: Vec<Pair> =
+        mechanism.pairs().into_iter().filter(|pair| !mechanism.by_shapes.contains(pair)).collect();
+    for _ in 0..DRAWN {
+        let posture: Vec<f64> = mechanism.joints.iter().map(|joint| pairs::drawn(joint, &mut random)).collect();
+        let poses = mechanism.poses(&posture);
+        Doubts::met(&exact, &posture).into_each(&mut |what| met.entry(what).or_default()[0] += 1);
+        let by_spheres = searched.iter().filter(|pair| pairs::spheres_meet(mechanism, &around, &poses, **pair));
+        by_spheres.for_each(|pair| met.entry(Met::Pair(*pair)).or_default()[1] += 1);
+    }
+    let mut often: Vec<(&Met, &[usize; 2])> = met.iter().collect();
+    often.sort_by_key(|(_, counts)| Reverse(counts.iter().max().copied()));
+    let mut doubts = Doubts::default();
+    for (what, [shapes, spheres]) in &often {
+        if spheres.saturating_sub(*shapes) * 10 > DRAWN {
+            doubts.insert((*what).clone());
+        }
+    }
+    let named = often.iter().take(NAMED).map(|(what, [shapes, spheres])| {
+        let link = |link: usize| &mechanism.links[link].name[..];
+        match what {
+            Met::Pair((a, b)) => {
+                format!("{} and {} in {shapes}, and by their spheres in {}", link(*a), link(*b), spheres.max(shapes))
+            }
+            Met::Beside((a, name)) => format!("{} and {name} in {shapes}", link(*a)),
+        }
+    });
+    let named: Vec<String> = named.collect();
+    if !named.is_empty() {
+        lines.push(format!("of {DRAWN} postures drawn, what meets in most: {}", named.join(", ")));
+    }
+    Blocked { lines, doubts }
+}
+
+/// How much larger the search takes the meshes that stand around, in metres.
+pub(crate) fn overhang_m(problem: &Problem) -> f64 {
+    problem.meshes.iter().map(|mesh| mesh.overhang_m).fold(0.0, f64::max)
+}
+
+/// What the spheres touch in one of these postures though the shapes do not: that alone, and with as much as the search takes meshes larger.
+pub(crate) fn doubts<'p>(
+    mechanism: &Mechanism,
+    problem: &Problem,
+    postures: impl IntoIterator<Item = &'p [f64]>,
+) -> Doubts {
+    let surroundings = problem.surroundings();
+    let coarse = of_spheres(mechanism, ROUNDING_M + overhang_m(problem));
+    let (coarse, exact) = (Exact::new(&coarse, surroundings), Exact::new(mechanism, surroundings));
+    let mut doubts = Doubts::default();
+    for posture in postures {
+        doubts.add(&coarse, &exact, posture);
+    }
+    doubts
 }
 
 /// What the spheres of the robot touch; they alone, and with as much as the search takes meshes larger.
 fn by_spheres(mechanism: &Mechanism, problem: &Problem, positions: &[f64], which: &str) -> Vec<String> {
-    let overhang_m = problem.meshes.iter().map(|mesh| mesh.overhang_m).fold(0.0, f64::max);
-    let touches = [0.0, overhang_m].into_iter().find_map(|larger_m| {
+    let touches = [0.0, overhang_m(problem)].into_iter().find_map(|larger_m| {
         let touches = sphere_touches(mechanism, problem.surroundings(), positions, larger_m);
         (!touches.is_empty()).then_some(touches)
     });
@@ -48,9 +155,7 @@ pub(crate) fn crowding(mechanism: &Mechanism, own: usize, Touch { link, other, d
     let of_link =
         if index(other).is_some_and(|index| !mechanism.links[index].spheres.is_empty()) { "those of " } else { "" };
     let what = if is_own(link) && is_own(other) {
-        format!(
-            "if the two never touch, say so in the SRDF: <disable_collisions link1=\"{link}\" link2=\"{other}\" reason=\"Never\"/>"
-        )
+        format!("if the two never touch, say so in the SRDF: {}", exception(link, other, "Never"))
     } else {
         "leave that much more room".to_owned()
     };

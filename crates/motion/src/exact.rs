@@ -46,23 +46,32 @@ pub struct Exact<'a> {
     pairs: Vec<(usize, usize)>,
 }
 
+/// What a link touches.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Other<'n> {
+    /// Something that stands around, by its name.
+    Standing(&'n str),
+    /// Another link, whose index is the greater one.
+    Link(usize),
+}
+
 /// A shape of a link or an obstacle, and its pose there.
-#[derive(Debug)]
-struct Shape {
-    at: Pose,
-    form: Form,
-    solid: Solid,
+#[derive(Debug, Clone)]
+pub(crate) struct Shape {
+    pub(crate) at: Pose,
+    pub(crate) form: Form,
+    pub(crate) solid: Solid,
 }
 
 impl Shape {
-    fn placed(&self, frame: &Pose) -> Placed<'_> {
+    pub(crate) fn placed(&self, frame: &Pose) -> Placed<'_> {
         Placed { pose: to_f32(&compose(frame, &self.at)), solid: &self.solid }
     }
 }
 
 impl Placed<'_> {
     /// How deep the deepest ball of a cloud is in this.
-    fn depth_in(&self, cloud: &Cloud) -> Option<f64> {
+    pub(crate) fn depth_in(&self, cloud: &Cloud) -> Option<f64> {
         let mut deepest = None;
         self.meet(cloud, 0.0, &mut |_, depth| {
             deepest = Some(deepest.map_or(depth, |d: f32| d.max(depth)));
@@ -83,14 +92,7 @@ impl<'a> Exact<'a> {
     /// A robot among obstacles.
     pub fn new(mechanism: &'a Mechanism, surroundings: impl Into<Surroundings<'a>>) -> Exact<'a> {
         let Surroundings { obstacles, clouds, meshes } = surroundings.into();
-        let solid = |obstacle: &'a Obstacle| {
-            let body = obstacle.geometry.at(obstacle.pose);
-            (&*obstacle.name, Shape { at: body.pose, form: Form::Own, solid: Solid::primitive(&body, 0.0) })
-        };
-        let mesh = |MeshObstacle { name, pose, mesh, .. }: &'a MeshObstacle| {
-            (&**name, Shape { at: *pose, form: Form::Own, solid: Solid::mesh(mesh, 0.0) })
-        };
-        let standing = obstacles.iter().map(solid).chain(meshes.iter().map(mesh)).collect();
+        let standing = standing(obstacles, meshes).collect();
         let bodies = mechanism.links.iter().map(shapes).collect();
         Exact { mechanism, obstacles: standing, clouds, bodies, pairs: mechanism.pairs() }
     }
@@ -98,18 +100,27 @@ impl<'a> Exact<'a> {
     /// What touches first in a posture, if anything.
     pub fn touch(&self, positions: &[f64]) -> Option<Touch> {
         let mut first = None;
-        self.visit(positions, &mut |touch| {
-            first = Some(touch);
+        self.visit(positions, &mut |link, other, depth_m| {
+            first = Some(self.told(link, other, depth_m));
             false
         });
         first
     }
 
+    fn told(&self, link: usize, other: Other<'_>, depth_m: f64) -> Touch {
+        let name = |link: usize| self.mechanism.links[link].name.clone();
+        let other = match other {
+            Other::Standing(name) => name.to_owned(),
+            Other::Link(second) => name(second),
+        };
+        Touch { link: name(link), other, depth_m }
+    }
+
     /// All that touches in a posture, the deepest first, once per pair of names.
     pub fn touches(&self, positions: &[f64]) -> Vec<Touch> {
         let mut all: Vec<Touch> = Vec::new();
-        self.visit(positions, &mut |touch| {
-            all.push(touch);
+        self.visit(positions, &mut |link, other, depth_m| {
+            all.push(self.told(link, other, depth_m));
             true
         });
         all.sort_by(|a, b| b.depth_m.total_cmp(&a.depth_m));
@@ -126,6 +137,16 @@ impl<'a> Exact<'a> {
     pub(crate) fn do_meet(&self, poses: &[Pose], a: usize, b: usize) -> bool {
         let placed = |link: usize| self.bodies[link].iter().map(move |shape| shape.placed(&poses[link]));
         placed(a).any(|body| placed(b).any(|other| body.touches(&other)))
+    }
+
+    /// Keeps of these pairs of links those that meet in a posture.
+    pub(crate) fn retain_meeting(&self, positions: &[f64], pairs: &mut Vec<(usize, usize)>) {
+        let placed = self.placed(positions);
+        pairs.retain(|&(a, b)| {
+            let by_shapes = self.mechanism.is_by_shapes(a, b);
+            let of = |link: usize| placed[link].iter().filter(move |(form, _)| form.counts(by_shapes));
+            of(a).any(|(_, body)| of(b).any(|(_, other)| body.touches(other)))
+        });
     }
 
     /// The numbers of a cloud's points whose balls come within `margin_m` metres of the robot.
@@ -149,18 +170,17 @@ impl<'a> Exact<'a> {
         placed
     }
 
-    /// Shows touches until it hears that no more are wanted.
-    fn visit(&self, positions: &[f64], wants_more: &mut dyn FnMut(Touch) -> bool) {
+    /// Shows what touches what and how deep, in metres, until it hears that no more is wanted.
+    pub(crate) fn visit(&self, positions: &[f64], wants_more: &mut dyn FnMut(usize, Other<'_>, f64) -> bool) {
         let placed = self.placed(positions);
         let of_link = |link: usize, by_shapes: bool| {
             placed[link].iter().filter(move |(form, _)| form.counts(by_shapes)).map(|(_, body)| body)
         };
-        let name = |link: usize| self.mechanism.links[link].name.clone();
         for link in 0..placed.len() {
             for body in of_link(link, false) {
                 for (obstacle, shape) in self.obstacles.iter().filter(|o| self.mechanism.is_kept_from(link, o.0)) {
                     if let Some(depth_m) = body.depth(&shape.placed(&Pose::IDENTITY))
-                        && !wants_more(Touch { link: name(link), other: (*obstacle).to_owned(), depth_m })
+                        && !wants_more(link, Other::Standing(obstacle), depth_m)
                     {
                         return;
                     }
@@ -171,7 +191,7 @@ impl<'a> Exact<'a> {
             for cloud in self.clouds.iter().filter(|cloud| self.mechanism.is_kept_from(link, &cloud.name)) {
                 let deepest = of_link(link, false).filter_map(|body| body.depth_in(cloud)).reduce(f64::max);
                 if let Some(depth_m) = deepest
-                    && !wants_more(Touch { link: name(link), other: cloud.name.clone(), depth_m })
+                    && !wants_more(link, Other::Standing(&cloud.name), depth_m)
                 {
                     return;
                 }
@@ -182,7 +202,7 @@ impl<'a> Exact<'a> {
             for body in of_link(link, by_shapes) {
                 for other in of_link(second, by_shapes) {
                     if let Some(depth_m) = body.depth(other)
-                        && !wants_more(Touch { link: name(link), other: name(second), depth_m })
+                        && !wants_more(link, Other::Link(second), depth_m)
                     {
                         return;
                     }
@@ -211,8 +231,23 @@ impl<'a> Exact<'a> {
     }
 }
 
+/// What stands around but clouds, by name.
+pub(crate) fn standing<'a>(
+    obstacles: &'a [Obstacle],
+    meshes: &'a [MeshObstacle],
+) -> impl Iterator<Item = (&'a str, Shape)> {
+    let solid = |obstacle: &'a Obstacle| {
+        let body = obstacle.geometry.at(obstacle.pose);
+        (&*obstacle.name, Shape { at: body.pose, form: Form::Own, solid: Solid::primitive(&body, 0.0) })
+    };
+    let mesh = |MeshObstacle { name, pose, mesh, .. }: &'a MeshObstacle| {
+        (&**name, Shape { at: *pose, form: Form::Own, solid: Solid::mesh(mesh, 0.0) })
+    };
+    obstacles.iter().map(solid).chain(meshes.iter().map(mesh))
+}
+
 /// All shapes of a link.
-fn shapes(link: &Link) -> Vec<Shape> {
+pub(crate) fn shapes(link: &Link) -> Vec<Shape> {
     let padding_m = link.padding_m;
     let primitive =
         |(form, body): (Form, &Body)| Shape { at: body.pose, form, solid: Solid::primitive(body, padding_m) };

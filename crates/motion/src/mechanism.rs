@@ -107,7 +107,7 @@ impl Mechanism {
 
     /// Links moved by the joints that are planned for, of which those pairs are checked.
     pub(crate) fn new(name: &str, joints: Vec<Joint>, links: Vec<Link>, checks: Checks) -> Mechanism {
-        let Checks { excepted, by_shapes } = checks;
+        let Checks { excepted, by_shapes, .. } = checks;
         Mechanism { name: name.to_owned(), joints, links, excepted, by_shapes, allowed: BTreeSet::new() }
     }
 

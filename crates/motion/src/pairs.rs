@@ -5,13 +5,15 @@
 //! prove nothing; so does one that meets in the default state and can part, because it can meet elsewhere, too. Only two kinds are not checked:
 //!
 //! - neighbours whose spheres meet in the default state: they are made to touch at the joint between them, and its limits keep them from more;
-//! - pairs that meet in every posture: nothing is there to be kept apart, and a check would forbid all postures.
+//! - pairs that meet in every posture: nothing is there to be kept apart, and a check would forbid all postures. These are not checked beside an SRDF
+//!   either; one that excepts no pair at all is taken for none.
 //!
 //! The search sees spheres. Where they meet so often though the shapes do not that it could not move, the exact check of the finished path alone
 //! sees the pair ([`Checks::by_shapes`]). With an SRDF that is so where the spheres leave hardly a posture of those in which the shapes are apart:
 //! they would forbid nearly all that the SRDF leaves to be planned. The robots of workers and cells, which know meshes by spheres that hold them,
 //! take that for links with meshes without an SRDF, too (`RobotModel::read_with_covers`).
 
+use crate::diagnosis;
 use crate::exact::Exact;
 use crate::mechanism::Mechanism;
 use crate::robot_model::{Joint, RobotModel};
@@ -75,6 +77,8 @@ pub struct Checks {
     pub excepted: BTreeSet<Pair>,
     /// Checked by the exact shapes, and not by spheres.
     pub by_shapes: BTreeSet<Pair>,
+    /// Of those that are not checked, those of which no SRDF says so: they meet in every posture, or are neighbours that are made to touch.
+    pub unsaid: BTreeSet<Pair>,
 }
 
 /// What postures are looked at for.
@@ -136,10 +140,54 @@ pub(crate) fn checks(model: &RobotModel) -> Checks {
             _ => {}
         }
     }
+    checks.unsaid = checks.excepted.clone();
     checks
 }
 
-/// Of the pairs that an SRDF does not except, those whose spheres meet in nearly all postures in which their shapes are apart.
+/// What to check where an SRDF excepts pairs: all others, but for those that meet in every posture.
+pub(crate) fn beside_srdf(model: &RobotModel, excepted: BTreeSet<Pair>) -> Checks {
+    let mut checks = Checks { excepted, ..Checks::default() };
+    for (pair, tally) in tallies(model, checks.clone(), Look::Undecided) {
+        if tally.met == tally.postures {
+            checks.unsaid.insert(pair);
+        } else if tally.is_undecided() {
+            checks.by_shapes.insert(pair);
+        }
+    }
+    checks.excepted.extend(&checks.unsaid);
+    checks
+}
+
+/// The names of pairs, at the most so many of them.
+pub fn named(model: &RobotModel, pairs: &mut dyn Iterator<Item = &Pair>, most: usize) -> String {
+    let name = |(a, b): &Pair| format!("{} and {}", model.links[*a].name, model.links[*b].name);
+    let mut names: Vec<String> = pairs.map(name).collect();
+    let more = names.len().saturating_sub(most);
+    names.truncate(most);
+    names.join(", ") + &if more > 0 { format!(" and {more} more") } else { String::new() }
+}
+
+/// What an SRDF says of a pair that is not to be checked.
+pub fn exception(model: &RobotModel, (a, b): Pair, reason: &str) -> String {
+    diagnosis::exception(&model.links[a].name, &model.links[b].name, reason)
+}
+
+/// Pairs that are checked and meet in every posture of what is planned for: no planned joint parts them, so no posture is free.
+pub fn never_apart(mechanism: &Mechanism) -> Vec<Pair> {
+    let exact = Exact::new(mechanism, &[]);
+    let mut random = ChaCha8Rng::seed_from_u64(SEED);
+    let mut pairs = mechanism.pairs();
+    for _ in 0..SAMPLES {
+        if pairs.is_empty() {
+            break;
+        }
+        let positions: Vec<f64> = mechanism.joints.iter().map(|joint| drawn(joint, &mut random)).collect();
+        exact.retain_meeting(&positions, &mut pairs);
+    }
+    pairs
+}
+
+/// Of the pairs that are checked, those whose spheres meet in nearly all postures in which their shapes are apart.
 pub(crate) fn undecided(model: &RobotModel, excepted: &BTreeSet<Pair>) -> BTreeSet<Pair> {
     let checks = Checks { excepted: excepted.clone(), ..Checks::default() };
     let tallies = tallies(model, checks, Look::Undecided).into_iter();
@@ -191,7 +239,7 @@ fn tallies(model: &RobotModel, checks: Checks, look: Look) -> BTreeMap<Pair, Tal
     tallies
 }
 
-fn drawn(joint: &Joint, random: &mut impl Rng) -> f64 {
+pub(crate) fn drawn(joint: &Joint, random: &mut impl Rng) -> f64 {
     let (lower, upper) = match (joint.lower.is_finite(), joint.upper.is_finite()) {
         (true, true) => (joint.lower, joint.upper),
         (true, false) => (joint.lower, joint.lower + 2.0 * ENDLESS),
@@ -202,7 +250,7 @@ fn drawn(joint: &Joint, random: &mut impl Rng) -> f64 {
 }
 
 /// Of each link, a sphere that holds its spheres.
-fn around(mechanism: &Mechanism) -> Vec<Sphere> {
+pub(crate) fn around(mechanism: &Mechanism) -> Vec<Sphere> {
     let of = |spheres: &[Sphere]| {
         let count = spheres.len().max(1) as f64;
         let centre: [f64; 3] = std::array::from_fn(|i| spheres.iter().map(|s| s.centre[i]).sum::<f64>() / count);
@@ -212,7 +260,7 @@ fn around(mechanism: &Mechanism) -> Vec<Sphere> {
     mechanism.links.iter().map(|link| of(&link.spheres)).collect()
 }
 
-fn spheres_meet(mechanism: &Mechanism, around: &[Sphere], poses: &[Pose], (a, b): Pair) -> bool {
+pub(crate) fn spheres_meet(mechanism: &Mechanism, around: &[Sphere], poses: &[Pose], (a, b): Pair) -> bool {
     let far = away(poses[a].transform(around[a].centre), poses[b].transform(around[b].centre));
     if far >= around[a].radius + around[b].radius {
         return false;

@@ -45,6 +45,8 @@ pub struct RobotModel {
     pub(crate) texts: BTreeMap<String, JointText>,
     /// What the SRDF says of pairs of links, or, without one, what follows from how they meet ([`pairs`]).
     pub(crate) checks: Checks,
+    /// Whether an SRDF excepts pairs of links from checks.
+    has_exceptions: bool,
 }
 
 /// A joint and its limits (radians, or metres for sliding joints).
@@ -242,7 +244,7 @@ impl RobotModel {
         load: &mut Loader<'_>,
     ) -> Result<RobotModel, MechanismError> {
         let mut model = RobotModel::read_with_meshes(urdf, srdf, load)?;
-        if srdf.is_none() {
+        if !model.has_exceptions {
             // Such spheres forbid no more than they did, and the search sees them: of pairs with meshes only those go by their shapes of which spheres
             // leave hardly anything.
             let undecided = pairs::undecided(&model, &model.checks.excepted);
@@ -267,15 +269,11 @@ impl RobotModel {
 
     fn of(description: Description, srdf: Option<&str>) -> Result<RobotModel, MechanismError> {
         let Description { name, joints, links, mimics, texts } = description;
-        let excepted = srdf.map(|text| srdf::excepted(text, &links)).transpose()?;
-        let mut model = RobotModel { name, joints, links, mimics, texts, checks: Checks::default() };
-        model.checks = match excepted {
-            Some(excepted) => {
-                let by_shapes = pairs::undecided(&model, &excepted);
-                Checks { excepted, by_shapes }
-            }
-            None => pairs::checks(&model),
-        };
+        let excepted = srdf.map_or_else(|| Ok(BTreeSet::new()), |text| srdf::excepted(text, &links))?;
+        let has_exceptions = !excepted.is_empty();
+        let mut model = RobotModel { name, joints, links, mimics, texts, checks: Checks::default(), has_exceptions };
+        // An SRDF may say nothing but groups of joints and postures.
+        model.checks = if has_exceptions { pairs::beside_srdf(&model, excepted) } else { pairs::checks(&model) };
         Ok(model)
     }
 
@@ -307,6 +305,11 @@ impl RobotModel {
     /// What is checked of pairs of links.
     pub fn checks(&self) -> &Checks {
         &self.checks
+    }
+
+    /// Whether an SRDF excepts pairs of its links from checks. Without any, [`pairs`] finds out.
+    pub fn has_exceptions(&self) -> bool {
+        self.has_exceptions
     }
 
     /// Whether two links are excepted from checks. A link is never checked against itself.

@@ -8,6 +8,7 @@
 
 use crate::branches;
 use crate::cloud::Cloud;
+use crate::confirmed::Confirmed;
 use crate::geometry::Geometry;
 use crate::mechanism::{MAX_JOINTS, Mechanism};
 use crate::occupied::{self, Reached};
@@ -76,11 +77,16 @@ pub struct Space {
     /// A part that no joint moves stands in an obstacle.
     blocked: bool,
     swept: bool,
+    /// What is told apart by exact shapes.
+    confirmed: Option<Arc<Confirmed>>,
 }
 
 impl Space {
     /// Postures per radian of a motion that the search looks at; more where a link that mimics the joint goes further ([`Mechanism`]).
     pub const RESOLUTION: f32 = 32.0;
+
+    /// Postures per radian that are looked at by exact shapes where nothing is to be left between the postures.
+    pub(crate) const EXACT_RESOLUTION: f32 = 4.0 * Space::RESOLUTION;
 
     /// A robot among obstacles.
     pub fn new<'a>(mechanism: &Mechanism, surroundings: impl Into<Surroundings<'a>>) -> Space {
@@ -136,7 +142,7 @@ impl Space {
         }
         let scratch = Scratch::new(&compiled);
         let branches = branches::branches(&parents(&compiled));
-        Space { compiled, scratch, isa, lower, upper, fineness, branches, blocked, swept: false }
+        Space { compiled, scratch, isa, lower, upper, fineness, branches, blocked, swept: false, confirmed: None }
     }
 
     /// How many joints there are.
@@ -164,6 +170,11 @@ impl Space {
         self.swept = swept;
     }
 
+    /// From now on this is looked at, too, by exact shapes.
+    pub(crate) fn confirm(&mut self, confirmed: Confirmed) {
+        self.confirmed = Some(Arc::new(confirmed));
+    }
+
     /// Whether it leaves nothing.
     pub fn is_swept(&self) -> bool {
         self.swept
@@ -176,7 +187,9 @@ impl Space {
 
     /// Whether a posture touches nothing.
     pub fn is_free(&mut self, state: &State) -> bool {
-        !self.blocked && self.check(state, &[0.0; MAX_JOINTS], 1, ALL)
+        !self.blocked
+            && self.check(state, &[0.0; MAX_JOINTS], 1, ALL)
+            && self.confirmed.as_ref().is_none_or(|confirmed| confirmed.is_free(state))
     }
 
     /// Which of up to [`WIDEST`] postures touch something that was touched lately, a bit each.
@@ -198,7 +211,15 @@ impl Space {
         }
         let delta = difference(to, from);
         let batches = self.batches(&delta);
-        !self.blocked && self.check(from, &delta, batches, ALL)
+        !self.blocked && self.check(from, &delta, batches, ALL) && self.is_confirmed(from, to, Space::RESOLUTION)
+    }
+
+    /// Whether what is told apart by exact shapes is apart along a straight motion, by so many postures per radian.
+    fn is_confirmed(&self, from: &State, to: &State, per_radian: f32) -> bool {
+        let Some(confirmed) = &self.confirmed else { return true };
+        let delta = difference(to, from);
+        let length = length(&std::array::from_fn(|j| delta[j] * self.fineness[j]));
+        confirmed.is_free_motion(from, to, (length * per_radian).ceil().max(1.0) as usize)
     }
 
     /// Whether a straight motion touches nothing, also between the postures.
@@ -206,7 +227,10 @@ impl Space {
         let delta = difference(to, from);
         // What is wrong at all is mostly found by the coarse look.
         let batches = self.batches(&delta);
-        !self.blocked && self.check(from, &delta, batches, ALL) && self.sweep(from, &delta)
+        !self.blocked
+            && self.check(from, &delta, batches, ALL)
+            && self.sweep(from, &delta)
+            && self.is_confirmed(from, to, Space::EXACT_RESOLUTION)
     }
 
     /// One batch of postures along a motion; what the measurements time.
@@ -216,7 +240,7 @@ impl Space {
 
     /// As [`Space::is_swept_free`], for a motion whose postures were looked at before.
     pub(crate) fn is_swept_free_too(&mut self, from: &State, to: &State) -> bool {
-        !self.blocked && self.sweep(from, &difference(to, from))
+        !self.blocked && self.sweep(from, &difference(to, from)) && self.is_confirmed(from, to, Space::EXACT_RESOLUTION)
     }
 
     fn sweep(&mut self, from: &State, delta: &State) -> bool {

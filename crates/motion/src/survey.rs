@@ -3,17 +3,20 @@
 
 use crate::arm::{self, line};
 use crate::collision::{CONTACT_TOLERANCE_M, Checker, Contact, PADDING_M};
+use crate::diagnosis::no_joint_parts;
 use crate::joint_vector::JointVector;
+use crate::pairs::{self, Pair};
 use crate::plan::has_room;
 use crate::reach::Target;
 use crate::robot::{Configuration, Joint, Robot};
+use crate::robot_model::RobotModel;
 use crate::top_grasp::{APPROACH_M, grasp_poses};
 use crate::workplace::{Boxes, HOME, Surface, Workplace};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use ratn_model::pose::Pose;
 use ratn_world::scene::{Placement, Scene, SceneObject, Shape};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
 use std::ops::RangeInclusive;
 
@@ -40,6 +43,7 @@ pub fn survey(robot: &Robot) -> Survey {
     let has = |it: bool| if it { "yes" } else { "no" };
     let mut survey = Survey { lines: vec![format!("robot     {}", robot.name())], faults: Vec::new() };
     survey.add_arm(robot, "");
+    survey.add_pairs(robot);
     survey.lines.extend([
         format!("base      {}", has(!robot.base_joints().is_empty())),
         format!("head      {}", has(!robot.head_joints().is_empty())),
@@ -111,6 +115,31 @@ impl Survey {
         ]);
     }
 
+    /// Which pairs of links are not checked though no SRDF says so, which the search does not see, and which are in the way of every motion.
+    fn add_pairs(&mut self, robot: &Robot) {
+        let (model, checks) = (&robot.model, robot.model.checks());
+        let says = match (model.has_exceptions(), checks.unsaid.is_empty()) {
+            (true, true) => "the SRDF says which are not checked".to_owned(),
+            (true, false) => "those that the SRDF excepts are not checked, nor are those that meet in every posture".to_owned(),
+            (false, _) => {
+                "no SRDF excepts any; not checked are neighbours that are made to touch, and those that meet in every posture".to_owned()
+            }
+        };
+        self.lines.push(format!("pairs     {says}{}", listed(model, &checks.unsaid)));
+        if !checks.by_shapes.is_empty() {
+            let names = listed(model, &checks.by_shapes);
+            self.lines.push(format!(
+                "          not seen by the search, but by the check of its ends and of the finished path{names}"
+            ));
+        }
+        let arm = robot.arm(&robot.at_zero());
+        for (a, b) in pairs::never_apart(&arm) {
+            let names = [&arm.links[a].name[..], &arm.links[b].name];
+            let [a, b] = names;
+            self.faults.push(format!("{a} meets {b} in every posture of the arm, {}", no_joint_parts(names)));
+        }
+    }
+
     /// Where the postures of that arm bring its tool, and whether they collide with the table or the robot itself, whose other arms stand in
     /// their postures `home`, or leave the planner no room.
     fn add_postures(&mut self, robot: &Robot, scene: &Scene, whose: &str) {
@@ -128,6 +157,11 @@ impl Survey {
             self.faults.extend(fault.map(|fault| format!("the posture `{name}`{whose} {fault}")));
         }
     }
+}
+
+/// The names of pairs, behind a colon.
+fn listed(model: &RobotModel, pairs: &BTreeSet<Pair>) -> String {
+    if pairs.is_empty() { String::new() } else { format!(": {}", pairs::named(model, &mut pairs.iter(), usize::MAX)) }
 }
 
 /// The tool's least and greatest height, and how far it gets from the arm's first joint.

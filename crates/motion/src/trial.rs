@@ -1,7 +1,8 @@
 //! One planning problem solved as a user of the crate would, timed by the caller's clock and checked by the exact shapes.
 
+use crate::confirmed::{Confirmed, Doubts};
 use crate::connect::{Budget, ConnectError, Route, connect};
-use crate::diagnosis::diagnosis;
+use crate::diagnosis;
 use crate::endless::{Unwound, unwound, wound_too_far};
 use crate::exact::{Exact, Touch};
 use crate::mechanism::Mechanism;
@@ -9,17 +10,20 @@ use crate::pace::Control;
 use crate::problems::Problem;
 use crate::simplify::{path_length, simplify};
 use crate::space::{Isa, Space, State, state};
+use std::cell::RefCell;
 
 /// Postures per radian that the exact check looks at: four times those of the search.
-const EXACT_PER_RADIAN: f64 = 4.0 * Space::RESOLUTION as f64;
+const EXACT_PER_RADIAN: f64 = Space::EXACT_RESOLUTION as f64;
 
 /// How a problem is tried.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
     /// What the search may cost.
     pub budget: Budget,
-    /// How often it is solved, for the least times; at least once. Every time gives the same path.
+    /// How often it is solved, for the least times; at least once. Every time gives the same path. What was not solved is not tried again.
     pub repetitions: usize,
+    /// How long all of that may take before it is given up, in the clock's units; infinity for as long as the budget lasts.
+    pub limit: f64,
 }
 
 /// What came of a problem.
@@ -76,48 +80,137 @@ pub fn run_with_isa(
         ("goal state", &problem.goal, ConnectError::Goal { goals: 1 }),
     ];
     for (which, positions, error) in ends {
-        let diagnosis = wound_too_far(mechanism, positions, which);
-        if !diagnosis.is_empty() {
-            return Trial { plan: 0.0, simplify: 0.0, outcome: Err(error), diagnosis };
+        let wound = wound_too_far(mechanism, positions, which);
+        if !wound.is_empty() {
+            return Trial { plan: 0.0, simplify: 0.0, outcome: Err(error), diagnosis: wound };
         }
     }
     let unwound = unwound(mechanism, &problem.start, &problem.goal);
     let mechanism = &unwound.mechanism;
-    let mut space = Space::with_isa(mechanism, problem.surroundings(), isa);
     let ends = [("start", &unwound.start), ("goal", &unwound.goals[0])].map(|(which, positions)| {
         let (positions, beyond) = mechanism.clamped(positions);
         (positions, beyond.iter().map(|b| format!("{which} state: {b}")).collect::<Vec<_>>())
     });
-    let start = state(&ends[0].0);
-    let goals: Vec<State> = unwound.goals.iter().map(|goal| state(&mechanism.clamped(goal).0)).collect();
-    let mut go_on = |_: usize| Control::Continue;
-    let (mut plan_time, mut simplify_time) = (f64::INFINITY, f64::INFINITY);
-    let mut outcome = Err(ConnectError::Cancelled);
-    for _ in 0..settings.repetitions.max(1) {
-        let begin = clock();
-        let route = connect(&mut space, &start, &goals, settings.budget, &mut go_on);
-        let between = clock();
-        let paths = route.and_then(|route| {
-            let path = simplify(&mut space, &route.path, settings.budget, &mut go_on)?;
-            Ok((route, path))
-        });
-        let end = clock();
-        plan_time = plan_time.min(between - begin);
-        simplify_time = simplify_time.min(end - between);
-        outcome = paths.map_err(|error| match error {
+    let goals: Vec<Vec<f64>> = unwound.goals.iter().map(|goal| mechanism.clamped(goal).0).collect();
+    let exact = Exact::new(mechanism, problem.surroundings());
+    // Some pairs are not looked at in the search: the exact shapes decide about its ends.
+    let goals: Vec<Vec<f64>> = goals.into_iter().filter(|goal| exact.touch(goal).is_none()).collect();
+    let refusal = match () {
+        () if exact.touch(&ends[0].0).is_some() => Some(ConnectError::Start),
+        () if goals.is_empty() => Some(ConnectError::Goal { goals: 1 }),
+        () => None,
+    };
+    let mut space = Space::with_isa(mechanism, problem.surroundings(), isa);
+    let mut doubts = Doubts::default();
+    let mut postures = goals.iter().chain([&ends[0].0]).map(Vec::as_slice);
+    if refusal.is_none() && postures.clone().any(|posture| !space.is_free(&state(posture))) {
+        doubts = diagnosis::doubts(mechanism, problem, &mut postures);
+    }
+    let mut task = Task { unwound: &unwound, problem, settings, isa, start: &ends[0].0, goals: &goals };
+    let clock = RefCell::new(clock);
+    let now = || (clock.borrow_mut())();
+    let begin = now();
+    let mut tried = match refusal {
+        Some(error) => Tried { plan: 0.0, simplify: 0.0, outcome: Err(error) },
+        None if doubts.is_empty() => task.attempt(&mut space, begin, &now),
+        None => task.attempt(&mut task.confirming(&doubts), begin, &now),
+    };
+    let mut lines = Vec::new();
+    // Spheres may leave no way where the shapes do, and the shapes reject what was found beside pairs that the search does not look at.
+    let again = match &tried.outcome {
+        Ok(Found { touch: Some(_), .. }) => {
+            doubts.extend(Doubts { pairs: mechanism.by_shapes.clone(), ..Doubts::default() })
+        }
+        Err(ConnectError::Exhausted { .. } | ConnectError::TimeUp { .. }) => {
+            let blocked = diagnosis::blocked(mechanism, problem, [&ends[0].0, &goals[0]]);
+            lines = blocked.lines;
+            doubts.extend(blocked.doubts)
+        }
+        _ => false,
+    };
+    if again && now() - begin < settings.limit {
+        task.settings.repetitions = 1;
+        let mended = task.attempt(&mut task.confirming(&doubts), begin, &now);
+        // A path that the shapes reject is still told as one where there is no other.
+        if mended.outcome.is_ok() || tried.outcome.is_err() {
+            tried = Tried { plan: tried.plan + tried.simplify + mended.plan, ..mended };
+        }
+    }
+    let Tried { plan, simplify, outcome } = tried;
+    let clamped = ends.iter().flat_map(|(_, clamped)| clamped.clone()).collect();
+    let outcome = outcome.map(|found| Found { clamped, ..found });
+    let diagnosis = match &outcome {
+        Err(ConnectError::Start) => diagnosis::diagnosis(mechanism, problem, &ends[0].0, "start state"),
+        Err(ConnectError::Goal { .. }) => diagnosis::diagnosis(mechanism, problem, &ends[1].0, "goal state"),
+        Err(_) => lines,
+        Ok(_) => Vec::new(),
+    };
+    Trial { plan, simplify, outcome, diagnosis }
+}
+
+/// What is searched.
+struct Task<'t> {
+    unwound: &'t Unwound,
+    problem: &'t Problem,
+    settings: Settings,
+    isa: Isa,
+    start: &'t [f64],
+    goals: &'t [Vec<f64>],
+}
+
+/// What came of a search, and how long it took.
+struct Tried {
+    plan: f64,
+    simplify: f64,
+    outcome: Result<Found, ConnectError>,
+}
+
+impl Task<'_> {
+    /// The robot among the obstacles, of which this is looked at by exact shapes.
+    fn confirming(&self, doubts: &Doubts) -> Space {
+        let (mechanism, surroundings) = (&self.unwound.mechanism, self.problem.surroundings());
+        let mut space = Space::with_isa(&doubts.left_out_of(mechanism), surroundings, self.isa);
+        space.confirm(Confirmed::new(mechanism, surroundings, doubts));
+        space
+    }
+
+    /// Searches, as often as the settings want it and something is found, until the limit of time after `begin`.
+    fn attempt(&self, space: &mut Space, begin: f64, now: &dyn Fn() -> f64) -> Tried {
+        let Task { problem, settings, .. } = self;
+        let start = state(self.start);
+        let goals: Vec<State> = self.goals.iter().map(|goal| state(goal)).collect();
+        let mut go_on = |_: usize| if now() - begin > settings.limit { Control::TimeUp } else { Control::Continue };
+        let (mut plan, mut simplified) = (f64::INFINITY, f64::INFINITY);
+        let mut routes = Err(ConnectError::Cancelled);
+        for repetition in 0..settings.repetitions.max(1) {
+            // Every time gives the same path, or the same failure.
+            let is_enough = now() - begin > settings.limit || routes.is_err();
+            if repetition > 0 && is_enough {
+                break;
+            }
+            let begin = now();
+            let route = connect(space, &start, &goals, settings.budget, &mut go_on);
+            let between = now();
+            let paths = route.and_then(|route| {
+                let path = simplify(space, &route.path, settings.budget, &mut go_on)?;
+                Ok((route, path))
+            });
+            let end = now();
+            plan = plan.min(between - begin);
+            simplified = simplified.min(end - between);
+            // One that was stopped by the time is none.
+            if repetition == 0 || paths.is_ok() {
+                routes = paths;
+            }
+        }
+        let outcome = routes.map_err(|error| match error {
             // The same one, turned to by other ways.
             ConnectError::Goal { .. } => ConnectError::Goal { goals: 1 },
             error => error,
         });
+        let outcome = outcome.map(|(route, path)| found(self.unwound, problem, &route, &path));
+        Tried { plan, simplify: simplified, outcome }
     }
-    let clamped = ends.iter().flat_map(|(_, clamped)| clamped.clone()).collect();
-    let outcome = outcome.map(|(route, path)| Found { clamped, ..found(&unwound, problem, &route, &path) });
-    let diagnosis = match &outcome {
-        Err(ConnectError::Start) => diagnosis(mechanism, problem, &ends[0].0, "start state"),
-        Err(ConnectError::Goal { .. }) => diagnosis(mechanism, problem, &ends[1].0, "goal state"),
-        _ => Vec::new(),
-    };
-    Trial { plan: plan_time, simplify: simplify_time, outcome, diagnosis }
 }
 
 fn found(unwound: &Unwound, problem: &Problem, route: &Route, path: &[State]) -> Found {

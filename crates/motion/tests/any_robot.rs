@@ -614,7 +614,7 @@ fn a_problem_that_cannot_be_says_what_touches_what_and_how_deep() {
         Obstacle { name: "nearer".into(), pose: Pose::at(0.58, 0.0, -0.075), geometry: ball },
     ];
     let problem = Problem { obstacles, start: vec![1.0, 0.0, 0.0, 0.0], goal: vec![0.0; 4], ..Problem::default() };
-    let settings = Settings { budget: BUDGET, repetitions: 1 };
+    let settings = Settings { budget: BUDGET, repetitions: 1, limit: f64::INFINITY };
     let mut now = 0.0;
     let mut clock = || {
         now += 1.0;
@@ -713,7 +713,7 @@ fn links_that_no_joint_moves_against_each_other_are_a_pair_for_neither_check() {
 fn a_position_that_is_rounded_beyond_a_limit_is_taken_as_the_limit_and_said() {
     let (urdf, names) = chain(4);
     let mechanism = Mechanism::read(&urdf.replace("2.5'", "3.14159265'"), Some(&folding(4)), &names).unwrap();
-    let settings = Settings { budget: BUDGET, repetitions: 1 };
+    let settings = Settings { budget: BUDGET, repetitions: 1, limit: f64::INFINITY };
     let try_goal = |goal: f64| {
         let problem = Problem { start: vec![0.0; 4], goal: vec![0.5, goal, 0.0, 0.0], ..Problem::default() };
         trial::run(&mechanism, &problem, settings, &mut || 0.0)

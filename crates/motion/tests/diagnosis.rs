@@ -22,12 +22,17 @@ fn cubes(gap_m: f64) -> Mechanism {
          <limit lower='-1' upper='1' velocity='1' effort='1'/></joint></robot>",
         0.2 + gap_m
     );
-    Mechanism::read(&urdf, Some("<robot name='cubes'/>"), &[]).unwrap()
+    Mechanism::read(
+        &urdf,
+        Some("<robot name='cubes'><disable_collisions link1='foot' link2='low' reason='Never'/></robot>"),
+        &[],
+    )
+    .unwrap()
 }
 
 fn run(mechanism: &Mechanism, start: [f64; 2], goal: [f64; 2], obstacles: Vec<Obstacle>) -> Trial {
     let problem = Problem { obstacles, start: start.to_vec(), goal: goal.to_vec(), ..Problem::default() };
-    let settings = Settings { budget: Budget { iterations: 1000, seed: 1 }, repetitions: 1 };
+    let settings = Settings { budget: Budget { iterations: 1000, seed: 1 }, repetitions: 1, limit: f64::INFINITY };
     trial::run(mechanism, &problem, settings, &mut || 0.0)
 }
 
@@ -56,7 +61,7 @@ fn what_touches_is_named_with_its_depth() {
 }
 
 #[test]
-fn what_only_the_spheres_of_the_search_touch_is_named_as_that() {
+fn what_only_the_spheres_of_the_search_touch_refuses_nothing() {
     let mechanism = cubes(0.3);
     let at = |gap_m: f64| {
         let pose = Pose::at(0.0, 0.0, -0.11 - gap_m);
@@ -67,16 +72,44 @@ fn what_only_the_spheres_of_the_search_touch_is_named_as_that() {
             && !Space::new(&mechanism, obstacles).is_free(&state(&[0.0; 2]))
     };
     let beside = (1..30).map(|mm| at(1e-3 * f64::from(mm))).find(is_doubtful).unwrap();
-    let refused = run(&mechanism, [0.0, 0.0], [0.3, 0.0], beside);
-    assert_eq!(refused.outcome, Err(ConnectError::Start));
-    says(
-        &refused,
-        &["start state: the shapes are apart", "spheres", "those of low are", "mm inside ball", "more room"],
-    );
+    let found = |trial: Trial| trial.outcome.map(|found| (found.path.len(), found.touch));
+    assert_eq!(found(run(&mechanism, [0.0, 0.0], [0.2, 0.0], beside.clone())), Ok((2, None)));
+    // Through the ball there is no way.
+    let refused = run(&mechanism, [0.0, 0.0], [-0.2, 0.0], beside);
+    says(&refused, &["goal state: low is", "inside ball"]);
     // The cubes are a few millimetres apart at zero, and further apart below.
     let near = cubes(0.005);
     assert!(Exact::new(&near, &[]).touch(&[0.0; 2]).is_none());
-    let refused = run(&near, [-0.3, 0.0], [0.0, 0.0], Vec::new());
-    assert_eq!(refused.outcome, Err(ConnectError::Goal { goals: 1 }));
-    says(&refused, &["goal state: the shapes are apart", "those of low are", "mm inside those of high"]);
+    assert!(!Space::new(&near, &[]).is_free(&state(&[0.0; 2])));
+    assert_eq!(found(run(&near, [-0.3, 0.0], [0.0, 0.0], Vec::new())), Ok((2, None)));
+}
+
+#[test]
+fn where_there_is_no_path_it_is_said_what_is_in_the_way_and_the_search_is_not_repeated() {
+    let wall = Obstacle {
+        name: "wall".into(),
+        pose: Pose::at(0.0, 0.0, 0.15),
+        geometry: Geometry::Box { half: [0.5, 0.5, 0.01] },
+    };
+    let problem = Problem { obstacles: vec![wall], start: vec![0.0, 0.0], goal: vec![0.45, 0.0], ..Problem::default() };
+    let mechanism = cubes(2.0);
+    let times = std::cell::Cell::new(0);
+    let mut clock = || {
+        times.set(times.get() + 1);
+        f64::from(times.get())
+    };
+    let mut run = |repetitions: usize, limit: f64| {
+        times.set(0);
+        let settings = Settings { budget: Budget { iterations: 2000, seed: 1 }, repetitions, limit };
+        let trial = trial::run(&mechanism, &problem, settings, &mut clock);
+        (trial, times.get())
+    };
+    let (once, times) = run(1, f64::INFINITY);
+    assert_eq!(once.outcome, Err(ConnectError::Exhausted { iterations: 2000 }));
+    says(&once, &["on the straight way low is", "inside wall", "of 100 postures drawn", "low and wall"]);
+    assert!(run(50, f64::INFINITY).1 <= times + 1);
+    // The clock counts how often it is asked.
+    let (stopped, _) = run(50, 2.0);
+    assert!(matches!(stopped.outcome, Err(ConnectError::TimeUp { .. })), "{:?}", stopped.outcome);
+    says(&stopped, &["inside wall"]);
 }

@@ -47,7 +47,7 @@ fn clock(kind: &str, beside: &str) -> Mechanism {
 fn solve(mechanism: &Mechanism, start: [f64; 2], goal: [f64; 2], obstacles: &[Obstacle]) -> Option<Found> {
     let obstacles = obstacles.to_vec();
     let problem = Problem { obstacles, start: start.to_vec(), goal: goal.to_vec(), ..Problem::default() };
-    let settings = Settings { budget: Budget { iterations: 20_000, seed: 1 }, repetitions: 1 };
+    let settings = Settings { budget: Budget { iterations: 20_000, seed: 1 }, repetitions: 1, limit: f64::INFINITY };
     trial::run(mechanism, &problem, settings, &mut || 0.0).outcome.ok()
 }
 
@@ -87,7 +87,8 @@ fn positions_that_are_too_many_turns_from_zero_are_refused_and_say_so() {
     check(&solve(&mechanism, [far - 1.0, 0.0], [0.5, 0.0], &[]).unwrap(), [far - 1.0, 0.0], [0.5, 0.0], 1.49..1.51);
     for (start, goal, which) in [([far + 1.0, 0.0], [0.5, 0.0], "start"), ([0.5, 0.0], [0.0, -1e16], "goal")] {
         let problem = Problem { start: start.to_vec(), goal: goal.to_vec(), ..Problem::default() };
-        let settings = Settings { budget: Budget { iterations: 20_000, seed: 1 }, repetitions: 1 };
+        let settings =
+            Settings { budget: Budget { iterations: 20_000, seed: 1 }, repetitions: 1, limit: f64::INFINITY };
         let trial = trial::run(&mechanism, &problem, settings, &mut || 0.0);
         assert!(trial.outcome.is_err(), "{:?}", trial.outcome);
         let said = trial.diagnosis.join("; ");

@@ -206,15 +206,11 @@ fn plates(geometry: &str) -> String {
 #[test]
 fn with_an_srdf_too_pairs_whose_spheres_always_meet_are_decided_by_their_shapes() {
     let urdf = plates("<box size='0.4 0.4 0.04'/>");
-    let model = RobotModel::read(&urdf, Some("<robot name='plates'/>")).unwrap();
+    let model = RobotModel::read(&urdf, Some(OTHERS_EXCEPTED)).unwrap();
     assert_eq!(model.checks().by_shapes, [pair(&model, "low", "high")].into());
-    let mechanism = Mechanism::read(&urdf, Some("<robot name='plates'/>"), &[]).unwrap();
+    let mechanism = Mechanism::read(&urdf, Some(OTHERS_EXCEPTED), &[]).unwrap();
     assert!(Space::new(&mechanism, &[]).is_free(&[0.0; MAX_JOINTS]));
     assert_eq!(Exact::new(&mechanism, &[]).touch(&[0.0]), None);
-    // Where they do meet, the shapes say so.
-    let lower = urdf.replace("0 0 0.044", "0 0 0.039");
-    let mechanism = Mechanism::read(&lower, Some("<robot name='plates'/>"), &[]).unwrap();
-    assert!(mechanism.by_shapes.is_empty() && !Space::new(&mechanism, &[]).is_free(&[0.0; MAX_JOINTS]));
     // Of our robot the spheres of one pair that its SRDF leaves meet in every posture: no posture was free.
     let joints: Vec<String> = (1..=7).map(|i| format!("arm_joint_{i}")).collect();
     let arm = Mechanism::read(AIMM, Some(AIMM_SRDF), &joints).unwrap();
@@ -246,7 +242,9 @@ fn cuboid_stl(half: [f64; 3]) -> Vec<u8> {
 }
 
 const PLATE: [f64; 3] = [0.2, 0.2, 0.02];
-const NO_PAIR_EXCEPTED: &str = "<robot name='plates'/>";
+/// Excepts pairs of which one link is the lamp, or has no shape.
+const OTHERS_EXCEPTED: &str = "<robot name='plates'><disable_collisions link1='low' link2='turned' reason='Never'/>\
+                               <disable_collisions link1='low' link2='between' reason='Never'/></robot>";
 
 /// A robot whose links are meshes of a plate.
 fn of_plates(urdf: &str, joints: &str, srdf: Option<&str>) -> Robot {
@@ -264,12 +262,65 @@ fn with_meshes(urdf: &str, srdf: Option<&str>) -> RobotModel {
 fn meshes_that_are_always_apart_do_not_collide_for_the_spheres_that_stand_for_them() {
     let robot = |height: &str| {
         let urdf = plates("<mesh filename='plate.stl'/>").replace("0 0 0.044", height);
-        of_plates(&urdf, "'turn'", Some(NO_PAIR_EXCEPTED))
+        of_plates(&urdf, "'turn'", Some(OTHERS_EXCEPTED))
     };
-    let touches = |robot: &Robot| robot.touches(&robot.at_zero(), &[]);
-    assert_eq!(touches(&robot("0 0 0.044")), []);
-    // Meshes that meet do.
-    assert!(!touches(&robot("0 0 0.039")).is_empty());
+    let apart = robot("0 0 0.044");
+    assert_eq!(apart.touches(&apart.at_zero(), &[]), []);
+    assert!(!apart.model.is_excepted(0, 2) && apart.model.checks().unsaid.is_empty());
+}
+
+#[test]
+fn an_srdf_that_excepts_no_pair_is_taken_for_none() {
+    let links = [ball("upper", "base", "0 0 0", "0.3 0 0"), ball("wrist", "upper", "0.3 0 0", "0.06 0 0")];
+    let urdf = format!("<robot name='r'><link name='base'/>{}</robot>", links.concat());
+    let group = "<robot name='r'><group name='arm'><joint name='upper_joint'/></group>\
+                 <disable_collisions link1='upper' link2='of_another_robot' reason='Never'/></robot>";
+    let model = |srdf| RobotModel::read(&urdf, srdf).unwrap();
+    let neighbours = pair(&model(None), "upper", "wrist");
+    for srdf in [None, Some(group)] {
+        let model = model(srdf);
+        assert!(!model.has_exceptions());
+        assert_eq!(model.checks(), RobotModel::read(&urdf, None).unwrap().checks());
+        assert!(model.checks().excepted.contains(&neighbours) && model.checks().unsaid.contains(&neighbours));
+    }
+}
+
+#[test]
+fn pairs_that_meet_in_every_posture_are_not_checked_beside_an_srdf_either_and_others_are() {
+    let links = [
+        ball("upper", "base", "0 0 0", "0.3 0 0"),
+        ball("wrist", "upper", "0.3 0 0", "0.06 0 0"),
+        ball("hand", "wrist", "0.06 0 0", "0.02 0 0"),
+        ball("lever", "base", "0.3 0.5 0", "0 -0.42 0"),
+    ];
+    let urdf = format!("<robot name='r'><link name='base'/>{}</robot>", links.concat());
+    let srdf = "<robot name='r'><disable_collisions link1='upper' link2='wrist' reason='Adjacent'/></robot>";
+    let model = RobotModel::read(&urdf, Some(srdf)).unwrap();
+    let always: std::collections::BTreeSet<Pair> =
+        [pair(&model, "upper", "hand"), pair(&model, "wrist", "hand")].into();
+    assert!(model.has_exceptions());
+    assert_eq!(model.checks().unsaid, always);
+    let said = [pair(&model, "upper", "wrist")];
+    assert_eq!(model.checks().excepted, always.iter().copied().chain(said).collect());
+    // What meets in the default state and can part stays checked.
+    assert!(!model.is_excepted(pair(&model, "upper", "lever").0, pair(&model, "upper", "lever").1));
+}
+
+#[test]
+fn a_pair_that_no_planned_joint_parts_is_named() {
+    let mast = "<link name='mast'><collision><geometry><sphere radius='0.05'/></geometry></collision></link>\
+                <joint name='lift' type='prismatic'><parent link='base'/><child link='mast'/><axis xyz='0 0 1'/>\
+                <limit lower='0' upper='1' velocity='1' effort='1'/></joint>";
+    // Not a neighbour: there is a shape between.
+    let links = [ball("arm", "base", "0 0 0", "0 0 0"), ball("hand", "arm", "0 0 0", "0.3 0 0")];
+    let urdf = format!("<robot name='r'><link name='base'/>{mast}{}</robot>", links.concat());
+    let mechanism = |joints: &[&str]| {
+        let names: Vec<String> = joints.iter().map(ToString::to_string).collect();
+        Mechanism::read(&urdf, None, &names).unwrap()
+    };
+    let arm = mechanism(&["arm_joint", "hand_joint"]);
+    assert_eq!(pairs::never_apart(&arm), [(arm.link("mast").unwrap(), arm.link("arm").unwrap())]);
+    assert_eq!(pairs::never_apart(&mechanism(&["arm_joint", "hand_joint", "lift"])), []);
 }
 
 /// A plate of a mesh that tilts about x and y, each by `limit` at the most, 4 mm above one that stands. The link between them has a shape, so
@@ -302,7 +353,7 @@ fn judged(robot: &Robot, posture: [f64; 2]) -> [bool; 3] {
 fn meshes_whose_spheres_always_meet_are_told_apart_in_the_robots_of_workers_and_cells() {
     // A corner comes down by 0.2 m times both angles.
     let urdf = tilting(0.04);
-    for srdf in [None, Some(NO_PAIR_EXCEPTED)] {
+    for srdf in [None, Some(OTHERS_EXCEPTED)] {
         let robot = of_plates(&urdf, "'x', 'y'", srdf);
         assert_eq!(robot.model.checks(), with_meshes(&urdf, srdf).checks(), "{srdf:?}");
         let plates = pair(&robot.model, "low", "high");
@@ -339,7 +390,7 @@ fn meshes_that_were_apart_in_all_postures_that_were_looked_at_are_checked_where_
     let urdf = tilting(limit);
     let exact = with_meshes(&urdf, None);
     assert!(pairs::kinds(&exact)[&Kind::Never].contains(&pair(&exact, "low", "high")));
-    for srdf in [None, Some(NO_PAIR_EXCEPTED)] {
+    for srdf in [None, Some(OTHERS_EXCEPTED)] {
         let robot = of_plates(&urdf, "'x', 'y'", srdf);
         assert_eq!(judged(&robot, [0.0, 0.0]), [true, true, true]);
         assert_eq!(judged(&robot, [limit, limit]), [false, false, false], "{srdf:?}");
@@ -354,9 +405,9 @@ fn with_an_srdf_a_pair_whose_spheres_leave_hardly_a_posture_is_decided_by_its_sh
         let slide = format!("<axis xyz='1 0 0'/><limit lower='0' upper='{far}' velocity='1' effort='1'/>");
         plates("<box size='0.4 0.4 0.04'/>").replace(turn, &slide).replace("revolute", "prismatic")
     };
-    let checks = |urdf: &str| RobotModel::read(urdf, Some(NO_PAIR_EXCEPTED)).unwrap().checks().by_shapes.len();
+    let checks = |urdf: &str| RobotModel::read(urdf, Some(OTHERS_EXCEPTED)).unwrap().checks().by_shapes.len();
     let urdf = slid("0.44");
-    let mechanism = Mechanism::read(&urdf, Some(NO_PAIR_EXCEPTED), &[]).unwrap();
+    let mechanism = Mechanism::read(&urdf, Some(OTHERS_EXCEPTED), &[]).unwrap();
     // There is a posture in which the spheres are apart.
     let poses = mechanism.poses(&[0.44]);
     let placed = |link: usize| {
@@ -377,7 +428,7 @@ fn with_an_srdf_a_pair_whose_spheres_leave_hardly_a_posture_is_decided_by_its_sh
 #[test]
 fn meshes_that_are_made_to_run_close_to_each_other_leave_goals() {
     let urdf = plates("<mesh filename='plate.stl'/>").replace("0 0 0.044", "0 0 0.0415");
-    for srdf in [None, Some(NO_PAIR_EXCEPTED)] {
+    for srdf in [None, Some(OTHERS_EXCEPTED)] {
         let robot = of_plates(&urdf, "'turn'", srdf);
         let request = Request::new(robot.at_zero(), vec![Goal::Joints(JointVector::of([0.5]))]);
         let planned = plan(&robot, &nothing(), &request, &mut |_| Control::Continue);

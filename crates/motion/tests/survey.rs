@@ -50,7 +50,7 @@ fn links_that_leave_the_search_no_room_are_named_with_what_to_do_and_so_does_the
         (plate("plate") + &plate("lid"), joint("lower", "foot", "plate") + &joint("upper", "plate", "lid"));
     let urdf = format!("<robot name='r'><link name='foot'/>{plates}{joints}</robot>");
     let robot = |srdf: &str| with_postures(&urdf, srdf, &["lower", "upper"], "lid");
-    let crowded = robot("<robot name='r'/>");
+    let crowded = robot("<robot name='r'><disable_collisions link1='foot' link2='lid' reason='Never'/></robot>");
     let Survey { lines, faults } = survey(&crowded);
     let except = "<disable_collisions link1=\"plate\" link2=\"lid\" reason=\"Never\"/>";
     assert!(faults.len() == 2 && faults.iter().all(|fault| fault.contains(except)), "{faults:?}");
@@ -73,10 +73,12 @@ fn how_near_links_with_meshes_are_is_said_by_their_meshes() {
         let (foot, cube, at) = (link("foot"), link("cube"), 0.1 + apart_m);
         format!(
             "<robot name='r'>{foot}{cube}<joint name='slide' type='prismatic'><parent link='foot'/><child link='cube'/>\
-             <origin xyz='{at} 0 0'/><axis xyz='1 0 0'/><limit lower='-0.2' upper='1' velocity='1' effort='1'/></joint></robot>"
+             <origin xyz='{at} 0 0'/><axis xyz='1 0 0'/><limit lower='-0.2' upper='1' velocity='1' effort='1'/></joint>\
+             <link name='tip'/><joint name='end' type='fixed'><parent link='cube'/><child link='tip'/></joint></robot>"
         )
     };
-    let faults = |apart_m: f64| survey(&with_postures(&urdf(apart_m), "<robot name='r'/>", &["slide"], "cube")).faults;
+    let other = "<robot name='r'><disable_collisions link1='foot' link2='tip' reason='Never'/></robot>";
+    let faults = |apart_m: f64| survey(&with_postures(&urdf(apart_m), other, &["slide"], "cube")).faults;
     let says = |apart_m: f64, what: &str| {
         let faults = faults(apart_m);
         assert!(matches!(&faults[..], [one] if one.ends_with(what)), "{faults:?}");

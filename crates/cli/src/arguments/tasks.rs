@@ -1,6 +1,6 @@
 //! What is said of tasks: how they are checked, run, steered, reported and simulated, and of planning problems.
 
-use super::values::{Due, at_least_one, chart, due, makespan, padding, run_share, setting, share, speed};
+use super::values::{Due, at_least_one, chart, due, padding, positive, run_share, setting, share, speed};
 use clap::{Args, Subcommand, ValueEnum};
 use ratn_task_control::checkpoint::EVERY_EVENTS;
 use std::net::SocketAddr;
@@ -353,7 +353,7 @@ pub(crate) struct SimulateArguments {
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "best")]
     pub(crate) project: Vec<PathBuf>,
     /// The best makespan known; of well-known job shops it is known
-    #[arg(long, value_name = "N", value_parser = makespan)]
+    #[arg(long, value_name = "N", value_parser = positive)]
     pub(crate) best: Option<f64>,
     /// A table of best makespans of projects: lines `file,lower bound,best known`, with or without the bound
     #[arg(long, value_name = "CSV", requires = "project")]
@@ -381,7 +381,7 @@ pub(crate) struct PlanArguments {
     /// Where the packages are that the robot's meshes are named by (`package://NAME/...`)
     #[arg(long, value_name = "DIR")]
     pub(crate) packages: Vec<PathBuf>,
-    /// Which links may touch; without it neighbours, and links that touch in the middle of all limits
+    /// Which links may touch; without it neighbours that are made to touch, and links that meet in every posture
     #[arg(long, value_name = "FILE")]
     pub(crate) srdf: Option<PathBuf>,
     /// Problems in JSON: `joints`, and per class `objects`, `start` and `goal`; the form is in docs/running.md
@@ -393,7 +393,10 @@ pub(crate) struct PlanArguments {
     /// Samples per problem before it is given up
     #[arg(long, value_name = "N", default_value_t = 100_000, value_parser = at_least_one)]
     pub(crate) iterations: usize,
-    /// Solve each problem this often and take the least times
+    /// Seconds for a problem, all its repetitions together, before it is given up
+    #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = positive)]
+    pub(crate) limit_s: f64,
+    /// Solve each problem this often and take the least times; one that is not solved is not tried again
     #[arg(long, value_name = "N", default_value_t = 15, value_parser = at_least_one)]
     pub(crate) repeat: usize,
     /// How much larger the robot's shapes are taken

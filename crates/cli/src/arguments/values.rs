@@ -41,9 +41,9 @@ pub(super) fn at_least_one(text: &str) -> Result<usize, String> {
     }
 }
 
-pub(super) fn makespan(text: &str) -> Result<f64, String> {
+pub(super) fn positive(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
-        Ok(makespan) if makespan > 0.0 && makespan.is_finite() => Ok(makespan),
+        Ok(value) if value > 0.0 && value.is_finite() => Ok(value),
         _ => Err("expected a number greater than 0".to_owned()),
     }
 }

@@ -14,7 +14,13 @@ use ratn_motion::trial::{self, Settings, Trial};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::time::Instant;
+use std::time::{Duration, Instant};
+
+/// More pairs of a kind are not named.
+const MOST_NAMED: usize = 8;
+
+/// How often it is said how far the problems are, where they take long.
+const TOLD_EVERY: Duration = Duration::from_secs(5);
 
 /// Longest file of problems, and of a robot.
 const MAX_FILE: usize = 256 << 20;
@@ -74,15 +80,17 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
     let mut load = |name: &str| meshes.read(name);
     let model = RobotModel::read_with_meshes(&urdf, srdf.as_deref(), &mut load)
         .map_err(|error| refused(&arguments.robot, error))?;
-    if srdf.is_none() {
-        output::progress(pairs_without_srdf(&model));
+    if let Some(said) = pairs_said(&model, srdf.is_some()) {
+        output::progress(said);
     }
     let mut robot: Option<(BTreeMap<String, f64>, Mechanism)> = None;
     let settings = Settings {
         budget: Budget { iterations: arguments.iterations, seed: arguments.seed },
         repetitions: arguments.repeat,
+        limit: arguments.limit_s * 1e6,
     };
     let begin = Instant::now();
+    let mut told = begin;
     let mut clock = || begin.elapsed().as_secs_f64() * 1e6;
     let mut classes = Vec::new();
     for (class, list) in &problems.classes {
@@ -98,6 +106,11 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
                 }
             };
             trials.push((problem.index, trial::run(&mechanism, problem, settings, &mut clock)));
+            if told.elapsed() >= TOLD_EVERY {
+                told = Instant::now();
+                let (done, all, so_far) = (trials.len(), list.len(), begin.elapsed().as_secs());
+                output::progress(format!("{class}: {done} of {all} problems after {so_far} s"));
+            }
             robot = Some((problem.state.clone(), mechanism));
         }
         classes.push(summary(class, trials, arguments.paths));
@@ -110,36 +123,54 @@ pub(crate) fn run(arguments: &PlanArguments) -> Result<(), Failure> {
     verdict(&classes)
 }
 
-/// What is checked of the pairs of links where no SRDF says so.
-fn pairs_without_srdf(model: &RobotModel) -> String {
-    /// More pairs of a kind are not named.
-    const MOST_NAMED: usize = 8;
-    let name = |(a, b): &Pair| format!("{} and {}", model.links[*a].name, model.links[*b].name);
-    let named = |pairs: &mut dyn Iterator<Item = &Pair>| {
-        let mut names: Vec<String> = pairs.map(name).collect();
-        let more = names.len().saturating_sub(MOST_NAMED);
-        names.truncate(MOST_NAMED);
-        names.join(", ") + &if more > 0 { format!(" and {more} more") } else { String::new() }
-    };
-    let mut lines = vec!["Without an SRDF (--srdf), pairs of links are told apart by how they meet:".to_owned()];
-    for (kind, pairs) in pairs::kinds(model) {
-        let names = match kind {
-            Kind::Sometimes | Kind::Never => String::new(),
-            _ => format!(": {}", named(&mut pairs.iter())),
-        };
-        let is_excepted = matches!(kind, Kind::Neighbours | Kind::Always);
-        let checked = if is_excepted { "not checked" } else { "checked" };
-        lines.push(format!("  {} {kind}, {checked}{names}", pairs.len()));
+/// What is not checked of the pairs of links, or not in the search, though no SRDF says so.
+fn pairs_said(model: &RobotModel, has_srdf: bool) -> Option<String> {
+    let checks = model.checks();
+    let named = |pairs: &mut dyn Iterator<Item = &Pair>| pairs::named(model, pairs, MOST_NAMED);
+    let mut lines = Vec::new();
+    if !model.has_exceptions() {
+        lines.push(match has_srdf {
+            true => "The SRDF excepts no pair of links (it has no <disable_collisions> of two of them), so they are told apart by how they meet:",
+            false => "Without an SRDF (--srdf), pairs of links are told apart by how they meet:",
+        });
+    } else if !checks.unsaid.is_empty() || !checks.by_shapes.is_empty() {
+        lines.push("Of the pairs of links that the SRDF does not except:");
+    } else {
+        return None;
     }
-    let by_shapes = &model.checks().by_shapes;
+    let mut lines: Vec<String> = lines.into_iter().map(str::to_owned).collect();
+    if model.has_exceptions() {
+        if !checks.unsaid.is_empty() {
+            let names = named(&mut checks.unsaid.iter());
+            lines.push(format!("  {} meet in every posture, not checked: {names}", checks.unsaid.len()));
+            lines.extend(
+                checks
+                    .unsaid
+                    .iter()
+                    .take(MOST_NAMED)
+                    .map(|pair| format!("    to say so in the SRDF: {}", pairs::exception(model, *pair, "Default"))),
+            );
+        }
+    } else {
+        for (kind, pairs) in pairs::kinds(model) {
+            let names = match kind {
+                Kind::Sometimes | Kind::Never => String::new(),
+                _ => format!(": {}", named(&mut pairs.iter())),
+            };
+            let is_excepted = matches!(kind, Kind::Neighbours | Kind::Always);
+            let checked = if is_excepted { "not checked" } else { "checked" };
+            lines.push(format!("  {} {kind}, {checked}{names}", pairs.len()));
+        }
+    }
+    let by_shapes = &checks.by_shapes;
     if !by_shapes.is_empty() {
         let names = named(&mut by_shapes.iter());
         lines.push(format!(
-            "  {} of them by the check of the finished path alone, their spheres are too coarse: {names}",
+            "  {} of them in the start, the goal and on the finished path alone, their spheres are too coarse for the search: {names}",
             by_shapes.len()
         ));
     }
-    lines.join("\n")
+    Some(lines.join("\n"))
 }
 
 /// The robot with the joints that are not planned for where a problem says.

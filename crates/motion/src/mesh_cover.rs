@@ -1,0 +1,279 @@
+//! Spheres that hold a mesh, few and close to it.
+//!
+//! The mesh is put into a fine grid: the cells that the surface passes through and those that it closes in are its own. They are joined in blocks, and
+//! of each block the box of its own cells is to be held. About the middle of each box there may be a sphere, as large as the way to the nearest cell
+//! that is not the mesh's allows, and the overhang beside that. Of these the one that holds the most boxes is taken, until all are held (greedy set
+//! cover). So thick parts get large spheres and everything of the mesh is in a sphere by construction, its inside too where it is closed. The overhang
+//! is a share of the mesh's length, and grows where that takes too many spheres.
+
+use crate::spheres::Sphere;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BinaryHeap};
+
+/// Spheres of one mesh at the most.
+const MAX_SPHERES: usize = 96;
+
+/// How far a sphere may stand out of the cells, as a part of the mesh's longest side, at first; and how much more each time it is too little.
+const OVERHANG: f64 = 0.025;
+const MORE: f64 = 1.4;
+
+/// Blocks along the longest side at the most, how many of them there are at the most, and cells along the edge of one.
+const FINEST: usize = 32;
+const MOST_BLOCKS: usize = 1_500;
+const CELLS: usize = 3;
+
+/// Cells that the triangles are looked for in: a mesh of many that are all as large as itself is put into a coarser grid.
+const MOST_LOOKS: usize = 5_000_000;
+
+/// Surfaces that lie between two cells belong to both, in cells.
+const SKIN: f64 = 1e-6;
+
+/// Spheres that hold triangles.
+pub(crate) fn cover(triangles: &[[[f64; 3]; 3]]) -> Vec<Sphere> {
+    let mut blocks = FINEST;
+    while blocks > 1 && looks(triangles, CELLS * blocks) > MOST_LOOKS {
+        blocks = blocks * 4 / 5;
+    }
+    let (grid, boxes) = loop {
+        let grid = Grid::new(triangles, CELLS * blocks);
+        let boxes = grid.boxes();
+        if boxes.len() <= MOST_BLOCKS || blocks == 1 {
+            break (grid, boxes);
+        }
+        blocks = blocks * 4 / 5;
+    };
+    let deep = grid.depths(&boxes);
+    let longest = (0..3).map(|i| grid.cell[i] * grid.counts[i] as f64).fold(0.0, f64::max);
+    let mut overhang = OVERHANG * longest;
+    loop {
+        let spheres = held(&boxes, &deep, overhang);
+        if spheres.len() <= MAX_SPHERES || overhang > longest {
+            return spheres;
+        }
+        overhang *= MORE;
+    }
+}
+
+/// In how many cells triangles may be, of a grid with so many along the longest edge.
+fn looks(triangles: &[[[f64; 3]; 3]], longest: usize) -> usize {
+    let between = |corners: &mut dyn Iterator<Item = f64>| {
+        let (least, greatest) = corners.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), c| (a.min(c), b.max(c)));
+        greatest - least
+    };
+    let extent = (0..3).map(|i| between(&mut triangles.iter().flatten().map(|c| c[i]))).fold(1e-9, f64::max);
+    let cell = extent / longest as f64;
+    let of = |triangle: &[[f64; 3]; 3]| -> usize {
+        (0..3).map(|i| (between(&mut triangle.iter().map(|c| c[i])) / cell) as usize + 1).product()
+    };
+    triangles.iter().map(of).sum()
+}
+
+/// Few of the spheres about the middles of boxes, each so much larger than it is deep, that hold all boxes.
+fn held(boxes: &[Cuboid], deep: &[f64], overhang: f64) -> Vec<Sphere> {
+    let sphere = |(cuboid, deep): (&Cuboid, &f64)| Sphere {
+        centre: cuboid.centre,
+        radius: (deep + overhang).max(cuboid.reach_from(cuboid.centre)) * (1.0 + SKIN),
+    };
+    let all: Vec<Sphere> = boxes.iter().zip(deep).map(sphere).collect();
+    let holds = |sphere: usize, cuboid: usize| boxes[cuboid].reach_from(all[sphere].centre) <= all[sphere].radius;
+    let mut open: Vec<usize> = (0..boxes.len()).collect();
+    let count = |sphere: usize, open: &[usize]| open.iter().filter(|cuboid| holds(sphere, **cuboid)).count();
+    // What a sphere holds of the boxes that are left gets less: the first whose count is still true holds the most. Of two the earlier one.
+    let mut counts: BinaryHeap<(usize, Reverse<usize>)> =
+        (0..all.len()).map(|i| (count(i, &open), Reverse(i))).collect();
+    let mut taken = Vec::new();
+    while let Some((before, Reverse(i))) = counts.pop() {
+        if open.is_empty() {
+            break;
+        }
+        let now = count(i, &open);
+        if now < before {
+            counts.push((now, Reverse(i)));
+            continue;
+        }
+        let centre = all[i].centre;
+        let (own, left): (Vec<usize>, Vec<usize>) = open.into_iter().partition(|cuboid| holds(i, *cuboid));
+        open = left;
+        // No larger than it has to be.
+        let radius = own.iter().map(|cuboid| boxes[*cuboid].reach_from(centre)).fold(0.0, f64::max) * (1.0 + SKIN);
+        taken.push(Sphere { centre, radius });
+    }
+    taken
+}
+
+/// A box along the axes.
+struct Cuboid {
+    centre: [f64; 3],
+    half: [f64; 3],
+}
+
+impl Cuboid {
+    /// How far its farthest corner is from a point.
+    fn reach_from(&self, point: [f64; 3]) -> f64 {
+        (0..3).map(|i| ((point[i] - self.centre[i]).abs() + self.half[i]).powi(2)).sum::<f64>().sqrt()
+    }
+}
+
+/// Cells over the box that holds a mesh.
+struct Grid {
+    least: [f64; 3],
+    cell: [f64; 3],
+    counts: [usize; 3],
+    taken: Vec<bool>,
+}
+
+impl Grid {
+    /// With so many cells along the longest edge.
+    fn new(triangles: &[[[f64; 3]; 3]], longest: usize) -> Grid {
+        let corners = || triangles.iter().flatten();
+        let least: [f64; 3] = std::array::from_fn(|i| corners().map(|c| c[i]).fold(f64::INFINITY, f64::min));
+        let greatest: [f64; 3] = std::array::from_fn(|i| corners().map(|c| c[i]).fold(f64::NEG_INFINITY, f64::max));
+        let extents: [f64; 3] = std::array::from_fn(|i| greatest[i] - least[i]);
+        let wanted = extents.into_iter().fold(1e-9, f64::max) / longest as f64;
+        let counts = extents.map(|extent| ((extent / wanted).ceil() as usize).clamp(1, longest));
+        let cell = std::array::from_fn(|i| (extents[i] / counts[i] as f64).max(1e-9));
+        let mut grid = Grid { least, cell, counts, taken: vec![false; counts.iter().product()] };
+        for triangle in triangles {
+            let polygon = triangle.iter().map(|c| std::array::from_fn(|i| (c[i] - least[i]) / cell[i])).collect();
+            grid.take(polygon, 0, [0; 3]);
+        }
+        grid.fill();
+        grid
+    }
+
+    fn index(&self, [x, y, z]: [usize; 3]) -> usize {
+        (x * self.counts[1] + y) * self.counts[2] + z
+    }
+
+    /// Marks the cells of a polygon, in cells, slab by slab along one axis after the other.
+    fn take(&mut self, polygon: Vec<[f64; 3]>, axis: usize, at: [usize; 3]) {
+        if polygon.is_empty() {
+            return;
+        }
+        if axis == 3 {
+            let index = self.index(at);
+            self.taken[index] = true;
+            return;
+        }
+        let least = polygon.iter().map(|c| c[axis]).fold(f64::INFINITY, f64::min);
+        let greatest = polygon.iter().map(|c| c[axis]).fold(f64::NEG_INFINITY, f64::max);
+        let last = self.counts[axis] - 1;
+        let first = ((least - SKIN).floor().max(0.0) as usize).min(last);
+        for slab in first..=((greatest + SKIN).floor().max(0.0) as usize).min(last) {
+            let mut at = at;
+            at[axis] = slab;
+            let (low, high) = (slab as f64 - SKIN, (slab + 1) as f64 + SKIN);
+            self.take(cut(&cut(&polygon, axis, low, 1.0), axis, high, -1.0), axis + 1, at);
+        }
+    }
+
+    /// Marks what the surface closes in: all that cannot be reached from outside.
+    fn fill(&mut self) {
+        let mut outside = vec![false; self.taken.len()];
+        let mut open = Vec::new();
+        for index in 0..self.taken.len() {
+            let at = self.place(index);
+            if (0..3).any(|i| at[i] == 0 || at[i] + 1 == self.counts[i]) {
+                open.push(at);
+            }
+        }
+        while let Some(at) = open.pop() {
+            let index = self.index(at);
+            if self.taken[index] || outside[index] {
+                continue;
+            }
+            outside[index] = true;
+            for axis in 0..3 {
+                let mut beside = at;
+                if at[axis] > 0 {
+                    beside[axis] = at[axis] - 1;
+                    open.push(beside);
+                }
+                if at[axis] + 1 < self.counts[axis] {
+                    beside[axis] = at[axis] + 1;
+                    open.push(beside);
+                }
+            }
+        }
+        self.taken = outside.into_iter().map(|outside| !outside).collect();
+    }
+
+    /// Of each block that has cells of the mesh, the box around those.
+    fn boxes(&self) -> Vec<Cuboid> {
+        let mut bounds: BTreeMap<[usize; 3], [[usize; 3]; 2]> = BTreeMap::new();
+        for at in (0..self.taken.len()).filter(|index| self.taken[*index]).map(|index| self.place(index)) {
+            let [least, greatest] = bounds.entry(at.map(|c| c / CELLS)).or_insert([at, at]);
+            for i in 0..3 {
+                least[i] = least[i].min(at[i]);
+                greatest[i] = greatest[i].max(at[i]);
+            }
+        }
+        let cuboid = |[least, greatest]: [[usize; 3]; 2]| Cuboid {
+            centre: std::array::from_fn(|i| self.least[i] + self.cell[i] * (least[i] + greatest[i] + 1) as f64 / 2.0),
+            half: std::array::from_fn(|i| self.cell[i] * ((greatest[i] + 1 - least[i]) as f64 / 2.0 + SKIN)),
+        };
+        bounds.into_values().map(cuboid).collect()
+    }
+
+    /// How far the middle of each box is from the nearest cell that is not the mesh's.
+    fn depths(&self, boxes: &[Cuboid]) -> Vec<f64> {
+        let is_beside = |index: &usize| {
+            let at = self.place(*index);
+            (0..3).any(|i| {
+                let mut beside = at;
+                let before = at[i] > 0 && {
+                    beside[i] = at[i] - 1;
+                    self.taken[self.index(beside)]
+                };
+                before
+                    || at[i] + 1 < self.counts[i] && {
+                        beside[i] = at[i] + 1;
+                        self.taken[self.index(beside)]
+                    }
+            })
+        };
+        let free = (0..self.taken.len()).filter(|index| !self.taken[*index] && is_beside(index));
+        let free: Vec<[f64; 3]> = free
+            .map(|index| {
+                let at = self.place(index);
+                std::array::from_fn(|i| self.least[i] + (at[i] as f64 + 0.5) * self.cell[i])
+            })
+            .collect();
+        let square = |centre: [f64; 3], cell: &[f64; 3]| -> f64 {
+            (0..3).map(|i| ((centre[i] - cell[i]).abs() - self.cell[i] / 2.0).max(0.0).powi(2)).sum()
+        };
+        let depth = |cuboid: &Cuboid| {
+            let centre = cuboid.centre;
+            let around = (0..3).map(|i| {
+                let beyond = centre[i] - self.least[i];
+                beyond.min(self.cell[i] * self.counts[i] as f64 - beyond)
+            });
+            let near = free.iter().map(|cell| square(centre, cell)).fold(f64::INFINITY, f64::min).sqrt();
+            around.fold(near, f64::min).max(0.0)
+        };
+        boxes.iter().map(depth).collect()
+    }
+
+    fn place(&self, index: usize) -> [usize; 3] {
+        let [_, y, z] = self.counts;
+        [index / (y * z), index / z % y, index % z]
+    }
+}
+
+/// The part of a polygon on one side of a plane (Sutherland and Hodgman, CACM 1974).
+fn cut(polygon: &[[f64; 3]], axis: usize, at: f64, side: f64) -> Vec<[f64; 3]> {
+    let beyond = |corner: &[f64; 3]| (corner[axis] - at) * side;
+    let mut kept = Vec::with_capacity(polygon.len() + 1);
+    for (i, corner) in polygon.iter().enumerate() {
+        let next = &polygon[(i + 1) % polygon.len()];
+        let (here, there) = (beyond(corner), beyond(next));
+        if here >= 0.0 {
+            kept.push(*corner);
+        }
+        if (here > 0.0 && there < 0.0) || (here < 0.0 && there > 0.0) {
+            let share = here / (here - there);
+            kept.push(std::array::from_fn(|j| corner[j] + (next[j] - corner[j]) * share));
+        }
+    }
+    kept
+}
