@@ -1,6 +1,6 @@
 //! Random regions that share facts: what each decides, and computes, is by what the other has really done when it comes to its place, in both
 //! modes. They hold motions alone, of two units and with durations that are never over at the same moment: so both modes do the same at the
-//! same times.
+//! same times, also where motions are imprecise, for each needs the unit that the one before it has.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
@@ -41,7 +41,10 @@ impl Writer {
         let duration =
             0.3 + 0.17 * self.below(20) as f64 + 0.000_137 * number as f64 + 0.000_001_9 * (number * number) as f64;
         let [of, unit] = [["arm/move", "Arm"], ["head/turn", "Head"]][self.actuator];
-        let what = format!("pia: true, reads: [], {inputs}effects: ['{effect}'], resources: [{{ block: {unit} }}]");
+        let exceptions = if self.below(3) == 0 { "exceptions: imprecise, " } else { "" };
+        let what = format!(
+            "pia: true, {exceptions}reads: [], {inputs}effects: ['{effect}'], resources: [{{ block: {unit} }}]"
+        );
         self.line(depth, &format!("- m{number}: {{ action: {of}, {what}, duration: {duration:.7} }}"));
     }
 

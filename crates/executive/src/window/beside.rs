@@ -84,10 +84,25 @@ impl Window {
     fn is_at_its_place(&self, instance: &Instance) -> bool {
         instance.is_head && instance.is_under_way() && self.older_beside(instance).is_none()
     }
+
+    /// Of an instance in a region that uses some facts which regions share: an older imprecise PIA that still runs. Before that has ended, the
+    /// sequential program would not be at the place of the instance, and might find these facts otherwise when it comes there.
+    pub(super) fn beside_of_shared(
+        &self,
+        context: &Context<'_>,
+        instance: &Instance,
+        uses: [&Footprint; 2],
+    ) -> Option<InstanceId> {
+        if !uses.into_iter().any(|facts| facts.overlaps(&context.plan.crossing)) || regions_around(instance).is_empty()
+        {
+            return None;
+        }
+        self.older_beside(instance)
+    }
 }
 
 /// The regions that an instance is in, the outermost first.
-pub(super) fn regions_around(instance: &Instance) -> Vec<Region> {
+fn regions_around(instance: &Instance) -> Vec<Region> {
     let mut regions = Vec::new();
     let mut inner = instance.state;
     let mut frames = instance.environment.frames.as_deref();
@@ -97,4 +112,11 @@ pub(super) fn regions_around(instance: &Instance) -> Vec<Region> {
     }
     regions.reverse();
     regions
+}
+
+/// Whether the sequential program executes one of two instances before the other: they are not in regions beside each other.
+pub(super) fn is_in_order(one: &Instance, other: &Instance) -> bool {
+    let (one, other) = (regions_around(one), regions_around(other));
+    let parting = one.iter().zip(&other).find(|(one, other)| one != other);
+    parting.is_none_or(|(one, other)| one.0 != other.0)
 }

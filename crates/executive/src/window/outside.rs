@@ -129,7 +129,7 @@ impl Window {
 }
 
 /// What a condition, a test, a loop or a decider decides from.
-fn decides_from<'p>(program: &'p Program, instance: &Instance) -> Vec<&'p Expr> {
+pub(super) fn decides_from<'p>(program: &'p Program, instance: &Instance) -> Vec<&'p Expr> {
     match (&program.state(instance.state).kind, instance.role()) {
         (StateKind::Condition { predicate, .. }, Some(Role::Condition)) => vec![predicate],
         (StateKind::While { predicate, .. }, Some(Role::Test)) => vec![predicate],

@@ -1,10 +1,11 @@
 //! Readiness of a node: the first thing that is missing before it may ask for its resources.
 
 use super::Window;
-use super::beside::regions_around;
+use super::beside::is_in_order;
 use super::graph::instance::{Instance, Role};
 use super::growth::environment::Link;
 use super::memory::{Blocked, Looked, Seen, Sight, View, facts_of};
+use super::outside::decides_from;
 use super::waits::Wait;
 use crate::binding::{self, BindError, Outputs};
 use crate::context::Context;
@@ -152,7 +153,7 @@ impl Window {
         }
     }
 
-    /// An imprecise PIA that still runs beside an instance, although older, and must end before it begins.
+    /// An imprecise PIA that still runs beside an instance, although older, and must end before it begins, or becomes real.
     pub(super) fn conflict_beside(&self, context: &Context<'_>, instance: &Instance) -> Option<InstanceId> {
         // A wait looks at what is real, and changes nothing.
         if self.graph.detached().is_empty() || context.program.state(instance.state).is_pause() {
@@ -171,6 +172,9 @@ impl Window {
             });
             mine.writes = mine.writes.union(writes.unwrap_or(Footprint::NOTHING));
         }
+        if let Some(beside) = self.beside_of_shared(context, instance, [&mine.reads, &mine.writes]) {
+            return Some(beside);
+        }
         // What it deletes or uses up at its end may be held beside it.
         let operates = matches!(instance.role(), None | Some(Role::Exit));
         let uses = |other: &Instance| {
@@ -179,22 +183,25 @@ impl Window {
         };
         self.graph.detached().iter().copied().filter(|id| *id < instance.id).find(|id| {
             let Some(other) = self.graph.get(*id) else { return false };
-            let its = self.touches(context, other);
-            its.writes.overlaps(&mine.reads)
-                || its.writes.overlaps(&mine.writes)
-                || its.reads.overlaps(&mine.writes)
-                || uses(other)
+            // The facts that regions beside each other share have no order.
+            let conflicts = || {
+                let its = self.touches(context, other);
+                its.writes.overlaps(&mine.reads)
+                    || its.writes.overlaps(&mine.writes)
+                    || its.reads.overlaps(&mine.writes)
+            };
+            uses(other) || (is_in_order(other, instance) && conflicts())
         })
     }
 
-    /// An older imprecise PIA that still runs, of its line or of one around that. A wait does not begin beside it: a signal that it took
-    /// would be lost if that one fails and its path is left.
+    /// An older imprecise PIA that still runs, of its line, of one around that, or of one that has been left. A wait does not begin beside it: a
+    /// signal that it took would be lost if that one fails and its path is left.
     pub(super) fn older_beside(&self, instance: &Instance) -> Option<InstanceId> {
-        let is_around = |id: &InstanceId| {
+        let is_before = |id: &InstanceId| {
             let other = self.graph.get(*id).filter(|other| other.id < instance.id);
-            other.is_some_and(|other| regions_around(instance).starts_with(&regions_around(other)))
+            other.is_some_and(|other| is_in_order(other, instance))
         };
-        self.graph.detached().iter().copied().find(is_around)
+        self.graph.detached().iter().copied().find(is_before)
     }
 
     /// An imprecise PIA that still runs beside an instance and whose outputs it is made of, its effects included.
@@ -220,6 +227,7 @@ impl Window {
                 }
             };
             reads = reads.union(facts_of(&state.annotations.requires, view));
+            reads = reads.union(facts_of(decides_from(context.program, instance), view));
             // What its effects are made of is read when it ends.
             reads = reads.union(FactExpr::footprint(&own.effect_lookups, view));
             let ended = instance.ended().and_then(|ended| own.outcome(&ended.outcome));

@@ -2,6 +2,7 @@
 
 use super::view::View;
 use crate::plan::{Chain, EVERYTHING, Plan};
+use crate::window::beside::is_in_order;
 use crate::window::graph::instance::{Instance, Role};
 use crate::window::growth::environment::Link;
 use ratn_model::fact::{FactPattern, Footprint};
@@ -110,7 +111,9 @@ impl<'a> View<'a> {
         }
         // A younger writer that has retired already hides those that still run beside it.
         for id in graph.detached().iter().rev().filter(|id| **id < self.instance.id && !beside.contains(id)) {
+            // What regions beside it do counts when it is real.
             if let Some(writer) = graph.get(*id)
+                && is_in_order(writer, self.instance)
                 && !visit(writer, self.link_beside(writer))
             {
                 return;
