@@ -67,7 +67,7 @@ async fn answers_that_a_caller_does_not_read_have_a_bound_in_bytes_until_it_read
     let map = ratn_model::value::Value::String("x".repeat(60_000));
     ping(&mut client, "maps").await.unwrap();
     for number in 0..240 {
-        let resource = Resource::new(&format!("map-{number:03}"), ResourceClass::Task, "Map");
+        let resource = Resource::new(format!("map-{number:03}"), ResourceClass::Task, "Map");
         let resource = Some(resource.with_attribute("map", map.clone()).into());
         client
             .create(v1::CreateRequest { session_id: "maps".to_owned(), resource, ..Default::default() })

@@ -7,6 +7,9 @@ mod ahead;
 pub mod aimm;
 mod along;
 pub mod arm;
+#[cfg(test)]
+#[path = "../tests/common/ball.rs"]
+mod ball;
 pub mod base;
 mod branches;
 mod closed_form;

@@ -1,9 +1,7 @@
 //! What is known ahead is true.
 
-#[path = "../../tests/common/ball.rs"]
-mod ball;
-
 use super::*;
+use crate::ball;
 use crate::geometry::Geometry;
 use crate::mechanism::Mechanism;
 use crate::simd::Isa;
@@ -21,7 +19,7 @@ fn samples() -> impl FnMut() -> State {
 
 /// A ball among nine posts.
 fn posts(isa: Isa) -> Space {
-    let mechanism = Mechanism::read(&ball::urdf(2), None, &[]).unwrap();
+    let mechanism = Mechanism::read(&ball::urdf(2), None, &[]).expect("a robot");
     let post = |i: i32| {
         let pose = Pose::at(f64::from(i % 3 - 1) * 0.6, f64::from(i / 3 - 1) * 0.6, 0.0);
         Obstacle { name: format!("post {i}"), pose, geometry: Geometry::Cylinder { radius: 0.2, half_length: 1.0 } }

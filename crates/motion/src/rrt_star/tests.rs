@@ -1,9 +1,7 @@
 //! The tree is one, and its costs are those of its ways.
 
-#[path = "../../tests/common/ball.rs"]
-mod ball;
-
 use super::*;
+use crate::ball;
 use crate::geometry::Geometry;
 use crate::mechanism::Mechanism;
 use crate::space::Obstacle;
