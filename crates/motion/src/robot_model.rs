@@ -261,10 +261,9 @@ impl RobotModel {
     /// As [`RobotModel::read_with_meshes`], but for what is wrong with meshes.
     pub(crate) fn outline(urdf: &str, srdf: Option<&str>) -> Result<RobotModel, MechanismError> {
         let Description { name, joints, links, mimics, texts } = urdf::read_outline(urdf)?;
-        if let Some(text) = srdf {
-            srdf::excepted(text, &links)?;
-        }
-        Ok(RobotModel { name, joints, links, mimics, texts, checks: Checks::default() })
+        let excepted = srdf.map_or_else(|| Ok(BTreeSet::new()), |text| srdf::excepted(text, &links))?;
+        let has_exceptions = !excepted.is_empty();
+        Ok(RobotModel { name, joints, links, mimics, texts, checks: Checks::default(), has_exceptions })
     }
 
     fn of(description: Description, srdf: Option<&str>) -> Result<RobotModel, MechanismError> {
