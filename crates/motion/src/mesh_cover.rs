@@ -8,7 +8,7 @@
 
 use crate::spheres::Sphere;
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, BinaryHeap};
+use std::collections::{BTreeMap, BinaryHeap, VecDeque};
 
 /// Spheres of one mesh at the most.
 const MAX_SPHERES: usize = 96;
@@ -36,8 +36,8 @@ pub(crate) fn cover(triangles: &[[[f64; 3]; 3]]) -> Vec<Sphere> {
     }
     let (grid, boxes) = loop {
         let grid = Grid::new(triangles, CELLS * blocks);
-        let boxes = grid.boxes();
-        if boxes.len() <= MOST_BLOCKS || blocks == 1 {
+        if grid.blocks() <= MOST_BLOCKS || blocks == 1 {
+            let boxes = grid.boxes();
             break (grid, boxes);
         }
         blocks = blocks * 4 / 5;
@@ -170,32 +170,45 @@ impl Grid {
     /// Marks what the surface closes in: all that cannot be reached from outside.
     fn fill(&mut self) {
         let mut outside = vec![false; self.taken.len()];
-        let mut open = Vec::new();
+        // From the sides of the grid inwards, one layer after the other, so that few cells wait.
+        let mut open: VecDeque<[usize; 3]> = VecDeque::new();
+        let mut reach = |at: [usize; 3], open: &mut VecDeque<[usize; 3]>| {
+            let index = self.index(at);
+            if !self.taken[index] && !std::mem::replace(&mut outside[index], true) {
+                open.push_back(at);
+            }
+        };
         for index in 0..self.taken.len() {
             let at = self.place(index);
             if (0..3).any(|i| at[i] == 0 || at[i] + 1 == self.counts[i]) {
-                open.push(at);
+                reach(at, &mut open);
             }
         }
-        while let Some(at) = open.pop() {
-            let index = self.index(at);
-            if self.taken[index] || outside[index] {
-                continue;
-            }
-            outside[index] = true;
+        while let Some(at) = open.pop_front() {
             for axis in 0..3 {
                 let mut beside = at;
                 if at[axis] > 0 {
                     beside[axis] = at[axis] - 1;
-                    open.push(beside);
+                    reach(beside, &mut open);
                 }
                 if at[axis] + 1 < self.counts[axis] {
                     beside[axis] = at[axis] + 1;
-                    open.push(beside);
+                    reach(beside, &mut open);
                 }
             }
         }
         self.taken = outside.into_iter().map(|outside| !outside).collect();
+    }
+
+    /// How many blocks have cells of the mesh.
+    fn blocks(&self) -> usize {
+        let counts = self.counts.map(|count| count.div_ceil(CELLS));
+        let mut is_its = vec![false; counts.iter().product()];
+        for index in (0..self.taken.len()).filter(|index| self.taken[*index]) {
+            let [x, y, z] = self.place(index).map(|c| c / CELLS);
+            is_its[(x * counts[1] + y) * counts[2] + z] = true;
+        }
+        is_its.into_iter().filter(|is_its| *is_its).count()
     }
 
     /// Of each block that has cells of the mesh, the box around those.

@@ -37,9 +37,11 @@ enum Value {
     Limit,
     /// A number that is held against no other: it is read, and nothing here is computed from it.
     Unused,
+    /// Red, green, blue and opacity: of what is beyond 0 to 1, or no number, whoever shows it makes something that is.
+    Colour,
 }
 
-use Value::{Limit, Most, Numbers, Scale, Sizes, Text, Unused};
+use Value::{Colour, Limit, Most, Numbers, Scale, Sizes, Text, Unused};
 
 /// Places and sizes beyond this are not in metres. Shapes are computed in single precision, which has no room for much more.
 const FARTHEST: f64 = 1e6;
@@ -92,7 +94,7 @@ const ATTRIBUTES: &[(&str, &str, &str, Value, bool)] = &[
     ("geometry", "mesh", "filename", Text, true),
     ("geometry", "mesh", "scale", Scale, false),
     ("visual", "material", "name", Text, true),
-    ("material", "color", "rgba", Numbers(4), false),
+    ("material", "color", "rgba", Colour, false),
 ];
 
 /// What a text without a fault says.
@@ -218,18 +220,20 @@ fn wrong(element: &str, key: &str, found: Option<&str>, value: Value, needed: bo
     let count = match value {
         Text => return None,
         Numbers(count) | Sizes(count) => count,
+        Colour => 4,
         Scale => 3,
         Most | Limit | Unused => 1,
     };
     let is = format!("`{key}` of `{element}` is `{text}`");
     let numbers: Option<Vec<f64>> = text.split_whitespace().map(|word| word.parse().ok()).collect();
-    let Some(numbers) = numbers.filter(|numbers| numbers.len() == count && !numbers.iter().any(|n| n.is_nan())) else {
+    let may_be = |number: &f64| !number.is_nan() || matches!(value, Colour);
+    let Some(numbers) = numbers.filter(|numbers| numbers.len() == count && numbers.iter().all(may_be)) else {
         let plural = if count == 1 { "a number".to_owned() } else { format!("{count} numbers") };
         return Some(format!("{is} instead of {plural}"));
     };
     let any = |is_wrong: fn(f64) -> bool| numbers.iter().any(|n| is_wrong(*n));
     let far = match value {
-        Text | Limit => return None,
+        Text | Limit | Colour => return None,
         Most => {
             return any(|n| n < 0.0)
                 .then(|| format!("{is}: that is never below 0; leave out the sign, or write 0 where it is not known"));
