@@ -7,6 +7,7 @@
 //! is a share of the mesh's length, and grows where that takes too many spheres.
 
 use crate::spheres::Sphere;
+use crate::surface::cut;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap, VecDeque};
 
@@ -271,22 +272,4 @@ impl Grid {
         let [_, y, z] = self.counts;
         [index / (y * z), index / z % y, index % z]
     }
-}
-
-/// The part of a polygon on one side of a plane (Sutherland and Hodgman, CACM 1974).
-fn cut(polygon: &[[f64; 3]], axis: usize, at: f64, side: f64) -> Vec<[f64; 3]> {
-    let beyond = |corner: &[f64; 3]| (corner[axis] - at) * side;
-    let mut kept = Vec::with_capacity(polygon.len() + 1);
-    for (i, corner) in polygon.iter().enumerate() {
-        let next = &polygon[(i + 1) % polygon.len()];
-        let (here, there) = (beyond(corner), beyond(next));
-        if here >= 0.0 {
-            kept.push(*corner);
-        }
-        if (here > 0.0 && there < 0.0) || (here < 0.0 && there > 0.0) {
-            let share = here / (here - there);
-            kept.push(std::array::from_fn(|j| corner[j] + (next[j] - corner[j]) * share));
-        }
-    }
-    kept
 }

@@ -170,8 +170,9 @@ fn slabs(piece: &[[f64; 2]], axis: usize, width: f64) -> Vec<Vec<[f64; 2]>> {
     (0..count).map(slab).filter(|piece| !piece.is_empty()).collect()
 }
 
-/// What is on one side (Sutherland and Hodgman).
-fn cut<const N: usize>(piece: &[[f64; N]], axis: usize, at: f64, side: f64) -> Vec<[f64; N]> {
+/// The part of a polygon on one side of a plane, or of a line (Sutherland and Hodgman, CACM 1974): where `side` times what the corners have along the
+/// axis beyond `at` is 0 or more.
+pub(crate) fn cut<const N: usize>(piece: &[[f64; N]], axis: usize, at: f64, side: f64) -> Vec<[f64; N]> {
     let beyond = |corner: &[f64; N]| (corner[axis] - at) * side;
     let mut kept = Vec::with_capacity(piece.len() + 1);
     for (i, corner) in piece.iter().enumerate() {
