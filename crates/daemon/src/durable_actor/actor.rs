@@ -15,13 +15,14 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-/// Messages that are put into an order together.
+/// Maximum number of messages that are ordered together as a batch.
 const AT_ONCE: usize = 64;
-/// Urgent messages that are taken in a row while others wait.
+/// Maximum number of urgent messages that are taken in a row while others wait.
 const URGENT_AT_ONCE: usize = 64;
-/// What came together is written down together, and nothing else is looked at meanwhile, unless that takes longer than this.
+/// Messages that arrive together are written to the log together. A batch that takes longer than this is split: its changes so far are
+/// written, and urgent messages are read.
 const TURN: Duration = Duration::from_millis(1);
-/// Before the state is closed, what is being written has so long to be on the disk.
+/// Time for pending records to reach the disk before the state is closed.
 const LAST_WRITES: Duration = Duration::from_secs(1);
 
 pub(super) struct Actor<C: Core> {
@@ -30,7 +31,7 @@ pub(super) struct Actor<C: Core> {
     context: TurnContext<C>,
     outbox: Outbox<Outgoing<C>>,
     drained: bool,
-    /// Nothing may be said for now, and health says so.
+    /// The actor may send nothing for now, and its health says so.
     silenced: bool,
     vitals: Vitals,
 }
@@ -56,7 +57,7 @@ impl<C: Core> Actor<C> {
         over: CancellationToken,
     ) {
         let mut arrived = Vec::new();
-        // Since other messages were.
+        // Urgent messages since the last other message.
         let mut urgent_taken = 0;
         let mut tick = tokio::time::interval(TICK);
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -71,13 +72,14 @@ impl<C: Core> Actor<C> {
             }
             let deadline = self.core.next_deadline(&self.context).and_then(|at| self.context.instant(at));
             let (running, room) = (self.context.stopped().is_none(), !self.outbox.is_full() && !self.context.is_full());
-            // What is urgent comes first, but not for ever.
+            // Urgent messages come first, but cannot starve the others.
             let urgent_first = urgent_taken < URGENT_AT_ONCE || !room || inbox.messages.is_empty();
             tokio::select! {
                 biased;
                 () = over.cancelled() => return self.end().await,
                 () = draining.cancelled(), if !self.drained => self.drain(),
-                // While nothing may be said its answers wait as all do, so it waits for room as well.
+                // While the actor may not speak, answers to urgent messages are held back like all others, so urgent messages need room,
+                // too.
                 Some(urgent) = inbox.urgent.recv(), if urgent_first && (room || self.context.may_speak()) => {
                     urgent_taken += 1;
                     self.receive_urgent(urgent);
@@ -106,7 +108,7 @@ impl<C: Core> Actor<C> {
                         }
                         if turn.elapsed() > TURN {
                             self.deliver();
-                            // So that what is urgent and came meanwhile is read.
+                            // Lets urgent messages that came meanwhile be read.
                             tokio::task::yield_now().await;
                             turn = Instant::now();
                         }
@@ -124,7 +126,7 @@ impl<C: Core> Actor<C> {
         self.collect();
     }
 
-    /// A batch of messages may take long: each of them is a sign of life.
+    /// A batch of messages may take long, so each message is a sign of life.
     fn receive(&mut self, message: C::Message) {
         self.vitals.beat();
         let behind = if self.context.stopped().is_none() { self.journal.behind() } else { None };
@@ -144,8 +146,8 @@ impl<C: Core> Actor<C> {
         self.collect();
     }
 
-    /// Lets out what is on the disk by now, and what the rest of it was waiting for. A disk or an etcd that hangs does not keep it from
-    /// showing that it is alive: how long this may take is decided by the deadline of the process, not by a watchdog.
+    /// Sends what is on the disk by now, and what waited for the rest. A disk or an etcd that hangs does not keep the actor from showing
+    /// that it is alive: how long the end may take is decided by the deadline of the process, not by a watchdog.
     async fn end(mut self) {
         self.deliver();
         self.write_last().await;
@@ -156,34 +158,34 @@ impl<C: Core> Actor<C> {
             tokio::select! {
                 biased;
                 closed = &mut closing => break closed,
-                // What is on the disk leaves before the place is given up.
+                // What is on the disk is sent before the place is given up.
                 Ok(Progress { fault: None, .. }) = self.journal.changed() => self.hand_out_durable(),
                 () = tokio::time::sleep(TICK) => {}
             }
             self.vitals.beat();
         };
         match closed {
-            // What changes by it now is not written any more.
+            // Changes that this causes are not written any more.
             Ok(Ok(())) => self.hand_out_durable(),
-            // It is the end of a process that was told to end. Nobody was told of anything that is lost.
+            // The process was told to end, and nobody was told of anything that is lost.
             Ok(Err(fault)) if self.journal.is_written() => {
                 tracing::info!(%fault, "all was written before");
                 self.outbox.take_all();
             }
             Ok(Err(fault)) => drop(self.refuse_changes(&fault)),
-            // The runtime ends, and with it the process.
+            // The runtime is shutting down, and with it the process.
             Err(error) => tracing::debug!(%error, "nobody waits for the state to be closed"),
         }
     }
 
-    /// Waits for a moment until all is on the disk, also what handing it out led to: a grant that nobody waits for any more is given back. A
-    /// log that is closed takes nothing.
+    /// Waits up to `LAST_WRITES` until everything is on the disk, also the changes that sending causes: a grant whose client is gone is
+    /// given back. A closed log accepts nothing.
     async fn write_last(&mut self) {
         let until = Instant::now() + LAST_WRITES;
         while self.context.stopped().is_none() && Instant::now() < until {
             let written = self.journal.is_written();
             self.deliver();
-            // All was handed out, and led to nothing new.
+            // Everything was sent, and nothing new came of it.
             if written && self.journal.is_written() {
                 return;
             }
@@ -196,19 +198,19 @@ impl<C: Core> Actor<C> {
         }
     }
 
-    /// What the state has to say goes behind what was to be said before.
+    /// Queues what the state has to say behind everything that is queued already.
     fn collect(&mut self) {
         if self.context.stopped().is_none() {
             self.core.collect(&mut self.context);
         }
     }
 
-    /// Writes down what has changed, and hands out what is on the disk, including what that in turn leads to.
+    /// Writes what has changed to the journal, and sends what is on the disk, including what that in turn causes.
     fn deliver(&mut self) {
         loop {
             self.collect();
             let written = match self.context.stopped() {
-                // What is told when nothing can be written any more is on the disk.
+                // Nothing more can be written: whatever is told now is on the disk already.
                 Some(_) => Ok(Position(0)),
                 None => self.journal.write(self.core.state()),
             };
@@ -218,7 +220,7 @@ impl<C: Core> Actor<C> {
                         self.outbox.hold(position, outgoing);
                     }
                 }
-                // It has no position yet.
+                // The entry has no position yet.
                 Err(AppendError::Full { .. }) => {}
                 Err(error) => self.stop(&error),
             }
@@ -254,7 +256,7 @@ impl<C: Core> Actor<C> {
         }
     }
 
-    /// More is on the disk, or something went wrong.
+    /// More records are on the disk, or writing failed.
     fn written(&mut self, progress: Result<Progress, Fault>) {
         match progress {
             Ok(Progress { fault: Some(fault), .. }) | Err(fault) => return self.stop(&fault),
@@ -266,7 +268,7 @@ impl<C: Core> Actor<C> {
         self.journal.metrics().commits.inc();
     }
 
-    /// It cannot be seen who has the state: nothing is said until it can.
+    /// The writer of the state cannot be confirmed: nothing is sent until it can.
     fn silence(&mut self, why: Option<&Fault>) {
         if std::mem::replace(&mut self.silenced, true) {
             return;
@@ -283,7 +285,7 @@ impl<C: Core> Actor<C> {
         }
     }
 
-    /// A log that has failed stays so, whatever else there is to say.
+    /// A failed log stays reported, whatever else there is to report.
     fn tell_health(&self, silence: Option<&str>) {
         match (self.context.stopped(), silence) {
             (Some(stopped), _) => self.vitals.unwell(storage_failed(&stopped.status)),
@@ -294,7 +296,7 @@ impl<C: Core> Actor<C> {
         }
     }
 
-    /// Another process has the state: nothing is said any more, and this one ends.
+    /// Another process has the state: this one sends nothing more and ends.
     fn fenced(&mut self, fault: &Fault) {
         self.outbox.take_all();
         self.context.take_outgoing();
@@ -306,7 +308,7 @@ impl<C: Core> Actor<C> {
         self.vitals.fail(failure_of(fault));
     }
 
-    /// Nothing changes any more. What was not on the disk has not happened, and is not shown either.
+    /// No changes from now on. Changes that were not on the disk have not happened, and are not shown either.
     fn stop(&mut self, fault: &(dyn std::error::Error + 'static)) {
         if self.refuse_changes(fault)
             && let Err(error) = self.core.restore(&self.journal, &self.context)
@@ -317,14 +319,14 @@ impl<C: Core> Actor<C> {
         }
     }
 
-    /// Nothing changes any more. Whether what is on the disk may still be shown.
+    /// No changes from now on. Returns whether the state on the disk may still be shown.
     fn refuse_changes(&mut self, fault: &(dyn std::error::Error + 'static)) -> bool {
         let status = of_fault(fault);
         match fault_of(fault) {
             Some(Fault::Ended { .. }) => {
                 self.vitals.fail(CoreFailure::Panicked { part: "the log".to_owned(), what: fault.to_string() });
             }
-            // Another process may be able to write: this one gives the place up, and stands by.
+            // Another process may be able to write: this one gives up its place and stands by.
             Some(Fault::Remote { .. }) => self.vitals.fail(CoreFailure::Deposed { what: fault.to_string() }),
             Some(fenced) if fenced.is_lost_place() => {
                 self.context.stop(Stopped { status, unreadable: true });
@@ -344,7 +346,7 @@ impl<C: Core> Actor<C> {
                 answer(Some(&status));
             }
         }
-        // They find a state that may be behind the one they saw coming, and watch again.
+        // Watchers may have been told of changes that are not on the disk; they watch again.
         self.context.watchers.clear();
         self.context.stop(Stopped { status, unreadable: false });
         true
@@ -355,7 +357,7 @@ fn storage_failed(status: &Status) -> String {
     format!("storage failed: {}", status.message())
 }
 
-/// What the system said; a fault's own text speaks of writing.
+/// The error of the operating system; the fault's own text speaks of writing.
 fn reason_of(fault: &Fault) -> String {
     match fault {
         Fault::Io { action, place, source } => format!("cannot {action} {place}: {source}"),

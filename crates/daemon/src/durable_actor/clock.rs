@@ -1,33 +1,33 @@
-//! Time as the actor lives through it: what it was not running is left out, and what it might say nothing.
+//! The actor's own time, without the time in which the process was not running or was not allowed to send anything.
 //!
-//! An actor that was suspended (SIGSTOP, a machine without a moment for it) has heard no ping meanwhile, so no session, lease or
-//! waiter may be held to that time. The actor looks at the clock at every turn, and takes a turn at least every [`TICK`]; from one
-//! look to the next at most [`MOST_STEP`] counts.
+//! An actor that was suspended (SIGSTOP, an overloaded machine) has received no pings meanwhile, so that time must not count against any
+//! session, lease or waiter. The actor reads the clock at every turn, and takes a turn at least every [`TICK`]; between two reads at most
+//! [`MOST_STEP`] counts.
 //!
-//! Nor does time count after a look at which nothing might be said ([`super::may_speak`]): a ping may have arrived then, and was not
-//! answered. Otherwise a session would run out although its client and this process were there all the time, because a directory or etcd
-//! was not.
+//! Time does not count either after a read at which nothing might be sent ([`super::may_speak`]): a ping may have arrived then without an
+//! answer. Otherwise a session would expire because a directory or etcd was unreachable, although its client and this process were running
+//! all the time.
 //!
-//! Both are safe, because deadlines are only ever later for that, never earlier. Whoever holds something believes in it until its ping was
-//! asked plus the time to live, by a clock of its own, and stops by itself: it needs no deadline here. Whoever waits for something
-//! waits longer. A process that was got past while it was silent never speaks again, and its successor counts by a clock of its own.
+//! Both are safe, because deadlines only become later, never earlier. A holder trusts its lease only until the time of its last answered
+//! ping plus the time to live, by its own clock, and stops by itself: it needs no deadline here. Waiters wait longer. A process that was
+//! superseded while it was silent never sends again, and its successor uses its own clock.
 
 use ratn_model::time::Timestamp;
 use std::time::{Duration, Instant};
 
-/// The actor takes a turn at least so often.
+/// Maximum time between two turns of the actor.
 pub(super) const TICK: Duration = Duration::from_millis(100);
-/// More than this has passed between two looks only where the actor was not running.
+/// A longer time between two reads means that the actor was not running; only this much counts.
 const MOST_STEP: Duration = Duration::from_millis(250);
-/// A longer pause is said in the log.
+/// A longer pause is logged.
 const LONG_PAUSE: Duration = Duration::from_secs(1);
 
 #[derive(Debug)]
 pub(super) struct Clock {
-    /// Up to the last look.
+    /// Counted time up to the last read.
     lived: Duration,
     looked: Instant,
-    /// Something might be said at the last look.
+    /// Sending was allowed at the last read.
     counts: bool,
 }
 
@@ -36,7 +36,7 @@ impl Clock {
         Clock { lived: Duration::ZERO, looked: now, counts: true }
     }
 
-    /// A turn begins; whether anything may be said now.
+    /// Reads the clock at the beginning of a turn; `may_speak` is whether sending is allowed now.
     pub(super) fn look(&mut self, now: Instant, may_speak: bool) {
         let passed = now.saturating_duration_since(self.looked);
         self.lived += self.counted(passed);
@@ -52,7 +52,7 @@ impl Clock {
         Timestamp(u64::try_from(lived.as_nanos()).unwrap_or(u64::MAX))
     }
 
-    /// When it is `at`, unless there is a pause before; nothing while no time counts.
+    /// The instant of `at` if no pause comes before; `None` while no time counts.
     pub(super) fn instant(&self, at: Timestamp) -> Option<Instant> {
         let left = Duration::from_nanos(at.0).saturating_sub(self.lived);
         (self.counts || left.is_zero()).then(|| self.looked + left)

@@ -8,12 +8,12 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::coop::unconstrained;
 use tonic::Status;
 
-/// Messages that wait for the actor; more make their senders wait.
+/// Capacity for messages to the actor; beyond it senders wait.
 const INBOX: usize = 1_024;
-/// Of those that go before all others.
+/// Capacity for urgent messages.
 const URGENT: usize = 1_024;
 
-/// What the actor hears.
+/// The receiving ends of the inbox.
 pub(super) struct Inbox<C: Core> {
     pub(super) messages: mpsc::Receiver<C::Message>,
     pub(super) urgent: mpsc::Receiver<C::Urgent>,
@@ -32,7 +32,7 @@ pub(super) fn open<C: Core>() -> (Handle<C>, Inbox<C>) {
 }
 
 impl<C: Core> Handle<C> {
-    /// Sends a message and waits for the answer that it is to be given.
+    /// Sends a message and waits for the answer.
     pub(crate) async fn ask<T>(&self, message: impl FnOnce(oneshot::Sender<T>) -> C::Message) -> Result<T, Status> {
         let (answer, answered) = oneshot::channel();
         self.send(message(answer)).await?;
@@ -47,7 +47,7 @@ impl<C: Core> Handle<C> {
         self.ask(message).await?
     }
 
-    /// As [`Handle::ask`], of what goes before every message.
+    /// As [`Handle::ask`], for an urgent message.
     pub(crate) async fn ask_urgently<T>(
         &self,
         urgent: impl FnOnce(oneshot::Sender<T>) -> C::Urgent,
@@ -61,12 +61,12 @@ impl<C: Core> Handle<C> {
         self.messages.send(message).await.map_err(|_| ending())
     }
 
-    /// Sends a message from where nothing can be waited for. Into a full inbox it may come behind what is sent after this.
+    /// Sends a message from a place that cannot wait. If the inbox is full, messages that are sent later may overtake it.
     pub(crate) fn send_later(&self, message: C::Message) {
         if let Err(mpsc::error::TrySendError::Full(message)) = self.messages.try_send(message) {
             let messages = self.messages.clone();
             let mut sending = Box::pin(unconstrained(async move { messages.send(message).await }));
-            // It asks for room here and now: the new task may run after what is sent next.
+            // Polled once here, to queue for room now: the spawned task may run after later messages are sent.
             if sending.as_mut().now_or_never().is_none() {
                 tokio::spawn(sending);
             }

@@ -1,10 +1,10 @@
-//! The journal keeps a daemon's state over a restart: a log of entries, and from time to time a snapshot in their place.
+//! The journal keeps a daemon's state over a restart: a log of entries, which a snapshot replaces from time to time.
 //!
 //! ```text
 //!   state ──entries──▶ log ──durable──▶ outbox: what depended on them leaves
 //!     └────snapshot──▶ log (in the background, when there is more to replay than is worth it)
 //! ```
-//! What an entry and a snapshot mean is the state's: [`Journaled`] makes them, a `restore` function reads them back.
+//! The state defines what an entry and a snapshot mean: [`Journaled`] makes them, a `restore` function reads them back.
 
 use super::may_speak::MaySpeak;
 use crate::config::StorageConfig;
@@ -24,38 +24,38 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use tokio::task::JoinHandle;
 use tonic::{Code, Status};
 
-/// One entry holds what one turn of an actor changed; larger than any message that asks for it.
+/// Maximum size of an entry. An entry holds what one turn of an actor changed; the limit is larger than any message that causes a change.
 const RECORD_BYTES: usize = 64 << 20;
-/// What may wait for the disk. The actor takes no more on long before ([`super::outbox::MOST_HELD`]).
+/// Maximum bytes that wait for the disk. The actor refuses new work long before ([`super::outbox::MOST_HELD`]).
 const BUFFERED_BYTES: usize = 256 << 20;
-/// With more than this waiting for the disk nothing new is taken on. The rest of [`BUFFERED_BYTES`] is for what cannot be refused: what
-/// time ends, and what is given back.
+/// With more than this waiting for the disk new work is refused. The rest of [`BUFFERED_BYTES`] is for changes that cannot be refused: expiries
+/// and releases.
 pub(super) const MOST_WAITING_BYTES: usize = 64 << 20;
-/// Who was refused for that asks again after so long.
+/// Retry delay of a client that was refused for that.
 const BEHIND_RETRY: Duration = Duration::from_millis(500);
 
 /// A state that is kept in a [`Journal`].
 pub(crate) trait Journaled {
-    /// What has changed since the last call, as one entry; `None` where nothing has.
+    /// What has changed since the last call, as one entry; `None` where nothing has changed.
     fn take_entry(&mut self) -> Option<Vec<u8>>;
 
-    /// All of it as it is after the last entry taken. Cheap: it is made into bytes where it holds nobody up.
+    /// The whole state after the last entry taken. Cheap: the bytes are made later, where that delays nobody.
     fn snapshot(&self) -> MakeSnapshot;
 }
 
-/// The log of a state, and what is known of it.
+/// The log of a state, and its current position and size.
 #[derive(Debug)]
 pub(crate) struct Journal {
     role: &'static str,
     store: Arc<dyn Store>,
-    /// Nothing after the end.
+    /// `None` once closed.
     writer: Option<Box<dyn Writer>>,
     durable: Durable,
-    /// An older state was put in place, and nothing was written since.
+    /// An older state was restored, and nothing has been written since.
     restored: bool,
-    /// The last entry.
+    /// Position of the last entry.
     last: Position,
-    /// An entry for which there was no room yet; the next one in its place.
+    /// An entry for which there was no room yet; it is written before the next one.
     unwritten: Option<Vec<u8>>,
     compact_bytes: u64,
     /// Bytes of entries since the last snapshot.
@@ -64,7 +64,7 @@ pub(crate) struct Journal {
     metrics: JournalMetrics,
 }
 
-/// Why the state of before cannot be had.
+/// Why the earlier state cannot be loaded.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum JournalError {
     #[error("cannot open the state of the {role}")]
@@ -79,9 +79,9 @@ pub(crate) enum JournalError {
     Restore { role: &'static str, source: Box<dyn Error + Send + Sync> },
 }
 
-/// A floor for what has to be above all of before, also where the end of the log was lost (no durability, a restored backup): the
-/// microseconds since 1970. Nothing that begins there may grow by more than one a microsecond: tokens are held back where they would
-/// ([`ratn_resources::Pool::above`]), revisions and projections take longer to make.
+/// Microseconds since 1970: a lower bound for numbers that have to be above all earlier ones, also where the end of the log was lost (no
+/// durability, a restored backup). Numbers that begin there may grow by one per microsecond at most: tokens are held back where they would grow
+/// faster ([`ratn_resources::Pool::above`]), revisions and projections take longer than that to make.
 pub(crate) fn floor() -> u64 {
     #[expect(clippy::disallowed_methods, reason = "a floor: where the clock was set back, what was kept is above it")]
     let now = SystemTime::now();
@@ -90,7 +90,7 @@ pub(crate) fn floor() -> u64 {
 }
 
 impl Journal {
-    /// The log of a journal in files.
+    /// The log of a journal that is kept in files.
     pub(crate) fn log(config: &StorageConfig, directory: &Path) -> Log {
         let options = Options {
             durability: config.durability,
@@ -101,12 +101,12 @@ impl Journal {
         Log::new(directory, options)
     }
 
-    /// The bounds of a journal in etcd.
+    /// Size limits of a journal in etcd.
     pub(crate) fn bounds() -> Bounds {
         Bounds { record: RECORD_BYTES, buffered: BUFFERED_BYTES, ..Bounds::default() }
     }
 
-    /// Takes the place of the one writer, and restores the state. Blocks.
+    /// Becomes the one writer, and restores the state. Blocks.
     pub(crate) fn open<T, E: Error + Send + Sync + 'static>(
         role: &'static str,
         config: &StorageConfig,
@@ -143,7 +143,7 @@ impl Journal {
         Ok((state, journal))
     }
 
-    /// The state as the log has it: for reading, after writing has failed.
+    /// The state according to the log: for reading, after writing has failed.
     pub(crate) fn read<T, E: Error + Send + Sync + 'static>(
         &self,
         restore: impl FnOnce(Recovered) -> Result<T, E>,
@@ -153,9 +153,9 @@ impl Journal {
         restore(recovered).map_err(|error| JournalError::Restore { role, source: error.into() })
     }
 
-    /// Writes down what has changed since the last call, and says where the last entry stands. Does not wait for the disk.
+    /// Writes what has changed since the last call, and returns the position of the last entry. Does not wait for the disk.
     ///
-    /// Where there is no room ([`AppendError::Full`]) the entry is kept, and written at a later call.
+    /// Where there is no room ([`AppendError::Full`]) the entry is kept and written at a later call.
     pub(crate) fn write(&mut self, state: &mut impl Journaled) -> Result<Position, AppendError> {
         while let Some(entry) = self.unwritten.take().or_else(|| state.take_entry()) {
             match self.append(&entry) {
@@ -182,14 +182,14 @@ impl Journal {
         Ok(())
     }
 
-    /// Counts there from now on.
+    /// Counts in `metrics` from now on.
     #[must_use]
     pub(crate) fn counting(self, metrics: &JournalMetrics) -> Journal {
         Journal { metrics: metrics.clone(), ..self }
     }
 
-    /// Whether an older state was put in place when it was opened, and nothing had been written since: revisions that somebody has heard of may
-    /// be missing.
+    /// Whether an older state had been restored when the journal was opened, with nothing written since: revisions that clients know of may be
+    /// missing.
     pub(crate) fn is_restored(&self) -> bool {
         self.restored
     }
@@ -198,7 +198,7 @@ impl Journal {
         &self.metrics
     }
 
-    /// Why nothing more is taken on for now: the disk is behind.
+    /// The refusal of new work while the disk cannot keep up.
     pub(crate) fn behind(&self) -> Option<Status> {
         let waiting = self.writer.as_ref()?.waiting_bytes() + self.unwritten.as_ref().map_or(0, Vec::len);
         if waiting <= MOST_WAITING_BYTES && self.unwritten.is_none() {
@@ -214,7 +214,7 @@ impl Journal {
         Some(retry_later(Code::ResourceExhausted, "STORAGE_BEHIND", message, BEHIND_RETRY))
     }
 
-    /// Begins to look whether the place is still this writer's. It is kept only as long as the core takes its turns.
+    /// Starts the thread that checks whether this is still the one writer. The writer keeps its place only while the core takes turns.
     pub(super) fn may_speak(&mut self, vitals: Vitals) -> Result<MaySpeak, JournalError> {
         let role = self.role;
         let Some(writer) = &mut self.writer else { return Err(JournalError::Closed { role }) };
@@ -223,7 +223,7 @@ impl Journal {
         MaySpeak::begin(writer.place(), vitals).map_err(|source| JournalError::Thread { role, source })
     }
 
-    /// Whether everything through this entry is on the disk.
+    /// Whether every entry up to this position is on the disk.
     pub(crate) fn reached(&self, position: Position) -> bool {
         matches!(self.durable.reached(position), Ok(true))
     }
@@ -233,24 +233,24 @@ impl Journal {
         self.unwritten.is_none() && self.reached(self.last)
     }
 
-    /// Returns when more is on the disk, or something went wrong.
+    /// Returns when more is on the disk, or when writing failed.
     pub(crate) async fn changed(&mut self) -> Result<Progress, Fault> {
         self.durable.changed().await
     }
 
-    /// Waits until everything is on the disk, which may take as long as that (or etcd) hangs; in a thread that may block.
+    /// Waits until everything is on the disk, for as long as the disk (or etcd) hangs; runs in a thread that may block.
     pub(super) fn close(&mut self) -> JoinHandle<Result<(), Fault>> {
         let writer = self.writer.take();
         let close = move || writer.map_or(Ok(()), |writer| writer.close().map(|_| ()));
         tokio::task::spawn_blocking(|| exit_on_panic_blocking("what closes the state", close))
     }
 
-    /// A snapshot stands for all entries so far; it has to be of the state after the last of them.
+    /// A snapshot replaces all entries so far, so it has to be of the state after the last of them.
     fn compact(&mut self, state: &impl Journaled) -> Result<(), Fault> {
         let Some(writer) = self.writer.as_mut().filter(|_| !self.durable.progress().compacting) else { return Ok(()) };
         match writer.compact(self.last, state.snapshot()) {
             Ok(()) => {
-                // As long as nothing better is known: the next one is as large as what it stands for.
+                // Estimate until the size is known: the snapshot is as large as the entries that it replaces.
                 (self.snapshot_bytes, self.since_snapshot) = (self.since_snapshot / 2, 0);
                 Ok(())
             }
@@ -263,7 +263,7 @@ impl Journal {
     }
 }
 
-/// A log that was put in place of a newer one, for tests.
+/// A log that was restored in place of a newer one, for tests.
 #[cfg(test)]
 #[derive(Debug)]
 pub(crate) struct PutInPlace(pub(crate) Log);

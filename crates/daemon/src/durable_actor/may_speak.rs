@@ -1,25 +1,26 @@
-//! May speak until: nothing leaves an actor unless it was confirmed a moment ago that it is the one writer of its state.
+//! Permission to speak: an actor sends nothing unless it was confirmed a moment ago that it is the one writer of its state.
 //!
-//! A thread of its own looks whether the writer's place is still held, every [`CONFIRM_INTERVAL`], and never waits for a sync. Before
-//! every answer the actor compares: the last look that found the place held began less than [`CONFIRMED_FOR`] (G) ago, or nothing
-//! leaves. A process that was suspended finds its confirmation too old, before anything else that it does; so does one whose machine was
-//! suspended ([`BootClock`]).
+//! A separate thread checks whether the writer still holds its place, every [`CONFIRM_INTERVAL`], and never waits for a sync. Before every
+//! answer the actor checks that the last successful check began less than [`CONFIRMED_FOR`] (G) ago; otherwise nothing is sent. A process
+//! that was suspended finds its confirmation too old before it does anything else; so does a process whose machine was suspended
+//! ([`BootClock`]).
 //!
-//! Where the state directory cannot be looked at (permissions, a file system that hangs) nothing is confirmed either. The actor is
-//! [`Speech::Held`] then, and its health says why until a look succeeds.
+//! Where the state directory cannot be checked (permissions, a file system that hangs) nothing is confirmed either. The actor is
+//! [`Speech::Held`] then, and its health says why until a check succeeds.
 //!
 //! # Why a predecessor does no harm
 //!
-//! Let a successor take the place at T. Every look of the predecessor that began after T fails, so it says nothing after T + G.
+//! Let a successor take the place at T. Every check of the predecessor that begins after T fails, so the predecessor sends nothing after T
+//! + G.
 //!
-//! - *Sessions.* A client believes in its session until its ping was asked plus the time to live. The predecessor answers no ping
-//!   that was asked after T + G, so nobody believes in it beyond T + G + TTL. The successor restores the session at T or later, and
-//!   lets it expire no earlier than G + TTL after that ([`ratn_resources::Pool::with_session_grace`]). An answer that is delayed on its way
-//!   promises no more: it counts from its question.
-//! - *Grants, closed sessions, changed times to live.* They leave when they are on the disk, and what is acknowledged there was so
-//!   before T (the log looks at the place after every sync): the successor has read it.
-//! - *Lists and watches* tell of what was on the disk before T. Who moves something by what the predecessor said does so for at most
-//!   G after T, under a lease that the successor has, too, and does not give to another before its session has ended.
+//! - *Sessions.* A client trusts its session until the time at which it sent its last answered ping, plus the time to live (TTL). The
+//!   predecessor answers no ping that was sent after T + G, so no client trusts it beyond T + G + TTL. The successor restores the session
+//!   at T or later, and lets it expire no earlier than G + TTL after that ([`ratn_resources::Pool::with_session_grace`]). An answer that is
+//!   delayed on its way promises no more: the time counts from the ping.
+//! - *Grants, closed sessions, changed times to live.* They are sent when they are on the disk, and whatever is acknowledged there was so
+//!   before T (the log checks the place after every sync): the successor has read it.
+//! - *Lists and watches* report what was on the disk before T. A client that moves something because of the predecessor's answer does so
+//!   for at most G after T, under a lease that the successor knows, too, and does not give to another client before its session has ended.
 
 use ratn_panic_point::panic_point;
 use ratn_storage::{Fault, Place};
@@ -31,55 +32,55 @@ use std::thread;
 use std::time::Duration;
 use tokio::sync::watch;
 
-/// G: a confirmation holds for so long.
+/// G: how long a confirmation is valid.
 pub(crate) const CONFIRMED_FOR: Duration = Duration::from_secs(1);
-/// The place is looked at so often.
+/// Interval between two checks of the place.
 const CONFIRM_INTERVAL: Duration = Duration::from_millis(250);
 
-/// An actor that does not end for so long when its place is lost hangs: then its process ends without it.
+/// An actor that has not ended this long after it lost its place hangs: then its process is ended without it.
 const END_PATIENCE: Duration = Duration::from_secs(1);
 
-/// What is known of the place.
+/// Result of the checks of the place.
 #[derive(Debug, Clone)]
 enum Confirmed {
-    /// No look has found it held.
+    /// No check has succeeded yet.
     NotYet,
-    /// It was held at a look that began then.
+    /// The place was held, by a check that began at this instant.
     At(BootInstant),
-    /// Somebody else has it.
+    /// Another process has the place.
     Lost(Fault),
 }
 
-/// What the looks have found.
+/// What the checks have found.
 #[derive(Debug, Clone)]
 struct Found {
     confirmed: Confirmed,
-    /// Why nothing is known since: what the system said to the last look.
+    /// Error of the last check, where it failed and nothing is known since.
     unseen: Option<Fault>,
 }
 
-/// What may be said now.
+/// Whether the actor may send now.
 #[derive(Debug)]
 pub(super) enum Speech {
     Allowed,
-    /// Not for now: the last confirmation is too old. Why, as far as is known.
+    /// Not for now: the last confirmation is too old. The reason, as far as it is known.
     Held(Option<Fault>),
     /// Never again.
     Over(Fault),
 }
 
-/// See the module. The thread ends with it.
+/// See the module. Dropping this ends the thread.
 #[derive(Debug)]
 pub(super) struct MaySpeak {
     found: watch::Receiver<Found>,
     clock: BootClock,
-    /// The actor gives its place up.
+    /// The actor is giving up its place.
     loss_expected: Arc<AtomicBool>,
     _end: mpsc::Sender<()>,
 }
 
 impl MaySpeak {
-    /// Looks at once, and from then on beside.
+    /// Checks at once, and from then on in a thread.
     pub(super) fn begin(place: Box<dyn Place>, vitals: Vitals) -> std::io::Result<MaySpeak> {
         MaySpeak::begin_by(BootClock::default(), place, vitals)
     }
@@ -108,12 +109,12 @@ impl MaySpeak {
                         if expected.load(Ordering::SeqCst) {
                             return;
                         }
-                        // An actor that takes its turns ends by itself.
+                        // An actor that still takes turns ends by itself.
                         let hangs = || matches!(ended.recv_timeout(END_PATIENCE), Err(mpsc::RecvTimeoutError::Timeout));
                         if hangs() {
                             let failure = failure_of(&lost);
                             failing.fail(failure.clone());
-                            // With the actor its runtime may hang, and with that everything that could end the process.
+                            // The runtime may hang together with the actor, and with it everything else that could end the process.
                             if hangs() {
                                 std::process::exit(failure.exit_code().into());
                             }
@@ -139,12 +140,12 @@ impl MaySpeak {
         }
     }
 
-    /// From now on the place may be given up by the actor itself, however long it takes it to end then: that is no failure.
+    /// From now on the actor may give up its place itself: the loss is no failure, however long the actor takes to end.
     pub(super) fn expect_loss(&self) {
         self.loss_expected.store(true, Ordering::SeqCst);
     }
 
-    /// Returns after the next look.
+    /// Returns after the next check.
     pub(super) async fn changed(&mut self) {
         if self.found.changed().await.is_err() && !matches!(self.now(), Speech::Over(_)) {
             std::future::pending::<()>().await;
@@ -152,7 +153,7 @@ impl MaySpeak {
     }
 }
 
-/// The end of a core whose place is lost.
+/// The failure of a core that has lost its place.
 pub(super) fn failure_of(lost: &Fault) -> CoreFailure {
     let what = lost.to_string();
     match lost {
@@ -161,7 +162,7 @@ pub(super) fn failure_of(lost: &Fault) -> CoreFailure {
     }
 }
 
-/// Nothing is known where the look itself fails.
+/// An error says that the check itself failed: nothing is known.
 fn look(clock: &BootClock, place: &dyn Place) -> Result<Confirmed, Fault> {
     let began = clock.now();
     match place.check() {
@@ -188,7 +189,7 @@ mod tests {
         }
     }
 
-    /// Lost from a moment on.
+    /// A place that is lost from a moment on.
     #[derive(Debug)]
     struct GivenUp(Arc<AtomicBool>);
 
@@ -207,7 +208,7 @@ mod tests {
         let mut speech = MaySpeak::begin(Box::new(GivenUp(given_up.clone())), vitals.clone()).unwrap();
         speech.expect_loss();
         given_up.store(true, Ordering::SeqCst);
-        // Until the thread has ended.
+        // Waits until the thread has ended.
         while speech.found.changed().await.is_ok() {}
         assert!(matches!(speech.now(), Speech::Over(_)));
         assert_eq!(vitals.condition().borrow().failure, None);
@@ -219,7 +220,7 @@ mod tests {
         let place = Box::new(HangingPlace(hangs.clone()));
         let mut speech = MaySpeak::begin_by(clock.clone(), place, Vitals::default()).unwrap();
         {
-            // No look ends before the machine sleeps, and `Instant` does not see that it did.
+            // No check ends before the machine sleeps, and `Instant` does not count the time asleep.
             let _hanging = hangs.lock().unwrap();
             clock.suspend(CONFIRMED_FOR);
             assert!(matches!(speech.now(), Speech::Held(None)));

@@ -1,12 +1,12 @@
-//! The one task that owns a durable state: takes messages in order, ends what time has ended, and lets nothing out before the records
-//! of what it tells of are on the disk. The resource manager and the world pool are both a [`Core`] in it.
+//! The one task that owns a durable state. It takes messages in order, expires what is due, and sends nothing before the records that
+//! it depends on are on the disk. The resource manager and the world pool are both a [`Core`] in it.
 //!
 //! ```text
 //!   inbox ──message──▶ Core (the state) ──records──▶ journal ──durable──▶ outbox ──▶ answers, watchers
 //! ```
-//! What came together is written down together. When records cannot be written, every change is refused from then on; what can be read
-//! is the state that is on the disk. Nothing at all is said unless this is known to be the one writer ([`may_speak`]), and no deadline
-//! counts the time in which the process was not running, or might say nothing ([`clock`]).
+//! Changes of messages that arrive together are written together. When records cannot be written, every change is refused from then
+//! on, and readers see the state that is on the disk. Nothing at all is sent unless this is confirmed to be the one writer
+//! ([`may_speak`]), and no deadline counts the time in which the process was not running or was not allowed to send ([`clock`]).
 
 mod actor;
 mod clock;
@@ -34,74 +34,74 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-/// A state and what is done with it: everything that is not the same for every daemon.
+/// A state and its operations: everything that differs between the daemons.
 pub(crate) trait Core: Sized + Send + 'static {
-    /// What is kept over a restart.
+    /// The state that is kept over a restart.
     type State: Journaled;
-    /// What the service asks.
+    /// Requests of the service.
     type Message: Send + 'static;
-    /// What goes before every message.
+    /// Requests that overtake every message.
     type Urgent: Send + 'static;
-    /// What the state has to say beside answers; it waits for the disk as they do.
+    /// What the state sends apart from answers; it waits for the disk like answers.
     type Said: Send + 'static;
-    /// What watchers are told.
+    /// An update for watchers.
     type Update: Clone + Send + 'static;
-    /// What is told from outside, of which only the newest counts.
+    /// Input from outside of which only the newest value counts.
     type Signal: Send + Sync + 'static;
 
-    /// What the journal writes down.
+    /// The state that the journal writes.
     fn state(&mut self) -> &mut Self::State;
 
-    /// The journal cannot be written any more: the state is what it holds.
+    /// The journal cannot be written any more: replaces the state by what the journal holds.
     ///
     /// # Errors
-    /// Where it cannot be read either.
+    /// Where the journal cannot be read either.
     fn restore(&mut self, journal: &Journal, context: &TurnContext<Self>) -> Result<(), JournalError>;
 
     /// When [`Core::advance`] is due.
     fn next_deadline(&self, context: &TurnContext<Self>) -> Option<Timestamp>;
 
-    /// Ends what time has ended.
+    /// Expires what is due.
     fn advance(&mut self, context: &mut TurnContext<Self>);
 
-    /// One message. It also comes when nothing can be written any more ([`TurnContext::stopped`]): then nothing may change.
+    /// Handles a message. It is also called when nothing can be written any more ([`TurnContext::stopped`]): then nothing may change.
     fn receive(&mut self, message: Self::Message, context: &mut TurnContext<Self>);
 
-    /// As [`Core::receive`], of what goes before every message.
+    /// As [`Core::receive`], for an urgent message.
     fn receive_urgent(&mut self, urgent: Self::Urgent, context: &mut TurnContext<Self>);
 
-    /// The newest signal.
+    /// Handles the newest signal.
     fn signal(&mut self, signal: &Self::Signal, context: &mut TurnContext<Self>);
 
     /// Passes on what the state has to say since the last call ([`TurnContext::say`]), in order.
     fn collect(&mut self, context: &mut TurnContext<Self>);
 
-    /// What was said is on the disk: it leaves.
+    /// Sends `said`, whose records are on the disk now.
     fn hand_out(&mut self, said: Self::Said, context: &mut TurnContext<Self>);
 
-    /// The disk is behind. A message that would add to it is answered with `status`; one that would not comes back.
+    /// The disk cannot keep up. A message that would write more is answered with `status`; any other is returned.
     fn refuse(message: Self::Message, status: &Status) -> Option<Self::Message>;
 
     /// Puts messages that arrived together into another order.
     fn order(_messages: &mut [Self::Message]) {}
 
-    /// Whether a message may change so much that it is written down on its own.
+    /// Whether a message may change so much that it gets an entry of its own.
     fn is_large(_message: &Self::Message) -> bool {
         false
     }
 
-    /// Nobody is made to wait any more.
+    /// From now on no caller is made to wait.
     fn drain(&mut self, _desk: &mut TurnContext<Self>) {}
 
     /// A turn has ended.
     fn turned(&mut self, _desk: &mut TurnContext<Self>) {}
 }
 
-/// Starts the actor. With `draining` whoever waits is told to ask the successor; with `over` it ends, when everything is on the disk.
-/// How it is, also that it has panicked, is in the `vitals`.
+/// Starts the actor. `draining` tells everybody who waits to ask the successor; `over` ends the actor when everything is on the disk.
+/// Its condition, a panic included, is in `vitals`.
 ///
 /// # Errors
-/// Where the thread cannot be started that watches the writer's place.
+/// Where the thread that checks the writer's place cannot be started.
 pub(crate) fn start<C: Core>(
     core: C,
     mut journal: Journal,

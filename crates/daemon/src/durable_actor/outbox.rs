@@ -1,20 +1,20 @@
 //! The outbox: replies are held back until their records are on the disk, and are sent in order.
 //!
-//! An answer waits for the last entry written before it was made, also when it changed nothing itself: it may tell of what others
-//! changed.
+//! An answer waits for the last entry written before the answer was made, even when its request changed nothing: the answer may
+//! show what other requests changed.
 
 use ratn_storage::Position;
 use std::collections::VecDeque;
 use tokio::sync::oneshot;
 use tonic::Status;
 
-/// With so much held back an actor takes on nothing new: the disk does not keep up.
+/// With this many replies held back an actor accepts no new work: the disk cannot keep up.
 pub(super) const MOST_HELD: usize = 16_384;
 
 /// Sends an answer, or a status instead of it.
 pub(super) type SendAnswer = Box<dyn FnOnce(Option<&Status>) + Send>;
 
-/// Answers that can be held back, until it is known whether what they tell of is on the disk.
+/// An answer that can be held back until the records that it depends on are on the disk, or are known to be lost.
 pub(super) fn send_answer<T: Send + 'static>(
     answer: oneshot::Sender<Result<T, Status>>,
     result: Result<T, Status>,
@@ -22,19 +22,19 @@ pub(super) fn send_answer<T: Send + 'static>(
     Box::new(move |refused| drop(answer.send(refused.map_or(result, |status| Err(status.clone())))))
 }
 
-/// What leaves, in order.
+/// Replies in the order in which they are sent.
 #[derive(Debug)]
 pub(super) struct Outbox<T> {
     held: VecDeque<(Position, T)>,
 }
 
 impl<T> Outbox<T> {
-    /// Puts it behind all others.
+    /// Queues a reply behind all others.
     pub(super) fn hold(&mut self, position: Position, outgoing: T) {
         self.held.push_back((position, outgoing));
     }
 
-    /// What the first waits for.
+    /// The position for which the first reply waits.
     pub(super) fn waits_for(&self) -> Option<Position> {
         self.held.front().map(|(position, _)| *position)
     }

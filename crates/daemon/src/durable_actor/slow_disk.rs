@@ -7,11 +7,11 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 
-/// Clones are the same.
+/// Clones share the state.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct SlowDisk(Arc<(Mutex<bool>, Condvar)>, Arc<AtomicBool>);
 
-/// Dropped, the disk goes on.
+/// The disk goes on when this is dropped.
 pub(crate) struct Hanging(SlowDisk);
 
 #[derive(Debug)]

@@ -1,4 +1,4 @@
-//! The actor with a state that is a list of blobs: what it does when it panics, is got past, or has a slow disk.
+//! The actor with a list of blobs as its state: what it does when it panics, is superseded, or has a slow disk.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use super::journal::MOST_WAITING_BYTES;
@@ -21,7 +21,7 @@ use tonic::{Code, Status};
 
 const DEADLINE: Duration = Duration::from_secs(20);
 
-/// How long its blobs are.
+/// Lengths of the blobs.
 #[derive(Debug, Default)]
 struct Blobs {
     lengths: Vec<usize>,
@@ -33,17 +33,17 @@ type Answer<T> = oneshot::Sender<Result<T, Status>>;
 enum Message {
     Add(usize, Answer<usize>),
     Count(Answer<usize>),
-    /// Answered when it is taken, whatever the disk does.
+    /// Answered as soon as the actor takes it, whatever the disk does.
     Taken(oneshot::Sender<()>),
-    /// How many pings were taken.
+    /// Number of pings that were taken.
     Pings(oneshot::Sender<usize>),
-    /// Something is due after so long.
+    /// Sets a deadline after this time.
     Alarm(Duration),
-    /// Takes its time.
+    /// Takes this long.
     Work(Duration),
-    /// Something is said when it is on the disk, and what was said is taken back then.
+    /// Something is sent when it is on the disk, and taken back then.
     Say,
-    /// Whether it was.
+    /// Whether the deadline of `Alarm` has come.
     Rung(oneshot::Sender<bool>),
     Panic,
 }
@@ -54,13 +54,13 @@ struct BlobCore {
     pings: usize,
     alarm: Option<Timestamp>,
     rung: bool,
-    /// How often the state was read anew.
+    /// How often the state was read from the journal again.
     restored: Arc<AtomicUsize>,
-    /// Is to be said.
+    /// Something is still to be sent.
     says: bool,
 }
 
-/// As a grant that nobody waits for any more: a change of its own.
+/// A change that sending causes, like giving back a grant whose client is gone.
 struct TakenBack;
 
 impl BlobCore {
@@ -248,7 +248,7 @@ async fn a_state_directory_that_cannot_be_looked_at_makes_the_daemon_silent_and_
     let (handle, vitals) = begin(&link, &SlowDisk::default());
     assert_eq!(in_time(handle.request(|answer| Message::Add(1, answer))).await.unwrap(), 1);
     assert_eq!(vitals.condition().borrow().unwell, None);
-    // A link that leads to itself cannot be followed, by root neither.
+    // A symbolic link to itself cannot be followed, not even by root.
     std::fs::remove_file(&link).unwrap();
     std::os::unix::fs::symlink(&link, &link).unwrap();
     let mut condition = vitals.condition();
@@ -258,7 +258,7 @@ async fn a_state_directory_that_cannot_be_looked_at_makes_the_daemon_silent_and_
         why.contains("it cannot be seen who has the state (cannot look at") && why.contains("writer.lock"),
         "{why}"
     );
-    // No deadline comes meanwhile, though the actor takes its turns.
+    // No deadline comes meanwhile, though the actor takes turns.
     handle.send(Message::Alarm(Duration::from_millis(50))).await.unwrap();
     tokio::time::sleep(Duration::from_millis(500)).await;
     assert!(!in_time(handle.ask(Message::Rung)).await.unwrap());
@@ -357,7 +357,7 @@ async fn an_actor_that_works_through_a_batch_is_seen_to_take_its_turns() {
     let place = tempfile::tempdir().unwrap();
     let (handle, vitals) = begin(place.path(), &SlowDisk::default());
     assert_eq!(in_time(handle.request(Message::Count)).await.unwrap(), 0);
-    // They are taken together.
+    // They are taken as one batch.
     let before = vitals.beats().unwrap();
     let messages = 32;
     for _ in 0..messages {

@@ -1,4 +1,4 @@
-//! What a core can use during a turn: the time, the callers to answer, the watches, and whether changes are allowed.
+//! What a core can use during a turn: the time, answers to callers, watches, and whether changes are allowed.
 
 use super::Core;
 use super::clock::Clock;
@@ -10,28 +10,28 @@ use std::time::Instant;
 use tokio::sync::{mpsc, oneshot};
 use tonic::Status;
 
-/// Something that leaves when the records of what it tells of are on the disk.
+/// Something that is sent when the records that it depends on are on the disk.
 pub(super) enum Outgoing<C: Core> {
-    /// To one who asked.
+    /// An answer to a request.
     Answer(SendAnswer),
-    /// From here on it sees every update that it wants.
+    /// A new watcher; from here on it receives every update that it wants.
     Watcher(Watcher<C::Update>),
-    /// What the state has to say.
+    /// What the state sends by itself.
     Said(C::Said),
 }
 
-/// Why nothing changes any more.
+/// Why changes are no longer possible.
 #[derive(Debug)]
 pub(crate) struct Stopped {
-    /// What who asks for a change is told.
+    /// The answer to requests that would change something.
     pub(crate) status: Status,
-    /// Nor is anything shown: it is not known what is on the disk.
+    /// Reads are refused as well: it is not known what is on the disk.
     pub(super) unreadable: bool,
 }
 
 /// See the module.
 pub(crate) struct TurnContext<C: Core> {
-    /// Everybody who watches.
+    /// All watchers.
     pub(crate) watchers: Watchers<C::Update>,
     outgoing: Vec<Outgoing<C>>,
     stopped: Option<Stopped>,
@@ -45,22 +45,22 @@ impl<C: Core> TurnContext<C> {
         TurnContext { watchers: Watchers::default(), outgoing: Vec::new(), stopped: None, clock, may_speak }
     }
 
-    /// The time since the start, without pauses of the process, and without the time in which it might say nothing.
+    /// The time since the start, without the time in which the process was paused or was not allowed to send.
     pub(crate) fn now(&self) -> Timestamp {
         self.clock.at(Instant::now())
     }
 
-    /// Whether anything may be said at all ([`super::may_speak`]).
+    /// Whether sending is allowed at all ([`super::may_speak`]).
     pub(crate) fn may_speak(&self) -> bool {
         matches!(self.may_speak.now(), Speech::Allowed)
     }
 
-    /// Why nothing may change any more; nothing as long as it may.
+    /// Why changes are no longer possible; `None` as long as they are.
     pub(crate) fn stopped(&self) -> Option<&Stopped> {
         self.stopped.as_ref()
     }
 
-    /// Answers when what the answer tells of is on the disk.
+    /// Answers when the records that the answer depends on are on the disk.
     pub(crate) fn reply<T: Send + 'static>(
         &mut self,
         answer: oneshot::Sender<Result<T, Status>>,
@@ -69,7 +69,8 @@ impl<C: Core> TurnContext<C> {
         self.outgoing.push(Outgoing::Answer(send_answer(answer, result)));
     }
 
-    /// As [`TurnContext::reply`], of what has been on the disk for long: it leaves at once, past what waits.
+    /// As [`TurnContext::reply`], for an answer whose records have been on the disk for long: it is sent at once,
+    /// before others that wait.
     pub(crate) fn reply_now<T: Send + 'static>(
         &mut self,
         answer: oneshot::Sender<Result<T, Status>>,
@@ -82,7 +83,7 @@ impl<C: Core> TurnContext<C> {
         }
     }
 
-    /// As [`TurnContext::reply`], to one who only looks; without an answer they ask again.
+    /// As [`TurnContext::reply`], for a request that only reads; where it gets no answer, its caller asks again.
     pub(crate) fn tell<T: Send + 'static>(&mut self, answer: oneshot::Sender<T>, told: T) {
         self.outgoing.push(Outgoing::Answer(Box::new(move |stopped| {
             if stopped.is_none() {
@@ -91,20 +92,20 @@ impl<C: Core> TurnContext<C> {
         })));
     }
 
-    /// What the state has to say, behind what was to be said before.
+    /// Queues what the state sends, behind everything that is queued already.
     pub(crate) fn say(&mut self, said: C::Said) {
         self.outgoing.push(Outgoing::Said(said));
     }
 
-    /// Begins a watch with what is known now. What waits for the disk is in that; what comes later follows.
+    /// Begins a watch with the current state, including changes that still wait for the disk; later updates follow.
     ///
     /// # Errors
-    /// Where so many watch already.
+    /// Where there are too many watches already.
     pub(crate) fn watch(&mut self, first: Vec<C::Update>) -> Result<mpsc::Receiver<C::Update>, Status> {
         self.watch_where(first, |_| true)
     }
 
-    /// As [`TurnContext::watch`], of the updates that are wanted.
+    /// As [`TurnContext::watch`], limited to the updates that `wants` accepts.
     ///
     /// # Errors
     /// As [`TurnContext::watch`].

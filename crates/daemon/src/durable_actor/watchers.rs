@@ -1,4 +1,5 @@
-//! Watches: each gets everything as it is, then every update. A watch that does not keep up is closed; the actor never waits for it.
+//! Watches: each receives the whole state first, then every update. A watch that cannot keep up is closed; the actor never waits for
+//! it.
 
 use crate::details::{retry_later, status};
 use std::fmt;
@@ -6,25 +7,25 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 use tonic::{Code, Status};
 
-/// Updates that wait for a watcher; one that has more to catch up with is cut off.
+/// Updates that may wait for a watcher; a watcher that falls further behind is closed.
 const WATCH_BUFFER: usize = 4_096;
-/// When a watch that was refused may be asked for again.
+/// Retry delay of a watch that was refused.
 const WATCH_AGAIN_AFTER: Duration = Duration::from_secs(1);
 
-/// Everybody who watches.
+/// All watchers.
 #[derive(Debug)]
 pub(crate) struct Watchers<U> {
     all: Vec<Watcher<U>>,
 }
 
-/// One who watches.
+/// A watcher.
 pub(super) struct Watcher<U> {
     updates: mpsc::Sender<U>,
     wants: Box<dyn Fn(&U) -> bool + Send>,
 }
 
 impl<U> Watcher<U> {
-    /// One whose channel holds what it begins with.
+    /// A watcher whose channel already holds the first updates.
     pub(super) fn begin(
         first: Vec<U>,
         wants: impl Fn(&U) -> bool + Send + 'static,
@@ -44,10 +45,10 @@ impl<U> fmt::Debug for Watcher<U> {
 }
 
 impl<U: Clone> Watchers<U> {
-    /// Whether one more may watch.
+    /// Whether another watcher is allowed.
     ///
     /// # Errors
-    /// Where so many do already.
+    /// Where there are too many already.
     pub(crate) fn admit(&mut self, most: usize) -> Result<(), Status> {
         self.all.retain(|watcher| !watcher.updates.is_closed());
         if self.all.len() >= most {
@@ -57,7 +58,7 @@ impl<U: Clone> Watchers<U> {
         Ok(())
     }
 
-    /// Tells all who want it.
+    /// Sends the update to all watchers that want it.
     pub(crate) fn publish(&mut self, update: &U) {
         self.all.retain(|watcher| {
             if !(watcher.wants)(update) {
